@@ -25,15 +25,7 @@ from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import Vector
 from dopepp.metrics.functional import average_precision, match
 from dopepp.metrics.references import REFERENCES, reference_rows
-from dopepp.metrics.row import (
-    PoseErrors,
-    PoseRow,
-    finite_median,
-    finite_p90,
-    mean_row,
-    summarise,
-    symmetries,
-)
+from dopepp.metrics.row import PoseErrors, PoseRow, mean_row, summarise
 from dopepp.parts.part import Part
 
 MEAN: Final = "mean"
@@ -284,24 +276,16 @@ class Gathered:
 
     def row(self, method: str) -> PoseRow:
         """Sum up; only the false positives of an object without ground truth mean anything."""
-        part, errors, num_false = self.part, self.errors, len(self.false_positives)
-        num_symmetries = len(symmetries(part))
+        errors, num_false = self.errors, len(self.false_positives)
         if len(errors.add) == 0:
-            return PoseRow(
-                part.name, method, 0, false_positives=num_false, num_symmetries=num_symmetries
-            )
-        row = summarise(part.name, method, part.diameter, errors, num_symmetries)
-        matched = int(errors.add.isfinite().sum())
-        row.median_translation = finite_median(errors.translation)
-        row.p90_translation = finite_p90(errors.translation)
-        if errors.deviations is not None:
-            row.median_deviations = finite_median(errors.deviations)
-        near = (errors.translation < 0.05) & (errors.rotation_s_deg < 5)
-        row.pass_5cm_5deg = float(near.double().mean())
-        row.miss_rate = 1 - matched / len(errors.add)
-        row.precision = matched / max(matched + num_false, 1)
+            row = PoseRow(self.part.name, method, 0, num_symmetries=errors.num_symmetries)
+        else:
+            row = summarise(self.part.name, method, errors)
+            matched = int(errors.add.isfinite().sum())
+            row.miss_rate = 1 - matched / len(errors.add)
+            row.precision = matched / max(matched + num_false, 1)
+            row.average_precision = self._average_precision(0.1 * self.part.diameter)
         row.false_positives = num_false
-        row.average_precision = self._average_precision(0.1 * part.diameter)
         return row
 
     def _average_precision(self, threshold: float) -> float:

@@ -93,9 +93,12 @@ def _row(part: Part, name: str, Q: Tensor, few_points: Tensor, points: Tensor) -
         mspd=None,
         rotation_deg=rotation_error_deg(Q, identity),
         rotation_s_deg=rotation_error_deg(Q[some], identity[some], group),
-        translation=nowhere[:, 0],
+        translation=None,
+        deviations=None,
+        diameter=part.diameter,
+        num_symmetries=len(group),
     )
-    return summarise(part.name, name, part.diameter, errors, len(group))
+    return summarise(part.name, name, errors)
 
 
 def _other_poses(

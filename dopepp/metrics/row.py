@@ -1,15 +1,15 @@
 """Every error of one object's poses, and the row of a result table that sums them up.
 
 To add an error, give :class:`PoseErrors` a field and :meth:`PoseErrors.of` its function. To add a
-measure, give :class:`PoseRow` a field, :func:`summarise` its formula and :data:`COLUMNS` its
-heading; tables, CSV and ``metrics.json`` follow.
+measure, give :class:`PoseRow` a field and :data:`COLUMNS` its heading and formula; tables, CSV and
+``metrics.json`` follow.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Final
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -54,9 +54,11 @@ class PoseErrors:
             not known.
         rotation_deg: Angle between the orientations, degrees.
         rotation_s_deg: The least such angle over the part's symmetries, degrees.
-        translation: Distance between the object frame's origins, metres.
+        translation: Distance between the object frame's origins, metres; None of guesses.
         deviations: Mahalanobis distance by the estimate's own covariance, over the median that
             right covariances give; infinite, too, where none is known. None of guesses.
+        diameter: Diameter of the part, metres.
+        num_symmetries: Transforms that map the part onto itself, the identity among them.
     """
 
     add: Errors
@@ -65,8 +67,10 @@ class PoseErrors:
     mspd: Errors | None
     rotation_deg: Errors
     rotation_s_deg: Errors
-    translation: Errors
-    deviations: Errors | None = None
+    translation: Errors | None
+    deviations: Errors | None
+    diameter: float
+    num_symmetries: int = 1
 
     @classmethod
     def of(
@@ -96,13 +100,19 @@ class PoseErrors:
             rotation_s_deg=rotation_error_deg(poses[0], poses[2], group),
             translation=translation_error(poses[1], poses[3]),
             deviations=mahalanobis(*poses, covariance, group) / _USUAL_MAHALANOBIS,
+            diameter=part.diameter,
+            num_symmetries=len(group),
         )
+
+    @property
+    def add_or_s(self) -> Errors:
+        """ADD, of a part with symmetries ADD-S, metres."""
+        return self.add_s if self.num_symmetries > 1 else self.add
 
 
 def symmetries(part: Part) -> Float[Tensor, "s 4 4"]:
     """Return the part's symmetry transforms, the identity first."""
-    group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
-    return torch.from_numpy(group)
+    return torch.from_numpy(symmetry_group(part.symmetries_discrete, part.symmetries_continuous))
 
 
 def bop_points(part: Part) -> Float[Tensor, "v 3"]:
@@ -114,44 +124,42 @@ def bop_points(part: Part) -> Float[Tensor, "v 3"]:
     return torch.from_numpy(np.asarray(points, np.float64))
 
 
+def finite_median(errors: Errors | None) -> float | None:
+    """Median of the finite errors (the mean of the middle two if even); None if there is none."""
+    finite = torch.empty(0) if errors is None else errors[errors.isfinite()].double().sort().values
+    if len(finite) == 0:
+        return None
+    return float((finite[(len(finite) - 1) // 2] + finite[len(finite) // 2]) / 2)
+
+
+def finite_p90(errors: Errors | None) -> float | None:
+    """90th percentile of the finite errors, between two of them linearly; None if there is none."""
+    finite = torch.empty(0) if errors is None else errors[errors.isfinite()].double()
+    return float(finite.quantile(0.9)) if len(finite) else None
+
+
 @dataclass
 class PoseRow:
     """Measures of one method on one object; None where a measure does not exist ("n/a").
 
-    Shares lie in [0, 1]. (Not frozen: torchmetrics rebuilds what ``compute`` returns.)
+    Shares lie in [0, 1], angles are degrees, distances metres. Medians and 90th percentiles are
+    over matched instances. (Not frozen: torchmetrics rebuilds what ``compute`` returns.)
 
     Attributes:
         object: The part's name, or ``mean``.
         method: What produced the poses: the estimator, or a reference row's name.
         num_instances: Ground-truth instances that count; poses tried in a reference row.
-        add_01d: Share with ADD below a tenth of the diameter.
-        add_005d: Share with ADD below a twentieth of the diameter.
-        add_002d: Share with ADD below a fiftieth of the diameter.
-        pass_5cm: Share with ADD below 0.05 m.
-        pass_10cm: Share with ADD below 0.1 m.
-        auc_10cm: Exact area under the ADD accuracy-threshold curve up to 0.1 m.
-        add_or_s_01d: Share with ADD, of a part with symmetries ADD-S, below a tenth of the
-            diameter.
-        auc_or_s_10cm: Exact area under the curve of the same error up to 0.1 m.
-        pass_5cm_5deg: Share off by less than 0.05 m and, of the nearest symmetry, 5°.
-        add_s_01d: Share with ADD-S below a tenth of the diameter.
-        auc_s_10cm: Exact area under the ADD-S curve up to 0.1 m.
-        median_rotation_deg: Over matched instances, degrees.
-        median_translation: Over matched instances, metres.
-        p90_rotation_deg: Nine of ten matched instances are below, degrees.
-        p90_translation: Nine of ten matched instances are below, metres.
-        median_deviations: By how many times the true errors of matched instances exceed the
-            standard deviations that the estimates state, in the median: 1 is honest; None without
-            covariances.
-        miss_rate: Share of instances without a matched prediction.
-        precision: TP / (TP + FP); 0 without predictions.
-        false_positives: Predictions matched with no instance.
-        average_precision: AP over the scores, with ADD below a tenth of the diameter right.
-        mssd_01d: Share with MSSD below a tenth of the diameter.
+        add_01d: Share with ADD below a tenth of the diameter, and so on.
+        add_or_s_01d: The same with ADD-S of a part with symmetries, with ADD of others.
         ar_mssd: BOP's average recall of MSSD.
         ar_mspd: BOP's average recall of MSPD; None where an image's camera is not known.
-        median_rotation_s_deg: Over matched instances, the nearest symmetry's angle, degrees.
-        num_symmetries: Transforms that map the part onto itself, the identity among them.
+        median_deviations: By how many times the true errors exceed the standard deviations that
+            the estimates state, in the median: 1 is honest; None without covariances.
+        miss_rate: Share of instances without a matched prediction.
+        average_precision: AP over the scores, with ADD below a tenth of the diameter right.
+        precision: TP / (TP + FP); 0 without predictions.
+        false_positives: Predictions matched with no instance.
+        num_symmetries: As of :class:`PoseErrors`.
     """
 
     object: str
@@ -183,22 +191,23 @@ class PoseRow:
     pass_5cm_5deg: float | None = None
     num_symmetries: int = 1
 
-    def to_record(self) -> dict[str, str | int | float | None]:
-        """Return a plain dict that JSON can hold; ``PoseRow(**record)`` reads it back."""
-        return asdict(self)
+
+Formula = Callable[[PoseErrors], float | None]
+"""Errors of N >= 1 poses to what they amount to."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """How a table shows one field of :class:`PoseRow`.
+    """How a field of :class:`PoseRow` is computed, and how a table shows it.
 
     Attributes:
         field: The field's name.
         heading: What stands above it, with the unit.
         scale: Factor from the stored unit to the shown one.
         decimals: Digits after the point.
-        group: Measures of one group stand together in a printed table.
-        symmetric: Whether it says something of its own only about a part with symmetries.
+        group: Measures of one group stand together in a printed table; those of the group
+            ``symmetry`` say something of their own only about a part with symmetries.
+        formula: Function of the errors; None of what needs more than errors.
     """
 
     field: str
@@ -206,7 +215,7 @@ class Column:
     scale: float = 1.0
     decimals: int = 0
     group: str = ""
-    symmetric: bool = False
+    formula: Formula | None = None
 
     def text(self, row: PoseRow) -> str:
         """Return a row's cell."""
@@ -219,28 +228,64 @@ class Column:
         return f"{value * self.scale:{'+' if signed else ''}.{self.decimals}f}"
 
 
+def _below(error: str, diameters: float) -> Formula:
+    return lambda errors: pass_rate(getattr(errors, error), diameters * errors.diameter)
+
+
+def _within(error: str, metres: float) -> Formula:
+    return lambda errors: pass_rate(getattr(errors, error), metres)
+
+
+def _area(error: str) -> Formula:
+    return lambda errors: auc(getattr(errors, error), 0.1)
+
+
+def _median(error: str) -> Formula:
+    return lambda errors: finite_median(getattr(errors, error))
+
+
+def _p90(error: str) -> Formula:
+    return lambda errors: finite_p90(getattr(errors, error))
+
+
+def _near(errors: PoseErrors) -> float | None:
+    """Return the share off by less than 0.05 m and, of the nearest symmetry, 5°."""
+    if errors.translation is None:
+        return None
+    near = (errors.translation < 0.05) & (errors.rotation_s_deg < 5)
+    return float(near.double().mean())
+
+
+def _ar_mssd(errors: PoseErrors) -> float:
+    return average_recall(errors.mssd, [share * errors.diameter for share in BOP_THRESHOLDS])
+
+
+def _ar_mspd(errors: PoseErrors) -> float | None:
+    return None if errors.mspd is None else average_recall(errors.mspd, BOP_MSPD_THRESHOLDS)
+
+
 COLUMNS: Final[tuple[Column, ...]] = (
     Column("num_instances", "instances"),
-    Column("add_01d", "ADD-0.1d %", 100, 1, "ADD"),
-    Column("add_005d", "ADD-0.05d %", 100, 1, "ADD"),
-    Column("add_002d", "ADD-0.02d %", 100, 1, "ADD"),
-    Column("pass_5cm", "ADD<5cm %", 100, 1, "ADD"),
-    Column("pass_10cm", "ADD<10cm %", 100, 1, "ADD"),
-    Column("auc_10cm", "AUC[0,10cm] %", 100, 1, "ADD"),
-    Column("pass_5cm_5deg", "5 cm 5° %", 100, 1, "ADD"),
-    Column("add_or_s_01d", "ADD(-S)-0.1d %", 100, 1, "symmetry", symmetric=True),
-    Column("auc_or_s_10cm", "AUC(-S)[0,10cm] %", 100, 1, "symmetry", symmetric=True),
-    Column("add_s_01d", "ADD-S-0.1d %", 100, 1, "symmetry", symmetric=True),
-    Column("auc_s_10cm", "AUC-S[0,10cm] %", 100, 1, "symmetry", symmetric=True),
-    Column("mssd_01d", "MSSD-0.1d %", 100, 1, "symmetry", symmetric=True),
-    Column("median_rotation_s_deg", "rotation-S °", 1, 1, "symmetry", symmetric=True),
-    Column("ar_mssd", "AR_MSSD %", 100, 1, "BOP"),
-    Column("ar_mspd", "AR_MSPD %", 100, 1, "BOP"),
-    Column("median_rotation_deg", "rotation °", 1, 1, "median"),
-    Column("median_translation", "translation mm", 1000, 1, "median"),
-    Column("p90_rotation_deg", "rotation 90 % °", 1, 1, "median"),
-    Column("p90_translation", "translation 90 % mm", 1000, 1, "median"),
-    Column("median_deviations", "error / stated", 1, 1, "median"),
+    Column("add_01d", "ADD-0.1d %", 100, 1, "ADD", _below("add", 0.1)),
+    Column("add_005d", "ADD-0.05d %", 100, 1, "ADD", _below("add", 0.05)),
+    Column("add_002d", "ADD-0.02d %", 100, 1, "ADD", _below("add", 0.02)),
+    Column("pass_5cm", "ADD<5cm %", 100, 1, "ADD", _within("add", 0.05)),
+    Column("pass_10cm", "ADD<10cm %", 100, 1, "ADD", _within("add", 0.1)),
+    Column("auc_10cm", "AUC[0,10cm] %", 100, 1, "ADD", _area("add")),
+    Column("pass_5cm_5deg", "5 cm 5° %", 100, 1, "ADD", _near),
+    Column("add_or_s_01d", "ADD(-S)-0.1d %", 100, 1, "symmetry", _below("add_or_s", 0.1)),
+    Column("auc_or_s_10cm", "AUC(-S)[0,10cm] %", 100, 1, "symmetry", _area("add_or_s")),
+    Column("add_s_01d", "ADD-S-0.1d %", 100, 1, "symmetry", _below("add_s", 0.1)),
+    Column("auc_s_10cm", "AUC-S[0,10cm] %", 100, 1, "symmetry", _area("add_s")),
+    Column("mssd_01d", "MSSD-0.1d %", 100, 1, "symmetry", _below("mssd", 0.1)),
+    Column("median_rotation_s_deg", "rotation-S °", 1, 1, "symmetry", _median("rotation_s_deg")),
+    Column("ar_mssd", "AR_MSSD %", 100, 1, "BOP", _ar_mssd),
+    Column("ar_mspd", "AR_MSPD %", 100, 1, "BOP", _ar_mspd),
+    Column("median_rotation_deg", "rotation °", 1, 1, "median", _median("rotation_deg")),
+    Column("median_translation", "translation mm", 1000, 1, "median", _median("translation")),
+    Column("p90_rotation_deg", "rotation 90 % °", 1, 1, "median", _p90("rotation_deg")),
+    Column("p90_translation", "translation 90 % mm", 1000, 1, "median", _p90("translation")),
+    Column("median_deviations", "error / stated", 1, 1, "median", _median("deviations")),
     Column("miss_rate", "missed %", 100, 1, "detection"),
     Column("average_precision", "AP[ADD-0.1d] %", 100, 1, "detection"),
     Column("precision", "precision %", 100, 1, "detection"),
@@ -248,59 +293,19 @@ COLUMNS: Final[tuple[Column, ...]] = (
 )
 """The measures of a table, in order; ``object`` and ``method`` name its rows."""
 
-
-def shown_columns(row: PoseRow, all_measures: bool = False) -> list[Column]:
-    """Return what tells something of a row's object: symmetric measures where it has symmetries."""
-    return [one for one in COLUMNS if all_measures or row.num_symmetries > 1 or not one.symmetric]
-
-
 _TOTALS: Final = ("num_instances", "false_positives")
 
 
-def summarise(
-    name: str, method: str, diameter: float, errors: PoseErrors, num_symmetries: int
-) -> PoseRow:
-    """Fill the measures that follow from the errors of N >= 1 poses alone.
-
-    Symmetries count with the identity.
-    """
-    add_or_s = errors.add_s if num_symmetries > 1 else errors.add
-    return PoseRow(
-        object=name,
-        method=method,
-        num_instances=len(errors.add),
-        add_01d=pass_rate(errors.add, 0.1 * diameter),
-        add_005d=pass_rate(errors.add, 0.05 * diameter),
-        add_002d=pass_rate(errors.add, 0.02 * diameter),
-        pass_5cm=pass_rate(errors.add, 0.05),
-        pass_10cm=pass_rate(errors.add, 0.1),
-        auc_10cm=auc(errors.add, 0.1),
-        add_s_01d=pass_rate(errors.add_s, 0.1 * diameter),
-        auc_s_10cm=auc(errors.add_s, 0.1),
-        median_rotation_deg=finite_median(errors.rotation_deg),
-        p90_rotation_deg=finite_p90(errors.rotation_deg),
-        mssd_01d=pass_rate(errors.mssd, 0.1 * diameter),
-        ar_mssd=average_recall(errors.mssd, [share * diameter for share in BOP_THRESHOLDS]),
-        ar_mspd=None if errors.mspd is None else average_recall(errors.mspd, BOP_MSPD_THRESHOLDS),
-        median_rotation_s_deg=finite_median(errors.rotation_s_deg),
-        add_or_s_01d=pass_rate(add_or_s, 0.1 * diameter),
-        auc_or_s_10cm=auc(add_or_s, 0.1),
-        num_symmetries=num_symmetries,
-    )
+def shown_columns(row: PoseRow, all_measures: bool = False) -> list[Column]:
+    """Return what tells something of a row's object: symmetric measures where it has symmetries."""
+    everything = all_measures or row.num_symmetries > 1
+    return [column for column in COLUMNS if everything or column.group != "symmetry"]
 
 
-def finite_median(errors: Float[Tensor, "n"]) -> float | None:
-    """Median of the finite errors (the mean of the middle two if even); None if there is none."""
-    finite = errors[errors.isfinite()].double().sort().values
-    if len(finite) == 0:
-        return None
-    return float((finite[(len(finite) - 1) // 2] + finite[len(finite) // 2]) / 2)
-
-
-def finite_p90(errors: Float[Tensor, "n"]) -> float | None:
-    """90th percentile of the finite errors, between two of them linearly; None if there is none."""
-    finite = errors[errors.isfinite()].double()
-    return float(finite.quantile(0.9)) if len(finite) else None
+def summarise(name: str, method: str, errors: PoseErrors) -> PoseRow:
+    """Fill the measures that follow from the errors of N >= 1 poses alone."""
+    measures: dict[str, Any] = {one.field: one.formula(errors) for one in COLUMNS if one.formula}
+    return PoseRow(name, method, len(errors.add), num_symmetries=errors.num_symmetries, **measures)
 
 
 def mean_row(rows: Sequence[PoseRow], method: str) -> PoseRow:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import sys
 from collections import namedtuple
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -51,11 +52,9 @@ def feed(target: PoseMetrics, images: range) -> None:
 def summary(source: PoseMetrics) -> dict[str, object]:
     references = source.references()
     return {
-        "rows": {name: row.to_record() for name, row in source.compute().items()},
+        "rows": {name: asdict(row) for name, row in source.compute().items()},
         "errors": sorted(source.errors("box").tolist()),
-        "references": {
-            reference: rows["box"].to_record() for reference, rows in references.items()
-        },
+        "references": {reference: asdict(rows["box"]) for reference, rows in references.items()},
     }
 
 

@@ -7,7 +7,7 @@ import json
 import math
 import pickle
 from collections import namedtuple
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -148,7 +148,7 @@ def test_what_stands_for_an_instance(found, error, counts):
     row = metric.compute()["box"]
     assert (row.false_positives, row.precision, row.miss_rate) == counts
     assert metric.errors("box") == pytest.approx([error])
-    assert not any(isinstance(v, float) and math.isnan(v) for v in row.to_record().values())
+    assert not any(isinstance(v, float) and math.isnan(v) for v in asdict(row).values())
 
 
 def test_the_distance_is_taken_between_centres_not_origins():
@@ -229,7 +229,7 @@ def test_an_object_without_ground_truth_stays_out_of_the_mean():
     assert rows[MEAN].add_01d == 0.5
     assert rows[MEAN].median_rotation_deg == 0.0  # only a was matched
     assert (rows[MEAN].num_instances, rows[MEAN].false_positives) == (2, 1)
-    assert json.loads(json.dumps(rows["c"].to_record(), allow_nan=False))["add_01d"] is None
+    assert json.loads(json.dumps(asdict(rows["c"]), allow_nan=False))["add_01d"] is None
 
 
 def test_reset_pickle_and_copy():

@@ -32,8 +32,10 @@ def report_of(
     rows, constant = {}, {}
     for part, values in errors.items():
         e = torch.from_numpy(values)
-        errors_of = PoseErrors(e, e, e, None, 10_000 * e, 10_000 * e, e)
-        rows[part] = summarise(part, name, DIAMETER, errors_of, num_symmetries)
+        errors_of = PoseErrors(
+            e, e, e, None, 10_000 * e, 10_000 * e, e, None, DIAMETER, num_symmetries
+        )
+        rows[part] = summarise(part, name, errors_of)
         rows[part].miss_rate = float(np.isinf(values).sum() / max(len(values), 1))
         constant[part] = PoseRow(part, "best constant pose", len(values), add_01d=0.2)
     rows[MEAN] = mean_row(list(rows.values()), name)
