@@ -31,7 +31,7 @@ from dopepp.metrics.row import finite_median
 
 _log = logging.getLogger(__name__)
 
-Values = Float[np.ndarray, "n"]
+Numbers = Float[np.ndarray, "n"]
 """A number of each of n instances."""
 
 
@@ -40,21 +40,11 @@ class Quantity:
     """What instances are sorted by: its name and unit, its value of each, digits in tables."""
 
     heading: str
-    of: Callable[[Gathered], Values]
+    of: Callable[[Gathered], Numbers]
     decimals: int
 
 
-def distances(instances: Gathered) -> Values:
-    """Return the distance from the camera to the centre of the cuboid, metres."""
-    return np.asarray(np.linalg.norm(_centres(instances), axis=1))
-
-
-def visible_fractions(instances: Gathered) -> Values:
-    """Return the visible share of the silhouette, in [0, 1]."""
-    return np.asarray(instances.visible_fractions.numpy())
-
-
-def sizes(instances: Gathered) -> Values:
+def sizes(instances: Gathered) -> Numbers:
     """Return the root of the area of the projected cuboid, pixels of the image as it came.
 
     The whole cuboid counts, with what is hidden or outside the image; unlike the distance it says
@@ -69,7 +59,7 @@ def sizes(instances: Gathered) -> Values:
     return np.sqrt(np.array(areas, np.float64))
 
 
-def view_angles(instances: Gathered) -> Values:
+def view_angles(instances: Gathered) -> Numbers:
     """Return the angle between the object's +z axis and the way from it to the camera, degrees.
 
     At 0° the +z face of the cuboid looks at the camera, at 90° it is seen from its edge.
@@ -86,15 +76,15 @@ def _centres(instances: Gathered) -> Float[np.ndarray, "n 3"]:
 
 
 QUANTITIES: Final[dict[QuantityName, Quantity]] = {
-    "distance": Quantity("distance (m)", distances, 3),
-    "visibility": Quantity("visible fraction", visible_fractions, 3),
+    "distance": Quantity("distance (m)", lambda one: np.linalg.norm(_centres(one), axis=1), 3),
+    "visibility": Quantity("visible fraction", lambda one: one.visible_fractions.numpy(), 3),
     "size": Quantity("apparent size (px)", sizes, 1),
     "rotation": Quantity("view angle (°)", view_angles, 1),
 }
 """What rates can be broken down by."""
 
 
-def bin_numbers(values: Values, num_bins: int) -> Int[np.ndarray, "n"]:
+def bin_numbers(values: Numbers, num_bins: int) -> Int[np.ndarray, "n"]:
     """Return each value's bin, counted from 0; bins have equal counts, equal values share one.
 
     A value falls where the middle of its ranks does, so that a bin of many equal values (objects
@@ -155,7 +145,7 @@ def break_down(
 def _in_bin(
     one: Bin,
     method: str,
-    numbers: Values,
+    numbers: Numbers,
     gathered: Sequence[Gathered],
     rates: Sequence[PassRate],
 ) -> Iterator[Value]:
@@ -163,6 +153,7 @@ def _in_bin(
     chosen = torch.from_numpy((numbers >= one.low) & (numbers <= one.high))
     rotations = torch.cat([own.errors.rotation_s_deg for own in gathered])[chosen]
     num = len(rotations)
+    median = finite_median(rotations)
     value = Value(method, MEAN, condition=one.middle)
     yield value._replace(measure="num_instances", value=num)
     for rate in rates:
@@ -170,7 +161,6 @@ def _in_bin(
         share = int(passed.sum()) / num if num else math.nan
         low, high = interval(share, num)
         yield value._replace(measure=rate.field, value=share, low=low, high=high)
-    median = finite_median(rotations)
     yield value._replace(
         measure="median_rotation_deg", value=math.nan if median is None else median
     )

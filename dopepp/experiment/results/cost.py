@@ -20,11 +20,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import pandas as pd
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import nn
 
-from dopepp.core.files import read_csv, write_csv, write_png
+from dopepp.core.files import write_png, write_whole
 from dopepp.data.batch import collate
 from dopepp.data.sample import Sample, pad_sample, resize_sample
 from dopepp.drawing.curves import PlotLine, figure_image, lines_figure
@@ -114,19 +115,6 @@ class NetworkCost:
         }
 
 
-@dataclass(frozen=True)
-class FrameTimes:
-    """Seconds that frames took, in their order, from picture to poses.
-
-    In them are those of the network, from the resized picture to maps, and those from maps to
-    poses; the rest resizes and pads.
-    """
-
-    seconds: Float[np.ndarray, "frames"]
-    network_seconds: Float[np.ndarray, "frames"]
-    recovery_seconds: Float[np.ndarray, "frames"]
-
-
 class RehearsedEstimator(PoseEstimator):
     """An estimator that runs its network and then goes on with maps that it was given.
 
@@ -172,23 +160,16 @@ def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
         picture_size=samples[0].size,
         device=torch.cuda.get_device_name() if has_gpu else platform.machine(),
         threads=torch.get_num_threads(),
-        ms_per_frame=1000 * float(np.median(frames.seconds)),
-        network_ms=1000 * float(np.median(frames.network_seconds)),
-        recovery_ms=1000 * float(np.median(frames.recovery_seconds)),
+        ms_per_frame=1000 * float(frames["seconds"].median()),
+        network_ms=1000 * float(frames["network_seconds"].median()),
+        recovery_ms=1000 * float(frames["recovery_seconds"].median()),
         batch_size=config.cost.batch_size,
         frames_per_s=_frames_per_s(estimator, config.cost.batch_size, description.input_size),
     )
     write_config(run_dir, config.plain)
     write_json(run_dir / COST_FILE, asdict(cost))
     write_json(run_dir / VERSIONS_FILE, environment(config.seed, ""))
-    rows = [
-        {
-            "frame": number,
-            **{name: f"{values[number]:.6f}" for name, values in vars(frames).items()},
-        }
-        for number in range(len(frames.seconds))
-    ]
-    write_csv(run_dir / FRAMES_FILE, rows)
+    write_whole(run_dir / FRAMES_FILE, frames.to_csv(float_format="%.6f").encode())
     save_frame_rates(run_dir / "frame_rate.png", {cost.name: frames})
     write_job_readme(run_dir, f"Cost of {cost.name}")
     display.show_table(
@@ -205,11 +186,15 @@ def time_frames(
     geometry: MapGeometry,
     num_frames: int,
     seed: int,
-) -> FrameTimes:
+) -> pd.DataFrame:
     """Time frames from picture to poses, after :data:`WARM_UP` that are not timed.
 
     Pictures are taken in turn. Geometry and seed are of the maps that a trained network would
     answer and of their noise.
+
+    Returns:
+        By frame the ``seconds`` from picture to poses; in them are ``network_seconds``, from the
+        resized picture to maps, and ``recovery_seconds``, from maps to poses.
     """
     generator = torch.Generator().manual_seed(seed)
     rehearsed = [(one, likely_maps(one, estimator, geometry, generator)) for one in samples]
@@ -220,7 +205,8 @@ def time_frames(
         ended = time.perf_counter()
         network = estimator.network_ended - estimator.network_began
         rows.append((ended - began, network, ended - estimator.network_ended))
-    return FrameTimes(*np.array(rows[WARM_UP:]).T)
+    table = pd.DataFrame(rows[WARM_UP:], columns=["seconds", "network_seconds", "recovery_seconds"])
+    return table.rename_axis("frame")
 
 
 def likely_maps(
@@ -243,24 +229,15 @@ def likely_maps(
     return belief, field
 
 
-def read_frames(path: Path) -> FrameTimes:
-    """Return what each frame of a cost job took; earlier versions timed the network alone."""
-    rows = read_csv(path)
-    whole = np.array([float(row["seconds"]) for row in rows])
-    network = np.array([float(row.get("network_seconds", row["seconds"])) for row in rows])
-    recovery = np.array([float(row.get("recovery_seconds", 0)) for row in rows])
-    return FrameTimes(whole, network, recovery)
-
-
-def save_frame_rates(path: Path, frames: Mapping[str, FrameTimes]) -> None:
+def save_frame_rates(path: Path, frames: Mapping[str, pd.DataFrame]) -> None:
     """Draw frames a second over time into a PNG, two curves per network (paper Fig. 13).
 
     One is from picture to poses, the dashed one what the network alone would reach.
     """
     lines = []
     for number, (name, times) in enumerate(frames.items()):
-        at, colour = np.cumsum(times.seconds), f"C{number}"
-        whole, alone = 1 / times.seconds[None], 1 / times.network_seconds[None]
+        at, colour = times["seconds"].cumsum().to_numpy(), f"C{number}"
+        whole, alone = (1 / times[[name]].to_numpy().T for name in ("seconds", "network_seconds"))
         lines.append(PlotLine(f"{name}, picture to poses", at, whole, colour, False))
         lines.append(PlotLine(f"{name}, network alone", at, alone, colour, True))
     write_png(path, figure_image(lines_figure(lines, "time (s)", "frames a second")))

@@ -31,7 +31,6 @@ from dopepp.experiment.results.cost import (
     COST_FILE,
     FRAMES_FILE,
     NOTE,
-    read_frames,
     save_frame_rates,
 )
 from dopepp.experiment.results.differences import REFINED_NOTE, compared, noise
@@ -397,7 +396,7 @@ def time_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
     ]
     if costs:
         jobs = {label: methods[label].runs[0].folder / FRAMES_FILE for label in costs}
-        frames = {label: read_frames(path) for label, path in jobs.items()}
+        frames = {label: pd.read_csv(path) for label, path in jobs.items()}
         save_frame_rates(folder / "frame_rate.png", frames)
     return rows + missing + others, []
 
