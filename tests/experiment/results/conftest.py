@@ -33,7 +33,7 @@ def report_of(
     for part, values in errors.items():
         e = torch.from_numpy(values)
         errors_of = PoseErrors(
-            e, e, e, None, 10_000 * e, 10_000 * e, e, None, DIAMETER, num_symmetries
+            e, e, e, None, 10_000 * e, 10_000 * e, None, None, DIAMETER, num_symmetries
         )
         rows[part] = summarise(part, name, errors_of)
         rows[part].miss_rate = float(np.isinf(values).sum() / max(len(values), 1))
