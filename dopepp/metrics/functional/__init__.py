@@ -9,6 +9,8 @@ against an independent implementation.
 """
 
 from dopepp.metrics.functional.distances import (
+    BOP_THRESHOLDS,
+    VSD_DELTA,
     add,
     add_s,
     mahalanobis,
@@ -17,10 +19,10 @@ from dopepp.metrics.functional.distances import (
     reprojection_error,
     rotation_error_deg,
     translation_error,
+    vsd,
 )
 from dopepp.metrics.functional.rates import (
     BOP_MSPD_THRESHOLDS,
-    BOP_THRESHOLDS,
     MATCH_DISTANCE,
     auc,
     average_precision,
@@ -30,7 +32,6 @@ from dopepp.metrics.functional.rates import (
     pass_rate,
     wilson_interval,
 )
-from dopepp.metrics.functional.vsd import VSD_DELTA, vsd
 
 __all__ = [
     "BOP_MSPD_THRESHOLDS",

@@ -17,9 +17,6 @@ from dopepp.metrics.functional.distances import Errors, nan_is_miss, to_float64
 
 AucMethod = Literal["exact", "voc"]
 
-BOP_THRESHOLDS: Final = tuple(round(0.05 * k, 2) for k in range(1, 11))
-"""0.05 to 0.5: of MSSD, times the diameter (BOP)."""
-
 BOP_MSPD_THRESHOLDS: Final = tuple(5.0 * k for k in range(1, 11))
 """5 to 50 pixels: of MSPD in an image 640 pixels wide; times width/640 in others (BOP)."""
 
