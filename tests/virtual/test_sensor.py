@@ -140,9 +140,7 @@ def test_drawn_sensors_keep_to_their_ranges():
 
 
 def test_everything_off_is_the_zero_sensor():
-    off = Sensors(
-        exposure_probability=0, blur_probability=0, motion_probability=0, noise_probability=0,
-        jpeg_probability=0,
-    )  # fmt: skip
+    steps = ("exposure", "blur", "motion", "noise", "jpeg")
+    off = Sensors(**{f"{step}_probability": 0 for step in steps})
     drawn = off.draw(np.random.default_rng(1))
     assert drawn == Sensor(noise_seed=drawn.noise_seed)

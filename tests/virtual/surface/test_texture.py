@@ -9,20 +9,11 @@ from dopepp.geometry.camera import make_transform
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.virtual import Ambient, Material, Scene, SceneObject, make_surface, render
 from dopepp.virtual.presets.placement import FACING
+from dopepp.virtual.sensor import decode_srgb, encode_srgb
 from dopepp.virtual.surface.texture import make_texture
 
 SIDE = 0.3
 DIM = Ambient(above=(0.4, 0.4, 0.4), below=(0.4, 0.4, 0.4))
-
-
-def linear(codes: np.ndarray) -> np.ndarray:
-    codes = codes / 255.0
-    return np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
-
-
-def encoded(light: np.ndarray) -> np.ndarray:
-    curve = 1.055 * np.maximum(light, 0) ** (1 / 2.4) - 0.055
-    return 255 * np.where(light <= 0.0031308, 12.92 * light, curve)
 
 
 def supersampled(texture: np.ndarray, pose: np.ndarray, scene: Scene, n: int = 12) -> np.ndarray:
@@ -30,7 +21,7 @@ def supersampled(texture: np.ndarray, pose: np.ndarray, scene: Scene, n: int = 1
     width, height = scene.size
     v, u = np.mgrid[:height, :width]
     inverse_K, rotation = np.linalg.inv(scene.K), pose[:3, :3]
-    start, light, total = -rotation.T @ pose[:3, 3], linear(texture), 0.0
+    start, light, total = -rotation.T @ pose[:3, 3], decode_srgb(texture / 255), 0.0
     for dx, dy in (np.mgrid[:n, :n].reshape(2, -1).T + 0.5) / n - 0.5:
         rays = np.stack([u + dx, v + dy, np.ones_like(u)], axis=-1) @ inverse_K.T @ rotation
         stretch = -start[2] / rays[..., 2]
@@ -51,10 +42,10 @@ def test_a_fine_checker_matches_supersampling(scene_of, sheet, angle, distance):
     pose = make_transform(tilt @ turn @ FACING, np.array([0, 0, distance]))
     item = SceneObject(make_surface(sheet(SIDE, texture)), pose, Material((1, 1, 1), 1.0, 0.0))
     scene = scene_of(item, lights=(), ambient=DIM)
-    expected = encoded(0.4 * supersampled(texture, pose, scene))
+    expected = 255 * encode_srgb(0.4 * supersampled(texture, pose, scene))
     known = np.isfinite(expected)
     assert known.sum() > 400
-    point_sampled = encoded(0.4 * supersampled(texture, pose, scene, 1))
+    point_sampled = 255 * encode_srgb(0.4 * supersampled(texture, pose, scene, 1))
     errors = [
         float(np.sqrt(((image - expected)[known] ** 2).mean()))
         for image in (render(scene).image, point_sampled)
@@ -85,5 +76,5 @@ def test_the_coarsest_level_is_the_mean_light(shape):
     texture = make_texture(image, uv, np.array([(0, 1, 2), (0, 2, 3)], np.int32))
     assert texture.image(-1).shape == (1, 1, 3)
     np.testing.assert_array_equal(texture.image(), image)
-    expected = encoded(linear(image.astype(float)).mean(axis=(0, 1)))
+    expected = 255 * encode_srgb(decode_srgb(image / 255).mean(axis=(0, 1)))
     np.testing.assert_allclose(texture.image(-1)[0, 0], expected, atol=3)

@@ -12,6 +12,7 @@ from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.virtual import Surface, make_surface, render
 from dopepp.virtual.presets.placement import FACING
 from dopepp.virtual.scene import Ambient, Grooves, Light, Material, SceneObject
+from dopepp.virtual.sensor import decode_srgb
 
 
 def even(light: float) -> Ambient:
@@ -19,8 +20,7 @@ def even(light: float) -> Ambient:
 
 
 def linear(codes: np.ndarray) -> np.ndarray:
-    codes = np.asarray(codes) / 255.0
-    return np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
+    return np.asarray(decode_srgb(np.asarray(codes) / 255))
 
 
 def facing(surface: Surface, place: tuple[float, float, float], *material: Material) -> SceneObject:
