@@ -11,13 +11,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Annotated, Any, Final
 
 import numpy as np
 import torch
-from pydantic import Field
 from torch import Tensor
 
 from dopepp.core.errors import UserError
@@ -110,9 +109,6 @@ class Checkpoint:
         return {"state_dict": weights, KEY: self.to_payload()}
 
 
-_Side = Annotated[int, Range(1, MAX_SIDE, "pixels")]
-
-
 @dataclass(frozen=True)
 class _Header:
     """A description's fields, except the version; unknown ones are ignored."""
@@ -120,7 +116,7 @@ class _Header:
     spec: dict[str, Any]
     parts: list[Any]
     data: dict[str, Any]
-    input_size: Annotated[list[_Side], Field(min_length=2, max_length=2)]
+    input_size: Annotated[tuple[int, int], Range(1, MAX_SIDE, "pixels")]
     stride: Annotated[int, Range(1, 256, "pixels")]
     sigma: Annotated[float, Range(0.1, 100, "cells")]
     recovery: dict[str, int | float]
@@ -144,8 +140,15 @@ def read(path: Path) -> Checkpoint:
     if KEY not in content:
         raise UserError(f"{path} without {KEY!r} entry", _WHAT, "pass a file written by train.py")
     try:
-        weights = _parse_weights(content.get("state_dict"))
-        checkpoint = replace(parse_description(content[KEY]), state_dict=weights)
+        checkpoint = parse_description(content[KEY])
+        weights = content.get("state_dict")
+        if not isinstance(weights, dict):
+            raise UserError(f"state_dict as {type(weights).__name__}", "weights by name", _FIX)
+        checkpoint.state_dict = {
+            name.removeprefix(STATE_PREFIX): value
+            for name, value in weights.items()
+            if isinstance(name, str) and name.startswith(STATE_PREFIX)
+        }
         _check_weights(checkpoint, size)
     except UserError as error:
         raise UserError(f"{error.got}, in checkpoint {path}", error.allowed, error.fix) from error
@@ -176,19 +179,11 @@ def parse_description(payload: object) -> Checkpoint:
     # Containers whose content has a reader of its own are not copied: empty ones stand for them.
     own = {name: payload[name] for name in ("spec", "parts", "data") if name in payload}
     empty = {name: type(value)() for name, value in own.items() if isinstance(value, (dict, list))}
-    header = parse(_Header, {**payload, **empty}, fix=_FIX)
-    return Checkpoint(
-        spec=architecture(own["spec"]),
-        state_dict={},
-        parts=[Part.from_record(record) for record in own["parts"]],
-        input_size=(header.input_size[0], header.input_size[1]),
-        stride=header.stride,
-        sigma=header.sigma,
-        recovery=header.recovery,
-        data=own["data"],
-        data_fingerprint=header.data_fingerprint,
-        seen={name: Seen.parse(values) for name, values in header.seen.items()},
-    )
+    fields = vars(parse(_Header, {**payload, **empty}, fix=_FIX))
+    parts = [Part.from_record(record) for record in own["parts"]]
+    seen = {name: Seen.parse(values) for name, values in fields["seen"].items()}
+    own |= {"spec": architecture(own["spec"]), "parts": parts, "seen": seen}
+    return Checkpoint(**{**fields, **own}, state_dict={})
 
 
 def _check_plain(payload: Mapping[Any, Any]) -> None:
@@ -223,17 +218,6 @@ def _count(value: object, depth: int, counts: dict[int, int]) -> int:
     if counts[id(value)] > _MAX_VALUES:
         raise ValueError(f"over {_MAX_VALUES} values")
     return counts[id(value)]
-
-
-def _parse_weights(state_dict: object) -> dict[str, Tensor]:
-    if not isinstance(state_dict, dict):
-        got = f"state_dict as {type(state_dict).__name__}"
-        raise UserError(got, "weights by name", _FIX)
-    return {
-        name.removeprefix(STATE_PREFIX): value
-        for name, value in state_dict.items()
-        if isinstance(name, str) and name.startswith(STATE_PREFIX)
-    }
 
 
 def _check_weights(checkpoint: Checkpoint, size: int) -> None:

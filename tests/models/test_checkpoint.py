@@ -193,7 +193,7 @@ def set_weight(value: Any) -> Any:
         (set_payload("spec", "DSC"), "spec='DSC'"),
         (set_payload("spec", {}), "a model spec with"),
         (set_payload("input_size", [128]), r"input_size=\[128\]"),
-        (set_payload("input_size", [0, 128]), r"input_size\[0\]=0"),
+        (set_payload("input_size", [0, 128]), r"input_size=\[0, 128\]"),
         (set_payload("stride", 4), "stride 4 and 1 parts"),
         (set_payload("stride", 8.5), "stride=8.5"),
         (set_payload("sigma", 0.0), "sigma=0.0"),

@@ -230,8 +230,8 @@ DESCRIPTIONS = {
     ),
     "a multiple of nothing": (lambda payload: section(payload, size_multiple=7), "size_multiple 7"),
     "a rate of text": (lambda payload: section(payload, add_01d={"int8": "1"}), "int8='1'"),
-    "another field": (lambda payload: section(payload, code="import os"), "export .*code"),
-    "no section": (lambda payload: edited(payload, export=None), "export None"),
+    "another field": (lambda payload: section(payload, code="import os"), r"export\.code"),
+    "no section": (lambda payload: edited(payload, export=None), "export=None"),
 }  # fmt: skip
 
 
