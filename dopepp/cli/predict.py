@@ -12,7 +12,18 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dopepp.cli.errors import resumable
-from dopepp.cli.options import CameraFile, Crop, Device, KSize, Meshes, Unit
+from dopepp.cli.options import (
+    CameraFile,
+    Crop,
+    Device,
+    Distances,
+    Intrinsics,
+    KSize,
+    MaxMs,
+    Meshes,
+    Track,
+    Unit,
+)
 from dopepp.core.errors import UserError
 
 if TYPE_CHECKING:
@@ -37,35 +48,25 @@ def predict(
             "a camera's number, an rtsp:// or http:// stream"
         ),
     ],
-    intrinsics: Annotated[
-        tuple[float, float, float, float] | None,
-        typer.Option("--K", help="fx fy cx cy, pixels; or --camera; a bag may have its own"),
-    ] = None,
+    intrinsics: Intrinsics = None,
     camera: CameraFile = None,
     K_size: KSize = None,
     crop: Crop = None,
     topic: Annotated[
         str | None, typer.Option(help="of a ROS bag's pictures, where it has several")
     ] = None,
-    distance: Annotated[
-        tuple[float, float] | None,
-        typer.Option(help="nearest and farthest part, metres; else those of training, then any"),
-    ] = None,
+    distance: Distances = None,
     roi: Annotated[
         tuple[int, int, int, int] | None,
         typer.Option(help="x y width height: look at this part of the picture only"),
     ] = None,
     conf: Annotated[float, typer.Option(help="least score of a detection, 0 to 1")] = 0.0,
-    stride: Annotated[int, typer.Option(help="every so manieth picture only")] = 1,
-    track: Annotated[
-        bool, typer.Option("--track", help="follow the parts from picture to picture")
-    ] = False,
+    stride: Annotated[int, typer.Option(help="use every n-th picture only")] = 1,
+    track: Track = False,
     refine: Annotated[
         str | None, typer.Option(help="region: on the picture; depth: with --depth; region,depth")
     ] = None,
-    max_ms: Annotated[
-        float | None, typer.Option(help="of refining, then detections keep the network's poses")
-    ] = None,
+    max_ms: MaxMs = None,
     depth: Annotated[
         Path | None, typer.Option(help="16-bit PNG aligned to the picture, 0 where unknown")
     ] = None,

@@ -1,4 +1,4 @@
-"""``dopepp render``: a data set of labelled images."""
+"""Data sets: ``dopepp render``, ``check``, ``download`` and ``symmetries``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from dopepp.cli.errors import resumable
+from dopepp.cli.errors import report_errors, resumable
 from dopepp.cli.options import Unit
 
 
@@ -95,3 +95,56 @@ def render(
             typer.echo(write_preview(job, out))
         else:
             typer.echo(run(job, out, num, shard, workers, engine, ray_address))
+
+
+def check(
+    folder: Annotated[Path, typer.Argument(help="BOP, BOP-WebDataset, NDDS/FAT or YCB-Video")],
+    most: Annotated[int, typer.Option(min=0, help="defects that are listed, at most")] = 10_000,
+) -> None:
+    """Check a data set and list every defect with its file and field, a line each.
+
+    Exit codes: 0 nothing is wrong; 1 something is; 2 there is no data set.
+    """
+    from dopepp.data.check import check_dataset
+
+    with report_errors():
+        report = check_dataset(folder)
+    typer.echo("\n".join(report.lines(most)))
+    if not report.ok:
+        raise typer.Exit(1)
+
+
+def download(
+    name: Annotated[str, typer.Argument(help="voc2007: photos for --backgrounds, 460 MB")],
+    out: Annotated[Path, typer.Option(help="folder to keep it in")] = Path("data"),
+) -> None:
+    """Download a public data set, verify its checksum, and print the folder of its photos."""
+    from rich.console import Console
+    from rich.progress import DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
+
+    from dopepp.data.download import download as fetch_and_unpack
+
+    columns = (DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
+    console = Console(stderr=True)
+    with resumable(), Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task(name, total=None)
+        photos = fetch_and_unpack(
+            name, out, lambda there, total: bar.update(task, completed=there, total=total)
+        )
+    typer.echo(photos)
+
+
+def symmetries(
+    part: Annotated[
+        str, typer.Argument(help="a mesh file (STL, OBJ, PLY, GLB, 3MF, OFF) or a built-in part")
+    ],
+    unit: Unit = None,
+    tolerance: Annotated[
+        float, typer.Option(help="largest miss of the surface, share of the diameter")
+    ] = 0.01,
+) -> None:
+    """Find a part's symmetries and print its entry of BOP's models_info.json."""
+    from dopepp.data.part_symmetries import describe_symmetries
+
+    with report_errors():
+        typer.echo(describe_symmetries(part, unit, tolerance))
