@@ -26,8 +26,7 @@ PACKAGES: Final = {"--ros2": ("rclpy", "ros2"), "--bag": ("rosbags", "bags")}
 def node(
     model: Annotated[Path, typer.Argument(help="best.ckpt of a run, or a released network")],
     source: Annotated[
-        list[str] | None,
-        typer.Argument(help="of --json and --udp: as `dopepp predict` takes it"),
+        list[str] | None, typer.Argument(help="of --json and --udp: as `dopepp predict` takes it")
     ] = None,
     ros2: Annotated[bool, typer.Option("--ros2", help="a node of ROS 2 (extra ros2)")] = False,
     bag: Annotated[

@@ -14,11 +14,7 @@ from dopepp.core.files import write_png
 from dopepp.geometry.camera import camera_matrix, invert_transform, make_transform
 from dopepp.geometry.camera_file import Camera, read_camera
 from dopepp.robot.calibration.board import draw_view, parse_board
-from dopepp.robot.calibration.files import (
-    read_transform,
-    transform_record,
-    write_calibration,
-)
+from dopepp.robot.calibration.files import read_transform, transform_record, write_calibration
 from dopepp.robot.calibration.lens import write_camera
 
 BOARD = "charuco:8x6:25:19"

@@ -24,13 +24,7 @@ from rich.text import Text
 
 from dopepp.core.errors import UserError
 from dopepp.core.interrupts import StoppedError, stopped
-from dopepp.core.pool import (
-    ClusterPool,
-    LostWorkerError,
-    Pool,
-    ProcessPool,
-    available_cores,
-)
+from dopepp.core.pool import ClusterPool, LostWorkerError, Pool, ProcessPool, available_cores
 from dopepp.data.formats import RECORD_FILE, Writer
 from dopepp.data.jobs.job import Job, begin, is_begun
 from dopepp.data.sources.rendered import MAX_ITEMS, rendered_sample

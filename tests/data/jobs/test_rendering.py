@@ -23,13 +23,7 @@ from dopepp.core.pool import PickledFunction, Pool, opened
 from dopepp.data.formats import RECORD_FILE
 from dopepp.data.formats.ndds.writer import NddsWriter
 from dopepp.data.jobs.job import WRITERS, make_job, named_part
-from dopepp.data.jobs.rendering import (
-    ProgressDisplay,
-    RenderReport,
-    Shard,
-    plan,
-    render_dataset,
-)
+from dopepp.data.jobs.rendering import ProgressDisplay, RenderReport, Shard, plan, render_dataset
 
 NUM = 10
 
