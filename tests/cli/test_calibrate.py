@@ -31,10 +31,8 @@ def cell(tmp_path_factory):
     """A folder with ten pictures, poses.csv and camera.yaml, and where the camera truly is."""
     folder, rng = tmp_path_factory.mktemp("cell"), np.random.default_rng(0)
     camera = Camera((640, 480), camera_matrix(560, 560, 322, 236), (0.05, -0.1, 0, 0, 0), "true")
-    board, X = (
-        parse_board(BOARD),
-        make_transform(Rotation.random(rng=rng).as_matrix(), [0.03, -0.05, 0.08]),
-    )
+    board = parse_board(BOARD)
+    X = make_transform(Rotation.random(rng=rng).as_matrix(), [0.03, -0.05, 0.08])
     Y = make_transform(Rotation.random(rng=rng).as_matrix(), [0.5, 0.1, 0.02])
     write_camera(folder / "camera.yaml", camera)
     rows = []
@@ -95,17 +93,9 @@ def test_a_calibration_that_is_not_trusted_is_written_by_force_alone(cell, tmp_p
 
 def test_poses_in_millimetres_are_told(cell, tmp_path):
     folder, _, _ = cell
-    words = (
-        "--board",
-        BOARD,
-        "--camera",
-        folder / "camera.yaml",
-        "--mount",
-        "hand",
-        "--unit",
-        "mm",
-    )
-    done = call("handeye", folder, folder / "poses.csv", *words, "--out", tmp_path / "x.yaml")
+    words = ("--board", BOARD, "--camera", folder / "camera.yaml", "--mount", "hand")
+    words += ("--unit", "mm", "--out", tmp_path / "x.yaml")
+    done = call("handeye", folder, folder / "poses.csv", *words)
     assert done.exit_code == 2
     assert "--unit m" in done.output
 
@@ -122,13 +112,9 @@ def test_a_tip_and_a_bench_are_written(tmp_path):
     assert np.allclose(tip, [0, 0.01, 0.12], atol=1e-6)
     points = np.array([[0, 0, 0], [300, 0, 1], [0, 300, 0], [300, 300, 1.0]])
     np.savetxt(tmp_path / "b.csv", points, delimiter=",", header="x,y,z", comments="")
-    assert (
-        call(
-            "bench", tmp_path / "b.csv", "--unit", "mm", "--out", tmp_path / "bench.yaml"
-        ).exit_code
-        == 0
-    )
-    assert read_transform(tmp_path / "bench.yaml", "T_base_bench")[2, 2] > 0.99
+    out = tmp_path / "bench.yaml"
+    assert call("bench", tmp_path / "b.csv", "--unit", "mm", "--out", out).exit_code == 0
+    assert read_transform(out, "T_base_bench")[2, 2] > 0.99
 
 
 @pytest.fixture(scope="module")

@@ -1,22 +1,24 @@
-"""The node of ROS 2: messages filled by their own types, and a camera in another process."""
+"""The node of ROS 2: messages filled by their own types, a camera in another process; its slot."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+from dopepp.robot.nodes.messages import diagnosis, picture
+from dopepp.robot.nodes.ros2 import Pace, Slot, _Node, native
+from dopepp.robot.nodes.worker import Settings, Stamp, Worker
 
 ROOT = Path(__file__).parents[3]
 
 
 def test_messages_are_filled_by_their_own_types():
     pytest.importorskip("rclpy", reason="needs the extra ros2")
-    from dopepp.robot.nodes.messages import diagnosis, picture
-    from dopepp.robot.nodes.ros2 import native
-    from dopepp.robot.nodes.worker import Stamp
 
     message = diagnosis(Stamp(3, 4), "dope", "oh", {"rate": "30"})
     told = native(message.kind, message.fields)
@@ -30,9 +32,6 @@ def test_messages_are_filled_by_their_own_types():
 def test_parameters_change_while_it_runs(estimator, tmp_path):
     rclpy = pytest.importorskip("rclpy", reason="needs the extra ros2")
     from rclpy.parameter import Parameter
-
-    from dopepp.robot.nodes.ros2 import _Node
-    from dopepp.robot.nodes.worker import Settings, Worker
 
     params = tmp_path / "dope.yaml"
     params.write_text("/**:\n  ros__parameters:\n    confidence: 0.25\n")
@@ -55,10 +54,6 @@ def test_a_camera_that_offers_less_is_heard(estimator, seen, caplog):
     rclpy = pytest.importorskip("rclpy", reason="needs the extra ros2")
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.qos import qos_profile_sensor_data
-
-    from dopepp.robot.nodes.messages import picture
-    from dopepp.robot.nodes.ros2 import _Node, native
-    from dopepp.robot.nodes.worker import Worker
 
     rclpy.init()
     try:
@@ -97,3 +92,46 @@ def test_no_picture_is_lost_between_two_processes_and_a_killed_node_starts_again
         assert (sent, received, lost) == (50, 50, 0)
         assert answered > 0
     assert "ended with 143" in done.stdout
+
+
+def test_whoever_is_slow_gets_the_newest():
+    begun, go_on, done = threading.Event(), threading.Event(), threading.Event()
+    taken = []
+
+    def handle(item):
+        taken.append(item)
+        begun.set()
+        go_on.wait(10)
+        if item == 9:
+            done.set()
+
+    slot = Slot(handle)
+    slot.put(0)
+    assert begun.wait(10)
+    for item in range(1, 10):
+        slot.put(item)
+    go_on.set()
+    assert done.wait(10)
+    slot.stop()
+    assert taken == [0, 9]
+    assert (slot.received, slot.replaced) == (10, 8)
+
+
+def test_what_its_thread_raises_is_raised():
+    slot = Slot(lambda item: 1 / item)
+    slot.put(0)
+    slot._thread.join(10)
+    for call in (slot.check, lambda: slot.put(1)):
+        with pytest.raises(ZeroDivisionError):
+            call()
+
+
+def test_pace_tells_rate_and_latency():
+    seconds = iter(range(100))
+    pace = Pace(lambda: next(seconds) / 10)
+    assert pace.values() == {"answered": "0"}
+    for latency in (0.01, 0.02, 0.03):
+        pace.count(latency)
+    told = pace.values()
+    assert told["rate (1/s)"] == "10.0"
+    assert told["latency, median (ms)"] == "20.0"

@@ -1,7 +1,8 @@
-"""Twenty ways in which robot poses are wrong, each recognised."""
+"""Twenty ways in which robot poses are wrong, each recognised; what a calibration is worth."""
 
 import csv
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from dopepp.core.errors import UserError
 from dopepp.robot.calibration.board import board_pose
 from dopepp.robot.calibration.files import Reading, read_robot_poses
-from dopepp.robot.calibration.quality import check_poses
+from dopepp.robot.calibration.hand_eye import calibrate_hand_eye
+from dopepp.robot.calibration.quality import check_poses, expected_error, explain
 
 QUATERNION = ("qw", "qx", "qy", "qz")
 
@@ -79,49 +81,55 @@ def test_poses_that_are_read_wrongly_are_recognised(cell, tmp_path, how, reading
         judge(given, path, reading, mount)
 
 
-def test_the_other_mounting_is_recognised(cell, tmp_path):
-    given = cell(2, mount="hand")
+def same(given):
+    pass
+
+
+def on_a_larger_board(given):
+    given.sightings = [replace(one, points=one.points * 0.8) for one in given.sightings]
+
+
+def standing_still(given):
+    given.T_base_flange[:] = given.T_base_flange[0]
+
+
+def one_picture(given):
+    given.sightings = given.sightings[:1] * 20
+
+
+def one_late(given):
+    given.T_base_flange = np.roll(given.T_base_flange, 1, axis=0)
+
+
+def one_early(given):
+    given.T_base_flange = np.roll(given.T_base_flange, -1, axis=0)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "mount", "said"),
+    [
+        (same, "bench", "camera on the other side"),
+        (on_a_larger_board, "hand", r"squares: they would be 1\.2\d+ times"),
+        (standing_still, "hand", "the robot turns by 0"),
+        (one_picture, "hand", "the board, as the camera sees it, turns by 0"),
+        (one_late, "hand", "poses fit the"),
+        (one_early, "hand", "poses fit the"),
+    ],
+)
+def test_poses_that_are_not_those_of_the_pictures_are_recognised(
+    cell, tmp_path, spoil, mount, said
+):
+    given = cell(2)
+    spoil(given)
     path = write(tmp_path / "poses.csv", given.T_base_flange)
-    with pytest.raises(UserError, match="camera on the other side"):
-        judge(given, path, Reading(), "bench")
-
-
-def test_a_board_of_another_size_is_recognised(cell, tmp_path):
-    given = cell(2)
-    path = write(tmp_path / "poses.csv", given.T_base_flange)
-    given.sightings = [type(one)(one.name, one.points * 0.8, one.pixels) for one in given.sightings]
-    with pytest.raises(UserError, match=r"squares: they would be 1\.2\d+ times"):
-        judge(given, path, Reading(), "hand")
-
-
-def test_a_robot_that_stood_still_is_recognised(cell, tmp_path):
-    given = cell(2)
-    path = write(tmp_path / "poses.csv", np.repeat(given.T_base_flange[:1], 20, axis=0))
-    with pytest.raises(UserError, match="the robot turns by 0"):
-        judge(given, path, Reading(), "hand")
-
-
-def test_one_picture_over_and_over_is_recognised(cell, tmp_path):
-    given = cell(2)
-    path = write(tmp_path / "poses.csv", given.T_base_flange)
-    given.sightings = [given.sightings[0]] * 20
-    with pytest.raises(UserError, match="the board, as the camera sees it, turns by 0"):
-        judge(given, path, Reading(), "hand")
-
-
-@pytest.mark.parametrize("step", [1, -1])
-def test_a_list_that_is_off_by_one_is_recognised(cell, tmp_path, step):
-    given = cell(2)
-    path = write(tmp_path / "poses.csv", np.roll(given.T_base_flange, step, axis=0))
-    with pytest.raises(UserError, match="poses fit the"):
-        judge(given, path, Reading(), "hand")
+    with pytest.raises(UserError, match=said):
+        judge(given, path, Reading(), mount)
 
 
 def test_poses_of_another_day_are_refused(cell, tmp_path):
-    given, other = cell(2), cell(9)
-    path = write(tmp_path / "poses.csv", other.T_base_flange)
+    path = write(tmp_path / "poses.csv", cell(9).T_base_flange)
     with pytest.raises(UserError, match="medians of pairs"):
-        judge(given, path, Reading(), "hand")
+        judge(cell(2), path, Reading(), "hand")
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -129,3 +137,38 @@ def test_good_poses_with_two_outliers_raise_no_alarm(cell, tmp_path, seed):
     given = cell(seed)
     given.T_base_flange[:2, :3, 3] += 0.03
     judge(given, write(tmp_path / "poses.csv", given.T_base_flange), Reading(), "hand")
+
+
+def test_an_explanation_names_the_pose_that_matters_and_trusts_a_good_calibration(cell):
+    given = cell(6)
+    boards = [board_pose(one, given.camera) for one in given.sightings]
+    found = calibrate_hand_eye(given.T_base_flange, boards, "hand")
+    worth = explain(given.T_base_flange, boards, found)
+    assert not worth.findings
+    assert worth.shift < 0.001
+    one = int(worth.leave_one_out.argmax())
+    rest = [k for k in range(len(boards)) if k != one]
+    without = calibrate_hand_eye(given.T_base_flange[rest], [boards[k] for k in rest], "hand")
+    moved = np.linalg.norm(without.T_mount_cam[:3, 3] - found.T_mount_cam[:3, 3])
+    assert worth.leave_one_out[one] == pytest.approx(moved, rel=0.5)
+
+
+def test_turns_about_one_axis_are_not_trusted(cell):
+    given = cell(7, tilt=0.01)  # straight from above, turned about the optical axis only
+    boards = [board_pose(one, given.camera) for one in given.sightings]
+    found = calibrate_hand_eye(given.T_base_flange, boards, "hand")
+    worth = explain(given.T_base_flange, boards, found)
+    assert any("one direction only" in one for one in worth.findings)
+    optical = given.T_mount_cam[:3, 2]
+    assert abs(worth.weakest @ optical) > 0.9
+
+
+def test_expected_error_is_that_of_drawn_calibrations():
+    rng = np.random.default_rng(0)
+    root = 1e-3 * rng.normal(size=(6, 6))
+    steps = rng.normal(size=(20000, 6)) @ root.T
+    point = np.array([0, 0, 0.5])
+    moved = np.cross(steps[:, :3], point) + steps[:, 3:]
+    shift, turn = expected_error(root @ root.T, 0.5)
+    assert shift == pytest.approx(np.sqrt((moved**2).sum(axis=1).mean()), rel=0.03)
+    assert turn == pytest.approx(np.sqrt((steps[:, :3] ** 2).sum(axis=1).mean()), rel=0.03)
