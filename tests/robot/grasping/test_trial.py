@@ -1,5 +1,6 @@
 """Trials: plans keep clear of what is believed, physics decides, and seeds repeat them."""
 
+from copy import copy
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -8,7 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dopepp.geometry.camera import make_transform
-from dopepp.robot.grasping.cell import HOME, TRAY
+from dopepp.robot.grasping.cell import HOME, STEP, TRAY
+from dopepp.robot.grasping.execution import SPEED, Execution, _timed
 from dopepp.robot.grasping.grasps import Grasp
 from dopepp.robot.grasping.planner import rested
 from dopepp.robot.grasping.task import Source
@@ -113,3 +115,24 @@ def test_a_plan_keeps_clear_of_another_part(trials, part):
     across = [Grasp(np.zeros(3), np.array([0, 1.0, 0]), np.array([0, 0, -1.0]), 0.052)]
     assert planner.plan([lower], across, HOME) is not None
     assert planner.plan([lower, over], across, HOME) is None
+
+
+def test_a_motion_goes_from_rest_to_rest_through_its_waypoints(scene):
+    path = np.stack(
+        [scene.joints, scene.joints + 0.3, scene.joints + np.array([0.5, 0, 0, 0, 0, 0.1])]
+    )
+    joints, speeds = (np.array(values) for values in zip(*_timed(path), strict=True))
+    np.testing.assert_allclose(joints[-1], path[-1], atol=1e-9)
+    assert np.abs(joints - path[1]).max(axis=1).min() < 0.01
+    assert np.abs(speeds[[0, -1]]).max() < 0.05
+    assert np.abs(speeds).max() < 2.5 * SPEED
+    np.testing.assert_allclose(speeds.sum(axis=0) * STEP, path[-1] - path[0], atol=1e-3)
+
+
+def test_a_plan_through_the_part_is_a_collision(trials, scene, planner):
+    plan = planner.plan(scene.targets, trials.grasps, scene.joints)
+    closed = replace(plan, opening=0.0)
+    execution = Execution(scene.cell, copy(scene.start), trials.gripper, scene.robot.zero)
+    outcome = execution.run(closed)
+    assert outcome.collided
+    assert outcome.times == sorted(outcome.times)

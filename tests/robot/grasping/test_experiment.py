@@ -1,12 +1,24 @@
-"""The report counts as Table 9 does."""
+"""Trials are shared out, and the report counts them as Table 9 does."""
 
 import csv
 import json
+from concurrent.futures import Future
+from dataclasses import replace
 
 import pytest
 
-from dopepp.robot.grasping.experiment import counted, markdown, write_report
-from dopepp.robot.grasping.task import Record
+from dopepp.core.errors import RunError, UserError
+from dopepp.core.pool import LostWorkerError, ProcessPool
+from dopepp.robot.grasping import experiment
+from dopepp.robot.grasping.experiment import (
+    check_task,
+    counted,
+    markdown,
+    parse_sources,
+    run_trials,
+    write_report,
+)
+from dopepp.robot.grasping.task import Record, Source, Task
 
 
 def record(number, *, recognised=True, caught=True, failure="", source="network", off=0.0):
@@ -55,3 +67,41 @@ def test_all_formats_hold_every_trial(records, tmp_path):
     assert [(one["number"], one["add_mm"]) for one in unseen] == [(49, None)]
     assert (tmp_path / "curve.png").is_file()
     assert (tmp_path / "grasps.md").read_text().count("\n") > 10
+
+
+TASK = Task(sources=(Source("exact"),))
+
+
+def test_two_processes_make_the_trials_of_one(trials):
+    source = TASK.sources[0]
+    expected = [trials.attempt(trials.scene(number), source).record for number in (0, 1)]
+    records = sorted(run_trials(TASK, 2, workers=2), key=lambda record: record.number)
+    for record, other in zip(records, expected, strict=True):
+        assert (record.number, record.caught) == (other.number, other.caught)
+        assert record.hand_eye_mm == pytest.approx(other.hand_eye_mm, rel=1e-3)
+
+
+def test_a_lost_process_ends_the_experiment_in_one_line(monkeypatch):
+    class Lost(ProcessPool):
+        def submit(self, item):
+            future = Future()
+            future.set_exception(LostWorkerError("a worker process died (signal 9)"))
+            return future
+
+    monkeypatch.setattr(experiment, "ProcessPool", Lost)
+    with pytest.raises(RunError, match=r"died \(signal 9\)"):
+        list(run_trials(TASK, 2, workers=2))
+
+
+def test_sources_are_named_once_each_and_a_curve_is_many():
+    assert parse_sources("exact, exact,random") == (Source("exact"), Source("random"))
+    names = [source.name for source in parse_sources("curve")]
+    assert names[0] == "exact poses, off by 1 mm and 1°"
+    assert len(set(names)) == len(names) == 6
+    with pytest.raises(UserError, match="--poses truth"):
+        parse_sources("exact,truth")
+
+
+def test_a_network_is_dropped_where_no_source_needs_it():
+    assert check_task(replace(TASK, network="net.ckpt"), "exact", 1).network is None
+    assert check_task(replace(TASK, network="net.ckpt"), "network,exact", 1).network == "net.ckpt"

@@ -1,0 +1,95 @@
+"""The cell: convex pieces that fill a part, poses that are put and read, layouts, pictures."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from dopepp.core.errors import UserError
+from dopepp.geometry.camera import make_transform
+from dopepp.parts.catalogue import BUILTIN, load_part
+from dopepp.robot.grasping.cell import TRAY, Cell, Thing, convex_pieces
+from dopepp.robot.grasping.layouts import HEAP, LAYOUTS, SPREAD, Layout
+from dopepp.robot.grasping.rehearsal import SIZE
+from dopepp.robot.grasping.view import RasterView
+
+
+@pytest.mark.parametrize("name", sorted(BUILTIN))
+def test_convex_pieces_fill_a_part_and_stay_within_it(name):
+    part = load_part(name)
+    pieces = convex_pieces(part)
+    hulls = [trimesh.convex.convex_hull(piece) for piece in pieces]
+    solid = trimesh.Trimesh(part.mesh.vertices, part.mesh.faces)
+    assert sum(hull.volume for hull in hulls) == pytest.approx(solid.volume, rel=0.25)
+    ends = np.concatenate(pieces)
+    np.testing.assert_allclose(ends.min(axis=0), solid.bounds[0], atol=0.002)
+    np.testing.assert_allclose(ends.max(axis=0), solid.bounds[1], atol=0.002)
+
+
+def test_a_part_without_a_mesh_has_no_pieces(part):
+    with pytest.raises(UserError, match="without a mesh"):
+        convex_pieces(replace(part, mesh=None))
+
+
+def test_a_thing_is_where_it_was_put(part):
+    cell = Cell([Thing(convex_pieces(part))] * 2)
+    state = cell.data()
+    turn = Rotation.random(rng=np.random.default_rng(0)).as_matrix()
+    T = make_transform(turn, np.array([0.1, 0.2, 0.3]))
+    cell.put(state, 1, T)
+    mujoco.mj_forward(cell.model, state)
+    np.testing.assert_allclose(cell.pose(state, 1), T, atol=1e-9)
+    assert set(cell.groups.tolist()) == {-1, 0, 1, 2}
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_layouts_lie_on_the_bench_and_repeat_with_their_seed(part, name):
+    layout = Layout(part, name, yaw_deg=180.0, rest="any")
+    for seed in range(5):
+        lying, again = (layout.draw(np.random.default_rng(seed)) for _ in range(2))
+        parts = [item for item in lying if item.body.part is not None]
+        assert len(parts) == (1 if name != "heap" else len(lying))
+        assert name != "heap" or HEAP[0] <= len(parts) <= HEAP[1]
+        for item, other in zip(lying, again, strict=True):
+            T = item.T_base_obj
+            np.testing.assert_array_equal(T, other.T_base_obj)
+            heights = item.body.hull.vertices @ T[2, :3] + T[2, 3]
+            assert heights.min() > 0
+            assert np.linalg.norm(T[:2, 3] - TRAY[:2]) < 0.2
+
+
+def test_distractors_keep_clear_of_the_part(part):
+    layout = Layout(part, "distractors", yaw_deg=0.0, rest="front")
+    for seed in range(10):
+        first, *others = layout.draw(np.random.default_rng(seed))
+        middle = (first.T_base_obj @ [*part.cuboid[-1], 1.0])[:2]
+        assert np.linalg.norm(middle - TRAY[:2]) <= SPREAD + 1e-9
+        for item in others:
+            apart = np.linalg.norm(item.T_base_obj[:2, 3] - first.T_base_obj[:2, 3])
+            assert apart > part.diameter / 2
+
+
+def test_a_part_that_lies_on_its_front_looks_up_and_turns_within_its_yaw(part):
+    layout = Layout(part, "single", yaw_deg=20.0, rest="front")
+    for seed in range(20):
+        T = layout.drop(np.random.default_rng(seed))
+        np.testing.assert_allclose(T[:3, 2], [0, 0, 1], atol=1e-9)
+        assert abs(np.degrees(np.arctan2(T[1, 0], T[0, 0]))) <= 20
+
+
+@pytest.mark.parametrize("shadows", [False, True])
+def test_a_picture_shows_the_part_and_repeats_with_its_seed(trials, scene, shadows):
+    view, bodies = RasterView(shadows), [item.body for item in scene.lying]
+
+    def take(poses):
+        return view.take(bodies, poses, scene.T_base_cam, np.random.default_rng(1))
+
+    picture = take(scene.poses)
+    assert picture.shape == (SIZE[1], SIZE[0], 3)
+    np.testing.assert_array_equal(take(scene.poses), picture)
+    aside = [pose @ make_transform(np.eye(3), [0.0, 0.02, 0.0]) for pose in scene.poses]
+    changed = (take(aside).astype(int) - picture).any(axis=2).mean()
+    assert 0.005 < changed < 0.9
