@@ -1,27 +1,20 @@
+import gzip
 import io
 import os
-import struct
 import tarfile
-import zipfile
 from pathlib import Path
 
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.data.archive import Limits, safe_extract
+from dopepp.data.archive import safe_extract
 
 GOOD = [("set/a.txt", b"hello" * 1000), ("set/deep/b.bin", bytes(range(256))), ("c", b"")]
 
 
-def pack(members, mode: str = "w") -> bytes:
-    """Make an archive: tarfile's mode, or "zip"."""
+def pack(members) -> bytes:
     file = io.BytesIO()
-    if mode == "zip":
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, content in members:
-                archive.writestr(str(name), content)
-        return file.getvalue()
-    with tarfile.open(fileobj=file, mode=mode) as tar:
+    with tarfile.open(fileobj=file, mode="w") as tar:
         for name, content in members:
             info = tarfile.TarInfo(name) if isinstance(name, str) else name
             info.size = len(content)
@@ -29,23 +22,22 @@ def pack(members, mode: str = "w") -> bytes:
     return file.getvalue()
 
 
-def unpack(folder: Path, content: bytes, limits: Limits | None = None) -> Path:
+def unpack(folder: Path, content: bytes, **limits: int) -> Path:
     archive = folder / "archive"
     archive.write_bytes(content)
-    return safe_extract(archive, folder / "out", limits)
+    return safe_extract(archive, folder / "out", **limits)
 
 
-def refused(folder: Path, content: bytes, message: str, limits: Limits | None = None) -> None:
+def refused(folder: Path, content: bytes, message: str, **limits: int) -> None:
     """Nothing but one line: neither the folder nor a part of it is left."""
     with pytest.raises(UserError, match=message) as caught:
-        unpack(folder, content, limits)
+        unpack(folder, content, **limits)
     assert "\n" not in str(caught.value)
     assert [path.name for path in folder.iterdir()] == ["archive"]
 
 
-@pytest.mark.parametrize("mode", ["w", "w:gz", "w:bz2", "w:xz", "zip"])
-def test_every_format_is_unpacked_completely(tmp_path, mode):
-    folder = unpack(tmp_path, pack(GOOD, mode))
+def test_a_tar_file_is_unpacked_completely(tmp_path):
+    folder = unpack(tmp_path, pack(GOOD))
     files = {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*.*")}
     assert files == {str(name): data for name, data in GOOD if "." in str(name)}
     assert (folder / "c").read_bytes() == b""
@@ -77,41 +69,26 @@ def test_an_empty_folder_is_used_and_another_one_left_alone(tmp_path):
 @pytest.mark.parametrize(
     "name", ["../x", "set/../../x", "/etc/x", "set\\..\\x", "C:x", "a\nb", "x" * 300, "d/" * 900]
 )
-@pytest.mark.parametrize("mode", ["w", "zip"])
-def test_a_path_out_of_the_folder_is_refused(tmp_path, name, mode):
+def test_a_path_out_of_the_folder_is_refused(tmp_path, name):
     folder = tmp_path / "inner"
     folder.mkdir()
     message = "leads out of the folder|no name that every system can write"
-    refused(folder, pack([("good", b"1"), (name, b"2")], mode), message)
+    refused(folder, pack([("good", b"1"), (name, b"2")]), message)
     assert [path.name for path in tmp_path.iterdir()] == ["inner"]
 
 
-@pytest.mark.parametrize("mode", ["w:gz", "w:bz2", "w:xz", "zip"])
-def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path, mode):
-    content = pack([("zeros", bytes(60_000_000))], mode)
-    refused(tmp_path, content, "more than 10000000 bytes to unpack")
-
-
-def test_limits(tmp_path):
+def test_the_number_of_members_is_limited(tmp_path):
     content = pack([(f"file{number}", bytes(10)) for number in range(10)])
-    refused(tmp_path, content, "more than 9 members", Limits(num_members=9))
-    refused(tmp_path, content, "more than 99 bytes", Limits(total_bytes=99))
-    assert unpack(tmp_path, content, Limits(num_members=10, total_bytes=100)).is_dir()
+    refused(tmp_path, content, "more than 9 members", most_members=9)
+    assert unpack(tmp_path, content, most_members=10).is_dir()
 
 
-def test_a_zip_that_lies_about_a_size_is_refused(tmp_path):
-    content = pack([("a", b"hello" * 1000)], "zip")
-    record = content.rfind(b"PK\x01\x02")  # its size field is 24 bytes on
-    lie = content[: record + 24] + struct.pack("<I", 10) + content[record + 28 :]
-    refused(tmp_path, lie, "damaged|another size than it claims")
-
-
-@pytest.mark.parametrize("mode", ["w", "w:gz", "w:bz2", "w:xz", "zip"])
-def test_a_damaged_archive_is_refused(tmp_path, mode):
-    content = pack([("a", os.urandom(5000)), ("b", os.urandom(5000))], mode)
+def test_a_damaged_archive_is_refused(tmp_path):
+    content = pack([("a", os.urandom(5000)), ("b", os.urandom(5000))])
     for length in (0, 1, 7, 300, 4000, 7000):
         refused(tmp_path, content[:length], "damaged")
-    refused(tmp_path, b"junk" * 500, "damaged")
+    for other in (b"junk" * 500, gzip.compress(content)):
+        refused(tmp_path, other, "damaged")
 
 
 def test_what_is_no_file_is_refused(tmp_path):

@@ -5,10 +5,8 @@ import io
 import json
 import re
 import shlex
-import stat
 import struct
 import tarfile
-import zipfile
 import zlib
 from pathlib import Path
 from typing import Any
@@ -252,10 +250,6 @@ def pax(records: dict[str, str]) -> bytes:
 
 
 ARCHIVES = {
-    "a path out": tar(entry("../../canary")),
-    "an absolute path": tar(entry("/tmp/canary")),
-    "a path of Windows": tar(entry("..\\canary")),
-    "a drive": tar(entry("C:canary")),
     "a link out": tar(entry("a", tarfile.SYMTYPE, link="/etc")),
     "a link and a file through it": tar(
         entry("a", tarfile.SYMTYPE, link="/tmp"), entry("a/canary")
@@ -280,7 +274,6 @@ ARCHIVES = {
     "a name twice": tar(entry("a"), entry("a")),
     "a name twice where letters have no case": tar(entry("Photo"), entry("PHOTO")),
     "a gzip bomb": gzip.compress(tar(entry("a", size=10**8), content=bytes(10**8))),
-    "gzip in gzip": gzip.compress(gzip.compress(bytes(10**6))),
     "a name with a screen's commands": tar(entry("\x1b[2Jcanary")),
 }
 
@@ -308,22 +301,6 @@ def test_shards_that_reach_out_or_explode(name, tmp_path, bounded):
         except UserError as error:
             line = str(error)
     assert "\n" not in line
-
-
-def test_an_encrypted_zip_and_one_of_links(tmp_path, refused):
-    path = tmp_path / "a.zip"
-    with zipfile.ZipFile(path, "w") as archive:
-        info = zipfile.ZipInfo("a")
-        info.external_attr = (stat.S_IFLNK | 0o777) << 16
-        archive.writestr(info, "/etc/passwd")
-    with refused("link or special file"):
-        safe_extract(path, tmp_path / "out")
-    content = bytearray(path.read_bytes())
-    content[content.index(b"PK\x01\x02") + 8] |= 1
-    content[content.index(b"PK\x01\x02") + 38 : content.index(b"PK\x01\x02") + 42] = bytes(4)
-    path.write_bytes(content)
-    with refused("encrypted file"):
-        safe_extract(path, tmp_path / "out")
 
 
 def mat(**fields: object) -> bytes:

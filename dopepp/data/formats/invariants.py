@@ -52,19 +52,6 @@ class Box(NamedTuple):
             return None
         return cls(float(columns[0]), float(rows[0]), float(columns[-1]), float(rows[-1]))
 
-    @classmethod
-    def of_bop(cls, box: Float[np.ndarray, "4"]) -> Box | None:
-        """Return the box of BOP's (x, y, width, height), or None for −1 and NaN.
-
-        Width and height are the differences of the outermost pixels' coordinates.
-        """
-        x, y, width, height = map(float, box)
-        return cls(x, y, x + width, y + height) if width >= 0 and height >= 0 else None
-
-    def distance(self, other: Box) -> float:
-        """Return the largest distance of two boxes' sides, pixels."""
-        return max(abs(a - b) for a, b in zip(self, other, strict=True))
-
     def beyond(self, other: Box) -> float:
         """Return how far another box reaches out of this one, pixels; negative inside of it."""
         left, top = self.left - other.left, self.top - other.top

@@ -343,12 +343,15 @@ def _check_counts(
 
 def _check_boxes(place: Place, info: Mapping[str, Any], seen: Box | None) -> Box | None:
     """Compare ``bbox_visib`` with the mask's box; return the latter, or else the former."""
-    stated = {
-        field: Box.of_bop(place[field].numbers(info[field], 4))
-        for field in ("bbox_visib", "bbox_obj")
-        if field in info
-    }
-    box = stated.get("bbox_visib")
-    if seen is not None and box is not None and seen.distance(box) > BOX_EDGE_PX:
-        place["bbox_visib"].report(f"{box}, mask_visib has {seen}")
+    boxes: dict[str, Box] = {}
+    for field_name in ("bbox_visib", "bbox_obj"):
+        if field_name in info:
+            x, y, width, height = place[field_name].numbers(info[field_name], 4).tolist()
+            if width >= 0 and height >= 0:  # −1 where nothing is visible
+                boxes[field_name] = Box(x, y, x + width, y + height)
+    box = boxes.get("bbox_visib")
+    if seen is not None and box is not None:
+        distance = max(abs(a - b) for a, b in zip(seen, box, strict=True))
+        if distance > BOX_EDGE_PX:
+            place["bbox_visib"].report(f"{box}, mask_visib has {seen}")
     return seen or box

@@ -199,10 +199,11 @@ def _discrete(place: Place, value: object) -> Discrete | None:
     for number, row in enumerate(_rows(place, value)):
         matrix = place[number].numbers(row, 4, 4)
         problem = rotation_problem(matrix[:3, :3], INEXACT)
-        if problem is not None or (matrix[3] != [0, 0, 0, 1]).any():
-            got = problem or f"a last row of {matrix[3].tolist()}"
+        if problem is None and (matrix[3] != [0, 0, 0, 1]).any():
+            problem = f"a last row of {matrix[3].tolist()}"
+        if problem is not None:
             if np.isfinite(matrix).all():
-                place[number].report(got, "rigid transforms [R t; 0 0 0 1], row by row")
+                place[number].report(problem, "rigid transforms [R t; 0 0 0 1], row by row")
             continue
         if not is_rotation(matrix[:3, :3], EXACT):
             matrix[:3, :3] = nearest_rotation(matrix[:3, :3])
@@ -215,20 +216,17 @@ def _discrete(place: Place, value: object) -> Discrete | None:
 def _continuous(place: Place, value: object) -> Continuous:
     pairs = []
     for number, row in enumerate(place.entries(_rows(place, value))):
-        axis, offset = (
-            place[number][name].numbers(row.get(name), 3) for name in ("axis", "offset")
-        )
+        entry = place[number]
+        axis, offset = (entry[name].numbers(row.get(name), 3) for name in ("axis", "offset"))
         if not axis.any():
-            place[number]["axis"].report("zero", "an axis other than 0")
+            entry["axis"].report("zero", "an axis other than 0")
         pairs.append((tuple(axis.tolist()), tuple((offset / MM).tolist())))
     return tuple(pairs)
 
 
 def _rows(place: Place, value: object) -> list[Any]:
-    if value is None:
-        return []
-    if isinstance(value, list) and len(value) <= MAX_SYMMETRIES:
-        return value
+    if value is None or (isinstance(value, list) and len(value) <= MAX_SYMMETRIES):
+        return value or []
     place.report(f"{value!r:.60}", f"a list of at most {MAX_SYMMETRIES}")
     return []
 

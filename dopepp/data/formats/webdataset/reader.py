@@ -58,7 +58,7 @@ class WebdatasetReader:
 
     Args:
         parts: The objects to return, named as in ``models_info.json`` or ``obj_000001``.
-        shards: A folder in ``root``, a file or a URL, or several; see :func:`find_shards`.
+        shards: A folder in ``root``, a file or a URL; see :func:`find_shards`.
         download_dir: Folder for shards from URLs; None refuses URLs.
     """
 
@@ -66,13 +66,13 @@ class WebdatasetReader:
         self,
         root: str | Path,
         parts: Sequence[Part],
-        shards: str | Sequence[str] = ".",
+        shards: str = ".",
         part_of: tuple[float, float] = (0.0, 1.0),
         read_depth: bool = True,
         download_dir: str | Path | None = None,
     ) -> None:
         self.root = Path(root)
-        self.name = f"webdataset/{shards if isinstance(shards, str) else shards[0]}"
+        self.name = f"webdataset/{shards}"
         self._parts = parts_by_id(self.root, parts)
         self._read_depth, self._logged_inexact = read_depth, False
         folder = None if download_dir is None else Path(download_dir)
@@ -213,19 +213,14 @@ def _check_keys(shards: Sequence[ShardIndex]) -> None:
         owners |= dict.fromkeys(shard.keys, shard.path)
 
 
-def find_shards(
-    root: Path, shards: str | Sequence[str], download_dir: Path | None = None
-) -> list[Path]:
-    """Return the shards as local files, in the order in which they are named.
+def find_shards(root: Path, shards: str, download_dir: Path | None = None) -> list[Path]:
+    """Return the shards as local files, in order.
 
-    Args:
-        root: Folder that relative paths start from.
-        shards: A folder (its ``*.tar`` by name), a file, a URL, or several of them; braces as in
-            ``shard-{000000..000009}.tar`` are expanded.
-        download_dir: Folder for shards from URLs; a shard in it is not downloaded again.
+    ``shards`` is a folder in ``root`` (its ``*.tar`` by name), a file or a URL; braces as in
+    ``shard-{000000..000009}.tar`` are expanded. Shards from URLs are kept in ``download_dir``.
     """
     paths = []
-    for text in _expanded([shards] if isinstance(shards, str) else shards):
+    for text in _expanded(shards):
         scheme = _SCHEME.match(text)
         if scheme is None:
             paths += _local(root / text)
@@ -239,25 +234,22 @@ def find_shards(
     return paths
 
 
-def _expanded(texts: Sequence[str]) -> list[str]:
+def _expanded(text: str) -> list[str]:
     from braceexpand import braceexpand  # comes with the webdataset library
 
-    expanded: list[str] = []
-    for text in texts:
-        # The library lists a whole range at once, and nothing bounds the product of many braces.
-        lengths = (abs(int(m[2]) - int(m[1])) for m in _RANGE.finditer(text[:_MAX_TEXT]))
-        too_long = len(text) > _MAX_TEXT or text.count("{") > _MAX_BRACES
-        if not too_long and max(lengths, default=0) < MAX_SHARDS:
-            try:
-                expanded += islice(braceexpand(text), MAX_SHARDS + 1)
-            except ValueError as error:
-                got, allowed = f"shards {text!r:.100}: {error}", "braces as in shard-{00..09}.tar"
-                raise UserError(got, allowed, "close the brace") from error
+    # The library lists a whole range at once, and nothing bounds the product of many braces.
+    lengths = [abs(int(m[2]) - int(m[1])) for m in _RANGE.finditer(text[:_MAX_TEXT])]
+    is_short = len(text) <= _MAX_TEXT and text.count("{") <= _MAX_BRACES
+    try:
+        if is_short and max(lengths, default=0) < MAX_SHARDS:
+            expanded = list(islice(braceexpand(text), MAX_SHARDS + 1))
             if len(expanded) <= MAX_SHARDS:
-                continue
-        allowed = f"at most {MAX_SHARDS:,} shards"
-        raise UserError(f"shards {text!r:.100}", allowed, "correct the range")
-    return expanded
+                return expanded
+    except ValueError as error:
+        got, allowed = f"shards {text!r:.100}: {error}", "braces as in shard-{00..09}.tar"
+        raise UserError(got, allowed, "close the brace") from error
+    allowed = f"at most {MAX_SHARDS:,} shards"
+    raise UserError(f"shards {text!r:.100}", allowed, "correct the range")
 
 
 def _local(path: Path) -> list[Path]:

@@ -78,8 +78,7 @@ class _FrameCheck:
     """Checks frames; an object's points are read when they are first needed."""
 
     def __init__(self, report: CheckReport, classes: list[str]) -> None:
-        self._report, self._classes = report, classes
-        self._size = cache(self._read_size)
+        self._report, self._classes, self._size = report, classes, cache(self._read_size)
 
     def _read_size(self, name: str) -> tuple[Points, float] | None:
         """Return an object's points and diameter, metres; None where it has no points."""
