@@ -41,17 +41,19 @@ def check_dataset(root: Path) -> CheckReport:
         UserError: The folder is missing, of no known layout, or holds several data sets.
     """
     root = Path(root)
-    known = (
+    allowed = (
         "a YCB-Video folder (data/, image_sets/), a BOP data set, split or scene (scene_gt.json), "
         "BOP-WebDataset shards (*.tar), or an NDDS or FAT folder (000000.json beside 000000.png)"
     )
     if not root.is_dir():
-        raise UserError(f"{root}, which is no folder", known, "give the data set's folder")
+        raise UserError(f"{root}, which is no folder", allowed, "give the data set's folder")
     layout = _layout_of(root)
     if layout in (None, "NDDS"):  # which takes annotations anywhere below
         _refuse_parent(root, layout)
     if layout is None:
-        raise UserError(f"{root}, a folder of no known layout", known, "give the data set's folder")
+        raise UserError(
+            f"{root}, a folder of no known layout", allowed, "give the data set's folder"
+        )
     report = CheckReport(root, layout)
     LAYOUTS[layout][1](report)
     return report
@@ -75,7 +77,7 @@ def _refuse_parent(root: Path, layout: str | None) -> None:
     }
     if not any(is_set.values()) and (layout is not None or not layouts):
         return
-    listed = [f"{name} ({found})" for name, found in layouts.items()]
+    listed = [f"{name} ({kind})" for name, kind in layouts.items()]
     more = f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
     got = f"{root}, a folder of {len(listed)} data sets: {', '.join(listed[:_LISTED])}{more}"
     fix = f"check one of them, e.g. dopepp check {root / next(iter(layouts))}"

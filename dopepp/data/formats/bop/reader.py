@@ -10,6 +10,7 @@ import logging
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import ceil, floor
 from pathlib import Path
 from typing import Annotated, Final
@@ -225,7 +226,7 @@ class BopReader:
 
     def contains(self, label: str) -> bool:
         """Tell whether an image holds this object."""
-        return bool(self._count_instances().get(label))
+        return bool(self._num_instances.get(label))
 
     def describe(self) -> list[SourceInfo]:
         """Return the hash of the annotation, the objects and the origin of visible fractions."""
@@ -243,9 +244,10 @@ class BopReader:
             "left_out": self._left_out,
             "visible_fractions": "scene_gt_info.json" if not unknown else bop.ESTIMATED,
         }
-        return [SourceInfo(self.name, len(self), identity, self._count_instances())]
+        return [SourceInfo(self.name, len(self), identity, self._num_instances)]
 
-    def _count_instances(self) -> dict[str, int]:
+    @cached_property
+    def _num_instances(self) -> dict[str, int]:
         counts: Counter[int] = Counter()
         for number, row in self._items.tolist():
             scene = self._scenes[number]

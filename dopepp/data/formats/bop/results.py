@@ -145,8 +145,8 @@ def _row(text: str, where: str, objects: Collection[int]) -> list[float]:
         else:
             raise _bad(f"{where}: {name} {field!r:.40}", "a whole number 0 – 999999999")
         if name == "obj_id" and numbers[-1] not in objects:
-            known = ", ".join(map(str, sorted(objects)))
-            raise _bad(f"{where}: obj_id {field}", f"the data set's objects: {known:.400}")
+            listed = ", ".join(map(str, sorted(objects)))
+            raise _bad(f"{where}: obj_id {field}", f"the data set's objects: {listed:.400}")
     return numbers
 
 

@@ -108,10 +108,11 @@ def _check_item(
         if strangers:
             got = f"{strangers[:10]}: no object's segmentation_id"
             report.report(ndds.companion(path, ".seg.png"), "values", got)
-    values, known = ndds.label_values(objects, record, path, settings), settings.classes(path)
+    values = ndds.label_values(objects, record, path, settings)
+    classes = settings.classes(path)
     for place, item, label in objects:
-        if known is not None and label and label not in known:
-            got = f"unknown object {label!r:.60}; known: {', '.join(sorted(known)[:10])}"
+        if classes is not None and label and label not in classes:
+            got = f"unknown object {label!r:.60}; known: {', '.join(sorted(classes)[:10])}"
             place["class"].report(got)
         value = values[place.where]
         mask = None if labels is None or value is None else labels == value
@@ -140,8 +141,8 @@ def _check_camera(
 def _check_ids(place: Place, objects: Objects) -> set[int]:
     """Report ids that two objects share; return the segmentation ids."""
     for name in ("instance_id", "segmentation_id"):
-        ids = [item.get(name) for _, item, _ in objects]
-        known = [value for value in ids if type(value) is int and value > 0]  # −1, 0: none
-        for value in _twice(known):
+        stated = [item.get(name) for _, item, _ in objects]
+        ids = [value for value in stated if type(value) is int and value > 0]  # −1, 0: none
+        for value in _twice(ids):
             place[name].report(f"{value} twice")
-    return set(known)
+    return set(ids)

@@ -100,9 +100,9 @@ class ObjectCheck:
     def __init__(self, parsed: NddsObject, item: Mapping[str, Any], majority: Majority) -> None:
         self._place, self._item, self._majority = parsed.place, item, majority
         self._visibility = parsed.visibility
-        self._location, self._quaternion = _known(parsed.location), _known(parsed.quaternion)
-        self._projected, self._cuboid = _known(parsed.corners_px), _known(parsed.cuboid)
-        self._centroid = _known(parsed.centroid)
+        self._location, self._quaternion = _finite(parsed.location), _finite(parsed.quaternion)
+        self._projected, self._cuboid = _finite(parsed.corners_px), _finite(parsed.cuboid)
+        self._centroid = _finite(parsed.centroid)
         self._projected_centroid = self._numbers("projected_cuboid_centroid", 2)
 
     def check(
@@ -145,7 +145,7 @@ class ObjectCheck:
     def _numbers(self, field: str, *shape: int) -> Float[np.ndarray, "..."] | None:
         """Read a field that the reader does not need; None where it is missing or damaged."""
         value = self._item.get(field)
-        return None if value is None else _known(self._place[field].numbers(value, *shape))
+        return None if value is None else _finite(self._place[field].numbers(value, *shape))
 
     def _rotations(self) -> dict[str, RotationMatrix]:
         """Return the rotation by either order of ``quaternion_xyzw``; empty if it is damaged."""
@@ -199,7 +199,7 @@ class ObjectCheck:
             return
         place = self._place["bounding_box"]
         first, last = (
-            _known(place[name].numbers(stated.get(name), 2))
+            _finite(place[name].numbers(stated.get(name), 2))
             for name in ("top_left", "bottom_right")
         )
         if first is None or last is None:
@@ -283,7 +283,7 @@ class ObjectCheck:
                 self._add(name, got)
 
 
-def _known(values: Float[np.ndarray, "..."] | None) -> Float[np.ndarray, "..."] | None:
+def _finite(values: Float[np.ndarray, "..."] | None) -> Float[np.ndarray, "..."] | None:
     return values if values is not None and np.isfinite(values).all() else None
 
 

@@ -286,8 +286,8 @@ def _download(url: str, scheme: str, path: Path) -> None:
     from webdataset.gopen import gopen, gopen_schemes  # imports torch where it is installed
 
     if scheme not in gopen_schemes:
-        known = ", ".join(sorted(gopen_schemes.keys() - {"__default__", "pipe"}))
-        raise UserError(f"shards {url!r:.100}", f"URLs of {known}", "correct the URL")
+        schemes = ", ".join(sorted(gopen_schemes.keys() - {"__default__", "pipe"}))
+        raise UserError(f"shards {url!r:.100}", f"URLs of {schemes}", "correct the URL")
     path.parent.mkdir(parents=True, exist_ok=True)
     draft, size = partial_path(path), 0
     try:
