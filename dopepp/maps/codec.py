@@ -159,13 +159,8 @@ def find_peaks(
         geometry.field_radius, score.reshape(-1, slots[2]), position.reshape(-1, slots[2], 2),
         covariance.reshape(-1, slots[2], 2, 2), toward.reshape(-1, slots[2], 2),
     )  # fmt: skip
-    return Peaks(
-        position * geometry.stride + (geometry.stride - 1) / 2,
-        score,
-        covariance * geometry.stride**2,
-        toward,
-        score > 0.0,
-    )
+    pixels = position * geometry.stride + (geometry.stride - 1) / 2
+    return Peaks(pixels, score, covariance * geometry.stride**2, toward, score > 0.0)
 
 
 def _on_host(maps: Tensor) -> Float[np.ndarray, "batch channels height width"]:

@@ -31,6 +31,7 @@ from dopepp.models.storage import read_mapping
 Images = Float[Tensor, "batch 3 height width"]
 
 POOL: Final = "pool"
+Plan = tuple[int | str, ...]
 
 
 class Backbone(nn.Module, ABC):
@@ -74,12 +75,7 @@ class VGG19(_Chain):
         UserError: An argument is out of range, or the file does not fit.
     """
 
-    plan: ClassVar[tuple[int | str, ...]] = (
-        *(64, 64, POOL),
-        *(128, 128, POOL),
-        *(256, 256, 256, 256, POOL),
-        *(512, 512),
-    )
+    plan: ClassVar[Plan] = (64, 64, POOL, 128, 128, POOL, 256, 256, 256, 256, POOL, 512, 512)
     reduction: ClassVar[tuple[int, ...]] = (256, 128)
 
     def __init__(
@@ -101,11 +97,11 @@ class VGG19(_Chain):
         initialise(self)
         if weights_path is not None:
             if width != 1 or batch_norm or not isinstance(weights_path, str):
-                raise UserError(
-                    f"weights_path={weights_path!r:.200}, width={width:g}, batch_norm={batch_norm}",
-                    "a file's path, and only with width=1 and batch_norm=false",
-                    "drop weights_path, or set width=1 and batch_norm=false",
+                got = (
+                    f"weights_path={weights_path!r:.200}, width={width:g}, batch_norm={batch_norm}"
                 )
+                allowed = "a file's path, and only with width=1 and batch_norm=false"
+                raise UserError(got, allowed, "drop weights_path, or set the other two so")
             self._load_pretrained(weights_path)
 
     def _load_pretrained(self, path: str) -> None:
@@ -125,7 +121,7 @@ class VGG19(_Chain):
 class VGG19Original(VGG19):
     """Table 4's "original": VGG19's first 24 layers (one convolution more), then the same two."""
 
-    plan: ClassVar[tuple[int | str, ...]] = (*VGG19.plan, 512)
+    plan: ClassVar[Plan] = (*VGG19.plan, 512)
 
 
 class DSC(_Chain):
@@ -136,11 +132,8 @@ class DSC(_Chain):
     ``batch_norm`` are those of :class:`VGG19`.
     """
 
-    plan: ClassVar[tuple[int | str, ...]] = (
-        *(64, POOL),
-        *(128, 128, POOL),
-        *(256, 256, 256, 256, POOL),
-        *(512, 512, 512, 256, 128),
+    plan: ClassVar[Plan] = (
+        *(64, POOL, 128, 128, POOL, 256, 256, 256, 256, POOL, 512, 512, 512, 256, 128),
     )
 
     def __init__(self, width: float = 1.0, batch_norm: bool = False) -> None:

@@ -53,15 +53,8 @@ def conv_block(
     relu: bool = True,
 ) -> nn.Sequential:
     """Return convolution, batch norm (or a bias in its place) and ReLU; size kept for stride 1."""
-    conv = nn.Conv2d(
-        in_channels,
-        out_channels,
-        kernel_size,
-        stride=stride,
-        padding=kernel_size // 2,
-        groups=groups,
-        bias=not batch_norm,
-    )
+    sizes = (kernel_size, stride, kernel_size // 2)
+    conv = nn.Conv2d(in_channels, out_channels, *sizes, groups=groups, bias=not batch_norm)
     norm = [nn.BatchNorm2d(out_channels)] if batch_norm else []
     return nn.Sequential(conv, *norm, *([nn.ReLU(inplace=True)] if relu else []))
 

@@ -77,11 +77,10 @@ class PoseNetwork(nn.Module):
         height, width = images.shape[-2:]
         fits = images.ndim == 4 and images.shape[1] == 3
         if not fits or height % self.size_multiple or width % self.size_multiple:
-            raise UserError(
-                f"images of shape {tuple(images.shape)}",
-                f"(batch, 3, height, width), height and width multiples of {self.size_multiple}",
-                "pad the images on the right and at the bottom",
-            )
+            sides = f"height and width multiples of {self.size_multiple}"
+            got, allowed = f"images of shape {tuple(images.shape)}", "(batch, 3, height, width)"
+            fix = "pad the images on the right and at the bottom"
+            raise UserError(got, f"{allowed}, {sides}", fix)
         normalised = (images.to(self.mean.dtype) - self.mean) / self.std
         return self.head(self.attention(self.backbone(normalised)))  # type: ignore[no-any-return]
 
@@ -138,15 +137,10 @@ def build_network(spec: Mapping[str, Any]) -> PoseNetwork:
     activation, num_objects = spec["activation"], spec["num_objects"]
     backbone = BACKBONES.build(spec["backbone"])
     channels = backbone.out_channels
-    return PoseNetwork(
-        backbone,
-        ATTENTIONS.build(spec["attention"], channels=channels),
-        HEADS.build(
-            spec["head"], in_channels=channels, num_objects=num_objects, activation=activation
-        ),
-        activation,
-        num_objects,
-    )
+    weighting = ATTENTIONS.build(spec["attention"], channels=channels)
+    head_inputs = {"in_channels": channels, "num_objects": num_objects, "activation": activation}
+    head = HEADS.build(spec["head"], **head_inputs)
+    return PoseNetwork(backbone, weighting, head, activation, num_objects)
 
 
 def check_spec(spec: Mapping[str, Any]) -> None:

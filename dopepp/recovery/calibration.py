@@ -224,13 +224,8 @@ def detection_features(
     extent = max(float(np.ptp(seen, axis=0).max()), 1.0) if len(seen) else 1.0
     sure = float(np.clip(detection.belief, _CERTAIN, 1 - _CERTAIN))
     spread = _expected_distance(detection.covariance, corners @ T[:3, :3].T) / size
-    logarithms = np.log(
-        [
-            sure / (1 - sure),
-            max(spread, 1e-9) / PASSING,
-            max(detection.reprojection_error_px, 1e-9) / (extent * _TYPICAL_MISFIT),
-        ]
-    )
+    misfit = max(detection.reprojection_error_px, 1e-9) / (extent * _TYPICAL_MISFIT)
+    logarithms = np.log([sure / (1 - sure), max(spread, 1e-9) / PASSING, misfit])
     missing = float(np.isfinite(detection.peaks).all(axis=1).mean()) - 1
     return np.array([1.0, *np.clip(logarithms, -2 * _EXPONENTS, 2 * _EXPONENTS), missing])
 

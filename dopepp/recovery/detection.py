@@ -83,12 +83,12 @@ def peaks_of_object(
     corners, centroid = (image, slice(first, first + NUM_CORNERS)), (image, first + CENTROID)
     strong = peaks.score[centroid] >= threshold
     extent = np.array(cells) * float(stride)
+    position, covariance = peaks.position[corners], peaks.covariance_px[corners]
+    covariance = _covariance_px(position, covariance, extent, float(stride))
     return ObjectPeaks(
-        peaks.position[corners],
+        position,
         peaks.score[corners],
-        _covariance_px(
-            peaks.position[corners], peaks.covariance_px[corners], extent, float(stride)
-        ),
+        covariance,
         peaks.toward[corners],
         peaks.position[centroid][strong],
         peaks.score[centroid][strong],

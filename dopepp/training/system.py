@@ -141,15 +141,9 @@ class PoseSystem(LightningModule):
 
     def recover(self, output: ValidationOutput, batch: Batch) -> list[list[Detection]]:
         """Recover the poses on every image of a validation batch."""
-        return recover_batch(
-            output.belief,
-            output.field,
-            self.cuboids,
-            batch.K.cpu().numpy(),
-            self.geometry.stride,
-            [part.name for part in self.parts],
-            **vars(self.recovery),
-        )
+        cameras, names = batch.K.cpu().numpy(), [part.name for part in self.parts]
+        maps = (output.belief, output.field, self.cuboids, cameras, self.geometry.stride)
+        return recover_batch(*maps, names, **vars(self.recovery))
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """Build the optimiser, and its schedule over all steps of the run."""

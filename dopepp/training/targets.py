@@ -55,11 +55,9 @@ class SymmetryOptions(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.border_deg > 0 and not self.canonical:
-            raise UserError(
-                f"symmetry.border_deg={self.border_deg} with symmetry.canonical=false",
-                "0 where there are no sectors and so no borders",
-                "set symmetry=none, or symmetry.canonical=true",
-            )
+            got = f"symmetry.border_deg={self.border_deg} with symmetry.canonical=false"
+            fix = "set symmetry=none, or symmetry.canonical=true"
+            raise UserError(got, "0 where there are no sectors and so no borders", fix)
 
 
 def draw_maps(

@@ -107,8 +107,6 @@ def open_storage(place: str) -> BaseStorage:
         url = f"sqlite:///{path.absolute()}"
         return RDBStorage(url, engine_kwargs={"connect_args": {"timeout": _WAIT_S}})
     except (OSError, ImportError, RuntimeError, SQLAlchemyError, StorageInternalError) as error:
-        raise UserError(
-            f"search.storage={place}, which cannot be opened: {error}",
-            "a file of an Optuna study or a place for one, or a database URL",
-            "choose another search.storage",
-        ) from error
+        got = f"search.storage={place}, which cannot be opened: {error}"
+        allowed = "a file of an Optuna study or a place for one, or a database URL"
+        raise UserError(got, allowed, "choose another search.storage") from error

@@ -150,11 +150,10 @@ def newest_checkpoint(run_dir: Path) -> tuple[Path, Checkpoint] | None:
             _log.warning("going on from %s, step %d", path.name, step)
         return path, checkpoint
     if damaged:
-        raise UserError(
-            f"{run_dir}, whose checkpoints are all damaged ({', '.join(damaged)})",
-            f"a run with at least one whole file among {LAST}, {PREVIOUS} and {BEST}",
-            "restore one of them from a backup, or start anew without resume",
-        )
+        got = f"{run_dir}, whose checkpoints are all damaged ({', '.join(damaged)})"
+        allowed = f"a run with at least one whole file among {LAST}, {PREVIOUS} and {BEST}"
+        fix = "restore one of them from a backup, or start anew without resume"
+        raise UserError(got, allowed, fix)
     return None
 
 
