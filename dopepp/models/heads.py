@@ -30,8 +30,7 @@ from dopepp.models.layers import (
 
 Beliefs = Float[Tensor, "batch 9*objects height width"]
 Fields = Float[Tensor, "batch 16*objects height width"]
-Stage: TypeAlias = tuple[Beliefs, Fields]
-"""Belief logits and vector field of one stage."""
+Stage: TypeAlias = tuple[Beliefs, Fields]  # Belief logits and vector field of one stage
 
 _OUTPUT_STD: Final = 0.01
 """Standard deviation of the output convolutions' weights: an untrained head answers its bias,

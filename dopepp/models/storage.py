@@ -25,11 +25,8 @@ from dopepp.core.errors import UserError
 from dopepp.core.files import partial_path, write_whole
 from dopepp.core.json import parse_json
 
-MAX_BYTES: Final = 4 * 2**30
-"""The largest checkpoint that is read: over six times the full DOPE with Adam's two moments."""
-
-_MAX_PICKLE_BYTES: Final = 16_000_000
-"""Over half a million ADD points. What one pickle builds takes at most 80 times as much."""
+MAX_BYTES: Final = 4 * 2**30  # Of a checkpoint: six times the full DOPE with Adam's moments
+_MAX_PICKLE_BYTES: Final = 16_000_000  # Half a million ADD points; builds at most 80 times as much
 
 _MAX_TUPLES: Final = 50_000
 """Ten for each tensor of any optimiser, and few enough to be nested without harm: Python hashes a
@@ -39,8 +36,7 @@ _ZIP: Final = b"PK\x03\x04"
 _LEGACY: Final = b"\x80\x02"
 """Beginning of a file: a zip archive, or, up to torch 1.5, a pickle of protocol 2."""
 
-_NUM_LEGACY_PICKLES: Final = 5
-"""Magic number, version, machine, content and the storages' keys stand before the numbers."""
+_NUM_LEGACY_PICKLES: Final = 5  # Magic number, version, machine, content, storage keys
 
 _STORAGE_BYTES: Final = {
     f"torch {name}Storage": size
@@ -63,14 +59,11 @@ _NAMES: Final = {
 has ``bytearray`` and tensor classes, which allocate what a number says (case "a call that fills the
 memory"), and ``_rebuild_from_type_v2``, which sets any attribute ("methods set on a tensor")."""
 
-MAX_SAFETENSORS_BYTES: Final = 2**30
-"""Five times the full DOPE in float32."""
+MAX_SAFETENSORS_BYTES: Final = 2**30  # Five times the full DOPE in float32
 
-MAX_HEADER_BYTES: Final = 16_000_000
-"""Of a safetensors header with its metadata: ADD points and meshes of forty parts as text."""
+MAX_HEADER_BYTES: Final = 16_000_000  # ADD points and meshes of forty parts as text
 
-_MAX_NAME: Final = 200
-"""Characters of a tensor's name or of a key of the metadata."""
+_MAX_NAME: Final = 200  # Characters of a tensor's name or of a key of the metadata
 
 _LENGTH_BYTES: Final = 8
 _METADATA: Final = "__metadata__"

@@ -27,13 +27,11 @@ LEAST_DEVIATION: Final = 0.05
 """Radians by which even a clear vector may be off its centroid's direction."""
 
 POSITION_PX: Final = 1.0
-"""Error of a peak's and a centroid's positions, as far as it turns the direction between them."""
+"""Error of positions, as far as it turns the direction between peak and centroid."""
 
-LEAST_LENGTH: Final = 1e-3
-"""Of a mean vector; a shorter one has no direction."""
+LEAST_LENGTH: Final = 1e-3  # Of a mean vector; a shorter one has no direction
 
-PREDICTION_PX: Final = 4.0
-"""Deviation of a measured keypoint from where the other ones put it: half a cell of stride 8."""
+PREDICTION_PX: Final = 4.0  # Deviation of a keypoint from its prediction: half a cell of stride 8
 
 CANDIDATES: Final = 3
 """Peaks of a corner that are tried: the likeliest ones by belief and direction."""
@@ -42,14 +40,11 @@ PERSPECTIVE: Final = 0.1
 """Deviation of corners from the affine camera, over their distance from the centroid: a part seen
 from five times its size away has corners ±10 % nearer or farther."""
 
-DIAGONALS: Final = np.array([(0, 6), (1, 7), (2, 4), (3, 5)])
-"""Opposite corners."""
-
-RIVALS: Final = -2
-"""In place of a peak that two instances want."""
+DIAGONALS: Final = np.array([(0, 6), (1, 7), (2, 4), (3, 5)])  # Opposite corners
+RIVALS: Final = -2  # In place of a peak that two instances want
 
 ALTERNATING: Final = np.array([1.0, -1.0, 1.0, -1.0])
-"""The sum of the first corners' arms with these signs is zero."""
+"""The first corners' arms, signed so, sum to zero."""
 
 
 @dataclass(frozen=True)

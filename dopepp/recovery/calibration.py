@@ -30,48 +30,40 @@ from dopepp.geometry.camera import (
 from dopepp.geometry.cuboid import NUM_CORNERS, Cuboid
 from dopepp.recovery.detection import Detection
 
-FEATURES: Final = ("bias", "belief", "spread", "misfit", "found")
-"""What the score is made of, in this order."""
+FEATURES: Final = ("bias", "belief", "spread", "misfit", "found")  # Of the score, in this order
 
 REFINED_FEATURES: Final = ("bias", "score", "agreement", "support")
-"""What the score of a refined pose is made of, in this order."""
+"""Of the score of a refined pose."""
 
 CANDIDATE: Final = 0.005
 """Score from which a detection is refined where the refined poses have a score of their own: the
 picture, looked at closely, tells a ghost from a part that the network was in doubt about."""
 
 DISTANCE_FACTORS: Final = (0.5, 2.0)
-"""Smallest and greatest factor on a distance; trained networks' are within a tenth of 1."""
+"""Smallest and greatest; trained networks' are within a tenth of 1."""
 
-COVARIANCE_FACTORS: Final = (0.01, 100.0)
-"""Smallest and greatest factor on a covariance; trained networks' are 1 to 4."""
+COVARIANCE_FACTORS: Final = (0.01, 100.0)  # Smallest and greatest; trained networks' are 1 to 4
 
 _TENTH_BEYOND: Final = 10.645
-"""Squared Mahalanobis distance in six dimensions that a tenth exceeds (chi-squared)."""
+"""Squared Mahalanobis distance in 6D that a tenth exceeds (chi-squared)."""
 
-_CERTAIN: Final = 1e-3
-"""Beliefs nearer to 0 or 1 than this are all the same."""
+_CERTAIN: Final = 1e-3  # Beliefs nearer to 0 or 1 than this are all the same
 
-_EXPONENTS: Final = 4.0
-"""Natural logarithms beyond this are cut off: outliers must not rule the score."""
+_EXPONENTS: Final = 4.0  # Logarithms are cut off beyond this: outliers must not rule the score
+_TYPICAL_MISFIT: Final = 0.01  # Reprojection error over the size in the image, neither good nor bad
 
-_TYPICAL_MISFIT: Final = 0.01
-"""Reprojection error over the object's size in the image that counts as neither good nor bad."""
+PASSING: Final = 0.1  # ADD over the diameter below which a pose is right
 
-PASSING: Final = 0.1
-"""ADD over the diameter below which a pose is right."""
-
-_RIDGE: Final = 0.1
-"""Weight of the squared weights, in detections: few or perfectly told ones keep them finite."""
+_RIDGE: Final = 0.1  # Weight of the squared weights, in detections, which keeps them finite
 
 _STEPS: Final = 50
 
 
 _MEAN_BELIEF: Final = tuple(float(name == "belief") for name in FEATURES)
-"""The weights that make the score the mean belief."""
+"""The score is the mean belief."""
 
 _NETWORK_SCORE: Final = tuple(float(name == "score") for name in REFINED_FEATURES)
-"""The weights that leave a refined pose the network's score."""
+"""A refined pose keeps the network's score."""
 
 
 _Belief = Annotated[float, Range(1e-6, 1.0)]

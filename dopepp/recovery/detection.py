@@ -17,17 +17,14 @@ from dopepp.geometry.refine import MIN_POINTS, too_few
 from dopepp.maps.codec import Peaks
 from dopepp.recovery.association import KeypointGroup, ObjectPeaks, associate, direction_evidence
 
-SIGMA_FLOOR_PX: Final = 1.0
-"""No peak is trusted beyond this: it bounds the weight of a clean peak against a blurred one."""
+SIGMA_FLOOR_PX: Final = 1.0  # Bounds the weight of a clean peak against a blurred one
 
 WIDENINGS: Final = (1.0, 2.0, 4.0)
-"""Factors on the peaks' standard deviations, tried in turn until most keypoints agree."""
+"""Factors on the peaks' standard deviations, until most keypoints agree."""
 
-ROUNDS: Final = 3
-"""Most turns of grouping and solving."""
+ROUNDS: Final = 3  # Most turns of grouping and solving
 
-BORDER: Final = 1.0
-"""Distance from the maps' border within which a peak may be that of a keypoint beyond, cells."""
+BORDER: Final = 1.0  # Distance from the maps' border within which a keypoint may lie beyond, cells
 
 BORDER_DEVIATION: Final = 0.75
 """Error of such a peak, cells (root mean square of trained networks): half of the belief lies where

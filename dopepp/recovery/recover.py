@@ -40,8 +40,7 @@ KINDS: Final[dict[Kind, str]] = {
 }
 """What ends the way from maps to poses, in its order, as a summary says it."""
 
-LEAST_CELLS: Final = 3.0
-"""Extent of an object's keypoints below which its maps are one blot, cells."""
+LEAST_CELLS: Final = 3.0  # Extent of an object's keypoints below which its maps are one blot, cells
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,9 @@ from torch.optim.swa_utils import AveragedModel
 from dopepp.core.validation import Range, check
 
 TRAINED: Final = "trained_state"
-"""Checkpoint entry of the weights that training goes on with; ``state_dict`` are the averaged."""
+"""Entry of the weights that training goes on with; ``state_dict`` is the average."""
 
-_AVERAGED: Final = "averaged_state"
-"""Entry of a loaded checkpoint that hands its averaged weights to the callback."""
+_AVERAGED: Final = "averaged_state"  # Entry of a loaded checkpoint's averaged weights
 
 _RAMP: Final = 10
 """The average spans the last ``n / _RAMP`` of n steps until the decay is reached: the untrained

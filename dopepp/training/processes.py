@@ -26,10 +26,8 @@ from dopepp.core.errors import RunError
 _STARTED_BY: Final = "DOPEPP_STARTED_BY"
 """Environment variable with the id of the process that started this one."""
 _POLL_S: Final = 1.0
-_NOTICE_S: Final = 5.0
-"""Time that a death may take to show after the connection that it broke."""
-_GRACE_S: Final = 20.0
-"""Time after a death in which a process may end by itself."""
+_NOTICE_S: Final = 5.0  # Time that a death may take to show after the connection that it broke
+_GRACE_S: Final = 20.0  # Time after a death in which a process may end by itself
 
 
 class ProcessDiedError(RunError):

@@ -44,7 +44,7 @@ OptimizerFactory = Callable[[Iterable[nn.Parameter]], Optimizer]
 SchedulerFactory = Callable[[Optimizer, int], LRScheduler]
 
 _SCHEDULE_PROGRESS: Final = ("last_epoch", "_step_count", "_last_lr")
-"""What torch's schedulers call how far they are; the rest of their state is the run's length."""
+"""The rest of a state is the schedule."""
 
 
 @dataclass

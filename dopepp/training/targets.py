@@ -29,14 +29,12 @@ from dopepp.models.losses import MapLoss
 from dopepp.parts.part import Part
 
 Keypoints = Float[Tensor, "batch instances 9 2"]
-Targets = tuple[Beliefs, Fields]
-"""Belief maps and vector fields as the network should give them."""
+Targets = tuple[Beliefs, Fields]  # Belief maps and vector fields as the network should give them
 
-FACING: Final = np.diag([1.0, -1.0, -1.0])
-"""The reference orientation: the part's +z at the camera, its +y up in the image."""
+FACING: Final = np.diag([1.0, -1.0, -1.0])  # Reference orientation: +z at the camera, +y up
 
 UP: Final = np.array([0.0, -1.0, 0.0])
-"""Where the axis of a round part points in its reference orientation: up in the image."""
+"""Direction of a round part's axis in the reference orientation."""
 
 
 @dataclass(frozen=True)

@@ -36,20 +36,17 @@ from dopepp.training.system import PoseSystem, ValidationOutput, all_finite
 
 _log = logging.getLogger(__name__)
 
-FOLDER: Final = "nonfinite"
-"""Folder of the run that keeps the batch that ended it."""
+FOLDER: Final = "nonfinite"  # Folder of the run that keeps the batch that ended it
 
 _COUNTS: Final = Range(1, 10**6)
 _MAX_TILES: Final = 64
 _CHECKED: Final = ("loss", "gradient", "batch norm's statistics")
-"""What is looked at after every backward pass, in this order."""
+"""After every backward pass, in this order."""
 
 _MIN_INSIDE: Final = 0.5
-"""With fewer keypoints than this inside the images, poses or camera are probably wrong."""
-_MIN_CELLS: Final = 3.0
-"""Objects narrower than this on the maps have their nine keypoints in one place."""
-_FALL: Final = 0.95
-"""A validation loss above this share of its first value has not fallen."""
+"""With fewer keypoints inside the images, poses or camera are probably wrong."""
+_MIN_CELLS: Final = 3.0  # Objects narrower than this on the maps have all keypoints in one place
+_FALL: Final = 0.95  # A validation loss above this share of its first value has not fallen
 
 
 @dataclass

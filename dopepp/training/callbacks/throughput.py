@@ -22,11 +22,9 @@ from dopepp.data.batch import Batch
 
 _log = logging.getLogger(__name__)
 
-FOLDER: Final = "profile"
-"""Where in the run folder the full report is, and with ``pytorch`` the traces for a browser."""
+FOLDER: Final = "profile"  # Folder of the run with the report and traces
 
-_STARVED: Final = 0.2
-"""A larger share of waiting is worth a hint."""
+_STARVED: Final = 0.2  # A larger share of waiting is worth a hint
 _FILE: Final = "report"
 
 Total = tuple[str, int, float]

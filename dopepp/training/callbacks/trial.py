@@ -19,11 +19,8 @@ if TYPE_CHECKING:
     from optuna import Study
     from optuna.storages import BaseStorage
 
-_WAIT_S: Final = 60
-"""How long a trial waits for others to finish writing to an SQLite file."""
-
-MOST: Final = 10**6
-"""Above any number of trials or epochs that means something."""
+_WAIT_S: Final = 60  # How long a trial waits for others to finish writing to an SQLite file
+MOST: Final = 10**6  # Above any number of trials or epochs that means something
 
 
 class PrunedError(Exception):

@@ -41,7 +41,7 @@ LOGGED: Final = (
     "ar_mspd", "median_rotation_deg", "median_rotation_s_deg", "miss_rate",
 )  # fmt: skip
 _OF_MATCHES: Final = ("median_rotation_deg", "median_rotation_s_deg")
-"""These do not exist where nothing was found."""
+"""Do not exist without a match."""
 
 
 class PoseMetricsCallback(Callback):
