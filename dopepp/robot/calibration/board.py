@@ -308,7 +308,8 @@ def draw_view(
     on_board = np.column_stack([rays, np.ones(len(rays))]) @ homography.T
     at = 1000 * PX_PER_MM * on_board[:, :2] / on_board[:, 2:]
     at = (at + board.first_px - 0.5).astype(np.float32).reshape(len(v), len(u), 2)
-    page = cv2.GaussianBlur(board.drawing(), (0, 0), 0.4 * PX_PER_MM * _mm_per_pixel(camera, t))
+    blur = 0.4 * PX_PER_MM * float(1000 * t[2] / camera.K[0, 0])  # of the page, as a lens does
+    page = cv2.GaussianBlur(board.drawing(), (0, 0), blur)
     drawn = cv2.remap(
         page, at[..., 0], at[..., 1], cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_CONSTANT, borderValue=BACKGROUND,
@@ -316,7 +317,3 @@ def draw_view(
     grey = drawn.reshape(height, OVERSAMPLED, width, OVERSAMPLED).mean(axis=(1, 3))
     grey = 20 + 0.8 * grey + rng.normal(0, noise, grey.shape)
     return np.repeat(np.clip(np.rint(grey), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
-
-
-def _mm_per_pixel(camera: Camera, t: np.ndarray) -> float:
-    return float(1000 * t[2] / camera.K[0, 0])

@@ -104,7 +104,9 @@ def read_robot_poses(path: Path) -> RobotPoses:
         raise UserError(f"robot poses {path}", "a .csv, .json or .yaml file", FORMAT)
     if not records:
         raise UserError(f"{path} without a pose", FORMAT, "write a record a pose")
-    names = tuple(_name(one) for one in records)
+    names = tuple(
+        next((str(record[key]) for key in NAMES if record.get(key)), "") for record in records
+    )
     if "matrix" in records[0]:
         whole = np.stack([_matrix(one, number, path) for number, one in enumerate(records)])
         return RobotPoses(
@@ -171,10 +173,6 @@ def _listed(content: object, path: Path) -> list[Mapping[object, object]]:
     if not isinstance(content, list) or not all(isinstance(one, Mapping) for one in content):
         raise UserError(f"{path}: no list of records", FORMAT, "write a record a pose")
     return content
-
-
-def _name(record: Mapping[object, object]) -> str:
-    return next((str(record[key]) for key in NAMES if record.get(key)), "")
 
 
 def _number(record: Mapping[object, object], key: str, number: int, path: Path) -> float:

@@ -125,7 +125,9 @@ def park(M: Transforms, B: Transforms) -> tuple[Transform, Transform]:
     system = (P[:, :3, :3] - np.eye(3)).reshape(-1, 3)
     target = (Q[:, :3, 3] @ R.T - P[:, :3, 3]).ravel()
     X = make_transform(R, np.linalg.lstsq(system, target, rcond=None)[0])
-    return X, _mean(M @ X @ B)
+    boards = M @ X @ B
+    R_board = nearest_rotation(boards[:, :3, :3].sum(axis=0))
+    return X, make_transform(R_board, boards[:, :3, 3].mean(axis=0))
 
 
 def shah(M: Transforms, B: Transforms) -> tuple[Transform, Transform]:
@@ -137,7 +139,8 @@ def shah(M: Transforms, B: Transforms) -> tuple[Transform, Transform]:
     C = inverted(B)
     kronecker = np.einsum("nij,nkl->ikjl", C[:, :3, :3], M[:, :3, :3]).reshape(9, 9)
     left, _, right = np.linalg.svd(kronecker)
-    R_Y, R_X = (_signed_rotation(one.reshape(3, 3).T) for one in (left[:, 0], right[0]))
+    vectors = (one.reshape(3, 3).T for one in (left[:, 0], right[0]))  # known up to their signs
+    R_Y, R_X = (nearest_rotation(np.sign(np.linalg.det(one)) * one) for one in vectors)
     system = np.concatenate([np.hstack([one[:3, :3], -np.eye(3)]) for one in M])
     target = (C[:, :3, 3] @ R_Y.T - M[:, :3, 3]).ravel()
     shifts = np.linalg.lstsq(system, target, rcond=None)[0]
@@ -254,20 +257,10 @@ def inverted(T: Transforms) -> Transforms:
     return back
 
 
-def _mean(T: Transforms) -> Transform:
-    """Return the mean pose: shift by shift, and the rotation nearest to all."""
-    return make_transform(nearest_rotation(T[:, :3, :3].sum(axis=0)), T[:, :3, 3].mean(axis=0))
-
-
 def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
     """Return the rotation nearest to a matrix (Frobenius norm)."""
     left, _, right = np.linalg.svd(matrix)
     return np.asarray(left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right)
-
-
-def _signed_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation of a matrix that is one but for its scale and sign."""
-    return nearest_rotation(matrix if np.linalg.det(matrix) > 0 else -matrix)
 
 
 def _cross(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:

@@ -54,19 +54,15 @@ def find_tip(T_base_flange: Float[np.ndarray, "poses 4 4"]) -> Tip:
     spread = np.sqrt((residuals**2).sum() / max(1, residuals.size - 6))
     covariance = np.linalg.pinv(system.T @ system, rcond=1e-12)[:3, :3]
     distances = np.linalg.norm(residuals, axis=1)
-    values, axes = np.linalg.eigh(_information(poses[:, :3, :3]))
+    # What a pose tells of the tip on average, once the point is solved for.
+    mean = poses[:, :3, :3].mean(axis=0)
+    values, axes = np.linalg.eigh(np.eye(3) - mean.T @ mean)
     amplification = float(1 / np.sqrt(values[0])) if values[0] > 1e-9 else np.inf
     weakest = axes[:, 0]
     return Tip(
         solution[:3], solution[3:], distances, spread * np.sqrt(np.diag(covariance)),
         amplification, weakest, _doubts(amplification, weakest, distances),
     )  # fmt: skip
-
-
-def _information(rotations: Float[np.ndarray, "poses 3 3"]) -> Float[np.ndarray, "3 3"]:
-    """Return what a pose tells of the tip on average, once the point is solved for."""
-    mean = rotations.mean(axis=0)
-    return np.asarray(np.eye(3) - mean.T @ mean)
 
 
 def _doubts(

@@ -266,7 +266,10 @@ def convex_pieces(part: Part) -> tuple[Piece, ...]:
             return _read_pieces(place)
     logger.info("%s: its mesh is cut into convex pieces, once; this takes a minute", part.name)
     pieces = _cut(part.mesh)
-    write_whole(cache_folder() / "solids" / name, _packed_pieces(pieces))
+    vertices, counts = np.concatenate(pieces).astype(np.float32), [len(piece) for piece in pieces]
+    content = io.BytesIO()
+    np.savez_compressed(content, vertices=vertices, counts=counts)
+    write_whole(cache_folder() / "solids" / name, content.getvalue())
     return pieces
 
 
@@ -281,16 +284,6 @@ def _cut(mesh: Mesh) -> tuple[Piece, ...]:
         mcts_max_depth=2, seed=0,
     )  # fmt: skip
     return tuple(np.asarray(vertices, np.float64) for vertices, _ in found)
-
-
-def _packed_pieces(pieces: tuple[Piece, ...]) -> bytes:
-    content = io.BytesIO()
-    np.savez_compressed(
-        content,
-        vertices=np.concatenate(pieces).astype(np.float32),
-        counts=[len(piece) for piece in pieces],
-    )
-    return content.getvalue()
 
 
 def _read_pieces(path: Path) -> tuple[Piece, ...]:

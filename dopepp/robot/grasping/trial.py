@@ -94,6 +94,10 @@ class Trials:
         self.distance = NO_NETWORK_DISTANCE
         if task.network is not None:
             self.distance = self._distances()
+        self._symmetries = symmetry_group(
+            self.part.symmetries_discrete, self.part.symmetries_continuous
+        )
+        self._raster = RasterView(task.renderer == "raster-shadows")
         self.robot = cache(self._robot)
         self._parts_cell = cache(lambda count: Cell([self.layout.thing] * count))
         self._parts_view = cache(lambda count: MujocoView([self.layout.thing] * count))
@@ -222,10 +226,6 @@ class Trials:
             for one in self._symmetries
         )
 
-    @cached_property
-    def _symmetries(self) -> np.ndarray:
-        return symmetry_group(self.part.symmetries_discrete, self.part.symmetries_continuous)
-
     def _look(self, robot: Robot, rng: Generator) -> tuple[Joints, Transform]:
         """Stand the arm where its camera sees the tray; return its joints and the camera."""
         for _ in range(20):
@@ -262,10 +262,6 @@ class Trials:
         if any(item.body.part is None for item in lying):
             return MujocoView([item.thing for item in lying])
         return self._parts_view(len(lying))
-
-    @cached_property
-    def _raster(self) -> RasterView:
-        return RasterView(self.task.renderer == "raster-shadows")
 
 
 def _height(T_base_obj: Transform) -> float:
