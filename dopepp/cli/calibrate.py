@@ -95,11 +95,11 @@ def camera(
 def tcp(
     poses: Poses,
     out: Out,
+    force: Force = False,
     unit: Unit = "m",
     angles: Angles = "rad",
     quaternion: Quaternion = "wxyz",
     direction: Direction = "flange-to-base",
-    force: Force = False,
 ) -> None:
     """Find a tool's tip from poses of the flange in which it touches one point."""
     from dopepp.robot.calibration.files import read_robot_poses, write_calibration
@@ -362,39 +362,34 @@ def _show_lens(found: LensCalibration) -> None:
 
 
 def _show_hand_eye(boards: Sequence[BoardPose], found: HandEye, worth: Explanation) -> None:
-    import math
+    from math import degrees
 
-    for number, one in enumerate(boards):
+    for number, board in enumerate(boards):
         left = "" if found.inliers[number] else "  left out: contradicts the others"
         typer.echo(
-            f"{one.name}: {math.degrees(found.turns[number]):.3f}°, "
+            f"{board.name}: {degrees(found.turns[number]):.3f}°, "
             f"{1000 * found.shifts[number]:.2f} mm; without it the camera moves by "
             f"{1000 * worth.leave_one_out[number]:.2f} mm{left}"
         )
     turn, shift = found.robot_noise
-    typer.echo(f"the robot's own error as these show it: {math.degrees(turn):.3f}°, "
-               f"{1000 * shift:.2f} mm")  # fmt: skip
-    turns = ", ".join(f"{math.degrees(one):.0f}°" for one in worth.diversity)
-    typer.echo(f"turns about the three main axes, RMS over pairs: {turns}")
-    typer.echo(f"to know it better: {worth.next_pose}")
+    turns = ", ".join(f"{degrees(axis):.0f}°" for axis in worth.diversity)
     typer.echo(
+        f"the robot's own error as these show it: {degrees(turn):.3f}°, {1000 * shift:.2f} mm\n"
+        f"turns about the three main axes, RMS over pairs: {turns}\n"
+        f"to know it better: {worth.next_pose}\n"
         f"expected error at the board's distance: {1000 * worth.shift:.2f} mm, "
-        f"{math.degrees(worth.turn):.3f}°"
+        f"{degrees(worth.turn):.3f}°"
     )
 
 
 def _hand_eye_record(found: HandEye, worth: Explanation) -> dict[str, object]:
     from dopepp.robot.calibration.files import transform_record
 
-    places = (
-        ("T_flange_cam", "T_base_board")
-        if found.mount == "hand"
-        else ("T_base_cam", "T_flange_board")
-    )
+    mount, other = ("flange", "base") if found.mount == "hand" else ("base", "flange")
     return {
         "mount": found.mount,
-        places[0]: transform_record(found.T_mount_cam),
-        places[1]: transform_record(found.T_other_board),
+        f"T_{mount}_cam": transform_record(found.T_mount_cam),
+        f"T_{other}_board": transform_record(found.T_other_board),
         "covariance": [[float(one) for one in row] for row in found.covariance],
         "expected_error": {"position": worth.shift, "rotation": worth.turn},
         "poses_used": int(found.inliers.sum()),

@@ -240,13 +240,29 @@ def explain(
     to_mount = calibration.T_mount_cam[:3, :3]
     place = to_mount @ calibration.covariance[3:, 3:] @ to_mount.T
     weakest = np.linalg.eigh(place)[1][:, -1]
-    left_out = _left_out(T_base_flange, boards, calibration)
     mount = "flange" if calibration.mount == "hand" else "base"
     next_pose = (
         f"turn the flange by 30° or more about an axis across the {mount}'s {named(weakest)}"
     )
-    findings = _findings(calibration, boards, diversity, shift, turn, next_pose)
-    return Explanation(shift, turn, left_out, diversity, weakest, next_pose, findings)
+    findings = []
+    left_out = [
+        board.name for board, used in zip(boards, calibration.inliers, strict=True) if not used
+    ]
+    num_used = len(boards) - len(left_out)
+    if num_used < MIN_POSES:
+        findings.append(f"only {num_used} poses: take at least {MIN_POSES}, better 15")
+    if num_used < MIN_USED * len(boards):
+        contradicting = f"{len(left_out)} of {len(boards)} poses contradict the others"
+        findings.append(f"{contradicting}: {', '.join(left_out)}")
+    if diversity[1] < MIN_DIVERSITY:
+        findings.append(f"the robot turned about almost one direction only: {next_pose}")
+    if shift > MAX_ERROR or turn > MAX_TURN:
+        findings.append(
+            f"expected error {1000 * shift:.1f} mm and {np.degrees(turn):.2f}° at the board's "
+            f"distance: {next_pose}"
+        )
+    moves = _moves_without(T_base_flange, boards, calibration)
+    return Explanation(shift, turn, moves, diversity, weakest, next_pose, tuple(findings))
 
 
 def expected_error(covariance: Float[np.ndarray, "6 6"], distance: float) -> tuple[float, float]:
@@ -260,7 +276,7 @@ def expected_error(covariance: Float[np.ndarray, "6 6"], distance: float) -> tup
     return float(np.sqrt(np.trace(place))), float(np.sqrt(np.trace(covariance[:3, :3])))
 
 
-def _left_out(
+def _moves_without(
     T: Transforms, boards: Sequence[BoardPose], calibration: HandEye
 ) -> Float[np.ndarray, "poses"]:
     """Return by how much the camera moves without each pose, metres; 0 for those not used."""
@@ -275,32 +291,3 @@ def _left_out(
         )
         moves[one] = np.linalg.norm(without[:3, 3] - X[:3, 3])
     return moves
-
-
-def _findings(
-    calibration: HandEye,
-    boards: Sequence[BoardPose],
-    diversity: Vector,
-    shift: float,
-    turn: float,
-    next_pose: str,
-) -> tuple[str, ...]:
-    found = []
-    used = int(calibration.inliers.sum())
-    if used < MIN_POSES:
-        found.append(f"only {used} poses: take at least {MIN_POSES}, better 15")
-    if used < MIN_USED * len(boards):
-        names = [
-            one.name for one, used in zip(boards, calibration.inliers, strict=True) if not used
-        ]
-        found.append(
-            f"{len(names)} of {len(boards)} poses contradict the others: {', '.join(names)}"
-        )
-    if diversity[1] < MIN_DIVERSITY:
-        found.append(f"the robot turned about almost one direction only: {next_pose}")
-    if shift > MAX_ERROR or turn > MAX_TURN:
-        found.append(
-            f"expected error {1000 * shift:.1f} mm and {np.degrees(turn):.2f}° at the board's "
-            f"distance: {next_pose}"
-        )
-    return tuple(found)
