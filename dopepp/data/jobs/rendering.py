@@ -34,7 +34,6 @@ from dopepp.virtual.renderers.photoreal import THREADS_SETTING
 _log = logging.getLogger(__name__)
 
 ENGINES: Final = ("local", "ray")
-
 MAX_WORKERS: Final = 1024  # more processes than any machine here has cores: a slip of the keyboard
 _LINE_EVERY_S: Final = 30.0
 

@@ -28,9 +28,7 @@ PX_PER_MM: Final = 10
 """Of a printed board: 254 dots per inch, so that sizes in tenths of millimetres are exact."""
 
 MARGIN_MM: Final = 10
-
 LONGEST_MM: Final = 1200
-
 MIN_POINTS: Final = 8  # fewer do not tell a board's turn from its distance
 SPELLING: Final = (
     "charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY], chess:COLUMNSxROWS:SQUARE (inner corners), "
@@ -39,12 +37,9 @@ SPELLING: Final = (
 
 DICTIONARY: Final = "5X5_100"
 
-
 PIXEL_NOISE: Final = 0.1  # of a found point, pixels, where the picture itself shows less
 OVERSAMPLED: Final = 2
-
 BACKGROUND: Final = 110
-
 
 Transforms = Float[np.ndarray, "poses 4 4"]
 

@@ -37,7 +37,6 @@ ROTATIONS: Final = {
 }
 
 NAMES: Final = ("name", "image", "picture", "file", "filename")
-
 MAX_BYTES: Final = 4_000_000
 
 FORMAT: Final = (

@@ -32,6 +32,10 @@ from dopepp.robot.calibration.board import BoardPose, Transforms, displaced
 
 Mount = Literal["hand", "bench"]
 
+Covariances = Float[np.ndarray, "poses 6 6"]
+Residuals = Float[np.ndarray, "poses 6"]  # turns (radians) and shifts (metres), camera axes
+Noise = Float[np.ndarray, "2"]  # deviations of a robot's turn and shift, radians and metres
+
 MIN_POSES: Final = 3
 
 ROBOT_NOISE: Final = (0.0005, 0.0005)
@@ -106,7 +110,7 @@ def calibrate_hand_eye(
 
 def equations(
     T_base_flange: Transforms, boards: Sequence[BoardPose], mount: Mount
-) -> tuple[Transforms, Transforms, Float[np.ndarray, "poses 6 6"]]:
+) -> tuple[Transforms, Transforms, Covariances]:
     """Return M and B of M_i X B_i = Y, and the covariances of B."""
     M = np.asarray(T_base_flange, np.float64)
     B = np.stack([one.T_cam_board for one in boards])
@@ -154,12 +158,7 @@ def pairs(M: Transforms, B: Transforms) -> tuple[Transforms, Transforms]:
 
 
 def refined(
-    M: Transforms,
-    B: Transforms,
-    seen: Float[np.ndarray, "poses 6 6"],
-    X: Transform,
-    Y: Transform,
-    robot: Float[np.ndarray, "2"],
+    M: Transforms, B: Transforms, seen: Covariances, X: Transform, Y: Transform, robot: Noise
 ) -> tuple[Transform, Transform, Float[np.ndarray, "6 6"]]:
     """Return X and Y of robust least squares, and the covariance of X (:class:`HandEye`).
 
@@ -181,9 +180,7 @@ def refined(
     return moved[0], moved[1], turn.T @ covariance @ turn
 
 
-def _residuals(
-    M: Transforms, B: Transforms, X: Transform, Y: Transform
-) -> Float[np.ndarray, "poses 6"]:
+def _residuals(M: Transforms, B: Transforms, X: Transform, Y: Transform) -> Residuals:
     """Return how the seen board is turned (about its origin) and shifted, camera axes."""
     expected = invert_transform(X) @ inverted(M) @ Y
     turn = Rotation.from_matrix(B[:, :3, :3] @ expected[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
@@ -191,18 +188,14 @@ def _residuals(
 
 
 def _covariances(
-    M: Transforms,
-    X: Transform,
-    Y: Transform,
-    seen: Float[np.ndarray, "poses 6 6"],
-    robot: Float[np.ndarray, "2"],
-) -> Float[np.ndarray, "poses 6 6"]:
+    M: Transforms, X: Transform, Y: Transform, seen: Covariances, robot: Noise
+) -> Covariances:
     """Return the covariances of the residuals: what pictures tell and what the robot adds."""
     return np.asarray(seen + _robot_part(M, X, Y) @ np.diag(np.repeat(robot**2, 3)) @
                       _robot_part(M, X, Y).transpose(0, 2, 1))  # fmt: skip
 
 
-def _robot_part(M: Transforms, X: Transform, Y: Transform) -> Float[np.ndarray, "poses 6 6"]:
+def _robot_part(M: Transforms, X: Transform, Y: Transform) -> Covariances:
     """Return how a small turn and shift of the robot's pose moves the board, camera axes.
 
     The turn is about the origin of the frame that the camera is mounted on.
@@ -215,11 +208,7 @@ def _robot_part(M: Transforms, X: Transform, Y: Transform) -> Float[np.ndarray, 
     return part
 
 
-def _robot_noise(
-    residuals: Float[np.ndarray, "poses 6"],
-    seen: Float[np.ndarray, "poses 6 6"],
-    robot: Float[np.ndarray, "2"],
-) -> Float[np.ndarray, "2"]:
+def _robot_noise(residuals: Residuals, seen: Covariances, robot: Noise) -> Noise:
     """Return the robot's deviations (radians, metres) that residuals show beyond the pictures'.
 
     Robust: by medians. A robot is taken to be no better than a fifth of :data:`ROBOT_NOISE`.
@@ -235,12 +224,7 @@ def _robot_noise(
 
 
 def _distances(
-    M: Transforms,
-    B: Transforms,
-    seen: Float[np.ndarray, "poses 6 6"],
-    X: Transform,
-    Y: Transform,
-    robot: Float[np.ndarray, "2"],
+    M: Transforms, B: Transforms, seen: Covariances, X: Transform, Y: Transform, robot: Noise
 ) -> Float[np.ndarray, "poses"]:
     """Return every pose's squared distance from what is expected, standard deviations."""
     residuals = _residuals(M, B, X, Y)

@@ -30,12 +30,10 @@ MAX_ERROR_PX: Final = 1.0
 OUTLIER: Final = 3.0  # times the median view's error, from which on a view is left out
 LEAST_OUTLIER_PX: Final = 0.5
 
-
 APART: Final = 0.04
 """Mean shift of a board's points between two views that differ, share of the picture's width."""
 
 MAX_VIEWS: Final = 60
-
 LOOKS_PER_S: Final = 5.0  # how often a video is looked at
 
 

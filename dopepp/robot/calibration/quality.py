@@ -33,7 +33,6 @@ MIN_TURN: Final = np.radians(5.0)  # between the two poses that are farthest fro
 TURN: Final = np.radians(1.5)  # median disagreement of pairs' turns below which a reading is right
 SHIFT: Final = 0.01  # the same of shifts, metres
 MOUNTS: Final[tuple[Mount, Mount]] = ("hand", "bench")
-
 SCALE: Final = 1.03  # factor between robot's and camera's lengths that is none
 MIN_POSES: Final = 8
 
@@ -42,7 +41,6 @@ MIN_DIVERSITY: Final = np.radians(15.0)
 
 MAX_ERROR: Final = 0.003  # of a part at the board's distance, metres, one standard deviation
 MAX_TURN: Final = np.radians(0.5)
-
 MIN_USED: Final = 0.7  # share of the poses that agree with each other
 
 

@@ -37,13 +37,11 @@ HOME: Final = np.radians([-90.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 """Joints of an arm whose tool looks straight down over the tray, radians."""
 
 JOINTS: Final = 6
-
 DENSITY: Final = 1200.0  # of a printed part, kg/m³
 FRICTION: Final = 0.5
 """Of a part on the bench and on others; on the finger pads it is theirs, 0.6 and 0.7."""
 
 STEP: Final = 0.002  # of the simulation, seconds
-
 FLANGE, GRIPPER, CAMERA = "attachment_site", "gripper/", "wrist"
 
 Shown = Literal["nothing", "things", "all"]
@@ -54,7 +52,6 @@ CONCAVITY: Final = 0.05
 """Of CoACD: how far a piece may be from its convex hull, as a share of the whole."""
 
 MAX_PIECES: Final = 64
-
 _KEPT: Final = Path(__file__).parent / "data"
 
 logger = logging.getLogger(__name__)

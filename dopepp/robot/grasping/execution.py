@@ -21,7 +21,6 @@ CLOSED: Final = 255.0
 """The command at which the fingers would meet: on a part of any width they press."""
 
 PAUSE_S: Final = 0.3
-
 SHAKE_S: Final = 1.2
 SHAKE_HZ: Final = 3.0
 SHAKE: Final = np.radians([0.0, 0.0, 0.0, 7.0, 7.0, 12.0])

@@ -25,7 +25,6 @@ from dopepp.robot.grasping.trial import Attempt, Scene, Trials
 from dopepp.robot.grasping.view import has_gl, open_gl
 
 VIDEO_SIZE: Final = (640, 480)
-
 EVERY: Final = 2  # recorded states from frame to frame of a video
 STRIP: Final = (0.0, 0.3, 0.42, 0.53, 0.72, 1.0)
 """Times of a strip's pictures, as shares of the motion: look, come, reach, close, lift, hold."""

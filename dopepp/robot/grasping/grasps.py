@@ -38,7 +38,6 @@ from dopepp.parts.part import Mesh, Part
 from dopepp.virtual.body import make_body
 
 MAX_GRASPS: Final = 1000
-
 WIDEST: Final = 0.085  # metres that the fingers open (2F-85)
 CLEARANCE: Final = 0.006
 """Metres between each finger and the part as the fingers come down, where they open so far."""

@@ -54,10 +54,8 @@ ZERO: Final = np.radians(0.02)
 """Standard deviation of a joint's zero, radians: 0.3 mm at the flange."""
 
 TOUCH: Final = 1e-4  # standard deviation of a touch, metres along each axis
-
 TOUCHES, VIEWS = 8, 15
 BOARD: Final = "charuco:8x6:20:15"
-
 _DOWN: Final = np.diag([1.0, -1.0, -1.0])  # rotation of a tool that looks straight down
 
 

@@ -8,7 +8,6 @@ from typing import Final
 
 BLOCK: Final = 50  # trials after which another robot is calibrated, as Table 9 counts them
 EXACT: Final = "exact poses"
-
 FAILURES: Final = ("not seen", "wrong pose", "no plan", "collided", "slipped")
 
 

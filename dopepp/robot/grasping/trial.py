@@ -45,7 +45,6 @@ TILT: Final = np.radians(17.0)
 """Largest turn of the camera about its x and about its y from straight down, radians."""
 
 SETTLE_S: Final = {"single": 0.2, "distractors": 0.4, "heap": 1.5}
-
 MOST_BELIEVED: Final = 8  # parts of which a plan keeps clear
 RECOGNISED: Final = 0.1  # ADD over the diameter below which a part counts as recognised
 

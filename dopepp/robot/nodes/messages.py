@@ -32,7 +32,6 @@ MARKER_FACES: Final = 1000
 TRIANGLE_LIST: Final = 11
 ADD: Final = 0
 DELETE_ALL: Final = 3
-
 OK: Final = 0
 WARN: Final = 1  # these two are levels of a diagnosis
 OVERLAY: Final = "rgb_points"  # topic of the pictures with poses drawn on them

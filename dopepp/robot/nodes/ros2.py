@@ -41,7 +41,6 @@ QUEUE_IN: Final = 5
 before anybody has chosen: 10 and 33 of 300 at 30 Hz. With many, it begins with old ones."""
 
 QUEUE_OUT: Final = 10
-
 WAIT_S: Final = 0.2  # seconds between two looks at whether the node is to end
 RECENT: Final = 100  # pictures over which rates and latencies are told
 
