@@ -18,10 +18,8 @@ _log = logging.getLogger(__name__)
 def fitted_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
     """Choose, where a camera is given, scale and input size by how large the parts appear in it.
 
-    Who learns from renders of a BOP data set's models and gives none has that of its pictures.
-    What was chosen stands in the config as if it had been given, and the log says it. A
-    :class:`UserError`: the parts are larger than the picture or too small in it, or a given input
-    size has no room for them.
+    Renders of a BOP data set's models have the camera of its pictures where none is given. What was
+    chosen stands in the config as if it had been given, and the log says it.
     """
     config = _with_camera_of_pictures(config, parts)
     data, virtual = config.data, config.data.virtual
@@ -52,9 +50,7 @@ def fitted_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
 def _with_camera_of_pictures(config: RunConfig, parts: Parts) -> RunConfig:
     """Return a config with the camera, and the distances, of the test's BOP pictures.
 
-    Only where renders are learned, those pictures are the test, and no camera is given; nor, where
-    some of what is learned is real, an input size. A :class:`UserError`: no distance is given and
-    no object annotated.
+    Only where renders are learned, no camera is given, nor, with real images, an input size.
     """
     data, virtual = config.data, config.data.virtual
     rendered = data.real_fraction == 0 or (data.real_fraction < 1 and data.input_size is None)

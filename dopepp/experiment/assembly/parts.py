@@ -27,11 +27,7 @@ PAPER_OBJECTS: Final = (
 
 
 def build_parts(data: DataConfig) -> list[Part]:
-    """Build the objects to learn: those of the labelled images in ``root``, else the listed parts.
-
-    They have the symmetries that ``data.symmetries`` says. A :class:`UserError` tells what is wrong
-    with root, objects or parts, or that real frames were asked for without a root.
-    """
+    """Build the objects to learn: of the labelled images in ``root``, else the listed parts."""
     return choose_symmetries(_read_parts(data), data.symmetries)
 
 

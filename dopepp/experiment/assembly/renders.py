@@ -69,11 +69,10 @@ def empty_renders(data: DataConfig, parts: Parts, split: Split, num_images: int)
 def validation_renders(
     checkpoint: Checkpoint, path: Path, count: int, size: Size | None = None
 ) -> DescribedSource:
-    """Render a checkpoint's parts, by the meshes in it, as its validation images are rendered.
+    """Render a checkpoint's parts as its validation images, in pictures of another ``size``.
 
-    The other models of the data set it was trained for are not shown: that may be on another
-    machine. The path is for messages. ``size`` is the pictures' (width, height), pixels, instead of
-    their own; those of a camera that the checkpoint was trained for keep theirs.
+    Neither the data set that it was trained on is needed nor its other models shown. Pictures of a
+    camera that the checkpoint was trained for keep their size. The path is for messages.
     """
     data = chosen_data({}, {}, trained_on(checkpoint.data), str(path))
     virtual = replace(data.virtual, preset=data.preset_name)

@@ -47,11 +47,7 @@ _TRAINING_SHARE: Final = 0.8
 
 
 def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModule:
-    """Build training, validation and test data and say in one line where real frames are missing.
-
-    The seed is that of the training images; the others have ``data.eval_seed``. A
-    :class:`UserError` tells which option or file is wrong.
-    """
+    """Build training images of this seed, and validation and test images of ``data.eval_seed``."""
     backgrounds = find_backgrounds(data.virtual.backgrounds)
     return PoseDataModule(
         train=_train_source(data, parts, seed, backgrounds),
@@ -70,10 +66,7 @@ def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModul
 
 
 def _validation_source(data: DataConfig, parts: Parts) -> DescribedSource:
-    """Build the validation images as the network sees them while it trains.
-
-    In a camera of its own, these are windows; all others who measure take the whole pictures.
-    """
+    """Build the validation images as training sees them: in a camera of its own, windows."""
     source = held_out_source(data, parts, "val")
     if data.virtual.view is None or not isinstance(source, RenderedSource):
         return source
@@ -83,9 +76,8 @@ def _validation_source(data: DataConfig, parts: Parts) -> DescribedSource:
 def held_out_source(data: DataConfig, parts: Parts, split: Split) -> DescribedSource:
     """Build the validation or the test images alone, at their native resolution.
 
-    They are labelled ones where there is a root, else a range of renders that no other uses; so
-    is validation where the labelled images show no object and all can be rendered, which the log
-    says.
+    These are labelled ones where there is a root, else renders that no other split uses. Validation
+    is on renders, too, where the labelled images show no object; the log says so.
     """
     if data.is_rendered(split):
         return held_out_renders(data, parts, split)

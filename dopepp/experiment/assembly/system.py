@@ -58,11 +58,7 @@ def build_system(
     images: Mapping[str, Any] | None = None,
     seen: Mapping[str, Seen] | None = None,
 ) -> PoseSystem:
-    """Build the network, its loss and its optimiser as the config names them.
-
-    Fingerprint and description of the data's images, by split, and the sizes in which they show
-    the parts are kept in the checkpoint.
-    """
+    """Build network, loss and optimiser; the checkpoint keeps what the data's images are."""
     network, description = build_untrained(config, parts)
     description = replace(
         description,
@@ -92,11 +88,7 @@ def build_system(
 
 
 def build_untrained(config: RunConfig, parts: list[Part]) -> tuple[PoseNetwork, Checkpoint]:
-    """Build the chosen network and what it is to be trained for, its data left out.
-
-    Its spec is the chosen components, and what the loss and the objects decide. A
-    :class:`UserError` tells which choice or threshold is wrong.
-    """
+    """Build the chosen network and what it is to be trained for, its data left out."""
     spec = {
         "backbone": config.model.backbone,
         "attention": config.model.attention,
@@ -130,11 +122,7 @@ def _start_from(network: torch.nn.Module, path: Path) -> None:
 
 
 def build_trainer(config: RunConfig, run_dir: Path, trackers: Sequence[Logger] = ()) -> Trainer:
-    """Build Lightning's trainer with the config's callbacks.
-
-    Trackers are loggers besides the CSV table that is always on. A :class:`UserError`: a callback
-    is wrong, or Lightning refuses an option.
-    """
+    """Build Lightning's trainer with the config's callbacks, and trackers beside the CSV table."""
     options, accelerator = config.trainer, config.trainer.accelerator
     if accelerator in ("auto", "gpu") and torch.cuda.is_available():
         accelerator = "cuda"

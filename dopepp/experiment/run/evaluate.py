@@ -79,11 +79,7 @@ def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part
 
 
 def evaluate(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
-    """Parse ``evaluate.py``'s composed config and measure what it names on a test set.
-
-    That is a checkpoint, a file of another method's poses, or both; the test set is the
-    checkpoint's own one or another one. A :class:`UserError` tells what of it is wrong.
-    """
+    """Parse ``evaluate.py``'s config; measure a checkpoint, another method's poses, or both."""
     program.quiet_lightning()
     asked = EvaluationConfig.of(config)
     extensions.enable(asked.extensions)

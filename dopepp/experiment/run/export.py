@@ -56,13 +56,16 @@ def export(
 ) -> Exported:
     """Write a checkpoint's network as one file (OpenVINO: a folder) and return what it is.
 
-    ``layout`` is one of :data:`~dopepp.inference.export.EXPORTERS`; without ``out`` the file
-    stands beside the checkpoint, of a released one in this folder. Scenes are rendered as those of
-    the checkpoint's validation: to compare the two, and for int8 ``num_images`` to calibrate and
-    as many others to measure ADD-0.1d before and after.
+    Args:
+        path: The checkpoint.
+        layout: One of :data:`~dopepp.inference.export.EXPORTERS`.
+        precision: One of :data:`~dopepp.inference.export.PRECISIONS`.
+        out: The file (default: beside the checkpoint; of a released one, in this folder).
+        num_images: Rendered scenes to calibrate int8 on, and as many to measure ADD-0.1d on.
 
-    A :class:`UserError`: the checkpoint, an option or the place is wrong, or an extra is missing. A
-    :class:`RunError`: the export does not answer what the checkpoint does; nothing was written.
+    Raises:
+        UserError: The checkpoint, an option or the place is wrong, or an extra is missing.
+        RunError: The export does not answer what the checkpoint does; nothing was written.
     """
     target = _target(path, layout, precision, out)
     if runtimes.is_export(path):

@@ -91,12 +91,10 @@ def _shown(value: object) -> str:
 
 
 def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Parts) -> None:
-    """Say it in one line where figures are not comparable with the checkpoint's own.
+    """Warn of test images that changed under the checkpoint's own options, and of other shapes.
 
-    Two things are: a test set that has changed although its configuration is the checkpoint's, and
-    an object of another shape than the one trained on, whatever the test set (``parts`` are the
-    checkpoint's objects as these data have them). Another test set, chosen by its configuration, is
-    as its user wants it.
+    ``parts`` are the checkpoint's objects as these data have them. A test set of other options is
+    what its user wants.
     """
     pairs = zip(checkpoint.parts, parts, strict=True)
     others = [a.name for a, b in pairs if a.mesh_hash and b.mesh_hash not in ("", a.mesh_hash)]

@@ -1,14 +1,11 @@
-"""What is asked for several times and made once: rendered pictures and a network's maps.
-
-Tuning looks at each picture two to four times, with other options. What does not fit into memory is
-made again.
-"""
+"""Rendered pictures and a network's maps, made once: tuning uses each two to four times."""
 
 from __future__ import annotations
 
 import copy
 import hashlib
 from collections.abc import Callable, Hashable
+from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
 from dopepp.data.sample import Sample, Source
@@ -24,7 +21,7 @@ Made = TypeVar("Made")
 
 
 class Memory:
-    """Keeps what was made, first come, first kept, up to so many bytes."""
+    """Keeps what was made, first come, first kept; what does not fit is made again."""
 
     def __init__(self, most_bytes: int = MOST_BYTES) -> None:
         self._free = most_bytes
@@ -42,44 +39,47 @@ class Memory:
 
     def of(self, source: Source) -> Source:
         """Return a source whose items of epoch 0 are made once."""
-        return _RememberedSource(source, self)
+        return _RememberedSource(source, self, source.name)
 
     def behind(self, estimator: PoseEstimator) -> PoseEstimator:
         """Return a copy of an estimator that runs its network once on each picture."""
-        remembering = copy.copy(estimator)
-        remembering.network = _RememberedNetwork(estimator.network, self)
+        network, remembering = estimator.network, copy.copy(estimator)
+        remembering.network = _RememberedNetwork(
+            network, self, network.stride, network.size_multiple
+        )
         return remembering
 
 
+@dataclass
 class _RememberedSource:
-    def __init__(self, source: Source, memory: Memory) -> None:
-        self.name, self._source, self._memory = source.name, source, memory
+    source: Source
+    memory: Memory
+    name: str
 
     def __len__(self) -> int:
-        return len(self._source)
+        return len(self.source)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Return item ``index`` of ``epoch``."""
         if epoch:
-            return self._source.sample(index, epoch)
-        return self._memory.recall((id(self), index), lambda: self._source.sample(index), _bytes_of)
+            return self.source.sample(index, epoch)
+        return self.memory.recall((id(self), index), lambda: self.source.sample(index), _num_bytes)
 
 
+@dataclass
 class _RememberedNetwork:
-    def __init__(self, network: Runtime, memory: Memory) -> None:
-        self.stride, self.size_multiple = network.stride, network.size_multiple
-        self._network, self._memory = network, memory
+    network: Runtime
+    memory: Memory
+    stride: int
+    size_multiple: int
 
     def maps(self, images: Images) -> Stage:
-        """Return the belief maps and the vector field of images."""
         pixels = images.permute(0, 2, 3, 1).contiguous().cpu().numpy()
         key = (id(self), pixels.shape, hashlib.blake2b(pixels.tobytes()).digest())
-        return self._memory.recall(
-            key, lambda: self._network.maps(images), lambda maps: sum(one.nbytes for one in maps)
+        return self.memory.recall(
+            key, lambda: self.network.maps(images), lambda maps: sum(each.nbytes for each in maps)
         )
 
 
-def _bytes_of(sample: Sample) -> int:
-    """Return the size of a sample's pictures."""
-    arrays = [sample.image, sample.depth, *(one.mask for one in sample.instances)]
-    return sum(one.nbytes for one in arrays if one is not None)
+def _num_bytes(sample: Sample) -> int:
+    arrays = [sample.image, sample.depth, *(each.mask for each in sample.instances)]
+    return sum(each.nbytes for each in arrays if each is not None)

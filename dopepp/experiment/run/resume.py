@@ -71,12 +71,13 @@ class ConfigDifference:
 def check_resume(
     run: Path, config: RunConfig, saved: Checkpoint, payload: Mapping[str, Any]
 ) -> list[ConfigDifference]:
-    """Compare a run's folder and checkpoint with the config that is to go on with it.
+    """Return the accepted differences between a run and the config that is to go on with it.
 
     ``payload`` is what a checkpoint of the present run would say of itself.
 
-    Returns the differences that are accepted. A :class:`UserError`: the network or the kind of
-    optimiser differs, or what is learnt from does and ``resume_anyway`` is not set.
+    Raises:
+        UserError: The network or the kind of optimiser differs, or what is learnt from does and
+            ``resume_anyway`` is not set.
     """
     path = run / CONFIG_FILE
     before = read_yaml(path) if path.is_file() else config.plain
@@ -132,9 +133,8 @@ def image_differences(saved: object, present: object) -> list[ConfigDifference]:
 def trusted_overrides(stored: object, source: Path) -> list[str]:
     """Return a run's own overrides without those that belong to the call it was started with.
 
-    A run's folder may come from anybody, and what stands in it goes back on the command line. There
-    Hydra takes flags, and builds whatever its own nodes name; so neither is taken from a folder.
-    Anything but overrides is a :class:`UserError`.
+    A run's folder may come from anybody. On the command line Hydra takes flags, and builds whatever
+    its own nodes name; so neither is taken from a folder. The rest must be overrides.
     """
     if not isinstance(stored, list) or not all(isinstance(text, str) for text in stored):
         raise UserError(f"{source} without a list of overrides", "key=value lines", "check the run")
@@ -154,10 +154,7 @@ def trusted_overrides(stored: object, source: Path) -> list[str]:
 
 
 def read_overrides(run: Path) -> list[str] | None:
-    """Return the overrides that a run was started with; None where they are not known as a whole.
-
-    A file that holds something else is a :class:`UserError`.
-    """
+    """Return the overrides that a run was started with; None where a file is missing or cut."""
     own, overrides, hydra = (run / path for path in (OVERRIDES_FILE, OVERRIDES, _HYDRA))
     if own.is_file():
         return trusted_overrides(read_json(own).get("overrides"), own)
@@ -172,10 +169,7 @@ def read_overrides(run: Path) -> list[str] | None:
 
 
 def remember_overrides(run: Path) -> None:
-    """Write down how a run was started: Hydra's own file may be cut in the middle.
-
-    A resumed run calls it once it is accepted, so that a refused one leaves the folder as it was.
-    """
+    """Write down how a run was started, or goes on: Hydra's own file may be cut in the middle."""
     if not HydraConfig.initialized():
         return
     overrides = [str(text) for text in HydraConfig.get().overrides.task]

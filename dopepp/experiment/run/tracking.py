@@ -1,9 +1,7 @@
-"""What experiment trackers are told of a run: Weights & Biases and TensorBoard.
+"""Experiment trackers, Weights & Biases and TensorBoard: a run is a run there, ended with it.
 
-Each run is one run there: named after what was chosen, grouped with the others of its multirun,
-with its config, its curves and pictures while it trains, its test result at the end, and ended with
-it. A multirun ends with a run of its own that holds the comparison. Nothing a tracker does or fails
-to do changes a run; see :class:`~dopepp.training.loggers.GuardedLogger`.
+A multirun ends with a run of its own that holds the comparison. Nothing that a tracker does or
+fails to do changes a run (:class:`~dopepp.training.loggers.GuardedLogger`).
 """
 
 from __future__ import annotations
@@ -41,10 +39,7 @@ _UNSAID: Final = ("experiment=", "scale=", "logger", "model=", "data=", "resume"
 
 @contextmanager
 def tracked(config: RunConfig, run_dir: Path) -> Iterator[list[GuardedLogger]]:
-    """Give a training's trackers, and end the run with each of them however the training ends.
-
-    A job's folder is in its multirun's. A ``logger`` that names no logger is a :class:`UserError`.
-    """
+    """Yield a training's trackers, and end the run with each of them however the training ends."""
     chosen = [one for one in overrides_of(run_dir) if not one.startswith(_UNSAID)]
     name = " ".join([config.model.name, config.data.name, *chosen])
     group = run_dir.resolve().parent.name if run_dir.name.isdigit() else None
@@ -108,10 +103,7 @@ def _figures(prefix: str, rows: Mapping[str, PoseRow]) -> dict[str, float]:
 
 
 def log_comparison(nodes: Mapping[str, Any] | None, folder: Path) -> None:
-    """Tell trackers how a multirun's jobs compare, in a run of its own in their group.
-
-    The multirun's folder holds the comparison's files.
-    """
+    """Tell trackers how a multirun's jobs compare, in a run of its own in their group."""
     with _open(nodes, folder, _COMPARISON, folder.resolve().name, _COMPARISON) as trackers:
         for tracker in trackers:
             for file in (TABLE_FILE, PAPER_TABLE_FILE):

@@ -70,10 +70,7 @@ QUICKSTART: Final = "experiment=quickstart"
 
 
 def do_job(config: Mapping[str, Any], run_dir: Path) -> object:
-    """Parse ``train.py``'s composed config and do the job that it names.
-
-    A :class:`UserError` tells which option is wrong.
-    """
+    """Parse ``train.py``'s composed config and do the job that it names."""
     program.quiet_lightning()
     parsed = RunConfig.of(config)
     extensions.enable(parsed.extensions)
@@ -99,9 +96,10 @@ def _refuse_parallel_multirun(trainer: TrainerConfig) -> None:
 def train(config: RunConfig, run_dir: Path) -> Report:
     """Train, then measure the best checkpoint on the test set.
 
-    A choice, a file or an option that is wrong is a :class:`UserError`; a search that stops this
-    training a ``PrunedError``; what cannot be written a ``SavingFailedError``; a signal that ends
-    it an :class:`Interruption`, whose message names the last checkpoint.
+    Raises:
+        UserError: A choice, a file or an option is wrong.
+        PrunedError: A search stopped the training.
+        Interruption: A signal ended it; the message names the last checkpoint.
     """
     explanation = pages.RunReadme(config, run_dir)
     try:

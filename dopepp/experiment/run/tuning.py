@@ -45,11 +45,7 @@ agree all the same."""
 
 @dataclass(frozen=True)
 class Scored:
-    """The detections on a set of images.
-
-    Of every detection its features, what the estimator said, whether it is right, and the number of
-    its image; then images in all, and instances that were to be found.
-    """
+    """The detections on a set of images, and how many instances there were to be found."""
 
     features: Float[np.ndarray, "n features"]
     scores: Float[np.ndarray, "n"]
@@ -67,11 +63,7 @@ class Scored:
 
 @dataclass(frozen=True)
 class Figures:
-    """How good scores and a threshold are.
-
-    The scores' expected calibration error, the share of images without objects on which something
-    is found, and the share of instances with a right pose above the threshold.
-    """
+    """How good scores and a threshold are: ``recall`` counts right poses above the threshold."""
 
     calibration_error: float
     false_positive_rate: float
@@ -80,11 +72,7 @@ class Figures:
 
 @dataclass(frozen=True)
 class Tuning:
-    """What tuning chose: recovery options to change, and how good it is on other images.
-
-    Figures are of the checkpoint as it was and with the new options; ``num_images`` counts the test
-    images with objects, and without.
-    """
+    """Recovery options to change, and figures on test images, with objects and without."""
 
     options: dict[str, float]
     before: Figures
@@ -97,10 +85,10 @@ def tune(
 ) -> Tuning:
     """Choose factor, weights and threshold on validation images; measure them on test images.
 
-    Of an estimator that refines, first those of the network alone and then, on the refined poses,
-    those of theirs; ``before`` are the figures of the network as it was.
+    An estimator that refines gets those of the network first, then those of its refined poses.
 
-    A :class:`UserError`: the network finds nothing, or all that it finds is right or wrong.
+    Raises:
+        UserError: The network finds nothing, or all that it finds is right or wrong.
     """
     old, refiner, memory = estimator.recovery, estimator.refiner, Memory()
     estimator = memory.behind(estimator)
@@ -110,9 +98,9 @@ def tune(
     empty = memory.of(empty_renders(data, parts, "val", count))
     empty_test = memory.of(empty_renders(data, parts, "test", count))
 
-    def scored(options: RecoveryOptions, source: Source) -> Scored:
+    def scored(options: RecoveryOptions, *sources: Source) -> Scored:
         estimator.recovery = options
-        return score_images(estimator, parts, source)
+        return score_images(estimator, parts, *sources)
 
     estimator.refiner = None
     # Every detection counts here, whatever its score.
@@ -130,7 +118,7 @@ def tune(
         # Features are of the network's score, which an earlier tuning's would hide.
         candidate = min(new.min_score, calibration.CANDIDATE)
         heard = replace(new.unrefined(), min_score=candidate)
-        shown = joined(scored(heard, validation), scored(heard, Hidden(validation)))
+        shown = scored(heard, validation, Hidden(validation))
         refined = choose(shown, scored(heard, empty), rate, refined=True)
         chosen |= refined
         threshold = refined.pop("refined_min_score")
@@ -167,8 +155,8 @@ def choose(
 ) -> dict[str, float]:
     """Choose the weights and the threshold from detections on images with objects and without.
 
-    ``false_positive_rate`` is as in :class:`FalsePositiveTarget`; ``refined`` tells that the poses
-    are. A :class:`UserError`: there is nothing to learn from.
+    Raises:
+        UserError: There is nothing to learn from.
     """
     features = np.concatenate([shown.features, empty.features])
     correct = np.concatenate([shown.correct, empty.correct])
@@ -193,28 +181,28 @@ def choose(
     return dict(zip(names, [threshold, *map(float, weights)], strict=True))
 
 
-def score_images(estimator: PoseEstimator, parts: Parts, source: Source) -> Scored:
-    """Run an estimator over a source and judge every detection; features are of what it does."""
+def score_images(estimator: PoseEstimator, parts: Parts, *sources: Source) -> Scored:
+    """Run an estimator over sources and judge every detection; features are of what it does."""
     refined = estimator.refiner is not None
     names = calibration.REFINED_FEATURES if refined else calibration.FEATURES
     rows: list[tuple[np.ndarray, float, bool, int]] = []
     num_instances = 0
-    for number, sample, part, own, true in _by_object(estimator, parts, source):
+    for number, sample, part, detections, true in _by_object(estimator, parts, *sources):
         num_instances += sum(map(counted, true))
-        right, judged = _judge(part, own, true)
-        for one, is_right in zip(compress(own, judged), right[judged], strict=True):
-            known = (
-                calibration.refined_features(one)
-                if refined
-                else calibration.detection_features(one, part.cuboid, sample.K)
-            )
-            rows.append((known, one.score, bool(is_right), number))
+        right, judged = _judge(part, detections, true)
+        for detection, is_right in zip(compress(detections, judged), right[judged], strict=True):
+            if refined:
+                features = calibration.refined_features(detection)
+            else:
+                features = calibration.detection_features(detection, part.cuboid, sample.K)
+            rows.append((features, detection.score, bool(is_right), number))
+    table, scores, correct, images = zip(*rows, strict=True) if rows else ((), (), (), ())
     return Scored(
-        np.array([row[0] for row in rows]).reshape(-1, len(names)),
-        np.array([row[1] for row in rows], np.float64),
-        np.array([row[2] for row in rows], bool),
-        np.array([row[3] for row in rows], np.int64),
-        len(source),
+        np.reshape(table, (-1, len(names))),
+        np.array(scores, np.float64),
+        np.array(correct, bool),
+        np.array(images, np.int64),
+        sum(map(len, sources)),
         num_instances,
     )
 
@@ -222,10 +210,7 @@ def score_images(estimator: PoseEstimator, parts: Parts, source: Source) -> Scor
 def matched_poses(
     estimator: PoseEstimator, parts: Parts, source: Source
 ) -> list[tuple[Detection, Float[np.ndarray, "equivalents 4 4"]]]:
-    """Return the detections on a source and the true poses of the instance each has found.
-
-    A symmetric part's are all that look alike.
-    """
+    """Return detections, each with all poses that look like the one of the instance it found."""
     found = []
     for _, _, part, own, instances in _by_object(estimator, parts, source):
         group = symmetries(part).numpy()
@@ -236,11 +221,12 @@ def matched_poses(
 
 
 def _by_object(
-    estimator: PoseEstimator, parts: Parts, source: Source
+    estimator: PoseEstimator, parts: Parts, *sources: Source
 ) -> Iterator[tuple[int, Sample, Part, list[Detection], list[Instance]]]:
-    """Run an estimator over a source; for every image and part what was found and what is there."""
-    for number in range(len(source)):
-        sample = source.sample(number, 0)
+    """Yield detections and instances of every image, numbered over all sources, and part."""
+    images = ((source, index) for source in sources for index in range(len(source)))
+    for number, (source, index) in enumerate(images):
+        sample = source.sample(index, 0)
         found = estimator.predict(sample.image, sample.K, cropped=True)
         for part in parts:
             own = [one for one in found if one.object == part.name]
@@ -249,10 +235,7 @@ def _by_object(
 
 
 class Hidden:
-    """Images of a source with :data:`HIDDEN` of every object's visible pixels covered.
-
-    Objects without a mask stay as they are.
-    """
+    """Images of a source with :data:`HIDDEN` of every masked object's visible pixels covered."""
 
     def __init__(self, source: Source) -> None:
         self._source, self.name = source, f"{source.name}, hidden"
@@ -266,18 +249,6 @@ class Hidden:
         return shade(self._source.sample(index, epoch), [HIDDEN], 0, index)[0].sample
 
 
-def joined(one: Scored, other: Scored) -> Scored:
-    """Return the detections on two sets of images together."""
-    return Scored(
-        np.concatenate([one.features, other.features]),
-        np.concatenate([one.scores, other.scores]),
-        np.concatenate([one.correct, other.correct]),
-        np.concatenate([one.image, other.image + one.num_images]),
-        one.num_images + other.num_images,
-        one.num_instances + other.num_instances,
-    )
-
-
 def write_tuned(checkpoint: Checkpoint, path: Path, options: Mapping[str, float]) -> Path:
     """Write a checkpoint with other recovery options beside the old one; returns its path."""
     tuned = replace(checkpoint, recovery={**checkpoint.recovery, **options})
@@ -289,10 +260,9 @@ def write_tuned(checkpoint: Checkpoint, path: Path, options: Mapping[str, float]
 def _judge(
     part: Part, found: Sequence[Detection], true: Sequence[Instance]
 ) -> tuple[Bool[np.ndarray, "found"], Bool[np.ndarray, "found"]]:
-    """Tell which detections of one object on one image are right, and which are judged at all.
+    """Return which detections of an object are right (ADD(-S) below 0.1 d), and which are judged.
 
-    As in every evaluation, one that finds an instance too hidden to count is neither right nor
-    wrong. Right is ADD below 0.1 d, for a part with symmetries ADD-S.
+    As in every evaluation, one of an instance too hidden to count is neither right nor wrong.
     """
     numbers = assign(part.cuboid[CENTROID], found, true)
     counts = np.array([number < 0 or counted(true[number]) for number in numbers], bool)

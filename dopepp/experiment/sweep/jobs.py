@@ -39,11 +39,7 @@ _ANYWHERE: Final = ("timeout_min", "nodes", "tasks_per_node", "cpus_per_task", "
 
 @dataclass(frozen=True)
 class Jobs:
-    """What the jobs of a multirun have in common; travels to the processes that run them.
-
-    That is Hydra's config loader and callbacks, the config of the multirun, the entry point's
-    function, and Hydra's global state.
-    """
+    """What the jobs of a multirun have in common; travels to the processes that run them."""
 
     context: HydraContext
     config: DictConfig
@@ -96,11 +92,7 @@ Runner = Callable[[Jobs, Mapping[int, list[str]]], Ended]
 def launch(
     jobs: Jobs, overrides: Sequence[Sequence[str]], first: int, run: Runner
 ) -> list[JobReturn]:
-    """Run jobs and wait for all of them; a lost one has failed, the others go on.
-
-    ``overrides`` are of each job, ``first`` is the number of the first one. A :class:`UserError`:
-    they cannot be run there.
-    """
+    """Run jobs, numbered from ``first``, and wait for all; a lost one has failed, others go on."""
     jobs.folder.mkdir(parents=True, exist_ok=True)
     numbered = {first + index: list(one) for index, one in enumerate(overrides)}
     returns: dict[int, JobReturn] = {}
@@ -122,10 +114,7 @@ def _lost(folder: Path, error: Exception) -> JobReturn:
 
 
 def on_joblib(n_jobs: int) -> Runner:
-    """Return a runner that keeps so many jobs going in processes of this machine.
-
-    A :class:`UserError`: the number is out of range, or joblib is not installed.
-    """
+    """Return a runner that keeps so many jobs going in processes of this machine."""
     check("hydra.launcher.n_jobs", n_jobs, int, Range(1, _MOST))
     require("joblib", "hydra/launcher=joblib", "joblib")
 
@@ -142,8 +131,7 @@ def on_joblib(n_jobs: int) -> Runner:
 def on_ray(address: str | None, num_cpus: float, num_gpus: float) -> Runner:
     """Return a runner of jobs that occupy so many cores and accelerators of a cluster.
 
-    ``address`` is the cluster's ``host:port``; None starts one on this machine for these jobs. A
-    job sees only its own accelerators.
+    ``address`` is the cluster's ``host:port``; None starts one on this machine for these jobs.
     """
 
     def run(jobs: Jobs, overrides: Mapping[int, list[str]]) -> Ended:
@@ -174,10 +162,11 @@ def _run(pool: Pool, overrides: Mapping[int, list[str]]) -> Ended:
 def on_slurm(folder: str, cluster: str, max_num_timeout: int, sbatch: Mapping[str, Any]) -> Runner:
     """Return a runner that submits an array and waits for it.
 
-    SLURM's own logs go to the folder. The cluster is ``slurm``, or submitit's ``local``: processes
-    of this machine. A job that reaches its time limit is queued again ``max_num_timeout`` times.
-    Of ``sbatch``, options by submitit's names, None leaves one to the cluster. A
-    :class:`UserError`: submitit is not installed.
+    Args:
+        folder: Of SLURM's own logs.
+        cluster: ``slurm``, or submitit's ``local``: processes of this machine.
+        max_num_timeout: How often a job that reaches its time limit is queued again.
+        sbatch: Options by submitit's names; None leaves one to the cluster.
     """
     require("submitit", "hydra/launcher=submitit_slurm", "slurm")
     given = {key: value for key, value in sbatch.items() if value is not None}

@@ -1,12 +1,11 @@
 """Searching: trials are asked from a study, run by Hydra's launcher, and told to it.
 
-A trial's number is its job's. Whatever ends a command in the middle, its trials stay ``RUNNING`` in
-the study: the next command runs those first, each under its number and in its folder, where a
-training goes on from its last checkpoint. A study is opened by one command at a time, and trials of
-different configurations are never mixed in it.
+A trial's number is its job's. Trials that a command left ``RUNNING`` are run first by the next one,
+each in its own folder, where a training goes on from its last checkpoint. A study is opened by one
+command at a time, and never mixes trials of different configurations.
 
-An option is varied by a sweep of Hydra's, ``key=interval(0, 1)``. To vary another one, write it
-into ``search.space`` or on the command line.
+To vary an option, write a sweep of Hydra's, ``key=interval(0, 1)``, into ``search.space`` or on the
+command line.
 """
 
 from __future__ import annotations
@@ -60,11 +59,7 @@ _NO_PART: Final = (
 
 @dataclass(frozen=True)
 class Space:
-    """What is varied, by option, and from what it is drawn; and what is not.
-
-    ``texts`` are the same as they were written, to be compared with those of an earlier command;
-    ``fixed`` are the overrides that every trial has.
-    """
+    """Options that vary, with their texts as written, and the overrides that every trial has."""
 
     varied: dict[str, distributions.BaseDistribution]
     texts: dict[str, str]
@@ -80,9 +75,9 @@ def search(
 ) -> list[JobReturn]:
     """Run trials until the study has as many finished ones as ``search.num_trials``.
 
-    ``swept`` are the options that the experiment sweeps over by itself; there must be none. A
-    :class:`UserError`: an option of the search is wrong, or the study does not belong to this
-    command.
+    Raises:
+        UserError: An option of the search is wrong, the study does not belong to this command, or
+            the experiment sweeps over options (``swept``) by itself.
     """
     if swept:
         raise UserError(
@@ -184,10 +179,7 @@ def _report(study: optuna.Study, options: Mapping[str, Any]) -> None:
 
 
 def read_space(loader: ConfigLoader, space: Sequence[str], arguments: Sequence[str]) -> Space:
-    """Read ``search.space`` and the command line, whose overrides win.
-
-    A :class:`UserError`: an entry cannot be read or is no sweep, or nothing is varied.
-    """
+    """Read ``search.space`` and the command line, whose overrides win; a mistake is a UserError."""
     parser = OverridesParser.create(config_loader=loader)
     try:
         entries = parser.parse_overrides([str(text) for text in space])
@@ -253,14 +245,9 @@ def examples(space: Space) -> list[list[str]]:
     return [overrides(space, params) for params in tried]
 
 
-def _ends(distribution: distributions.BaseDistribution) -> list[object]:
+def _ends(distribution: Any) -> list[object]:
     """Return every choice, or one number of a range: another one composes as well."""
-    if isinstance(distribution, distributions.CategoricalDistribution):
-        return list(distribution.choices)
-    assert isinstance(
-        distribution, (distributions.FloatDistribution, distributions.IntDistribution)
-    )
-    return [distribution.low]
+    return list(getattr(distribution, "choices", ())) or [distribution.low]
 
 
 def overrides(space: Space, params: dict[str, object]) -> list[str]:
@@ -269,10 +256,7 @@ def overrides(space: Space, params: dict[str, object]) -> list[str]:
 
 
 def chosen(params: dict[str, object]) -> list[str]:
-    """Return what a trial varies as overrides: as it is run, shown, and run again by hand.
-
-    Four digits of a drawn number are enough, and fit into a table.
-    """
+    """Return what a trial varies as overrides; four digits of a number fit into a table."""
     return [
         f"{key}={value:.4g}" if isinstance(value, float) else f"{key}={value}"
         for key, value in params.items()
@@ -281,10 +265,7 @@ def chosen(params: dict[str, object]) -> list[str]:
 
 @contextmanager
 def alone(folder: Path, study: str) -> Iterator[None]:
-    """Keep a second command from searching in the same folder; ends with the process.
-
-    If there is another one, it is a :class:`UserError`.
-    """
+    """Refuse a second command that searches in the same folder; ends with the process."""
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / ".search.lock").open("w") as stream:
         try:
@@ -301,9 +282,13 @@ def alone(folder: Path, study: str) -> Iterator[None]:
 def open_study(options: Mapping[str, Any], facts: Mapping[str, str], seed: int) -> optuna.Study:
     """Open a study, or begin it.
 
-    ``facts`` is what decides about a trial's result besides what is varied, by its name. The seed
-    is of the draws; those of a command that goes on are not those of the first one again. A
-    :class:`UserError`: the study was begun with other facts, or its storage cannot be opened.
+    Args:
+        options: Of the search.
+        facts: Options that decide a trial's result besides what is varied.
+        seed: Of the draws; a command that goes on draws others than the first one.
+
+    Raises:
+        UserError: The study was begun with other facts, or its storage cannot be opened.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     name = str(options["study"])
@@ -340,10 +325,7 @@ def _check_same(before: Mapping[str, str], now: Mapping[str, str], study: str) -
 
 
 def outcome(folder: Path) -> tuple[TrialState, float | None]:
-    """Read from a job's folder how its trial ended; RUNNING where it has not.
-
-    A job without a finite objective has failed as a trial.
-    """
+    """Read from a job's folder how its trial ended: without a finite objective it has failed."""
     if (folder / PRUNED_FILE).is_file():
         return TrialState.PRUNED, None
     if (folder / FAILURE_FILE).is_file():

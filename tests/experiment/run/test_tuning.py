@@ -17,7 +17,6 @@ from dopepp.experiment.run.tuning import (
     Scored,
     choose,
     fit_factors,
-    joined,
     matched_poses,
     score_images,
     write_tuned,
@@ -188,12 +187,9 @@ def test_scores_of_refined_poses_learn_from_hidden_parts_too():
     assert shown.mask.sum() == pytest.approx((1 - HIDDEN) * mask.sum(), abs=1)
     assert np.array_equal(shown.T_cam_obj, POSE)
     assert not Hidden(images).sample(1, 0).instances
-    one, other = scored(0, 30), scored(1, 20, right=False)
-    both = joined(one, other)
-    assert (both.num_images, both.num_instances) == (50, 50)
-    loudest = both.loudest(both.scores)
-    np.testing.assert_array_equal(loudest[:30], one.loudest(one.scores))
-    np.testing.assert_array_equal(loudest[30:], other.loudest(other.scores))
+    both = score_images(estimator(found(POSE, 0.9)), [PART], images, Images(POSE))
+    assert (both.num_images, both.num_instances) == (4, 2)
+    assert both.image.tolist() == [0, 1, 2, 3]
 
 
 def test_a_symmetric_part_is_right_at_any_of_its_poses():
