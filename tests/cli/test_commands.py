@@ -1,9 +1,7 @@
 from __future__ import annotations
 
-import errno
 import json
 import logging
-import os
 from pathlib import Path
 
 import cv2
@@ -36,19 +34,11 @@ def refused(*arguments: object) -> str:
 
 
 @pytest.fixture
-def write_checkpoint(tiny_spec, tmp_path):
-    def write(**recovery: float) -> Path:
-        weights = build_network(tiny_spec).state_dict()
-        content = Checkpoint(tiny_spec, weights, [pivconnector()], (64, 64), 8, 1.0, recovery)
-        write_atomic(content.to_file(), tmp_path / "best.ckpt")
-        return tmp_path / "best.ckpt"
-
-    return write
-
-
-@pytest.fixture
-def checkpoint(write_checkpoint):
-    return write_checkpoint(peak_threshold=1e-4)
+def checkpoint(tiny_spec, tmp_path):
+    weights, recovery = build_network(tiny_spec).state_dict(), {"peak_threshold": 1e-4}
+    content = Checkpoint(tiny_spec, weights, [pivconnector()], (64, 64), 8, 1.0, recovery)
+    write_atomic(content.to_file(), tmp_path / "best.ckpt")
+    return tmp_path / "best.ckpt"
 
 
 @pytest.fixture
@@ -56,25 +46,6 @@ def picture(tmp_path):
     path = tmp_path / "picture.png"
     cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8))
     return path
-
-
-def test_predict_prints_json_lines_and_draws(checkpoint, picture, tmp_path):
-    drawn = tmp_path / "drawn" / "picture.png"
-    done = call("predict", checkpoint, picture, *K, "--save", drawn.parent)
-    assert done.exit_code == 0, done.output
-    for line in done.stdout.splitlines():
-        record = json.loads(line)
-        assert record["object"] == "pivconnector"
-        assert np.shape(record["T_cam_obj"]) == (4, 4)
-    assert cv2.imread(str(drawn)).shape[2] == 3
-
-
-def test_predict_says_in_one_line_why_there_is_nothing(write_checkpoint, picture):
-    done = call("predict", write_checkpoint(centroid_threshold=1.0), picture, *K)
-    assert (done.exit_code, done.stdout) == (0, "")
-    assert done.stderr.startswith("nothing found: pivconnector: ")
-    assert "belief" in done.stderr
-    assert done.stderr.count("\n") == 1
 
 
 def test_predict_verifies_and_refines(checkpoint, picture, tmp_path):
@@ -184,14 +155,6 @@ def test_render_shows_a_users_camera(tmp_path, caplog):
         (["--working-distance", "0.3,0.8"], "got --working-distance alone"),
         (["--camera", "{camera}", "--working-distance", "0.8,0.3"], "got working_distance=[0.8, 0"),
         (["--camera", "{camera}", "--working-distance", "near"], "got --working-distance near; al"),
-        (
-            ["--camera", "{camera}", "--working-distance", "0.05,1"],
-            "got working_distance from 0.05",
-        ),
-        (
-            ["--camera", "{camera}", "--working-distance", "0.5,9"],
-            "got working_distance to 9 m, wh",
-        ),
         (["--camera", "/nowhere", "--working-distance", "0.5,1"], "got camera file /nowhere: No"),
     ],
 )
@@ -218,14 +181,11 @@ def test_render_previews_and_stops(tmp_path):
         ([], "got no -n; allowed: the number of images, or --preview"),
         (["-n", "5", "--size", "4x4"], "got width=4 of "),
         (["-n", "5", "--size", "big"], "got --size big; allowed: WIDTHxHEIGHT"),
-        (["-n", "5", "--size", "0x0"], "got width=0 of "),
-        (["-n", "5", "--size", "64,0"], "got height=0 of "),
         (["-n", "many"], "Invalid value for '-n'"),
         (["-n", "5", "--colour"], "No such option: --colour"),
         (["-n", "5", "--backgrounds", "skimag"], "got no photo in the background folder skimag"),
         (["-n", "5", "--unit", "furlong", "part.stl"], "got unit='furlong' for part.stl"),
         (["-n", "5", "servoholder"], "got parts ['servoholder', 'servoholder'] to render"),
-        (["-n", "5", "--set", "horizontal_fov_deg=1"], "got horizontal_fov_deg=1; allowed"),
         (["-n", "5", "--preset", "moon"], "got preset 'moon'; allowed: bin, paper, "),
         (["-n", "5", "--format", "coco"], "got format 'coco'; allowed: bop, ndds, webdataset"),
         (["-n", "5", "--renderer", "gl"], "got renderer 'gl'; allowed: raster, photoreal"),
@@ -359,18 +319,6 @@ print(sorted({{"torch", "lightning", "torchmetrics", "ray"}} & set(sys.modules))
 """
     done = command("-c", code)
     assert (done.out, done.code) == ("[]\n", 0), done.err
-
-
-def test_a_full_disk_is_one_line_and_code_1(tmp_path, monkeypatch):
-    def write(path: Path, content: bytes) -> int:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(Path, "write_bytes", write)
-    done = call(*RENDER, "-n", "5", "--out", tmp_path / "out")
-    assert done.exit_code == 1
-    assert done.stderr.count("\n") == 1
-    assert done.stderr.startswith("no space left for ")
-    assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_the_command_line_starts_light(command):
