@@ -19,29 +19,19 @@ from dopepp.recovery.detection import Detection
 
 MAX_MAPS: Final = 1e-4
 MAX_MM: Final = 0.1
-MAX_DEG: Final = 0.05
-"""What float32 of another runtime may change: maps, positions and rotations."""
+MAX_DEG: Final = 0.05  # what float32 of another runtime may change: maps, positions and rotations
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """The largest differences, and how many poses they are of.
+    """The largest differences, and how many poses they are of."""
 
-    Attributes:
-        maps: Of a value of a map, as a share of the largest one's size where that is over 1.
-        position_mm: Of a position, millimetres.
-        rotation_deg: Of a rotation, degrees.
-        num_poses: Best-scored poses that both found.
-        num_single: Those that only one of them found.
-        num_pictures: Pictures they looked at.
-    """
-
-    maps: float
-    position_mm: float
-    rotation_deg: float
-    num_poses: int
-    num_single: int
-    num_pictures: int
+    maps: float  # of a value of a map, as a share of the largest one's size where that is over 1
+    position_mm: float  # of a position, millimetres
+    rotation_deg: float  # of a rotation, degrees
+    num_poses: int  # best-scored poses that both found
+    num_single: int  # those that only one of them found
+    num_pictures: int  # pictures they looked at
 
     @property
     def is_exact(self) -> bool:

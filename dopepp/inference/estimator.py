@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from dopepp.core.compiled import compile_beside
 from dopepp.core.errors import UserError
 from dopepp.core.extensions import enable
 from dopepp.drawing.pictures import Picture
@@ -88,6 +89,8 @@ class PoseEstimator:
 
             self.refiner = Refiner(refine, parts or checkpoint.parts)
         self.max_ms = max_ms
+        for function in ("rehearse_pose", "rehearse_refinement"):
+            compile_beside(f"dopepp.inference.refinement.refiner:{function}")
         self.device = checked_device(device)
         self.solid_parts = tuple(parts or checkpoint.parts)
         """Its parts, with the meshes that it was given."""

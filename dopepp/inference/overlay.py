@@ -46,11 +46,8 @@ COLOURS: Final[tuple[Colour, ...]] = (
 AXES: Final[tuple[Colour, ...]] = ((240, 50, 50), (50, 200, 50), (70, 110, 255))
 """Of the object's x, y and z axis."""
 
-AXIS: Final = 0.35
-"""Length of a drawn axis, diameters."""
-
-LINE: Final = 1 / 640
-"""Width of a line, share of the picture's width."""
+AXIS: Final = 0.35  # length of a drawn axis, diameters
+LINE: Final = 1 / 640  # width of a line, share of the picture's width
 
 FINEST: Final = 1 / 60
 """Widest line, share of the instance's extent: a small part on a large picture stays visible."""
@@ -58,14 +55,10 @@ FINEST: Final = 1 / 60
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """How a part is drawn.
+    """How a part is drawn."""
 
-    Attributes:
-        diameter: Metres.
-        mesh: Its triangles; None where nobody has them, and only its cuboid can be drawn.
-    """
-
-    diameter: float
+    diameter: float  # metres
+    # Its triangles; None where nobody has them, and only its cuboid can be drawn
     mesh: OutlineMesh | None
 
 

@@ -39,14 +39,9 @@ from dopepp.inference.results import PoseResult
 from dopepp.parts.size import part_in_words
 from dopepp.recovery.recover import explained
 
-HOST: Final = "127.0.0.1"
-"""Nobody but this machine reaches it."""
-
-MAX_UPLOAD: Final = "64mb"
-"""Of a file: a picture of 20 million pixels without compression."""
-
-SHOWN_PX: Final = 1600
-"""Longer side of the drawn picture: a browser shows no more."""
+HOST: Final = "127.0.0.1"  # nobody but this machine reaches it
+MAX_UPLOAD: Final = "64mb"  # of a file: a picture of 20 million pixels without compression
+SHOWN_PX: Final = 1600  # longer side of the drawn picture: a browser shows no more
 
 VIEW, NUMBERS, FILE = "field of view", "K", "camera file"
 """How the page can be told what took the picture."""

@@ -35,27 +35,21 @@ if TYPE_CHECKING:
     from dopepp.models.checkpoint import Checkpoint
     from dopepp.recovery.detection import Detection
 
-Region = tuple[int, int, int, int]
-"""x, y, width and height, pixels."""
+Region = tuple[int, int, int, int]  # x, y, width and height, pixels
 
 Distances = tuple[float, float] | Literal["any"]
 """Nearest and farthest depth, metres; ``any``: wherever the network can see a part."""
 
 Depth = Float[np.ndarray, "height width"]
-Depth32 = Float32[np.ndarray, "height width"]
-"""Metres along z of every pixel."""
+Depth32 = Float32[np.ndarray, "height width"]  # metres along z of every pixel
 
-Coefficients = Float[np.ndarray, "coefficients"]
-"""Of a lens's distortion, in OpenCV's order."""
+Coefficients = Float[np.ndarray, "coefficients"]  # of a lens's distortion, in OpenCV's order
 
 FARTHEST: Final = 50.0
 """Metres. No depth camera for parts sees so far; millimetres taken for metres do."""
 
-MAX_PIXELS: Final = 640 * 480
-"""Of a resized picture: a part too small for that is not looked for."""
-
-MARGIN: Final = 1.1
-"""Factor on a size that makes no difference to a network."""
+MAX_PIXELS: Final = 640 * 480  # of a resized picture: a part too small for that is not looked for
+MARGIN: Final = 1.1  # factor on a size that makes no difference to a network
 
 
 def checked_picture(

@@ -36,29 +36,21 @@ FRAME: Final = "camera, OpenCV: x right, y down, z forward; metres"
 
 @dataclass(frozen=True, eq=False)
 class PoseResult:
-    """The parts on one picture.
+    """The parts on one picture."""
 
-    Attributes:
-        image: RGB, without lens distortion: keypoints and K refer to it.
-        K: Camera matrix, pixels.
-        detections: Best score first; of a tracker, in the order of their identities.
-        speed: Milliseconds spent in each of :data:`STEPS`.
-        name: The picture's file, or its source.
-        number: Its place in the source, from 0.
-        time: Seconds: of a video since its start, of a camera or a bag since 1970; None of a
-            single picture.
-        identities: Of each detection, where a tracker follows them; else None.
-        shapes: How each part is drawn, by its name.
-    """
-
-    image: Picture = field(repr=False)
-    K: CameraMatrix
+    image: Picture = field(repr=False)  # RGB, without lens distortion: keypoints and K refer to it
+    K: CameraMatrix  # camera matrix, pixels
+    # Best score first; of a tracker, in the order of their identities
     detections: Sequence[Detection]
-    speed: Mapping[str, float]
-    name: str
-    number: int = 0
+    speed: Mapping[str, float]  # milliseconds spent in each of STEPS
+    name: str  # the picture's file, or its source
+    number: int = 0  # its place in the source, from 0
+    # Seconds: of a video since its start, of a camera or a bag since 1970; None of a single
+    # picture
     time: float | None = None
+    # Of each detection, where a tracker follows them; else None
     identities: Sequence[int] | None = None
+    # How each part is drawn, by its name
     shapes: Mapping[str, Shape] = field(default_factory=dict, repr=False)
 
     def plot(self) -> Picture:

@@ -25,31 +25,21 @@ if TYPE_CHECKING:
 
 
 class StreamOptions(TypedDict, total=False):
-    """How a source is looked at.
+    """How a source is looked at."""
 
-    Attributes:
-        stride: Every so manieth picture only.
-        track: Follow the parts from picture to picture, with an estimator that refines by region.
-        least_score: Leave out detections of lower scores, in [0, 1].
-        distances: As :meth:`PoseEstimator.predict` takes it; not with ``track``.
-        roi: Idem.
-        K_size: (width, height) that K belongs to, where the pictures were resized.
-        crop: (x, y, width, height) of the pictures in the calibrated one, where they were cut out.
-        topic: Of a bag's pictures, where it has several.
-        depth: Of the one picture of a source: a 16-bit PNG, 0 where unknown; not with ``track``.
-        depth_scale: Metres per unit of it.
-    """
-
-    stride: int
+    stride: int  # every so manieth picture only
+    # Follow the parts from picture to picture, with an estimator that refines by region
     track: bool
-    least_score: float
-    distances: Distances | None
-    roi: Region | None
-    K_size: Size | None
+    least_score: float  # leave out detections of lower scores, in [0, 1]
+    distances: Distances | None  # as predict takes it; not with `track`
+    roi: Region | None  # idem
+    K_size: Size | None  # (width, height) that K belongs to, where the pictures were resized
+    # (x, y, width, height) of the pictures in the calibrated one, where they were cut out
     crop: Crop | None
-    topic: str | None
+    topic: str | None  # of a bag's pictures, where it has several
+    # Of the one picture of a source: a 16-bit PNG, 0 where unknown; not with `track`
     depth: Path | None
-    depth_scale: float
+    depth_scale: float  # metres per unit of it
 
 
 def stream(

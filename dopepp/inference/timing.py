@@ -22,19 +22,12 @@ WARM_UP: Final = 3
 
 @dataclass(frozen=True)
 class Timing:
-    """What frames took, milliseconds.
+    """What frames took, milliseconds."""
 
-    Attributes:
-        first: The first frame after loading.
-        frame: Each later one, from picture to poses.
-        steps: By step, what of it each took.
-        num_found: Poses found on a frame, on average.
-    """
-
-    first: float
-    frame: Float[np.ndarray, "frames"]
-    steps: dict[str, Float[np.ndarray, "frames"]]
-    num_found: float
+    first: float  # the first frame after loading
+    frame: Float[np.ndarray, "frames"]  # each later one, from picture to poses
+    steps: dict[str, Float[np.ndarray, "frames"]]  # by step, what of it each took
+    num_found: float  # poses found on a frame, on average
 
 
 def time_frames(

@@ -49,8 +49,7 @@ NEAR: Final = 0.5
 ELSEWHERE: Final = 0.1
 """Diameters, of mean distance between keypoints: farther apart, track and detection disagree."""
 
-OUTVOTED: Final = 2
-"""Detections in a row that disagree with a track before it is moved to them."""
+OUTVOTED: Final = 2  # detections in a row that disagree with a track before it is moved to them
 
 DOUBTFUL: Final = 0.8
 """Share of its usual agreement below which a track may have been drawn away by what hides it: on
@@ -61,17 +60,13 @@ TRUSTED: Final = 0.6
 lie on edges of something else."""
 
 SURE: Final = 0.85
-OFTEN: Final = 5
-"""Agreement below which the network looks at every so manieth frame."""
-
-USUAL: Final = 0.1
-"""Weight of a frame in the usual agreement."""
+OFTEN: Final = 5  # agreement below which the network looks at every so manieth frame
+USUAL: Final = 0.1  # weight of a frame in the usual agreement
 
 PATIENCE: Final = 6
 """Doubtful frames in a row, in which a part goes on as it was going, before it is lost."""
 
-FORGOTTEN: Final = 300
-"""Frames after which a lost part is no longer looked for."""
+FORGOTTEN: Final = 300  # frames after which a lost part is no longer looked for
 
 
 STILL: Final = (math.radians(0.05), 2e-4)
@@ -84,26 +79,19 @@ SUDDEN: Final = (math.radians(4.0), 0.025)
 SWERVE: Final = 0.6
 """Share of its speed, and of what the last frame has corrected, that may come on top of it."""
 
-PERSISTENCE: Final = 0.95
-"""Share of the velocity that is left after a frame."""
+PERSISTENCE: Final = 0.95  # share of the velocity that is left after a frame
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A part's pose and velocity.
+    """A part's pose and velocity."""
 
-    Attributes:
-        T_cam_obj: The pose.
-        velocity: A frame's turn (rotation vector, radians) about the object's origin, and its shift
-            (metres), both in camera axes.
-        covariance: Of pose and velocity, in the same six numbers each.
-        correction: By which the last frame has moved the forecast.
-    """
-
-    T_cam_obj: Transform
+    T_cam_obj: Transform  # the pose
+    # A frame's turn (rotation vector, radians) about the object's origin, and its shift
+    # (metres), both in camera axes
     velocity: Step
-    covariance: Float[np.ndarray, "12 12"]
-    correction: Step
+    covariance: Float[np.ndarray, "12 12"]  # of pose and velocity, in the same six numbers each
+    correction: Step  # by which the last frame has moved the forecast
 
     @property
     def pose_covariance(self) -> Float[np.ndarray, "6 6"]:
@@ -154,21 +142,17 @@ def at_rest(T_cam_obj: Transform, covariance: Float[np.ndarray, "6 6"]) -> Motio
 
 @dataclass(frozen=True)
 class Track:
-    """A part that was found on a frame.
+    """A part that was found on a frame."""
 
-    Attributes:
-        identity: Of this instance, the same as long as it is followed, and when it is found again.
-        detection: Its pose, keypoints and covariance on this frame; score and peaks are those of
-            the network's last look.
-        velocity: Its motion a frame, camera axes: a turn (rotation vector, radians) about the
-            object's origin, and a shift (metres).
-        detected: Whether this frame's pose came from the network's detection.
-    """
-
+    # Of this instance, the same as long as it is followed, and when it is found again
     identity: int
+    # Its pose, keypoints and covariance on this frame; score and peaks are those of the
+    # network's last look
     detection: Detection
+    # Its motion a frame, camera axes: a turn (rotation vector, radians) about the object's
+    # origin, and a shift (metres)
     velocity: Step
-    detected: bool
+    detected: bool  # whether this frame's pose came from the network's detection
 
 
 @dataclass

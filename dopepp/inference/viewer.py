@@ -36,26 +36,22 @@ from dopepp.recovery.detection import Detection
 if TYPE_CHECKING:
     import rerun as rr
 
-MEMORY: Final = "2GB"
-"""Of the viewer's window, which then drops what is oldest."""
+MEMORY: Final = "2GB"  # of the viewer's window, which then drops what is oldest
 
 GROUPS: Final = ("parts", "meshes", "uncertainty")
 
-CENTRE: Final = 0.5
-"""Of the top-left pixel, in Rerun's pixels."""
+CENTRE: Final = 0.5  # of the top-left pixel, in Rerun's pixels
 
 LOCALHOST: Final = "127.0.0.1"
 
-START_S: Final = 20.0
-"""Seconds that a window may take to open."""
+START_S: Final = 20.0  # seconds that a window may take to open
 
 ELLIPSOID: Final = 2.8
 """Half axes of the ellipsoid, standard deviations: 95 % of a normal distribution in space."""
 
 JPEG_QUALITY: Final = 90
 
-SINCE_1970: Final = 1e8
-"""Seconds above which a time is a date, not a place in a video."""
+SINCE_1970: Final = 1e8  # seconds above which a time is a date, not a place in a video
 
 
 class Viewer:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dopepp.inference.diagnosis.quality import clipped, edge_width, highlights
+from dopepp.inference.diagnosis.case import clipped, edge_width, highlights
 
 
 def shapes(noise: float = 0.0) -> np.ndarray:

@@ -14,14 +14,12 @@ import numpy as np
 from dopepp.geometry.camera import Letterbox, focal_length
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.focal import focal_factor
-from dopepp.inference.diagnosis.case import Case, num_keypoints
-from dopepp.inference.diagnosis.quality import clipped, edge_width, highlights
+from dopepp.inference.diagnosis.case import Case, clipped, edge_width, highlights, num_keypoints
 from dopepp.inference.picture import MARGIN
 from dopepp.parts.part import UNITS
 from dopepp.parts.size import is_plausible, size_in_words
 
-SAME: Final = 1.05
-"""Factor on a part's size that a lighter mesh may have."""
+SAME: Final = 1.05  # factor on a part's size that a lighter mesh may have
 
 DARK: Final = 70.0
 """Highlights, of 255: good renders' are 106 and more, those of a 16th of the light 35 to 60."""
@@ -48,8 +46,7 @@ LEAST_SCORE: Final = 0.03
 OFF: Final = 0.08
 """Reprojection error, share of the part's length on the picture: good poses have up to 0.06."""
 
-AGREEING: Final = 0.6
-"""Share of the outline that agrees: good renders have 0.68 to 1."""
+AGREEING: Final = 0.6  # share of the outline that agrees: good renders have 0.68 to 1
 
 ABSENT: Final = (
     "see that it is on the picture, uncovered, with a side that training showed; else its look "
@@ -59,17 +56,11 @@ ABSENT: Final = (
 
 @dataclass(frozen=True)
 class Finding:
-    """What was looked at, and what was seen.
+    """What was looked at, and what was seen."""
 
-    Attributes:
-        subject: One of part, exposure, sharpness, camera, size, visibility and pose.
-        sentence: What was seen.
-        fix: What to do about it; empty where all is well.
-    """
-
-    subject: str
-    sentence: str
-    fix: str = ""
+    subject: str  # one of part, exposure, sharpness, camera, size, visibility and pose
+    sentence: str  # what was seen
+    fix: str = ""  # what to do about it; empty where all is well
 
     def __str__(self) -> str:
         return f"{self.subject}: {self.sentence}" + (f"; fix: {self.fix}" if self.fix else "")

@@ -20,20 +20,11 @@ from jaxtyping import Float, Float32, Int, UInt8
 from dopepp.core.compiled import Array, Scalar, compiled
 from dopepp.geometry.camera import CameraMatrix, crop_camera, resize_camera
 
-SMALLEST_PX: Final = 12
-"""A part that is shorter on the picture shows no outline."""
-
-MARGIN: Final = 0.35
-"""Of the part's extent, looked at around it."""
-
-EDGE_PX: Final = 6.0
-"""Looked at around it besides: an outline is looked for no nearer."""
-
-STEPS: Final = 16
-"""Of a channel."""
-
-UNSEEN: Final = 0.3
-"""Pixels of each colour that both histograms have from the start."""
+SMALLEST_PX: Final = 12  # A part that is shorter on the picture shows no outline
+MARGIN: Final = 0.35  # of the part's extent, looked at around it
+EDGE_PX: Final = 6.0  # looked at around it besides: an outline is looked for no nearer
+STEPS: Final = 16  # of a channel
+UNSEEN: Final = 0.3  # pixels of each colour that both histograms have from the start
 
 KNOWN: Final = 100.0
 """Pixels that the whole part's colours, and those all around, count for in each tile."""
@@ -41,28 +32,18 @@ KNOWN: Final = 100.0
 MOST: Final = 3.0
 """Bound of the logarithm: no colour proves more than 20 to 1, because colours come in patches."""
 
-LONGEST_PX: Final = 250
-"""Of larger pictures, not every pixel is counted."""
-
-FEWEST: Final = 60
-"""Pixels that a histogram needs."""
+LONGEST_PX: Final = 250  # of larger pictures, not every pixel is counted
+FEWEST: Final = 60  # pixels that a histogram needs
 
 
 @dataclass(frozen=True, eq=False)
 class Crop:
-    """A piece of a picture.
+    """A piece of a picture."""
 
-    Attributes:
-        colours: RGB.
-        K: Its camera matrix, pixels.
-        extent: Longer side of the part on it, pixels.
-        scale: Its pixels per pixel of the picture: 1 over a whole number.
-    """
-
-    colours: UInt8[np.ndarray, "height width 3"]
-    K: CameraMatrix
-    extent: float
-    scale: float
+    colours: UInt8[np.ndarray, "height width 3"]  # RGB
+    K: CameraMatrix  # its camera matrix, pixels
+    extent: float  # longer side of the part on it, pixels
+    scale: float  # its pixels per pixel of the picture: 1 over a whole number
 
     @property
     def size(self) -> tuple[int, int]:
@@ -105,10 +86,11 @@ def crop_around(
     width, height = (right - left) // few, (bottom - top) // few
     colours = image[top : top + few * height, left : left + few * width]
     own = crop_camera(K, left, top)
-    if few > 1:
+    if few == 1:
+        colours = colours.copy()  # one kind of array, whose inner loops are compiled once
+    else:
         own = resize_camera(own, 1 / few, 1 / few)
         colours = cv2.resize(colours, (width, height), interpolation=cv2.INTER_AREA)
-    colours = np.ascontiguousarray(colours)
     return Crop(colours, own, extent / few, 1 / few)
 
 

@@ -24,8 +24,7 @@ from dopepp.parts.mesh import Faces, Vertices, face_areas, weld
 from dopepp.parts.mesh.decimate import decimate
 from dopepp.parts.part import MAX_LIGHT_FACES
 
-NEAR: Final = 1e-3
-"""Metres before the camera that every vertex must keep."""
+NEAR: Final = 1e-3  # metres before the camera that every vertex must keep
 
 WINDOW_PX: Final = 3.0
 """Radius of the disc of the mask in which a point's outward direction is read."""
@@ -39,25 +38,18 @@ LONG_PX: Final = 4.0
 
 @dataclass(frozen=True, eq=False)
 class OutlineMesh:
-    """Triangles with what their outlines need.
+    """Triangles with what their outlines need."""
 
-    Attributes:
-        vertices: Positions, metres.
-        faces: Corners of each triangle.
-        planes: Normal of each triangle (of any length) and its product with a corner.
-        edges: The two vertices of each edge.
-        sides: The two triangles at it; the second is −1 where there is one only.
-        opposed: 1 where these two run along it in the same direction, else 0.
-        is_closed: Whether the triangles that face the camera hide all others.
-    """
-
-    vertices: Vertices
-    faces: Faces
+    vertices: Vertices  # positions, metres
+    faces: Faces  # corners of each triangle
+    # Normal of each triangle (of any length) and its product with a corner
     planes: Float[np.ndarray, "faces 4"]
-    edges: Int[np.ndarray, "edges 2"]
+    edges: Int[np.ndarray, "edges 2"]  # the two vertices of each edge
+    # The two triangles at it; the second is −1 where there is one only
     sides: Int[np.ndarray, "edges 2"]
+    # 1 where these two run along it in the same direction, else 0
     opposed: UInt8[np.ndarray, "edges"]
-    is_closed: bool
+    is_closed: bool  # whether the triangles that face the camera hide all others
 
 
 def make_outline_mesh(
@@ -96,19 +88,12 @@ def make_outline_mesh(
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """A mesh at a pose.
+    """A mesh at a pose."""
 
-    Attributes:
-        T_cam_obj: The pose.
-        arms: Vertices from the object's origin, camera axes, metres.
-        pixels: Where they are on the picture.
-        front: Which triangles face the camera.
-    """
-
-    T_cam_obj: Transform
-    arms: Float[np.ndarray, "vertices 3"]
-    pixels: Float[np.ndarray, "vertices 2"]
-    front: Bool[np.ndarray, "faces"]
+    T_cam_obj: Transform  # the pose
+    arms: Float[np.ndarray, "vertices 3"]  # vertices from the object's origin, camera axes, metres
+    pixels: Float[np.ndarray, "vertices 2"]  # where they are on the picture
+    front: Bool[np.ndarray, "faces"]  # which triangles face the camera
 
 
 def posed(mesh: OutlineMesh, T_cam_obj: Transform, K: CameraMatrix) -> Posed | None:
@@ -136,16 +121,11 @@ def filled_mask(
 
 @dataclass(frozen=True, eq=False)
 class Contour:
-    """Points on the outline of a posed part.
+    """Points on the outline of a posed part."""
 
-    Attributes:
-        arms: From the object's origin to each, camera axes, metres.
-        pixels: Where they are on the picture.
-        normals: Unit vectors on the picture that point away from the part.
-    """
-
-    arms: Float[np.ndarray, "points 3"]
-    pixels: Float[np.ndarray, "points 2"]
+    arms: Float[np.ndarray, "points 3"]  # from the object's origin to each, camera axes, metres
+    pixels: Float[np.ndarray, "points 2"]  # where they are on the picture
+    # Unit vectors on the picture that point away from the part
     normals: Float[np.ndarray, "points 2"]
 
     def __len__(self) -> int:

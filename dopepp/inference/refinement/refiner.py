@@ -12,7 +12,7 @@ import contextlib
 from collections.abc import Sequence
 from functools import partial
 from itertools import combinations
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import cv2
 import numpy as np
@@ -20,8 +20,16 @@ from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Picture
-from dopepp.geometry.camera import CameraMatrix, Transform, make_transform
+from dopepp.geometry.camera import (
+    CameraMatrix,
+    Transform,
+    camera_matrix,
+    make_transform,
+    project,
+    transform,
+)
 from dopepp.geometry.cuboid import Cuboid
+from dopepp.geometry.pnp import solve_pnp
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.picture import Depth
 from dopepp.inference.refinement.depth import DepthEvidence
@@ -33,9 +41,11 @@ from dopepp.inference.refinement.solver import (
     UndecidedError,
     make_prior,
 )
-from dopepp.inference.refinement.surface import FEWEST_POINTS, surface_points
+from dopepp.inference.refinement.surface import FEWEST_POINTS, Points, surface_points
 from dopepp.parts.part import Part
-from dopepp.recovery.detection import Detection
+
+if TYPE_CHECKING:
+    from dopepp.recovery.detection import Detection
 
 TERMS: Final = ("region", "depth")
 
@@ -43,14 +53,10 @@ LOOSER: Final = 3.0
 """Factor on the deviations of a network's pose: its covariance was learned on pictures like those
 of its training, and it is farther off on others."""
 
-FEW: Final = 4
-"""Keypoints that fix a pose."""
+FEW: Final = 4  # keypoints that fix a pose
+NUM_QUADRUPLES: Final = 40  # of the 126 of nine keypoints
 
-NUM_QUADRUPLES: Final = 40
-"""Of the 126 of nine keypoints."""
-
-Refine = str | Sequence[str]
-"""What ``refine=`` takes: one of :data:`TERMS`, or several."""
+Refine = str | Sequence[str]  # what `refine=` takes: one of TERMS, or several
 
 
 class Refiner:
@@ -188,6 +194,36 @@ def poses_of_four(
         if found and np.isfinite(turn).all() and place[2, 0] > 0:
             poses.append(make_transform(rotation_vector_to_matrix(turn[:, 0]), place[:, 0]))
     return poses
+
+
+def rehearse_pose() -> None:
+    """Solve for the pose of a box, which compiles the inner loops.
+
+    See :func:`~dopepp.core.compiled.compile_beside`.
+    """
+    corners, K, _, pixels = _box()
+    pixels[0] += 20.0
+    solve_pnp(corners, pixels, K, covariance_px=np.tile(np.eye(2), (8, 1, 1)))
+
+
+def rehearse_refinement() -> None:
+    """Refine the pose of a drawn box, as :func:`rehearse_pose` does."""
+    corners, K, T, pixels = _box()
+    image = np.full((128, 128, 3), 40, np.uint8)
+    cv2.fillConvexPoly(image, cv2.convexHull(np.rint(pixels).astype(np.int32)), (200, 160, 90))
+    sides = np.array(
+        [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    )
+    triangles = np.concatenate([sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]])
+    RegionRefiner(corners, triangles).refine(image, K, T, starts=list)
+
+
+def _box() -> tuple[Points, CameraMatrix, Transform, Float[np.ndarray, "8 2"]]:
+    """Return the corners of a box, a camera, the box's pose and the corners' pixels."""
+    corners = 0.06 * (np.array(list(np.ndindex(2, 2, 2))) - 0.5)
+    turn = rotation_vector_to_matrix(np.array([0.5, 0.4, 0.3]))
+    K, T = camera_matrix(120, 120, 63.5, 63.5), make_transform(turn, np.array([0.0, 0.0, 0.2]))
+    return corners, K, T, project(transform(T, corners), K)
 
 
 def _by_depth(measured: DepthEvidence, end: Solution) -> Refinement:

@@ -22,11 +22,8 @@ PoseMatrix = Float[np.ndarray, "6 6"]
 NormalEquations = tuple[PoseMatrix, Float[np.ndarray, "6"]]
 """H and g of H ξ = g, whose ξ is a turn and a shift, both in camera axes."""
 
-DAMPING: Final = 1e-6
-"""Share of each unknown's own information: the prior leaves none of them open."""
-
-ARRIVED: Final = 0.1
-"""Standard deviations; a shorter step ends the descent."""
+DAMPING: Final = 1e-6  # share of each unknown's own information: the prior leaves none of them open
+ARRIVED: Final = 0.1  # standard deviations; a shorter step ends the descent
 
 UNKNOWN_TURN: Final = math.radians(8.0)
 UNKNOWN_ACROSS: Final = 0.07
@@ -47,23 +44,17 @@ class UndecidedError(Exception):
 
 @dataclass(frozen=True)
 class Refinement:
-    """What the evidence has made of a pose.
+    """What the evidence has made of a pose."""
 
-    Attributes:
-        T_cam_obj: The refined pose.
-        covariance: Of the refined pose, as :class:`~dopepp.geometry.pnp.PnPResult` defines it; None
-            where the given pose was kept.
-        reason: Why the given pose was kept; empty where it was refined.
-        agreement: Share of what the picture tells about the refined outline that agrees with it;
-            None without it.
-        support: Share of the refined outline that the picture tells about and that agrees; None
-            without it.
-    """
-
-    T_cam_obj: Transform
+    T_cam_obj: Transform  # the refined pose
+    # Of the refined pose, as PnPResult defines it; None where the given pose was kept
     covariance: PoseMatrix | None = None
-    reason: str = ""
+    reason: str = ""  # why the given pose was kept; empty where it was refined
+    # Share of what the picture tells about the refined outline that agrees with it; None
+    # without it
     agreement: float | None = None
+    # Share of the refined outline that the picture tells about and that agrees; None without
+    # it
     support: float | None = None
 
 

@@ -20,23 +20,15 @@ from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import CameraMatrix, Transform, crop_camera
 from dopepp.inference.picture import Depth
 
-Region = Bool[np.ndarray, "height width"]
-"""Some of the pixels."""
+Region = Bool[np.ndarray, "height width"]  # some of the pixels
 
 Points = Float[np.ndarray, "points 3"]
 Seen = Bool[np.ndarray, "points"]
 
-MOST_POINTS: Final = 3000
-"""More do not make a refinement better, only slower."""
-
-FEWEST_POINTS: Final = 100
-"""Fewer do not show a surface."""
-
-NEIGHBOURS: Final = 12
-"""Points that a normal is estimated from."""
-
-FLAT: Final = 0.3
-"""In spacings: neighbours farther off a plane belong to another face."""
+MOST_POINTS: Final = 3000  # more do not make a refinement better, only slower
+FEWEST_POINTS: Final = 100  # fewer do not show a surface
+NEIGHBOURS: Final = 12  # points that a normal is estimated from
+FLAT: Final = 0.3  # in spacings: neighbours farther off a plane belong to another face
 
 SLIVER: Final = 0.3
 """Twice the area of a triangle, in squared spacings, below which it fixes no plane."""
@@ -53,26 +45,19 @@ STEEPEST: Final = 0.2
 LONGEST_PX: Final = 112
 """Longer crops are thinned out: ten thousand pixels fix six numbers as well as a million."""
 
-MARGIN: Final = 0.3
-"""Of the part's extent, looked at around it: the pose may be off by as much."""
+MARGIN: Final = 0.3  # of the part's extent, looked at around it: the pose may be off by as much
 
 NOISE: Final = 2e-3
 """Standard deviation of a depth camera at 1 m, metres; it grows with the square of the depth."""
 
-LEAST_NOISE: Final = 1e-3
-"""Metres: quantisation and distortion, which no sensor is without."""
-
-GATE: Final = 3.0
-"""Standard deviations within which depth agrees with the part."""
-
-BESIDE: Final = 6.0
-"""Spacings around the part that are compared with it."""
+LEAST_NOISE: Final = 1e-3  # metres: quantisation and distortion, which no sensor is without
+GATE: Final = 3.0  # standard deviations within which depth agrees with the part
+BESIDE: Final = 6.0  # spacings around the part that are compared with it
 
 EXTENDED: Final = 4.0
 """Spacings by which a point's plane may rise or fall: it does not go on for ever."""
 
-COVERED: Final = 1.0
-"""Spacings around a surface point that count as covered by the part."""
+COVERED: Final = 1.0  # spacings around a surface point that count as covered by the part
 
 STEP: Final = 2.0
 """Standard deviations of the depth by which a surface may differ from what it goes on from."""
@@ -183,23 +168,15 @@ def view_around(depth: Depth, K: CameraMatrix, points_cam: Points) -> DepthView 
 
 @dataclass(frozen=True, eq=False)
 class Overlay:
-    """A posed part's visible points, laid over a depth view.
+    """A posed part's visible points, laid over a depth view."""
 
-    Attributes:
-        points: Those within the view, camera frame, metres.
-        normals: Unit normals of their planes, of either sign.
-        pixels: Column and row of each.
-        distance: Of every pixel of the view to the nearest of them, spacings of the part.
-        nearest: Index of that point.
-        offset: Depth measured less depth predicted by that point's plane, metres; NaN where no
-            depth was measured.
-    """
-
-    points: Points
-    normals: Points
-    pixels: Int[np.ndarray, "points 2"]
-    distance: Depth
-    nearest: Int[np.ndarray, "height width"]
+    points: Points  # those within the view, camera frame, metres
+    normals: Points  # unit normals of their planes, of either sign
+    pixels: Int[np.ndarray, "points 2"]  # column and row of each
+    distance: Depth  # of every pixel of the view to the nearest of them, spacings of the part
+    nearest: Int[np.ndarray, "height width"]  # index of that point
+    # Depth measured less depth predicted by that point's plane, metres; NaN where no depth
+    # was measured
     offset: Depth
 
     @property

@@ -32,8 +32,7 @@ from dopepp.models.checkpoint import KEY, Checkpoint
 if TYPE_CHECKING:
     import onnx
 
-_DOMAINS: Final = ("", "ai.onnx")
-"""Of operators that are ONNX's own."""
+_DOMAINS: Final = ("", "ai.onnx")  # of operators that are ONNX's own
 
 _SMALL: Final = 1024
 """Numbers of a constant that may be a shape or a factor; larger ones are weights."""

@@ -31,11 +31,8 @@ from dopepp.models.storage import MAX_HEADER_BYTES
 NAME: Final = "model.xml"
 WEIGHTS: Final = ".bin"
 
-MAX_XML_BYTES: Final = 2 * MAX_HEADER_BYTES
-"""Description and graph."""
-
-_OWN: Final = re.compile(r"opset\d{1,2}", re.ASCII)
-"""Versions of operators that are OpenVINO's own."""
+MAX_XML_BYTES: Final = 2 * MAX_HEADER_BYTES  # description and graph
+_OWN: Final = re.compile(r"opset\d{1,2}", re.ASCII)  # versions of operators that are OpenVINO's own
 
 
 def load_openvino(choice: str) -> Any:

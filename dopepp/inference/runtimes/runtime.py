@@ -28,11 +28,8 @@ from dopepp.models.network import Images, check_spec
 from dopepp.models.storage import MAX_HEADER_BYTES
 
 INPUT: Final = "pixels"
-OUTPUTS: Final = ("belief", "field")
-"""Names in every exported graph."""
-
-MAX_BYTES: Final = 2**30
-"""Of an exported file: five times the full DOPE in float32."""
+OUTPUTS: Final = ("belief", "field")  # names in every exported graph
+MAX_BYTES: Final = 2**30  # of an exported file: five times the full DOPE in float32
 
 _MAX_PER_PIXEL: Final = 512
 """Numbers of a tensor in a graph for every pixel of its input; VGG19 has 64."""
@@ -49,28 +46,21 @@ Arrays = tuple[
 
 @dataclass(frozen=True)
 class Export:
-    """How a network was exported.
-
-    Attributes:
-        format: ``onnx``, ``openvino`` or ``safetensors``.
-        precision: ``fp32``, ``fp16`` (weights) or ``int8``.
-        size_multiple: Image height and width must be multiples of this.
-        parameters: Trained numbers of the network.
-        gmacs: 10⁹ multiply-accumulates for one image of the training's size.
-        add_01d: Share of instances with ADD below a tenth of the diameter on validation scenes, by
-            precision; where it was quantised, before and after.
-        num_images: How many scenes that were.
-    """
+    """How a network was exported."""
 
     __pydantic_config__ = STRICT
 
-    format: str
-    precision: str
+    format: str  # `onnx`, `openvino` or `safetensors`
+    precision: str  # `fp32`, `fp16` (weights) or `int8`
+    # Image height and width must be multiples of this
     size_multiple: Annotated[int, Range(1, 1024)]
-    parameters: Count
+    parameters: Count  # trained numbers of the network
+    # 10⁹ multiply-accumulates for one image of the training's size
     gmacs: Annotated[float, Range(0, 1e12)]
+    # Share of instances with ADD below a tenth of the diameter on validation scenes, by
+    # precision; where it was quantised, before and after
     add_01d: Mapping[str, Annotated[float, Range(0, 1)]] = field(default_factory=dict)
-    num_images: Count = 0
+    num_images: Count = 0  # how many scenes that were
 
 
 class Runtime(Protocol):

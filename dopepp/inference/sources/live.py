@@ -26,11 +26,8 @@ SCHEMES: Final = ("rtsp", "rtsps", "http", "https")
 FIRST_S: Final = 15.0
 """Seconds until a camera's first picture: streams begin with a key frame, which may be far off."""
 
-STALLED_S: Final = 5.0
-"""Seconds without a picture after which a camera is taken to be gone."""
-
-_RETRY_S: Final = 0.02
-"""Seconds between two questions to a camera that has nothing."""
+STALLED_S: Final = 5.0  # seconds without a picture after which a camera is taken to be gone
+_RETRY_S: Final = 0.02  # seconds between two questions to a camera that has nothing
 
 
 class Capture(Protocol):

@@ -69,26 +69,17 @@ def info_topic(topic: str) -> str:
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """What a ``camera_info`` says.
+    """What a ``camera_info`` says."""
 
-    Attributes:
-        size: (width, height) of the whole sensor's picture, which K and P belong to, pixels.
-        model: Of the distortion, and
-        D: its coefficients.
-        K: Nine numbers, row by row; P: twelve, of pictures without distortion.
-        binning: Sensor pixels in a picture's pixel, across and down.
-        roi: What of the sensor is read out; None is all of it.
-        frame_id: The camera's frame.
-    """
-
+    # (width, height) of the whole sensor's picture, which K and P belong to, pixels
     size: tuple[int, int]
-    model: str
-    D: Sequence[float]
-    K: Sequence[float]
+    model: str  # of the distortion, and
+    D: Sequence[float]  # its coefficients
+    K: Sequence[float]  # nine numbers, row by row; P: twelve, of pictures without distortion
     P: Sequence[float]
-    binning: tuple[int, int] = (1, 1)
-    roi: Crop | None = None
-    frame_id: str = ""
+    binning: tuple[int, int] = (1, 1)  # sensor pixels in a picture's pixel, across and down
+    roi: Crop | None = None  # what of the sensor is read out; None is all of it
+    frame_id: str = ""  # the camera's frame
 
     def camera(self, source: str, rectified: bool) -> Camera:
         """Return the camera of its pictures.

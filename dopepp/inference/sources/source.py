@@ -19,20 +19,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One picture of a source.
+    """One picture of a source."""
 
-    Attributes:
-        image: RGB, as the camera took it.
-        name: The picture's file, or the source where that has many.
-        number: Its place in the source, counted from 0; where all pictures' files are named by
-            numbers alone, as BOP's are, that number.
-        time: Seconds: of a video since its start, of a camera or a bag since 1970; None of a
-            picture.
-    """
-
-    image: Picture
-    name: str
+    image: Picture  # RGB, as the camera took it
+    name: str  # the picture's file, or the source where that has many
+    # Its place in the source, counted from 0; where all pictures' files are named by numbers
+    # alone, as BOP's are, that number
     number: int
+    # Seconds: of a video since its start, of a camera or a bag since 1970; None of a picture
     time: float | None = None
 
 
@@ -68,16 +62,11 @@ class Source(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A camera, and what was made of its pictures.
+    """A camera, and what was made of its pictures."""
 
-    Attributes:
-        camera: The one that took them.
-        K_size: (width, height) that K belongs to, where the pictures were resized.
-        crop: What of the calibrated picture they are, where they were cut out of it.
-    """
-
-    camera: Camera
-    K_size: Size | None = None
+    camera: Camera  # the one that took them
+    K_size: Size | None = None  # (width, height) that K belongs to, where the pictures were resized
+    # What of the calibrated picture they are, where they were cut out of it
     crop: Crop | None = None
 
     def seen(self, picture: Picture) -> tuple[Picture, CameraMatrix]:

@@ -43,29 +43,14 @@ from dopepp.inference.refinement.surface import (
 FARTHEST: Final = 3.0
 """Standard deviations (Mahalanobis distance) beyond which depth contradicts the image."""
 
-LEAST_INLIERS: Final = 0.5
-"""Of the points with depth that nothing stands before."""
-
-LEAST_SEEN: Final = 0.25
-"""Of the visible points that must have agreeing depth at all."""
-
-MOST_RMS: Final = 2.0
-"""Standard deviations of the depth: a right pose leaves about one."""
-
-CLOSE: Final = 5.0
-"""Spacings before a part up to which nothing else is expected."""
-
-BESIDE: Final = 3.0
-"""Spacings around the part in which its surface must not go on."""
-
-SEARCHED_POINTS: Final = 400
-"""Points in the search."""
-
-ACROSS: Final = 6
-"""Steps to each side, along x and y."""
-
-REACH: Final = 2.5
-"""Standard deviations of the prior that are searched along the viewing axis."""
+LEAST_INLIERS: Final = 0.5  # of the points with depth that nothing stands before
+LEAST_SEEN: Final = 0.25  # of the visible points that must have agreeing depth at all
+MOST_RMS: Final = 2.0  # standard deviations of the depth: a right pose leaves about one
+CLOSE: Final = 5.0  # spacings before a part up to which nothing else is expected
+BESIDE: Final = 3.0  # spacings around the part in which its surface must not go on
+SEARCHED_POINTS: Final = 400  # points in the search
+ACROSS: Final = 6  # steps to each side, along x and y
+REACH: Final = 2.5  # standard deviations of the prior that are searched along the viewing axis
 
 MISSING: Final = 0.5
 """What a point without depth costs, against 1 for one that looks past the surface."""
@@ -76,30 +61,20 @@ HIDDEN: Final = 0.5
 PENALTY: Final = 0.03
 """Share of the points that a shift by one standard deviation of the prior must gain."""
 
-LEAST_FOUND: Final = 20
-"""Points that must find their depth."""
+LEAST_FOUND: Final = 20  # points that must find their depth
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One of the rounds from coarse to fine; lengths in diameters where nothing else is said.
+    """One of the rounds from coarse to fine; lengths in diameters where nothing else is said."""
 
-    Attributes:
-        reach: Largest distance from a plane that pulls.
-        steps: Gauss–Newton steps.
-        anew: Whether the visible points are found anew.
-        search: Step of the search across the viewing axis before it; 0 for none.
-        tolerance: Of that search, standard deviations of the depth; a pose that is still tilted
-            needs more.
-        outline: Largest difference of outlines that pulls; 0 for none.
-    """
-
-    reach: float
-    steps: int = 2
-    anew: bool = False
-    search: float = 0.0
+    reach: float  # largest distance from a plane that pulls
+    steps: int = 2  # Gauss–Newton steps
+    anew: bool = False  # whether the visible points are found anew
+    search: float = 0.0  # step of the search across the viewing axis before it; 0 for none
+    # Of that search, standard deviations of the depth; a pose that is still tilted needs more
     tolerance: float = 0.0
-    outline: float = 0.0
+    outline: float = 0.0  # largest difference of outlines that pulls; 0 for none
 
 
 FINE: Final = Stage(0.03, steps=3, anew=True, outline=0.05)
@@ -220,19 +195,12 @@ class DepthEvidence:
 
 @dataclass(frozen=True)
 class Fit:
-    """Agreement of a pose with depth.
+    """Agreement of a pose with depth."""
 
-    Attributes:
-        inliers: Share that agrees among the points with depth that nothing stands before.
-        seen: Share that agrees among all points that the part itself does not hide.
-        rms: Of the agreeing points' offsets, in standard deviations of the depth.
-        uncovered: Area beside the part that goes on as its surface does, over the part's own.
-    """
-
-    inliers: float
-    seen: float
-    rms: float
-    uncovered: float
+    inliers: float  # share that agrees among the points with depth that nothing stands before
+    seen: float  # share that agrees among all points that the part itself does not hide
+    rms: float  # of the agreeing points' offsets, in standard deviations of the depth
+    uncovered: float  # area beside the part that goes on as its surface does, over the part's own
 
     @property
     def score(self) -> float:

@@ -38,27 +38,18 @@ from dopepp.inference.refinement.surface import (
 INDEPENDENT: Final = 100.0
 """So many independent measurements stand behind any number of neighbouring pixels."""
 
-ROUGH: Final = 0.25
-"""Of the part's spacing: standard deviation of a point's plane."""
+ROUGH: Final = 0.25  # of the part's spacing: standard deviation of a point's plane
 
 
 @dataclass(frozen=True, eq=False)
 class DepthTerm:
-    """The pull of depth on the points of a part that are seen.
+    """The pull of depth on the points of a part that are seen."""
 
-    Attributes:
-        view: The depth.
-        surface: The part's points.
-        seen: Which of them the camera sees.
-        reach: Largest distance from a plane that pulls, metres.
-        outline: Largest difference of outlines that pulls, metres; 0 leaves the outline out.
-    """
-
-    view: DepthView
-    surface: SurfacePoints
-    seen: Seen
-    reach: float
-    outline: float
+    view: DepthView  # the depth
+    surface: SurfacePoints  # the part's points
+    seen: Seen  # which of them the camera sees
+    reach: float  # largest distance from a plane that pulls, metres
+    outline: float  # largest difference of outlines that pulls, metres; 0 leaves the outline out
 
     def __call__(self, pose: Transform, known: NormalEquations) -> NormalEquations | None:
         """Return the pull at a pose; None where no point is within the view."""

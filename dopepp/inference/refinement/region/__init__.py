@@ -65,8 +65,7 @@ NUM_DRAWS: Final = 4
 NUM_STARTS: Final = 4
 """Poses that are drawn there, and the likeliest starts that are tried besides the given pose."""
 
-CERTAIN: Final = 0.95
-"""Share of what the picture tells that ends the search."""
+CERTAIN: Final = 0.95  # share of what the picture tells that ends the search
 
 REACH: Final = (2.5, 0.15)
 """Standard deviations of the outline under the prior; not above such a share of its extent."""
@@ -78,8 +77,7 @@ needs none before it."""
 Starts = Callable[[], Sequence[Transform]]
 """Where else a part may be; called where that is asked for."""
 
-Found = tuple[Solution, Agreement]
-"""Where a descent ended, and how well the outline agrees there."""
+Found = tuple[Solution, Agreement]  # where a descent ended, and how well the outline agrees there
 
 
 class RegionRefiner:

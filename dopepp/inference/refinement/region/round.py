@@ -41,14 +41,9 @@ from dopepp.inference.refinement.solver import (
     descend,
 )
 
-RING: Final = 0.2
-"""Of the part's extent: width of what counts as its surroundings."""
-
-SAMPLES: Final = 7
-"""Steps on each side of a normal, which are 1 to 4 pixels."""
-
-FEWEST_POINTS: Final = 24
-"""Of an outline on the picture, to fix six numbers."""
+RING: Final = 0.2  # of the part's extent: width of what counts as its surroundings
+SAMPLES: Final = 7  # steps on each side of a normal, which are 1 to 4 pixels
+FEWEST_POINTS: Final = 24  # of an outline on the picture, to fix six numbers
 
 LEAST_GAIN: Final = 2.0
 """Of the logarithm of the covariance's volume, below which the picture says nothing."""
@@ -60,8 +55,7 @@ AGREE_PX: Final = 2.0
 LEAST_AGREEING: Final = 0.3
 """Share of a refined outline, by information, that the picture's is so near to."""
 
-TOLD: Final = 0.1
-"""Pixels⁻²: information from which on the picture tells where the part ends."""
+TOLD: Final = 0.1  # pixels⁻²: information from which on the picture tells where the part ends
 
 FARTHEST: Final = 4.5
 """Standard deviations (Mahalanobis distance of six numbers) that a pose may be moved."""
@@ -69,34 +63,22 @@ FARTHEST: Final = 4.5
 
 @dataclass(frozen=True)
 class Stage:
-    """How a round looks at the picture.
+    """How a round looks at the picture."""
 
-    Attributes:
-        longest_px: A part that is longer on the picture is read from a smaller one.
-        reach: Of the normals, share of the first reach.
-        steps: Gauss–Newton steps.
-        points: About so many on the outline.
-        tiles: Along each side of the part, with colours of their own.
-    """
-
-    longest_px: int
-    reach: float
-    steps: int
-    points: int
-    tiles: int
+    longest_px: int  # A part that is longer on the picture is read from a smaller one
+    reach: float  # of the normals, share of the first reach
+    steps: int  # Gauss–Newton steps
+    points: int  # about so many on the outline
+    tiles: int  # along each side of the part, with colours of their own
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well a refined outline agrees with the picture.
+    """How well a refined outline agrees with the picture."""
 
-    Attributes:
-        share: Of what the picture tells about the outline, by information, in [0, 1].
-        support: Share of the outline that the picture tells about and that agrees, in [0, 1]: what
-            is hidden, or before its own colour, has none.
-    """
-
-    share: float
+    share: float  # of what the picture tells about the outline, by information, in [0, 1]
+    # Share of the outline that the picture tells about and that agrees, in [0, 1]: what is
+    # hidden, or before its own colour, has none
     support: float
 
 

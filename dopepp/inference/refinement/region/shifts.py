@@ -23,8 +23,7 @@ from dopepp.geometry.refine import solve_damped
 from dopepp.inference.refinement.outline import Contour
 from dopepp.inference.refinement.solver import DAMPING, NormalEquations
 
-LEAST_CHANGE: Final = 3.0
-"""Grey levels that are noise: a picture that changes less has no edges."""
+LEAST_CHANGE: Final = 3.0  # grey levels that are noise: a picture that changes less has no edges
 
 CHANCE: Final = 1.2
 """Variance of no knowledge over one that is read from nothing but noise, at most."""
@@ -32,16 +31,12 @@ CHANCE: Final = 1.2
 LEAST_DEVIATION: Final = 0.3
 """Pixels: no place of an edge is better known than to this, of one point."""
 
-INDEPENDENT_PX: Final = 4.0
-"""Length of the outline along which its errors are one error."""
-
-LEAST_INFORMATION: Final = 1e-3
-"""Pixels⁻²; less is none."""
+INDEPENDENT_PX: Final = 4.0  # length of the outline along which its errors are one error
+LEAST_INFORMATION: Final = 1e-3  # pixels⁻²; less is none
 
 REWEIGHTINGS: Final = 2
 
-GATE: Final = 2.0
-"""Standard deviations that a point may differ by and still count for a quarter."""
+GATE: Final = 2.0  # standard deviations that a point may differ by and still count for a quarter
 
 ALIKE: Final = 0.5
 """Of the part's extent: so far along the outline, errors beyond a pixel are one error."""
@@ -51,16 +46,12 @@ OFFSET_PX: Final = 1.5
 
 
 class Weights(NamedTuple):
-    """How much colours and edges tell.
+    """How much colours and edges tell."""
 
-    Attributes:
-        colour: Exponent of the likelihood of neighbouring pixels, whose colours are not
-            independent.
-        edge: Exponent of a place's likelihood of an edge: one, plus the square of its change over
-            the mean.
-    """
-
+    # Exponent of the likelihood of neighbouring pixels, whose colours are not independent
     colour: float
+    # Exponent of a place's likelihood of an edge: one, plus the square of its change over the
+    # mean
     edge: float
 
 
@@ -74,14 +65,10 @@ whatever the colours. From far starts on real pictures 9 % of poses get worse by
 
 @dataclass(frozen=True, eq=False)
 class Shifts:
-    """How far the picture's outline is from a pose's, along each normal.
+    """How far the picture's outline is from a pose's, along each normal."""
 
-    Attributes:
-        mean: Pixels, outward.
-        information: Inverse of the variance beyond what not knowing has, pixels⁻².
-    """
-
-    mean: Float[np.ndarray, "points"]
+    mean: Float[np.ndarray, "points"]  # pixels, outward
+    # Inverse of the variance beyond what not knowing has, pixels⁻²
     information: Float[np.ndarray, "points"]
 
 
