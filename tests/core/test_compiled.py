@@ -16,3 +16,25 @@ def test_compiling_is_announced_once_and_never_again(command, tmp_path):
     assert first.out == second.out == "3 3.5\n"
     assert first.err.count("compiling") == 1
     assert second.err == ""
+
+
+def test_a_first_compilation_calls_functions_beside(command, tmp_path):
+    (tmp_path / "later.py").write_text(
+        f"from pathlib import Path\ndef call(): Path({str(tmp_path / 'called')!r}).touch()\n"
+    )
+    module = tmp_path / "loops.py"
+    module.write_text(
+        "import gc, time\n"
+        "from pathlib import Path\n"
+        "from dopepp.core.compiled import compile_beside, compiled\n"
+        "compile_beside('later:call')\n"
+        "@compiled()\n"
+        "def double(x):\n"
+        "    return x + x\n"
+        "print(double(1), gc.isenabled())\n"
+        "called = Path(__file__).with_name('called')\n"
+        "until = time.monotonic() + 30\n"
+        "while not called.exists() and time.monotonic() < until: time.sleep(0.05)\n"
+        "print(called.exists())\n"
+    )
+    assert command(str(module)).out == "2 True\nTrue\n"

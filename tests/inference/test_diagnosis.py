@@ -3,12 +3,14 @@
 from collections import Counter
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from dopepp import PoseEstimator
 from dopepp.geometry.camera import project_keypoints
 from dopepp.inference.diagnosis import CHECKS, Case, diagnose
+from dopepp.inference.diagnosis.case import clipped, edge_width, highlights
 from dopepp.models.checkpoint import load_network
 from dopepp.parts.catalogue import pivconnector
 from dopepp.virtual import PRESETS, Factory
@@ -130,7 +132,7 @@ def test_a_mesh_of_another_size_is_named_before_all_else(estimator, factory, fac
     assert fix in wrong.fix
 
 
-def test_a_checkpoint_of_an_earlier_version_is_diagnosed(factory):
+def test_a_part_without_mesh_or_sizes_is_diagnosed(factory):
     network, checkpoint = load_network("pretrained/pivconnector")
     checkpoint.seen.clear()
     checkpoint.parts[0] = replace(checkpoint.parts[0], mesh=None)
@@ -138,8 +140,46 @@ def test_a_checkpoint_of_an_earlier_version_is_diagnosed(factory):
     for image in (rendered.image, np.full_like(rendered.image, 90)):
         case = Case(PoseEstimator(network, checkpoint), image, rendered.scene.K, checkpoint.parts)
         findings = {one.subject: one for one in diagnose(case)}
-        assert "earlier version" in findings["size"].sentence
+        assert "does not know in which sizes" in findings["size"].sentence
         assert (findings["visibility"].fix == "") == (image is rendered.image)
+
+
+def shapes(noise: float = 0.0) -> np.ndarray:
+    """Return a sharp picture of large shapes."""
+    image = np.full((240, 320, 3), 60, np.uint8)
+    cv2.rectangle(image, (30, 40), (140, 190), (180, 170, 90), -1)
+    cv2.circle(image, (230, 120), 60, (90, 200, 220), -1)
+    noisy = image + np.random.default_rng(0).normal(size=image.shape) * noise
+    return np.clip(noisy, 0, 255).round().astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("sigma", "noise"), [(1.5, 0.0), (1.5, 3.0), (2.5, 3.0), (4.0, 0.0), (4.0, 3.0), (6.0, 0.0)]
+)
+def test_a_known_blur_is_measured(sigma, noise):
+    blurred = cv2.GaussianBlur(shapes(), (0, 0), sigma).astype(float)
+    blurred += np.random.default_rng(1).normal(size=blurred.shape) * noise
+    width = edge_width(np.clip(blurred, 0, 255).astype(np.uint8))
+    assert width == pytest.approx(sigma, rel=0.2)
+
+
+@pytest.mark.parametrize("noise", [0.0, 4.0])
+def test_sharp_edges_are_narrow(noise):
+    assert edge_width(shapes(noise)) < 0.8
+
+
+@pytest.mark.parametrize("level", [0, 90, 255])
+def test_a_plain_picture_does_not_tell(level):
+    assert edge_width(np.full((64, 64, 3), level, np.uint8)) is None
+
+
+def test_highlights_and_white_are_shares_of_the_picture():
+    image = np.full((100, 100, 3), 40, np.uint8)
+    image[:20] = 255
+    image[20:30] = (255, 255, 90)  # yellow has detail left
+    assert clipped(image) == 0.2
+    assert highlights(image) == 255
+    assert highlights(image[30:]) == 40
 
 
 @pytest.mark.slow

@@ -92,7 +92,7 @@ class Case:
 
     @property
     def seen(self) -> Seen | None:
-        """How training had the part; None where an earlier version wrote the checkpoint."""
+        """How training had the part; None where the images that it measured did not show it."""
         return self.estimator.checkpoint.seen.get(self.part.name)
 
     @property

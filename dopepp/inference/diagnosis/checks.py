@@ -137,7 +137,7 @@ def size(case: Case) -> Finding:
     """See whether the part is as near and as large as the network has learned."""
     name, seen = case.part.name, case.seen
     if seen is None:
-        return Finding("size", "an earlier version's checkpoint does not know its parts' sizes")
+        return Finding("size", f"the checkpoint does not know in which sizes {name} was trained")
     near, far = case.distances or seen[2:]
     usual = f"{near:.2g} – {far:.2g} m"
     if case.found is None:

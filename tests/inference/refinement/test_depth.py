@@ -8,10 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from dopepp.core.errors import UserError
 from dopepp.geometry.camera import camera_matrix, make_transform, transform
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
-from dopepp.inference.picture import checked_depth, read_depth, undistorted_depth
 from dopepp.inference.refinement.depth import DepthEvidence
 from dopepp.inference.refinement.depth.terms import outline_terms, plane_terms
 from dopepp.inference.refinement.refiner import PartRefiner
@@ -251,37 +249,3 @@ def test_prior_measures_turns_and_shifts(values):
     assert np.linalg.eigvalsh(prior.information).min() > 0
     broken = make_prior(TRUE, 0.1, np.full((6, 6), np.nan))  # a covariance that is none
     assert_allclose(broken.information, prior.information)
-
-
-@pytest.mark.parametrize(
-    ("depth", "message"),
-    [
-        (np.ones((2, 3), np.float32), r"depth of shape \(2, 3\) for an image of 4×3"),
-        (np.full((3, 4), 800, np.uint16), "depth of type uint16"),
-        (np.full((3, 4), 800.0, np.float32), "median of 800 m.*divide by 1000"),
-        (np.full((3, 4), -1.0, np.float32), "values down to -1"),
-    ],
-)
-def test_depth_that_cannot_be_right(depth, message):
-    with pytest.raises(UserError, match=message):
-        checked_depth(depth, (4, 3))
-    unknown = np.array([[np.nan, np.inf], [0.0, 1.5]])
-    assert_allclose(checked_depth(unknown, (2, 2)), [[0, 0], [0, 1.5]])
-
-
-def test_depth_is_undistorted_without_mixing():
-    depth = np.where(np.arange(64) < 32, 0.5, 2.0).astype(np.float32)[None].repeat(48, axis=0)
-    small = camera_matrix(60, 60, 31.5, 23.5)
-    moved = undistorted_depth(depth, small, np.array([-0.2, 0.05, 0, 0]))
-    assert set(np.unique(moved)) <= {0.0, 0.5, 2.0}
-
-
-def test_read_depth(tmp_path):
-    path = tmp_path / "depth.png"
-    cv2.imwrite(str(path), np.array([[0, 1000], [250, 65535]], np.uint16))
-    assert_allclose(read_depth(path, 0.001), [[0, 1], [0.25, 65.535]])
-    with pytest.raises(UserError, match="depth scale 0"):
-        read_depth(path, 0.0)
-    cv2.imwrite(str(path), np.zeros((2, 2, 3), np.uint8))
-    with pytest.raises(UserError, match="16 bits"):
-        read_depth(path, 0.001)

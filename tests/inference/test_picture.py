@@ -11,11 +11,20 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import given
+from numpy.testing import assert_allclose
 
 from dopepp import PoseEstimator
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import Letterbox, camera_matrix, resize_camera, transform
-from dopepp.inference.picture import MARGIN, MAX_PIXELS, letterboxes, merged
+from dopepp.inference.picture import (
+    MARGIN,
+    MAX_PIXELS,
+    checked_depth,
+    letterboxes,
+    merged,
+    read_depth,
+    undistorted_depth,
+)
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.size import Seen
 from dopepp.virtual import PRESETS, Factory, render
@@ -180,3 +189,37 @@ def test_a_region_is_looked_at_as_a_picture_of_its_own(estimator, scenes):
 def test_a_region_outside_of_the_picture_is_refused(estimator, roi):
     with pytest.raises(UserError, match="roi"):
         estimator.predict(picture(128, 128), camera_matrix(110, 110, 63.5, 63.5), roi=roi)
+
+
+@pytest.mark.parametrize(
+    ("depth", "message"),
+    [
+        (np.ones((2, 3), np.float32), r"depth of shape \(2, 3\) for an image of 4×3"),
+        (np.full((3, 4), 800, np.uint16), "depth of type uint16"),
+        (np.full((3, 4), 800.0, np.float32), "median of 800 m.*divide by 1000"),
+        (np.full((3, 4), -1.0, np.float32), "values down to -1"),
+    ],
+)
+def test_depth_that_cannot_be_right(depth, message):
+    with pytest.raises(UserError, match=message):
+        checked_depth(depth, (4, 3))
+    unknown = np.array([[np.nan, np.inf], [0.0, 1.5]])
+    assert_allclose(checked_depth(unknown, (2, 2)), [[0, 0], [0, 1.5]])
+
+
+def test_depth_is_undistorted_without_mixing():
+    depth = np.where(np.arange(64) < 32, 0.5, 2.0).astype(np.float32)[None].repeat(48, axis=0)
+    small = camera_matrix(60, 60, 31.5, 23.5)
+    moved = undistorted_depth(depth, small, np.array([-0.2, 0.05, 0, 0]))
+    assert set(np.unique(moved)) <= {0.0, 0.5, 2.0}
+
+
+def test_read_depth(tmp_path):
+    path = tmp_path / "depth.png"
+    cv2.imwrite(str(path), np.array([[0, 1000], [250, 65535]], np.uint16))
+    assert_allclose(read_depth(path, 0.001), [[0, 1], [0.25, 65.535]])
+    with pytest.raises(UserError, match="depth scale 0"):
+        read_depth(path, 0.0)
+    cv2.imwrite(str(path), np.zeros((2, 2, 3), np.uint8))
+    with pytest.raises(UserError, match="16 bits"):
+        read_depth(path, 0.001)
