@@ -21,17 +21,7 @@ NUM_KEYPOINTS: Final = 9
 CENTROID: Final = 8
 
 CORNER_SIGNS: Final[NDArray[np.float64]] = np.array(
-    [
-        (+1, -1, +1),
-        (-1, -1, +1),
-        (-1, +1, +1),
-        (+1, +1, +1),
-        (+1, -1, -1),
-        (-1, -1, -1),
-        (-1, +1, -1),
-        (+1, +1, -1),
-    ],
-    dtype=np.float64,
+    [(x, y, z) for z in (1, -1) for x, y in ((1, -1), (-1, -1), (-1, 1), (1, 1))], np.float64
 )
 """Corners in units of half-extents, NDDS order, shape (8, 3)."""
 

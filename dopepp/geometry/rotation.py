@@ -88,14 +88,7 @@ def rotation_angle(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarra
     ``atan2(|axial vector|, trace − 1)`` keeps full precision near 0 and π, unlike ``arccos``.
     """
     rotation = np.asarray(rotation, np.float64)
-    axial = np.stack(
-        [
-            rotation[..., 2, 1] - rotation[..., 1, 2],
-            rotation[..., 0, 2] - rotation[..., 2, 0],
-            rotation[..., 1, 0] - rotation[..., 0, 1],
-        ],
-        axis=-1,
-    )
+    axial = (rotation - np.swapaxes(rotation, -1, -2))[..., [2, 0, 1], [1, 2, 0]]
     trace = np.trace(rotation, axis1=-2, axis2=-1)
     return np.asarray(np.arctan2(np.linalg.norm(axial, axis=-1), trace - 1.0))
 

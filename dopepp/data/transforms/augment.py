@@ -1,22 +1,25 @@
 """Photometric augmentation: light, colour, focus, sensor noise and compression vary, poses do not.
 
 Lens, sensor and file are those of the virtual camera (:mod:`dopepp.virtual.sensor`). To add a
-change, write a function of an image, give its range a constructor argument and call it in
+change, write a function of an image, give its range a field and call it in
 :meth:`Photometric.__call__`, where the order is the order of a camera: light and colour, lens,
 sensor, file.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
 import cv2
 import numpy as np
 from jaxtyping import Float
 from numpy.random import Generator
 
+from dopepp.core.validation import Checked, Pair, Range, Share, Span
 from dopepp.drawing.pictures import Picture
 from dopepp.virtual.sensor import add_noise, compress, defocus
-
-Range = tuple[float, float]
 
 # BT.601 luma weights: grey keeps its brightness when saturation or hue changes.
 _LUMA = np.array([0.299, 0.587, 0.114])
@@ -25,16 +28,15 @@ _YIQ = np.array([_LUMA, [0.5959, -0.2746, -0.3213], [0.2115, -0.5227, 0.3112]])
 _RGB = np.linalg.inv(_YIQ)
 
 
-def _fits(name: str, value: float | Range) -> bool:
-    """Tell whether a range ascends from 0, or a probability or the largest change can be one."""
-    low, high = (0, value) if isinstance(value, (int, float)) else value
-    return 0 <= low <= high and (high <= 1 or not name.endswith("_probability"))
+_Change = Annotated[float, Range(0, math.inf)]
+_Changes = Annotated[Pair, Span(0, math.inf)]
 
 
-class Photometric:
+@dataclass(frozen=True)
+class Photometric(Checked):
     """Random photometric changes, each drawn from the item's own generator.
 
-    Args:
+    Attributes:
         brightness: Largest offset, as a share of 255.
         contrast: Largest relative change of the contrast about mid-grey.
         hue: Largest hue rotation, radians.
@@ -43,28 +45,17 @@ class Photometric:
         noise_sigma: Range of its standard deviation, grey levels.
     """
 
-    def __init__(
-        self,
-        brightness: float = 0.2,
-        contrast: float = 0.3,
-        saturation: float = 0.3,
-        hue: float = 0.15,
-        colour_gain: float = 0.1,
-        blur_probability: float = 0.2,
-        blur_sigma: Range = (0.3, 1.2),
-        noise_probability: float = 0.3,
-        noise_sigma: Range = (1.0, 8.0),
-        jpeg_probability: float = 0.1,
-        jpeg_quality: Range = (40, 95),
-    ) -> None:
-        self.brightness, self.contrast, self.saturation = brightness, contrast, saturation
-        self.hue, self.colour_gain = hue, colour_gain
-        self.blur_probability, self.blur_sigma = blur_probability, blur_sigma
-        self.noise_probability, self.noise_sigma = noise_probability, noise_sigma
-        self.jpeg_probability, self.jpeg_quality = jpeg_probability, jpeg_quality
-        bad = [f"{name}={value}" for name, value in vars(self).items() if not _fits(name, value)]
-        if bad:
-            raise ValueError(f"not an allowed range or probability: {', '.join(bad)}")
+    brightness: _Change = 0.2
+    contrast: _Change = 0.3
+    saturation: _Change = 0.3
+    hue: _Change = 0.15
+    colour_gain: _Change = 0.1
+    blur_probability: Share = 0.2
+    blur_sigma: _Changes = (0.3, 1.2)
+    noise_probability: Share = 0.3
+    noise_sigma: _Changes = (1.0, 8.0)
+    jpeg_probability: Share = 0.1
+    jpeg_quality: _Changes = (40, 95)
 
     def __call__(self, image: Picture, rng: Generator) -> Picture:
         """Return a changed copy of an RGB image."""

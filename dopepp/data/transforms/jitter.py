@@ -7,43 +7,36 @@ that rolls about its optical axis and zooms sees the same rays, at other pixels.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Annotated
 
 import cv2
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from dopepp.core.validation import Checked, Pair, Range, Span
 from dopepp.data.sample import Instance, Sample, less_visible
 from dopepp.geometry.camera import crop_camera, make_transform
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 
 
-class CameraJitter:
+@dataclass(frozen=True)
+class CameraJitter(Checked):
     """Roll, zoom and move the camera's picture at random; what comes into view repeats its border.
 
-    Args:
+    Attributes:
         roll_deg: Largest turn of the picture about its middle, to either side.
         zoom: Range of the factor on the focal length, logarithmically uniform.
         shift: Largest move in each direction, as a share of the picture's sides.
     """
 
-    def __init__(
-        self, roll_deg: float = 20.0, zoom: tuple[float, float] = (0.9, 1.1), shift: float = 0.1
-    ) -> None:
-        if not (0 <= roll_deg <= 180 and 0 < zoom[0] <= zoom[1] and 0 <= shift < 0.5):
-            raise ValueError(
-                f"roll_deg={roll_deg}, zoom={zoom}, shift={shift}: a roll in [0, 180], a zoom that "
-                "ascends from above 0, a shift in [0, 0.5)"
-            )
-        self.roll_deg, self.zoom, self.shift = roll_deg, zoom, shift
+    roll_deg: Annotated[float, Range(0, 180, "degrees")] = 20.0
+    zoom: Annotated[Pair, Span(1e-3, 1e3, "factor")] = (0.9, 1.1)
+    shift: Annotated[float, Range(0, 0.49, "share")] = 0.1
 
     def __call__(self, sample: Sample, rng: Generator) -> Sample:
-        """Return a sample seen by another camera; the argument is not changed.
-
-        Of the objects, visible fractions become smaller by what leaves the picture
-        (:func:`~dopepp.data.sample.less_visible`).
-        """
+        """Return a copy seen by another camera, visible fractions reduced by what it lost."""
         size = np.array(sample.size)
         middle = (size - 1) / 2
         roll = np.radians(rng.uniform(-self.roll_deg, self.roll_deg))
@@ -61,7 +54,6 @@ class CameraJitter:
             return np.asarray(moved, np.uint8)
 
         def seen(one: Instance) -> Instance:
-            """Return an object as the other camera sees it."""
             mask = one.mask
             if mask is not None:
                 codes = warped(mask.astype(np.uint8), cv2.BORDER_CONSTANT, cv2.INTER_NEAREST)

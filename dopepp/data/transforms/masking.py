@@ -9,7 +9,7 @@ fractions lose the covered pixels; keypoints stay, as the network still has to p
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.random import Generator
 
+from dopepp.core.validation import Checked, Share
 from dopepp.data.sample import Instance, Sample, silhouette
 from dopepp.drawing.pictures import Mask, Picture, Size
 from dopepp.virtual.backgrounds import Backgrounds
@@ -135,31 +136,22 @@ def covered_instances(
     return changed
 
 
-class RandomMask:
+@dataclass(frozen=True)
+class RandomMask(Checked):
     """Cover each instance with one background patch, with a probability.
 
-    Args:
+    Attributes:
         max_height: Largest patch height as a share of the object's box height (paper: 0.8).
         max_width: Largest patch width as a share of the object's box width (paper: 0.8).
         min_contrast: Grey levels of standard deviation that a crop needs in a colour channel.
         max_draws: Crops drawn from each picture; without any, the instance stays uncovered.
     """
 
-    def __init__(
-        self,
-        probability: float = 0.5,
-        max_height: float = 0.8,
-        max_width: float = 0.8,
-        min_contrast: float = MIN_CONTRAST,
-        max_draws: int = MAX_DRAWS,
-    ) -> None:
-        if not all(0.0 <= share <= 1.0 for share in (probability, max_height, max_width)):
-            raise ValueError(
-                f"probability={probability}, max_height={max_height}, max_width={max_width}: "
-                "each must be in [0, 1]"
-            )
-        self.probability, self.max_height, self.max_width = probability, max_height, max_width
-        self.min_contrast, self.max_draws = min_contrast, max_draws
+    probability: Share = 0.5
+    max_height: Share = 0.8
+    max_width: Share = 0.8
+    min_contrast: float = MIN_CONTRAST
+    max_draws: int = MAX_DRAWS
 
     def __call__(self, sample: Sample, rng: Generator, other: Backgrounds) -> Sample:
         """Return a masked copy of an unpadded sample; ``other`` replaces a missing background."""
