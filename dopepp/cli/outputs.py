@@ -169,7 +169,7 @@ class BopCsv:
 
     def take(self, result: PoseResult) -> None:
         """Keep the poses until all are known."""
-        from dopepp.data.formats.bop import model_numbers
+        from dopepp.data.formats.bop.models import model_numbers
         from dopepp.data.formats.bop.results import PoseResult as Row
 
         numbers = model_numbers(list(result.shapes))

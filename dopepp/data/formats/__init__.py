@@ -1,4 +1,4 @@
-"""Parts that the layouts share: shares of a data set, and writers that survive a kill.
+"""Parts that the layouts share: instances, shares of a data set, writers that survive a kill.
 
 Items are written one by one and finalized chunk by chunk. An item's last file marks the item as
 complete. Files that a chunk's items share (``scene_gt.json``, a tar shard) are assembled from
@@ -11,16 +11,22 @@ from __future__ import annotations
 
 import fcntl
 import json
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, Protocol, TypeVar
 
+import numpy as np
+
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.core.json import MAX_BYTES, read_json
-from dopepp.data.sample import Sample
+from dopepp.data.sample import Instance, Sample, hull_areas
+from dopepp.drawing.pictures import Mask, Shape
+from dopepp.geometry.camera import CameraMatrix, Transform, project, project_keypoints, transform
+from dopepp.parts.part import Part
 
 T = TypeVar("T")
 
@@ -29,6 +35,11 @@ STAGING: Final = ".items"
 
 RECORD_FILE: Final = "_dopepp_render.json"
 """A render job's record. The underscore marks a settings file, so NDDS readers skip it."""
+
+ESTIMATED: Final = (
+    "estimated: mask pixels, or without a mask those inside the image, over the hull of the points"
+)
+"""How :func:`make_instance` gets a visible fraction that the annotation does not state."""
 
 _LOCK: Final = "lock"
 _ATTEMPTS: Final = 100
@@ -78,6 +89,28 @@ def share(num_items: int, part_of: tuple[float, float], name: str) -> slice:
         got = f"{name}: no image in the share {first:.3g} – {last:.3g} of {num_items} images"
         raise UserError(got, "a folder with more images", "give every split a folder of its own")
     return chosen
+
+
+def make_instance(
+    part: Part,
+    T_cam_obj: Transform,
+    K: CameraMatrix,
+    visible_fraction: float,
+    mask: Mask | None,
+    shape: Shape,
+) -> Instance:
+    """Return an annotated object as an instance.
+
+    A fraction that is not stated (NaN) is estimated: mask pixels or, without a mask, the hull's
+    area inside the image, over the area of the convex hull of the projected ADD points. The
+    estimate is too small for a concave object.
+    """
+    if math.isnan(visible_fraction):
+        inside, whole = hull_areas(project(transform(T_cam_obj, part.points), K), shape)
+        visible = inside if mask is None else float(np.count_nonzero(mask))
+        visible_fraction = min(1.0, visible / whole) if whole > 0 else 0.0
+    keypoints = project_keypoints(part.cuboid, T_cam_obj, K)
+    return Instance(part.name, T_cam_obj, keypoints, visible_fraction, mask)
 
 
 def read_object(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:

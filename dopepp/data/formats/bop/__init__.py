@@ -1,29 +1,29 @@
 """BOP's annotations as checked arrays: camera, poses, visible fractions; millimetres to metres.
 
-The same records stand in ``scene_*.json`` (by image) and in a shard's ``KEY.*.json``. A wrong
-record goes to the :class:`~dopepp.data.formats.problems.Problems` and leaves NaN in the arrays.
+The same records stand in a scene's ``scene_*.json`` (by image) and in a shard's ``KEY.*.json``. A
+wrong record goes to the :class:`~dopepp.data.formats.problems.Problems` and leaves NaN in the
+arrays. A scene has the folders ``rgb`` (or ``gray``), ``depth``, ``mask`` and ``mask_visib``.
 """
 
 from __future__ import annotations
 
+import logging
 import math
-import re
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dopepp.data.formats.invariants import rotation_problem
-from dopepp.data.formats.problems import FARTHEST, Place, mapping
-from dopepp.data.sample import Instance, hull_areas
-from dopepp.drawing.pictures import Mask, Shape
-from dopepp.geometry.camera import CameraMatrix, Transform, project, project_keypoints, transform
+from dopepp.data.formats.problems import FARTHEST, STRICT, Place, Problems, mapping
 from dopepp.geometry.rotation import nearest_rotation
-from dopepp.parts.part import Part
+
+_log = logging.getLogger(__name__)
 
 MM: Final = 1000.0
 """Millimetres per metre."""
@@ -33,15 +33,15 @@ INEXACT: Final = 1e-2
 """Largest deviation of R·Rᵀ from the identity of a matrix that is kept, and of one that the nearest
 rotation replaces. LM-O's published poses are off by up to 2e-3."""
 
-ESTIMATED: Final = (
-    "estimated: mask pixels, or without a mask those inside the image, over the hull of the points"
-)
-"""How :func:`make_instance` gets a visible fraction that the annotation does not state."""
-
 _ROUNDING: Final = 1e-3
 """By which a visible fraction may leave [0, 1]."""
 
-_NUMBERED: Final = re.compile(r"obj_(\d{1,9})")
+MAX_SCENE_BYTES: Final = 128_000_000
+"""Largest JSON file of a scene: 40,000 images with ten objects each."""
+
+IMAGE_FOLDERS: Final = ("rgb", "gray")
+IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+DEPTH_SUFFIXES: Final = (".png", ".tif", ".tiff")
 
 Record = Mapping[str, Any]
 
@@ -137,28 +137,6 @@ def read_poses(
     return BopPoses(ids.astype(np.int64), poses, np.clip(fractions, 0.0, 1.0), inexact)
 
 
-def make_instance(
-    part: Part,
-    T_cam_obj: Transform,
-    K: CameraMatrix,
-    visible_fraction: float,
-    mask: Mask | None,
-    shape: Shape,
-) -> Instance:
-    """Return an annotated object as an instance.
-
-    A fraction that is not stated (NaN) is estimated: mask pixels or, without a mask, the hull's
-    area inside the image, over the area of the convex hull of the projected ADD points. The
-    estimate is too small for a concave object.
-    """
-    if math.isnan(visible_fraction):
-        inside, whole = hull_areas(project(transform(T_cam_obj, part.points), K), shape)
-        visible = inside if mask is None else float(np.count_nonzero(mask))
-        visible_fraction = min(1.0, visible / whole) if whole > 0 else 0.0
-    keypoints = project_keypoints(part.cuboid, T_cam_obj, K)
-    return Instance(part.name, T_cam_obj, keypoints, visible_fraction, mask)
-
-
 def _stated_column(
     records: Sequence[object], field: str, place: Callable[[int], Place]
 ) -> Float[np.ndarray, " records"]:
@@ -200,24 +178,150 @@ def _orthogonality(matrices: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " 
         return np.where(np.linalg.det(matrices) < 0, np.inf, error)
 
 
-def number_in_name(name: str) -> int | None:
-    """Return the number in a name like BOP's ``obj_000005``; None for any other name."""
-    numbered = _NUMBERED.fullmatch(name)
-    return int(numbered[1]) if numbered else None
-
-
-def model_numbers(names: Sequence[str]) -> dict[str, int]:
-    """Return the number of each object by name: 1, 2, … unless all are named like BOP's files.
-
-    So renders of another data set's models keep that data set's numbers.
-    """
-    stated = {name: number_in_name(name) for name in names}
-    numbers = {name: number for name, number in stated.items() if number}
-    if len(set(numbers.values())) == len(names):
-        return numbers
-    return {name: number for number, name in enumerate(names, start=1)}
-
-
 def is_number(text: str) -> bool:
     """Tell whether a key or a name is the number of an image, an object or a scene."""
     return text.isascii() and text.isdecimal() and len(text) < 10
+
+
+class SceneRecords(NamedTuple):
+    """The content of a scene's JSON files, by image.
+
+    ``infos`` has one record for each of ``truths``, None where it is missing.
+    """
+
+    cameras: Mapping[int, object]
+    truths: Mapping[int, list[Record]]
+    infos: Mapping[int, list[Record | None]]
+
+
+def read_records(folder: Path, problems: Problems = STRICT) -> SceneRecords:
+    """Read a scene's JSON files; the two with ground truth may be missing."""
+    camera, gt, gt_info = (
+        Place(problems, folder / f"scene_{name}.json") for name in ("camera", "gt", "gt_info")
+    )
+    cameras = _by_image(camera)
+    truths, infos = (_by_image(p) if Path(p.path).exists() else {} for p in (gt, gt_info))
+    objects = {image: gt[f"{image}"].entries(rows) for image, rows in truths.items()}
+    paired: dict[int, list[Record | None]] = {image: [] for image in infos.keys() - objects}
+    for image, records in objects.items():
+        paired[image] = pair_infos(records, infos.get(image), gt_info[f"{image}"])
+    return SceneRecords(cameras, objects, paired)
+
+
+def _by_image(place: Place) -> dict[int, Any]:
+    allowed = 'images by number: {"0": …, "1": …}'
+    by_image: dict[int, Any] = {}
+    for key, record in (place.load(allowed, MAX_SCENE_BYTES) or {}).items():
+        if not is_number(key):
+            place[f"{key!r:.40}"].report("no image's number", allowed)
+        elif int(key) in by_image:
+            place[f"{key!r:.40}"].report(f"image {int(key)} twice", "each once")
+        else:
+            by_image[int(key)] = record
+    return by_image
+
+
+def image_files(
+    scene: Path, folders: tuple[str, ...], suffixes: tuple[str, ...], problems: Problems = STRICT
+) -> dict[int, Path]:
+    """Return the images in the first existing one of some folders, by number."""
+    folder = next((scene / name for name in folders if (scene / name).is_dir()), None)
+    files: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()) if folder is not None else ():
+        if not is_number(path.stem) or path.suffix.lower() not in suffixes:
+            continue
+        number = int(path.stem)
+        if number in files:
+            got = f"image {number} twice, also as {files[number].name}"
+            problems.report(path, "file", got, "one file an image")
+        else:
+            files[number] = path
+    return files
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene's images, in the order of their numbers.
+
+    Attributes:
+        files: File of every image, relative to the folder; empty where it is not on disk.
+        depth_files: File of every depth image likewise.
+        depth_scales: Millimetres a unit of its depth image; NaN where not stated.
+        first: Objects ``first[i] … first[i + 1] − 1`` are on image i.
+        gt_ids: Each object's index in its image's list, which names its masks.
+        num_other: Number of other parts' objects that have a model.
+        without_model: Numbers of objects without a model, by object number.
+        num_behind: Number of objects behind the camera, which are left out like the others.
+    """
+
+    folder: Path
+    image_ids: Int[np.ndarray, " images"]
+    files: list[str]
+    depth_files: list[str]
+    K: Float[np.ndarray, "images 3 3"]
+    depth_scales: Float[np.ndarray, " images"]
+    first: Int[np.ndarray, " bounds"]
+    gt_ids: Int[np.ndarray, " objects"]
+    poses: BopPoses
+    num_other: int
+    without_model: Counter[int]
+    num_behind: int
+
+    def objects(self, row: int) -> slice:
+        """Return the slice of the objects on an image."""
+        return slice(int(self.first[row]), int(self.first[row + 1]))
+
+
+def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int] = ()) -> Scene:
+    """Read a scene's annotation: ``scene_camera.json`` and, if present, its ground truth.
+
+    ``wanted`` are the numbers of the objects to keep, ``with_model`` those of the objects with a
+    model, empty where the data set has no models.
+    """
+    cameras, truths, infos = read_records(folder)
+    images = sorted(cameras)
+    if without := truths.keys() - cameras.keys():
+        got = f"{len(without)} images have ground truth and no camera, and are left out"
+        _log.warning("%s: %s; first: %d", folder, got, min(without))
+    owners = [(row, n) for row, i in enumerate(images) for n in range(len(truths.get(i, ())))]
+
+    def places(what: str, number: int) -> Place:
+        place = Place(STRICT, folder / f"scene_{what}.json")
+        if what == "camera":
+            return place[f"{images[number]}"]
+        row, n = owners[number]
+        return place[f"{images[row]}"][n]
+
+    K, scales = read_cameras([cameras[i] for i in images], places)
+    poses = read_poses(
+        [truths[images[row]][n] for row, n in owners],
+        [infos[images[row]][n] for row, n in owners],
+        places,
+    )
+    table = np.array(owners, np.int64).reshape(-1, 2)
+    is_wanted = np.isin(poses.obj_ids, sorted(wanted))
+    is_behind = poses.T_cam_obj[:, 2, 3] <= 0
+    keep = is_wanted & ~is_behind
+    without_model = poses.of(~is_wanted).without_model(with_model)
+    return Scene(
+        folder,
+        np.array(images, np.int64),
+        _relative_files(folder, IMAGE_FOLDERS, IMAGE_SUFFIXES, images),
+        _relative_files(folder, ("depth",), DEPTH_SUFFIXES, images),
+        K,
+        scales,
+        np.searchsorted(table[keep, 0], np.arange(len(images) + 1)),
+        table[keep, 1],
+        poses.of(keep),
+        int((~is_wanted).sum()) - without_model.total(),
+        without_model,
+        int((is_wanted & is_behind).sum()),
+    )
+
+
+def _relative_files(
+    folder: Path, folders: tuple[str, ...], suffixes: tuple[str, ...], images: Sequence[int]
+) -> list[str]:
+    """Return the file of every image, relative to the scene; empty where there is none."""
+    files = image_files(folder, folders, suffixes)
+    return [files[i].relative_to(folder).as_posix() if i in files else "" for i in images]

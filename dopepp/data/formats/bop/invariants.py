@@ -19,15 +19,18 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.data.formats import STAGING, bop, invariants, staged_items
-from dopepp.data.formats.bop import MM, BopPoses, Places, Record
-from dopepp.data.formats.bop.models import INFO_FILE, info_path, modelled, parse_models, part_of
-from dopepp.data.formats.bop.scene import (
+from dopepp.data.formats.bop import (
     DEPTH_SUFFIXES,
     IMAGE_FOLDERS,
     IMAGE_SUFFIXES,
+    MM,
+    BopPoses,
+    Places,
+    Record,
     image_files,
     read_records,
 )
+from dopepp.data.formats.bop.models import INFO_FILE, info_path, modelled, parse_models, part_of
 from dopepp.data.formats.images import COLOUR_MODES, DEPTH_MODES, one_channel_of, picture_shape
 from dopepp.data.formats.invariants import Box
 from dopepp.data.formats.problems import CheckReport, Place, mapping

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
-from dopepp.data.formats.bop import EXACT, INEXACT, MM, is_number, model_numbers, number_in_name
+from dopepp.data.formats.bop import EXACT, INEXACT, MM, is_number
 from dopepp.data.formats.images import encode_png
 from dopepp.data.formats.invariants import rotation_problem
 from dopepp.data.formats.problems import STRICT, Place, Problems, mapping
@@ -29,6 +30,8 @@ from dopepp.parts.mesh.read import read_mesh
 from dopepp.parts.part import MAX_SYMMETRIES, Mesh, Part, check_name, make_part
 
 _log = logging.getLogger(__name__)
+
+_NUMBERED: Final = re.compile(r"obj_(\d{1,9})")
 
 MODEL_FOLDERS: Final = ("models", "models_cad", "models_reconst", "models_eval")
 """Where data sets keep their models, the full ones first."""
@@ -104,6 +107,24 @@ def parts_by_id(root: Path, parts: Sequence[Part]) -> dict[int, Part]:
             )
         numbered[number] = part
     return numbered
+
+
+def number_in_name(name: str) -> int | None:
+    """Return the number in a name like BOP's ``obj_000005``; None for any other name."""
+    numbered = _NUMBERED.fullmatch(name)
+    return int(numbered[1]) if numbered else None
+
+
+def model_numbers(names: Sequence[str]) -> dict[str, int]:
+    """Return the number of each object by name: 1, 2, … unless all are named like BOP's files.
+
+    So renders of another data set's models keep that data set's numbers.
+    """
+    stated = {name: number_in_name(name) for name in names}
+    numbers = {name: number for name, number in stated.items() if number}
+    if len(set(numbers.values())) == len(names):
+        return numbers
+    return {name: number for number, name in enumerate(names, start=1)}
 
 
 def part_of(info: ModelInfo) -> Part:
@@ -232,7 +253,7 @@ def _rows(place: Place, value: object) -> list[Any]:
 
 
 def write_models(root: Path, parts: Sequence[Part]) -> None:
-    """Write the parts' models, numbered by :func:`~dopepp.data.formats.bop.model_numbers`.
+    """Write the parts' models, numbered by :func:`model_numbers`.
 
     ``models_info.json`` is written last, as a sign.
 

@@ -1,6 +1,6 @@
 """BOP data sets in their scenewise layout: LM-O, T-LESS, YCB-V, ITODD, or a rendered one.
 
-``SPLIT/NNNNNN/`` are scenes, see :mod:`~dopepp.data.formats.bop.scene`.
+``SPLIT/NNNNNN/`` are scenes, see :mod:`~dopepp.data.formats.bop`.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from jaxtyping import Int
 from dopepp.core.errors import UserError
 from dopepp.core.json import read_json
 from dopepp.core.validation import Range, parse
-from dopepp.data.formats import bop, share
+from dopepp.data.formats import ESTIMATED, bop, make_instance, share
+from dopepp.data.formats.bop import Scene, read_scene
 from dopepp.data.formats.bop.models import modelled, parts_by_id, read_models
-from dopepp.data.formats.bop.scene import Scene, read_scene
 from dopepp.data.formats.images import decode_depth, decode_mask, decode_rgb
 from dopepp.data.sample import Instance, Sample, SourceInfo
 from dopepp.drawing.pictures import DepthMap, Shape, Size, read_content
@@ -80,7 +80,7 @@ class BopReader:
     image without ground truth has no instances. Objects that are none of the parts, and objects
     behind the camera (rendered sets pose them too), are left out and counted. The visible fraction
     is ``visib_fract`` of ``scene_gt_info.json``; without it, see
-    :func:`~dopepp.data.formats.bop.make_instance`.
+    :func:`~dopepp.data.formats.make_instance`.
 
     Args:
         parts: The objects to return, named as in ``models_info.json`` or ``obj_000001``.
@@ -198,7 +198,7 @@ class BopReader:
         mask = decode_mask(read_content(path), str(path), shape) if path.exists() else None
         poses, part = scene.poses, self._parts[int(scene.poses.obj_ids[k])]
         fraction = float(poses.visible_fractions[k])
-        return bop.make_instance(part, poses.T_cam_obj[k].copy(), K, fraction, mask, shape)
+        return make_instance(part, poses.T_cam_obj[k].copy(), K, fraction, mask, shape)
 
     def _depth(self, scene: Scene, row: int, shape: Shape) -> DepthMap | None:
         """Read the depth image; None in a scene without any."""
@@ -242,7 +242,7 @@ class BopReader:
             "annotation": digest.hexdigest(),
             "objects": {part.name: part.mesh_hash for part in self._parts.values()},
             "left_out": self._left_out,
-            "visible_fractions": "scene_gt_info.json" if not unknown else bop.ESTIMATED,
+            "visible_fractions": "scene_gt_info.json" if not unknown else ESTIMATED,
         }
         return [SourceInfo(self.name, len(self), identity, self._num_instances)]
 

@@ -22,7 +22,7 @@ import numpy as np
 from dopepp.core.errors import UserError
 from dopepp.core.files import partial_path
 from dopepp.core.json import MAX_BYTES
-from dopepp.data.formats import bop, share
+from dopepp.data.formats import ESTIMATED, bop, make_instance, share
 from dopepp.data.formats.bop.models import parts_by_id
 from dopepp.data.formats.images import decode_depth, decode_rgb, decode_runs
 from dopepp.data.formats.problems import STRICT, Place, Problems, mapping
@@ -54,7 +54,7 @@ class WebdatasetReader:
     Opening reads the archives' headers; an image's members are read and checked with the image. An
     image without ``gt.json`` has no instances. Objects that are none of the parts, and objects
     behind the camera, are left out. The visible fraction is ``visib_fract`` of ``gt_info.json``;
-    without it, see :func:`~dopepp.data.formats.bop.make_instance`.
+    without it, see :func:`~dopepp.data.formats.make_instance`.
 
     Args:
         parts: The objects to return, named as in ``models_info.json`` or ``obj_000001``.
@@ -107,7 +107,7 @@ class WebdatasetReader:
             mask = records.mask("mask_visib", number, shape) if has_masks else None
             part = self._parts[int(poses.obj_ids[number])]
             T, fraction = poses.T_cam_obj[number], float(poses.visible_fractions[number])
-            instances.append(bop.make_instance(part, T, camera, fraction, mask, shape))
+            instances.append(make_instance(part, T, camera, fraction, mask, shape))
         encoded, depth = shard.read(image, "depth") if self._read_depth else None, None
         if encoded is not None:
             depth = decode_depth(encoded, f"{records.start}.depth", float(scales[0]), shape)
@@ -139,7 +139,7 @@ class WebdatasetReader:
             "shards": [shard.path.name for shard in self._shards],
             "members": digest.hexdigest(),
             "objects": {part.name: part.mesh_hash for part in self._parts.values()},
-            "visible_fractions": "gt_info.json" if stated else bop.ESTIMATED,
+            "visible_fractions": "gt_info.json" if stated else ESTIMATED,
         }
         return [SourceInfo(self.name, len(self), identity)]
 

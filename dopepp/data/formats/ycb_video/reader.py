@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.bop import make_instance
+from dopepp.data.formats import make_instance
 from dopepp.data.formats.ycb_video import (
     FOLDERS,
     FrameMeta,

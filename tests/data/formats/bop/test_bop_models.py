@@ -8,8 +8,13 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.bop import model_numbers
-from dopepp.data.formats.bop.models import bop_parts, parts_by_id, read_models, write_models
+from dopepp.data.formats.bop.models import (
+    bop_parts,
+    model_numbers,
+    parts_by_id,
+    read_models,
+    write_models,
+)
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.mesh.decimate import decimate
 from dopepp.parts.mesh.read import read_mesh, ycb_part
