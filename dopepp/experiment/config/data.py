@@ -14,7 +14,7 @@ from dopepp.core.errors import UserError
 from dopepp.core.validation import STRICT, Range, parse, shown
 from dopepp.data.sources.rendered import MAX_ITEMS, Split
 from dopepp.geometry.camera import camera_matrix
-from dopepp.virtual.presets import Preset, preset_of
+from dopepp.virtual.presets import Preset, preset_of, written_out
 from dopepp.virtual.presets.view import View, read_lens
 
 Node = Mapping[str, Any]
@@ -79,7 +79,7 @@ class VirtualConfig:
     @classmethod
     def of(cls, node: object) -> VirtualConfig:
         """Read the node; an option of it may be a :class:`UserError`."""
-        return parse(cls, with_lens(node or {}), "virtual")
+        return parse(cls, with_files(node or {}), "virtual")
 
     @property
     def view(self) -> View | None:
@@ -281,14 +281,29 @@ def trained_on(description: Mapping[str, Any]) -> dict[str, Any] | None:
     return config if isinstance(config, dict) else None
 
 
-def with_lens(virtual: object) -> object:
-    """Return the node ``virtual`` with the numbers of its camera's file in place of the path."""
-    if not isinstance(virtual, Mapping) or not isinstance(virtual.get("camera"), str):
+def with_files(virtual: object) -> object:
+    """Return the node ``virtual`` with the contents of files in place of their paths.
+
+    A camera's numbers replace its file, and changes to a shipped preset a file of the user's own.
+    """
+    if not isinstance(virtual, Mapping):
         return virtual
-    (width, height), K = read_lens(virtual["camera"])
-    (fx, _, cx), (_, fy, cy), _ = K.tolist()
-    lens = {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
-    return {**virtual, "camera": lens}
+    written = dict(virtual)
+    if isinstance(virtual.get("camera"), str):
+        (width, height), K = read_lens(virtual["camera"])
+        (fx, _, cx), (_, fy, cy), _ = K.tolist()
+        written["camera"] = {
+            "width": width,
+            "height": height,
+            "fx": fx,
+            "fy": fy,
+            "cx": cx,
+            "cy": cy,
+        }
+    if isinstance(virtual.get("preset"), str):
+        preset, scene = written_out(virtual["preset"], virtual.get("scene"))
+        written |= {"preset": preset, "scene": scene}
+    return written
 
 
 def _chosen_virtual(given: Mapping[str, Any], stored: object, source: str) -> VirtualConfig:

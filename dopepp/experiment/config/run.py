@@ -11,7 +11,7 @@ import torch
 
 from dopepp.core.errors import UserError
 from dopepp.core.validation import STRICT, Range, parse, shown
-from dopepp.experiment.config.data import Count, DataConfig, Node, Seed, Share, with_lens
+from dopepp.experiment.config.data import Count, DataConfig, Node, Seed, Share, with_files
 from dopepp.experiment.config.protocols import Protocols
 from dopepp.models.layers import MAX_WIDTH, MIN_WIDTH
 from dopepp.training.targets import SymmetryOptions
@@ -257,7 +257,7 @@ class RunConfig(MeasurementConfig):
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> RunConfig:
         """Read a composed and resolved config; a :class:`UserError` tells what is wrong."""
-        plain = {**config, "virtual": with_lens(config.get("virtual"))}
+        plain = {**config, "virtual": with_files(config.get("virtual"))}
         data = DataConfig.of(plain.get("data"), plain["virtual"])
         options = {key: value for key, value in plain.items() if key != "virtual"}
         options["trainer"] = TrainerConfig.node(options.get("trainer") or {})

@@ -160,7 +160,8 @@ def preset_of(name: str, changes: object = None, where: str = "") -> Preset:
     """Return a preset with some fields changed.
 
     Args:
-        name: Name of a shipped preset, or a YAML file of the user's own.
+        name: Name of a shipped preset, or a YAML file of the user's own, which names the preset
+            that it changes as ``base``.
         changes: Values by field. A group of fields is a mapping, of which the other fields stay as
             they are, e.g. ``{"horizontal_fov_deg": 70, "materials": {"metal_share": 0.2}}``. A
             group that the preset lacks (``table`` of ``paper``) starts from its defaults, as does
@@ -171,31 +172,35 @@ def preset_of(name: str, changes: object = None, where: str = "") -> Preset:
         UserError: The preset or a field is unknown, or a value is of the wrong type or outside of
             the field's range.
     """
-    values = _merged({"name": Path(name).stem, **preset_fields(name)}, changes or {})
-    return parse(Preset, values, where)
+    base, changes = written_out(name, changes)
+    return parse(Preset, _merged({"name": base, **_shipped(base)}, changes), where)
 
 
-def preset_fields(name: str) -> dict[str, Any]:
-    """Return the fields of a preset's file, over those of the preset that it names as ``base``.
+def written_out(name: str, changes: object = None) -> tuple[str, object]:
+    """Return a shipped preset's name, and the changes to it of a file and of the caller.
 
     Raises:
-        UserError: There is no such preset, or its file holds no mapping.
+        UserError: There is no such preset, or the file is no mapping with a ``base``.
     """
     path = Path(name)
     if path.suffix != ".yaml":
         if name not in _NAMES:
             allowed = f"{', '.join(_NAMES)}, or a FILE.yaml"
             raise UserError(f"preset {name!r}", allowed, "choose one of them")
-        path = _FOLDER / f"{name}.yaml"
-    values = read_yaml(path)
-    if not isinstance(values, dict):
-        raise UserError(f"preset {path}, {shown(values)}", "fields and their values", "correct it")
-    base = values.pop("base", None)
-    if base is None:
-        return values
-    if base not in _NAMES or base == name:
-        raise UserError(f"base={shown(base)} of {path}", ", ".join(_NAMES), "choose one of them")
-    return dict(_merged(preset_fields(base), values))
+        return name, changes or {}
+    fields: Any = read_yaml(path)
+    base = fields.pop("base", None) if isinstance(fields, dict) else None
+    if base not in _NAMES:
+        got = f"{path} with base={shown(base)}"
+        raise UserError(got, ", ".join(_NAMES), "name the preset that the file changes as base")
+    return base, _merged({"name": path.stem, **fields}, changes or {})
+
+
+def _shipped(name: str) -> Any:
+    """Return the fields of a shipped preset's file, over those of its base."""
+    fields: Any = read_yaml(_FOLDER / f"{name}.yaml")
+    base = fields.pop("base", None)
+    return fields if base is None else _merged(_shipped(base), fields)
 
 
 def _merged(values: Any, changes: Any) -> Any:

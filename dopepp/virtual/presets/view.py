@@ -32,17 +32,10 @@ _FINE_PX: Final = 45.0
 _USUAL_PX: Final = 70.0
 _WIDE_RATIO: Final = 3.5
 
-_ROOM: Final = 1.3
-"""The shorter side of a window over the diameter of the largest part in it."""
-
-_MULTIPLE: Final = 32
-"""Both sides of a window are multiples of it, pixels."""
-
-_MOST_BLUR: Final = 10.0
-"""A sharp lens takes large pictures: blur in them is at most so many times that of small ones."""
-
-_BEYOND: Final = 1.25
-"""On a table, a part's depth differs from that of the point the camera looks at by this at most."""
+_ROOM: Final = 1.3  # the shorter side of a window over the diameter of the largest part in it
+_MULTIPLE: Final = 32  # both sides of a window are multiples of it, pixels
+_MOST_BLUR: Final = 10.0  # in large pictures, at most so many times the blur of small ones
+_BEYOND: Final = 1.25  # the depth of a part on a table over that of the point looked at, at most
 
 
 @dataclass(frozen=True, eq=False)

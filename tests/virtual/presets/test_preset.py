@@ -13,7 +13,7 @@ from dopepp.geometry.camera import project, resize_camera, transform
 from dopepp.geometry.rotation import is_rotation, random_rotation
 from dopepp.parts.part import Part
 from dopepp.virtual import PRESETS, Distractors, Factory, Preset, Scene, Table, visible_fractions
-from dopepp.virtual.presets import preset_of
+from dopepp.virtual.presets import preset_of, written_out
 from dopepp.virtual.presets.placement import (
     DistancePlacement,
     FacingTurning,
@@ -378,15 +378,15 @@ def test_a_file_of_ones_own_builds_on_a_shipped_preset(tmp_path):
     preset = preset_of(str(path), {"width": 256})
     table = replace(PRESETS["table"].table, roll_deg=3.0)
     assert preset == replace(PRESETS["table"], name="shelf", width=256, table=table)
-    for text, message in [
-        ("base: shelf", "base='shelf' of .*shelf.yaml; allowed: bin, "),
-        ("- 1", "fields and their values"),
-        ("base: paper\nwdith: 3", "wdith=3; allowed: name, width"),
-        ("width: 64", "no height"),
-    ]:
+    base, changes = written_out(str(path), {"width": 256})
+    assert (base, preset_of(base, changes)) == ("table", preset)
+    for text in ("base: shelf", "- 1", "width: 64"):
         path.write_text(text)
-        with pytest.raises(UserError, match=message):
+        with pytest.raises(UserError, match=r"shelf.yaml with base=.*; allowed: bin, "):
             preset_of(str(path))
+    path.write_text("base: paper\nwdith: 3")
+    with pytest.raises(UserError, match="wdith=3; allowed: name, width"):
+        preset_of(str(path))
 
 
 PLAIN = st.recursive(
