@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import time
 
 import cv2
@@ -216,6 +217,17 @@ def test_its_lens_projects_as_opencvs(tmp_path):
     lens = np.array(camera.distortion)
     pixel = cv2.projectPoints(np.array([[x, y, 1.0]]), np.zeros(3), np.zeros(3), camera.K, lens)[0]
     assert_allclose(pixel[0, 0], expected, atol=1e-9)
+
+
+def test_reads_what_dopepp_writes(tmp_path):
+    from dopepp.data.formats.ndds.writer import camera_settings
+
+    four = {"fx": 601.25, "fy": 602.5, "cx": 318.75, "cy": 242.5}
+    content = camera_settings({"width": 640, "height": 480, "intrinsics": four})
+    (tmp_path / "_camera_settings.json").write_text(json.dumps(content))
+    camera = read_camera(tmp_path / "_camera_settings.json")
+    assert_array_equal(camera.K, K)
+    assert camera.size == ANY
 
 
 BAD = {
