@@ -26,6 +26,9 @@ from dopepp.virtual.presets.table import Table, inverse_depth_row, plane_of
 from dopepp.virtual.surface import Surface
 from dopepp.virtual.triangles import CENTRE_SAMPLE, rasterise
 
+Column = Float[np.ndarray, "vertices"]
+Cell = tuple[int, int]  # x and y
+
 
 def arrange_on_table(composition: Composition, table: Table, targets: Sequence[Body]) -> Transform:
     """Choose a view, add targets and distractors, and return T_cam_table (plane z = 0, z up)."""
@@ -51,7 +54,7 @@ class _Lying:
 
     T_table_obj: Transform
     footprint: Footprint
-    place: tuple[int, int]
+    place: Cell
     height: float
     centre: float
 
@@ -146,15 +149,14 @@ class Footprint:
 
     Attributes:
         bottom: Height of its underside above its lowest point, metres, the least of a cell and
-            its eight neighbours: what happens between cells' centres is provided for. Infinite
-            where the object is not.
+            its eight neighbours, for what happens between cells' centres; infinite beside it.
         top: Height of its upper side above its lowest point, metres; −infinite beside it.
         corner: x and y of the first cell's centre relative to the object's origin, in cells.
     """
 
     bottom: Float32[np.ndarray, "rows columns"]
     top: Float32[np.ndarray, "rows columns"]
-    corner: tuple[int, int]
+    corner: Cell
 
 
 class HeightMap:
@@ -185,11 +187,10 @@ class HeightMap:
             return None
         heights = z - lowest / self.cell
         span = max(float(heights.max()), 1.0)
-        faces, closed = surface.faces, surface.closed
-        below = _greatest(x, y, 1 - heights / span, faces, closed, (x0, y0), shape)
+        below = _greatest(x, y, 1 - heights / span, surface, surface.faces, (x0, y0), shape)
         # Seen from above without turning the map over, what is in front winds the other way.
-        mirrored = np.ascontiguousarray(faces[:, ::-1])
-        above = _greatest(x, y, heights / span, mirrored, closed, (x0, y0), shape)
+        mirrored = np.ascontiguousarray(surface.faces[:, ::-1])
+        above = _greatest(x, y, heights / span, surface, mirrored, (x0, y0), shape)
         if not above.any():
             # Thinner than a cell: it takes the one in the middle, from its foot to its head.
             above[shape[0] // 2, shape[1] // 2] = below[shape[0] // 2, shape[1] // 2] = 2
@@ -201,7 +202,7 @@ class HeightMap:
             corner=(x0, y0),
         )
 
-    def height(self, footprint: Footprint, place: tuple[int, int]) -> float | None:
+    def height(self, footprint: Footprint, place: Cell) -> float | None:
         """Return how high an object's lowest point would come to lie, metres; None beyond the map.
 
         ``place`` is x and y of its origin, in cells.
@@ -211,17 +212,17 @@ class HeightMap:
             return None
         return max(float((self._heights[window] - footprint.bottom).max()), 0.0)
 
-    def put(self, footprint: Footprint, place: tuple[int, int], height: float) -> None:
+    def put(self, footprint: Footprint, place: Cell, height: float) -> None:
         """Set an object down where :meth:`height` said."""
         window = self._window(footprint, place)
         np.maximum(self._heights[window], footprint.top + height, out=self._heights[window])
 
-    def is_free(self, footprint: Footprint, place: tuple[int, int]) -> bool:
+    def is_free(self, footprint: Footprint, place: Cell) -> bool:
         """Tell whether nothing lies where the object would, neither under nor over it."""
         window = self._window(footprint, place)
         return not bool((self._heights[window][np.isfinite(footprint.bottom)] > 0).any())
 
-    def _window(self, footprint: Footprint, place: tuple[int, int]) -> tuple[slice, slice]:
+    def _window(self, footprint: Footprint, place: Cell) -> tuple[slice, slice]:
         rows, columns = footprint.top.shape
         left = place[0] + footprint.corner[0] + self._half
         top = place[1] + footprint.corner[1] + self._half
@@ -229,13 +230,7 @@ class HeightMap:
 
 
 def _greatest(
-    x: Float[np.ndarray, "vertices"],
-    y: Float[np.ndarray, "vertices"],
-    values: Float[np.ndarray, "vertices"],
-    faces: Faces,
-    cull: bool,
-    corner: tuple[int, int],
-    shape: Shape,
+    x: Column, y: Column, values: Column, surface: Surface, faces: Faces, corner: Cell, shape: Shape
 ) -> Float32[np.ndarray, "rows columns"]:
     """Return 1 + the greatest value over every cell's centre, 0 beside the object."""
     # The rasteriser keeps the greatest 1/z and interpolates it linearly over the image, so a vertex
@@ -244,5 +239,5 @@ def _greatest(
     hom = np.stack([x * z, y * z, z], axis=1)
     greatest, ids = np.zeros((*shape, 1), np.float32), np.empty((*shape, 1), np.int32)
     # No depth is below 1/2.
-    rasterise(hom, faces, cull, 0.25, corner, CENTRE_SAMPLE, greatest, ids, 0)
+    rasterise(hom, faces, surface.closed, 0.25, corner, CENTRE_SAMPLE, greatest, ids, 0)
     return np.asarray(greatest[..., 0])

@@ -20,6 +20,9 @@ from dopepp.virtual.sensor import SRGB_TO_LINEAR
 from dopepp.virtual.surface.occlusion import OpenSky, bake_open_sky, spread_directions
 from dopepp.virtual.surface.texture import Texture, make_texture
 
+Corners = Float[np.ndarray, "faces 3 3"]
+PerFace = Float[np.ndarray, "faces"]
+
 _CREASE_ANGLE_DEG: Final = 35.0
 """Faces that meet at a larger angle keep a sharp edge; a CAD cylinder has facets of 5° to 30°."""
 
@@ -45,7 +48,7 @@ class Surface:
 
     vertices: Vertices
     faces: Faces
-    normals: Float[np.ndarray, "faces 3 3"]
+    normals: Corners
     patches: Int[np.ndarray, "faces"]
     uv: Float[np.ndarray, "uvs 2"]
     colours: Float32[np.ndarray, "colours 3"]
@@ -133,9 +136,7 @@ def make_surface(mesh: Mesh) -> Surface:
     )
 
 
-def _spread_points(
-    corners: Float[np.ndarray, "faces 3 3"], weights: Float[np.ndarray, "faces"]
-) -> Points:
+def _spread_points(corners: Corners, weights: PerFace) -> Points:
     """Return points evenly spread over triangles, by area; the corners of a mesh without any."""
     if weights.sum() <= 0.0:
         return corners.reshape(-1, 3)[:_NUM_POINTS]
@@ -158,7 +159,7 @@ def _merge_vertices(vertices: Vertices) -> Int[np.ndarray, "vertices"]:
     return np.asarray(np.unique(keys, return_inverse=True)[1].reshape(-1), np.int64)
 
 
-def _is_closed(merged: Faces, triangles: Float[np.ndarray, "faces 3 3"]) -> bool:
+def _is_closed(merged: Faces, triangles: Corners) -> bool:
     """Tell whether every directed edge has exactly one opposite and the volume is positive."""
     collapsed = (merged == merged[:, [1, 2, 0]]).any(axis=1)
     start, end = merged[~collapsed], merged[~collapsed][:, [1, 2, 0]]
@@ -173,11 +174,8 @@ def _is_closed(merged: Faces, triangles: Float[np.ndarray, "faces 3 3"]) -> bool
 
 
 def _corner_normals(
-    merged: Faces,
-    doubled: Float[np.ndarray, "faces 3"],
-    length: Float[np.ndarray, "faces"],
-    edges: Float[np.ndarray, "faces 3 3"],
-) -> Float[np.ndarray, "faces 3 3"]:
+    merged: Faces, doubled: Float[np.ndarray, "faces 3"], length: PerFace, edges: Corners
+) -> Corners:
     """Return angle-weighted corner normals (Thürmer and Wüthrich 1998) with creases.
 
     ``merged`` is the merged vertex of every corner; ``doubled`` the cross product of two ``edges``
@@ -197,10 +195,7 @@ def _corner_normals(
 
 
 def _take_given(
-    normals: Float[np.ndarray, "faces 3 3"],
-    given: Float[np.ndarray, "faces 3 3"],
-    doubled: Float[np.ndarray, "faces 3"],
-    length: Float[np.ndarray, "faces"],
+    normals: Corners, given: Corners, doubled: Float[np.ndarray, "faces 3"], length: PerFace
 ) -> None:
     """Put a file's normals at the corners where they can be the smooth surface's.
 
@@ -248,7 +243,7 @@ def _average_normals(
 
 
 def _smooth_patches(
-    corners: Faces, normals: Float[np.ndarray, "faces 3 3"], usable: Bool[np.ndarray, "faces"]
+    corners: Faces, normals: Corners, usable: Bool[np.ndarray, "faces"]
 ) -> Int[np.ndarray, "faces"]:
     """Number faces so that those connected by edges without a crease share a number.
 

@@ -60,8 +60,9 @@ print("mean", float(mi.TensorXf(mi.render(mi.load_dict(scene), spp=1)).array[0])
 def mitsuba() -> Any:
     """Return the ``mitsuba`` module with its variant and threads set.
 
-    A UserError: it is not installed, a setting is wrong, or this process was forked from one that
-    has rendered, whose threads it lacks.
+    Raises:
+        UserError: It is not installed, a setting is wrong, or this process was forked from one that
+            has rendered, whose threads it lacks.
     """
     require("mitsuba", "renderer 'photoreal'", "photoreal")
     pid = _start()
