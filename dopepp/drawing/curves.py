@@ -62,8 +62,7 @@ def accuracy_figure(
         area = 100 * _area(np.asarray(errors, np.float64), max_threshold)
         colour = None if colours is None else colours[name]
         axes.plot(thresholds, 100 * accuracy, label=f"{name} (AUC {area:.1f} %)", color=colour)
-    axes.set_xlim(0, max_threshold)
-    axes.set_ylim(0, 101)
+    axes.set(xlim=(0, max_threshold), ylim=(0, 101))
     if curves:
         axes.legend(loc="lower right", fontsize="small")
     return figure
@@ -80,12 +79,11 @@ def save_accuracy_curves(
     The CSV has a column ``threshold_m`` and one per method with the share below, in [0, 1].
     """
     path = Path(path)
-    thresholds = np.linspace(0.0, max_threshold, _NUM_STEPS + 1)
-    shares = [accuracy_curve(errors, max_threshold)[1] for errors in curves.values()]
-    columns = {"threshold_m": thresholds, **dict(zip(curves, shares, strict=True))}
+    columns = {"threshold_m": np.linspace(0.0, max_threshold, _NUM_STEPS + 1)}
+    columns |= {name: accuracy_curve(errors, max_threshold)[1] for name, errors in curves.items()}
     rows = [
-        {name: f"{values[k]:.6g}" for name, values in columns.items()}
-        for k in range(len(thresholds))
+        {name: f"{value:.6g}" for name, value in zip(columns, values, strict=True)}
+        for values in zip(*columns.values(), strict=True)
     ]
     write_csv(path.with_name(path.name + ".csv"), rows)
     figure = accuracy_figure(curves, max_threshold, title)
@@ -97,9 +95,7 @@ def figure_with_axes(x_label: str, y_label: str, title: str = "") -> tuple[Figur
     """Return an empty figure with labelled axes."""
     figure = Figure(figsize=(6.4, 4.4), dpi=120, layout="constrained")
     axes = figure.add_subplot()
-    axes.set_xlabel(x_label)
-    axes.set_ylabel(y_label)
-    axes.set_title(title)
+    axes.set(xlabel=x_label, ylabel=y_label, title=title)
     axes.grid(visible=True, alpha=0.3)
     return figure, axes
 
@@ -151,7 +147,19 @@ def rates_figure(
     figure = Figure(figsize=(columns * 5.2, rows * 4.0), dpi=120, layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes, (title, curves) in zip(grid.flat, panels.items(), strict=False):
-        _draw_panel(axes, title, curves, x_label, edges)
+        for name, curve in curves.items():
+            rate, low, high = 100 * curve.rate, 100 * curve.low, 100 * curve.high
+            (line,) = axes.plot(curve.x, rate, marker="o", markersize=4, label=name)
+            axes.fill_between(curve.x, low, high, color=line.get_color(), alpha=0.15, lw=0)
+            # A band needs two points, and a bar says which points are measured.
+            axes.vlines(curve.x, low, high, line.get_color(), alpha=0.5, lw=1)
+        for edge in () if edges is None else edges:
+            axes.axvline(float(edge), color="0.8", linewidth=0.8, zorder=0)
+        axes.set(title=title, xlabel=x_label, ylim=(-2, 102))
+        axes.set_ylabel("share of instances and 95 % interval (%)")
+        axes.grid(visible=True, axis="y", alpha=0.3)
+        if curves:
+            axes.legend(loc="best")
         if ratio:
             measured = sorted({float(x) for curve in curves.values() for x in curve.x})
             axes.set_xscale("log")
@@ -162,38 +170,9 @@ def rates_figure(
     return figure
 
 
-def _draw_panel(
-    axes: Axes,
-    title: str,
-    curves: Mapping[str, RateCurve],
-    x_label: str,
-    edges: Float[np.ndarray, "edges"] | None,
-) -> None:
-    for name, curve in curves.items():
-        (line,) = axes.plot(curve.x, 100 * curve.rate, marker="o", markersize=4, label=name)
-        axes.fill_between(
-            curve.x, 100 * curve.low, 100 * curve.high, color=line.get_color(), alpha=0.15, lw=0
-        )
-        # A band needs two points, and a bar says which points are measured.
-        axes.vlines(curve.x, 100 * curve.low, 100 * curve.high, line.get_color(), alpha=0.5, lw=1)
-    for edge in () if edges is None else edges:
-        axes.axvline(float(edge), color="0.8", linewidth=0.8, zorder=0)
-    axes.set_title(title)
-    axes.set_xlabel(x_label)
-    axes.set_ylabel("share of instances and 95 % interval (%)")
-    axes.set_ylim(-2, 102)
-    axes.grid(visible=True, axis="y", alpha=0.3)
-    if curves:
-        axes.legend(loc="best")
-
-
 @dataclass(frozen=True)
 class PlotLine:
-    """One method's values over training, of one or several runs.
-
-    Attributes:
-        values: Of each run; NaN where there is none.
-    """
+    """One method's values over training, by run; NaN where there is none."""
 
     name: str
     x: Float[np.ndarray, "points"]

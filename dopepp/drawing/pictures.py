@@ -99,14 +99,11 @@ def read_content(path: Path) -> bytes:
     """Return an image file's bytes; a UserError where it is missing or too large."""
     try:
         return _content(path)
-    except OSError as error:
-        raise UserError(
-            f"image {path}: {error.strerror}", "a readable file", "restore it"
-        ) from error
-    except ValueError as error:
-        raise UserError(
-            f"image {path}: {error}", f"at most {MAX_BYTES / 1e6:.0f} MB", "reduce it"
-        ) from error
+    except (OSError, ValueError) as error:
+        reason, allowed, fix = str(error), f"at most {MAX_BYTES / 1e6:.0f} MB", "reduce it"
+        if isinstance(error, OSError):
+            reason, allowed, fix = str(error.strerror), "a readable file", "restore it"
+        raise UserError(f"image {path}: {reason}", allowed, fix) from error
 
 
 def read_image(path: Path) -> NDArray[Any]:
@@ -193,13 +190,11 @@ def _content(path: Path) -> bytes:
 
 def _opened(content: bytes, formats: tuple[str, ...]) -> Image.Image:
     """Open a picture and hold it to its format, without decoding it."""
-    damage = ""
+    damage = "" if content else "an empty file"
     if content.startswith(_PNG):
         damage = _png_damage(content)
     elif content.startswith(_JPEG) and _JPEG_END not in content:
         damage = "no end marker"  # behind which cameras append anything
-    elif not content:
-        damage = "an empty file"
     if damage:
         raise ValueError(f"truncated or damaged, {damage}")
     with warnings.catch_warnings():
@@ -232,8 +227,7 @@ def _png_damage(content: bytes) -> str:
 
 def _is_deep_colour(content: bytes) -> bool:
     """Tell whether a PNG's header (behind signature, length, type and size) says 16-bit colour."""
-    depth, colour = content[24:26]
-    return content.startswith(_PNG) and depth == 16 and colour != 0
+    return content.startswith(_PNG) and content[24] == 16 and content[25] != 0
 
 
 def _is_deep(image: Image.Image, content: bytes) -> bool:

@@ -10,7 +10,7 @@ AR_MSSD and AR_MSPD (Hodan et al., "BOP Challenge 2020", 2020), as bop_toolkit c
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -61,10 +61,6 @@ class BopScores:
     ar_mspd: float
     ar: float | None
     add_or_s_01d: float
-
-    def to_record(self) -> dict[str, int | float | None]:
-        """Return plain values."""
-        return asdict(self)
 
     def in_words(self) -> str:
         """Return a line for people."""

@@ -11,7 +11,7 @@ import re
 import statistics
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Final, Protocol
 
@@ -289,7 +289,7 @@ def measure(
             },
             diameters={part.name: float(part.diameter) for part in method.parts},
             test_set=seen.word(),
-            details={"bop": measured.bop[name].to_record()} if name in measured.bop else {},
+            details={"bop": asdict(measured.bop[name])} if name in measured.bop else {},
         )
         for name, method in methods.items()
     ]

@@ -8,50 +8,23 @@ To add an error, write one function of this form, its formula in ``docs/metrics.
 against an independent implementation.
 """
 
-from dopepp.metrics.functional.distances import (
-    BOP_THRESHOLDS,
-    VSD_DELTA,
-    add,
-    add_s,
-    mahalanobis,
-    mspd,
-    mssd,
-    reprojection_error,
-    rotation_error_deg,
-    translation_error,
-    vsd,
-)
-from dopepp.metrics.functional.rates import (
-    BOP_MSPD_THRESHOLDS,
-    MATCH_DISTANCE,
-    auc,
-    average_precision,
-    average_recall,
-    expected_calibration_error,
-    match,
-    pass_rate,
-    wilson_interval,
-)
-
-__all__ = [
-    "BOP_MSPD_THRESHOLDS",
-    "BOP_THRESHOLDS",
-    "MATCH_DISTANCE",
-    "VSD_DELTA",
-    "add",
-    "add_s",
-    "auc",
-    "average_precision",
-    "average_recall",
-    "expected_calibration_error",
-    "mahalanobis",
-    "match",
-    "mspd",
-    "mssd",
-    "pass_rate",
-    "reprojection_error",
-    "rotation_error_deg",
-    "translation_error",
-    "vsd",
-    "wilson_interval",
-]
+from dopepp.metrics.functional.distances import BOP_MSPD_THRESHOLDS as BOP_MSPD_THRESHOLDS
+from dopepp.metrics.functional.distances import BOP_THRESHOLDS as BOP_THRESHOLDS
+from dopepp.metrics.functional.distances import VSD_DELTA as VSD_DELTA
+from dopepp.metrics.functional.distances import add as add
+from dopepp.metrics.functional.distances import add_s as add_s
+from dopepp.metrics.functional.distances import mahalanobis as mahalanobis
+from dopepp.metrics.functional.distances import mspd as mspd
+from dopepp.metrics.functional.distances import mssd as mssd
+from dopepp.metrics.functional.distances import reprojection_error as reprojection_error
+from dopepp.metrics.functional.distances import rotation_error_deg as rotation_error_deg
+from dopepp.metrics.functional.distances import translation_error as translation_error
+from dopepp.metrics.functional.distances import vsd as vsd
+from dopepp.metrics.functional.rates import MATCH_DISTANCE as MATCH_DISTANCE
+from dopepp.metrics.functional.rates import auc as auc
+from dopepp.metrics.functional.rates import average_precision as average_precision
+from dopepp.metrics.functional.rates import average_recall as average_recall
+from dopepp.metrics.functional.rates import expected_calibration_error as expected_calibration_error
+from dopepp.metrics.functional.rates import match as match
+from dopepp.metrics.functional.rates import pass_rate as pass_rate
+from dopepp.metrics.functional.rates import wilson_interval as wilson_interval

@@ -17,9 +17,6 @@ from dopepp.metrics.functional.distances import Errors, nan_is_miss, to_float64
 
 AucMethod = Literal["exact", "voc"]
 
-BOP_MSPD_THRESHOLDS: Final = tuple(5.0 * k for k in range(1, 11))
-"""5 to 50 pixels: of MSPD in an image 640 pixels wide; times width/640 in others (BOP)."""
-
 
 def auc(errors: Errors, max_threshold: float, method: AucMethod = "exact") -> float:
     """Area under the accuracy-threshold curve from 0 to ``max_threshold``, as a share of 1.
