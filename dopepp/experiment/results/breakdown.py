@@ -16,6 +16,7 @@ from typing import Final
 
 import cv2
 import numpy as np
+import pandas as pd
 import torch
 from jaxtyping import Float, Int
 
@@ -90,10 +91,9 @@ def bin_numbers(values: Numbers, num_bins: int) -> Int[np.ndarray, "n"]:
     A value falls where the middle of its ranks does, so that a bin of many equal values (objects
     that nothing hides) draws no others in. Bins that stay empty are left out.
     """
-    _, place, counts = np.unique(values, return_inverse=True, return_counts=True)
-    middles = np.cumsum(counts) - counts / 2
-    bins = np.floor(middles * num_bins / max(len(values), 1)).astype(int)
-    return np.asarray(np.unique(bins, return_inverse=True)[1][place])
+    middles = pd.Series(values, dtype=float).rank() - 0.5
+    bins = np.floor(middles * num_bins / max(len(values), 1))
+    return np.asarray(bins.rank(method="dense").astype(int) - 1)
 
 
 @dataclass(frozen=True)
@@ -130,9 +130,9 @@ def break_down(
         for name, own in gathered.items()
     }
     everything = next(reversed(numbers.values()))
-    bin_of = bin_numbers(everything, num_bins)
-    groups = [everything[bin_of == number] for number in range(int(bin_of.max(initial=-1)) + 1)]
-    bins = [Bin(float(one.min()), float(one.max()), float(np.median(one))) for one in groups]
+    groups = pd.Series(everything, dtype=float).groupby(bin_numbers(everything, num_bins))
+    ends = groups.agg(["min", "max", "median"]).itertuples(index=False)
+    bins = [Bin(*map(float, one)) for one in ends]
     values = [
         value
         for one in bins

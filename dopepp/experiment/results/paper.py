@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import pandas as pd
 from scipy.stats import t
@@ -91,7 +91,7 @@ class PaperTable:
 
     __pydantic_config__ = STRICT
     title: str
-    kind: str = "poses"
+    kind: Literal["poses", "shading", "parameters", "time"] = "poses"
     threshold: float = 0.05
     labels: Mapping[str, str] = dataclasses.field(default_factory=dict)
     paper: Printed = dataclasses.field(default_factory=dict)
@@ -102,8 +102,6 @@ class PaperTable:
     def of(cls, config: Mapping[str, Any]) -> PaperTable:
         """Read the config's ``table``; a :class:`UserError` if a field or a value is unknown."""
         table = parse(cls, config, "table")
-        if table.kind not in KINDS:
-            raise UserError(f"table.kind={table.kind!r}", ", ".join(KINDS), "choose one of them")
         if table.threshold not in _PASS_FIELDS:
             allowed = ", ".join(f"{one:g}" for one in _PASS_FIELDS)
             raise UserError(f"table.threshold={table.threshold}", f"{allowed}, metres", "change it")
@@ -132,6 +130,10 @@ class PaperTable:
     def field(self, key: str) -> str:
         """Return the field of ``PoseRow`` that a config's figure is of."""
         return self.pass_field if key == "pass" else key
+
+    def printed(self, label: str, measure: str) -> str:
+        """Return what the paper prints of a network."""
+        return _number(self.paper.get(label, {}).get(_NETWORK, {}).get(measure))
 
     def methods(self, entries: Sequence[Entry]) -> dict[str, Entry]:
         """Return the methods by what the paper calls them, or by their own name.
@@ -358,58 +360,50 @@ def _change(points: pd.Series[float]) -> str:
 
 def parameter_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
     """Return what was counted."""
-    costs, missing = _costs(methods)
-    counted = [
-        {
-            _METHOD: label,
+
+    def row(label: str, cost: Mapping[str, Any]) -> Row:
+        return {
             "backbone weights": f"{cost['backbone_weights']:,}",
-            _PAPER: _printed(layout, label, "backbone weights"),
+            _PAPER: layout.printed(label, "backbone weights"),
             "parameters": f"{cost['parameters']:,}",
             "GMACs": f"{cost['gmacs']:.3f}",
         }
-        for label, cost in costs.items()
-    ]
-    return counted + missing, []
+
+    return _cost_rows(methods, row), []
 
 
 def time_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
     """Return what was timed, then the paper's other methods; draw the frame rates (Fig. 13)."""
-    costs, missing = _costs(methods)
     printed = f"{_PAPER}: ms/frame"
-    rows = [
-        {
-            _METHOD: label,
+
+    def row(label: str, cost: Mapping[str, Any]) -> Row:
+        return {
             "ms/frame": f"{cost['ms_per_frame']:.1f}",
-            printed: _printed(layout, label, "ms/frame"),
+            printed: layout.printed(label, "ms/frame"),
             "network ms": f"{cost['network_ms']:.1f}",
             "recovery ms": f"{cost['recovery_ms']:.1f}",
             f"network, frames/s, batch {cost['batch_size']}": f"{cost['frames_per_s']:.1f}",
             "pixels": "×".join(map(str, cost["input_size"])),
             "on": f"{cost['device']}, {cost['threads']} threads",
         }
-        for label, cost in costs.items()
-    ]
-    others = [
-        {_METHOD: label, printed: _printed(layout, label, "ms/frame")}
-        for label in layout.paper
-        if label not in methods
-    ]
-    if costs:
-        jobs = {label: methods[label].runs[0].folder / FRAMES_FILE for label in costs}
-        frames = {label: pd.read_csv(path) for label, path in jobs.items()}
+
+    others = [one for one in layout.paper if one not in methods]
+    rows = [{_METHOD: one, printed: layout.printed(one, "ms/frame")} for one in others]
+    jobs = {label: entry.runs[0].folder / FRAMES_FILE for label, entry in methods.items()}
+    frames = {label: pd.read_csv(path) for label, path in jobs.items() if path.is_file()}
+    if frames:
         save_frame_rates(folder / "frame_rate.png", frames)
-    return rows + missing + others, []
+    return _cost_rows(methods, row) + rows, []
 
 
-def _printed(layout: PaperTable, label: str, measure: str) -> str:
-    return _number(layout.paper.get(label, {}).get(_NETWORK, {}).get(measure))
-
-
-def _costs(methods: Mapping[str, Entry]) -> tuple[dict[str, dict[str, Any]], list[Row]]:
-    """Return what each method's network costs, and rows of those of which nobody knows."""
+def _cost_rows(
+    methods: Mapping[str, Entry], row: Callable[[str, Mapping[str, Any]], Row]
+) -> list[Row]:
+    """Return a row per network, then those of which nobody knows the cost."""
     paths = {label: entry.runs[0].folder / COST_FILE for label, entry in methods.items()}
-    costs = {label: read_json(path) for label, path in paths.items() if path.is_file()}
-    return costs, [{_METHOD: _failed(one, methods[one])} for one in methods if one not in costs]
+    known = {label: read_json(path) for label, path in paths.items() if path.is_file()}
+    rows = [{_METHOD: label, **row(label, cost)} for label, cost in known.items()]
+    return rows + [{_METHOD: _failed(one, methods[one])} for one in methods if one not in known]
 
 
 def _failed(label: str, entry: Entry) -> str:
