@@ -7,17 +7,14 @@ and in :data:`dopepp.experiment.config.protocols.QuantityName`.
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
 import pandas as pd
-import torch
 from jaxtyping import Float, Int
 
 from dopepp.core.files import write_csv, write_png
@@ -28,7 +25,6 @@ from dopepp.experiment.results.frame import PassRate, Row, Value, interval, pivo
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.metrics.pose import MEAN, Gathered, PoseMetrics
-from dopepp.metrics.row import finite_median
 
 _log = logging.getLogger(__name__)
 
@@ -36,8 +32,7 @@ Numbers = Float[np.ndarray, "n"]
 """A number of each of n instances."""
 
 
-@dataclass(frozen=True)
-class Quantity:
+class Quantity(NamedTuple):
     """What instances are sorted by: its name and unit, its value of each, digits in tables."""
 
     heading: str
@@ -77,31 +72,27 @@ def _centres(instances: Gathered) -> Float[np.ndarray, "n 3"]:
 
 
 QUANTITIES: Final[dict[QuantityName, Quantity]] = {
-    "distance": Quantity("distance (m)", lambda one: np.linalg.norm(_centres(one), axis=1), 3),
-    "visibility": Quantity("visible fraction", lambda one: one.visible_fractions.numpy(), 3),
+    "distance": Quantity("distance (m)", lambda poses: np.linalg.norm(_centres(poses), axis=1), 3),
+    "visibility": Quantity("visible fraction", lambda poses: poses.visible_fractions.numpy(), 3),
     "size": Quantity("apparent size (px)", sizes, 1),
     "rotation": Quantity("view angle (°)", view_angles, 1),
 }
 """What rates can be broken down by."""
 
 
-def bin_numbers(values: Numbers, num_bins: int) -> Int[np.ndarray, "n"]:
-    """Return each value's bin, counted from 0; bins have equal counts, equal values share one.
+def bin_numbers(numbers: Numbers, num_bins: int) -> Int[np.ndarray, "n"]:
+    """Return each number's bin, counted from 0; bins have equal counts, equal numbers share one.
 
-    A value falls where the middle of its ranks does, so that a bin of many equal values (objects
+    A number falls where the middle of its ranks does, so that a bin of many equal numbers (objects
     that nothing hides) draws no others in. Bins that stay empty are left out.
     """
-    middles = pd.Series(values, dtype=float).rank() - 0.5
-    bins = np.floor(middles * num_bins / max(len(values), 1))
+    middles = pd.Series(numbers, dtype=float).rank() - 0.5
+    bins = np.floor(middles * num_bins / max(len(numbers), 1))
     return np.asarray(bins.rank(method="dense").astype(int) - 1)
 
 
-@dataclass(frozen=True)
-class Bin:
-    """The instances between two values of a quantity, over the whole test set.
-
-    ``middle`` is their median, which no other bin has.
-    """
+class Bin(NamedTuple):
+    """The instances between two values of a quantity; ``middle`` is their median."""
 
     low: float
     high: float
@@ -124,48 +115,47 @@ def break_down(
         instances, the rates, the median rotation of those that were matched (degrees, to the
         nearest symmetry) and the share that was missed. The condition is the middle of a bin.
     """
-    gathered = {name: [one.instances(part) for part in one.parts] for name, one in metrics.items()}
-    numbers = {
-        name: np.concatenate([QUANTITIES[quantity].of(one) for one in own])
-        for name, own in gathered.items()
-    }
-    everything = next(reversed(numbers.values()))
-    groups = pd.Series(everything, dtype=float).groupby(bin_numbers(everything, num_bins))
-    ends = groups.agg(["min", "max", "median"]).itertuples(index=False)
-    bins = [Bin(*map(float, one)) for one in ends]
+    instances = {name: _instances(each, quantity, rates) for name, each in metrics.items()}
+    quantities = next(reversed(instances.values()))["quantity"]
+    ends = quantities.groupby(bin_numbers(quantities, num_bins)).agg(["min", "max", "median"])
+    bins = [Bin(*map(float, row)) for row in ends.itertuples(index=False)]
     values = [
         value
-        for one in bins
-        for name, own in gathered.items()
-        for value in _in_bin(one, name, numbers[name], own, rates)
+        for each in bins
+        for name, table in instances.items()
+        for value in _in_bin(
+            name, each, table[table["quantity"].between(each.low, each.high)], rates
+        )
     ]
     return bins, values
 
 
+def _instances(
+    metrics: PoseMetrics, quantity: QuantityName, rates: Sequence[PassRate]
+) -> pd.DataFrame:
+    """Return quantity, rotation error and what passed of every instance of every object."""
+    tables = []
+    for gathered in map(metrics.instances, metrics.parts):
+        passed = {rate.field: rate.passed(gathered).numpy() for rate in rates}
+        numbers = {"quantity": QUANTITIES[quantity].of(gathered), **passed}
+        tables.append(pd.DataFrame({**numbers, "rotation": gathered.errors.rotation_s_deg.numpy()}))
+    return pd.concat(tables, ignore_index=True)
+
+
 def _in_bin(
-    one: Bin,
-    method: str,
-    numbers: Numbers,
-    gathered: Sequence[Gathered],
-    rates: Sequence[PassRate],
+    method: str, limits: Bin, table: pd.DataFrame, rates: Sequence[PassRate]
 ) -> Iterator[Value]:
     """Measure one method in one bin; a rate of no instance does not exist."""
-    chosen = torch.from_numpy((numbers >= one.low) & (numbers <= one.high))
-    rotations = torch.cat([own.errors.rotation_s_deg for own in gathered])[chosen]
-    num = len(rotations)
-    median = finite_median(rotations)
-    value = Value(method, MEAN, condition=one.middle)
+    value, num = Value(method, MEAN, condition=limits.middle), len(table)
     yield value._replace(measure="num_instances", value=num)
     for rate in rates:
-        passed = torch.cat([rate.passed(own) for own in gathered])[chosen]
-        share = int(passed.sum()) / num if num else math.nan
+        share = float(table[rate.field].mean())
         low, high = interval(share, num)
         yield value._replace(measure=rate.field, value=share, low=low, high=high)
-    yield value._replace(
-        measure="median_rotation_deg", value=math.nan if median is None else median
-    )
-    missed = float((~rotations.isfinite()).double().mean())
-    yield value._replace(measure="miss_rate", value=missed)
+    is_matched = np.isfinite(table["rotation"])
+    median = float(table["rotation"][is_matched].median())
+    yield value._replace(measure="median_rotation_deg", value=median)
+    yield value._replace(measure="miss_rate", value=float((~is_matched).mean()))
 
 
 def record_breakdown(
@@ -183,13 +173,13 @@ def record_breakdown(
     if not bins:
         _log.warning("by=%s: the test set has no instance that counts, so no bin", quantity)
         return
-    what = QUANTITIES[quantity]
-    by_middle = {one.middle: one for one in bins}
+    title, _, decimals = QUANTITIES[quantity]
+    by_middle = {each.middle: each for each in bins}
 
-    def shown(value: Value) -> Row:
-        own = by_middle[value.condition]
-        ends = dict.fromkeys(f"{end:.{what.decimals}f}" for end in (own.low, own.high))
-        row = {what.heading: " … ".join(ends)}
+    def cells(value: Value) -> Row:
+        limits = by_middle[value.condition]
+        ends = dict.fromkeys(f"{end:.{decimals}f}" for end in (limits.low, limits.high))
+        row = {title: " … ".join(ends)}
         if value.measure == "num_instances":
             return {**row, value.heading: value.text}
         if value.measure == "miss_rate":
@@ -199,15 +189,14 @@ def record_breakdown(
         return {**row, f"{prefix}{value.heading}": f"{value.text}{span}"}
 
     def recorded(value: Value) -> dict[str, object]:
-        own = by_middle[value.condition]
-        row = {"method": value.method, "from": own.low, "to": own.high, "median": own.middle}
+        low, high, middle = by_middle[value.condition]
+        row = {"method": value.method, "from": low, "to": high, "median": middle}
         ends = {"low": value.low, "high": value.high} if value.ends else {}
         named = {f"{value.measure}_{end}": number for end, number in ends.items()}
         return {**row, value.measure: value.plain, **named}
 
-    display.show_table(
-        f"by {quantity}: rates with 95 % intervals", pivot(values, ["condition"], shown)
-    )
+    rows = pivot(values, ["condition"], cells)
+    display.show_table(f"by {quantity}: rates with 95 % intervals", rows)
     path = run_dir / f"by_{quantity}"
     write_csv(path.with_suffix(".csv"), pivot(values, ["condition", "method"], recorded))
     panels = {
@@ -215,7 +204,7 @@ def record_breakdown(
         for rate in rates
     }
     # Between two bins lie no instances; the line stands in the middle of the gap.
-    gaps = [(one.high + following.low) / 2 for one, following in pairwise(bins)]
+    gaps = [(lower.high + upper.low) / 2 for lower, upper in pairwise(bins)]
     edges = np.array([bins[0].low, *gaps, bins[-1].high])
-    figure = rates_figure(panels, what.heading, len(rates), edges)
+    figure = rates_figure(panels, title, len(rates), edges)
     write_png(path.with_suffix(".png"), figure_image(figure))

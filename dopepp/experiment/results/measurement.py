@@ -32,7 +32,7 @@ from dopepp.experiment.results.report import Cost, Fingerprint, Report
 from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.runtimes.runtime import ExportedNetwork
-from dopepp.metrics.localisation import BopScores, Localisation
+from dopepp.metrics.localisation import BopScores, Draw, Localisation
 from dopepp.metrics.pose import PoseMetrics, PredictedPose
 from dopepp.models.network import build_network, network_cost
 from dopepp.parts.part import Part, Parts
@@ -59,15 +59,6 @@ class Posed(PredictedPose, Protocol):
     @property
     def keypoints(self) -> Float[np.ndarray, "9 2"]:
         """The cuboid projected with it, pixels."""
-
-
-@dataclass(frozen=True)
-class MeasuredPose:
-    """A pose on an image of the test set, and what the whole image took; None where unknown."""
-
-    image: ImageId
-    pose: Posed
-    seconds: float | None
 
 
 class Method(Protocol):
@@ -220,14 +211,15 @@ def _median_ms(seconds: Sequence[float]) -> float | None:
 class Measured:
     """What came out of measuring methods: a report each, and pictures of the first images.
 
-    ``poses`` is every pose of each method, ``metrics`` the accumulator of each; ``silent`` are the
-    numbers of the images with instances on which each found nothing, ``bop`` BOP's scores of each
-    where they were asked for and there are targets.
+    ``poses`` is every pose of each method with its image and the seconds that the whole image took,
+    None where unknown; ``metrics`` is the accumulator of each. ``silent`` are the numbers of the
+    images with instances on which each found nothing, ``bop`` BOP's scores of each where they were
+    asked for and there are targets.
     """
 
     reports: list[Report]
     tiles: list[Tile]
-    poses: dict[str, list[MeasuredPose]]
+    poses: dict[str, list[tuple[ImageId, Posed, float | None]]]
     metrics: dict[str, PoseMetrics]
     silent: dict[str, list[int]]
     bop: dict[str, BopScores] = field(default_factory=dict)
@@ -249,9 +241,8 @@ def measure(
     """
     metrics = accumulators(methods)
     seconds: dict[str, list[float]] = {name: [] for name in methods}
-    poses_of: dict[str, list[MeasuredPose]] = {name: [] for name in methods}
-    measured = Measured([], [], poses_of, metrics, {name: [] for name in methods})
-    draw = DepthDrawer().draw
+    measured = Measured([], [], {name: [] for name in methods}, metrics, {n: [] for n in methods})
+    draw = depth_drawer()
     localised = {name: Localisation(one.parts, draw) for name, one in methods.items() if bop}
     num_images = 0
     parts = {part.name: part for method in methods.values() for part in method.parts}
@@ -269,7 +260,7 @@ def measure(
                 localised[name].update(poses, sample.instances, sample.K, sample.size, sample.depth)
             if sample.instances and not poses:
                 measured.silent[name].append(index)
-            measured.poses[name] += [MeasuredPose(image, one, taken) for one in poses]
+            measured.poses[name] += [(image, one, taken) for one in poses]
             colour = BLUE if number < len(methods) - 1 else YELLOW
             wireframes += [Wireframe(one.keypoints, colour, name) for one in poses]
         if len(measured.tiles) < num_pictures:
@@ -296,22 +287,21 @@ def measure(
     return measured
 
 
-class DepthDrawer:
-    """Draws the depth of parts alone; each part's mesh is prepared once."""
+def depth_drawer() -> Draw:
+    """Return what draws the depth of parts alone; each part's mesh is prepared once."""
+    surfaces: dict[str, Surface] = {}
 
-    def __init__(self) -> None:
-        self._surfaces: dict[str, Surface] = {}
-
-    def draw(self, part: Part, T_cam_obj: Transform, K: CameraMatrix, size: Size) -> DepthMap:
-        """Return metres along z at pixel centres, 0 beside the part."""
+    def draw(part: Part, T_cam_obj: Transform, K: CameraMatrix, size: Size) -> DepthMap:
         assert part.mesh is not None
-        if part.name not in self._surfaces:
-            self._surfaces[part.name] = make_surface(part.mesh)
-        item = SceneObject(self._surfaces[part.name], T_cam_obj, part=part)
+        if part.name not in surfaces:
+            surfaces[part.name] = make_surface(part.mesh)
+        item = SceneObject(surfaces[part.name], T_cam_obj, part=part)
         inverse, _ = draw_alone(item, project_object(item, K).hom, (0, 0, *size))
         depth = np.zeros_like(inverse)
         np.divide(1, inverse, out=depth, where=inverse > 0)
         return depth
+
+    return draw
 
 
 def accumulators(methods: Mapping[str, Method]) -> dict[str, PoseMetrics]:

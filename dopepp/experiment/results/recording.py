@@ -25,9 +25,10 @@ from dopepp.experiment.results.frame import reported_rates
 from dopepp.experiment.results.measurement import (
     EstimatorMethod,
     FileMethod,
+    ImageId,
     Measured,
-    MeasuredPose,
     Method,
+    Posed,
     measure,
     object_numbers,
 )
@@ -186,7 +187,7 @@ def _show_silence(
 
 def _write_results(
     run_dir: Path,
-    poses: Mapping[str, Sequence[MeasuredPose]],
+    poses: Mapping[str, Sequence[tuple[ImageId, Posed, float | None]]],
     data: DataConfig,
     numbers: Mapping[str, int],
 ) -> None:
@@ -194,15 +195,10 @@ def _write_results(
     dataset, split = data.name, "test"
     if data.root is not None and not data.is_rendered("test"):
         dataset, split = data.root.resolve().name, data.image_set("test")
-    for method, found in poses.items():
-        rows = [
-            PoseResult(
-                *one.image,
-                numbers[one.pose.object],
-                one.pose.score,
-                one.pose.T_cam_obj,
-                UNKNOWN_TIME if one.seconds is None else one.seconds,
-            )
-            for one in found
-        ]
+    for method, measured in poses.items():
+        rows = []
+        for image, pose, seconds in measured:
+            time = UNKNOWN_TIME if seconds is None else seconds
+            number = numbers[pose.object]
+            rows.append(PoseResult(*image, number, pose.score, pose.T_cam_obj, time))
         write_results(run_dir / results_name(method, dataset, split), rows)
