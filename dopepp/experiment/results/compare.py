@@ -167,7 +167,7 @@ def compare_runs(
     tiles, missing = picture_tiles(networks, shown) if shown else ([], "")
     if tiles:
         write_png(folder / PICTURES_FILE, contact_sheet(tiles, len(networks)))
-        width = 2 * max([one.shape[1] for one in panels], default=_PANEL_PX)
+        width = 2 * max([panel.shape[1] for panel in panels], default=_PANEL_PX)
         tile_width = width // max(_MIN_COLUMNS, len(networks)) - _GAP_PX
         sheet = contact_sheet(tiles, len(networks), tile_width)
         panels = [*([grid(panels, 2)] if panels else []), sheet]
@@ -214,11 +214,12 @@ def training_lines(
     have logged. Colours go by method; ``scale`` is a factor of the values.
     """
     lines = []
-    for entry in (one for one in entries if not one.refine):
-        series = [one for run in entry.runs if (one := logged(run.folder / LOG_FILE, column))]
+    for entry in (entry for entry in entries if not entry.refine):
+        logs = [logged(run.folder / LOG_FILE, column) for run in entry.runs]
+        series = [log for log in logs if log]
         steps = sorted(set(series[0]).intersection(*series[1:])) if series else []
         if steps:
-            values = scale * np.array([[one[step] for step in steps] for one in series])
+            values = scale * np.array([[log[step] for step in steps] for log in series])
             lines.append(PlotLine(entry.name, np.array(steps, float), values, colours[entry.name]))
     return lines
 
@@ -260,7 +261,7 @@ class _Model:
     def __init__(self, entry: Entry, parts: tuple[str, ...]) -> None:
         self.name, self.reason = entry.name, entry.failure
         self.estimator: PoseEstimator | None = None
-        self.run = next((one for one in entry.runs if _parts(one) == parts), entry.runs[0])
+        self.run = next((run for run in entry.runs if _parts(run) == parts), entry.runs[0])
         path = self.run.checkpoint
         if path is None or not path.is_file():
             self.reason = entry.failure or f"no file {path}"
@@ -298,10 +299,10 @@ class _Model:
             width, height = sample.size
             factor = max(1, -(-MIN_WIDTH_PX // width))
             return Tile(message_picture(width * factor, height * factor, reason), self.name)
-        known = {part.name for part in self.estimator.parts}
-        truths = [one for one in sample.instances if one.label in known]
-        wireframes = [Wireframe(one.keypoints, GREEN, "true") for one in truths]
-        wireframes += [Wireframe(one.keypoints, colour, "predicted") for one in poses]
+        names = {part.name for part in self.estimator.parts}
+        truths = [instance for instance in sample.instances if instance.label in names]
+        wireframes = [Wireframe(truth.keypoints, GREEN, "true") for truth in truths]
+        wireframes += [Wireframe(pose.keypoints, colour, "predicted") for pose in poses]
         missed = "" if poses else ": finds nothing"
         return Tile(overlay(sample.image, wireframes), f"{self.name}{missed} ({sample.key})")
 

@@ -174,8 +174,8 @@ def record_condition(
         heading(field): pivot([v for v in values if v.measure == field], _LABELS, cells)
         for field in fields
     }
-    shown = [{"measure": title, **row} for title, table in tables.items() for row in table]
-    display.show_table(f"{condition.name}: {condition.axis}", shown, num_labels=3)
+    printed = [{"measure": title, **row} for title, table in tables.items() for row in table]
+    display.show_table(f"{condition.name}: {condition.axis}", printed, num_labels=3)
     notes = [level.note for level in levels if level.note]
     for line in notes:
         _log.warning("%s", line)
@@ -187,8 +187,8 @@ def record_condition(
     panels = {}  # one per object and rate, in each every method that was measured on it
     for name in dict.fromkeys(value.object for value in values if value.object != MEAN):
         for rate in rates:
-            own = [one for one in values if one.object == name and one.measure == rate.field]
-            curves = rate_curves(own, condition.per_unit)
+            shown = [v for v in values if (v.object, v.measure) == (name, rate.field)]
+            curves = rate_curves(shown, condition.per_unit)
             drawn = {method: curve for method, curve in curves.items() if len(curve.x)}
             panels[f"{name}: {rate.title}"] = drawn
     figure = rates_figure(panels, condition.axis, len(rates), ratio=condition.ratio)
@@ -266,9 +266,9 @@ def measure_shading(
 def _shaded(share: float, metrics: Mapping[str, PoseMetrics], reached: Sequence[float]) -> Level:
     """Sum up, and say how many instances are not shaded as much as they should be."""
     # A share that is not known (NaN) is near no other.
-    num_outside = sum(not abs(one - share) <= TOLERANCE for one in reached)
-    known = [one for one in reached if np.isfinite(one)]
-    mean = float(np.mean(known)) if known else math.nan
+    num_outside = sum(not abs(covered - share) <= TOLERANCE for covered in reached)
+    finite = [covered for covered in reached if np.isfinite(covered)]
+    mean = float(np.mean(finite)) if finite else math.nan
     note = (
         f"At {SHADING.heading(share)}, {num_outside} of {len(reached)} instances are not within "
         f"{100 * TOLERANCE:g} points of it: no mask, or no background to cover them with."

@@ -56,11 +56,11 @@ def _passes(threshold: float) -> Counted:
 
 
 COMPARED: Final[dict[str, tuple[Counted, StatisticName]]] = {
-    "add_01d": (lambda one, name: _passes(0.1 * one.diameters[name])(one, name), "mean"),
+    "add_01d": (lambda report, name: _passes(0.1 * report.diameters[name])(report, name), "mean"),
     "pass_5cm": (_passes(0.05), "mean"),
     "pass_10cm": (_passes(0.1), "mean"),
-    "auc_10cm": (lambda one, name: np.clip(1 - one.errors[name] / 0.1, 0, 1), "mean"),
-    "median_rotation_deg": (lambda one, name: one.rotation_deg[name], "median"),
+    "auc_10cm": (lambda report, name: np.clip(1 - report.errors[name] / 0.1, 0, 1), "mean"),
+    "median_rotation_deg": (lambda report, name: report.rotation_deg[name], "median"),
 }
 """Measures with a Δ, by their field of ``PoseRow``, as a statistic of what instances count."""
 
@@ -153,9 +153,9 @@ def _opposite(entry: Entry, entries: Sequence[Entry]) -> Entry | None:
 
     The first refined one is set off against the first of all, and that one against nothing.
     """
-    measured = [one for one in entries if one.reports]
-    alike = [one for one in measured if one.refine == entry.refine]
-    return next((one for one in (alike[0], measured[0]) if one is not entry), None)
+    measured = [each for each in entries if each.reports]
+    alike = [each for each in measured if each.refine == entry.refine]
+    return next((each for each in (alike[0], measured[0]) if each is not entry), None)
 
 
 def _cost_values(entry: Entry, name: str) -> Iterator[Value]:
@@ -240,10 +240,10 @@ def _baseline_notes(
         yield _how(baseline, alike)
         yield from doubts
     seeds = set(baseline.seeds)
-    several = [one for one in alike if max(len(one.seeds), len(seeds)) > 1]
+    several = [entry for entry in alike if max(len(entry.seeds), len(seeds)) > 1]
     if unpaired := [entry.name for entry in several if set(entry.seeds) != seeds]:
-        said = f"Not of the same seeds as {baseline.name}, so not paired over them"
-        yield f"{said}: {', '.join(unpaired)}."
+        reason = f"Not of the same seeds as {baseline.name}, so not paired over them"
+        yield f"{reason}: {', '.join(unpaired)}."
     if not baseline.test_set:
         said = f"Without Δ: {baseline.name} does not say which images it was measured on"
         yield f"{said}; evaluate.py measures it again."

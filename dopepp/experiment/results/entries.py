@@ -138,7 +138,7 @@ def find_runs(paths: Sequence[Path]) -> list[Run]:
 def _folders(path: Path) -> list[Path]:
     if any((path / trace).exists() for trace in _TRACES):
         return [path]
-    jobs = [one for one in path.iterdir() if one.name.isdigit()] if path.is_dir() else []
+    jobs = [job for job in path.iterdir() if job.name.isdigit()] if path.is_dir() else []
     if not jobs:
         raise UserError(
             f"{path}, which holds no run",
@@ -271,8 +271,8 @@ def group(runs: Sequence[Run]) -> list[Entry]:
     """
     entries: list[Entry] = []
     for run in runs:
-        same = (one for one in entries if run.alike and run.alike == one.runs[0].alike)
-        entry = next((one for one in same if run.seed not in one.seeds), None)
+        alike = [each for each in entries if run.alike and run.alike == each.runs[0].alike]
+        entry = next((each for each in alike if run.seed not in each.seeds), None)
         if entry is None:
             entry = Entry("", failure=run.failure, pruned=run.pruned)
             entries.append(entry)
@@ -282,11 +282,10 @@ def group(runs: Sequence[Run]) -> list[Entry]:
             entry.seeds.append(run.seed)
     methods: list[list[Entry]] = []
     for entry in entries:
-        method = next((one for one in methods if _is_of_another_part(entry, one)), None)
-        if method is None:
-            methods.append([entry])
-        else:
-            method.append(entry)
+        method = next((each for each in methods if _is_of_another_part(entry, each)), [])
+        if not method:
+            methods.append(method)
+        method.append(entry)
     entries = [method[0] if len(method) == 1 else _join(method) for method in methods]
     _name(entries)
     return entries

@@ -239,7 +239,7 @@ def rate_curves(rates: Iterable[Value], per_unit: float = 1.0) -> dict[str, Rate
     for rate in rates:
         point = (per_unit * rate.condition, rate.value, rate.low, rate.high)
         points.setdefault(rate.method, []).extend([point] if rate.ends else [])
-    arrays = {method: np.array(own).reshape(-1, 4).T for method, own in points.items()}
+    arrays = {method: np.array(rows).reshape(-1, 4).T for method, rows in points.items()}
     return {method: RateCurve(*columns) for method, columns in arrays.items()}
 
 

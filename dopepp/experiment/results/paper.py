@@ -220,18 +220,18 @@ def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
     rows = []
     for name in objects:
         for label in dict.fromkeys([*methods, *layout.recomputed, *layout.paper]):
-            known = layout.paper.get(label, {})
+            in_paper = layout.paper.get(label, {})
             recomputed = layout.recomputed.get(label, {})
             # The paper's mean is over its own objects.
-            is_other_mean = name == MEAN and set(known) != set(objects)
-            printed = {} if is_other_mean else known.get(name, {})
+            is_other_mean = name == MEAN and set(in_paper) != set(objects)
+            printed = {} if is_other_mean else in_paper.get(name, {})
             entry = methods.get(label)
             if entry is not None and name in entry.objects:
                 rows.append(_pose_row(layout, label, name, texts[label, name], printed))
             elif entry is not None:
                 reason = f"{label}: {entry.failure or 'not measured on it'}"
                 rows.append(_pose_row(layout, reason, name, {}, printed))
-            elif name in known or name in recomputed:
+            elif name in in_paper or name in recomputed:
                 numbers = recomputed.get(name, {}).items()
                 cells = {layout.field(key): _number(number) for key, number in numbers}
                 rows.append(_pose_row(layout, label, name, cells, printed))
@@ -283,8 +283,8 @@ def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path)
         table = everything[everything[["object", "measure"]].eq([name, measure]).all(axis=1)]
         head = {_OBJECT: name, _MEASURE: heading(measure)}
         firsts: dict[str, pd.DataFrame] = {}  # by how poses are refined
-        for label, own in table.groupby("method", sort=False):
-            rates = 100 * own.pivot(index="seed", columns="share", values="rate")
+        for label, rows_of_label in table.groupby("method", sort=False):
+            rates = 100 * rows_of_label.pivot(index="seed", columns="share", values="rate")
             rows.append({_METHOD: label, **head, **_by_share(rates, _mean)})
             refine = methods[label].refine
             if firsts:
@@ -316,8 +316,8 @@ def _shading(label: str, entry: Entry, measures: Sequence[str]) -> pd.DataFrame:
         path = run.folder / f"{SHADING.name}.csv"
         if report is not None and path.is_file():
             table = pd.read_csv(path)
-            own = table[table["method"] == report.name].reindex(columns=columns)
-            tables.append(own.assign(seed=str(run.seed)))
+            table = table[table["method"] == report.name].reindex(columns=columns)
+            tables.append(table.assign(seed=str(run.seed)))
     keys = ["object", "measure", "share", "seed"]
     rates = pd.concat([table for table in tables if len(table)] or tables)
     rates = rates.melt(["seed", *columns[:3]], list(measures), "measure", "rate")
@@ -334,9 +334,9 @@ def _shading(label: str, entry: Entry, measures: Sequence[str]) -> pd.DataFrame:
 
 def _pooled(rates: pd.DataFrame) -> Iterator[Value]:
     """Return the mean of the rates of all seeds, as one over all their instances."""
-    for (method, share), own in rates.groupby(["method", "share"], sort=False):
-        rate = float(own["rate"].mean())
-        low, high = interval(rate, int(own["num_instances"].sum()))
+    for (method, share), seeds in rates.groupby(["method", "share"], sort=False):
+        rate = float(seeds["rate"].mean())
+        low, high = interval(rate, int(seeds["num_instances"].sum()))
         yield Value(method, "", value=rate, condition=share, low=low, high=high)
 
 
@@ -387,8 +387,8 @@ def time_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
             "on": f"{cost['device']}, {cost['threads']} threads",
         }
 
-    others = [one for one in layout.paper if one not in methods]
-    rows = [{_METHOD: one, printed: layout.printed(one, "ms/frame")} for one in others]
+    others = [label for label in layout.paper if label not in methods]
+    rows = [{_METHOD: label, printed: layout.printed(label, "ms/frame")} for label in others]
     jobs = {label: entry.runs[0].folder / FRAMES_FILE for label, entry in methods.items()}
     frames = {label: pd.read_csv(path) for label, path in jobs.items() if path.is_file()}
     if frames:
@@ -401,9 +401,10 @@ def _cost_rows(
 ) -> list[Row]:
     """Return a row per network, then those of which nobody knows the cost."""
     paths = {label: entry.runs[0].folder / COST_FILE for label, entry in methods.items()}
-    known = {label: read_json(path) for label, path in paths.items() if path.is_file()}
-    rows = [{_METHOD: label, **row(label, cost)} for label, cost in known.items()]
-    return rows + [{_METHOD: _failed(one, methods[one])} for one in methods if one not in known]
+    costs = {label: read_json(path) for label, path in paths.items() if path.is_file()}
+    rows = [{_METHOD: label, **row(label, cost)} for label, cost in costs.items()]
+    failed = [_failed(label, methods[label]) for label in methods if label not in costs]
+    return rows + [{_METHOD: text} for text in failed]
 
 
 def _failed(label: str, entry: Entry) -> str:

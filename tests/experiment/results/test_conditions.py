@@ -14,8 +14,6 @@ from dopepp.data.sample import Instance, Sample
 from dopepp.experiment.assembly.parts import build_parts
 from dopepp.experiment.assembly.renders import scaled_test_renders
 from dopepp.experiment.assembly.sources import held_out_source
-from dopepp.experiment.assembly.system import build_untrained
-from dopepp.experiment.config.protocols import Protocols
 from dopepp.experiment.results.conditions import (
     SCALE,
     SHADING,
@@ -27,10 +25,8 @@ from dopepp.experiment.results.conditions import (
 )
 from dopepp.experiment.results.frame import ADD_01D, ADD_5CM
 from dopepp.experiment.results.measurement import FileMethod, FilePose, ImageId, measure
-from dopepp.experiment.results.recording import measure_and_record
 from dopepp.experiment.results.report import Cost
 from dopepp.geometry.cuboid import cuboid_keypoints
-from dopepp.inference.estimator import PoseEstimator
 from dopepp.parts.part import Part
 
 RATES = (ADD_5CM, ADD_01D)
@@ -188,19 +184,3 @@ def test_every_method_is_measured_at_every_scale(tiny, tmp_path, caplog):
     assert note in caplog.text
     assert [tile.caption for tile in tiles] == [f"test/0/0, ×{scale}" for scale in ("0.5", 1, 20)]
     check_pictures(tmp_path, SCALE, 3)
-
-
-def test_untrained_networks_end_to_end(tiny, tmp_path):
-    config = tiny("data.num_test=2")
-    data, parts = config.data, build_parts(config.data)
-    estimator = PoseEstimator(*build_untrained(config, parts))
-    both, protocols = {"dope": estimator, "dopepp": estimator}, Protocols(scales=(0.5,))
-    reports = measure_and_record(both, parts, data, tmp_path, num_pictures=2, protocols=protocols)
-    rows = read_csv(tmp_path / "scale.csv")
-    assert [(row["method"], row["scale"], row["num_instances"]) for row in rows] == [
-        (name, scale, "2") for name in both for scale in ("0.5", "1.0")
-    ]
-    for report, row in zip(reports, rows[1::2], strict=True):
-        assert float(row["auc_10cm"]) == report.rows["pivconnector"].auc_10cm
-    for name in ("scale.png", "scale_examples.png", "overlay.png"):
-        assert cv2.imread(str(tmp_path / name)) is not None, name
