@@ -80,18 +80,14 @@ def scene_tiles(rendered: Rendered, name: str) -> Iterator[Tile]:
     names = [label if count == 1 else f"{count} {label}" for label, count in counts.items()]
     yield Tile(_posed(rendered, sample), ", ".join(names) or "no target")
     masks = [instance.mask for instance in sample.instances]
-    seen = _seen([round(100 * instance.visible_fraction) for instance in sample.instances])
+    percents = [round(100 * instance.visible_fraction) for instance in sample.instances]
+    seen = f"visible: {', '.join(f'{percent} %' for percent in percents)}"
+    if len(percents) > _LISTED:
+        seen = f"visible: {min(percents)} to {max(percents)} % of {len(percents)} targets"
+    elif not percents:
+        seen = "nothing to find"
     yield Tile(mask_panel(rendered.image, masks), f"{seen}; distractors: {others}")
     yield Tile(*depth_panel(rendered.depth, rendered.instances >= 0))
-
-
-def _seen(percents: list[int]) -> str:
-    """Say how much of each target is visible; of many, the least and the most."""
-    if not percents:
-        return "nothing to find"
-    if len(percents) > _LISTED:
-        return f"visible: {min(percents)} to {max(percents)} % of {len(percents)} targets"
-    return f"visible: {', '.join(f'{percent} %' for percent in percents)}"
 
 
 def _posed(rendered: Rendered, sample: Sample) -> Picture:

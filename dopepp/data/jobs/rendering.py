@@ -57,12 +57,13 @@ class RenderReport:
     def __str__(self) -> str:
         if not self.num_rendered:
             return f"all {self.num_images:,} images were there"
-        ms = 1000 / self.num_rendered
+        render_ms, write_ms = (
+            1000 * seconds / self.num_rendered for seconds in (self.render_s, self.write_s)
+        )
         return (
             f"{self.num_rendered:,} of {self.num_images:,} images rendered in {self.wall_s:.0f} s: "
-            f"{self.num_rendered / self.wall_s:.1f} images/s, "
-            f"{ms * (self.render_s + self.write_s):.1f} CPU-ms an image "
-            f"(rendering {ms * self.render_s:.1f}, writing {ms * self.write_s:.1f})"
+            f"{self.num_rendered / self.wall_s:.1f} images/s, {render_ms + write_ms:.1f} CPU-ms an "
+            f"image (rendering {render_ms:.1f}, writing {write_ms:.1f})"
         )
 
 
@@ -141,21 +142,18 @@ class Chunk:
     """What a shard has to do with a chunk."""
 
     number: int
-    # All of the job's images in it, also those of other shards: with these it is finalized.
-    required: range
+    required: range  # the job's images in it, also those of other shards, to finalize it with
     missing: Sequence[int]  # the shard's images in it that are not there yet
 
 
 def plan(writer: Writer, shard: Shard, num_items: int) -> Iterator[Chunk]:
     """Yield the chunks that a shard touches, in order, also those that are complete."""
     span, size = shard.span(num_items), writer.chunk_size
-    if not span:
-        return
-    for number in range(span[0] // size, span[-1] // size + 1):
+    for number in range(span.start // size, -(-span.stop // size) if span else 0):
         required = range(number * size, min((number + 1) * size, num_items))
-        own = range(max(span.start, required.start), min(span.stop, required.stop))
+        part = range(max(span.start, required.start), min(span.stop, required.stop))
         written = writer.written(number)
-        missing = [index for index in own if index not in written] if written else own
+        missing = [index for index in part if index not in written] if written else part
         yield Chunk(number, required, missing)
 
 
