@@ -91,15 +91,6 @@ def test_a_calibration_that_is_not_trusted_is_written_by_force_alone(cell, tmp_p
     assert "only 4 poses" in content["doubts"][0]
 
 
-def test_poses_in_millimetres_are_told(cell, tmp_path):
-    folder, _, _ = cell
-    words = ("--board", BOARD, "--camera", folder / "camera.yaml", "--mount", "hand")
-    words += ("--unit", "mm", "--out", tmp_path / "x.yaml")
-    done = call("handeye", folder, folder / "poses.csv", *words)
-    assert done.exit_code == 2
-    assert "--unit m" in done.output
-
-
 def test_a_tip_and_a_bench_are_written(tmp_path):
     rng = np.random.default_rng(0)
     turns = Rotation.from_euler("xyz", rng.uniform(-0.6, 0.6, (6, 3)))

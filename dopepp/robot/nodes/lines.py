@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import socket
 import sys
-from collections.abc import Callable, Iterable
-from contextlib import closing
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, nullcontext
 
 from dopepp.core.errors import RunError, UserError
 from dopepp.geometry.camera_file import Camera
@@ -30,38 +30,34 @@ def say_lines(
         UserError: The address is none, or a source cannot be read.
         RunError: A camera stopped delivering, or nobody reads stdout any more.
     """
-    if address is None:
-        _say(worker, sources, _print)
-        return
-    target = parse_address(address)
-    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sender:
-        too_long = False
+    with nullcontext(_print) if address is None else _datagrams(address) as send:
+        for source, camera in sources:
+            for frame in source.frames():
+                send(worker.result(frame, camera).to_json())
+
+
+@contextmanager
+def _datagrams(address: str) -> Iterator[Callable[[str], None]]:
+    target, left_out = parse_address(address), 0
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
 
         def send(line: str) -> None:
-            nonlocal too_long
+            nonlocal left_out
             content = f"{line}\n".encode()
             if len(content) > MAX_DATAGRAM:
-                if not too_long:
+                left_out += 1
+                if left_out == 1:
                     logger.warning(
                         "a line of %d bytes does not fit into a datagram (%d) and is left out: "
                         "raise --conf, or read --json", len(content), MAX_DATAGRAM,
                     )  # fmt: skip
-                too_long = True
                 return
             try:
                 sender.sendto(content, target)
             except OSError as error:
                 raise RunError(f"--udp {address}: {error.strerror or error}") from error
 
-        _say(worker, sources, send)
-
-
-def _say(
-    worker: Worker, sources: Iterable[tuple[Source, Camera]], send: Callable[[str], None]
-) -> None:
-    for source, camera in sources:
-        for frame in source.frames():
-            send(worker.result(frame, camera).to_json())
+        yield send
 
 
 def _print(line: str) -> None:
