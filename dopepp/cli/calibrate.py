@@ -279,7 +279,7 @@ def _chosen_views(source: str, board: Board) -> tuple[list[Sighting], tuple[int,
     """Find the board in a video or before a camera, until it ends, Ctrl-C, or views are enough."""
     from contextlib import suppress
 
-    from dopepp.core.interrupts import Interruption, interruptible
+    from dopepp.core.errors import Interruption, interruptible
     from dopepp.inference.sources import open_sources
     from dopepp.robot.calibration.lens import LOOKS_PER_S, Views
 

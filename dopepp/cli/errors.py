@@ -31,7 +31,7 @@ def resumable(advice: str | None = None) -> Iterator[None]:
 
     ``advice`` is what an interruption tells in place of how to resume.
     """
-    from dopepp.core.interrupts import RESUME, Interruption, StoppedError, interruptible
+    from dopepp.core.errors import RESUME, Interruption, StoppedError, interruptible
 
     try:
         with report_errors(), interruptible(advice or RESUME):

@@ -170,8 +170,7 @@ def serve(
 
     Nobody else reaches it, and it loads nothing from elsewhere.
     """
-    from dopepp.core.errors import require
-    from dopepp.core.interrupts import Interruption, interruptible
+    from dopepp.core.errors import Interruption, interruptible, require
 
     # Gradio asks its own server for signs of life.
     logging.getLogger("httpx").setLevel(logging.WARNING)

@@ -14,9 +14,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Final, Protocol
 
-from dopepp.core.errors import RunError, UserError
+from dopepp.core.errors import NO_SPACE, RunError, UserError
 from dopepp.core.files import PICTURES, check_target, partial_path
-from dopepp.core.interrupts import NO_SPACE
 
 if TYPE_CHECKING:
     from dopepp.data.formats.bop.results import PoseResult as Row

@@ -28,9 +28,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from dopepp.core.errors import RunError, UserError
+from dopepp.core.errors import NO_SPACE, Interruption, RunError, UserError, interruptible
 from dopepp.core.files import CONF
-from dopepp.core.interrupts import NO_SPACE, Interruption, interruptible
 from dopepp.experiment import command_line, program
 from dopepp.experiment.sweep import multirun, slurm
 

@@ -22,9 +22,8 @@ from typing import Any, Final
 import numpy as np
 import yaml
 
-from dopepp.core.errors import UserError
+from dopepp.core.errors import NO_SPACE, UserError, stopped
 from dopepp.core.files import PARTIAL_SUFFIX, is_abandoned, partial_path, write_whole
-from dopepp.core.interrupts import NO_SPACE, stopped
 from dopepp.core.json import read_json
 from dopepp.data.formats import RECORD_FILE, Writer
 from dopepp.parts.catalogue import load_part

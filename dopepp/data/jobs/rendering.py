@@ -22,8 +22,7 @@ from rich import progress as shown
 from rich.console import Console
 from rich.text import Text
 
-from dopepp.core.errors import UserError
-from dopepp.core.interrupts import StoppedError, stopped
+from dopepp.core.errors import StoppedError, UserError, stopped
 from dopepp.core.pool import ClusterPool, LostWorkerError, Pool, ProcessPool, available_cores
 from dopepp.data.formats import RECORD_FILE, Writer
 from dopepp.data.jobs.job import Job, begin, is_begun

@@ -20,8 +20,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities import rank_zero_only
 
 from dopepp.core import extensions
-from dopepp.core.errors import RunError, UserError
-from dopepp.core.interrupts import Interruption
+from dopepp.core.errors import Interruption, RunError, UserError
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment import program
 from dopepp.experiment.assembly.camera import fitted_to_camera

@@ -29,7 +29,7 @@ import torch
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 
-from dopepp.core.interrupts import Interruption
+from dopepp.core.errors import Interruption
 from dopepp.core.validation import Range, check
 from dopepp.data.batch import Batch
 from dopepp.data.datamodule import PoseLoader

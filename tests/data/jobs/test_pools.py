@@ -6,8 +6,7 @@ import signal
 
 import pytest
 
-from dopepp.core.errors import UserError
-from dopepp.core.interrupts import StoppedError
+from dopepp.core.errors import StoppedError, UserError
 from dopepp.core.pool import ClusterPool, ProcessPool
 from dopepp.data.jobs.job import WRITERS, begin
 from dopepp.data.jobs.rendering import RenderTasks, Shard, Task, render_dataset

@@ -16,9 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from dopepp.core.errors import UserError
+from dopepp.core.errors import StoppedError, UserError
 from dopepp.core.files import partial_path
-from dopepp.core.interrupts import StoppedError
 from dopepp.core.pool import PickledFunction, Pool, opened
 from dopepp.data.formats import RECORD_FILE
 from dopepp.data.formats.ndds.writer import NddsWriter
