@@ -88,8 +88,8 @@ class PhotoBackgrounds:
 
     def __init__(self, folder: Path, names: Sequence[str] | None = None) -> None:
         self.folder = Path(folder)
-        found = _photo_names(self.folder) if names is None else names
-        self.paths = [self.folder / name for name in sorted(found)]
+        photo_names = _photo_names(self.folder) if names is None else names
+        self.paths = [self.folder / name for name in sorted(photo_names)]
         if not self.paths:
             allowed = f"a folder with {', '.join(PHOTO_SUFFIXES)} files"
             fix = "correct the path, or leave it out to use procedural backgrounds"

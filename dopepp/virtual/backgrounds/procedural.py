@@ -250,7 +250,7 @@ class ClutteredBackgrounds:
         first, last = np.maximum(corner, 0), np.minimum(corner + math.ceil(size), (columns, rows))
         if (last - first < 2).any():
             return
-        wide, high = (int(one) for one in last - first)
+        wide, high = (last - first).tolist()
         mask = np.zeros((high, wide), np.uint8)
         points = np.round((outline + corner + size / 2 - first) * 2**_FINE_BITS).astype(np.int32)
         cv2.fillPoly(mask, [*points], 255, cv2.LINE_AA, _FINE_BITS)

@@ -255,11 +255,11 @@ def _smooth_patches(
     keys = (np.minimum(start, end) * np.int64(count) + np.maximum(start, end)).reshape(-1)
     order = np.argsort(keys, kind="stable")
     shared = np.flatnonzero(np.diff(keys[order]) == 0)
-    one, other = order[shared] // 3, order[shared + 1] // 3
-    meet = corners[one][:, :, None] == corners[other][:, None]
-    products = normals[one][:, :, None] * normals[other][:, None]
+    first, second = order[shared] // 3, order[shared + 1] // 3
+    meet = corners[first][:, :, None] == corners[second][:, None]
+    products = normals[first][:, :, None] * normals[second][:, None]
     agree = products.sum(axis=-1, dtype=np.float64) > 0.999
-    smooth = usable[one] & usable[other] & (agree | ~meet).all(axis=(1, 2))
-    edges = (np.ones(int(smooth.sum()), bool), (one[smooth], other[smooth]))
+    smooth = usable[first] & usable[second] & (agree | ~meet).all(axis=(1, 2))
+    edges = (np.ones(int(smooth.sum()), bool), (first[smooth], second[smooth]))
     joined = coo_array(edges, shape=(len(corners), len(corners)))
     return np.asarray(connected_components(joined, directed=False)[1], np.int32)

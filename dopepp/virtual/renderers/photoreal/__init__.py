@@ -125,10 +125,12 @@ def candidates() -> list[Path]:
     setting = os.environ.get(LIBRARY_SETTING)
     if setting:
         return [Path(setting)]
-    found = {path.resolve() for place in PLACES for path in Path("/").glob(place[1:])}
+    libraries = {path.resolve() for place in PLACES for path in Path("/").glob(place[1:])}
     # Their names give the version: libLLVM-17.so.1, libLLVM.so.19.1.
-    numbers = {path: [int(digits) for digits in re.findall(r"\d+", path.name)] for path in found}
-    return sorted(found, key=lambda path: (numbers[path], path), reverse=True)
+    numbers = {
+        path: [int(digits) for digits in re.findall(r"\d+", path.name)] for path in libraries
+    }
+    return sorted(libraries, key=lambda path: (numbers[path], path), reverse=True)
 
 
 def is_usable(library: Path) -> bool:

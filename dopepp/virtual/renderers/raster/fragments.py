@@ -97,12 +97,12 @@ def _group(
     """Group the samples of every pixel by patch; write pixel, weight, triangle, mean and 1/m."""
     num_faces = patches.shape[0]
     centre = samples.shape[0] - 1
-    found = 0
+    number = 0
     for j in range(window[1], window[3]):
         for i in range(window[0], window[2]):
-            one = ids[j, i, 0]
+            first = ids[j, i, 0]
             # Mostly one triangle, or nothing, fills a pixel.
-            alike = one == ids[j, i, 1] and one == ids[j, i, 2] and one == ids[j, i, 3]
+            alike = first == ids[j, i, 1] and first == ids[j, i, 2] and first == ids[j, i, 3]
             done = _ALL_BUT_FIRST if alike else 0
             for s in range(NUM_COLOUR_SAMPLES):
                 face = ids[j, i, s] - first_id
@@ -131,14 +131,14 @@ def _group(
                     other = ids[j, i, centre] - first_id
                     if 0 <= other < num_faces and patches[other] == patches[face]:
                         face, inverse = other, inverse_depth[j, i, centre]
-                x[found] = origin[0] + i + dx / count
-                y[found] = origin[1] + j + dy / count
-                pixel[found] = j * ids.shape[1] + i
-                weight[found] = count
-                triangle[found] = face
-                depth[found] = inverse
-                found += 1
-    return found
+                x[number] = origin[0] + i + dx / count
+                y[number] = origin[1] + j + dy / count
+                pixel[number] = j * ids.shape[1] + i
+                weight[number] = count
+                triangle[number] = face
+                depth[number] = inverse
+                number += 1
+    return number
 
 
 @compiled()
