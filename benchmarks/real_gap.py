@@ -23,10 +23,9 @@ from dopepp.core.yaml import read_yaml
 from dopepp.data.batch import collate
 from dopepp.data.sample import Sample, crop_sample, resize_sample
 from dopepp.drawing.pictures import Picture
-from dopepp.experiment.assembly.camera import fitted_to_camera
 from dopepp.experiment.assembly.parts import build_parts
 from dopepp.experiment.assembly.renders import seen_preset
-from dopepp.experiment.assembly.sources import labelled_images
+from dopepp.experiment.assembly.sources import fitted_to_camera, labelled_images
 from dopepp.experiment.assembly.system import build_system
 from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.results.folder import CONFIG_FILE

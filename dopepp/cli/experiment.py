@@ -16,7 +16,7 @@ HANDED_ON: Final = {"ignore_unknown_options": True, "help_option_names": []}
 
 def _completed(name: str) -> Callable[[typer.Context, str], list[str]]:
     def autocompletion(ctx: typer.Context, incomplete: str) -> list[str]:
-        from dopepp.experiment.completion import complete
+        from dopepp.experiment.command_line import complete
 
         return complete(name, ctx.params.get("overrides") or (), incomplete)
 

@@ -1,21 +1,25 @@
-"""The words after ``train`` and ``evaluate``: short names, requeued and resumed runs, mistakes."""
+"""The words after ``train`` and ``evaluate``: short names, resumed runs, mistakes, completion."""
 
 from __future__ import annotations
 
 import difflib
+import json
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
 from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.plugins.completion_plugin import DefaultCompletionPlugin
 from omegaconf import DictConfig
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import CONF
 from dopepp.experiment import program
-from dopepp.experiment.sweep import slurm
+from dopepp.experiment.sweep import multirun
 
 # The modules that load PyTorch are imported inside functions: a typo is told before.
 
@@ -48,7 +52,7 @@ def prepare(open_nodes: Sequence[str], short_names: Mapping[str, str], num_words
     """
     words, given = sys.argv[:num_words], sys.argv[num_words:]
     arguments = [_spelled_out(text, short_names, open_nodes) for text in given]
-    begun = slurm.begun_run([*words[1:], *arguments])
+    begun = multirun.begun_run([*words[1:], *arguments])
     if begun is not None:
         arguments.append(f"resume={begun}")
     _refuse_used_folder(arguments)
@@ -132,3 +136,36 @@ def _flat(node: DictConfig, prefix: str = "") -> Iterator[str]:
         child = node._get_node(key)
         if isinstance(child, DictConfig) and not child._is_none():
             yield from _flat(child, f"{prefix}{key!s}.")
+
+
+def complete(name: str, words: Sequence[str], incomplete: str) -> list[str]:
+    """Return what a shell may put in place of an incomplete word.
+
+    ``name`` is the entry's, ``words`` stand before. A key with one choice left is offered with its
+    values, because a shell ends a single match with a space. Bash takes ``=`` for a word of its
+    own and replaces only what follows.
+    """
+    line = re.sub(r" ?= ?", "=", " ".join([*words, incomplete]))
+    is_value = list(words[-1:]) == ["="]
+    if "virtual.scene." in line:
+        line = f"{_scene(line.split())} {line}"
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        plugin = DefaultCompletionPlugin(GlobalHydra.instance().config_loader())
+        matches = plugin._query(name, line)
+        while len(matches) == 1 and matches[0].endswith(("=", ".", "/")):
+            start = line.rpartition(" ")[0]
+            longer = plugin._query(name, f"{start} {matches[0]}")
+            if longer == matches or not longer:
+                break
+            matches = longer
+    return [match.rpartition("=")[2] if is_value else match for match in matches]
+
+
+def _scene(words: Sequence[str]) -> str:
+    """Return an override that writes out the preset's fields, which ``conf/`` does not list."""
+    from dopepp.virtual.presets import PRESETS
+
+    given = [word.partition("=")[2] for word in words if word.startswith("virtual.preset=")]
+    preset = PRESETS[given[-1] if given and given[-1] in PRESETS else "paper"]
+    fields = json.dumps(asdict(preset), separators=(",", ":")).replace('"', "")
+    return f"++virtual.scene={fields}"

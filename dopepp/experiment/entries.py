@@ -31,7 +31,7 @@ from omegaconf.errors import OmegaConfBaseException
 from dopepp.core.errors import NO_SPACE, Interruption, RunError, UserError, interruptible
 from dopepp.core.files import CONF
 from dopepp.experiment import command_line, program
-from dopepp.experiment.sweep import multirun, slurm
+from dopepp.experiment.sweep import multirun
 
 _log = logging.getLogger(__name__)
 
@@ -116,8 +116,8 @@ def entry(
     except Interruption as interruption:
         line = str(interruption)
         first = program.is_first_process()
-        if interruption.number == signal.SIGTERM and slurm.job_id() is not None and first:
-            line = f"{line}; {slurm.requeue()}"
+        if interruption.number == signal.SIGTERM and multirun.job_id() is not None and first:
+            line = f"{line}; {multirun.requeue()}"
         _exit(line, interruption.exit_code)
     except (HydraException, OmegaConfBaseException) as error:  # one of Hydra's is an OSError, too
         _exit(command_line.explain(error), USERS_MISTAKE)
@@ -163,7 +163,7 @@ def run_job(config: DictConfig, job: Job) -> float | None:
             from dopepp.experiment.run.resume import remember_overrides
 
             remember_overrides(run_dir)
-            slurm.remember_run(sys.argv[1:], run_dir)
+            multirun.remember_run(sys.argv[1:], run_dir)
         job(_plain(config), run_dir)
     # Here, because Hydra would print a stack before handing it on.
     except (UserError, OmegaConfBaseException) as error:

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from dopepp.experiment.completion import complete
+from dopepp.experiment.command_line import complete
 
 CONSOLE = """
 import sys

@@ -1,4 +1,4 @@
-"""From the ``data`` config to the DataModule, and to what each split shows.
+"""From the ``data`` config to the DataModule, to what each split shows, and in which camera.
 
 A split's images are labelled ones in a format of the field, or renders. To add a format, write a
 source and an entry in :data:`FORMATS`, or an entry point ``dopepp.formats`` to an :data:`Opener` in
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Final
@@ -35,7 +36,8 @@ from dopepp.experiment.assembly.renders import (
     training_renders,
     validation_windows,
 )
-from dopepp.experiment.config.data import DataConfig
+from dopepp.experiment.config.data import DataConfig, LensConfig
+from dopepp.experiment.config.run import RunConfig
 from dopepp.geometry.camera import Letterbox
 from dopepp.parts.part import Parts
 from dopepp.virtual.backgrounds import Backgrounds, find_backgrounds
@@ -221,3 +223,81 @@ def share_in_words(data: DataConfig) -> str | None:
         f"data.image_sets names it for {' and '.join(sharing)} as well: {all_of_it} measures all "
         "of it, training images included, and data.image_sets.test=FOLDER another one"
     )
+
+
+def fitted_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
+    """Choose, where a camera is given, scale and input size by how large the parts appear in it.
+
+    Renders of a BOP data set's models have the camera of its pictures where none is given. What was
+    chosen stands in the config as if it had been given, and the log says it.
+    """
+    config = _with_camera_of_pictures(config, parts)
+    data, virtual = config.data, config.data.virtual
+    view = virtual.view
+    if view is None:
+        return config
+    scale = virtual.camera_scale or view.scale_for(parts, data.input_size)
+    view.check(parts, scale)
+    size = data.input_size or view.window_for(parts, scale)
+    largest = view.sizes_px(parts, scale)[1]
+    if largest > min(size):
+        raise UserError(
+            f"data.input_size={list(size)} for parts of {largest:.0f} pixels across",
+            "an input that is larger than the parts in it",
+            "leave data.input_size=null, or set a smaller virtual.camera_scale",
+        )
+    for line in view.in_words(parts, scale, size):
+        _log.info("%s", line)
+    plain = {
+        **config.plain,
+        "data": {**config.plain["data"], "input_size": list(size)},
+        "virtual": {**config.plain["virtual"], "camera_scale": scale},
+    }
+    seen = replace(data, input_size=size, virtual=replace(virtual, camera_scale=scale))
+    return replace(config, plain=plain, data=seen)
+
+
+def _with_camera_of_pictures(config: RunConfig, parts: Parts) -> RunConfig:
+    """Return a config with the camera, and the distances, of the test's BOP pictures.
+
+    Only where renders are learned, no camera is given, nor, with real images, an input size.
+    """
+    data, virtual = config.data, config.data.virtual
+    rendered = data.real_fraction == 0 or (data.real_fraction < 1 and data.input_size is None)
+    if (
+        not rendered
+        or data.format != "bop"
+        or virtual.camera is not None
+        or data.is_rendered("test")
+    ):
+        return config
+    source = labelled_images(data, parts, data.eval_seed, "test")
+    if not isinstance(source, BopReader):
+        return config
+    (width, height), K, annotated = source.view()
+    distance = virtual.working_distance or annotated
+    if distance is None:
+        raise UserError(
+            f"no annotated object in {source.name}, which would tell how far away they are",
+            "working_distance=[near,far], metres",
+            "state the distances at which the camera is to find the parts",
+        )
+    if virtual.working_distance is None:
+        _log.info(
+            "%s: renders are as its camera sees parts at %g – %g m, as they are annotated there; "
+            "camera=FILE working_distance=[near,far] say it otherwise", source.name, *distance,
+        )  # fmt: skip
+    lens = LensConfig(
+        width=width, height=height,
+        fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2]),
+    )  # fmt: skip
+    chosen = replace(virtual, camera=lens, working_distance=distance)
+    plain = {
+        **config.plain,
+        "virtual": {
+            **config.plain["virtual"],
+            "camera": vars(lens),
+            "working_distance": list(distance),
+        },
+    }
+    return replace(config, plain=plain, data=replace(data, virtual=chosen))

@@ -22,7 +22,7 @@ from dopepp.experiment.results.folder import write_config, write_environment, wr
 from dopepp.experiment.results.pages import write_job_readme
 from dopepp.experiment.results.recording import measure_and_record, of_networks, refining
 from dopepp.experiment.results.report import Report
-from dopepp.experiment.run.images import warn_of_other_images
+from dopepp.experiment.run.resume import warn_of_other_images
 from dopepp.experiment.run.tuning import Tuning, tune, write_tuned
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.runtimes import is_export

@@ -23,9 +23,8 @@ from dopepp.core.errors import RunError, UserError
 from dopepp.core.files import write_csv, write_png
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.drawing.curves import figure_image, figure_with_axes
-from dopepp.experiment.assembly.camera import fitted_to_camera
 from dopepp.experiment.assembly.parts import build_parts
-from dopepp.experiment.assembly.sources import build_datamodule
+from dopepp.experiment.assembly.sources import build_datamodule, fitted_to_camera
 from dopepp.experiment.assembly.system import build_system, build_trainer
 from dopepp.experiment.config.run import LearningRateConfig, RunConfig
 from dopepp.experiment.results import display

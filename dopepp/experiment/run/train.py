@@ -23,9 +23,8 @@ from dopepp.core import extensions
 from dopepp.core.errors import Interruption, RunError, UserError
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment import program
-from dopepp.experiment.assembly.camera import fitted_to_camera
 from dopepp.experiment.assembly.parts import build_parts
-from dopepp.experiment.assembly.sources import build_datamodule
+from dopepp.experiment.assembly.sources import build_datamodule, fitted_to_camera
 from dopepp.experiment.assembly.system import (
     build_system,
     build_trainer,
@@ -47,9 +46,13 @@ from dopepp.experiment.results.paper import PaperTable
 from dopepp.experiment.results.recording import measure_and_record, refining
 from dopepp.experiment.results.report import FULL_SIZE_COST, Report
 from dopepp.experiment.run.evaluate import tune_and_record
-from dopepp.experiment.run.images import describe_images
 from dopepp.experiment.run.lr_finder import find_learning_rate
-from dopepp.experiment.run.resume import ConfigDifference, check_resume, remember_overrides
+from dopepp.experiment.run.resume import (
+    ConfigDifference,
+    check_resume,
+    describe_images,
+    remember_overrides,
+)
 from dopepp.experiment.run.tracking import log_report, tracked
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.parts.part import Parts

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.assembly.camera import fitted_to_camera
 from dopepp.experiment.assembly.parts import build_parts
-from dopepp.experiment.assembly.sources import build_datamodule, held_out_source
+from dopepp.experiment.assembly.sources import build_datamodule, fitted_to_camera, held_out_source
 from dopepp.experiment.config.data import chosen_data
 from dopepp.parts.catalogue import pivconnector
 

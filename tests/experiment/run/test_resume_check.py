@@ -12,10 +12,11 @@ import yaml
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample, SourceInfo
 from dopepp.experiment.results.folder import CONFIG_FILE, write_config
-from dopepp.experiment.run.images import describe_images, differing_images
 from dopepp.experiment.run.resume import (
     check_resume,
     config_differences,
+    describe_images,
+    differing_images,
     read_overrides,
     trusted_overrides,
 )

@@ -10,7 +10,7 @@ import yaml
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.results.folder import LAST_CHECKPOINT, write_config
-from dopepp.experiment.sweep import multirun, slurm
+from dopepp.experiment.sweep import multirun
 from dopepp.experiment.sweep.jobs import on_joblib, on_slurm
 
 RATES = ("1e-4", "1e-3", "1e-2")
@@ -180,15 +180,15 @@ def slurm_job(tmp_path, monkeypatch):
 
 
 def test_only_a_requeued_job_goes_on_and_with_its_own_command(slurm_job, tmp_path, monkeypatch):
-    slurm.remember_run(["seed=1"], tmp_path / "a")
-    slurm.remember_run(["seed=2"], tmp_path / "b")
-    assert slurm.begun_run(["seed=1"]) is None  # the first time: no restart
+    multirun.remember_run(["seed=1"], tmp_path / "a")
+    multirun.remember_run(["seed=2"], tmp_path / "b")
+    assert multirun.begun_run(["seed=1"]) is None  # the first time: no restart
     monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
-    assert slurm.begun_run(["seed=1"]) == tmp_path / "a"
-    assert slurm.begun_run(["seed=2"]) == tmp_path / "b"
-    assert slurm.begun_run(["seed=3"]) is None
+    assert multirun.begun_run(["seed=1"]) == tmp_path / "a"
+    assert multirun.begun_run(["seed=2"]) == tmp_path / "b"
+    assert multirun.begun_run(["seed=3"]) is None
     monkeypatch.setenv("SLURM_JOB_ID", "13")
-    assert slurm.begun_run(["seed=1"]) is None
+    assert multirun.begun_run(["seed=1"]) is None
 
 
 @pytest.mark.parametrize(
@@ -204,14 +204,14 @@ def test_only_a_requeued_job_goes_on_and_with_its_own_command(slurm_job, tmp_pat
 def test_a_job_is_named(variables, named, slurm_job, monkeypatch):
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    assert slurm.job_id() == named
+    assert multirun.job_id() == named
 
 
 def test_a_refused_or_missing_scontrol_is_told(slurm_job, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert slurm.requeue().startswith("SLURM did not requeue job 12: ")
+    assert multirun.requeue().startswith("SLURM did not requeue job 12: ")
     script = tmp_path / "scontrol"
     script.write_text("#!/bin/sh\necho Access denied >&2\nexit 1\n")
     script.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.defpath}")
-    assert slurm.requeue() == "SLURM did not requeue job 12: Access denied"
+    assert multirun.requeue() == "SLURM did not requeue job 12: Access denied"
