@@ -175,13 +175,13 @@ def parse_description(payload: object) -> Checkpoint:
         fix = "read the file with the dopepp that wrote it, or train again"
         raise UserError(f"format_version {version!r:.100}", f"{FORMAT_VERSION}", fix)
     # Containers whose content has a reader of its own are not copied: empty ones stand for them.
-    own = {name: payload[name] for name in ("spec", "parts", "data") if name in payload}
-    empty = {name: type(value)() for name, value in own.items() if isinstance(value, (dict, list))}
+    kept = {name: payload[name] for name in ("spec", "parts", "data") if name in payload}
+    empty = {name: type(value)() for name, value in kept.items() if isinstance(value, (dict, list))}
     fields = vars(parse(_Header, {**payload, **empty}, fix=_FIX))
-    parts = [Part.from_record(record) for record in own["parts"]]
+    parts = [Part.from_record(record) for record in kept["parts"]]
     seen = {name: Seen.parse(values) for name, values in fields["seen"].items()}
-    own |= {"spec": architecture(own["spec"]), "parts": parts, "seen": seen}
-    return Checkpoint(**{**fields, **own}, state_dict={})
+    kept |= {"spec": architecture(kept["spec"]), "parts": parts, "seen": seen}
+    return Checkpoint(**{**fields, **kept}, state_dict={})
 
 
 def _check_plain(payload: Mapping[Any, Any]) -> None:
@@ -267,11 +267,11 @@ def find(path: Path) -> Path:
     """Return the file of a path; a :class:`UserError` for an unknown ``pretrained/NAME``."""
     if path.parent != Path(FOLDER) or path.exists():
         return path
-    known = released_paths()
-    if path.name not in known:
-        names = ", ".join(f"{FOLDER}/{name}" for name in known) or "none"
+    released = released_paths()
+    if path.name not in released:
+        names = ", ".join(f"{FOLDER}/{name}" for name in released) or "none"
         raise UserError(f"checkpoint {path}", f"a file, or one of {names}", "correct the name")
-    return known[path.name]
+    return released[path.name]
 
 
 def _read_released(path: Path) -> tuple[dict[str, Any], int]:

@@ -288,8 +288,8 @@ def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         entries: Any = parse_json(header, "its header")
         metadata = entries.pop(_METADATA, {})
         # It takes these four: "another field", "a long name", "no name", "metadata of a long name".
-        known = all(entry.keys() == _FIELDS for entry in entries.values())
-        if not known or not all(0 < len(name) <= _MAX_NAME for name in (*entries, *metadata)):
+        complete = all(entry.keys() == _FIELDS for entry in entries.values())
+        if not complete or not all(0 < len(name) <= _MAX_NAME for name in (*entries, *metadata)):
             raise ValueError(f"an unknown field, or a name not of 1 to {_MAX_NAME} characters")
     except Exception as error:  # also the library's own, and what a foreign header leads to
         reason = getattr(error, "strerror", None) or getattr(error, "got", None) or str(error)

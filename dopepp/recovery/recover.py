@@ -125,12 +125,16 @@ def recover_batch(
     for image, camera in enumerate(K):
         detections: list[Detection] = []
         for c, (cuboid, name) in enumerate(zip(cuboids, labels, strict=True)):
-            own = peaks_of_object(peaks, image, c, chosen.centroid_threshold, cells, stride)
-            detections += _recover_object(own, cuboid, camera, name, chosen, stride, size, reasons)
-            if reasons is not None and not len(own.centroid):
+            object_peaks = peaks_of_object(
+                peaks, image, c, chosen.centroid_threshold, cells, stride
+            )
+            detections += _recover_object(
+                object_peaks, cuboid, camera, name, chosen, stride, size, reasons
+            )
+            if reasons is not None and not len(object_peaks.centroid):
                 beliefs = belief[image, c * NUM_KEYPOINTS : (c + 1) * NUM_KEYPOINTS]
                 reasons.append(_no_centroid(beliefs, name, chosen))
-        batch.append(sorted(detections, key=lambda one: -one.score))
+        batch.append(sorted(detections, key=lambda detection: -detection.score))
     return batch
 
 
@@ -222,37 +226,38 @@ def _or_too_small(reason: Reason, points: Float[np.ndarray, "9 2"], stride: int)
     return replace(reason, kind="small", text=f"{reason.text} (too small: {cell})")
 
 
-def rejected_refined(one: Detection, least: float) -> Reason:
-    """Say why a refined detection was dropped."""
-    text = f"once refined, score {one.score:.3f} below {least:g}"
-    return Reason(one.object, "refined", one.score, f"{text} ({one.kept})" if one.kept else text)
+def rejected_refined(detection: Detection, least: float) -> Reason:
+    """Return why a refined detection was dropped."""
+    text = f"once refined, score {detection.score:.3f} below {least:g}"
+    text += f" ({detection.kept})" if detection.kept else ""
+    return Reason(detection.object, "refined", detection.score, text)
 
 
 def furthest(reasons: Sequence[Reason]) -> list[Reason]:
     """Return of every object the reason that ended its best candidate, the best one last."""
     order = list(KINDS)
     best: dict[str, Reason] = {}
-    for one in sorted(reasons, key=lambda one: (order.index(one.kind), one.best)):
-        best.pop(one.object, None)
-        best[one.object] = one
+    for reason in sorted(reasons, key=lambda reason: (order.index(reason.kind), reason.best)):
+        best.pop(reason.object, None)
+        best[reason.object] = reason
     return list(best.values())
 
 
 def explained(reasons: Sequence[Reason]) -> str:
-    """Return one line on a picture where nothing was found."""
-    number = Counter(one.object for one in reasons)
+    """Return one line on an image without detections."""
+    counts = Counter(reason.object for reason in reasons)
     lines = []
-    for one in reversed(furthest(reasons)):
-        several = number[one.object] > 1
-        lines.append(f"{one}" + f" (the best of {number[one.object]})" * several)
+    for reason in reversed(furthest(reasons)):
+        count = counts[reason.object]
+        lines.append(f"{reason} (the best of {count})" if count > 1 else str(reason))
     return "; ".join(lines)
 
 
 def summary(silent: Sequence[Reason], num_images: int) -> str:
-    """Return one line on the pictures of many where nothing was found: a reason of each."""
+    """Return one line on images without detections, with a reason of each."""
     groups = []
     for kind, words in KINDS.items():
-        own = [one.best for one in silent if one.kind == kind]
-        if own:
-            groups.append(f"{len(own)} {words.format(best=max(own))}")
+        values = [reason.best for reason in silent if reason.kind == kind]
+        if values:
+            groups.append(f"{len(values)} {words.format(best=max(values))}")
     return f"{len(silent)} of {num_images} images silent: {', '.join(groups)}"

@@ -142,11 +142,13 @@ class SymmetryHandling:
         tables = self._on(batch.T_cam_obj.device)
         symmetric = tables["symmetric"][index] & (batch.object_index != PADDING)
         keypoints = _project(poses, tables["cuboids"][index], batch.K).to(batch.keypoints.dtype)
-        own = batch.keypoints[:, :, None].expand_as(keypoints)
+        labelled = batch.keypoints[:, :, None].expand_as(keypoints)
         border = np.radians(self.options.border_deg)
         allowed = symmetric[..., None] & (nearest - nearest[..., :1] < border)
         allowed[..., 0] = True
-        return Equivalents(torch.where(symmetric[..., None, None, None], keypoints, own), allowed)
+        return Equivalents(
+            torch.where(symmetric[..., None, None, None], keypoints, labelled), allowed
+        )
 
     def _poses(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """Return T·S·C of every discrete S, and the angle of each to the reference.

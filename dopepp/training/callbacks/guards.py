@@ -204,11 +204,11 @@ class EmptyMaps(Callback):
 
     def state_dict(self) -> dict[str, Any]:
         """Return what has been seen, for a run that goes on."""
-        return {"empty": self._num_empty, "told": self._warned, "first_loss": self._first_loss}
+        return {"empty": self._num_empty, "warned": self._warned, "first_loss": self._first_loss}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on counting."""
-        self._num_empty, self._warned = int(state_dict["empty"]), bool(state_dict["told"])
+        self._num_empty, self._warned = int(state_dict["empty"]), bool(state_dict["warned"])
         self._first_loss = float(state_dict["first_loss"])
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -131,7 +131,7 @@ class AUCCurves(Callback):
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw one curve per object; every process takes part in gathering the errors."""
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
-        (metrics,) = (one.metrics for one in callbacks if isinstance(one, PoseMetricsCallback))
+        (metrics,) = (item.metrics for item in callbacks if isinstance(item, PoseMetricsCallback))
         curves = {name: metrics.errors(name) for name in metrics.parts}
         if trainer.sanity_checking or not trainer.is_global_zero:
             return
@@ -194,7 +194,7 @@ class Overlays(ValidationSheet):
         tiles = []
         for row, detections in enumerate(system.recover(outputs, batch)):
             wireframes = [Wireframe(points, GREEN, "true") for points in truths[row]]
-            wireframes += [Wireframe(one.keypoints, YELLOW, "predicted") for one in detections]
+            wireframes += [Wireframe(pose.keypoints, YELLOW, "predicted") for pose in detections]
             tiles.append(Tile(overlay(images[row], wireframes), batch.keys[row]))
         return tiles
 
