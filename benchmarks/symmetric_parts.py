@@ -1,4 +1,4 @@
-"""Write the two symmetric parts of ``docs/symmetry.md`` as STL files in millimetres.
+"""Write the two symmetric parts of ``docs/how-to/symmetry.md`` as STL files in millimetres.
 
 ``python benchmarks/symmetric_parts.py FOLDER`` writes ``plate.stl``, 100 × 60 × 6 mm with two equal
 holes (three half turns), and ``can.stl``, a cylinder of 66 × 100 mm (round, and a flip).

@@ -25,7 +25,7 @@ from dopepp.virtual.renderers import find_renderer
 from dopepp.virtual.scene import Light, Material, Scene, SceneObject
 from dopepp.virtual.surface import make_surface
 
-TARGET = Path(__file__).parent / "chain.jpg"
+TARGET = Path(__file__).parent / "images" / "chain.jpg"
 SIDE = 320
 """Pixels of each of the four panels."""
 

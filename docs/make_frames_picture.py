@@ -1,4 +1,4 @@
-"""Draw the frames that poses are in, ``docs/results/frames.png``.
+"""Draw the frames that poses are in, ``docs/images/frames.png``.
 
 python docs/make_frames_picture.py
 """
@@ -127,7 +127,7 @@ def main() -> None:
     link = make_transform(OPTICAL_TO_LINK.T, np.array([0.0, -0.085, -0.01]))
     draw_frame(canvas, T_watch_cam @ link, 0.04, "ROS camera_link\n(drawn beside it)", (-40, 60))
     draw_frame(canvas, T_watch_cam @ T_CAM_OBJ, 0.06, "part: the mesh file's frame", (-130, 150))
-    write_png(Path(__file__).parent / "results" / "frames.png", canvas)
+    write_png(Path(__file__).parent / "images" / "frames.png", canvas)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from dopepp.parts import servoholder
 from dopepp.virtual import PRESETS, Factory
 from dopepp.virtual.renderers import RENDERERS
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[1] / "docs" / "how-to"
 
 
 def documented(page: str) -> str:

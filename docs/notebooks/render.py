@@ -14,12 +14,12 @@ import numpy as np
 from nbclient import NotebookClient
 
 FOLDER = Path(__file__).parent
-PAGES = FOLDER.parent
+PAGES = FOLDER.parent / "tutorials"
 JPEG_QUALITY = 85
 
 
 def page_of(notebook: nbformat.NotebookNode, name: str) -> str:
-    """Return an executed notebook as Markdown; its pictures go to ``docs/NAME/``."""
+    """Return an executed notebook as Markdown; its pictures go to ``docs/tutorials/NAME/``."""
     blocks = []
     for cell in notebook.cells:
         if cell.cell_type == "markdown":

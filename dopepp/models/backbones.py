@@ -1,7 +1,7 @@
 """Backbones: an RGB image to feature maps at stride 8.
 
 To add one: a subclass of :class:`Backbone` in this module and one YAML file in
-``conf/model/backbone`` (``docs/adding-a-backbone.md``).
+``conf/model/backbone`` (``docs/how-to/adding-a-backbone.md``).
 """
 
 from __future__ import annotations

@@ -184,7 +184,7 @@ def test_highlights_and_white_are_shares_of_the_picture():
 
 @pytest.mark.slow
 def test_the_faults_of_many_pictures_are_named(estimator, factory, empty):
-    """Each on forty pictures, as docs/doctor.md lists them."""
+    """Each on forty pictures, as docs/how-to/doctor.md lists them."""
     right = Counter()
     for index in range(40):
         rendered, without = factory.render(0, index), empty.render(0, index)

@@ -4,7 +4,7 @@ Items are written one by one and finalized chunk by chunk. An item's last file m
 complete. Files that a chunk's items share (``scene_gt.json``, a tar shard) are assembled from
 items that are staged in a hidden folder.
 
-To add a format, see ``docs/adding-a-data-format.md``.
+To add a format, see ``docs/how-to/adding-a-data-format.md``.
 """
 
 from __future__ import annotations
