@@ -4,8 +4,8 @@ Poses come as ``(R_est, t_est, R_gt, t_gt)`` with shapes (N, 3, 3), (N, 3), (N, 
 metres and ``T_cam_obj`` convention; object points as (V, 3). Every error is (N,). A pose that is
 not finite has an infinite error: it is a miss, and no function here returns NaN.
 
-To add an error, write one function of this form, its formula in ``docs/reference/metrics.md`` and a test
-against an independent implementation.
+To add an error, write one function of this form, its formula in ``docs/reference/metrics.md`` and
+a test against an independent implementation.
 """
 
 from dopepp.metrics.functional.distances import BOP_MSPD_THRESHOLDS as BOP_MSPD_THRESHOLDS

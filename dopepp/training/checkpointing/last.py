@@ -2,7 +2,7 @@
 
 A run that was cut off anywhere and resumed ends with the weights, the best checkpoint and the
 metrics of one that was not, as far as its arithmetic repeats (on CPUs it does). See
-``docs/explanation/reliability.md``. Ctrl-C and SIGTERM are remembered and answered between two steps.
+``docs/explanation/reliability.md``. Ctrl-C and SIGTERM take effect between two steps.
 
 Lightning's ``ModelCheckpoint`` keeps the best checkpoint, and cannot keep this one. It saves inside
 a batch or a validation, or at the end of an epoch, where Lightning's counters (a batch counts as
