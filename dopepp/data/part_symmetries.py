@@ -26,7 +26,7 @@ from dopepp.data.formats.bop.models import (
 )
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Part
-from dopepp.parts.symmetry import TOLERANCE, find_symmetries
+from dopepp.parts.symmetry_finder import TOLERANCE, find_symmetries
 
 _log = logging.getLogger(__name__)
 

@@ -86,8 +86,8 @@ class Camera:
             UserError: K belongs to another size and neither is stated, or what is stated is wrong.
         """
         if K_size is not None and crop is not None:
-            got, fix = "--K-size with --crop", "crop first, and pass the K of the crop's size"
-            raise UserError(got, "one of the two", fix)
+            problem, fix = "--K-size with --crop", "crop first, and pass the K of the crop's size"
+            raise UserError(problem, "one of the two", fix)
         if K_size is not None:
             stated = f"--K-size {K_size[0]} {K_size[1]}"
             if min(K_size) < 1:
@@ -95,19 +95,21 @@ class Camera:
             if self.size is not None and K_size != self.size:
                 allowed = f"the file's own size, {_by(self.size)}"
                 raise UserError(f"{stated} with {self.source}", allowed, "correct it")
-        own = K_size or self.size
-        if own is not None:
-            check_camera(self.K, own, self.source, WHOLE)
+        calibrated = K_size or self.size
+        if calibrated is not None:
+            check_camera(self.K, calibrated, self.source, WHOLE)
         if crop is not None:
-            K = check_camera(_cut(self.K, own, size, crop), size, self.source, ANYWHERE)
-        elif own is None or own == size:
+            K = check_camera(_cut(self.K, calibrated, size, crop), size, self.source, ANYWHERE)
+        elif calibrated is None or calibrated == size:
             K = check_camera(self.K, size, self.source, WHOLE)
-        elif K_size is None or not _one_shape(size, own):
-            got = f"{self.source}, whose K is of {_by(own)}, for a picture of {_by(size)}"
+        elif K_size is None or not _one_shape(size, calibrated):
+            problem = (
+                f"{self.source}, whose K is of {_by(calibrated)}, for a picture of {_by(size)}"
+            )
             allowed = "K of the picture's size, or how the picture was made of one of the other"
-            raise UserError(got, allowed, _fix(size, own))
+            raise UserError(problem, allowed, _fix(size, calibrated))
         else:
-            K = resize_camera(self.K, size[0] / own[0], size[1] / own[1])
+            K = resize_camera(self.K, size[0] / calibrated[0], size[1] / calibrated[1])
         return replace(self, size=size, K=K)
 
 
@@ -128,19 +130,19 @@ def camera_of_fields(fields: Mapping[str, object], source: str) -> Camera:
     return _camera(calibration_of_fields(fields, source), source)
 
 
-def _camera(found: Calibration, source: str) -> Camera:
-    """Check what was found of a camera."""
-    K = pinhole_matrix(found.K, source)
+def _camera(calibration: Calibration, source: str) -> Camera:
+    """Check a calibration and return its camera."""
+    K = pinhole_matrix(calibration.K, source)
     if min(K[0, 0], K[1, 1]) <= 0:
-        got = f"{source}: fx={K[0, 0]:g}, fy={K[1, 1]:g}"
+        problem = f"{source}: fx={K[0, 0]:g}, fy={K[1, 1]:g}"
         fix = "calibrate the camera: this one was not"
-        raise UserError(got, "focal lengths above 0 pixels", fix)
-    if len(found.distortion) not in COEFFICIENTS:
-        got = f"{source}: {len(found.distortion)} distortion coefficients"
+        raise UserError(problem, "focal lengths above 0 pixels", fix)
+    if len(calibration.distortion) not in COEFFICIENTS:
+        problem = f"{source}: {len(calibration.distortion)} distortion coefficients"
         allowed = f"{', '.join(map(str, COEFFICIENTS))} in OpenCV's order (k1, k2, p1, p2, k3, …)"
-        raise UserError(got, allowed, "add zeros for those that the calibration left out")
-    lens = found.distortion if any(found.distortion) else ()
-    return Camera(found.size, K, lens, source)
+        raise UserError(problem, allowed, "add zeros for those that the calibration left out")
+    lens = calibration.distortion if any(calibration.distortion) else ()
+    return Camera(calibration.size, K, lens, source)
 
 
 def _text(path: Path) -> str:
@@ -158,22 +160,22 @@ def _text(path: Path) -> str:
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        got = f"camera file {path}: byte {error.start} is no UTF-8"
-        raise UserError(got, allowed, "pass the camera's file") from error
+        problem = f"camera file {path}: byte {error.start} is no UTF-8"
+        raise UserError(problem, allowed, "pass the camera's file") from error
     return text.strip()
 
 
-def _cut(K: CameraMatrix, own: Size | None, size: Size, crop: Crop) -> CameraMatrix:
+def _cut(K: CameraMatrix, calibrated: Size | None, size: Size, crop: Crop) -> CameraMatrix:
     """Return the K of what was cut out of a picture."""
     x, y, width, height = crop
-    said = "--crop " + " ".join(map(str, crop))
+    stated = "--crop " + " ".join(map(str, crop))
     if (width, height) != size:
-        got = f"{said} with a picture of {_by(size)}"
-        raise UserError(got, "the picture's width and height behind x and y", "correct it")
-    beyond = own is not None and (x + width > own[0] or y + height > own[1])
+        problem = f"{stated} with a picture of {_by(size)}"
+        raise UserError(problem, "the picture's width and height behind x and y", "correct it")
+    beyond = calibrated is not None and (x + width > calibrated[0] or y + height > calibrated[1])
     if min(x, y) < 0 or beyond:
-        inside = f"inside the calibrated picture{f' of {_by(own)}' if own else ''}"
-        raise UserError(said, f"x y width height {inside}", "correct it")
+        inside = f"inside the calibrated picture{f' of {_by(calibrated)}' if calibrated else ''}"
+        raise UserError(stated, f"x y width height {inside}", "correct it")
     return crop_camera(K, x, y)
 
 
@@ -182,13 +184,15 @@ def _one_shape(a: Size, b: Size) -> bool:
     return min(abs(a[0] - a[1] * b[0] / b[1]), abs(a[1] - a[0] * b[1] / b[0])) <= 1
 
 
-def _fix(size: Size, own: Size) -> str:
+def _fix(size: Size, calibrated: Size) -> str:
     """Say what to do where a picture's size is not the one that K belongs to."""
-    fits = size[0] <= own[0] and size[1] <= own[1]
+    fits = size[0] <= calibrated[0] and size[1] <= calibrated[1]
     cut = f"--crop X Y {size[0]} {size[1]} if it was cut out" if fits else ""
-    if _one_shape(size, own):
-        return f"--K-size {own[0]} {own[1]} if the picture was resized" + (cut and f", {cut}")
-    if size == own[::-1]:
+    if _one_shape(size, calibrated):
+        return f"--K-size {calibrated[0]} {calibrated[1]} if the picture was resized" + (
+            cut and f", {cut}"
+        )
+    if size == calibrated[::-1]:
         return "turn the picture back, or calibrate the turned one (EXIF orientation is applied)"
     return cut or f"calibrate the camera at {_by(size)}"
 

@@ -116,8 +116,8 @@ def _xml(text: str, source: str) -> dict[object, object]:
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
-        got = f"{source}, unreadable: {error!s:.200}"
-        raise UserError(got, allowed, "write the file again") from error
+        problem = f"{source}, unreadable: {error!s:.200}"
+        raise UserError(problem, allowed, "write the file again") from error
     if root.tag != "opencv_storage":
         raise UserError(f"{source}: <{root.tag:.50}>", allowed, "write it with cv2.FileStorage")
     return {node.tag: {part.tag: _words(part) for part in node} or _words(node) for node in root}
@@ -175,8 +175,8 @@ class _Fields:
             camera = cameras[0] if len(cameras) == 1 else None
             inner = camera.get("intrinsic_settings") if isinstance(camera, Mapping) else None
             if not isinstance(camera, Mapping) or not isinstance(inner, Mapping):
-                got = f"{source}: camera_settings of {len(cameras)} cameras"
-                raise UserError(got, "one camera with intrinsic_settings", "keep one of them")
+                problem = f"{source}: camera_settings of {len(cameras)} cameras"
+                raise UserError(problem, "one camera with intrinsic_settings", "keep one of them")
             size = camera.get("captured_image_size")
             content = {**inner, **(size if isinstance(size, Mapping) else {})}
         named = {name[:40]: value for name, value in content.items() if isinstance(name, str)}
@@ -220,8 +220,8 @@ def _numbers(name: str, value: object) -> list[float]:
         rows, columns = value.get("rows"), value.get("cols")
         stated = None not in (rows, columns)
         if stated and len(numbers) != _number(name, rows) * _number(name, columns):
-            got = f"{name} of {rows}×{columns} with {len(numbers)} numbers"
-            raise UserError(got, "as many numbers as rows × cols", "write the file again")
+            problem = f"{name} of {rows}×{columns} with {len(numbers)} numbers"
+            raise UserError(problem, "as many numbers as rows × cols", "write the file again")
         return numbers
     rows = value if isinstance(value, list) else [value]
     flat = [entry for row in rows for entry in (row if isinstance(row, list) else [row])]
@@ -232,8 +232,8 @@ def _number(name: str, value: Any) -> float:
     """Return a number, which XML has as text."""
     numbers = None if isinstance(value, bool) else _floats([value])
     if numbers is None:
-        got = f"{name}={shown(value, 80)}"
-        raise UserError(got, "finite numbers", "write it as plain numbers, without base64")
+        problem = f"{name}={shown(value, 80)}"
+        raise UserError(problem, "finite numbers", "write it as plain numbers, without base64")
     return numbers[0]
 
 

@@ -45,10 +45,10 @@ def focal_factor(
 
     ``keypoints`` are pixels, NaN where unknown; the pose is the one found with K, metres.
     """
-    known = np.isfinite(keypoints).all(axis=1)
-    if known.sum() < MIN_POINTS:
+    is_known = np.isfinite(keypoints).all(axis=1)
+    if is_known.sum() < MIN_POINTS:
         return None
-    extent = float(np.ptp(keypoints[known], axis=0).max())
+    extent = float(np.ptp(keypoints[is_known], axis=0).max())
 
     def errors(values: Float[np.ndarray, "unknowns"], first: float) -> Float[np.ndarray, "errors"]:
         step, lens, start = values[:6].copy(), K.copy(), T_cam_obj.copy()
@@ -56,8 +56,8 @@ def focal_factor(
         lens[[0, 1], [0, 1]] *= factor
         start[2, 3] *= factor  # where the part appears as large
         step[3:] *= start[2, 3]
-        seen = project_keypoints(cuboid, moved(start, step), lens)[known]
-        return np.asarray(np.nan_to_num((seen - keypoints[known]) / extent, nan=10.0).ravel())
+        seen = project_keypoints(cuboid, moved(start, step), lens)[is_known]
+        return np.asarray(np.nan_to_num((seen - keypoints[is_known]) / extent, nan=10.0).ravel())
 
     def fitted(unknowns: int, first: float) -> OptimizeResult:
         """Fit the pose and, with a seventh unknown, the logarithm of the factor over ``first``."""
@@ -68,9 +68,9 @@ def focal_factor(
         )
 
     free = {first: fitted(7, first) for first in LENGTHS}
-    first = min(free, key=lambda one: float(free[one].cost))
+    first = min(free, key=lambda factor: float(free[factor].cost))
     best = free[first]
-    spare = 2 * int(known.sum()) - 7
+    spare = 2 * int(is_known.sum()) - 7
     covariance = np.linalg.pinv(best.jac.T @ best.jac) * 2 * best.cost / spare
     gain = (2 * fitted(6, 1.0).cost / (spare + 1)) / max(2 * best.cost / spare, 1e-12)
     return Focal(first * math.exp(best.x[6]), math.sqrt(covariance[6, 6]), float(gain))

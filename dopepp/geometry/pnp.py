@@ -285,11 +285,14 @@ class _Starts:
             steps = np.full((len(kept), 6), np.nan)
             for step, rows in zip(steps, kept, strict=True):
                 with suppress(cv2.error):  # OpenCV 5 raises on coincident points
-                    found, vector, move = cv2.solvePnP(
-                        self.object_points[rows], self.rays[rows], _NO_CAMERA, None,
+                    solved, vector, move = cv2.solvePnP(
+                        self.object_points[rows],
+                        self.rays[rows],
+                        _NO_CAMERA,
+                        None,
                         flags=cv2.SOLVEPNP_SQPNP,
-                    )  # fmt: skip
-                    if found:
+                    )
+                    if solved:
                         step[:3], step[3:] = vector[:, 0], move[:, 0]
             self._steps.append(steps)
         return self._steps[left_out]

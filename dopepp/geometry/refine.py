@@ -161,7 +161,7 @@ def normal_equations(
         gradient[c] = 0.0
         for d in range(6):
             hessian[c, d] = 0.0
-    rows, own = np.empty((2, 6)), np.empty(6)
+    rows, jacobian = np.empty((2, 6)), np.empty(6)
     for i in range(len(rays)):
         squared = residuals[i, 0] ** 2 + residuals[i, 1] ** 2
         if not squared >= 0.0:
@@ -180,11 +180,11 @@ def normal_equations(
         for r in range(2):
             a, b = whitening[i, r, 0] * inverse, whitening[i, r, 1] * inverse
             for c in range(6):
-                own[c] = a * rows[0, c] + b * rows[1, c]
+                jacobian[c] = a * rows[0, c] + b * rows[1, c]
             for c in range(6):
-                gradient[c] += weight * own[c] * residuals[i, r]
+                gradient[c] += weight * jacobian[c] * residuals[i, r]
                 for d in range(c + 1):
-                    hessian[c, d] += weight * own[c] * own[d]
+                    hessian[c, d] += weight * jacobian[c] * jacobian[d]
     for c in range(6):
         for d in range(c):
             hessian[d, c] = hessian[c, d]
@@ -299,11 +299,11 @@ def _spreads(
             centred[i, axis] = (object_points[i, axis] - mean) / extent  # NaN for a single place
     for i in range(n):
         deviation = (whitening[i, 0, 0] * whitening[i, 1, 1]) ** -0.5
-        place = i
-        while place > 0 and sigma[place - 1] > deviation:
-            sigma[place] = sigma[place - 1]
-            place -= 1
-        sigma[place] = deviation
+        rank = i
+        while rank > 0 and sigma[rank - 1] > deviation:
+            sigma[rank] = sigma[rank - 1]
+            rank -= 1
+        sigma[rank] = deviation
         for axis in range(2):
             spread[i, axis] = to_px[axis, 0] * rays[i, 0] + to_px[axis, 1] * rays[i, 1]
     distinct = 0.0

@@ -100,18 +100,18 @@ def paired_difference(
     if np.isnan(np.concatenate(figures)).any():
         return None
     rng = np.random.default_rng(seed)
-    counts = [len(own) for own in figures]
+    counts = [len(by_seed) for by_seed in figures]
     draws = [rng.multinomial(n, np.full(n, 1 / n), num_resamples) / n for n in counts]
     if same_seeds:
         draws[1] = draws[0]
     resampled = _resampled_difference(mine, baseline, compute, draws, rng)
     if few_seeds:
         resampled += _stretching(figures, draws, same_seeds, confidence)
-    known = resampled[~np.isnan(resampled)]
-    if not len(known):
+    defined = resampled[~np.isnan(resampled)]
+    if not len(defined):
         return None
     tail = (1 - confidence) / 2
-    low, high = np.quantile(known, [tail, 1 - tail])
+    low, high = np.quantile(defined, [tail, 1 - tail])
     value = float(figures[0].mean() - figures[1].mean())
     paired = same_seeds and len(figures[0]) > 1 and statistic == "mean"
     needed = seeds_to_tell(mine, baseline, confidence) if paired else None
@@ -129,11 +129,12 @@ def seeds_to_tell(mine: Numbers, baseline: Numbers, confidence: float = 0.95) ->
     Returned is S, more than there are of these paired rows; infinite where the instances are too
     few for any number of seeds.
     """
-    differences = [one - other for one, other in zip(mine, baseline, strict=True)]
-    if min(one.shape[1] for one in differences) < 2:
+    differences = [ours - theirs for ours, theirs in zip(mine, baseline, strict=True)]
+    if min(values.shape[1] for values in differences) < 2:
         return math.inf
-    effects = np.mean([one.mean(axis=1) for one in differences], axis=0)
-    over_instances = sum(one.mean(axis=0).var(ddof=1) / one.shape[1] for one in differences)
+    effects = np.mean([values.mean(axis=1) for values in differences], axis=0)
+    variances = [v.mean(axis=0).var(ddof=1) / v.shape[1] for v in differences]
+    over_instances = sum(variances)
     level = (1 + confidence) / 2
     z = norm.ppf(level)
     room = effects.mean() ** 2 - z**2 * over_instances / len(differences) ** 2
@@ -178,8 +179,8 @@ def _check(mine: Numbers, baseline: Numbers, statistic: str, same_seeds: bool) -
     """Refuse what cannot be paired."""
     shapes = [[values.shape for values in method] for method in (mine, baseline)]
     plain = all(len(shape) == 2 and min(shape) > 0 for shape in [*shapes[0], *shapes[1]])
-    seeds = [{shape[0] for shape in own} for own in shapes]
-    counts = [[shape[-1] for shape in own] for own in shapes] if plain else [[], []]
+    seeds = [{shape[0] for shape in method} for method in shapes]
+    counts = [[shape[-1] for shape in method] for method in shapes] if plain else [[], []]
     if not plain or not mine or counts[0] != counts[1] or max(map(len, seeds)) > 1:
         raise UserError(
             f"numbers of shapes {shapes[0]} and, of the baseline, {shapes[1]}",
@@ -188,14 +189,16 @@ def _check(mine: Numbers, baseline: Numbers, statistic: str, same_seeds: bool) -
         )
     if same_seeds and seeds[0] != seeds[1]:
         raise UserError(
-            f"{seeds[0].pop()} seeds against {seeds[1].pop()}", "as many, to pair them",
+            f"{seeds[0].pop()} seeds against {seeds[1].pop()}",
+            "as many, to pair them",
             "pass same_seeds=False",
-        )  # fmt: skip
+        )
     if statistic == "mean" and not all(np.isfinite(v).all() for v in [*mine, *baseline]):
         raise UserError(
-            "a mean over numbers that are not finite", "finite numbers",
+            "a mean over numbers that are not finite",
+            "finite numbers",
             "turn a miss into what it counts, e.g. 0 of a pass rate",
-        )  # fmt: skip
+        )
 
 
 def _resampled_difference(
@@ -207,13 +210,13 @@ def _resampled_difference(
 ) -> Float[np.ndarray, "resamples"]:
     """Return the difference in each resample, averaged over objects."""
     total = np.zeros(len(draws[0]))
-    for one, other in zip(mine, baseline, strict=True):
-        count = one.shape[1]
-        step = max(1, _BLOCK // (count * max(len(one), len(other))))
+    for ours, theirs in zip(mine, baseline, strict=True):
+        count = ours.shape[1]
+        step = max(1, _BLOCK // (count * max(len(ours), len(theirs))))
         for start in range(0, len(total), step):
             rows = slice(start, start + step)
             drawn = rng.integers(count, size=(len(total[rows]), count))
-            for sign, values, weights in ((1, one, draws[0]), (-1, other, draws[1])):
+            for sign, values, weights in ((1, ours, draws[0]), (-1, theirs, draws[1])):
                 by_seed = compute(values[:, drawn]).T
                 # A seed that was not drawn must not count, even where its figure does not exist.
                 weighted = np.where(weights[rows] > 0, weights[rows] * by_seed, 0.0)
@@ -245,9 +248,9 @@ def _stretching(
 def _num_differing(mine: Numbers, baseline: Numbers) -> int:
     """Count instances whose numbers, as a list over seeds, differ between the methods."""
     count = 0
-    for one, other in zip(mine, baseline, strict=True):
-        sums = [np.sort(np.where(np.isfinite(v), v, np.inf), axis=0).mean(axis=0)
-                for v in (one, other)]  # fmt: skip
+    for ours, theirs in zip(mine, baseline, strict=True):
+        finite = [np.where(np.isfinite(v), v, np.inf) for v in (ours, theirs)]
+        sums = [np.sort(values, axis=0).mean(axis=0) for values in finite]
         # Of other numbers of seeds, equal numbers may have means that differ in the last digit.
         count += int((~np.isclose(sums[0], sums[1], rtol=1e-12, atol=0)).sum())
     return count

@@ -30,7 +30,7 @@ from dopepp.metrics.functional import (
     vsd,
 )
 from dopepp.metrics.pose import PredictedPose, TruePose, counted
-from dopepp.metrics.row import bop_points, symmetries
+from dopepp.metrics.row import bop_points, symmetry_transforms
 from dopepp.parts.part import Part
 
 Draw = Callable[[Part, Transform, CameraMatrix, Size], DepthMap]
@@ -96,9 +96,11 @@ class Localisation:
     ) -> None:
         """Add one image; ``depth`` is what was measured on it, metres."""
         for part in self._parts.values():
-            true = [one.T_cam_obj for one in instances if one.label == part.name and counted(one)]
-            own = sorted((d for d in detections if d.object == part.name), key=lambda d: -d.score)
-            estimated = [one.T_cam_obj for one in own[: len(true)]]
+            true = [i.T_cam_obj for i in instances if i.label == part.name and counted(i)]
+            ranked = sorted(
+                (d for d in detections if d.object == part.name), key=lambda d: -d.score
+            )
+            estimated = [detection.T_cam_obj for detection in ranked[: len(true)]]
             if not true:
                 continue
             group = _errors(part, np.array(estimated).reshape(-1, 4, 4), np.array(true), K, size[0])
@@ -127,7 +129,7 @@ class Localisation:
         ar_vsd = None
         of_vsd = [group.vsd for group in self._groups if group.vsd is not None]
         if len(of_vsd) == len(self._groups):
-            each = [[one[..., k] for one in of_vsd] for k in range(len(BOP_THRESHOLDS))]
+            each = [[errors[..., k] for errors in of_vsd] for k in range(len(BOP_THRESHOLDS))]
             ar_vsd = float(np.mean([average(errors, BOP_THRESHOLDS) for errors in each]))
         return BopScores(
             num_targets=num_targets,
@@ -178,7 +180,7 @@ def _errors(
     T_est = torch.from_numpy(np.repeat(estimated.astype(np.float64), shape[1], axis=0))
     T_gt = torch.from_numpy(np.tile(true.astype(np.float64), (shape[0], 1, 1)))
     poses = T_est[:, :3, :3], T_est[:, :3, 3], T_gt[:, :3, :3], T_gt[:, :3, 3]
-    vertices, group = bop_points(part), symmetries(part)
+    vertices, group = bop_points(part), symmetry_transforms(part)
     cameras = torch.from_numpy(np.asarray(K, np.float64)).expand(len(T_est), 3, 3)
     average = add_s if len(group) > 1 else add
 

@@ -104,13 +104,13 @@ def assign(
     distances = torch.from_numpy(np.linalg.norm(offsets, axis=2))
     scores = torch.tensor([float(d.score) for d in detections], dtype=torch.float64)
     counts = np.array([counted(i) for i in instances], bool)
-    found = np.full(len(detections), -1)
+    assigned = np.full(len(detections), -1)
     for group in (counts, ~counts):
-        left, numbers = np.flatnonzero(found < 0), np.flatnonzero(group)
+        left, numbers = np.flatnonzero(assigned < 0), np.flatnonzero(group)
         matches = match(scores[left], distances[left][:, numbers]).numpy()
         hit = matches >= 0
-        found[left[hit]] = numbers[matches[hit]]
-    return found
+        assigned[left[hit]] = numbers[matches[hit]]
+    return assigned
 
 
 def counted(instance: TruePose) -> bool:
@@ -172,21 +172,21 @@ class PoseMetrics(Metric):
                 )
         camera = _camera(K, width)
         for index, part in enumerate(self.parts.values()):
-            own = [d for d in detections if d.object == part.name]
+            candidates = [d for d in detections if d.object == part.name]
             true = [i for i in instances if i.label == part.name]
-            found = assign(part.cuboid[CENTROID], own, true)
+            assigned = assign(part.cuboid[CENTROID], candidates, true)
             table = np.full((len(true), _WIDTH), np.nan)
             table[:, 0], table[:, _CAMERA] = index, camera
             for row, instance in zip(table, true, strict=True):
                 row[_T_GT], row[_VISIBLE] = np.ravel(instance.T_cam_obj), instance.visible_fraction
-            for number, detection in zip(found, own, strict=True):
+            for number, detection in zip(assigned, candidates, strict=True):
                 if number >= 0:
                     table[number, _T_EST] = np.ravel(detection.T_cam_obj)
                     table[number, _SCORE] = detection.score
                     if detection.covariance is not None:
                         table[number, _COVARIANCE] = np.ravel(detection.covariance)
             self._keep(self.poses, table[[counted(instance) for instance in true]])
-            strays = [(index, own[k].score) for k in np.flatnonzero(found < 0)]
+            strays = [(index, candidates[k].score) for k in np.flatnonzero(assigned < 0)]
             self._keep(self.false_positives, np.array(strays, np.float64))
 
     def _keep(self, state: list[Tensor], rows: Float[np.ndarray, "rows columns"]) -> None:
@@ -267,7 +267,7 @@ class Gathered:
         false_positives: Float[Tensor, "false_positives"],
     ) -> None:
         self.part, self.false_positives = part, false_positives
-        T_est, self.T_gt = (table[:, place].reshape(-1, 4, 4) for place in (_T_EST, _T_GT))
+        T_est, self.T_gt = (table[:, columns].reshape(-1, 4, 4) for columns in (_T_EST, _T_GT))
         self.visible_fractions, self.scores = table[:, _VISIBLE], table[:, _SCORE]
         camera = table[:, _CAMERA]
         self.K = camera[:, :9].reshape(-1, 3, 3)

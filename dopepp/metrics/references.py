@@ -24,7 +24,7 @@ from torch import Tensor
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import nearest_rotation, random_rotation
 from dopepp.metrics.functional import add, add_s, mssd, pass_rate, rotation_error_deg
-from dopepp.metrics.row import PoseErrors, PoseRow, bop_points, summarise, symmetries
+from dopepp.metrics.row import PoseErrors, PoseRow, bop_points, summarise, symmetry_transforms
 from dopepp.parts.part import Part
 
 CHANCE_ALL: Final = "chance, all rotations"
@@ -68,7 +68,7 @@ def reference_rows(
         guesses[BEST_CONSTANT] = _best_constant(rotations, few_points, 0.1 * part.diameter)
     rows = {}
     for name, guess in guesses.items():
-        rows[name] = PoseRow(part.name, name, 0, num_symmetries=len(symmetries(part)))
+        rows[name] = PoseRow(part.name, name, 0, num_symmetries=len(symmetry_transforms(part)))
         if len(guess):
             rows[name] = _row(part, name, torch.from_numpy(guess), few_points, points)
         rows[name].num_instances = num_instances
@@ -85,7 +85,7 @@ def _row(part: Part, name: str, Q: Tensor, few_points: Tensor, points: Tensor) -
     # Symmetries are transforms of the object frame, whose origin may lie anywhere.
     centre = torch.from_numpy(np.asarray(part.cuboid[CENTROID], np.float64))
     turned = Q[some], centre - Q[some] @ centre, identity[some], nowhere[some]
-    group = symmetries(part)
+    group = symmetry_transforms(part)
     errors = PoseErrors(
         add=add(Q, nowhere, identity, nowhere, few_points),
         add_s=add_s(*about_centre, points),

@@ -89,7 +89,7 @@ class PoseErrors:
         """
         poses = T_est[:, :3, :3], T_est[:, :3, 3], T_gt[:, :3, :3], T_gt[:, :3, 3]
         points = torch.from_numpy(np.asarray(part.points, np.float64))
-        vertices, group = bop_points(part), symmetries(part)
+        vertices, group = bop_points(part), symmetry_transforms(part)
         has_cameras = bool(K.isfinite().all() & width.isfinite().all())
         return cls(
             add=add(*poses, points),
@@ -110,7 +110,7 @@ class PoseErrors:
         return self.add_s if self.num_symmetries > 1 else self.add
 
 
-def symmetries(part: Part) -> Float[Tensor, "s 4 4"]:
+def symmetry_transforms(part: Part) -> Float[Tensor, "s 4 4"]:
     """Return the part's symmetry transforms, the identity first."""
     return torch.from_numpy(symmetry_group(part.symmetries_discrete, part.symmetries_continuous))
 
@@ -304,7 +304,7 @@ def shown_columns(row: PoseRow, all_measures: bool = False) -> list[Column]:
 
 def summarise(name: str, method: str, errors: PoseErrors) -> PoseRow:
     """Fill the measures that follow from the errors of N >= 1 poses alone."""
-    measures: dict[str, Any] = {one.field: one.formula(errors) for one in COLUMNS if one.formula}
+    measures: dict[str, Any] = {c.field: c.formula(errors) for c in COLUMNS if c.formula}
     return PoseRow(name, method, len(errors.add), num_symmetries=errors.num_symmetries, **measures)
 
 
@@ -319,8 +319,8 @@ def mean_row(rows: Sequence[PoseRow], method: str) -> PoseRow:
     for column in COLUMNS:
         counted = column.field in _TOTALS
         values = [getattr(row, column.field) for row in rows if counted or row.num_instances]
-        known = torch.tensor([v for v in values if v is not None], dtype=torch.float64)
-        if len(known):
-            value = int(known.sum()) if counted else float(known.mean())
+        available = torch.tensor([v for v in values if v is not None], dtype=torch.float64)
+        if len(available):
+            value = int(available.sum()) if counted else float(available.mean())
             setattr(mean, column.field, value)
     return mean

@@ -141,8 +141,11 @@ def with_meshes(
             single = len(names) == len(given) == 1
             name = names[0] if single else text if text in BUILTIN else Path(text).stem
         if name not in names:
-            got, allowed = f"--part {text}, which is no part of the checkpoint", ", ".join(names)
-            raise UserError(got, allowed, "name the part: --part NAME=FILE")
+            problem, allowed = (
+                f"--part {text}, which is no part of the checkpoint",
+                ", ".join(names),
+            )
+            raise UserError(problem, allowed, "name the part: --part NAME=FILE")
         chosen[name] = path
     return [_with_mesh(part, chosen.get(part.name), unit) for part in parts]
 
@@ -153,8 +156,8 @@ def _with_mesh(part: Part, chosen: str | None, unit: str | None) -> Part:
         if part.mesh is not None:
             return part
         fix = f"add --part {part.name}=FILE and its --unit"
-        got = f"no mesh of {part.name} in the checkpoint"
-        raise UserError(got, "a mesh file for every part without one", fix)
+        problem = f"no mesh of {part.name} in the checkpoint"
+        raise UserError(problem, "a mesh file for every part without one", fix)
     loaded = load_part(chosen, unit)
     if part.mesh_hash and loaded.mesh_hash != part.mesh_hash:
         _log.warning(

@@ -154,8 +154,8 @@ class Part:
         """
         values = parse(_Record, record, "part", _FIX)
         if not all(any(axis) for axis, _ in values.symmetries_continuous):
-            got = "part.symmetries_continuous with an axis of length 0"
-            raise UserError(got, "[axis, offset] with an axis other than 0", _FIX)
+            problem = "part.symmetries_continuous with an axis of length 0"
+            raise UserError(problem, "[axis, offset] with an axis other than 0", _FIX)
         mesh, deviation = None, 0.0
         if values.mesh is not None:
             faces = np.array(values.mesh.faces, np.int32)
@@ -219,8 +219,8 @@ def _checked_cuboid(rows: Sequence[_Point]) -> Float[np.ndarray, "9 3"]:
     expected = cuboid_keypoints(cuboid.min(axis=0), cuboid.max(axis=0))
     # Another order of corners would give wrong poses without any error; 1e-6 is float32's rounding.
     if not np.abs(cuboid - expected).max() <= 1e-6 * np.ptp(cuboid):
-        got, allowed = "part.cuboid that is no axis-aligned box", "eight corners in NDDS order"
-        raise UserError(got, f"{allowed}, then the centre", _FIX)
+        problem, allowed = "part.cuboid that is no axis-aligned box", "eight corners in NDDS order"
+        raise UserError(problem, f"{allowed}, then the centre", _FIX)
     return cuboid
 
 
@@ -232,8 +232,8 @@ def _checked_transforms(
     transforms = np.array(matrices, np.float64).reshape(-1, 4, 4)
     for matrix in transforms:
         if not is_rotation(matrix[:3, :3]) or (matrix[3] != [0, 0, 0, 1]).any():
-            got = "part.symmetries_discrete with a matrix that is no rigid transform"
-            raise UserError(got, "[R t; 0 0 0 1] with a rotation R", _FIX)
+            problem = "part.symmetries_discrete with a matrix that is no rigid transform"
+            raise UserError(problem, "[R t; 0 0 0 1] with a rotation R", _FIX)
     return transforms
 
 
@@ -294,8 +294,11 @@ def _renderable(mesh: Mesh, name: str) -> tuple[Mesh, float]:
         ) from error
     logger.warning(
         "part %r: %d triangles decimated to %d to render; no point moved by more than %.2g mm",
-        name, len(mesh.faces), len(faces), 1000 * moved,
-    )  # fmt: skip
+        name,
+        len(mesh.faces),
+        len(faces),
+        1000 * moved,
+    )
     if mesh.colours is None or values is None:
         return Mesh(vertices, faces.astype(np.int32), values, mesh.texture), moved
     colours = np.rint(values).astype(np.uint8)

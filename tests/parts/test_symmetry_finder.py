@@ -9,7 +9,7 @@ from trimesh.transformations import translation_matrix
 
 from dopepp.core.errors import UserError
 from dopepp.parts.part import Mesh
-from dopepp.parts.symmetry import find_symmetries
+from dopepp.parts.symmetry_finder import find_symmetries
 
 
 def plate(*holes: tuple[float, float, float]) -> trimesh.Trimesh:

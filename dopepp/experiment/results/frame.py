@@ -25,7 +25,7 @@ from dopepp.experiment.config.data import DataConfig
 from dopepp.metrics.bootstrap import fewest_differing
 from dopepp.metrics.functional import wilson_interval
 from dopepp.metrics.pose import MEAN, Gathered
-from dopepp.metrics.row import COLUMNS, NOT_AVAILABLE, Column, PoseRow, symmetries
+from dopepp.metrics.row import COLUMNS, NOT_AVAILABLE, Column, PoseRow, symmetry_transforms
 from dopepp.parts.part import Parts
 
 Row = dict[str, str]
@@ -287,5 +287,5 @@ def reported_rates(data: DataConfig, parts: Parts) -> tuple[PassRate, ...]:
     """
     is_ycb = data.root is not None and data.format == "ycb_video"
     rates = (ADD_10CM if is_ycb else ADD_5CM), ADD_01D
-    symmetric = any(len(symmetries(part)) > 1 for part in parts)
+    symmetric = any(len(symmetry_transforms(part)) > 1 for part in parts)
     return (*rates, MSSD_01D) if symmetric else rates

@@ -29,7 +29,7 @@ from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.functional import add, add_s, expected_calibration_error, mahalanobis
 from dopepp.metrics.pose import assign, counted
-from dopepp.metrics.row import symmetries
+from dopepp.metrics.row import symmetry_transforms
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.storage import write_atomic
 from dopepp.parts.part import Part, Parts
@@ -213,7 +213,7 @@ def matched_poses(
     """Return detections, each with all poses that look like the one of the instance it found."""
     found = []
     for _, _, part, own, instances in _by_object(estimator, parts, source):
-        group = symmetries(part).numpy()
+        group = symmetry_transforms(part).numpy()
         for one, number in zip(own, assign(part.cuboid[CENTROID], own, instances), strict=True):
             if number >= 0 and counted(instances[number]):
                 found.append((one, instances[number].T_cam_obj @ group))
@@ -272,7 +272,7 @@ def _judge(
         T_est = torch.from_numpy(np.array([found[k].T_cam_obj for k in matched]))
         T_gt = torch.from_numpy(np.array([true[numbers[k]].T_cam_obj for k in matched]))
         points = torch.from_numpy(np.asarray(part.points, np.float64))
-        error = add_s if len(symmetries(part)) > 1 else add
+        error = add_s if len(symmetry_transforms(part)) > 1 else add
         errors = error(T_est[:, :3, :3], T_est[:, :3, 3], T_gt[:, :3, :3], T_gt[:, :3, 3], points)
         right[matched] = (errors < calibration.PASSING * part.diameter).numpy()
     return right, counts

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dopepp.geometry.camera import CameraMatrix
-from dopepp.metrics.functional.search import least_farthest, mean_nearest
+from dopepp.metrics.functional.point_search import least_farthest, mean_nearest
 
 Rotations = Float[Tensor, "n 3 3"]
 Positions = Float[Tensor, "n 3"]
@@ -209,13 +209,11 @@ def mahalanobis(
     if covariance.shape != (len(t_est), 6, 6):
         raise ValueError(f"covariance must be (N, 6, 6), got {tuple(covariance.shape)}")
     errors = torch.full_like(t_est[:, 0], torch.inf)
-    everything = torch.cat([one.flatten(1) for one in (R_est, t_est, R_gt, t_gt, covariance)], 1)
-    known = everything.isfinite().all(dim=1).nonzero()[:, 0]
-    if not len(known):
+    inputs = (R_est, t_est, R_gt, t_gt, covariance)
+    is_finite = torch.cat([tensor.flatten(1) for tensor in inputs], 1).isfinite().all(dim=1)
+    if not is_finite.any():
         return errors
-    R_est, t_est, R_gt, t_gt, covariance = (
-        one[known] for one in (R_est, t_est, R_gt, t_gt, covariance)
-    )
+    R_est, t_est, R_gt, t_gt, covariance = (tensor[is_finite] for tensor in inputs)
     for turn, shift in zip(*_check_symmetries(symmetries, t_est), strict=True):
         turns = Rotation.from_matrix((R_gt @ turn @ R_est.mT).cpu().numpy()).as_rotvec()
         shifts = t_gt + R_gt @ shift - t_est
@@ -223,7 +221,7 @@ def mahalanobis(
         solved, _ = torch.linalg.solve_ex(covariance, step)
         squared = (step * solved).sum(dim=1)
         away = torch.where(squared >= 0, squared.sqrt(), torch.inf)
-        errors[known] = torch.fmin(errors[known], away)
+        errors[is_finite] = torch.fmin(errors[is_finite], away)
     return nan_is_miss(errors)
 
 

@@ -142,9 +142,9 @@ def _longest_of_directions(points: Points) -> Iterator[tuple[float, int]]:
     columns = np.ascontiguousarray((points - points.mean(axis=0)).T, np.float32)
     for start in range(0, len(directions), 16):
         along = directions[start : start + 16] @ columns
-        one, other = along.argmin(axis=1), along.argmax(axis=1)
-        distances = np.linalg.norm(points[one] - points[other], axis=1)
-        yield float(distances.max()), int(one[distances.argmax()])
+        lowest, highest = along.argmin(axis=1), along.argmax(axis=1)
+        distances = np.linalg.norm(points[lowest] - points[highest], axis=1)
+        yield float(distances.max()), int(lowest[distances.argmax()])
 
 
 def half_sphere(num_directions: int) -> Float[np.ndarray, "directions 3"]:
@@ -192,12 +192,12 @@ class SurfaceTree:
         self.areas = np.linalg.norm(normals, axis=1) / 2
         self.normals = normals / (2 * self.areas[:, None])
         points, self._owners = self.spread(NUM_COVERING, seed=17)
-        own = np.arange(len(a))
+        numbers = np.arange(len(a))
         # Corners and centres give each triangle of a fine mesh a point of its own.
         self._tree = scipy.spatial.KDTree(
             np.concatenate([points, a, b, c, self.triangles.mean(axis=1)]), balanced_tree=False
         )
-        self._owners = np.concatenate([self._owners, own, own, own, own])
+        self._owners = np.concatenate([self._owners, *[numbers] * 4])
 
     def spread(self, num_points: int, seed: int) -> tuple[Points, Int[np.ndarray, " points"]]:
         """Spread points evenly along the summed area; return them and their triangles."""
@@ -217,8 +217,8 @@ class SurfaceTree:
     ) -> Float[np.ndarray, "*batch"]:
         """Return the distance of each point from the surface."""
         flat = points.reshape(-1, 3)
-        found = self._tree.query(flat, k=np.arange(1, neighbours + 1))[1]
-        triangles = self.triangles[self._owners[found]]
+        neighbour = self._tree.query(flat, k=np.arange(1, neighbours + 1))[1]
+        triangles = self.triangles[self._owners[neighbour]]
         closest = _closest_on_triangles(flat[:, None], triangles)
         lengths = np.linalg.norm(flat[:, None] - closest, axis=-1).min(axis=1)
         return np.asarray(lengths.reshape(points.shape[:-1]))

@@ -71,8 +71,8 @@ def read_stl(path: Path) -> RawMesh:
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():  # named here, where triangles have their numbers
         triangle, vertex = divmod(int(np.flatnonzero(~finite[faces.reshape(-1)])[0]), 3)
-        place = f"triangle {triangle + 1}, vertex {vertex + 1}"
-        raise ValueError(f"a coordinate that is not a finite number, {place}")
+        location = f"triangle {triangle + 1}, vertex {vertex + 1}"
+        raise ValueError(f"a coordinate that is not a finite number, {location}")
     return RawMesh(*weld(vertices, faces))
 
 
@@ -102,8 +102,8 @@ def read_3mf(path: Path) -> RawMesh:
         raise ValueError(f"{num_pieces} objects shown, {num_read} read")
     unit = str(mesh.unit).removesuffix("s")  # it calls the default one "millimeters"
     if unit not in UNITS_3MF:
-        got, allowed = f"mesh {path} in the unit {unit!r}", ", ".join(UNITS_3MF)
-        raise UserError(got, allowed, "export it in millimetres")
+        problem, allowed = f"mesh {path} in the unit {unit!r}", ", ".join(UNITS_3MF)
+        raise UserError(problem, allowed, "export it in millimetres")
     return mesh._replace(unit=UNITS_3MF[unit])
 
 
@@ -148,17 +148,17 @@ def read_glb(path: Path) -> RawMesh:
     header, binary = _chunks(path.read_bytes())
     files = [entry for kind in ("buffers", "images") for entry in header.get(kind, ())]
     if outside := [entry["uri"] for entry in files if "uri" in entry]:
-        got = f"mesh {path} that needs the file {str(outside[0])[:60]!r}"
+        problem = f"mesh {path} that needs the file {str(outside[0])[:60]!r}"
         allowed = "a GLB file with its arrays and textures inside"
-        raise UserError(got, allowed, "export the mesh again as one binary file")
+        raise UserError(problem, allowed, "export the mesh again as one binary file")
     primitives = [p for mesh in header.get("meshes", ()) for p in mesh["primitives"]]
     _check(header, primitives, len(binary))
     drawn = [p for p in primitives if p.get("mode", _TRIANGLES) >= _TRIANGLES]
     pictures = {_picture(header, primitive) for primitive in drawn}
     if len(pictures) > 1:
-        got = f"mesh {path} with faces of {len(pictures)} textures"
+        problem = f"mesh {path} with faces of {len(pictures)} textures"
         fix = "bake them into one texture, or remove them"
-        raise UserError(got, "one texture for all faces, or none", fix)
+        raise UserError(problem, "one texture for all faces, or none", fix)
     picture = next(iter(pictures), None)
     texture = None
     if picture is not None:

@@ -53,16 +53,16 @@ def read_obj(path: Path) -> RawMesh:
     try:
         corners = corners[fans(positions, corners[:, 0], np.array(obj.counts, np.int64))]
     except FoldedPolygonError as error:
-        got = f"mesh {path} with a polygon that is not convex in line {obj.lines[error.number]}"
+        problem = f"mesh {path} with a polygon that is not convex in line {obj.lines[error.number]}"
         fix = "switch on 'triangulate' when exporting the mesh"
-        raise UserError(got, "triangles and convex polygons", fix) from error
+        raise UserError(problem, "triangles and convex polygons", fix) from error
     texture = _texture(obj, path)
     if texture is None:
         return RawMesh(positions, corners[..., 0])
     if (corners[..., 1] == NO_COORDINATE).any():
-        got = f"textured mesh {path} with faces without texture coordinates"
+        problem = f"textured mesh {path} with faces without texture coordinates"
         fix = "unwrap the whole mesh, or delete its map_Kd line"
-        raise UserError(got, "texture coordinates (vt) on every face", fix)
+        raise UserError(problem, "texture coordinates (vt) on every face", fix)
     pairs, faces = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
     uv = np.array(obj.coordinates, np.float64).reshape(-1, 2)[pairs[:, 1]]
     return RawMesh(positions[pairs[:, 0]], faces.reshape(-1, 3), uv, texture)
@@ -131,15 +131,15 @@ def _texture(obj: ObjFile, path: Path) -> Picture | None:
         maps |= _colour_maps(companion_path(path, library, "mtllib"))
     unknown = sorted(name for name in obj.materials if name not in maps and name is not None)
     if unknown:
-        got = f"mesh {path} that uses the material {unknown[0]!r}"
+        problem = f"mesh {path} that uses the material {unknown[0]!r}"
         allowed = f"materials of {', '.join(obj.libraries)}"
         fix = "export the mesh again together with its materials"
-        raise UserError(got, allowed, fix)
+        raise UserError(problem, allowed, fix)
     used = {maps[name] for name in obj.materials}
     if len(used) > 1:
-        got = f"mesh {path} with faces of {len(used)} textures ({', '.join(map(str, used))})"
+        problem = f"mesh {path} with faces of {len(used)} textures ({', '.join(map(str, used))})"
         fix = "bake them into one texture, or delete the map_Kd lines"
-        raise UserError(got, "one texture for all faces, or none", fix)
+        raise UserError(problem, "one texture for all faces, or none", fix)
     name = next(iter(used), None)
     return None if name is None else read_texture(companion_path(path, name, "map_Kd"))
 
@@ -159,9 +159,9 @@ def _colour_maps(path: Path) -> dict[str | None, str | None]:
             maps[material] = None
         elif keyword.lower() == "map_kd":
             if rest.strip().startswith("-"):  # options change how a map lies on the part
-                got = f"material file {path} with map_Kd {rest.strip()!r}"
+                problem = f"material file {path} with map_Kd {rest.strip()!r}"
                 fix = "bake scale and offset into the texture coordinates"
-                raise UserError(got, "a file name without options", fix)
+                raise UserError(problem, "a file name without options", fix)
             maps[material] = rest.strip()
     return maps
 
@@ -180,13 +180,13 @@ def companion_path(mesh_path: Path, name: str, statement: str) -> Path:
     folder = mesh_path.parent.resolve()
     written = PureWindowsPath(name)  # splits at / and at \, and knows C:
     path = (folder / written.as_posix()).resolve()
-    got = f"{mesh_path} whose {statement} {name!r}"
+    problem = f"{mesh_path} whose {statement} {name!r}"
     if written.anchor or not path.is_relative_to(folder):
         fix = "copy the file beside the mesh and write its plain name"
-        raise UserError(f"{got} lies outside of its folder", "files in it or below it", fix)
+        raise UserError(f"{problem} lies outside of its folder", "files in it or below it", fix)
     if not path.is_file():
         fix = "put the file there, or delete the line for a part without texture"
-        raise UserError(f"{got} does not exist", "a file in the mesh's folder", fix)
+        raise UserError(f"{problem} does not exist", "a file in the mesh's folder", fix)
     return path
 
 

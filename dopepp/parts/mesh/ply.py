@@ -44,7 +44,7 @@ _ROUNDING: Final = 1e-3
 """Share of its range by which a colour may leave it: programs compute with floats."""
 
 
-class Column(NamedTuple):
+class PlyProperty(NamedTuple):
     """A property: its name, the type of its numbers (doubles in a text) and of a list's length."""
 
     name: str
@@ -58,7 +58,7 @@ class Element(NamedTuple):
 
     name: str
     num_rows: int
-    columns: list[Column]
+    columns: list[PlyProperty]
 
 
 Table = dict[str, NDArray[Any]]
@@ -121,7 +121,7 @@ def _colours(vertex: Table, elements: Sequence[Element]) -> NDArray[np.uint8] | 
     values = _vectors(vertex, COLOURS)
     if values is None or not len(values):
         return None
-    columns = [column for one in elements if one.name == "vertex" for column in one.columns]
+    columns = [column for e in elements if e.name == "vertex" for column in e.columns]
     kinds = {column.declared for column in columns if column.name in COLOURS}
     most = 255.0
     if kinds <= {"float", "float32", "double", "float64"}:
@@ -161,7 +161,7 @@ def _parse_header(lines: list[list[str]]) -> tuple[bool, list[Element]]:
             is_list = words[1] == "list"
             written = [order + TYPES[name] for name in words[2 if is_list else 1 : -1]]
             types = [np.dtype("<f8" if is_text else name) for name in written]
-            column = Column(words[-1], types[-1], types[0] if is_list else None, words[-2])
+            column = PlyProperty(words[-1], types[-1], types[0] if is_list else None, words[-2])
             elements[-1].columns.append(column)
     for name, num_rows, columns in elements:
         names = [column.name for column in columns]
@@ -190,8 +190,8 @@ def _read_table(body: bytes, start: int, element: Element) -> tuple[Table, int]:
     for name, number, length, _ in columns:
         shape: tuple[int, ...] = ()
         if length is not None:
-            place = start + np.dtype(fields).itemsize
-            shape = (_length(body, place, length) if num_rows else 0,)
+            list_start = start + np.dtype(fields).itemsize
+            shape = (_length(body, list_start, length) if num_rows else 0,)
             fields.append((f"{name}#", length))
         fields.append((name, number, shape))
     row = np.dtype(fields)

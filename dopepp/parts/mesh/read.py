@@ -110,8 +110,8 @@ def ycb_part(root: str | Path, name: str) -> Part:
     models = Path(root) / "models"
     names = sorted(path.parent.name for path in models.glob("*/points.xyz"))
     if not names:
-        got, allowed = f"{root}, which has no models/NAME/points.xyz", "the root of YCB-Video"
-        raise UserError(got, allowed, "check data.root, or unpack YCB_Video_Models into models")
+        problem, allowed = f"{root}, which has no models/NAME/points.xyz", "the root of YCB-Video"
+        raise UserError(problem, allowed, "check data.root, or unpack YCB_Video_Models into models")
     if name not in names:
         raise UserError(f"unknown object {name!r}", ", ".join(names), f"choose one of {models}")
     points_path, mesh_path = models / name / "points.xyz", models / name / "textured.obj"
@@ -158,8 +158,10 @@ def _checked(path: Path, raw: RawMesh) -> Mesh:
     if not topology.is_closed:
         logger.info(
             "%s is not watertight, taken as it is: %d open edges, %d edges of over two triangles",
-            path, topology.num_open, topology.num_crowded,
-        )  # fmt: skip
+            path,
+            topology.num_open,
+            topology.num_crowded,
+        )
     turned = opposed_faces(vertices, faces, topology)
     if turned.any():
         logger.info("%s: turned over %d triangles that faced the wrong way", path, turned.sum())
@@ -173,10 +175,10 @@ def _checked(path: Path, raw: RawMesh) -> Mesh:
     )
 
 
-def _damaged(path: Path, got: str, fix: str = "export the mesh again") -> UserError:
+def _damaged(path: Path, problem: str, fix: str = "export the mesh again") -> UserError:
     content = "triangles, finite coordinates and colours of their range"
     allowed = f"a whole mesh with {content}, under {MAX_BYTES / 1e6:.0f} MB"
-    return UserError(f"mesh {path} with {got}", allowed, fix)
+    return UserError(f"mesh {path} with {problem}", allowed, fix)
 
 
 @dataclass(frozen=True)
@@ -211,12 +213,12 @@ def find_topology(vertices: Vertices, faces: Faces) -> Topology:
     first = np.flatnonzero(np.diff(edges[order], prepend=-1))
     uses = np.diff(first, append=len(edges))
     pairs = first[uses == 2]
-    one, other = order[pairs], order[pairs + 1]
+    corner, opposite = order[pairs], order[pairs + 1]
     return Topology(
         num_open=int((uses == 1).sum()),
         num_crowded=int((uses > 2).sum()),
-        neighbours=np.stack([one // 3, other // 3], axis=1),
-        opposed=start[one] == start[other],
+        neighbours=np.stack([corner // 3, opposite // 3], axis=1),
+        opposed=start[corner] == start[opposite],
     )
 
 
@@ -250,10 +252,10 @@ def _minority(areas: Float[np.ndarray, " faces"], topology: Topology) -> Bool[np
     # that face the same way. A surface with two sides falls into two components: each is one way of
     # facing, and triangle f is to be turned if the component of its turned node is the better one.
     num_faces = len(areas)
-    one, other = topology.neighbours.T
+    first_face, second_face = topology.neighbours.T
     swap = np.where(topology.opposed, num_faces, 0)
-    rows = np.concatenate([one, one + num_faces])
-    columns = np.concatenate([other + swap, other + num_faces - swap])
+    rows = np.concatenate([first_face, first_face + num_faces])
+    columns = np.concatenate([second_face + swap, second_face + num_faces - swap])
     joined = scipy.sparse.coo_array(
         (np.ones(len(rows), bool), (rows, columns)), shape=(2 * num_faces,) * 2
     )
@@ -270,9 +272,9 @@ def _inverted_bodies(
     vertices: Vertices, faces: Faces, topology: Topology
 ) -> Bool[np.ndarray, " faces"]:
     """Return the triangles of closed bodies that face inwards and lie in no other body's box."""
-    one, other = topology.neighbours.T
+    first_face, second_face = topology.neighbours.T
     joined = scipy.sparse.coo_array(
-        (np.ones(len(one), bool), (one, other)), shape=(len(faces),) * 2
+        (np.ones(len(first_face), bool), (first_face, second_face)), shape=(len(faces),) * 2
     )
     num_bodies, bodies = scipy.sparse.csgraph.connected_components(joined, directed=False)
     volumes = np.bincount(bodies, _signed_volumes(vertices, faces), minlength=num_bodies)

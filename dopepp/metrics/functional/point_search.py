@@ -73,12 +73,12 @@ def _tree(
         step = 2 ** (depth - level)
         for k in range(2**level):
             node = order[firsts[k * step] : firsts[(k + 1) * step]]
-            own = points[node]
-            low, high = own.min(axis=0), own.max(axis=0)
+            corners = points[node]
+            low, high = corners.min(axis=0), corners.max(axis=0)
             boxes[2**level - 1 + k] = *low, *high
             if level < depth:
                 middle = firsts[k * step + step // 2] - firsts[k * step]
-                node[:] = node[own[:, (high - low).argmax()].argpartition(middle)]
+                node[:] = node[corners[:, (high - low).argmax()].argpartition(middle)]
     return np.ascontiguousarray(points[order]), boxes, firsts
 
 

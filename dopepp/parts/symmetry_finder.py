@@ -65,7 +65,7 @@ def find_symmetries(mesh: Mesh, tolerance: float = TOLERANCE) -> Symmetries:
     across = _across(axis)
     if shape.is_round(across):
         return np.empty((0, 4, 4)), tuple(shape.axis(unit) for unit in np.eye(3))
-    flip = turn(across, np.pi)
+    flip = axis_rotation(across, np.pi)
     flips = flip[None] if shape.fits(flip) else np.empty((0, 3, 3))
     return shape.transforms(flips), (shape.axis(axis),)
 
@@ -106,12 +106,12 @@ class _Shape:
         # any number of sides within a few per cent of a side.
         golden = (np.sqrt(5) - 1) / 2
         angles = 2 * np.pi * (golden * np.arange(1, 37) % 1)
-        return all(self.fits(turn(axis, float(angle))) for angle in angles)
+        return all(self.fits(axis_rotation(axis, float(angle))) for angle in angles)
 
     def order(self, axis: Vector, prime: int) -> int:
         """Return the most equal turns about an axis that fit, a multiple of a prime."""
         orders = range(MAX_ORDER - MAX_ORDER % prime, prime, -prime)
-        return next((n for n in orders if self.fits(turn(axis, 2 * np.pi / n))), prime)
+        return next((n for n in orders if self.fits(axis_rotation(axis, 2 * np.pi / n))), prime)
 
     def transforms(
         self, rotations: Float[np.ndarray, "rotations 3 3"]
@@ -135,7 +135,7 @@ def _search(shape: _Shape) -> tuple[Vector | None, list[RotationMatrix]]:
     # Every axis of up to twelve turns has one of these. The largest first: it finds round shapes.
     for prime in (11, 7, 5, 3, 2):
         for axis in candidates.axes(prime):
-            rotation = turn(axis, 2 * np.pi / prime)
+            rotation = axis_rotation(axis, 2 * np.pi / prime)
             away = rotation_angle(rotation @ np.swapaxes(group, 1, 2)).min()
             if away <= SAME_TURN or not shape.fits(rotation):
                 continue
@@ -143,9 +143,9 @@ def _search(shape: _Shape) -> tuple[Vector | None, list[RotationMatrix]]:
                 # Its largest coordinate is positive.
                 return axis * np.sign(axis[np.abs(axis).argmax()]), []
             order = shape.order(axis, prime)
-            generators.append((order, turn(axis, 2 * np.pi / order)))
-            known = exact_group(np.array([one for _, one in generators]))
-            group = group if known is None else known
+            generators.append((order, axis_rotation(axis, 2 * np.pi / order)))
+            larger = exact_group(np.array([generator for _, generator in generators]))
+            group = group if larger is None else larger
     generators.sort(key=lambda pair: -pair[0])
     return None, [rotation for _, rotation in generators]
 
@@ -176,7 +176,7 @@ class Candidates:
 
     def axes(self, order: int) -> Iterator[Vector]:
         """Yield refined axes of a prime order, those with the smallest rough distance first."""
-        turns = turn(self._axes, 2 * np.pi / order)
+        turns = axis_rotation(self._axes, 2 * np.pi / order)
         change = turns @ self._moments @ np.swapaxes(turns, 1, 2) - self._moments
         scale = np.linalg.norm(self._moments)
         # A half turn that is 2.6° off changes the moments of a rod by 0.13 of them.
@@ -198,10 +198,10 @@ class Candidates:
 
     def _refined(self, axis: Vector, order: int, special: bool) -> Vector:
         """Aim an axis so that the turned surface lies on the surface as well as it can."""
-        rotation = turn(axis, 2 * np.pi / order)
+        rotation = axis_rotation(axis, 2 * np.pi / order)
         for _ in range(12):
             step = self._step(rotation)
-            rotation = turn(step, 1.0) @ rotation
+            rotation = axis_rotation(step, 1.0) @ rotation
             if np.linalg.norm(step) < 1e-6:  # a thousandth of any tolerance
                 break
         # The axis as an eigenvector: a half turn's skew part, which others would give, vanishes.
@@ -224,11 +224,13 @@ class Candidates:
         return np.asarray(np.linalg.solve(normal_matrix, lever.T @ (weight * away)))
 
     def _error(self, axis: Vector, order: int) -> float:
-        moved = self._probes @ turn(axis, 2 * np.pi / order).T
+        moved = self._probes @ axis_rotation(axis, 2 * np.pi / order).T
         return float(np.sqrt((self._surface.distances(moved) ** 2).mean()))
 
 
-def turn(axis: Float[np.ndarray, "*batch 3"], angle: float) -> Float[np.ndarray, "*batch 3 3"]:
+def axis_rotation(
+    axis: Float[np.ndarray, "*batch 3"], angle: float
+) -> Float[np.ndarray, "*batch 3 3"]:
     """Return the rotation by an angle (radians) about a unit axis."""
     return rotation_vector_to_matrix(angle * axis)
 
@@ -250,12 +252,9 @@ def special_axes(surface: SurfaceTree) -> Float[np.ndarray, "axes 3"]:
     normals = _main_normals(surface)
     first, second = np.triu_indices(len(normals), 1)
     pairs = normals[first], normals[second]
-    axes = np.concatenate(
-        [
-            np.eye(3), np.linalg.eigh(second_moments(surface))[1].T, normals,
-            pairs[0] + pairs[1], pairs[0] - pairs[1], np.cross(*pairs),
-        ]
-    )  # fmt: skip
+    moment_axes = np.linalg.eigh(second_moments(surface))[1].T
+    combinations = pairs[0] + pairs[1], pairs[0] - pairs[1], np.cross(*pairs)
+    axes = np.concatenate([np.eye(3), moment_axes, normals, *combinations])
     lengths = np.linalg.norm(axes, axis=1)
     return np.asarray(axes[lengths > 0.1] / lengths[lengths > 0.1, None])
 
@@ -265,12 +264,12 @@ def _main_normals(surface: SurfaceTree) -> Float[np.ndarray, "clusters 3"]:
     # The largest triangles suffice: flat areas that matter have some among them.
     largest = np.argsort(-surface.areas, kind="stable")[:3000]
     normals, areas = surface.normals[largest], surface.areas[largest].copy()
-    found: list[Vector] = []
-    while len(found) < 8 and areas.any():
+    directions: list[Vector] = []
+    while len(directions) < 8 and areas.any():
         alike = np.abs(normals @ normals[areas.argmax()]) > np.cos(np.radians(5.0))
-        found.append(normals[areas.argmax()])
+        directions.append(normals[areas.argmax()])
         areas[alike] = 0
-    return np.array(found)
+    return np.array(directions)
 
 
 def _across(axis: Vector) -> Vector:
