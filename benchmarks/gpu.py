@@ -32,9 +32,9 @@ from dopepp.core.files import write_whole
 from dopepp.core.pool import available_cores
 from dopepp.data.batch import Batch, collate
 from dopepp.data.datamodule import PoseDataModule
-from dopepp.experiment.assembly.parts import build_parts
-from dopepp.experiment.assembly.sources import build_datamodule
-from dopepp.experiment.assembly.system import build_system
+from dopepp.experiment.assembly.build_parts import build_parts
+from dopepp.experiment.assembly.build_sources import build_datamodule
+from dopepp.experiment.assembly.build_system import build_system
 from dopepp.inference import runtimes
 from dopepp.training.system import PoseSystem
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from dopepp.experiment.assembly.system import choose_precision, keep_freed_memory
+from dopepp.experiment.assembly.build_system import choose_precision, keep_freed_memory
 from dopepp.models.losses import SpatialCrossEntropy
 from dopepp.models.network import PoseNetwork, build_network, network_cost
 

@@ -23,11 +23,11 @@ from dopepp.core.yaml import read_yaml
 from dopepp.data.batch import collate
 from dopepp.data.sample import Sample, crop_sample, resize_sample
 from dopepp.drawing.pictures import Picture
-from dopepp.experiment.assembly.parts import build_parts
+from dopepp.experiment.assembly.build_parts import build_parts
+from dopepp.experiment.assembly.build_sources import fitted_to_camera, labelled_images
+from dopepp.experiment.assembly.build_system import build_system
 from dopepp.experiment.assembly.renders import seen_preset
-from dopepp.experiment.assembly.sources import fitted_to_camera, labelled_images
-from dopepp.experiment.assembly.system import build_system
-from dopepp.experiment.config.run import RunConfig
+from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.results.folder import CONFIG_FILE
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.parts.part import Parts

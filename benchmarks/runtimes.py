@@ -68,7 +68,7 @@ def config_of(model: str, *overrides: str):
     from hydra import compose, initialize_config_dir
     from omegaconf import OmegaConf
 
-    from dopepp.experiment.config.run import RunConfig
+    from dopepp.experiment.config.run_config import RunConfig
 
     conf = Path(__file__).parents[1] / "conf"
     chosen = ["data.parts=[pivconnector]", "data=virtual", f"model={model}", *overrides]
@@ -80,8 +80,8 @@ def untrained(model: str):
     """Return an untrained network in its full width."""
     import torch
 
-    from dopepp.experiment.assembly.parts import build_parts
-    from dopepp.experiment.assembly.system import build_untrained
+    from dopepp.experiment.assembly.build_parts import build_parts
+    from dopepp.experiment.assembly.build_system import build_untrained
 
     config = config_of(model)
     torch.manual_seed(0)

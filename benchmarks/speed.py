@@ -52,8 +52,8 @@ def export(name: str, layout: str, precision: str, folder: Path) -> Path:
     import numpy as np
     import torch
 
-    from dopepp.experiment.assembly.parts import build_parts
-    from dopepp.experiment.assembly.system import build_untrained
+    from dopepp.experiment.assembly.build_parts import build_parts
+    from dopepp.experiment.assembly.build_system import build_untrained
     from dopepp.inference.export import EXPORTERS
     from dopepp.inference.runtimes.runtime import Export
     from dopepp.models.checkpoint import load_network

@@ -21,9 +21,13 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from dopepp.experiment.assembly.parts import build_parts
-from dopepp.experiment.assembly.system import build_untrained, choose_precision, keep_freed_memory
-from dopepp.experiment.config.run import RunConfig
+from dopepp.experiment.assembly.build_parts import build_parts
+from dopepp.experiment.assembly.build_system import (
+    build_untrained,
+    choose_precision,
+    keep_freed_memory,
+)
+from dopepp.experiment.config.run_config import RunConfig
 from dopepp.models.losses import SpatialCrossEntropy
 from dopepp.models.network import PoseNetwork, network_cost
 

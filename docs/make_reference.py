@@ -19,7 +19,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from dopepp.cli import app
-from dopepp.experiment.config.run import EvaluationConfig, RunConfig
+from dopepp.experiment.config.run_config import EvaluationConfig, RunConfig
 from dopepp.recovery.calibration import RecoveryOptions
 from dopepp.virtual.presets import Preset
 

@@ -93,7 +93,7 @@ def export(
     Exit codes: 0 done; 1 the comparison failed or the disk is full; 2 wrong input.
     """
     with report_errors():
-        from dopepp.experiment.run.export import export as write
+        from dopepp.experiment.run.export_checked import export as write
 
         done = write(checkpoint, layout, precision, out, images)
     size = sum(one.stat().st_size for one in (done.path, *done.path.glob("*")) if one.is_file())

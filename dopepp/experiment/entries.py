@@ -60,9 +60,9 @@ def evaluate(config: DictConfig) -> None:
     """Run one evaluation."""
 
     def job(plain: Mapping[str, Any], run_dir: Path) -> object:
-        from dopepp.experiment.run.evaluate import evaluate as measure
+        from dopepp.experiment.run.evaluate import run_evaluation
 
-        return measure(plain, run_dir)
+        return run_evaluation(plain, run_dir)
 
     run_job(config, job)
 

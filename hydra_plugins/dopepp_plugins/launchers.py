@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 
 class _RemoteLauncher(Launcher):
-    """Hands jobs to :mod:`dopepp.experiment.sweep.jobs`, whose ``function`` gives the runner."""
+    """Hand jobs to the runner that ``function`` of ``sweep.job_runners`` returns."""
 
     def __init__(self, function: str, *options: object) -> None:
         self.function, self.options = function, options
@@ -27,11 +27,11 @@ class _RemoteLauncher(Launcher):
         self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
     ) -> Sequence[JobReturn]:
         """Run the jobs, numbered from ``initial_job_idx``, and wait for all."""
-        from dopepp.experiment.sweep import jobs
+        from dopepp.experiment.sweep import job_runners
 
-        common = jobs.Jobs.of(self.hydra_context, self.config, self.task_function)
-        runner = getattr(jobs, self.function)(*self.options)
-        return jobs.launch(common, job_overrides, initial_job_idx, runner)
+        common = job_runners.Jobs.of(self.hydra_context, self.config, self.task_function)
+        runner = getattr(job_runners, self.function)(*self.options)
+        return job_runners.launch(common, job_overrides, initial_job_idx, runner)
 
 
 class JoblibLauncher(_RemoteLauncher):

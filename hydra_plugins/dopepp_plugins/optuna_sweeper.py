@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 
 
 class OptunaSweeper(Sweeper):
-    """Hands a search to :func:`dopepp.experiment.sweep.search.search`.
+    """Hands a search to :func:`dopepp.experiment.sweep.optuna_search.search`.
 
     ``params`` are what an experiment wants to sweep over; a search takes its ``space`` alone.
     """
@@ -38,6 +38,6 @@ class OptunaSweeper(Sweeper):
         from dopepp.core.errors import require
 
         require("optuna", "search=optuna", "search")
-        from dopepp.experiment.sweep.search import search
+        from dopepp.experiment.sweep.optuna_search import search
 
         return search(self.config, self.loader, self.launcher, arguments, list(self.params or ()))

@@ -6,7 +6,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from dopepp.experiment.config.run import RunConfig
+from dopepp.experiment.config.run_config import RunConfig
 
 CONF = Path(__file__).parents[2] / "conf"
 

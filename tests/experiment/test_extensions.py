@@ -8,7 +8,7 @@ import yaml
 from dopepp import PoseEstimator
 from dopepp.core import extensions
 from dopepp.core.errors import UserError
-from dopepp.experiment.assembly.sources import labelled_images
+from dopepp.experiment.assembly.build_sources import labelled_images
 from dopepp.models.network import BACKBONES
 from dopepp.virtual.renderers import find_renderer
 

@@ -10,8 +10,8 @@ from dopepp.core.files import cache_folder
 from dopepp.data.sample import DescribedSource
 from dopepp.data.sources.rendered import CachedSource, RenderedSource, Split
 from dopepp.drawing.pictures import Size
-from dopepp.experiment.assembly.parts import build_negatives
-from dopepp.experiment.config.data import Cache, DataConfig, chosen_data, trained_on
+from dopepp.experiment.assembly.build_parts import build_negatives
+from dopepp.experiment.config.data_config import Cache, DataConfig, chosen_data, trained_on
 from dopepp.geometry.camera import Letterbox
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.catalogue import with_meshes

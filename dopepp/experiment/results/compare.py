@@ -29,12 +29,11 @@ from dopepp.drawing.curves import (
 from dopepp.drawing.overlay import BLUE, GREEN, MIN_WIDTH_PX, YELLOW, Wireframe, overlay
 from dopepp.drawing.pictures import Picture
 from dopepp.drawing.sheet import Tile, contact_sheet, grid, message_picture
-from dopepp.experiment.assembly.parts import build_parts
-from dopepp.experiment.assembly.sources import held_out_source
-from dopepp.experiment.config.data import chosen_data, trained_on
+from dopepp.experiment.assembly.build_parts import build_parts
+from dopepp.experiment.assembly.build_sources import held_out_source
+from dopepp.experiment.config.data_config import chosen_data, trained_on
 from dopepp.experiment.results import display
-from dopepp.experiment.results.differences import compared, full, headline, notes
-from dopepp.experiment.results.entries import (
+from dopepp.experiment.results.compared_runs import (
     BASELINE,
     Entry,
     Run,
@@ -43,6 +42,7 @@ from dopepp.experiment.results.entries import (
     ordered,
     with_refined,
 )
+from dopepp.experiment.results.differences import compared, full, headline, notes
 from dopepp.experiment.results.frame import header_of, markdown
 from dopepp.experiment.results.pages import write_page
 from dopepp.experiment.results.paper import PaperTable, write_paper_table

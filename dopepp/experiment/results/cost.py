@@ -29,10 +29,10 @@ from dopepp.core.files import write_png, write_whole
 from dopepp.data.batch import collate
 from dopepp.data.sample import Sample, pad_sample, resize_sample
 from dopepp.drawing.curves import PlotLine, figure_image, lines_figure
-from dopepp.experiment.assembly.parts import build_parts
-from dopepp.experiment.assembly.sources import fitted_to_camera, held_out_source
-from dopepp.experiment.assembly.system import build_untrained, map_geometry
-from dopepp.experiment.config.run import RunConfig
+from dopepp.experiment.assembly.build_parts import build_parts
+from dopepp.experiment.assembly.build_sources import fitted_to_camera, held_out_source
+from dopepp.experiment.assembly.build_system import build_untrained, map_geometry
+from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import VERSIONS_FILE, environment, write_config, write_json
 from dopepp.experiment.results.pages import write_job_readme

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from dopepp.experiment.results.entries import Entry
+from dopepp.experiment.results.compared_runs import Entry
 from dopepp.experiment.results.frame import (
     BEYOND,
     COST_FORMS,

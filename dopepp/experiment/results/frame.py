@@ -21,7 +21,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from dopepp.drawing.curves import RateCurve
-from dopepp.experiment.config.data import DataConfig
+from dopepp.experiment.config.data_config import DataConfig
 from dopepp.metrics.bootstrap import fewest_differing
 from dopepp.metrics.functional import wilson_interval
 from dopepp.metrics.pose import MEAN, Gathered

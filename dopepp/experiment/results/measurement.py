@@ -27,7 +27,7 @@ from dopepp.data.sample import Sample
 from dopepp.drawing.overlay import BLUE, GREEN, YELLOW, Wireframe, overlay
 from dopepp.drawing.pictures import DepthMap, Size
 from dopepp.drawing.sheet import Tile
-from dopepp.experiment.config.data import DataConfig
+from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.results.report import Cost, Fingerprint, Report
 from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
 from dopepp.inference.estimator import PoseEstimator
@@ -53,7 +53,7 @@ _BOP_KEY: Final = re.compile(r"(\d{1,9})[/_](\d{1,9})", re.ASCII)
 _NUMBERED_SOURCES: Final = ("bop", "webdataset", "ycb_video")
 
 
-class Posed(PredictedPose, Protocol):
+class ScoredPose(PredictedPose, Protocol):
     """What a measurement reads of a detection."""
 
     @property
@@ -70,7 +70,7 @@ class Method(Protocol):
 
     parts: Parts
 
-    def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[Posed], float | None]:
+    def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
         """Return the poses on an image and the seconds they took, None where unknown."""
 
     def cost(self, seconds: Sequence[float]) -> Cost:
@@ -86,7 +86,7 @@ class EstimatorMethod:
         self.parts: Parts = [part for part in parts if part.name in known]
         self._names = {part.name for part in self.parts}
 
-    def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[Posed], float | None]:
+    def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
         """Run it; what it finds of objects that are not measured is left out."""
         start = time.perf_counter()
         detections = self.estimator.predict(
@@ -114,7 +114,7 @@ class EstimatorMethod:
 
 @dataclass(frozen=True)
 class FilePose:
-    """A pose that a file brings; see :class:`Posed`."""
+    """A pose that a file brings; see :class:`ScoredPose`."""
 
     object: str
     score: float
@@ -139,7 +139,7 @@ class FileMethod:
         for one in read_results(path, numbers.values()):
             self._unused.setdefault((one.scene_id, one.im_id), []).append(one)
 
-    def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[Posed], float | None]:
+    def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
         """Look the image up; of several times that its lines state, the largest counts."""
         rows = self._used.setdefault(image, self._unused.pop(image, []))
         poses = [
@@ -219,7 +219,7 @@ class Measured:
 
     reports: list[Report]
     tiles: list[Tile]
-    poses: dict[str, list[tuple[ImageId, Posed, float | None]]]
+    poses: dict[str, list[tuple[ImageId, ScoredPose, float | None]]]
     metrics: dict[str, PoseMetrics]
     silent: dict[str, list[int]]
     bop: dict[str, BopScores] = field(default_factory=dict)

@@ -21,7 +21,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.experiment import program
-from dopepp.experiment.config.run import RunConfig
+from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.results.folder import BEST_CHECKPOINT, VERSIONS_FILE, read_json
 from dopepp.experiment.results.frame import markdown, shown_rows
 from dopepp.experiment.results.report import Report

@@ -26,6 +26,7 @@ from dopepp.core.validation import STRICT, parse
 from dopepp.core.yaml import read_yaml
 from dopepp.drawing.curves import figure_image, rates_figure
 from dopepp.experiment.results import display
+from dopepp.experiment.results.compared_runs import Entry
 from dopepp.experiment.results.conditions import SHADING
 from dopepp.experiment.results.cost import (
     COST_FILE,
@@ -34,7 +35,6 @@ from dopepp.experiment.results.cost import (
     save_frame_rates,
 )
 from dopepp.experiment.results.differences import REFINED_NOTE, compared, noise
-from dopepp.experiment.results.entries import Entry
 from dopepp.experiment.results.folder import read_json
 from dopepp.experiment.results.frame import (
     ADD_5CM,

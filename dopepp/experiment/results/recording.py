@@ -13,9 +13,9 @@ from dopepp.data.formats.bop.results import UNKNOWN_TIME, PoseResult, results_na
 from dopepp.data.sample import Source
 from dopepp.drawing.curves import save_accuracy_curves
 from dopepp.drawing.sheet import contact_sheet
+from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.assembly.renders import scaled_test_renders
-from dopepp.experiment.assembly.sources import held_out_source
-from dopepp.experiment.config.data import DataConfig
+from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.config.protocols import Protocols
 from dopepp.experiment.results import conditions, display
 from dopepp.experiment.results.breakdown import record_breakdown
@@ -28,7 +28,7 @@ from dopepp.experiment.results.measurement import (
     ImageId,
     Measured,
     Method,
-    Posed,
+    ScoredPose,
     measure,
     object_numbers,
 )
@@ -187,7 +187,7 @@ def _show_silence(
 
 def _write_results(
     run_dir: Path,
-    poses: Mapping[str, Sequence[tuple[ImageId, Posed, float | None]]],
+    poses: Mapping[str, Sequence[tuple[ImageId, ScoredPose, float | None]]],
     data: DataConfig,
     numbers: Mapping[str, int],
 ) -> None:

@@ -13,10 +13,10 @@ from rich.table import Table
 from dopepp.core import extensions
 from dopepp.core.errors import UserError
 from dopepp.experiment import program
-from dopepp.experiment.assembly.parts import build_parts
-from dopepp.experiment.assembly.sources import share_in_words
-from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
-from dopepp.experiment.config.run import EvaluationConfig, FalsePositiveTarget
+from dopepp.experiment.assembly.build_parts import build_parts
+from dopepp.experiment.assembly.build_sources import share_in_words
+from dopepp.experiment.config.data_config import DataConfig, chosen_data, trained_on
+from dopepp.experiment.config.run_config import EvaluationConfig, FalsePositiveTarget
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import write_config, write_environment, write_json
 from dopepp.experiment.results.pages import write_job_readme
@@ -78,7 +78,7 @@ def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part
     return [available[name] for name in names]
 
 
-def evaluate(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
+def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     """Parse ``evaluate.py``'s config; measure a checkpoint, another method's poses, or both."""
     program.quiet_lightning()
     asked = EvaluationConfig.of(config)

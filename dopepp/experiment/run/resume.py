@@ -28,9 +28,9 @@ from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.core.yaml import read_yaml
 from dopepp.data.sample import DescribedSource, Sample
-from dopepp.experiment.assembly.sources import held_out_source
-from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
-from dopepp.experiment.config.run import RunConfig, below, flat
+from dopepp.experiment.assembly.build_sources import held_out_source
+from dopepp.experiment.config.data_config import DataConfig, chosen_data, trained_on
+from dopepp.experiment.config.run_config import RunConfig, below, flat
 from dopepp.experiment.results.folder import (
     BEST_CHECKPOINT,
     CONFIG_FILE,

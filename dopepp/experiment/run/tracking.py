@@ -19,9 +19,9 @@ from dopepp.core.errors import UserError
 from dopepp.core.files import read_csv
 from dopepp.drawing.pictures import read_rgb
 from dopepp.experiment.assembly.registries import LOGGERS
-from dopepp.experiment.config.run import RunConfig
+from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.results.compare import CURVES_FILE, LOSS_FILE, PICTURES_FILE, TABLE_FILE
-from dopepp.experiment.results.entries import overrides_of
+from dopepp.experiment.results.compared_runs import overrides_of
 from dopepp.experiment.results.frame import shown_rows
 from dopepp.experiment.results.paper import TABLE_FILE as PAPER_TABLE_FILE
 from dopepp.experiment.results.report import Report

@@ -1,7 +1,7 @@
 """What ``train.py`` does: a training, from its config to a run folder with a measured checkpoint.
 
 To add another ``job=``, write a function of config and run folder, give it a line in :data:`JOBS`
-and its name to :class:`~dopepp.experiment.config.run.RunConfig`.
+and its name to :class:`~dopepp.experiment.config.run_config.RunConfig`.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from dopepp.core import extensions
 from dopepp.core.errors import Interruption, RunError, UserError
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment import program
-from dopepp.experiment.assembly.parts import build_parts
-from dopepp.experiment.assembly.sources import build_datamodule, fitted_to_camera
-from dopepp.experiment.assembly.system import (
+from dopepp.experiment.assembly.build_parts import build_parts
+from dopepp.experiment.assembly.build_sources import build_datamodule, fitted_to_camera
+from dopepp.experiment.assembly.build_system import (
     build_system,
     build_trainer,
     estimate_training_s,
     keep_freed_memory,
 )
-from dopepp.experiment.config.run import RunConfig, TrainerConfig
+from dopepp.experiment.config.run_config import RunConfig, TrainerConfig
 from dopepp.experiment.results import display, pages
 from dopepp.experiment.results.conditions import check_masks
 from dopepp.experiment.results.cost import full_size_cost, measure_cost
@@ -95,7 +95,7 @@ def _refuse_parallel_multirun(trainer: TrainerConfig) -> None:
         )
 
 
-def train(config: RunConfig, run_dir: Path) -> Report:
+def run_training(config: RunConfig, run_dir: Path) -> Report:
     """Train, then measure the best checkpoint on the test set.
 
     Raises:

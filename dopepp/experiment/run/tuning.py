@@ -20,10 +20,10 @@ from jaxtyping import Bool, Float
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample, Source
 from dopepp.data.transforms.shading import shade
+from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.assembly.renders import empty_renders
-from dopepp.experiment.assembly.sources import held_out_source
-from dopepp.experiment.config.data import DataConfig
-from dopepp.experiment.config.run import FalsePositiveTarget
+from dopepp.experiment.config.data_config import DataConfig
+from dopepp.experiment.config.run_config import FalsePositiveTarget
 from dopepp.experiment.run.memory import Memory
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.estimator import PoseEstimator

@@ -69,7 +69,7 @@ def compare_jobs(folder: Path, config: DictConfig) -> bool:
     """Compare the jobs that a sweep's folder holds; return whether none has failed."""
     from dopepp.experiment.results import display
     from dopepp.experiment.results.compare import compare_runs
-    from dopepp.experiment.results.entries import read_run
+    from dopepp.experiment.results.compared_runs import read_run
     from dopepp.experiment.results.pages import write_multirun_readme
     from dopepp.experiment.results.paper import PaperTable, write_paper_table
     from dopepp.experiment.run.tracking import log_comparison

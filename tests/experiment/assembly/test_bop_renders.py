@@ -14,9 +14,13 @@ from dopepp.data.formats.bop.reader import BopReader
 from dopepp.data.formats.bop.results import PoseResult, write_results
 from dopepp.data.formats.bop.writer import BopWriter
 from dopepp.data.sources.rendered import RenderedSource
-from dopepp.experiment.assembly.parts import build_negatives, build_parts
+from dopepp.experiment.assembly.build_parts import build_negatives, build_parts
+from dopepp.experiment.assembly.build_sources import (
+    build_datamodule,
+    fitted_to_camera,
+    held_out_source,
+)
 from dopepp.experiment.assembly.renders import validation_renders
-from dopepp.experiment.assembly.sources import build_datamodule, fitted_to_camera, held_out_source
 from dopepp.geometry.camera import project_keypoints
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Mesh, make_part

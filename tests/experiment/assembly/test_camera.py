@@ -7,9 +7,13 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.assembly.parts import build_parts
-from dopepp.experiment.assembly.sources import build_datamodule, fitted_to_camera, held_out_source
-from dopepp.experiment.config.data import chosen_data
+from dopepp.experiment.assembly.build_parts import build_parts
+from dopepp.experiment.assembly.build_sources import (
+    build_datamodule,
+    fitted_to_camera,
+    held_out_source,
+)
+from dopepp.experiment.config.data_config import chosen_data
 from dopepp.parts.catalogue import pivconnector
 
 FOCAL = round(640 / math.tan(math.radians(69 / 2)), 1)

@@ -6,10 +6,14 @@ import pytest
 import trimesh
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.assembly.parts import PAPER_OBJECTS, build_parts
-from dopepp.experiment.assembly.sources import build_datamodule, held_out_source, share_in_words
-from dopepp.experiment.assembly.system import build_untrained
-from dopepp.experiment.config.data import DataConfig
+from dopepp.experiment.assembly.build_parts import PAPER_OBJECTS, build_parts
+from dopepp.experiment.assembly.build_sources import (
+    build_datamodule,
+    held_out_source,
+    share_in_words,
+)
+from dopepp.experiment.assembly.build_system import build_untrained
+from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.results.folder import METRICS_FILE, read_json
 from dopepp.experiment.results.recording import measure_and_record
 from dopepp.experiment.run.evaluate import parts_of

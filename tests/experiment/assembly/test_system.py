@@ -4,11 +4,15 @@ import pytest
 import torch
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.assembly import system as built
-from dopepp.experiment.assembly.parts import build_parts
-from dopepp.experiment.assembly.sources import build_datamodule
-from dopepp.experiment.assembly.system import build_system, choose_precision, estimate_training_s
-from dopepp.experiment.config.run import TrainerConfig
+from dopepp.experiment.assembly import build_system as built
+from dopepp.experiment.assembly.build_parts import build_parts
+from dopepp.experiment.assembly.build_sources import build_datamodule
+from dopepp.experiment.assembly.build_system import (
+    build_system,
+    choose_precision,
+    estimate_training_s,
+)
+from dopepp.experiment.config.run_config import TrainerConfig
 
 
 @pytest.mark.parametrize(

@@ -15,11 +15,11 @@ from dopepp.data.transforms.augment import Photometric
 from dopepp.data.transforms.jitter import CameraJitter
 from dopepp.data.transforms.masking import RandomMask
 from dopepp.experiment.assembly import registries
-from dopepp.experiment.assembly.parts import build_parts
+from dopepp.experiment.assembly.build_parts import build_parts
+from dopepp.experiment.assembly.build_sources import build_datamodule
+from dopepp.experiment.assembly.build_system import build_system, build_trainer
 from dopepp.experiment.assembly.registries import SCHEDULERS, optimizer_factory, scheduler_factory
-from dopepp.experiment.assembly.sources import build_datamodule
-from dopepp.experiment.assembly.system import build_system, build_trainer
-from dopepp.experiment.config.run import RunConfig
+from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.run.tracking import tracked
 from dopepp.models.network import ATTENTIONS, BACKBONES, HEADS, LOSSES
 from dopepp.models.registry import Registry
@@ -147,7 +147,7 @@ HOSTILE = (
     "os.system",
     "subprocess.Popen",
     "builtins.eval",
-    "dopepp.experiment.assembly.system.torch.hub.load",
+    "dopepp.experiment.assembly.build_system.torch.hub.load",
     "dopepp.models.network.build_network",
     "dopepp.training.system.PoseSystem",
     "not_a_module.Thing",

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.assembly.sources import share_of
-from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
-from dopepp.experiment.config.run import EvaluationConfig
+from dopepp.experiment.assembly.build_sources import share_of
+from dopepp.experiment.config.data_config import DataConfig, chosen_data, trained_on
+from dopepp.experiment.config.run_config import EvaluationConfig
 from dopepp.models.checkpoint import read
 
 PRETRAINED = sorted((Path(__file__).parents[3] / "dopepp" / "pretrained").glob("*.safetensors"))

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.config.run import EvaluationConfig, RunConfig
+from dopepp.experiment.config.run_config import EvaluationConfig, RunConfig
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,9 @@ import yaml
 from dopepp.core.errors import UserError
 from dopepp.core.files import read_csv
 from dopepp.experiment.results.compare import compare_paths, compare_reports, compare_runs, logged
+from dopepp.experiment.results.compared_runs import Entry, find_runs, group, read_run, with_refined
 from dopepp.experiment.results.cost import COST_FILE
 from dopepp.experiment.results.differences import compared, differences, full, headline
-from dopepp.experiment.results.entries import Entry, find_runs, group, read_run, with_refined
 from dopepp.experiment.results.folder import CONFIG_FILE, METRICS_FILE, write_config, write_json
 from dopepp.experiment.results.report import Report
 from dopepp.metrics.pose import MEAN

@@ -11,9 +11,9 @@ import pytest
 from dopepp.core.errors import UserError
 from dopepp.core.files import read_csv
 from dopepp.data.sample import Instance, Sample
-from dopepp.experiment.assembly.parts import build_parts
+from dopepp.experiment.assembly.build_parts import build_parts
+from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.assembly.renders import scaled_test_renders
-from dopepp.experiment.assembly.sources import held_out_source
 from dopepp.experiment.results.conditions import (
     SCALE,
     SHADING,

@@ -10,10 +10,10 @@ import torch
 from dopepp.core.errors import UserError
 from dopepp.data.sample import DescribedSource
 from dopepp.drawing.pictures import read_rgb
-from dopepp.experiment.assembly.parts import build_parts
-from dopepp.experiment.assembly.sources import held_out_source
-from dopepp.experiment.assembly.system import build_untrained, map_geometry
-from dopepp.experiment.config.run import RunConfig
+from dopepp.experiment.assembly.build_parts import build_parts
+from dopepp.experiment.assembly.build_sources import held_out_source
+from dopepp.experiment.assembly.build_system import build_untrained, map_geometry
+from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.results.cost import (
     WARM_UP,
     RehearsedEstimator,

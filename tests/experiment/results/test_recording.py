@@ -17,7 +17,7 @@ from dopepp.data.formats.bop.writer import BopWriter
 from dopepp.data.sample import Sample
 from dopepp.data.sources.rendered import rendered_sample
 from dopepp.experiment.results.measurement import image_id, object_numbers
-from dopepp.experiment.run.evaluate import evaluate
+from dopepp.experiment.run.evaluate import run_evaluation
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import PRESETS
@@ -62,7 +62,7 @@ def test_a_file_goes_through_tables_and_curves_and_comes_back(root, composed, tm
     path = tmp_path / "posecnn_two-test.csv"
     write_results(path, results(root, 0.002))
     config = composed(*options(root, f"results={path}", "bop_csv=true"), config="evaluate")
-    (report,) = evaluate(config, tmp_path / "run")
+    (report,) = run_evaluation(config, tmp_path / "run")
     assert report.name == report.mean.method == "posecnn"
     assert report.cost.ms_per_frame == 250
     assert (report.cost.parameters, report.cost.gmacs) == (None, None)
@@ -80,7 +80,7 @@ def test_a_file_goes_through_tables_and_curves_and_comes_back(root, composed, tm
     for back, one in zip(read_results(written, {1, 2}), read_results(path, {1, 2}), strict=False):
         np.testing.assert_allclose(back.T_cam_obj[:3, 3], one.T_cam_obj[:3, 3], atol=1e-6)
     again = composed(*options(root, f"results={written}", "method=again"), config="evaluate")
-    (second,) = evaluate(again, tmp_path / "second")
+    (second,) = run_evaluation(again, tmp_path / "second")
     assert {name: vars(row) | {"method": ""} for name, row in second.rows.items()} == {
         name: vars(row) | {"method": ""} for name, row in report.rows.items()
     }
@@ -95,7 +95,7 @@ def test_a_folder_is_the_networks_whatever_file_is_measured_beside_it(root, comp
     write_results(path, results(root))
     network = ("ckpt_path=pretrained/pivconnector", "refine=region")
     config = composed(*options(root, f"results={path}", *network), config="evaluate")
-    reports = evaluate(config, tmp_path / "run")
+    reports = run_evaluation(config, tmp_path / "run")
     assert [one.name for one in reports] == ["dopepp_fast", "dopepp_fast + region", "other"]
     written = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert written == reports[0].to_record()
@@ -109,7 +109,7 @@ def test_poses_beside_the_test_set_are_left_out(root, composed, tmp_path, caplog
     path = tmp_path / "results.csv"
     write_results(path, [*poses, elsewhere])
     arguments = options(root, f"results={path}", "data.objects=[pivconnector]", "num_pictures=0")
-    (report,) = evaluate(composed(*arguments, config="evaluate"), tmp_path / "run")
+    (report,) = run_evaluation(composed(*arguments, config="evaluate"), tmp_path / "run")
     assert list(report.rows) == ["pivconnector", "mean"]
     others = sum(one.obj_id == 1 for one in poses)
     assert f"left out 1 poses on images that are not in the test set and {others} of" in caplog.text
@@ -129,19 +129,19 @@ def test_a_file_that_does_not_fit_the_data(change, message, root, composed, tmp_
     write_results(path, [PoseResult(**{**one, **change})])
     config = composed(*options(root, f"results={path}"), config="evaluate")
     with pytest.raises(UserError, match=message) as error:
-        evaluate(config, tmp_path / "run")
+        run_evaluation(config, tmp_path / "run")
     assert "results.csv" in str(error.value)
 
 
 def test_an_evaluation_needs_something_to_measure(composed, tmp_path):
     with pytest.raises(UserError, match=r"got no ckpt_path; allowed: ckpt_path=… or results=…"):
-        evaluate(composed(config="evaluate"), tmp_path)
+        run_evaluation(composed(config="evaluate"), tmp_path)
     with pytest.raises(UserError, match=r"x\.csv, which names no data; .*data=…"):
-        evaluate(composed("results=x.csv", config="evaluate"), tmp_path)
+        run_evaluation(composed("results=x.csv", config="evaluate"), tmp_path)
     with pytest.raises(UserError, match=r"x\.csv, which does not say how to render"):
-        evaluate(composed("results=x.csv", "data=virtual", config="evaluate"), tmp_path)
+        run_evaluation(composed("results=x.csv", "data=virtual", config="evaluate"), tmp_path)
     with pytest.raises(UserError, match=r"got refine=region without ckpt_path; .*leave refine out"):
-        evaluate(composed("results=x.csv", "refine=region", config="evaluate"), tmp_path)
+        run_evaluation(composed("results=x.csv", "refine=region", config="evaluate"), tmp_path)
     assert not list(tmp_path.iterdir())
 
 

@@ -7,13 +7,13 @@ import pytest
 from dopepp.experiment.results.folder import METRICS_FILE, read_json
 from dopepp.experiment.results.recording import made_worse
 from dopepp.experiment.results.report import Cost, Report
-from dopepp.experiment.run.evaluate import evaluate
+from dopepp.experiment.run.evaluate import run_evaluation
 from dopepp.models.checkpoint import read, write_atomic
 
 
 def test_refined_poses_are_measured_beside_the_networks(composed, tmp_path):
     options = ("ckpt_path=pretrained/pivconnector", "refine=region", "+data.num_test=8")
-    network, refined = evaluate(composed(*options, config="evaluate"), tmp_path)
+    network, refined = run_evaluation(composed(*options, config="evaluate"), tmp_path)
     assert (network.name, refined.name) == ("dopepp_fast", "dopepp_fast + region")
     before, after = network.errors["pivconnector"], refined.errors["pivconnector"]
     found = np.isfinite(before)
@@ -40,7 +40,7 @@ def test_silent_images_are_counted_by_reason(composed, tmp_path, capsys):
     strict = replace(released, recovery={**released.recovery, "min_score": 1.0})
     write_atomic(strict.to_file(), tmp_path / "strict.ckpt")
     options = (f"ckpt_path={tmp_path / 'strict.ckpt'}", "+data.num_test=3")
-    evaluate(composed(*options, config="evaluate"), tmp_path / "run")
+    run_evaluation(composed(*options, config="evaluate"), tmp_path / "run")
     (line,) = [one for one in capsys.readouterr().out.splitlines() if "images silent:" in one]
     assert line.startswith("dopepp_fast: 3 of 3 images silent: ")
     assert "below the threshold (best score" in line

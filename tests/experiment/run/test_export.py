@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from dopepp.core.errors import RunError, UserError
-from dopepp.experiment.run import export as module
-from dopepp.experiment.run.export import export
+from dopepp.experiment.run import export_checked as module
+from dopepp.experiment.run.export_checked import export
 from dopepp.inference.estimator import PoseEstimator
 
 RELEASED = Path("pretrained/pivconnector")

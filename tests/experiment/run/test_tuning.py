@@ -10,7 +10,7 @@ import torch
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample
-from dopepp.experiment.config.run import FalsePositiveTarget
+from dopepp.experiment.config.run_config import FalsePositiveTarget
 from dopepp.experiment.run.tuning import (
     HIDDEN,
     Hidden,

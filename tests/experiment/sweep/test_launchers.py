@@ -11,7 +11,7 @@ import yaml
 from dopepp.core.errors import UserError
 from dopepp.experiment.results.folder import LAST_CHECKPOINT, write_config
 from dopepp.experiment.sweep import multirun
-from dopepp.experiment.sweep.jobs import on_joblib, on_slurm
+from dopepp.experiment.sweep.job_runners import on_joblib, on_slurm
 
 RATES = ("1e-4", "1e-3", "1e-2")
 SWEPT = f"optimizer.lr={','.join(RATES)}"

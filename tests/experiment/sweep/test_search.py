@@ -15,7 +15,7 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 from optuna.trial import FrozenTrial, TrialState
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.sweep.search import chosen, examples, overrides, read_space
+from dopepp.experiment.sweep.optuna_search import chosen, examples, overrides, read_space
 
 
 @pytest.fixture(scope="module")

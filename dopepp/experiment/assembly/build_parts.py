@@ -11,7 +11,7 @@ from dopepp.core.errors import UserError
 from dopepp.data.formats.bop.models import bop_parts
 from dopepp.data.formats.ycb_video import read_classes
 from dopepp.data.part_symmetries import choose_symmetries
-from dopepp.experiment.config.data import DataConfig
+from dopepp.experiment.config.data_config import DataConfig
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.mesh.read import ycb_part
 from dopepp.parts.part import Part, Parts

@@ -21,7 +21,7 @@ from dopepp.core.pool import cpu_fact
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment import program
 from dopepp.experiment.assembly.registries import CALLBACKS, optimizer_factory, scheduler_factory
-from dopepp.experiment.config.run import MapsConfig, RunConfig, TrainerConfig
+from dopepp.experiment.config.run_config import MapsConfig, RunConfig, TrainerConfig
 from dopepp.maps.codec import MapGeometry
 from dopepp.models.checkpoint import Checkpoint, load_network
 from dopepp.models.network import LOSSES, PoseNetwork, build_network

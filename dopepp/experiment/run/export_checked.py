@@ -16,7 +16,7 @@ from dopepp.core.errors import RunError, UserError
 from dopepp.core.files import draft
 from dopepp.data.sample import Sample, Source
 from dopepp.experiment.assembly.renders import validation_renders
-from dopepp.experiment.config.data import trained_on
+from dopepp.experiment.config.data_config import trained_on
 from dopepp.experiment.program import typed
 from dopepp.experiment.results.measurement import EstimatorMethod, measure
 from dopepp.inference import runtimes

@@ -120,7 +120,7 @@ class DataConfig:
     Attributes:
         name: Of the choice, for folders and tables.
         format: Format of the labelled images: a key of
-            :data:`~dopepp.experiment.assembly.sources.FORMATS`.
+            :data:`~dopepp.experiment.assembly.build_sources.FORMATS`.
         root: Folder of labelled images; None renders all images.
         objects: Objects of the root to learn; None takes the paper's five of YCB-Video, else all.
         parts: Built-in names or mesh files, without a root and for NDDS.

@@ -11,7 +11,7 @@ import torch
 
 from dopepp.core.errors import UserError
 from dopepp.core.validation import STRICT, Range, parse, shown
-from dopepp.experiment.config.data import Count, DataConfig, Node, Seed, Share, with_files
+from dopepp.experiment.config.data_config import Count, DataConfig, Node, Seed, Share, with_files
 from dopepp.experiment.config.protocols import Protocols
 from dopepp.models.layers import MAX_WIDTH, MIN_WIDTH
 from dopepp.training.targets import SymmetryOptions
@@ -208,7 +208,7 @@ class RunConfig(MeasurementConfig):
         lr_finder: Of ``job=lr_finder``.
         table: Of a multirun, how its table is laid out
             (:class:`~dopepp.experiment.results.paper.PaperTable`).
-        search: Of a multirun, what a search varies (:mod:`dopepp.experiment.sweep.search`).
+        search: Of a multirun, what a search varies (:mod:`dopepp.experiment.sweep.optuna_search`).
         recipe: Name of the loss, optimiser and schedule that were chosen together.
         seed: Of initial weights, order and training images.
         compile: Whether to compile the network with torch.
@@ -278,7 +278,7 @@ class EvaluationConfig(MeasurementConfig):
         results: A BOP challenge CSV of another method's poses.
         method: That method's name; None takes it from the file's.
         data: Data to measure on: whole, or options to change in the checkpoint's; see
-            :func:`~dopepp.experiment.config.data.chosen_data`.
+            :func:`~dopepp.experiment.config.data_config.chosen_data`.
         virtual: How to render, idem.
         bop_csv: Whether to write every method's poses as such a file.
         all_measures: Whether to print the symmetric measures of parts without symmetries, too.

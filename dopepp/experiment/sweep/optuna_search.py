@@ -35,7 +35,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from dopepp.core.errors import UserError
 from dopepp.core.validation import Range, check
-from dopepp.experiment.config.run import below, flat
+from dopepp.experiment.config.run_config import below, flat
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import (
     FAILURE_FILE,

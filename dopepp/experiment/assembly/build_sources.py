@@ -36,8 +36,8 @@ from dopepp.experiment.assembly.renders import (
     training_renders,
     validation_windows,
 )
-from dopepp.experiment.config.data import DataConfig, LensConfig
-from dopepp.experiment.config.run import RunConfig
+from dopepp.experiment.config.data_config import DataConfig, LensConfig
+from dopepp.experiment.config.run_config import RunConfig
 from dopepp.geometry.camera import Letterbox
 from dopepp.parts.part import Parts
 from dopepp.virtual.backgrounds import Backgrounds, find_backgrounds
