@@ -296,7 +296,7 @@ def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Traine
 
 
 JOBS: Final[Mapping[str, Callable[[RunConfig, Path], object]]] = {
-    "train": train,
+    "run_training": train,
     "cost": measure_cost,
     "lr_finder": find_learning_rate,
 }
