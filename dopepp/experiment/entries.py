@@ -125,8 +125,8 @@ def entry(
         if error.errno not in _REFUSALS:
             raise
         allowed, fix = "a folder that can be written", "set output_dir=…, or make it writable"
-        got = f"output folder {error.filename}: {error.strerror}"
-        _exit(UserError(got, allowed, fix), USERS_MISTAKE)
+        problem = f"output folder {error.filename}: {error.strerror}"
+        _exit(UserError(problem, allowed, fix), USERS_MISTAKE)
     except UserError as error:  # of a sweeper or launcher; jobs deal with their own
         _exit(error, USERS_MISTAKE)
 

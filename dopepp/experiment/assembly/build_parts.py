@@ -62,8 +62,8 @@ def build_negatives(data: DataConfig, parts: Parts) -> list[Part]:
     listed = [load_part(name, data.unit) for name in data.virtual.negatives]
     if data.root is None or data.format != "bop" or data.objects is None:
         return listed
-    known = {part.mesh_hash for part in (*parts, *listed)}
-    return listed + [part for part in _all_models(data.root) if part.mesh_hash not in known]
+    hashes = {part.mesh_hash for part in (*parts, *listed)}
+    return listed + [part for part in _all_models(data.root) if part.mesh_hash not in hashes]
 
 
 @lru_cache(maxsize=1)

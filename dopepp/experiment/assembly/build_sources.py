@@ -147,8 +147,8 @@ def labelled_images(data: DataConfig, parts: Parts, seed: int, split: Split) -> 
     added = extensions.found("formats")
     if data.format not in added:
         formats, advice = ", ".join((*FORMATS, *added)), extensions.advice("formats", data.format)
-        got = f"data.format={data.format}"
-        raise UserError(got, formats, f"choose the images' format, or {advice}")
+        problem = f"data.format={data.format}"
+        raise UserError(problem, formats, f"choose the images' format, or {advice}")
     opener: Opener = resolve_name(added[data.format])
     return opener(data, data.root, parts, seed, split)
 
@@ -179,8 +179,8 @@ def share_of(image_sets: Mapping[str, str | None], split: Split) -> tuple[float,
     borders = [0.0, first]
     for number in range(1, len(sharing)):
         borders.append(first + (1 - first) * number / (len(sharing) - 1))
-    place = sharing.index(split)
-    return borders[place], borders[place + 1]
+    position = sharing.index(split)
+    return borders[position], borders[position + 1]
 
 
 Opener = Callable[[DataConfig, Path, Parts, int, Split], DescribedSource]

@@ -32,7 +32,7 @@ OPTIMIZERS: Registry[Optimizer] = Registry(
 SCHEDULERS: Registry[LRScheduler] = Registry(
     "scheduler",
     LRScheduler,
-    (f"torch.optim.lr_scheduler.{one}LR" for one in ("CosineAnnealing", "Linear", "OneCycle")),
+    (f"torch.optim.lr_scheduler.{name}LR" for name in ("CosineAnnealing", "Linear", "OneCycle")),
 )
 CALLBACKS: Registry[Callback] = Registry(
     "callback",

@@ -192,8 +192,8 @@ class DataConfig:
         A :class:`UserError`: an option is unknown, missing, of a wrong type or out of range.
         """
         if isinstance(data, Mapping) and "virtual" in data:
-            got = f"data.virtual={shown(data['virtual'])}"
-            raise UserError(got, "virtual.… alone", "set virtual.…")
+            problem = f"data.virtual={shown(data['virtual'])}"
+            raise UserError(problem, "virtual.… alone", "set virtual.…")
         parsed = replace(parse(cls, data, "data"), virtual=VirtualConfig.of(virtual))
         _ = parsed.preset  # refuses a wrong field before anything is rendered
         return parsed

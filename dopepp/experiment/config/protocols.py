@@ -59,19 +59,23 @@ def _levels(
 ) -> tuple[float, ...]:
     """Read one level or several; the usual one, the images as they are, is measured anyway."""
     levels = [] if given is None else given if isinstance(given, list) else [given]
-    numbers = [one for one in levels if isinstance(one, int | float) and not isinstance(one, bool)]
-    wrong = len(numbers) < len(levels) or not all(bounds[0] <= one <= bounds[1] for one in numbers)
-    if wrong or (given is not None and all(one == usual for one in numbers)):
+    numbers = [
+        level for level in levels if isinstance(level, int | float) and not isinstance(level, bool)
+    ]
+    wrong = len(numbers) < len(levels) or not all(
+        bounds[0] <= level <= bounds[1] for level in numbers
+    )
+    if wrong or (given is not None and all(level == usual for level in numbers)):
         raise UserError(f"{option}={given!r:.100}", allowed, f"change {option}")
-    return tuple(sorted({float(one) for one in numbers if one != usual}))
+    return tuple(sorted({float(level) for level in numbers if level != usual}))
 
 
 def _quantities(given: object) -> tuple[QuantityName, ...]:
     """Read ``by``: one quantity or several."""
     names = [] if given is None else given if isinstance(given, list) else [given]
-    known: dict[object, QuantityName] = {name: name for name in get_args(QuantityName)}
-    wrong = [name for name in names if not isinstance(name, str) or name not in known]
+    quantities: dict[object, QuantityName] = {name: name for name in get_args(QuantityName)}
+    wrong = [name for name in names if not isinstance(name, str) or name not in quantities]
     if wrong or (given is not None and not names):
         allowed = f"one or more of {', '.join(get_args(QuantityName))}"
         raise UserError(f"by={given!r:.100}", allowed, "change by")
-    return tuple(dict.fromkeys(known[name] for name in names))
+    return tuple(dict.fromkeys(quantities[name] for name in names))

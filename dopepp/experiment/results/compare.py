@@ -106,7 +106,7 @@ def write_comparison(entries: Sequence[Entry], folder: Path) -> dict[str, Any]:
 def accuracy_curves(entries: Sequence[Entry]) -> dict[str, np.ndarray]:
     """Return the ADD of every instance of every object and seed, by method."""
     return {
-        entry.name: np.concatenate([e for one in entry.reports for e in one.errors.values()])
+        entry.name: np.concatenate([e for report in entry.reports for e in report.errors.values()])
         for entry in entries
         if entry.reports
     }

@@ -296,7 +296,7 @@ def with_refined(entries: Sequence[Entry]) -> list[Entry]:
     pairs: list[Entry] = []
     for entry in entries:
         pairs.append(entry)
-        refined = [one.refined for one in entry.reports if one.refined is not None]
+        refined = [report.refined for report in entry.reports if report.refined is not None]
         if refined and len(refined) == len(entry.reports):
             refine = refined[0].name.removeprefix(f"{entry.reports[0].name} + ")
             name = f"{entry.name} + {refine}"
@@ -309,15 +309,15 @@ def _is_of_another_part(entry: Entry, method: Sequence[Entry]) -> bool:
     mine, theirs = entry.runs[0].alike, method[0].runs[0].alike
     if mine is None or theirs is None or mine[:2] != theirs[:2]:
         return False
-    known = {name for one in method for name in one.reports[0].errors}
-    return set(entry.seeds) == set(method[0].seeds) and known.isdisjoint(entry.reports[0].errors)
+    names = {name for entry_of_method in method for name in entry_of_method.reports[0].errors}
+    return set(entry.seeds) == set(method[0].seeds) and names.isdisjoint(entry.reports[0].errors)
 
 
 def _join(method: Sequence[Entry]) -> Entry:
     by_seed = [dict(zip(entry.seeds, entry.reports, strict=True)) for entry in method]
     return replace(
         method[0],
-        reports=[Report.joined([one[seed] for one in by_seed]) for seed in method[0].seeds],
+        reports=[Report.joined([reports[seed] for reports in by_seed]) for seed in method[0].seeds],
         runs=[run for entry in method for run in entry.runs],
     )
 

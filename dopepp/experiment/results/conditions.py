@@ -218,7 +218,11 @@ def check_masks(source: Source) -> None:
     So it shows before anything takes time whether there is something to shade.
     """
     samples = (source.sample(index) for index in range(len(source)))
-    if not any(one.mask is not None and one.mask.any() for s in samples for one in s.instances):
+    if not any(
+        instance.mask is not None and instance.mask.any()
+        for s in samples
+        for instance in s.instances
+    ):
         raise UserError(
             f"shading on {source.name}, {len(source):,} images without an instance mask",
             "images with masks: renders, label images of YCB-Video, mask_visib of BOP",
@@ -247,14 +251,18 @@ def measure_shading(
     tiles: list[Tile] = []
     for index in range(len(source)):
         sample = source.sample(index)
-        counts = [one.visible_fraction >= MIN_VISIBLE_FRACTION for one in sample.instances]
+        counts = [
+            instance.visible_fraction >= MIN_VISIBLE_FRACTION for instance in sample.instances
+        ]
         shaded = shade(sample, shares, seed, index)
-        for one in shaded:
-            known = [np.nan if share is None else share for share in one.reached]
-            reached[one.share] += compress(known, counts)
+        for variant in shaded:
+            shares_reached = [np.nan if share is None else share for share in variant.reached]
+            reached[variant.share] += compress(shares_reached, counts)
             for name, method in methods.items():
-                poses, _ = method.detect(one.sample, image_id(sample, index))
-                metrics[one.share][name].update(poses, sample.instances, sample.K, sample.size[0])
+                poses, _ = method.detect(variant.sample, image_id(sample, index))
+                metrics[variant.share][name].update(
+                    poses, sample.instances, sample.K, sample.size[0]
+                )
         num_shown = len(tiles) // (len(shares) + 1)
         if num_shown < min(num_examples, MAX_EXAMPLES) and any(counts):
             tiles += _examples(sample, shaded)
@@ -273,26 +281,28 @@ def _shaded(share: float, metrics: Mapping[str, PoseMetrics], reached: Sequence[
         f"At {SHADING.heading(share)}, {num_outside} of {len(reached)} instances are not within "
         f"{100 * TOLERANCE:g} points of it: no mask, or no background to cover them with."
     )
-    rows = {name: one.compute() for name, one in metrics.items()}
+    rows = {name: accumulator.compute() for name, accumulator in metrics.items()}
     facts = {"share_reached": mean, "num_outside_tolerance": num_outside}
     return Level(share, rows, facts, note if num_outside else "")
 
 
 def _examples(sample: Sample, shaded: Sequence[Shaded]) -> list[Tile]:
     """Return the objects as they came and at every share, captioned with the shares reached."""
-    place = _around_masks(sample)
-    tiles = [Tile(sample.image[place], f"{sample.key}: unmasked")]
-    for one in shaded:
-        known = [f"{100 * r:.1f}" for r in sorted(r for r in one.reached if r is not None)]
-        covered = " … ".join(dict.fromkeys([*known[:1], *known[-1:]])) or "nothing"
-        caption = f"{SHADING.heading(one.share)} (reached {covered})"
-        tiles.append(Tile(one.sample.image[place], caption))
+    window = _around_masks(sample)
+    tiles = [Tile(sample.image[window], f"{sample.key}: unmasked")]
+    for variant in shaded:
+        percentages = [
+            f"{100 * r:.1f}" for r in sorted(r for r in variant.reached if r is not None)
+        ]
+        covered = " … ".join(dict.fromkeys([*percentages[:1], *percentages[-1:]])) or "nothing"
+        caption = f"{SHADING.heading(variant.share)} (reached {covered})"
+        tiles.append(Tile(variant.sample.image[window], caption))
     return tiles
 
 
 def _around_masks(sample: Sample) -> tuple[slice, slice]:
     """Return the image's rows and columns around all masks, with a margin."""
-    masks = [one.mask for one in sample.instances if one.mask is not None]
+    masks = [instance.mask for instance in sample.instances if instance.mask is not None]
     shown = np.any(masks, axis=0) if masks else np.ones(sample.image.shape[:2], bool)
     left, top, width, height = cv2.boundingRect(np.uint8(shown if shown.any() else ~shown))
 
@@ -319,8 +329,10 @@ def measure_scales(
         samples = (source.sample(index) for index in range(len(source)))
         measured[scale] = measure(methods, samples, num_examples)
     in_order = dict(sorted(measured.items()))
-    levels = [_scale_level(scale, one, unmoved) for scale, one in in_order.items()]
-    pictures = zip(*(one.tiles[:num_examples] for one in in_order.values()), strict=True)
+    levels = [
+        _scale_level(scale, measured_level, unmoved) for scale, measured_level in in_order.items()
+    ]
+    pictures = zip(*(level.tiles[:num_examples] for level in in_order.values()), strict=True)
     tiles = [
         replace(tile, caption=f"{tile.caption}, {SCALE.heading(scale)}")
         for same_scene in pictures

@@ -149,10 +149,10 @@ def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
     estimator = RehearsedEstimator(network, description, "cuda" if has_gpu else "cpu")
     geometry = map_geometry(config.maps, network.stride)
     frames = time_frames(estimator, samples, geometry, config.cost.num_frames, config.seed)
-    convolutions = [one for one in network.backbone.modules() if isinstance(one, nn.Conv2d)]
+    convolutions = [layer for layer in network.backbone.modules() if isinstance(layer, nn.Conv2d)]
     cost = NetworkCost(
         name=config.model.name,
-        backbone_weights=sum(one.weight.numel() for one in convolutions),
+        backbone_weights=sum(layer.weight.numel() for layer in convolutions),
         parameters=parameters,
         gmacs=gmacs,
         input_size=description.input_size,
@@ -196,7 +196,9 @@ def time_frames(
         resized picture to maps, and ``recovery_seconds``, from maps to poses.
     """
     generator = torch.Generator().manual_seed(seed)
-    rehearsed = [(one, likely_maps(one, estimator, geometry, generator)) for one in samples]
+    rehearsed = [
+        (picture, likely_maps(picture, estimator, geometry, generator)) for picture in samples
+    ]
     rows = []
     for sample, estimator.answer in islice(cycle(rehearsed), WARM_UP + num_frames):
         began = time.perf_counter()
@@ -222,8 +224,8 @@ def likely_maps(
     batch = collate([seen], {part.name: number for number, part in enumerate(estimator.parts)})
     true = draw_maps(batch, batch.keypoints, len(estimator.parts), geometry)
     belief, field = (
-        (one[0] + noise * torch.randn(one[0].shape, generator=generator)).to(estimator.device)
-        for one, noise in zip(true, (BELIEF_NOISE, FIELD_NOISE), strict=True)
+        (maps[0] + noise * torch.randn(maps[0].shape, generator=generator)).to(estimator.device)
+        for maps, noise in zip(true, (BELIEF_NOISE, FIELD_NOISE), strict=True)
     )
     return belief, field
 

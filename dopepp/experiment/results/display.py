@@ -60,8 +60,10 @@ def show_report(report: Report, all_measures: bool = False) -> None:
             console.print(f"{name}: {absent}; {row.false_positives} false positives")
             continue
         table = Table("", title=f"{name}: {report.num_images} test images")
-        for one in (row, *references):
-            table.add_column(one.method, justify="right", style="bold" if one is row else "dim")
+        for method_row in (row, *references):
+            table.add_column(
+                method_row.method, justify="right", style="bold" if method_row is row else "dim"
+            )
         for _, columns in groupby(shown_columns(row, all_measures), attrgetter("group")):
             for column in columns:
                 table.add_row(column.heading, *map(column.text, (row, *references)))

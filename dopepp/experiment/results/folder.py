@@ -103,9 +103,9 @@ def environment(seed: int, data_fingerprint: str) -> dict[str, Any]:
         "python": platform.python_version(),
         "platform": platform.platform(),
         "packages": {
-            name: one.version
-            for one in sorted(distributions(), key=lambda one: str(one.name).lower())
-            if isinstance(name := one.name, str)
+            name: package.version
+            for package in sorted(distributions(), key=lambda package: str(package.name).lower())
+            if isinstance(name := package.name, str)
         },
         "git": _git_state(),
         "hardware": _hardware(),

@@ -81,9 +81,9 @@ class EstimatorMethod:
     """An estimator, run on every image at its own size; scored on the objects that it knows."""
 
     def __init__(self, estimator: PoseEstimator, parts: Parts) -> None:
-        known = {part.name for part in estimator.parts}
+        names = {part.name for part in estimator.parts}
         self.estimator = estimator
-        self.parts: Parts = [part for part in parts if part.name in known]
+        self.parts: Parts = [part for part in parts if part.name in names]
         self._names = {part.name for part in self.parts}
 
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
@@ -93,12 +93,14 @@ class EstimatorMethod:
             sample.image, sample.K, depth=sample.depth, cropped=True
         )
         seconds = time.perf_counter() - start
-        return [one for one in detections if one.object in self._names], seconds
+        return [detection for detection in detections if detection.object in self._names], seconds
 
     def silence(self, sample: Sample) -> Reason | None:
         """Return why it finds nothing on an image: how its best candidate ended, if one did."""
-        found = furthest(self.estimator.explain(sample.image, sample.K, sample.depth, cropped=True))
-        return next((one for one in reversed(found) if one.object in self._names), None)
+        reasons = furthest(
+            self.estimator.explain(sample.image, sample.K, sample.depth, cropped=True)
+        )
+        return next((reason for reason in reversed(reasons) if reason.object in self._names), None)
 
     def cost(self, seconds: Sequence[float]) -> Cost:
         """Count parameters and operations, and take the median of the timed frames."""
@@ -136,18 +138,18 @@ class FileMethod:
         self._parts = {numbers[part.name]: part for part in parts}
         self._unused: dict[ImageId, list[PoseResult]] = {}
         self._used: dict[ImageId, list[PoseResult]] = {}
-        for one in read_results(path, numbers.values()):
-            self._unused.setdefault((one.scene_id, one.im_id), []).append(one)
+        for row in read_results(path, numbers.values()):
+            self._unused.setdefault((row.scene_id, row.im_id), []).append(row)
 
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
         """Look the image up; of several times that its lines state, the largest counts."""
         rows = self._used.setdefault(image, self._unused.pop(image, []))
         poses = [
-            FilePose(part.name, one.score, T, project_keypoints(part.cuboid, T, sample.K))
-            for one, T in ((one, one.T_cam_obj) for one in rows)
-            if (part := self._parts.get(one.obj_id)) is not None
+            FilePose(part.name, row.score, T, project_keypoints(part.cuboid, T, sample.K))
+            for row, T in ((row, row.T_cam_obj) for row in rows)
+            if (part := self._parts.get(row.obj_id)) is not None
         ]
-        seconds = max((one.seconds for one in rows), default=-1.0)
+        seconds = max((row.seconds for row in rows), default=-1.0)
         return poses, seconds if seconds >= 0 else None
 
     def cost(self, seconds: Sequence[float]) -> Cost:
@@ -159,8 +161,8 @@ class FileMethod:
 
         A :class:`UserError`: none of them was on one of the images.
         """
-        used = [one for rows in self._used.values() for one in rows]
-        unused = [one for rows in self._unused.values() for one in rows]
+        used = [row for rows in self._used.values() for row in rows]
+        unused = [row for rows in self._unused.values() for row in rows]
         if unused and not used:
             raise UserError(
                 f"{self._path}, whose {len(unused):,} poses are all on other images, the first "
@@ -168,7 +170,7 @@ class FileMethod:
                 f"images of the test set, e.g. scene and image {next(iter(self._used), 'none')}",
                 "choose the images that the file was made for, e.g. with data.image_sets.test",
             )
-        others = sum(one.obj_id not in self._parts for one in used)
+        others = sum(row.obj_id not in self._parts for row in used)
         if unused or others:
             _log.warning(
                 "%s: left out %s poses on images that are not in the test set and %s of objects "
@@ -184,8 +186,8 @@ def object_numbers(data: DataConfig, parts: Parts) -> dict[str, int]:
     """
     root = data.root
     if root is not None and data.format in ("bop", "webdataset"):
-        known = {info.name: number for number, info in read_models(root).items()}
-        return known or {part.name: number for number, part in parts_by_id(root, parts).items()}
+        numbers = {info.name: number for number, info in read_models(root).items()}
+        return numbers or {part.name: number for number, part in parts_by_id(root, parts).items()}
     if root is not None and data.format == "ycb_video":
         return {name: number for number, name in enumerate(read_classes(root), 1)}
     return {part.name: number for number, part in enumerate(parts, 1)}
@@ -243,7 +245,7 @@ def measure(
     seconds: dict[str, list[float]] = {name: [] for name in methods}
     measured = Measured([], [], {name: [] for name in methods}, metrics, {n: [] for n in methods})
     draw = depth_drawer()
-    localised = {name: Localisation(one.parts, draw) for name, one in methods.items() if bop}
+    localised = {name: Localisation(method.parts, draw) for name, method in methods.items() if bop}
     num_images = 0
     parts = {part.name: part for method in methods.values() for part in method.parts}
     seen = Fingerprint(list(parts.values()))
@@ -251,7 +253,7 @@ def measure(
         num_images += 1
         seen.add(sample)
         image = image_id(sample, index)
-        wireframes = [Wireframe(one.keypoints, GREEN, "true") for one in sample.instances]
+        wireframes = [Wireframe(instance.keypoints, GREEN, "true") for instance in sample.instances]
         for number, (name, method) in enumerate(methods.items()):
             poses, taken = method.detect(sample, image)
             seconds[name] += [] if taken is None else [taken]
@@ -260,13 +262,13 @@ def measure(
                 localised[name].update(poses, sample.instances, sample.K, sample.size, sample.depth)
             if sample.instances and not poses:
                 measured.silent[name].append(index)
-            measured.poses[name] += [(image, one, taken) for one in poses]
+            measured.poses[name] += [(image, pose, taken) for pose in poses]
             colour = BLUE if number < len(methods) - 1 else YELLOW
-            wireframes += [Wireframe(one.keypoints, colour, name) for one in poses]
+            wireframes += [Wireframe(pose.keypoints, colour, name) for pose in poses]
         if len(measured.tiles) < num_pictures:
             measured.tiles.append(Tile(overlay(sample.image, wireframes), sample.key))
-    scores = {name: one.scores() for name, one in localised.items()}
-    measured.bop = {name: one for name, one in scores.items() if one is not None}
+    scores = {name: localisation.scores() for name, localisation in localised.items()}
+    measured.bop = {name: score for name, score in scores.items() if score is not None}
     measured.reports = [
         Report(
             name,

@@ -182,7 +182,10 @@ def _result_table(name: str, rows: Sequence[PoseRow]) -> str:
     """Return the table that the terminal showed, without its title."""
     measures = shown_columns(rows[0])
     return markdown(
-        [{name: one.heading, **{row.method: one.text(row) for row in rows}} for one in measures]
+        [
+            {name: measure.heading, **{row.method: measure.text(row) for row in rows}}
+            for measure in measures
+        ]
     )
 
 
@@ -235,8 +238,12 @@ def release(checkpoint: Path, results: Path, name: str, folder: Path) -> list[Pa
         report=report,
         table=markdown([
             {"object": row.object, "method": row.method}
-            | {one.heading: one.text(row) for one in COLUMNS if one.field in _CARD_FIELDS}
-            for rows in [*(one.rows for one in reported), *report.references.values()]
+            | {
+                column.heading: column.text(row)
+                for column in COLUMNS
+                 if column.field in _CARD_FIELDS
+            }
+            for rows in [*(report.rows for report in reported), *report.references.values()]
             for row in shown_rows(rows).values()
         ]),
     )  # fmt: skip

@@ -103,7 +103,7 @@ class PaperTable:
         """Read the config's ``table``; a :class:`UserError` if a field or a value is unknown."""
         table = parse(cls, config, "table")
         if table.threshold not in _PASS_FIELDS:
-            allowed = ", ".join(f"{one:g}" for one in _PASS_FIELDS)
+            allowed = ", ".join(f"{threshold:g}" for threshold in _PASS_FIELDS)
             raise UserError(f"table.threshold={table.threshold}", f"{allowed}, metres", "change it")
         return table
 
@@ -171,8 +171,8 @@ def write_paper_table(table: PaperTable, entries: Sequence[Entry], folder: Path)
 def _recipe(entries: Sequence[Entry]) -> list[str]:
     """Say with which loss and schedule the networks were trained, ours or the paper's."""
     words = {str(run.config.get("recipe")) for entry in entries for run in entry.runs}
-    known = sorted(words & {"ours", "paper"})
-    return [f"recipe={' and '.join(known)}"] if known else []
+    recipes = sorted(words & {"ours", "paper"})
+    return [f"recipe={' and '.join(recipes)}"] if recipes else []
 
 
 def _notes(table: PaperTable, entries: Sequence[Entry]) -> list[str]:
@@ -216,7 +216,7 @@ def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
     measured = [entry for entry in methods.values() if entry.reports]
     objects = list(dict.fromkeys(name for entry in measured for name in entry.objects))
     if not objects:  # nothing was measured: the paper's figures and why there are no others
-        objects = list(dict.fromkeys(name for one in layout.paper.values() for name in one))
+        objects = list(dict.fromkeys(name for row in layout.paper.values() for name in row))
     rows = []
     for name in objects:
         for label in dict.fromkeys([*methods, *layout.recomputed, *layout.paper]):

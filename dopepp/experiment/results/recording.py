@@ -70,8 +70,8 @@ def measure_and_record(
     files = {name: FileMethod(path, parts, numbers) for name, path in (results or {}).items()}
     methods: dict[str, Method] = {
         **{
-            name: EstimatorMethod(one, parts)
-            for name, one in with_refined(estimators, refine, parts).items()
+            name: EstimatorMethod(estimator, parts)
+            for name, estimator in with_refined(estimators, refine, parts).items()
         },
         **files,
     }
@@ -81,7 +81,7 @@ def measure_and_record(
         conditions.check_masks(source)
     if protocols.scales:
         conditions.SCALE.check_methods(methods)
-    scaled = {one: scaled_test_renders(data, parts, one) for one in protocols.scales}
+    scaled = {scale: scaled_test_renders(data, parts, scale) for scale in protocols.scales}
     samples = (source.sample(index, 0) for index in range(len(source)))
     is_bop = data.root is not None and data.format in ("bop", "webdataset")
     measured = measure(methods, samples, num_pictures, bop=is_bop and not data.is_rendered("test"))
@@ -93,12 +93,12 @@ def measure_and_record(
             display.console.print(f"{report.name}: {measured.bop[report.name].in_words()}")
     _show_silence(methods, measured.silent, source)
     # What is compared later is the network's own result, unrefined; a file's where no network is.
-    own = of_networks(measured.reports, len(files))
+    reports = of_networks(measured.reports, len(files))
     refines = refine is not None and bool(estimators)
-    main = own[-2 if refines else -1]
+    main = reports[-2 if refines else -1]
     main.details.update(details or {})
     if refines:
-        main.refined = own[-1]
+        main.refined = reports[-1]
         share = main.details["made_worse"] = made_worse(main, main.refined)
         display.console.print(f"refinement made {share:.1%} of the instances worse by over 1 mm")
     write_json(run_dir / METRICS_FILE, main.to_record())
@@ -132,11 +132,11 @@ def with_refined(
 ) -> dict[str, PoseEstimator]:
     """Return every estimator, and behind it the same one refining: two rows in every table."""
     pairs: dict[str, PoseEstimator] = {}
-    for name, one in estimators.items():
-        pairs[name] = one
+    for name, estimator in estimators.items():
+        pairs[name] = estimator
         if refine is not None:
             terms = " + ".join([refine] if isinstance(refine, str) else refine)
-            pairs[f"{name} + {terms}"] = refining(one, refine, parts)
+            pairs[f"{name} + {terms}"] = refining(estimator, refine, parts)
     return pairs
 
 
@@ -147,10 +147,10 @@ def refining(estimator: PoseEstimator, refine: Refine | None, parts: Parts) -> P
     """
     if refine is None:
         return estimator
-    known = {part.name: part for part in parts}
-    own = [part if part.mesh is not None else known.get(part.name, part)
+    by_name = {part.name: part for part in parts}
+    own_parts = [part if part.mesh is not None else by_name.get(part.name, part)
            for part in estimator.parts]  # fmt: skip
-    return estimator.refining(refine, own)
+    return estimator.refining(refine, own_parts)
 
 
 def made_worse(network: Report, refined: Report) -> float:
@@ -181,7 +181,7 @@ def _show_silence(
         method = methods[name]
         if numbers and isinstance(method, EstimatorMethod):
             reasons = [method.silence(source.sample(number, 0)) for number in numbers]
-            line = summary([one for one in reasons if one is not None], len(source))
+            line = summary([reason for reason in reasons if reason is not None], len(source))
             display.console.print(f"{name}: {line}")
 
 

@@ -190,10 +190,10 @@ class Fingerprint:
     def add(self, sample: Sample) -> None:
         """Take the next image."""
         truths = []
-        for one in sample.instances:
-            counts = bool(one.visible_fraction >= MIN_VISIBLE_FRACTION)
-            covered = round(one.masked_fraction, 2)
-            truths.append([one.label, _rounded(one.T_cam_obj), counts, covered])
+        for instance in sample.instances:
+            counts = bool(instance.visible_fraction >= MIN_VISIBLE_FRACTION)
+            covered = round(instance.masked_fraction, 2)
+            truths.append([instance.label, _rounded(instance.T_cam_obj), counts, covered])
         self._add([sample.source, sample.key, sample.size, _rounded(sample.K), truths])
 
     def word(self) -> str:

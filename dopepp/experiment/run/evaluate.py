@@ -95,18 +95,20 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
         exported = any(is_export(Path(path)) for path in paths)
         device = "cuda" if torch.cuda.is_available() and not exported else "cpu"
     loaded = [PoseEstimator.load(path, device) for path in paths]
-    own = loaded[-1].checkpoint if loaded else None
-    measured = str(asked.results if own is None else paths[-1])
-    stored = None if own is None else trained_on(own.data)
+    checkpoint = loaded[-1].checkpoint if loaded else None
+    measured = str(asked.results if checkpoint is None else paths[-1])
+    stored = None if checkpoint is None else trained_on(checkpoint.data)
     data = chosen_data(asked.data, asked.virtual, stored, measured)
     write_config(run_dir, asked.plain)
-    write_environment(run_dir, data.eval_seed, "" if own is None else own.data_fingerprint)
+    write_environment(
+        run_dir, data.eval_seed, "" if checkpoint is None else checkpoint.data_fingerprint
+    )
     parts = parts_of(loaded, data)
     share = share_in_words(data)
     if share is not None:
         display.console.print(share)
-    if own is not None:
-        warn_of_other_images(own, data, parts)
+    if checkpoint is not None:
+        warn_of_other_images(checkpoint, data, parts)
     if asked.tune:
         _tune_only(asked, loaded, parts, data, run_dir)
         return []
@@ -157,7 +159,9 @@ def _tune_only(
 
 def _names(loaded: Sequence[PoseEstimator], others: Sequence[str]) -> list[str]:
     """Return the methods' names; of two with one name, the first is called the baseline."""
-    names = [str(one.checkpoint.data.get("name", "estimate")) for one in loaded] + list(others)
+    names = [str(estimator.checkpoint.data.get("name", "estimate")) for estimator in loaded] + list(
+        others
+    )
     for number, name in enumerate(names[:-1]):
         if name in names[number + 1 :]:
             names[number] += " (baseline)" if number == 0 else " (checkpoint)"

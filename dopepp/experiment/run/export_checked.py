@@ -82,15 +82,15 @@ def export(
             images += _seen(original, source.sample(index))
     save = EXPORTERS[layout][0](network, precision, images)
     described = Export(layout, precision, network.size_multiple, *cost)
-    with _written(target) as place:
-        save(place, checkpoint, described)
+    with _written(target) as path:
+        save(path, checkpoint, described)
         if precision == "int8":
             described = replace(
                 described, num_images=num_images,
-                add_01d=_accuracy(original, PoseEstimator.load(place), source, num_images),
+                add_01d=_accuracy(original, PoseEstimator.load(path), source, num_images),
             )  # fmt: skip
-            save(place, checkpoint, described)
-        agreement = _compared(PoseEstimator.load(place), original, source)
+            save(path, checkpoint, described)
+        agreement = _compared(PoseEstimator.load(path), original, source)
         if not (agreement.is_exact if precision == "fp32" else np.isfinite(agreement.maps)):
             raise RunError(f"{target} was not written: it differs from {path}: {agreement}")
     return Exported(target, described, agreement, _commands(target, checkpoint))
@@ -98,10 +98,10 @@ def export(
 
 @contextmanager
 def _written(target: Path) -> Iterator[Path]:
-    """Yield a place beside the target that becomes the target; a :class:`RunError` if it cannot."""
+    """Yield a path beside the target that becomes the target; a :class:`RunError` if it cannot."""
     try:
-        with draft(target) as place:
-            yield place
+        with draft(target) as path:
+            yield path
     except OSError as error:
         raise RunError(f"cannot write {target}: {error.strerror}; free or repair it") from error
 
@@ -124,11 +124,13 @@ def _target(path: Path, layout: str, precision: str, out: Path | None) -> Path:
         what = f"a file NAME{ending}" if is_file else "a folder"
         raise UserError(f"--out {out} for --format {layout}", what, "name it so")
     others = (
-        [one for one in out.iterdir() if one.suffix not in (".xml", ".bin")] if out.is_dir() else []
+        [path for path in out.iterdir() if path.suffix not in (".xml", ".bin")]
+        if out.is_dir()
+        else []
     )
     if (is_file and out.is_dir()) or (not is_file and out.is_file()) or others:
-        got = f"--out {out}, where there is something else"
-        raise UserError(got, "a new place, or one of an earlier export", "choose another place")
+        problem = f"--out {out}, where there is something else"
+        raise UserError(problem, "a new place, or one of an earlier export", "choose another place")
     if out.exists() and path.exists() and out.samefile(path):
         raise UserError(f"--out {out}, which is the checkpoint", "another place", "choose one")
     return out
@@ -137,8 +139,8 @@ def _target(path: Path, layout: str, precision: str, out: Path | None) -> Path:
 def _seen(estimator: PoseEstimator, sample: Sample) -> list[Pixels]:
     """Return a picture in the sizes in which the network sees it."""
     boxes = letterboxes(estimator.checkpoint, sample.K, sample.image)
-    pictures = [letterboxed(sample.image, one, estimator.network.size_multiple) for one in boxes]
-    return [np.ascontiguousarray(one.transpose(2, 0, 1)[None]) for one in pictures]
+    pictures = [letterboxed(sample.image, box, estimator.network.size_multiple) for box in boxes]
+    return [np.ascontiguousarray(picture.transpose(2, 0, 1)[None]) for picture in pictures]
 
 
 def _accuracy(
@@ -147,14 +149,16 @@ def _accuracy(
     """Measure ADD-0.1d of both on the same scenes."""
     _log.info("measuring both on %d other validation scenes", count)
     estimators = {"fp32": original, "int8": exported}
-    methods = {name: EstimatorMethod(one, one.parts) for name, one in estimators.items()}
+    methods = {
+        name: EstimatorMethod(estimator, estimator.parts) for name, estimator in estimators.items()
+    }
     measured = measure(methods, (source.sample(index) for index in range(count)), 0)
     return {report.name: report.mean.add_01d or 0.0 for report in measured.reports}
 
 
 def _compared(exported: PoseEstimator, original: PoseEstimator, source: Source) -> Agreement:
     samples: Sequence[Sample] = [source.sample(index) for index in range(NUM_CHECKED)]
-    return compare(exported, original, [(one.image, one.K) for one in samples])
+    return compare(exported, original, [(sample.image, sample.K) for sample in samples])
 
 
 def _commands(path: Path, checkpoint: Checkpoint) -> tuple[str, str]:
@@ -166,8 +170,8 @@ def _commands(path: Path, checkpoint: Checkpoint) -> tuple[str, str]:
     words = [f"ckpt_path={path}"]
     if config.get("root"):
         words.append(f"data.root={config['root']}")
-    parts = [str(one) for one in config.get("parts") or ()]
-    if not config.get("root") and any(Path(one).suffix for one in parts):
+    parts = [str(part) for part in config.get("parts") or ()]
+    if not config.get("root") and any(Path(part).suffix for part in parts):
         words.append(f"data.parts=[{','.join(parts)}]")
     predict = f"dopepp predict {shlex.quote(str(path))} PICTURE --K FX FY CX CY"
     return predict, " ".join([typed("evaluate"), *map(shlex.quote, words)])

@@ -89,9 +89,9 @@ def find_learning_rate(config: RunConfig, run_dir: Path) -> Suggestion | None:
             f"the loss diverged after {len(rates)} steps at a learning rate of "
             f"{config.lr_finder.min_lr:g}; set a smaller lr_finder.min_lr"
         )
-    found = _report(rates, losses, run_dir)
+    suggestion = _report(rates, losses, run_dir)
     write_job_readme(run_dir, f"Learning rate of {config.model.name}")
-    return found
+    return suggestion
 
 
 def _short_training(config: RunConfig) -> RunConfig:
@@ -126,7 +126,7 @@ def _sweep(
             trainer.should_stop = True
 
     with system.loss.register_forward_hook(note):
-        found = Tuner(trainer).lr_find(
+        sweep = Tuner(trainer).lr_find(
             system,
             datamodule=datamodule,
             min_lr=options.min_lr,
@@ -134,12 +134,12 @@ def _sweep(
             num_training=options.num_steps,
             update_attr=False,
         )
-    assert found is not None, "Lightning skips the sweep in its fast_dev_run alone"
+    assert sweep is not None, "Lightning skips the sweep in its fast_dev_run alone"
     per_step = trainer.accumulate_grad_batches
-    count = min(len(found.results["lr"]), len(passes) // per_step)
+    count = min(len(sweep.results["lr"]), len(passes) // per_step)
     losses = np.array(passes[: count * per_step]).reshape(count, per_step).mean(axis=1)
     count = int(np.isfinite(losses).cumprod().sum())
-    return np.array(found.results["lr"][:count]), losses[:count]
+    return np.array(sweep.results["lr"][:count]), losses[:count]
 
 
 def suggest(rates: Steps, losses: Steps) -> Suggestion | None:
@@ -173,23 +173,27 @@ def _report(rates: Steps, losses: Steps, run_dir: Path) -> Suggestion | None:
         for step, (rate, loss, mean) in enumerate(zip(rates, losses, smoothed, strict=True))
     ]
     write_csv(run_dir / TABLE_FILE, rows)
-    found = suggest(rates, losses)
+    suggestion = suggest(rates, losses)
     figure, axes = figure_with_axes("learning rate", "training loss")
     axes.plot(rates, losses, alpha=0.3)
     axes.plot(rates, smoothed, color="C0")
     axes.set_xscale("log")
     axes.set_ylim(min(losses.min(), 0.95 * smoothed.min()), 1.1 * smoothed.max())
-    if found is not None:
-        axes.axvline(found.steepest, color="C3", label=f"falls fastest: {found.steepest:.2g}")
-        axes.axvline(found.lowest, color="C7", linestyle=":", label=f"lowest: {found.lowest:.2g}")
+    if suggestion is not None:
+        axes.axvline(
+            suggestion.steepest, color="C3", label=f"falls fastest: {suggestion.steepest:.2g}"
+        )
+        axes.axvline(
+            suggestion.lowest, color="C7", linestyle=":", label=f"lowest: {suggestion.lowest:.2g}"
+        )
         axes.legend()
     write_png(run_dir / PICTURE_FILE, figure_image(figure))
     text = (
         "the loss does not fall anywhere in the sweep: widen lr_finder.min_lr … max_lr, or look at "
         "the data"
-        if found is None
-        else f"suggested optimizer.lr={found.steepest:.2g}, where the loss falls fastest; it is "
-        f"lowest at {found.lowest:.2g}"
+        if suggestion is None
+        else f"suggested optimizer.lr={suggestion.steepest:.2g}, where the loss falls fastest; "
+        f"it is lowest at {suggestion.lowest:.2g}"
     )
     display.console.print(f"{text}; {run_dir / PICTURE_FILE}")
-    return found
+    return suggestion

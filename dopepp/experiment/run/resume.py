@@ -93,10 +93,12 @@ def check_resume(
     before = read_yaml(path) if path.is_file() else config.plain
     if not isinstance(before, Mapping):
         raise UserError(f"{path} with a {type(before).__name__}", "a config", "check the run")
-    found = config_differences(before, config.plain)
-    state = [one for one in found if one.key == _OPTIMIZER]
+    differences = config_differences(before, config.plain)
+    state = [difference for difference in differences if difference.key == _OPTIMIZER]
     if saved.spec != payload["spec"] or state:
-        network = [one for one in found if below(one.key, _NETWORK)] + state
+        network = [
+            difference for difference in differences if below(difference.key, _NETWORK)
+        ] + state
         raise UserError(
             f"resume={run}, whose network differs from the chosen one ({_listed(network)})"
             if not state
@@ -105,8 +107,8 @@ def check_resume(
             f"leave them as they were, or start anew with init_from={run / BEST_CHECKPOINT}"
             " where the network is the same",
         )
-    learnt = [one for one in found if below(one.key, LEARNT_FROM)]
-    learnt = [one for one in learnt if not below(one.key, _NOT_LEARNT_FROM)]
+    learnt = [difference for difference in differences if below(difference.key, LEARNT_FROM)]
+    learnt = [difference for difference in learnt if not below(difference.key, _NOT_LEARNT_FROM)]
     if not learnt:  # else the images are others for that reason
         learnt = image_differences(saved.data.get("images"), payload["data"].get("images"))
     if learnt and not config.resume_anyway:
@@ -115,16 +117,16 @@ def check_resume(
             "what the run has learnt from so far",
             "leave these as they were, or add resume_anyway=true",
         )
-    return list(dict.fromkeys([*found, *learnt]))
+    return list(dict.fromkeys([*differences, *learnt]))
 
 
 def config_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[ConfigDifference]:
     """Return the options in which two configs differ, but for what belongs to one call alone."""
-    one, other = (dict(flat(config)) for config in (old, new))
+    old_options, new_options = (dict(flat(config)) for config in (old, new))
     return [
-        ConfigDifference(key, _text(one, key), _text(other, key))
-        for key in {**one, **other}
-        if one.get(key) != other.get(key) and not below(key, _THIS_CALL)
+        ConfigDifference(key, _text(old_options, key), _text(new_options, key))
+        for key in {**old_options, **new_options}
+        if old_options.get(key) != new_options.get(key) and not below(key, _THIS_CALL)
     ]
 
 
@@ -152,8 +154,8 @@ def trusted_overrides(stored: object, source: Path) -> list[str]:
     for text in stored:
         match = _OVERRIDE.fullmatch(text)
         if match is None:
-            got, allowed = f"{source} with {text!r:.100}", "overrides as key=value"
-            raise UserError(got, allowed, "check the run's folder")
+            value, allowed = f"{source} with {text!r:.100}", "overrides as key=value"
+            raise UserError(value, allowed, "check the run's folder")
         if match["key"] in ("resume", "resume_anyway", "hydra.run.dir"):
             continue
         if "hydra" in re.split(r"[/.@:]", match["key"]):
@@ -165,9 +167,9 @@ def trusted_overrides(stored: object, source: Path) -> list[str]:
 
 def read_overrides(run: Path) -> list[str] | None:
     """Return the overrides that a run was started with; None where a file is missing or cut."""
-    own, overrides, hydra = (run / path for path in (OVERRIDES_FILE, OVERRIDES, _HYDRA))
-    if own.is_file():
-        return trusted_overrides(read_json(own).get("overrides"), own)
+    resume_file, overrides, hydra = (run / path for path in (OVERRIDES_FILE, OVERRIDES, _HYDRA))
+    if resume_file.is_file():
+        return trusted_overrides(read_json(resume_file).get("overrides"), resume_file)
     # Killed before it wrote its own file. Hydra writes the overrides last
     # and once more in another file: a file that was cut in the middle does not agree with it.
     if not overrides.is_file():
@@ -227,13 +229,13 @@ def differing_images(stored: Mapping[str, Any], present: Mapping[str, Any]) -> l
         for key in {**old, **new}
         if old.get(key) != new.get(key)
     ]
-    one, other = stored["first_image"], present["first_image"]
-    if one["labels"] != other["labels"] or not all(
-        np.allclose(one[name], other[name], rtol=_MAX_LABEL, atol=_MAX_LABEL)
+    before, now = stored["first_image"], present["first_image"]
+    if before["labels"] != now["labels"] or not all(
+        np.allclose(before[name], now[name], rtol=_MAX_LABEL, atol=_MAX_LABEL)
         for name in ("K", "T_cam_obj")
     ):
         lines.append("labels of the first image")
-    if _picture_difference(one, other) > _MAX_LEVELS:
+    if _picture_difference(before, now) > _MAX_LEVELS:
         lines.append("pixels of the first image")
     return lines
 
@@ -243,20 +245,20 @@ def _look(sample: Sample) -> dict[str, Any]:
     small = cv2.resize(sample.image, (box.width, box.height), interpolation=cv2.INTER_AREA)
     return {
         "K": sample.K.tolist(),
-        "labels": [one.label for one in sample.instances],
-        "T_cam_obj": [one.T_cam_obj.tolist() for one in sample.instances],
+        "labels": [instance.label for instance in sample.instances],
+        "T_cam_obj": [instance.T_cam_obj.tolist() for instance in sample.instances],
         "size": [box.width, box.height],
         "pixels": np.asarray(small, np.uint8).tobytes().hex(),
     }
 
 
-def _picture_difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> float:
+def _picture_difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> float:
     """Return the mean absolute difference, grey levels; infinite for other sizes."""
-    if one["size"] != other["size"]:
+    if before["size"] != now["size"]:
         return np.inf
     pictures = (
         np.frombuffer(bytes.fromhex(look["pixels"]), np.uint8).astype(float)
-        for look in (one, other)
+        for look in (before, now)
     )
     return float(np.abs(np.subtract(*pictures)).mean())
 
@@ -280,17 +282,19 @@ def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Parts)
     if not isinstance(stored, dict) or config is None:
         return  # a checkpoint that train.py has not written
     try:
-        own = chosen_data(None, None, config, "the checkpoint")
+        trained_data = chosen_data(None, None, config, "the checkpoint")
     except UserError:
         return  # nor does one whose data nobody can read
-    if _test_set(own) != _test_set(data):
+    if _test_set(trained_data) != _test_set(data):
         return
-    found = differing_images(stored["test"], describe_images(held_out_source(data, parts, "test")))
-    if found:
+    differences = differing_images(
+        stored["test"], describe_images(held_out_source(data, parts, "test"))
+    )
+    if differences:
         _log.warning(
             "the test images are not those of the checkpoint's own figures, "
             "though their configuration is the same: %s",
-            "; ".join(found),
+            "; ".join(differences),
         )
 
 

@@ -40,7 +40,7 @@ _UNSAID: Final = ("experiment=", "scale=", "logger", "model=", "data=", "resume"
 @contextmanager
 def tracked(config: RunConfig, run_dir: Path) -> Iterator[list[GuardedLogger]]:
     """Yield a training's trackers, and end the run with each of them however the training ends."""
-    chosen = [one for one in overrides_of(run_dir) if not one.startswith(_UNSAID)]
+    chosen = [override for override in overrides_of(run_dir) if not override.startswith(_UNSAID)]
     name = " ".join([config.model.name, config.data.name, *chosen])
     group = run_dir.resolve().parent.name if run_dir.name.isdigit() else None
     begun = _begun_id(run_dir) if config.resume is not None else None
@@ -61,10 +61,10 @@ def _open(
     trackers = []
     for node in (nodes or {}).values():
         target = LOGGERS.resolve(node.get(TARGET))  # a wrong name is no failure of a logger
-        own: dict[str, Any] = {"save_dir": str(folder)}
+        options: dict[str, Any] = {"save_dir": str(folder)}
         if issubclass(target, WandbLogger):
-            own |= {"name": name, "group": group, "job_type": kind, "version": begun}
-        given = {key: value for key, value in own.items() if key not in node}
+            options |= {"name": name, "group": group, "job_type": kind, "version": begun}
+        given = {key: value for key, value in options.items() if key not in node}
         trackers.append(GuardedLogger(partial(LOGGERS.build, node, **given)))
     failed = True
     try:
@@ -78,8 +78,8 @@ def _open(
 def _begun_id(run_dir: Path) -> str | None:
     """Return the id that Weights & Biases gave a run before it was interrupted."""
     folders = sorted((run_dir / "wandb").glob("*run-*-*"), key=lambda path: path.stat().st_mtime)
-    found = re.fullmatch(r"(?:offline-)?run-\d+_\d+-(\w+)", folders[-1].name) if folders else None
-    return found.group(1) if found else None
+    match = re.fullmatch(r"(?:offline-)?run-\d+_\d+-(\w+)", folders[-1].name) if folders else None
+    return match.group(1) if match else None
 
 
 def log_report(trackers: Sequence[GuardedLogger], report: Report, run_dir: Path) -> None:
@@ -89,7 +89,7 @@ def log_report(trackers: Sequence[GuardedLogger], report: Report, run_dir: Path)
         figures |= _figures(f"reference/{reference}", rows)
     for tracker in trackers:
         tracker.log_summary(figures)
-        _send_pictures(tracker, {f"test/{one}": run_dir / f"{one}.png" for one in _PICTURES})
+        _send_pictures(tracker, {f"test/{name}": run_dir / f"{name}.png" for name in _PICTURES})
 
 
 def _figures(prefix: str, rows: Mapping[str, PoseRow]) -> dict[str, float]:
@@ -112,7 +112,7 @@ def log_comparison(nodes: Mapping[str, Any] | None, folder: Path) -> None:
                     text = (folder / file).with_suffix(".md").read_text()
                     tracker.log_table(Path(file).stem, rows, text)
             names = (CURVES_FILE, PICTURES_FILE, LOSS_FILE, "table_shading.png", "frame_rate.png")
-            _send_pictures(tracker, {Path(one).stem: folder / one for one in names})
+            _send_pictures(tracker, {Path(name).stem: folder / name for name in names})
 
 
 def _send_pictures(tracker: GuardedLogger, paths: Mapping[str, Path]) -> None:

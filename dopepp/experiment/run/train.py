@@ -158,7 +158,7 @@ def _train(
         display.console.print(f"changed since the run began: {change}")
     if not getattr(rank_zero_only, "rank", 0):
         write_config(run_dir, config.plain)
-        write_environment(run_dir, config.seed, fingerprint, [str(one) for one in changes])
+        write_environment(run_dir, config.seed, fingerprint, [str(change) for change in changes])
         if config.resume is not None:
             remember_overrides(run_dir)
         explanation.begin()
@@ -238,17 +238,17 @@ def _resume_path(
             raise UserError("resume_anyway=true without resume", "resume=RUN beside it", "add it")
         return None, []
     run_dir = Path(resume)
-    found = newest_checkpoint(run_dir)
-    if found is None and not (run_dir / OVERRIDES_FILE).is_file():
+    newest = newest_checkpoint(run_dir)
+    if newest is None and not (run_dir / OVERRIDES_FILE).is_file():
         raise UserError(
             f"resume={resume}, which has no {LAST_CHECKPOINT}",
             "the folder of an interrupted run",
             "pass that run's folder, or start anew without resume",
         )
-    if found is None:
+    if newest is None:
         display.console.print(f"no checkpoint yet in {resume}: the run starts from its beginning")
         return None, []
-    path, checkpoint = found
+    path, checkpoint = newest
     return path, check_resume(run_dir, config, checkpoint, system.payload)
 
 
@@ -261,7 +261,11 @@ def _advice(run_dir: Path) -> str:
 
 def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Trainer) -> Report:
     """Measure the best checkpoint of a finished run and write everything down."""
-    checkpoints = [one for one in trainer.checkpoint_callbacks if isinstance(one, ModelCheckpoint)]
+    checkpoints = [
+        callback
+        for callback in trainer.checkpoint_callbacks
+        if isinstance(callback, ModelCheckpoint)
+    ]
     path = Path(checkpoints[0].best_model_path) if checkpoints else Path()
     if not path.is_file():
         path = run_dir / LAST_CHECKPOINT
@@ -296,7 +300,7 @@ def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Traine
 
 
 JOBS: Final[Mapping[str, Callable[[RunConfig, Path], object]]] = {
-    "run_training": train,
+    "train": run_training,
     "cost": measure_cost,
     "lr_finder": find_learning_rate,
 }

@@ -131,13 +131,13 @@ def fit_factors(
     pairs: Sequence[tuple[Detection, Float[np.ndarray, "equivalents 4 4"]]],
 ) -> dict[str, float]:
     """Fit the factors on distances and covariances to poses that were found with factors of 1."""
-    estimated = np.reshape([one.T_cam_obj for one, _ in pairs], (-1, 4, 4))
+    estimated = np.reshape([detection.T_cam_obj for detection, _ in pairs], (-1, 4, 4))
     true = np.reshape([equivalents[0] for _, equivalents in pairs], (-1, 4, 4))
     distance = calibration.fit_distance_factor(estimated, true)
     surprises = []
-    for one, equivalents in pairs:
-        stated = np.broadcast_to(one.covariance, (len(equivalents), 6, 6)).copy()
-        T_est = np.broadcast_to(one.T_cam_obj, equivalents.shape).copy()
+    for detection, equivalents in pairs:
+        stated = np.broadcast_to(detection.covariance, (len(equivalents), 6, 6)).copy()
+        T_est = np.broadcast_to(detection.T_cam_obj, equivalents.shape).copy()
         T_est[:, :3, 3] *= distance
         poses = T_est[:, :3, :3], T_est[:, :3, 3], equivalents[:, :3, :3], equivalents[:, :3, 3]
         away = mahalanobis(*map(torch.from_numpy, (*poses, stated)))
@@ -175,9 +175,12 @@ def choose(
     # A detection passes from the threshold on, so it lies just above the first that must not.
     threshold = float(np.nextafter(loudest[allowed], 1.0)) if allowed < len(loudest) else 0.0
     if refined:
-        names = ["refined_min_score", *(f"refined_{one}" for one in calibration.REFINED_FEATURES)]
+        names = [
+            "refined_min_score",
+            *(f"refined_{feature}" for feature in calibration.REFINED_FEATURES),
+        ]
     else:
-        names = ["min_score", *(f"score_{one}" for one in calibration.FEATURES)]
+        names = ["min_score", *(f"score_{feature}" for feature in calibration.FEATURES)]
     return dict(zip(names, [threshold, *map(float, weights)], strict=True))
 
 
@@ -211,13 +214,15 @@ def matched_poses(
     estimator: PoseEstimator, parts: Parts, source: Source
 ) -> list[tuple[Detection, Float[np.ndarray, "equivalents 4 4"]]]:
     """Return detections, each with all poses that look like the one of the instance it found."""
-    found = []
-    for _, _, part, own, instances in _by_object(estimator, parts, source):
+    matches = []
+    for _, _, part, detections, instances in _by_object(estimator, parts, source):
         group = symmetry_transforms(part).numpy()
-        for one, number in zip(own, assign(part.cuboid[CENTROID], own, instances), strict=True):
+        for detection, number in zip(
+            detections, assign(part.cuboid[CENTROID], detections, instances), strict=True
+        ):
             if number >= 0 and counted(instances[number]):
-                found.append((one, instances[number].T_cam_obj @ group))
-    return found
+                matches.append((detection, instances[number].T_cam_obj @ group))
+    return matches
 
 
 def _by_object(
@@ -227,11 +232,11 @@ def _by_object(
     images = ((source, index) for source in sources for index in range(len(source)))
     for number, (source, index) in enumerate(images):
         sample = source.sample(index, 0)
-        found = estimator.predict(sample.image, sample.K, cropped=True)
+        detections = estimator.predict(sample.image, sample.K, cropped=True)
         for part in parts:
-            own = [one for one in found if one.object == part.name]
-            true = [one for one in sample.instances if one.label == part.name]
-            yield number, sample, part, own, true
+            of_part = [detection for detection in detections if detection.object == part.name]
+            true = [instance for instance in sample.instances if instance.label == part.name]
+            yield number, sample, part, of_part, true
 
 
 class Hidden:
@@ -258,18 +263,18 @@ def write_tuned(checkpoint: Checkpoint, path: Path, options: Mapping[str, float]
 
 
 def _judge(
-    part: Part, found: Sequence[Detection], true: Sequence[Instance]
+    part: Part, detections: Sequence[Detection], true: Sequence[Instance]
 ) -> tuple[Bool[np.ndarray, "found"], Bool[np.ndarray, "found"]]:
     """Return which detections of an object are right (ADD(-S) below 0.1 d), and which are judged.
 
     As in every evaluation, one of an instance too hidden to count is neither right nor wrong.
     """
-    numbers = assign(part.cuboid[CENTROID], found, true)
+    numbers = assign(part.cuboid[CENTROID], detections, true)
     counts = np.array([number < 0 or counted(true[number]) for number in numbers], bool)
     matched = np.flatnonzero(counts & (numbers >= 0)).tolist()
-    right = np.zeros(len(found), bool)
+    right = np.zeros(len(detections), bool)
     if matched:
-        T_est = torch.from_numpy(np.array([found[k].T_cam_obj for k in matched]))
+        T_est = torch.from_numpy(np.array([detections[k].T_cam_obj for k in matched]))
         T_gt = torch.from_numpy(np.array([true[numbers[k]].T_cam_obj for k in matched]))
         points = torch.from_numpy(np.asarray(part.points, np.float64))
         error = add_s if len(symmetry_transforms(part)) > 1 else add

@@ -94,7 +94,7 @@ def launch(
 ) -> list[JobReturn]:
     """Run jobs, numbered from ``first``, and wait for all; a lost one has failed, others go on."""
     jobs.folder.mkdir(parents=True, exist_ok=True)
-    numbered = {first + index: list(one) for index, one in enumerate(overrides)}
+    numbered = {first + index: list(override_list) for index, override_list in enumerate(overrides)}
     returns: dict[int, JobReturn] = {}
     for number, result in run(jobs, numbered):
         if isinstance(result, Exception):

@@ -110,9 +110,9 @@ class _Trials:
 
     def __init__(self, study: optuna.Study, space: Space, launcher: Launcher, folder: Path) -> None:
         self._study, self._space, self._launcher, self._folder = study, space, launcher, folder
-        known = {trial.number for trial in study.get_trials(deepcopy=False)}
+        numbers = {trial.number for trial in study.get_trials(deepcopy=False)}
         names = [path.name for path in folder.iterdir() if path.name.isdigit()]
-        foreign = [name for name in names if int(name) not in known]
+        foreign = [name for name in names if int(name) not in numbers]
         if foreign:  # a trial must not go on in the folder of another study's
             raise UserError(
                 f"{folder} with the jobs {', '.join(sorted(foreign))} of another study",
@@ -134,7 +134,9 @@ class _Trials:
         while (missing := wanted - len(self._study.get_trials(False, ended))) > 0:
             asked = range(min(missing, at_a_time))
             numbers_asked = {self._study.ask(self._space.varied).number for _ in asked}
-            returns += self._launch([one for one in self._running() if one.number in numbers_asked])
+            returns += self._launch(
+                [trial for trial in self._running() if trial.number in numbers_asked]
+            )
         return returns
 
     def _launch(self, trials: Sequence[FrozenTrial]) -> Sequence[JobReturn]:
@@ -201,7 +203,7 @@ def read_space(loader: ConfigLoader, space: Sequence[str], arguments: Sequence[s
             fixed.append(str(override.input_line))
     if not sweeps:
         raise _bad_entry("nothing to vary")
-    texts = {key: str(one.input_line).partition("=")[2] for key, one in sweeps.items()}
+    texts = {key: str(sweep.input_line).partition("=")[2] for key, sweep in sweeps.items()}
     return Space({key: _distribution(sweep) for key, sweep in sweeps.items()}, texts, fixed)
 
 
@@ -228,9 +230,9 @@ def _distribution(sweep: Override) -> distributions.BaseDistribution:
     raise _bad_entry(f"{sweep.input_line!r}")
 
 
-def _bad_entry(got: str) -> UserError:
+def _bad_entry(problem: str) -> UserError:
     return UserError(
-        f"search.space with {got}",
+        f"search.space with {problem}",
         "interval(low, high), int(interval(…)), tag(log, interval(…)), range(…), choice(…)",
         "correct search.space or the command line",
     )
@@ -238,7 +240,7 @@ def _bad_entry(got: str) -> UserError:
 
 def examples(space: Space) -> list[list[str]]:
     """Return overrides that try every option once, to see whether they compose."""
-    first = {key: _ends(one)[0] for key, one in space.varied.items()}
+    first = {key: _ends(choices)[0] for key, choices in space.varied.items()}
     tried = [first]
     for key, distribution in space.varied.items():
         tried += [{**first, key: end} for end in _ends(distribution)[1:]]
