@@ -89,8 +89,9 @@ def held_out_source(data: DataConfig, parts: Parts, split: Split) -> DescribedSo
         return labelled
     _log.warning(
         "%s shows none of %s: validation is on renders, as with data.image_sets.val=null",
-        labelled.name, ", ".join(part.name for part in parts),
-    )  # fmt: skip
+        labelled.name,
+        ", ".join(part.name for part in parts),
+    )
     return held_out_renders(data, parts, split)
 
 
@@ -163,9 +164,14 @@ def synthetic_companions(
     if image_set is None or not read_image_set(data.root, image_set, "synthetic"):
         return None
     return YcbVideoReader(
-        data.root, parts, image_set, "synthetic",
-        backgrounds=backgrounds, seed=seed, read_depth=False,
-    )  # fmt: skip
+        data.root,
+        parts,
+        image_set,
+        "synthetic",
+        backgrounds=backgrounds,
+        seed=seed,
+        read_depth=False,
+    )
 
 
 def share_of(image_sets: Mapping[str, str | None], split: Split) -> tuple[float, float]:
@@ -285,12 +291,18 @@ def _with_camera_of_pictures(config: RunConfig, parts: Parts) -> RunConfig:
     if virtual.working_distance is None:
         _log.info(
             "%s: renders are as its camera sees parts at %g – %g m, as they are annotated there; "
-            "camera=FILE working_distance=[near,far] say it otherwise", source.name, *distance,
-        )  # fmt: skip
+            "camera=FILE working_distance=[near,far] say it otherwise",
+            source.name,
+            *distance,
+        )
     lens = LensConfig(
-        width=width, height=height,
-        fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2]),
-    )  # fmt: skip
+        width=width,
+        height=height,
+        fx=float(K[0, 0]),
+        fy=float(K[1, 1]),
+        cx=float(K[0, 2]),
+        cy=float(K[1, 2]),
+    )
     chosen = replace(virtual, camera=lens, working_distance=distance)
     plain = {
         **config.plain,

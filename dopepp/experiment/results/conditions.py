@@ -102,8 +102,9 @@ class Condition:
             if isinstance(method, FileMethod):
                 raise UserError(
                     f"{self.name} with results of {name}, which has no poses on {self.images}",
-                    "checkpoints (ckpt_path, baseline)", f"leave out {self.name} or results",
-                )  # fmt: skip
+                    "checkpoints (ckpt_path, baseline)",
+                    f"leave out {self.name} or results",
+                )
 
 
 SHADING: Final = Condition(

@@ -174,8 +174,11 @@ class FileMethod:
         if unused or others:
             _log.warning(
                 "%s: left out %s poses on images that are not in the test set and %s of objects "
-                "that are not measured", self._path, f"{len(unused):,}", f"{others:,}",
-            )  # fmt: skip
+                "that are not measured",
+                self._path,
+                f"{len(unused):,}",
+                f"{others:,}",
+            )
 
 
 def object_numbers(data: DataConfig, parts: Parts) -> dict[str, int]:

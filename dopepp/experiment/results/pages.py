@@ -71,17 +71,31 @@ FILES: Final = {
 """What a run may leave, in the order of a reader's interest."""
 
 _PICTURES: Final = (
-    "overlay.png", "auc.png", "val_overlay.png", "val_belief.png", "lr_finder.png",
-    "frame_rate.png", "shading.png", "scale.png", "scale_examples.png",
-)  # fmt: skip
+    "overlay.png",
+    "auc.png",
+    "val_overlay.png",
+    "val_belief.png",
+    "lr_finder.png",
+    "frame_rate.png",
+    "shading.png",
+    "scale.png",
+    "scale_examples.png",
+)
 
 MAX_BYTES: Final = 8_000_000
 """Of a released file: it travels with the package."""
 
 _CARD_FIELDS: Final = (
-    "num_instances", "add_01d", "add_005d", "pass_5cm", "pass_10cm", "auc_10cm",
-    "median_rotation_deg", "median_translation", "miss_rate",
-)  # fmt: skip
+    "num_instances",
+    "add_01d",
+    "add_005d",
+    "pass_5cm",
+    "pass_10cm",
+    "auc_10cm",
+    "median_rotation_deg",
+    "median_translation",
+    "miss_rate",
+)
 
 
 @cache
@@ -220,8 +234,9 @@ def release(checkpoint: Path, results: Path, name: str, folder: Path) -> list[Pa
     if 2 * parameters > MAX_BYTES:
         raise UserError(
             f"{checkpoint} with {2 * parameters:,} bytes of weights in half precision",
-            f"at most {MAX_BYTES:,}", "release a narrower network (model.width)",
-        )  # fmt: skip
+            f"at most {MAX_BYTES:,}",
+            "release a narrower network (model.width)",
+        )
     target, card = folder / f"{name}{SUFFIX}", folder / f"{name}.md"
     write_content(trained.to_file(), target)
     reported = [report] if report.refined is None else [report, report.refined]
@@ -236,15 +251,17 @@ def release(checkpoint: Path, results: Path, name: str, folder: Path) -> list[Pa
         masks=(config.get("masking") or {}).get("probability", 0),
         refine="" if report.refined is None else " refine=region",
         report=report,
-        table=markdown([
-            {"object": row.object, "method": row.method}
-            | {
-                column.heading: column.text(row)
-                for column in COLUMNS
-                 if column.field in _CARD_FIELDS
-            }
-            for rows in [*(report.rows for report in reported), *report.references.values()]
-            for row in shown_rows(rows).values()
-        ]),
-    )  # fmt: skip
+        table=markdown(
+            [
+                {"object": row.object, "method": row.method}
+                | {
+                    column.heading: column.text(row)
+                    for column in COLUMNS
+                    if column.field in _CARD_FIELDS
+                }
+                for rows in [*(report.rows for report in reported), *report.references.values()]
+                for row in shown_rows(rows).values()
+            ]
+        ),
+    )
     return [target, card]

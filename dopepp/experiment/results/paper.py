@@ -117,9 +117,10 @@ class PaperTable:
         table = config.get("table") if isinstance(config, dict) else None
         if not isinstance(table, dict):
             raise UserError(
-                f"{path}, which lays out no table", "an experiment with `table:`",
+                f"{path}, which lays out no table",
+                "an experiment with `table:`",
                 "pass conf/experiment/table….yaml",
-            )  # fmt: skip
+            )
         return cls.of(table)
 
     @property

@@ -148,8 +148,9 @@ def refining(estimator: PoseEstimator, refine: Refine | None, parts: Parts) -> P
     if refine is None:
         return estimator
     by_name = {part.name: part for part in parts}
-    own_parts = [part if part.mesh is not None else by_name.get(part.name, part)
-           for part in estimator.parts]  # fmt: skip
+    own_parts = [
+        part if part.mesh is not None else by_name.get(part.name, part) for part in estimator.parts
+    ]
     return estimator.refining(refine, own_parts)
 
 

@@ -82,15 +82,16 @@ def export(
             images += _seen(original, source.sample(index))
     save = EXPORTERS[layout][0](network, precision, images)
     described = Export(layout, precision, network.size_multiple, *cost)
-    with _written(target) as path:
-        save(path, checkpoint, described)
+    with _written(target) as draft_path:
+        save(draft_path, checkpoint, described)
         if precision == "int8":
             described = replace(
-                described, num_images=num_images,
-                add_01d=_accuracy(original, PoseEstimator.load(path), source, num_images),
-            )  # fmt: skip
-            save(path, checkpoint, described)
-        agreement = _compared(PoseEstimator.load(path), original, source)
+                described,
+                num_images=num_images,
+                add_01d=_accuracy(original, PoseEstimator.load(draft_path), source, num_images),
+            )
+            save(draft_path, checkpoint, described)
+        agreement = _compared(PoseEstimator.load(draft_path), original, source)
         if not (agreement.is_exact if precision == "fp32" else np.isfinite(agreement.maps)):
             raise RunError(f"{target} was not written: it differs from {path}: {agreement}")
     return Exported(target, described, agreement, _commands(target, checkpoint))
@@ -100,8 +101,8 @@ def export(
 def _written(target: Path) -> Iterator[Path]:
     """Yield a path beside the target that becomes the target; a :class:`RunError` if it cannot."""
     try:
-        with draft(target) as path:
-            yield path
+        with draft(target) as draft_path:
+            yield draft_path
     except OSError as error:
         raise RunError(f"cannot write {target}: {error.strerror}; free or repair it") from error
 

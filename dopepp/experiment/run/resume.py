@@ -301,5 +301,12 @@ def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Parts)
 def _test_set(data: DataConfig) -> list[object]:
     """Return the options that name a test set; the others cannot mean another one."""
     named = (data.format, data.root, data.objects, data.parts, data.unit, data.frames, data.virtual)
-    return [*named, data.image_sets, data.num_test, data.eval_seed, data.test.renderer,
-            data.targets, data.classes or {}]  # fmt: skip
+    return [
+        *named,
+        data.image_sets,
+        data.num_test,
+        data.eval_seed,
+        data.test.renderer,
+        data.targets,
+        data.classes or {},
+    ]

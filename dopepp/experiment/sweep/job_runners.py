@@ -32,8 +32,15 @@ from dopepp.experiment.results.folder import FAILURE_FILE, write_json
 
 _MOST: Final = 1024
 
-_ANYWHERE: Final = ("timeout_min", "nodes", "tasks_per_node", "cpus_per_task", "gpus_per_node",
-                    "mem_gb", "name")  # fmt: skip
+_ANYWHERE: Final = (
+    "timeout_min",
+    "nodes",
+    "tasks_per_node",
+    "cpus_per_task",
+    "gpus_per_node",
+    "mem_gb",
+    "name",
+)
 """What submitit calls by these names on every kind of cluster; the rest is SLURM's own."""
 
 
@@ -139,11 +146,16 @@ def on_ray(address: str | None, num_cpus: float, num_gpus: float) -> Runner:
         from ray import cloudpickle
 
         pool = ClusterPool(
-            cloudpickle.dumps(jobs), address, available_cores(),
-            "hydra/launcher=ray", "hydra.launcher.address",
+            cloudpickle.dumps(jobs),
+            address,
+            available_cores(),
+            "hydra/launcher=ray",
+            "hydra.launcher.address",
             # Not repeated: a job that took its process down once would do so again.
-            max_retries=0, num_cpus=num_cpus, num_gpus=num_gpus,
-        )  # fmt: skip
+            max_retries=0,
+            num_cpus=num_cpus,
+            num_gpus=num_gpus,
+        )
         return _run(pool, overrides)
 
     return run
@@ -190,8 +202,10 @@ def on_slurm(folder: str, cluster: str, max_num_timeout: int, sbatch: Mapping[st
         for handle in submitit.helpers.as_completed(handles):
             try:
                 yield numbers[handle.job_id], handle.result()
-            except (submitit.core.utils.UncompletedJobError,
-                    submitit.core.utils.FailedJobError) as error:  # fmt: skip
+            except (
+                submitit.core.utils.UncompletedJobError,
+                submitit.core.utils.FailedJobError,
+            ) as error:
                 yield numbers[handle.job_id], error
 
     return run

@@ -168,8 +168,11 @@ def requeue() -> str:
     try:
         subprocess.run(
             ["scontrol", "requeue", job],
-            check=True, capture_output=True, text=True, timeout=30,
-        )  # fmt: skip
+            check=True,
+            capture_output=True,
+            text=True,
+            timeout=30,
+        )
     except (OSError, subprocess.SubprocessError) as error:
         reason = getattr(error, "stderr", None) or error
         return f"SLURM did not requeue job {job}: {' '.join(str(reason).split())}"
