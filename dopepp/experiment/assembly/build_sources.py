@@ -141,7 +141,11 @@ def _real_frames(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
 
 
 def labelled_images(data: DataConfig, parts: Parts, seed: int, split: Split) -> DescribedSource:
-    """Open a split's labelled images; a :class:`UserError` if ``data.root`` does not hold them."""
+    """Open a split's labelled images.
+
+    Raises:
+        UserError: ``data.root`` does not hold them.
+    """
     assert data.root is not None
     if data.format in FORMATS:
         return FORMATS[data.format](data, data.root, parts, seed, split)

@@ -86,7 +86,11 @@ def validation_renders(
 def kept(
     source: DescribedSource, data: DataConfig, cache: Cache, input_size: tuple[int, int] | None
 ) -> DescribedSource:
-    """Put the chosen cache around a source; a :class:`UserError` where there is no room."""
+    """Put the chosen cache around a source.
+
+    Raises:
+        UserError: The cache does not fit.
+    """
     if cache == "none":
         return source
     folder = None

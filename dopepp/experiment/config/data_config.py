@@ -78,14 +78,19 @@ class VirtualConfig:
 
     @classmethod
     def of(cls, node: object) -> VirtualConfig:
-        """Read the node; an option of it may be a :class:`UserError`."""
+        """Read the node ``virtual``.
+
+        Raises:
+            UserError: An option is unknown or wrong.
+        """
         return parse(cls, with_files(node or {}), "virtual")
 
     @property
     def view(self) -> View | None:
         """The camera at its working distance; None where the preset's camera is taken.
 
-        A :class:`UserError`: one of the two is missing, or wrong.
+        Raises:
+            UserError: The camera or the working distance is missing or wrong.
         """
         if self.camera is None and self.working_distance is None:
             return None
@@ -189,7 +194,8 @@ class DataConfig:
     def of(cls, data: object, virtual: object) -> DataConfig:
         """Read both nodes; ``virtual`` None is one that says nothing.
 
-        A :class:`UserError`: an option is unknown, missing, of a wrong type or out of range.
+        Raises:
+            UserError: An option is unknown, missing, of a wrong type or out of range.
         """
         if isinstance(data, Mapping) and "virtual" in data:
             problem = f"data.virtual={shown(data['virtual'])}"
@@ -218,7 +224,11 @@ class DataConfig:
 
     @property
     def network_input(self) -> tuple[int, int]:
-        """``input_size``, a :class:`UserError` where it is not known."""
+        """Size of the network's input, pixels.
+
+        Raises:
+            UserError: Neither the config nor a camera states the size.
+        """
         if self.input_size is None:
             raise UserError(
                 "no data.input_size and no camera to choose it for",
@@ -234,7 +244,11 @@ class DataConfig:
         return self.image_sets[split] is None
 
     def image_set(self, split: Split) -> str:
-        """Return what a split takes of the root; a :class:`UserError` where that is nothing."""
+        """Return the name of a split's image set below ``root``.
+
+        Raises:
+            UserError: The split has no image set.
+        """
         chosen = self.image_sets[split]
         if chosen is None:
             raise UserError(
@@ -249,8 +263,10 @@ def chosen_data(data: Node | None, virtual: Node | None, stored: object, source:
     """Return the data to evaluate on: the checkpoint's, with what the user gives instead.
 
     ``data`` and ``virtual`` are whole nodes or options to change. ``stored`` is what the checkpoint
-    of the path ``source`` was trained on; it may be by anybody. A :class:`UserError`: neither names
-    the data, or one of them is wrong.
+    of the path ``source`` was trained on; it is not trusted.
+
+    Raises:
+        UserError: Neither the user nor the checkpoint names the data, or an option is wrong.
     """
     given, base = data or {}, stored if isinstance(stored, dict) else {}
     whole = "name" in given  # a file of conf/data, not single options

@@ -38,7 +38,11 @@ class Protocols:
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> Protocols:
-        """Read the options, of which a training has no scales; one may be a :class:`UserError`."""
+        """Read the options; a training has no scales.
+
+        Raises:
+            UserError: An option is wrong.
+        """
         shares = "shares of the visible area from 0 to 1, not 0 alone, e.g. [0.2,0.4,0.6,0.8]"
         bounds = (1 / _MAX_SCALE, _MAX_SCALE)
         factors = "factors from {:g} to {:g}, not 1 alone, e.g. [0.5,1,2]".format(*bounds)

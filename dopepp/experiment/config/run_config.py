@@ -99,7 +99,11 @@ class TrainerConfig:
 
     @property
     def num_processes(self) -> int:
-        """Training processes, over all machines; a :class:`UserError` if ``devices`` is wrong."""
+        """Number of training processes on all machines.
+
+        Raises:
+            UserError: ``trainer.devices`` is wrong.
+        """
         # Where torchrun has started this process, the others exist already.
         world_size = os.environ.get("WORLD_SIZE", "")
         outside = int(world_size) if world_size.isdecimal() else 1
@@ -256,7 +260,11 @@ class RunConfig(MeasurementConfig):
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> RunConfig:
-        """Read a composed and resolved config; a :class:`UserError` tells what is wrong."""
+        """Read a composed and resolved config.
+
+        Raises:
+            UserError: An option is unknown, missing or wrong.
+        """
         plain = {**config, "virtual": with_files(config.get("virtual"))}
         data = DataConfig.of(plain.get("data"), plain["virtual"])
         options = {key: value for key, value in plain.items() if key != "virtual"}
@@ -299,7 +307,11 @@ class EvaluationConfig(MeasurementConfig):
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> EvaluationConfig:
-        """Read a composed and resolved config; a :class:`UserError` tells what is wrong."""
+        """Read a composed and resolved config.
+
+        Raises:
+            UserError: An option is unknown, missing or wrong.
+        """
         return _parsed(cls, config)
 
 

@@ -153,7 +153,10 @@ def compare_runs(
 
     A method measured refined as well is two, its network and behind it the same refined; pictures
     and curves of training are the networks'. The table is written first, so that it is there
-    whatever befalls curves and pictures. A :class:`UserError`: the baseline is none of the methods.
+    whatever befalls curves and pictures.
+
+    Raises:
+        UserError: The baseline is not among the methods.
     """
     networks = group(runs)
     names = [entry.name for entry in networks]

@@ -130,7 +130,11 @@ class Entry:
 
 
 def find_runs(paths: Sequence[Path]) -> list[Run]:
-    """Read folders of runs, evaluations and multiruns, each once; a :class:`UserError` if none."""
+    """Read each folder of runs, evaluations and multiruns once.
+
+    Raises:
+        UserError: A path holds no run.
+    """
     folders = {folder.resolve(): folder for path in paths for folder in _folders(path)}
     return [read_run(folder) for folder in folders.values()]
 

@@ -214,9 +214,10 @@ def _values(
 
 
 def check_masks(source: Source) -> None:
-    """Read images until one has an instance mask; a :class:`UserError` if none has.
+    """Read images until one has an instance mask, before anything takes time.
 
-    So it shows before anything takes time whether there is something to shade.
+    Raises:
+        UserError: No image has an instance mask, so there is nothing to shade.
     """
     samples = (source.sample(index) for index in range(len(source)))
     if not any(

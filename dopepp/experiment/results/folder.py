@@ -59,7 +59,8 @@ def write_json(path: Path, record: Mapping[str, Any]) -> None:
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON record of a run folder.
 
-    A :class:`UserError`: the file is missing or no JSON object.
+    Raises:
+        UserError: The file is missing or is not a JSON object.
     """
     try:
         record = read_strict_json(path)

@@ -126,7 +126,7 @@ class FilePose:
 
 
 class FileMethod:
-    """Another program's poses, out of a BOP challenge CSV; a :class:`UserError` if that is wrong.
+    """Poses of another program, read from a BOP challenge CSV.
 
     ``numbers`` are those of the data set's objects, by name; poses of objects that are not measured
     are left out.
@@ -157,9 +157,10 @@ class FileMethod:
         return Cost(ms_per_frame=_median_ms(seconds))
 
     def check_used(self) -> None:
-        """Say, after all images, how many poses had no place in the measurement.
+        """Log, after all images, how many poses were not measured.
 
-        A :class:`UserError`: none of them was on one of the images.
+        Raises:
+            UserError: No pose was on an image of the test set.
         """
         used = [row for rows in self._used.values() for row in rows]
         unused = [row for rows in self._unused.values() for row in rows]

@@ -223,8 +223,10 @@ def write_multirun_readme(folder: Path, command: Sequence[str], jobs: Mapping[st
 def release(checkpoint: Path, results: Path, name: str, folder: Path) -> list[Path]:
     """Write ``NAME.safetensors`` and its card ``NAME.md``; return both.
 
-    ``results`` is ``metrics.json`` of a run or an evaluation of the checkpoint. A
-    :class:`UserError`: a file is not what it should be, or the release is too large.
+    ``results`` is ``metrics.json`` of a run or an evaluation of the checkpoint.
+
+    Raises:
+        UserError: A file is of another kind, or the release is too large.
     """
     if not name.isidentifier():
         raise UserError(f"name {name!r}", "letters, digits and _", "choose another name")

@@ -100,7 +100,11 @@ class PaperTable:
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> PaperTable:
-        """Read the config's ``table``; a :class:`UserError` if a field or a value is unknown."""
+        """Read the config's ``table``.
+
+        Raises:
+            UserError: A field or a value is unknown.
+        """
         table = parse(cls, config, "table")
         if table.threshold not in _PASS_FIELDS:
             allowed = ", ".join(f"{threshold:g}" for threshold in _PASS_FIELDS)
@@ -111,7 +115,8 @@ class PaperTable:
     def read(cls, path: Path) -> PaperTable:
         """Read the ``table`` of an experiment's file, ``conf/experiment/NAME.yaml``.
 
-        A :class:`UserError`: the file cannot be read, or its table is missing or wrong.
+        Raises:
+            UserError: The file cannot be read, or its table is missing or wrong.
         """
         config = read_yaml(path)
         table = config.get("table") if isinstance(config, dict) else None

@@ -62,7 +62,11 @@ def measure_and_record(
     every estimator is measured without and with it; ``metrics.json`` is the last estimator's, with
     its refined poses' under ``refined``, and a file's where there is no estimator.
 
-    Returns a report per estimator, then per file. A :class:`UserError`: data or a file are wrong.
+    Returns:
+        A report per estimator, then per file.
+
+    Raises:
+        UserError: The data or a file of poses is wrong.
     """
     protocols = protocols or Protocols()
     source = held_out_source(data, parts, "test")

@@ -108,7 +108,7 @@ def _written(target: Path) -> Iterator[Path]:
 
 
 def _target(path: Path, layout: str, precision: str, out: Path | None) -> Path:
-    """Return where the export goes; a :class:`UserError` where an option or the place is wrong."""
+    """Return the path of the export, or raise a user error if an option or the path is wrong."""
     for name, value, allowed in (
         ("format", layout, EXPORTERS),
         ("precision", precision, PRECISIONS),
