@@ -1,0 +1,37 @@
+"""The pages keep the measurable rules of their language, and the generated ones are up to date."""
+
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+CHECK = runpy.run_path(str(DOCS / "check_pages.py"))
+
+
+@pytest.mark.parametrize("page", CHECK["user_pages"](), ids=lambda page: page.name)
+def test_a_user_page_keeps_the_rules(page):
+    assert list(CHECK["problems"](page.read_text(encoding="utf-8"))) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("line\n" * 121, "121 lines"),
+        ("word " * 41 + ".", "a sentence of 42 words"),
+        ("a" * 161, "a line of 161 characters"),
+        ("| a | b | c | d | e | f | g |\n| --- |", "a table of 7 columns"),
+        ("| a |\n| --- |\n" + "| b |\n" * 11, "a table of 11 rows"),
+    ],
+)
+def test_a_broken_rule_is_found(text, problem):
+    assert any(found.startswith(problem) for found in CHECK["problems"](text))
+
+
+def test_the_generated_reference_is_up_to_date(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["make_reference.py"])
+    reference = runpy.run_path(str(DOCS / "make_reference.py"))
+    for name, page in (("cli.md", "cli_page"), ("options.md", "options_page")):
+        written = (DOCS / "reference" / name).read_text(encoding="utf-8")
+        assert written == reference[page](), "run python docs/make_reference.py"
