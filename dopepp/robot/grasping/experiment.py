@@ -168,7 +168,7 @@ class _Attempts:
 
 
 def _interval(count: int, trials: int) -> tuple[float, float]:
-    from dopepp.metrics.functional.rates import wilson_interval  # imports torch
+    from dopepp.metrics.functional import wilson_interval  # imports torch
 
     return wilson_interval(count, trials)
 
