@@ -1,11 +1,11 @@
-"""How sure a difference between two methods is: a paired, hierarchical bootstrap.
+"""Confidence intervals of differences between two methods: a paired, hierarchical bootstrap.
 
-Two methods are measured on the same instances, each trained with one or several seeds. A resample
-draws seeds and instances with replacement, the same ones for both methods, and takes the difference
-anew; the interval holds the middle share of these differences (percentile bootstrap; Efron and
-Tibshirani, An Introduction to the Bootstrap, 1993).
+Both methods are measured on the same instances, and each is trained with one or several seeds. A
+resample draws seeds and instances with replacement, the same for both methods, and recomputes the
+difference; the interval holds the middle share of these differences (percentile bootstrap; Efron
+and Tibshirani, An Introduction to the Bootstrap, 1993).
 
-To take another statistic, add its function to :data:`STATISTICS`.
+To support another statistic, add its function to :data:`STATISTICS`.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from scipy.stats import norm, t
 from dopepp.core.errors import UserError
 
 Numbers = Sequence[Float[np.ndarray, "_ instances"]]
-"""Of each object a number per seed and instance."""
+"""One array per object: a number per seed and instance."""
 
 Draws = Float[np.ndarray, "resamples seeds"]
-"""How often each resample draws each seed, as a share."""
+"""Share of each resample that each seed makes up."""
 
 _Statistic = Callable[[Float[np.ndarray, "... n"]], Float[np.ndarray, "..."]]
 StatisticName = Literal["mean", "median"]
 
 _BLOCK: Final = 4_000_000
-"""Numbers that are resampled at once: 32 MB."""
+"""Numbers resampled at once: 32 MB."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +41,12 @@ class Difference:
 
     Attributes:
         value: The difference.
-        low: Lower end of the interval.
-        high: Upper end.
-        num_differing: Instances on which the methods differ.
-        fewest: Differing instances without which no difference is more than chance; see
-            :func:`fewest_differing`.
-        seeds_to_tell: About how many seeds would tell such a difference from chance on these
-            instances, see :func:`seeds_to_tell`; None where that is not known.
+        low: Lower end of the confidence interval.
+        high: Upper end of the confidence interval.
+        num_differing: Number of instances on which the methods differ.
+        fewest: Smallest significant ``num_differing`` (:func:`fewest_differing`).
+        seeds_to_tell: Estimated number of seeds that would make the difference significant
+            (:func:`seeds_to_tell`); None if unknown.
     """
 
     value: float
@@ -59,7 +58,7 @@ class Difference:
 
     @property
     def within_noise(self) -> bool:
-        """Whether such a difference is to be expected of methods that are equally good."""
+        """Whether two equally good methods may differ by as much."""
         return self.num_differing < self.fewest or self.low <= 0 <= self.high
 
 
@@ -74,23 +73,29 @@ def paired_difference(
     few_seeds: bool = True,
     seed: int = 0,
 ) -> Difference | None:
-    """Return the difference of two methods' figures and its confidence interval.
+    """Return the difference between two methods' figures with its confidence interval.
 
-    A method's figure is the statistic over instances, averaged over objects and seeds. With one
-    seed each, the interval knows nothing of the noise of training.
+    A figure is the statistic over instances, averaged over objects and seeds. With a single seed
+    the interval does not cover the noise of training.
 
-    The spread of two or three seeds says little about that of all seeds, and resamples of them
-    spread even less, by √((S − 1) / S). Therefore ``few_seeds`` stretches the seeds' part of every
-    resample as Student's t stretches the normal distribution, by t₍S₋₁₎ / z · √(S / (S − 1)): 9.2
-    for two seeds, 2.7 for three, 1.6 for five.
+    Args:
+        mine: Numbers of the method. The median ignores those that are not finite (misses).
+        baseline: Numbers of the baseline, on the same instances.
+        statistic: Name of the statistic.
+        same_seeds: Row s of both methods has the same seed, so seeds are drawn in pairs.
+        confidence: Share of the resamples inside the interval.
+        num_resamples: Number of resamples.
+        few_seeds: Resamples of S seeds spread less than new seeds would, so the seeds' part of each
+            resample is stretched as Student's t stretches the normal distribution, by
+            t₍S₋₁₎ / z · √(S / (S − 1)): 9.2 for two seeds, 2.7 for three, 1.6 for five.
+        seed: Seed of the resamples.
 
-    Of numbers that are not finite (missed), the median leaves each out. With ``same_seeds``, row s
-    of both methods is of one seed and seeds are drawn in pairs, else for each method by itself;
-    ``confidence`` is the share of resamples inside the interval, ``seed`` theirs.
+    Returns:
+        The difference, or None if a figure does not exist (a median over nothing).
 
-    The difference is None where a figure does not exist (a median over nothing). A
-    :class:`UserError`: objects, instances or paired seeds of the two differ in number, there are
-    none, or a mean is over numbers that are not finite.
+    Raises:
+        UserError: The numbers of objects, instances or paired seeds differ or are zero, or a mean
+            covers numbers that are not finite.
     """
     mine = [np.asarray(values, np.float64) for values in mine]
     baseline = [np.asarray(values, np.float64) for values in baseline]
@@ -105,8 +110,9 @@ def paired_difference(
     if same_seeds:
         draws[1] = draws[0]
     resampled = _resampled_difference(mine, baseline, compute, draws, rng)
+    effects = [figures[0] - figures[1]] if same_seeds else [figures[0], -figures[1]]
     if few_seeds:
-        resampled += _stretching(figures, draws, same_seeds, confidence)
+        resampled += sum(map(_stretching, effects, draws, [confidence] * 2))
     defined = resampled[~np.isnan(resampled)]
     if not len(defined):
         return None
@@ -120,14 +126,14 @@ def paired_difference(
 
 
 def seeds_to_tell(mine: Numbers, baseline: Numbers, confidence: float = 0.95) -> float:
-    """Return about how many paired seeds would tell a difference in means from chance.
+    """Estimate how many paired seeds would make a difference in means significant.
 
-    With S seeds the interval reaches √(z² · V + t₍S₋₁₎² · W / S) to both sides: V is the variance
-    of the mean over instances, W that of the difference over seeds, both estimated from the seeds
-    there are.
+    With S seeds the interval reaches √(z² · V + t₍S₋₁₎² · W / S) to both sides, where V is the
+    variance of the mean over instances and W the variance of the difference over seeds.
 
-    Returned is S, more than there are of these paired rows; infinite where the instances are too
-    few for any number of seeds.
+    Returns:
+        S, larger than the present number of seeds; infinite if the instances are too few for any
+        number of seeds.
     """
     differences = [ours - theirs for ours, theirs in zip(mine, baseline, strict=True)]
     if min(values.shape[1] for values in differences) < 2:
@@ -141,24 +147,20 @@ def seeds_to_tell(mine: Numbers, baseline: Numbers, confidence: float = 0.95) ->
     if room <= 0:
         return math.inf
     over_seeds = effects.var(ddof=1)
-    # Student's t is above z, so no fewer than these; and it comes down to z soon.
+    # Student's t exceeds z and approaches it soon, so the search starts here and is short.
     fewest = max(len(effects) + 1, math.ceil(z**2 * over_seeds / room))
     spread = ((num, t.ppf(level, num - 1) ** 2 * over_seeds) for num in itertools.count(fewest))
     return float(next(num for num, reached in spread if reached < room * num))
 
 
 def fewest_differing(confidence: float) -> int:
-    """Return on how many instances two methods must differ for any test to tell them apart.
+    """Return the smallest number of differing instances that any test calls significant.
 
-    If both are equally good, either wins a differing instance with probability ½; so all of k go
-    to the same one with probability 2 · ½ᵏ (sign test). Below that the bootstrap is overconfident:
-    of one or two instances every resample looks alike.
+    If both methods are equally good, all of k differing instances favour the same method with
+    probability 2 · ½ᵏ (sign test). With fewer the bootstrap is overconfident, because its resamples
+    hardly differ.
     """
     return math.ceil(math.log2(2 / (1 - confidence)))
-
-
-def _mean(values: Float[np.ndarray, "... n"]) -> Float[np.ndarray, "..."]:
-    return np.asarray(values.mean(axis=-1))
 
 
 def _finite_median(values: Float[np.ndarray, "... n"]) -> Float[np.ndarray, "..."]:
@@ -171,12 +173,14 @@ def _finite_median(values: Float[np.ndarray, "... n"]) -> Float[np.ndarray, "...
     return np.where(count[..., 0] > 0, median, np.nan)
 
 
-STATISTICS: Final = {"mean": _mean, "median": _finite_median}
+STATISTICS: Final[dict[StatisticName, _Statistic]] = {
+    "mean": lambda values: np.asarray(values.mean(axis=-1)),
+    "median": _finite_median,
+}
 """Functions of the last axis."""
 
 
 def _check(mine: Numbers, baseline: Numbers, statistic: str, same_seeds: bool) -> None:
-    """Refuse what cannot be paired."""
     shapes = [[values.shape for values in method] for method in (mine, baseline)]
     plain = all(len(shape) == 2 and min(shape) > 0 for shape in [*shapes[0], *shapes[1]])
     seeds = [{shape[0] for shape in method} for method in shapes]
@@ -188,17 +192,11 @@ def _check(mine: Numbers, baseline: Numbers, statistic: str, same_seeds: bool) -
             "measure both methods on the same test set",
         )
     if same_seeds and seeds[0] != seeds[1]:
-        raise UserError(
-            f"{seeds[0].pop()} seeds against {seeds[1].pop()}",
-            "as many, to pair them",
-            "pass same_seeds=False",
-        )
+        problem = f"{seeds[0].pop()} seeds against {seeds[1].pop()}"
+        raise UserError(problem, "equal numbers, to pair them", "pass same_seeds=False")
     if statistic == "mean" and not all(np.isfinite(v).all() for v in [*mine, *baseline]):
-        raise UserError(
-            "a mean over numbers that are not finite",
-            "finite numbers",
-            "turn a miss into what it counts, e.g. 0 of a pass rate",
-        )
+        problem, fix = "a mean over numbers that are not finite", "replace misses, e.g. by 0"
+        raise UserError(problem, "finite numbers", fix)
 
 
 def _resampled_difference(
@@ -218,39 +216,30 @@ def _resampled_difference(
             drawn = rng.integers(count, size=(len(total[rows]), count))
             for sign, values, weights in ((1, ours, draws[0]), (-1, theirs, draws[1])):
                 by_seed = compute(values[:, drawn]).T
-                # A seed that was not drawn must not count, even where its figure does not exist.
+                # A seed that was not drawn must not count, even if its figure is NaN.
                 weighted = np.where(weights[rows] > 0, weights[rows] * by_seed, 0.0)
                 total[rows] += sign * weighted.sum(axis=1)
     return total / len(mine)
 
 
 def _stretching(
-    figures: Sequence[Float[np.ndarray, "seeds"]],
-    draws: Sequence[Draws],
-    same_seeds: bool,
-    confidence: float,
+    effects: Float[np.ndarray, "seeds"], draws: Draws, confidence: float
 ) -> Float[np.ndarray, "resamples"]:
-    """Return what is added to each resample so that few seeds spread as much as they should."""
-    if same_seeds:
-        effects, weights = [figures[0] - figures[1]], [draws[0]]
-    else:
-        effects, weights = [figures[0], -figures[1]], list(draws)
-    added = np.zeros(len(draws[0]))
-    for effect, weight in zip(effects, weights, strict=True):
-        num = len(effect)
-        if num > 1:
-            level = (1 + confidence) / 2
-            factor = t.ppf(level, num - 1) / norm.ppf(level) * math.sqrt(num / (num - 1))
-            added += (factor - 1) * (weight @ (effect - effect.mean()))
-    return added
+    """Return the correction of each resample for the small number of seeds."""
+    num = len(effects)
+    if num == 1:
+        return np.zeros(len(draws))
+    level = (1 + confidence) / 2
+    factor = t.ppf(level, num - 1) / norm.ppf(level) * math.sqrt(num / (num - 1))
+    return np.asarray((factor - 1) * (draws @ (effects - effects.mean())))
 
 
 def _num_differing(mine: Numbers, baseline: Numbers) -> int:
-    """Count instances whose numbers, as a list over seeds, differ between the methods."""
+    """Count the instances whose numbers, sorted over seeds, differ between the methods."""
     count = 0
     for ours, theirs in zip(mine, baseline, strict=True):
         finite = [np.where(np.isfinite(v), v, np.inf) for v in (ours, theirs)]
-        sums = [np.sort(values, axis=0).mean(axis=0) for values in finite]
-        # Of other numbers of seeds, equal numbers may have means that differ in the last digit.
-        count += int((~np.isclose(sums[0], sums[1], rtol=1e-12, atol=0)).sum())
+        means = [np.sort(values, axis=0).mean(axis=0) for values in finite]
+        # With different numbers of seeds, means of equal numbers may differ in the last digit.
+        count += int((~np.isclose(means[0], means[1], rtol=1e-12, atol=0)).sum())
     return count

@@ -1,10 +1,10 @@
-"""BOP's scores of 6D localisation: recall over the targets, over three errors and their thresholds.
+"""BOP's scores of 6D localisation: recall over the targets for three errors and their thresholds.
 
-A target is so many instances of an object on an image, as a list of targets says
-(``test_targets_bop19.json``), else all that are visible to a tenth. As many of the best scored
-estimates are looked at. For each error and threshold they are matched anew, the best score first,
+A target is a number of instances of an object in an image, given by a list of targets
+(``test_targets_bop19.json``) or by visibility (at least a tenth). As many of the best-scored
+estimates are evaluated. For each error and threshold, estimates are matched by descending score,
 each with the free target of the smallest error below the threshold. AR is the mean of AR_VSD,
-AR_MSSD and AR_MSPD (Hodan et al., "BOP Challenge 2020", 2020), as bop_toolkit computes it.
+AR_MSSD and AR_MSPD (Hodan et al., "BOP Challenge 2020", 2020), as computed by bop_toolkit.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from dopepp.metrics.row import bop_points, symmetry_transforms
 from dopepp.parts.part import Part
 
 Draw = Callable[[Part, Transform, CameraMatrix, Size], DepthMap]
-"""Draws the depth of a part alone, metres, 0 beside it."""
+"""Renders the depth of a single part, metres, 0 beside the part."""
 
 _STRICT: Final = 0.1
-"""Diameters below which ADD(-S) counts."""
+"""Threshold of ADD(-S), diameters."""
 
 Errors = Float[np.ndarray, "estimates targets"]
 
@@ -47,11 +47,11 @@ class BopScores:
     """Scores over all targets of all objects, in [0, 1].
 
     Attributes:
-        num_targets: Instances to be found.
-        ar_vsd: Average recall of VSD; None where an image has no depth or a part no mesh.
+        num_targets: Number of target instances.
+        ar_vsd: Average recall of VSD; None if an image has no depth or a part no mesh.
         ar_mssd: Average recall of MSSD.
         ar_mspd: Average recall of MSPD.
-        ar: Mean of the three; None where one does not exist.
+        ar: Mean of the three; None without AR_VSD.
         add_or_s_01d: Recall of ADD, ADD-S for symmetric parts, below a tenth of the diameter.
     """
 
@@ -63,7 +63,7 @@ class BopScores:
     add_or_s_01d: float
 
     def in_words(self) -> str:
-        """Return a line for people."""
+        """Return the scores as one line of text."""
 
         def percent(share: float | None) -> str:
             return "n/a" if share is None else f"{share:.1%}"
@@ -78,7 +78,9 @@ class BopScores:
 class Localisation:
     """Accumulates the errors of one method's poses, image by image.
 
-    ``draw`` is what VSD needs; without it there is none.
+    Args:
+        parts: The evaluated objects.
+        draw: Renderer of a part's depth, for VSD; None leaves VSD out.
     """
 
     def __init__(self, parts: Sequence[Part], draw: Draw | None = None) -> None:
@@ -94,32 +96,31 @@ class Localisation:
         size: Size,
         depth: DepthMap | None = None,
     ) -> None:
-        """Add one image; ``depth`` is what was measured on it, metres."""
+        """Add the detections and ground truth of one image, with its measured depth in metres."""
         for part in self._parts.values():
             true = [i.T_cam_obj for i in instances if i.label == part.name and counted(i)]
-            ranked = sorted(
-                (d for d in detections if d.object == part.name), key=lambda d: -d.score
-            )
+            own_detections = (d for d in detections if d.object == part.name)
+            ranked = sorted(own_detections, key=lambda detection: -detection.score)
             estimated = [detection.T_cam_obj for detection in ranked[: len(true)]]
             if not true:
                 continue
             group = _errors(part, np.array(estimated).reshape(-1, 4, 4), np.array(true), K, size[0])
             if self._draw is not None and depth is not None and part.mesh is not None:
-                drawn = [
+                depths_est, depths_gt = (
                     [self._draw(part, T, K, size) for T in poses] for poses in (estimated, true)
-                ]
-                rows = [[vsd(e, t, depth, K, part.diameter) for t in drawn[1]] for e in drawn[0]]
+                )
+                rows = [[vsd(e, t, depth, K, part.diameter) for t in depths_gt] for e in depths_est]
                 group.vsd = np.array(rows).reshape(len(estimated), len(true), len(BOP_THRESHOLDS))
             self._groups.append(group)
 
     def scores(self) -> BopScores | None:
-        """Sum up; None without targets."""
-        num_targets = sum(group.mssd.shape[1] for group in self._groups)
-        if not num_targets:
+        """Return the scores over all images, or None without targets."""
+        if not self._groups:
             return None
+        num_targets = sum(group.mssd.shape[1] for group in self._groups)
 
         def recall(errors: Sequence[Errors], threshold: float) -> float:
-            return float(sum(num_matched(each, threshold) for each in errors) / num_targets)
+            return float(sum(num_matched(table, threshold) for table in errors) / num_targets)
 
         def average(errors: Sequence[Errors], thresholds: Sequence[float]) -> float:
             return float(np.mean([recall(errors, threshold) for threshold in thresholds]))
@@ -127,10 +128,10 @@ class Localisation:
         ar_mssd = average([group.mssd for group in self._groups], BOP_THRESHOLDS)
         ar_mspd = average([group.mspd for group in self._groups], BOP_MSPD_THRESHOLDS)
         ar_vsd = None
-        of_vsd = [group.vsd for group in self._groups if group.vsd is not None]
-        if len(of_vsd) == len(self._groups):
-            each = [[errors[..., k] for errors in of_vsd] for k in range(len(BOP_THRESHOLDS))]
-            ar_vsd = float(np.mean([average(errors, BOP_THRESHOLDS) for errors in each]))
+        tables = [group.vsd for group in self._groups if group.vsd is not None]
+        if len(tables) == len(self._groups):
+            by_tolerance = zip(*(np.moveaxis(table, -1, 0) for table in tables), strict=True)
+            ar_vsd = float(np.mean([average(errors, BOP_THRESHOLDS) for errors in by_tolerance]))
         return BopScores(
             num_targets=num_targets,
             ar_vsd=ar_vsd,
@@ -142,9 +143,9 @@ class Localisation:
 
 
 def num_matched(errors: Errors, threshold: float) -> int:
-    """Count the targets that are found with an error below a threshold.
+    """Count the targets matched with an error below a threshold.
 
-    The estimates, the best one first, take the free target of the smallest error each.
+    Each estimate, in order of its score, takes the free target with the smallest error.
     """
     free = np.ones(errors.shape[1], bool)
     for row in errors:
@@ -157,7 +158,7 @@ def num_matched(errors: Errors, threshold: float) -> int:
 
 @dataclass
 class _Group:
-    """Errors of the estimates of one object on one image to each of its targets.
+    """Errors between all estimates and targets of one object in one image.
 
     ``mssd`` and ``add_or_s`` are in diameters, ``mspd`` in pixels of an image 640 wide.
     """
@@ -175,7 +176,7 @@ def _errors(
     K: CameraMatrix,
     width: int,
 ) -> _Group:
-    """Compute them for all pairs of an estimate and a target, all over the mesh's vertices."""
+    """Compute all errors but VSD over the mesh's vertices."""
     shape = len(estimated), len(true)
     T_est = torch.from_numpy(np.repeat(estimated.astype(np.float64), shape[1], axis=0))
     T_gt = torch.from_numpy(np.tile(true.astype(np.float64), (shape[0], 1, 1)))

@@ -1,7 +1,7 @@
-"""The one accumulator of pose errors: validation, evaluation and any other method's poses.
+"""The accumulator of pose errors for validation, evaluation and other methods' poses.
 
-It keeps the poses themselves, so that every error is computed once, in one batch per object, and
-a new measure needs no new state.
+Its state are the poses themselves, so that all errors of an object are computed in one batch and a
+new measure needs no new state.
 """
 
 from __future__ import annotations
@@ -31,24 +31,23 @@ from dopepp.parts.part import Part
 MEAN: Final = "mean"
 
 MIN_VISIBLE_FRACTION: Final = 0.1
-"""An instance counts when at least this share of its silhouette is visible."""
+"""Smallest visible share of the silhouette of an evaluated instance."""
 
 CurveMeasure = Literal["add", "add_s", "mssd"]
-"""An error in metres, of which a curve can be drawn."""
+"""Error in metres, for accuracy-threshold curves."""
 
 InstanceError = Literal["add", "add_s", "mssd", "rotation_deg", "rotation_s_deg", "translation"]
-"""An error that every instance has; angles are in degrees, the others in metres."""
+"""Error of every instance, degrees or metres."""
 
 _WIDTH: Final = 81
 _T_EST, _T_GT, _CAMERA = slice(1, 17), slice(17, 33), slice(33, 43)
 _VISIBLE, _SCORE, _COVARIANCE = 43, 44, slice(45, 81)
-"""One instance in the state: object index, T_est (NaN for a miss), T_gt, K and image width (NaN
-where unknown), visible fraction, score (NaN for a miss), covariance (NaN for a miss, and where
-unknown)."""
+"""Columns of an instance in the state: object index, T_est, T_gt, K and image width, visible
+fraction, score, covariance; NaN for a miss and for unknown values."""
 
 
 class PredictedPose(Protocol):
-    """What the accumulator reads of a detection."""
+    """Attributes of a detection that the accumulator reads."""
 
     @property
     def object(self) -> str:
@@ -56,7 +55,7 @@ class PredictedPose(Protocol):
 
     @property
     def score(self) -> float:
-        """Confidence; a better one is matched first."""
+        """Confidence; higher scores are matched first."""
 
     @property
     def T_cam_obj(self) -> Transform:  # noqa: N802
@@ -64,11 +63,11 @@ class PredictedPose(Protocol):
 
     @property
     def covariance(self) -> Float[np.ndarray, "6 6"] | None:
-        """As of :class:`~dopepp.recovery.detection.Detection`; None where nothing states it."""
+        """As in :class:`~dopepp.recovery.detection.Detection`; None if unknown."""
 
 
 class TruePose(Protocol):
-    """What the accumulator reads of a ground-truth instance."""
+    """Attributes of a ground-truth instance that the accumulator reads."""
 
     @property
     def label(self) -> str:
@@ -84,19 +83,26 @@ class TruePose(Protocol):
 
     @property
     def wanted(self) -> bool | None:
-        """Whether a list of targets names it; None where there is no list."""
+        """Whether a list of targets names the instance; None without a list."""
 
 
 def assign(
     centre: Vector, detections: Sequence[PredictedPose], instances: Sequence[TruePose]
 ) -> Int[np.ndarray, "detections"]:
-    """Tell of one object on one image which instance each detection finds; −1 for none.
+    """Match the detections of one object in one image with its instances.
 
-    Instances that count are matched first; predictions left over may then explain themselves by
-    hidden ones. Matched are the centres of the object's cuboid (object frame, metres); see
-    :func:`~dopepp.metrics.functional.match`.
+    The positions of the cuboid's centre are matched (:func:`~dopepp.metrics.functional.match`),
+    first with evaluated instances, then with hidden ones.
+
+    Args:
+        centre: Centre of the object's cuboid, object frame, metres.
+        detections: Detections of the object.
+        instances: Instances of the object.
+
+    Returns:
+        Index of each detection's instance, −1 without one.
     """
-    # Infinity times zero would warn; as NaN throughout, such a pose just matches nothing.
+    # An infinite pose would warn (infinity times zero); as NaN throughout, it matches nothing.
     estimates = [np.asarray(d.T_cam_obj, np.float64) for d in detections]
     predicted = [transform(np.where(np.isfinite(T), T, np.nan), centre) for T in estimates]
     true = [transform(np.asarray(i.T_cam_obj, np.float64), centre) for i in instances]
@@ -114,18 +120,22 @@ def assign(
 
 
 def counted(instance: TruePose) -> bool:
-    """Tell whether an instance is a target or, without a list of these, visible enough."""
+    """Return whether an instance is a target or, without a list of targets, visible enough."""
     if instance.wanted is not None:
         return instance.wanted
     return instance.visible_fraction >= MIN_VISIBLE_FRACTION
 
 
 class PoseMetrics(Metric):
-    """Accumulates detections against ground truth, image by image; sums up per object.
+    """Accumulates detections and ground truth, image by image, and computes a row per object.
 
-    The scored parts are one or more, of different names. Instances of other objects are not ground
-    truth here; detections of other objects are an error. Rows show ``method``, which is what
-    produces the poses; further arguments are those of :class:`torchmetrics.Metric`.
+    Args:
+        parts: The evaluated objects, with distinct names. Instances of other objects are ignored.
+        method: Name of the method, for the rows.
+        kwargs: Arguments of :class:`torchmetrics.Metric`.
+
+    Raises:
+        UserError: There are no parts, or names are not distinct.
     """
 
     is_differentiable = False
@@ -140,11 +150,11 @@ class PoseMetrics(Metric):
         names = [part.name for part in parts]
         if not names or len(set(names)) < len(names) or MEAN in names:
             allowed = f"one or more parts of different names, none {MEAN!r}"
-            raise UserError(f"parts {names}", allowed, "rename")
+            raise UserError(f"parts {names}", allowed, "rename a part")
         self.parts = {part.name: part for part in parts}
         self.method = method
         self.set_dtype(torch.float64)
-        # Flat, because torchmetrics lets a rank without images send an empty vector.
+        # States are flat, because torchmetrics lets a rank without images send an empty vector.
         self.add_state("poses", default=[], dist_reduce_fx="cat")
         # Object index and score of every false positive.
         self.add_state("false_positives", default=[], dist_reduce_fx="cat")
@@ -157,11 +167,17 @@ class PoseMetrics(Metric):
         K: CameraMatrix | None = None,
         width: float | None = None,
     ) -> None:
-        """Add one image: detections of the scored parts, and ground truth.
+        """Add the detections and the ground truth of one image.
 
-        MSPD needs of every image its camera matrix and width, pixels. A detection of another object
-        is a :class:`UserError`; a ``ValueError``: only one of K and width is given, or one is
-        impossible.
+        Args:
+            detections: Detections of the evaluated parts.
+            instances: Ground truth of the image.
+            K: Camera matrix, pixels; MSPD needs it for every image.
+            width: Width of the image, pixels; given together with K.
+
+        Raises:
+            UserError: A detection is of another object.
+            ValueError: Only one of K and width is given, or is invalid.
         """
         for detection in detections:
             if detection.object not in self.parts:
@@ -196,7 +212,7 @@ class PoseMetrics(Metric):
     def compute(self) -> dict[str, PoseRow]:
         """Return a row per object, then their :data:`MEAN`; see :mod:`dopepp.metrics.row`.
 
-        An object without an instance that counts has None for everything but its counts.
+        Without evaluated instances, all measures of an object but its counts are None.
         """
         poses, false_positives = _table(self.poses, _WIDTH), _table(self.false_positives, 2)
         rows = {}
@@ -208,55 +224,53 @@ class PoseMetrics(Metric):
         return rows
 
     def errors(self, name: str, measure: InstanceError = "add") -> Float[np.ndarray, "instances"]:
-        """Return an error of every instance of a part, infinite where it was missed.
+        """Return an error of every instance of a part, infinite for a miss.
 
-        Like ``compute``, all ranks must call it, unless they have called ``compute`` since the
-        last update.
+        All ranks must call this method, as ``compute``.
         """
         self.compute()
         return np.asarray(getattr(self._gathered[name].errors, measure).numpy())
 
     def references(self, seed: int = 0) -> dict[str, dict[str, PoseRow]]:
-        """Return the reference rows on the instances seen: reference, then object or mean.
+        """Return the rows of each reference on the same instances, by object or :data:`MEAN`.
 
-        All ranks must call it, as :meth:`errors`.
+        All ranks must call this method, as ``compute``.
         """
         self.compute()
-        by_part = {
-            name: reference_rows(part, self._gathered[name].T_gt.numpy(), seed)
-            for name, part in self.parts.items()
-        }
-        table = {}
-        for reference in REFERENCES:
-            table[reference] = {name: rows[reference] for name, rows in by_part.items()}
-            table[reference][MEAN] = mean_row(list(table[reference].values()), reference)
+        table: dict[str, dict[str, PoseRow]] = {reference: {} for reference in REFERENCES}
+        for name, part in self.parts.items():
+            rows = reference_rows(part, self._gathered[name].T_gt.numpy(), seed)
+            for reference, row in rows.items():
+                table[reference][name] = row
+        for reference, by_part in table.items():
+            by_part[MEAN] = mean_row(list(by_part.values()), reference)
         return table
 
     def instances(self, name: str) -> Gathered:
-        """Return the instances of a part that count, in the order of :meth:`errors`.
+        """Return the evaluated instances of a part, in the order of :meth:`errors`.
 
-        All ranks must call it, as :meth:`errors`.
+        All ranks must call this method, as ``compute``.
         """
         self.compute()
         return self._gathered[name]
 
     def plot(self, measure: CurveMeasure = "add") -> tuple[Figure, Axes]:
-        """Draw each object's accuracy-threshold curve up to 0.1 m, of ADD or another error."""
+        """Draw the accuracy-threshold curve of each object up to 0.1 m."""
         curves = {name: self.errors(name, measure) for name in self.parts}
         figure = accuracy_figure(curves, title=self.method)
         return figure, figure.axes[0]
 
 
 class Gathered:
-    """All instances of one object that count, and the scores of its false positives.
+    """All evaluated instances of one object, and the scores of its false positives.
 
     Attributes:
         part: The object.
         T_gt: True poses, metres.
-        K: Camera matrices, pixels; NaN where unknown.
+        K: Camera matrices, pixels; NaN if unknown.
         visible_fractions: Visible share of each silhouette, in [0, 1].
         scores: Score of each instance's prediction; NaN for a miss.
-        errors: Every error of each instance.
+        errors: Errors of each instance.
         false_positives: Scores of the false positives.
     """
 
@@ -275,7 +289,7 @@ class Gathered:
         self.errors = PoseErrors.of(part, T_est, self.T_gt, self.K, camera[:, 9], covariance)
 
     def row(self, method: str) -> PoseRow:
-        """Sum up; only the false positives of an object without ground truth mean anything."""
+        """Return the row of the object; without ground truth it has only counts."""
         errors, num_false = self.errors, len(self.false_positives)
         if len(errors.add) == 0:
             row = PoseRow(self.part.name, method, 0, num_symmetries=errors.num_symmetries)
@@ -289,15 +303,13 @@ class Gathered:
         return row
 
     def _average_precision(self, threshold: float) -> float:
-        """Return AP with ADD below a threshold; of equal scores the wrong ones come first.
-
-        So it depends neither on the order of images nor on which rank saw them.
-        """
-        right = self.errors.add < threshold
-        wrong = ~right & self.errors.add.isfinite()
-        ordered = torch.cat([self.false_positives, self.scores[wrong], self.scores[right]])
-        correct = torch.arange(len(ordered)) >= len(ordered) - int(right.sum())
-        return average_precision(ordered, correct, len(right))
+        """Return AP with ADD below a threshold."""
+        hits = self.errors.add < threshold
+        misses = ~hits & self.errors.add.isfinite()
+        # Among equal scores, wrong predictions come first: AP must not depend on images or ranks.
+        scores = torch.cat([self.false_positives, self.scores[misses], self.scores[hits]])
+        correct = torch.arange(len(scores)) >= len(scores) - int(hits.sum())
+        return average_precision(scores, correct, len(hits))
 
 
 def _table(state: list[Tensor], width: int) -> Float[Tensor, "rows columns"]:
@@ -306,7 +318,7 @@ def _table(state: list[Tensor], width: int) -> Float[Tensor, "rows columns"]:
 
 
 def _camera(K: CameraMatrix | None, width: float | None) -> Float[np.ndarray, "10"]:
-    """Return K and the width in a row, NaN where they are not given."""
+    """Return K and the width as one row, NaN if neither is given."""
     if K is None and width is None:
         return np.full(10, np.nan)
     K = np.asarray(np.nan if K is None else K, np.float64)

@@ -1,13 +1,12 @@
-"""What a result must be compared with: poses that nobody had to estimate.
+"""Reference rows of a result table: poses that need no estimate.
 
-Three rows, all with the true position: any rotation at all, a rotation from the test set's own
-range, and the one rotation that suits the test set best. Where a task's range of poses is narrow,
-its pass rates are high for anybody; these rows say how high.
+The three references use the true position and, in turn, a random rotation, a rotation from the test
+set, and the constant rotation that suits the test set best. They show how high the pass rates are
+for a narrow range of poses.
 
-Every measure here depends only on the rotation Q between the true and the guessed orientation,
-because the part is turned about its own centre (the cuboid's), so each row is a list of Qs. MSPD
-depends on the place in the image as well, and a guess has no score, so there is neither AR_MSPD nor
-average precision.
+A part is rotated about the centre of its cuboid, so every measure here depends only on the rotation
+Q between the true and the guessed orientation, and a reference is a list of Qs. AR_MSPD, which also
+depends on the position in the image, and average precision, which needs scores, do not exist.
 
 To add a reference, write a function that returns its Qs and name it in :func:`reference_rows`.
 """
@@ -33,13 +32,13 @@ BEST_CONSTANT: Final = "best constant pose"
 REFERENCES: Final = (CHANCE_ALL, CHANCE_RANGE, BEST_CONSTANT)
 
 _MAX_POSES: Final = 300
-"""Test poses that take part; the best constant tries each against each."""
+"""Most test poses used; the best constant compares all pairs."""
 _NUM_DRAWS: Final = 2000
-"""Guesses of a chance row: a share near 15 % then has a standard error of 0.8 %."""
+"""Guesses of a chance row: the standard error of a share near 15 % is 0.8 %."""
 _NUM_POINTS: Final = 500
-"""ADD points of a guess: the mean of 500 of 2,000 distances is right to about 1 %."""
+"""ADD points of a guess: the mean of 500 of 2,000 distances is accurate to about 1 %."""
 _NUM_SURFACE_DRAWS: Final = 300
-"""Guesses whose ADD-S and symmetric errors are taken, which cost far more than ADD."""
+"""Guesses evaluated by ADD-S and symmetric errors, which cost far more than ADD."""
 
 
 def reference_rows(
@@ -47,9 +46,14 @@ def reference_rows(
 ) -> dict[str, PoseRow]:
     """Compute the three reference rows of one part on one test set.
 
-    The true poses are of its instances that count. The same seed gives the same draws. The rows
-    are by name, in the order of :data:`REFERENCES`. Without instances their measures are None; with
-    a single one, so is ``chance, test range``.
+    Args:
+        part: The object.
+        T_cam_obj: True poses of its evaluated instances, metres.
+        seed: Seed of the guesses.
+
+    Returns:
+        Rows by name, in the order of :data:`REFERENCES`. Without instances their measures are None;
+        with a single instance, those of ``chance, test range`` are None.
     """
     rng = np.random.default_rng(seed)
     rotations = np.asarray(T_cam_obj, np.float64).reshape(-1, 4, 4)[:, :3, :3]
@@ -76,23 +80,23 @@ def reference_rows(
 
 
 def _row(part: Part, name: str, Q: Tensor, few_points: Tensor, points: Tensor) -> PoseRow:
-    """Measure guesses that are off by the rotations Q, (n, 3, 3), at the true position."""
+    """Measure guesses with the rotation errors Q, (n, 3, 3), at the true position."""
     identity = torch.eye(3, dtype=torch.float64).expand_as(Q)
-    nowhere = Q.new_zeros(len(Q), 3)
-    # Chance guesses are in random order (the first are a fair sample), constant ones all fit.
-    some = slice(_NUM_SURFACE_DRAWS)
-    about_centre = Q[some], nowhere[some], identity[some], nowhere[some]
+    origin = Q.new_zeros(len(Q), 3)
+    # The first chance guesses are a fair sample, as their order is random.
+    subset = slice(_NUM_SURFACE_DRAWS)
+    about_centre = Q[subset], origin[subset], identity[subset], origin[subset]
     # Symmetries are transforms of the object frame, whose origin may lie anywhere.
     centre = torch.from_numpy(np.asarray(part.cuboid[CENTROID], np.float64))
-    turned = Q[some], centre - Q[some] @ centre, identity[some], nowhere[some]
+    turned = Q[subset], centre - Q[subset] @ centre, identity[subset], origin[subset]
     group = symmetry_transforms(part)
     errors = PoseErrors(
-        add=add(Q, nowhere, identity, nowhere, few_points),
+        add=add(Q, origin, identity, origin, few_points),
         add_s=add_s(*about_centre, points),
         mssd=mssd(*turned, bop_points(part), group),
         mspd=None,
         rotation_deg=rotation_error_deg(Q, identity),
-        rotation_s_deg=rotation_error_deg(Q[some], identity[some], group),
+        rotation_s_deg=rotation_error_deg(Q[subset], identity[subset], group),
         translation=None,
         deviations=None,
         diameter=part.diameter,
@@ -104,9 +108,9 @@ def _row(part: Part, name: str, Q: Tensor, few_points: Tensor, points: Tensor) -
 def _other_poses(
     rotations: Float[np.ndarray, "n 3 3"], rng: np.random.Generator
 ) -> Float[np.ndarray, "draws 3 3"]:
-    """Take some OTHER pose of the test set for each: all ordered pairs, or random ones of many."""
+    """Guess another pose of the test set for each: all ordered pairs, or a random subset."""
     n = len(rotations)
-    # Pair k of the n·(n − 1) ordered pairs: the true pose, then how far on the guessed one is.
+    # Pair k of the n·(n − 1) ordered pairs: the true pose, and the guessed pose's offset from it.
     true, step = np.divmod(rng.permutation(n * (n - 1))[:_NUM_DRAWS], max(n - 1, 1))
     guessed = (true + 1 + step) % n
     return np.asarray(rotations[true].transpose(0, 2, 1) @ rotations[guessed])
@@ -115,7 +119,7 @@ def _other_poses(
 def _best_constant(
     rotations: Float[np.ndarray, "n 3 3"], points: Tensor, threshold: float
 ) -> Float[np.ndarray, "n 3 3"]:
-    """Try every test rotation and their mean as the answer to all; equal rates go by mean ADD."""
+    """Return the errors of the best of all test rotations and their mean; ADD breaks ties."""
     mean = nearest_rotation(rotations.mean(axis=0))
     candidates = np.concatenate([rotations, mean[None]])
     Q = rotations.transpose(0, 2, 1)[None] @ candidates[:, None]

@@ -1,4 +1,4 @@
-"""Every error of one object's poses, and the row of a result table that sums them up.
+"""Errors of one object's poses, and the measures of a result table.
 
 To add an error, give :class:`PoseErrors` a field and :meth:`PoseErrors.of` its function. To add a
 measure, give :class:`PoseRow` a field and :data:`COLUMNS` its heading and formula; tables, CSV and
@@ -7,6 +7,7 @@ measure, give :class:`PoseRow` a field and :data:`COLUMNS` its heading and formu
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -39,26 +40,26 @@ NOT_AVAILABLE: Final = "n/a"
 Poses = Float[Tensor, "n 4 4"]
 
 _USUAL_MAHALANOBIS: Final = 2.3126
-"""Median of the Mahalanobis distance of six Gaussian numbers: the root of chi-squared's."""
+"""Median of the Mahalanobis distance of six standard normal numbers."""
 
 
 @dataclass
 class PoseErrors:
-    """Errors of N poses of one object, infinite where it was missed.
+    """Errors of N poses of one object, infinite for a miss.
 
     Attributes:
         add: ADD, metres.
         add_s: ADD-S, metres.
         mssd: MSSD over the part's symmetries, metres.
-        mspd: MSPD over the part's symmetries, pixels of an image 640 wide; None where a camera is
-            not known.
+        mspd: MSPD over the part's symmetries, pixels of an image 640 wide; None if a camera is
+            unknown.
         rotation_deg: Angle between the orientations, degrees.
-        rotation_s_deg: The least such angle over the part's symmetries, degrees.
-        translation: Distance between the object frame's origins, metres; None of guesses.
-        deviations: Mahalanobis distance by the estimate's own covariance, over the median that
-            right covariances give; infinite, too, where none is known. None of guesses.
+        rotation_s_deg: Smallest such angle over the part's symmetries, degrees.
+        translation: Distance between the object frame's origins, metres; None for guesses.
+        deviations: Mahalanobis distance by the stated covariance, divided by its median under
+            correct covariances; infinite without a covariance, None for guesses.
         diameter: Diameter of the part, metres.
-        num_symmetries: Transforms that map the part onto itself, the identity among them.
+        num_symmetries: Number of symmetry transforms, including the identity.
     """
 
     add: Errors
@@ -82,10 +83,16 @@ class PoseErrors:
         width: Errors,
         covariance: Float[Tensor, "n 6 6"],
     ) -> PoseErrors:
-        """Compute them, of estimated poses (NaN for a miss) and true ones, metres.
+        """Compute all errors.
 
-        Camera matrices and the images' widths are pixels, NaN where unknown; covariances are those
-        of :class:`~dopepp.recovery.detection.Detection`, NaN where an estimate has none.
+        Args:
+            part: The object.
+            T_est: Estimated poses, metres; NaN for a miss.
+            T_gt: True poses, metres.
+            K: Camera matrices, pixels; NaN if unknown.
+            width: Widths of the images, pixels; NaN if unknown.
+            covariance: Covariances as of :class:`~dopepp.recovery.detection.Detection`; NaN if
+                unknown.
         """
         poses = T_est[:, :3, :3], T_est[:, :3, 3], T_gt[:, :3, :3], T_gt[:, :3, 3]
         points = torch.from_numpy(np.asarray(part.points, np.float64))
@@ -106,7 +113,7 @@ class PoseErrors:
 
     @property
     def add_or_s(self) -> Errors:
-        """ADD, of a part with symmetries ADD-S, metres."""
+        """ADD-S for a part with symmetries, otherwise ADD, metres."""
         return self.add_s if self.num_symmetries > 1 else self.add
 
 
@@ -116,50 +123,36 @@ def symmetry_transforms(part: Part) -> Float[Tensor, "s 4 4"]:
 
 
 def bop_points(part: Part) -> Float[Tensor, "v 3"]:
-    """Return what BOP's scores look at: the mesh's vertices, of a part without mesh the ADD points.
+    """Return the points of BOP's scores: the mesh's vertices, or the ADD points without a mesh.
 
-    The surface samples of a CAD part miss its corners, where the largest distances are.
+    Surface samples miss the corners, which have the largest distances.
     """
     points = part.points if part.mesh is None else part.mesh.vertices
     return torch.from_numpy(np.asarray(points, np.float64))
 
 
-def finite_median(errors: Errors | None) -> float | None:
-    """Median of the finite errors (the mean of the middle two if even); None if there is none."""
-    finite = torch.empty(0) if errors is None else errors[errors.isfinite()].double().sort().values
-    if len(finite) == 0:
-        return None
-    return float((finite[(len(finite) - 1) // 2] + finite[len(finite) // 2]) / 2)
-
-
-def finite_p90(errors: Errors | None) -> float | None:
-    """90th percentile of the finite errors, between two of them linearly; None if there is none."""
-    finite = torch.empty(0) if errors is None else errors[errors.isfinite()].double()
-    return float(finite.quantile(0.9)) if len(finite) else None
-
-
 @dataclass
 class PoseRow:
-    """Measures of one method on one object; None where a measure does not exist ("n/a").
+    """Measures of one method on one object; None if a measure does not exist ("n/a").
 
     Shares lie in [0, 1], angles are degrees, distances metres. Medians and 90th percentiles are
-    over matched instances. (Not frozen: torchmetrics rebuilds what ``compute`` returns.)
+    over matched instances. (Not frozen, because torchmetrics rebuilds what ``compute`` returns.)
 
     Attributes:
         object: The part's name, or ``mean``.
         method: What produced the poses: the estimator, or a reference row's name.
-        num_instances: Ground-truth instances that count; poses tried in a reference row.
-        add_01d: Share with ADD below a tenth of the diameter, and so on.
-        add_or_s_01d: The same with ADD-S of a part with symmetries, with ADD of others.
+        num_instances: Number of evaluated ground-truth instances.
+        add_01d: Share of instances with ADD below a tenth of the diameter; others alike.
+        add_or_s_01d: Like ``add_01d``, with ADD-S for a part with symmetries.
         ar_mssd: BOP's average recall of MSSD.
-        ar_mspd: BOP's average recall of MSPD; None where an image's camera is not known.
-        median_deviations: By how many times the true errors exceed the standard deviations that
-            the estimates state, in the median: 1 is honest; None without covariances.
+        ar_mspd: BOP's average recall of MSPD; None if an image's camera is unknown.
+        median_deviations: Median ratio of the true errors to the stated standard deviations, 1 if
+            they are calibrated; None without covariances.
         miss_rate: Share of instances without a matched prediction.
-        average_precision: AP over the scores, with ADD below a tenth of the diameter right.
+        average_precision: AP over the scores, correct with ADD below a tenth of the diameter.
         precision: TP / (TP + FP); 0 without predictions.
-        false_positives: Predictions matched with no instance.
-        num_symmetries: As of :class:`PoseErrors`.
+        false_positives: Number of predictions without an instance.
+        num_symmetries: As in :class:`PoseErrors`.
     """
 
     object: str
@@ -193,21 +186,20 @@ class PoseRow:
 
 
 Formula = Callable[[PoseErrors], float | None]
-"""Errors of N >= 1 poses to what they amount to."""
+"""Function of the errors of N >= 1 poses; None if the measure does not exist."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """How a field of :class:`PoseRow` is computed, and how a table shows it.
+    """How a field of :class:`PoseRow` is computed and displayed.
 
     Attributes:
-        field: The field's name.
-        heading: What stands above it, with the unit.
-        scale: Factor from the stored unit to the shown one.
-        decimals: Digits after the point.
-        group: Measures of one group stand together in a printed table; those of the group
-            ``symmetry`` say something of their own only about a part with symmetries.
-        formula: Function of the errors; None of what needs more than errors.
+        field: Name of the field.
+        heading: Heading with the unit.
+        scale: Factor from the stored to the displayed unit.
+        decimals: Displayed digits after the point.
+        group: Group of measures in a printed table; ``symmetry`` is for parts with symmetries.
+        formula: Function of the errors; None if errors alone do not determine the measure.
     """
 
     field: str
@@ -218,11 +210,11 @@ class Column:
     formula: Formula | None = None
 
     def text(self, row: PoseRow) -> str:
-        """Return a row's cell."""
+        """Return the cell of a row."""
         return self.shown(getattr(row, self.field))
 
     def shown(self, value: float | None, *, signed: bool = False) -> str:
-        """Return a value in the shown unit, ``n/a`` where it does not exist."""
+        """Return a value in the displayed unit, or ``n/a`` for None."""
         if value is None:
             return NOT_AVAILABLE
         return f"{value * self.scale:{'+' if signed else ''}.{self.decimals}f}"
@@ -240,16 +232,27 @@ def _area(error: str) -> Formula:
     return lambda errors: auc(getattr(errors, error), 0.1)
 
 
+def _of_finite(error: str, statistic: Callable[[Tensor], float]) -> Formula:
+    """Return the formula of a statistic of the finite errors; None without any."""
+
+    def formula(errors: PoseErrors) -> float | None:
+        values = getattr(errors, error)
+        finite = torch.empty(0) if values is None else values[values.isfinite()].double()
+        return statistic(finite) if len(finite) else None
+
+    return formula
+
+
 def _median(error: str) -> Formula:
-    return lambda errors: finite_median(getattr(errors, error))
+    return _of_finite(error, lambda finite: statistics.median(finite.tolist()))
 
 
 def _p90(error: str) -> Formula:
-    return lambda errors: finite_p90(getattr(errors, error))
+    return _of_finite(error, lambda finite: float(finite.quantile(0.9)))
 
 
 def _near(errors: PoseErrors) -> float | None:
-    """Return the share off by less than 0.05 m and, of the nearest symmetry, 5°."""
+    """Return the share within 5 cm and, up to symmetry, 5°."""
     if errors.translation is None:
         return None
     near = (errors.translation < 0.05) & (errors.rotation_s_deg < 5)
@@ -291,19 +294,19 @@ COLUMNS: Final[tuple[Column, ...]] = (
     Column("precision", "precision %", 100, 1, "detection"),
     Column("false_positives", "false pos.", group="detection"),
 )
-"""The measures of a table, in order; ``object`` and ``method`` name its rows."""
+"""Measures of a table, in order."""
 
 _TOTALS: Final = ("num_instances", "false_positives")
 
 
 def shown_columns(row: PoseRow, all_measures: bool = False) -> list[Column]:
-    """Return what tells something of a row's object: symmetric measures where it has symmetries."""
-    everything = all_measures or row.num_symmetries > 1
-    return [column for column in COLUMNS if everything or column.group != "symmetry"]
+    """Return the columns of a row, with symmetric measures only if its object has symmetries."""
+    has_symmetries = all_measures or row.num_symmetries > 1
+    return [column for column in COLUMNS if has_symmetries or column.group != "symmetry"]
 
 
 def summarise(name: str, method: str, errors: PoseErrors) -> PoseRow:
-    """Fill the measures that follow from the errors of N >= 1 poses alone."""
+    """Return a row with the measures that the errors of N >= 1 poses determine."""
     measures: dict[str, Any] = {c.field: c.formula(errors) for c in COLUMNS if c.formula}
     return PoseRow(name, method, len(errors.add), num_symmetries=errors.num_symmetries, **measures)
 
@@ -311,8 +314,7 @@ def summarise(name: str, method: str, errors: PoseErrors) -> PoseRow:
 def mean_row(rows: Sequence[PoseRow], method: str) -> PoseRow:
     """Average each measure over the objects that have it and at least one instance.
 
-    Counts are totals over all objects. An object without ground truth takes no part in the means.
-    The mean has symmetries where an object has.
+    Counts are totals over all objects.
     """
     mean = PoseRow(object="mean", method=method, num_instances=0)
     mean.num_symmetries = max((row.num_symmetries for row in rows), default=1)

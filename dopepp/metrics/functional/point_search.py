@@ -1,13 +1,13 @@
-"""The two searches behind the pose errors, exact and compiled.
+"""Exact, compiled searches behind the pose errors.
 
-Nearest points, for ADD-S: one tree serves all poses. It splits the object's points in halves down
-to small leaves and keeps them in the order of the leaves. Queries come in the same order, so the
-answer to one is a close guess at the next, and most of the tree is never looked at.
+Nearest points (ADD-S): one k-d tree over the object's points serves all poses. Queries come in the
+order of the tree's leaves, so the previous answer is a close first guess, which prunes most of the
+tree.
 
-The symmetry under which the farthest point is nearest, for MSSD and MSPD: one is out as soon as a
-point is farther than the farthest of the best symmetry so far. Eight points as far apart as can be
-are tried first under every symmetry; the most promising one is measured in full, and nearly all
-others then end after a point or two.
+Symmetry with the smallest maximum distance (MSSD, MSPD): a symmetry is rejected at the first point
+that is farther than the maximum of the best symmetry so far. Eight probes far apart are evaluated
+under every symmetry first, and the most promising symmetry is evaluated in full; nearly all others
+are then rejected after a point or two.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from torch import Tensor
 from dopepp.core.compiled import Array, compiled
 
 Affine = tuple[Float[Tensor, "k 3 3"], Float[Tensor, "k 3"]]
-"""Matrices and what is added to their products."""
+"""Matrices and translations of affine maps."""
 
 _LEAF: Final = 16
-"""Most points of a leaf: fastest of 4, 8, 16 and 32 at 2,000 and 10,000 points."""
+"""Largest number of points in a leaf; the fastest of 4 to 32."""
 
 _ROUNDING: Final = 1e-9
-"""Share by which a bound is lowered, so that rounding never hides the nearest point."""
+"""Share by which a bound is lowered, so that rounding never prunes the nearest point."""
 
 _NUM_PROBES: Final = 8
-"""Points tried first under every symmetry: as many as a box has corners."""
+"""Number of probes, as many as a box has corners."""
 
 
 def mean_nearest(
@@ -41,10 +41,13 @@ def mean_nearest(
     R_gt: Float[np.ndarray, "n 3 3"],
     offset: Float[np.ndarray, "n 3"],
 ) -> Float[np.ndarray, "n"]:
-    """Return the mean distance from the true points to their nearest estimated ones, metres.
+    """Return the mean distance from the true points to the nearest estimated points, metres.
 
-    ``offset`` is the true minus the estimated translation, metres. The formula holds for any
-    matrix, not rotations alone.
+    Args:
+        points: Object points, metres.
+        R_est: Estimated rotations, or any matrices.
+        R_gt: True rotations, or any matrices.
+        offset: True minus estimated translations, metres.
     """
     points, boxes, firsts = _tree(points)
     distances = np.empty(len(offset))
@@ -52,8 +55,8 @@ def mean_nearest(
     least = np.linalg.svd(R_est, compute_uv=False)[:, 2]
     targets = np.empty_like(points)
     for n in range(len(offset)):
-        _place(points, np.ascontiguousarray(R_gt[n]), offset[n], targets)
-        # A flat matrix cannot be undone; with the bound 0 every point is looked at.
+        _transform(points, np.ascontiguousarray(R_gt[n]), offset[n], targets)
+        # A singular matrix has no inverse; the bound 0 then prunes nothing.
         inverse = np.linalg.inv(R_est[n]) if least[n] > 0 else np.zeros((3, 3))
         bound = least[n] ** 2 * (1 - _ROUNDING)
         R, queries = np.ascontiguousarray(R_est[n]), targets @ inverse.T
@@ -83,7 +86,7 @@ def _tree(
 
 
 @compiled()
-def _place(points: Array, R: Array, offset: Array, out: Array) -> None:
+def _transform(points: Array, R: Array, offset: Array, out: Array) -> None:
     """Write R·x + offset of every point, with the rounding of :func:`_squared`."""
     for i in range(len(points)):
         for r in range(3):
@@ -102,7 +105,7 @@ def _squared(point: Array, R: Array, target: Array) -> float:
 
 @compiled(inline="always")
 def _to_box(box: Array, x: float, y: float, z: float) -> float:
-    """Return the squared distance to a box of (least x, y, z, largest x, y, z); 0 inside."""
+    """Return the squared distance to a box (smallest x, y, z, largest x, y, z); 0 inside."""
     dx = max(box[0] - x, x - box[3], 0.0)
     dy = max(box[1] - y, y - box[4], 0.0)
     dz = max(box[2] - z, z - box[5], 0.0)
@@ -119,11 +122,11 @@ def _mean_distance(
     queries: Array,
     bound: float,
 ) -> float:
-    """Average the distances from targets to the nearest ``R·point``, points in the tree's order.
+    """Average the distances from targets to the nearest ``R·point``.
 
-    A box of every node is as of :func:`_to_box`; the children of k are 2k + 1 and 2k + 2.
-    ``firsts`` is the first point of every leaf, and the number of points; queries are R⁻¹·targets;
-    ‖R v‖² is at least ``bound`` times ‖v‖².
+    Points are in the tree's order. Node k has a box (:func:`_to_box`) and the children 2k + 1 and
+    2k + 2; ``firsts`` is the first point of every leaf, then the number of points. Queries are
+    R⁻¹·targets; ‖R v‖² is at least ``bound`` times ‖v‖².
     """
     num_inner = len(boxes) // 2
     nodes, floors = np.empty(64, np.int64), np.empty(64)
@@ -166,11 +169,15 @@ def least_farthest(
     symmetries: Affine,
     perspective: bool,
 ) -> Float[Tensor, "n"]:
-    """Return min over S of max over x of ‖π(Bx + b) − π(A(Sx) + a)‖, infinite where it is NaN.
+    """Return min over S of max over x of ‖π(Bx + b) − π(A(Sx) + a)‖, infinite instead of NaN.
 
-    Estimated are (B, b), true are (A, a); symmetries are rotations and translations of the S. With
-    ``perspective`` π divides by the third coordinate, which must be positive; otherwise it changes
-    nothing.
+    Args:
+        estimated: Estimated maps (B, b).
+        true: True maps (A, a).
+        points: Object points x.
+        symmetries: Rotations and translations of the symmetries S.
+        perspective: Whether π divides by the third coordinate, which must be positive; otherwise
+            it is the identity.
     """
     ordered = _probes_first(points.detach().cpu().numpy())
     B, b, A, a, turns, shifts = (
@@ -183,7 +190,7 @@ def least_farthest(
 
 
 def _probes_first(points: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
-    """Put the probes first: each is the point farthest from the ones before it."""
+    """Put the probes first: each is the point farthest from all before it."""
     order = np.arange(len(points))
     distances = ((points - points.mean(axis=0)) ** 2).sum(axis=1)
     for k in range(min(_NUM_PROBES, len(points))):
@@ -196,7 +203,7 @@ def _probes_first(points: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
 
 @compiled(inline="always")
 def _squared_gap(P: Array, p: Array, x: Array, target: Array, perspective: bool) -> float:
-    """Return ‖π(Px + p) − target‖², infinite where it is no number or not before the camera."""
+    """Return ‖π(Px + p) − target‖², infinite if NaN or behind the camera."""
     u = P[0, 0] * x[0] + P[0, 1] * x[1] + P[0, 2] * x[2] + p[0]
     v = P[1, 0] * x[0] + P[1, 1] * x[1] + P[1, 2] * x[2] + p[1]
     w = P[2, 0] * x[0] + P[2, 1] * x[1] + P[2, 2] * x[2] + p[2]
@@ -212,9 +219,9 @@ def _squared_gap(P: Array, p: Array, x: Array, target: Array, perspective: bool)
 
 @compiled()
 def _set_targets(B: Array, b: Array, points: Array, perspective: bool, targets: Array) -> bool:
-    """Write π(Bx + b) of every point; return False as soon as one is not before the camera.
+    """Write π(Bx + b) of every point; return False at the first point behind the camera.
 
-    In one pass: placed first and divided then, MSPD takes a quarter longer.
+    Two passes would take a quarter longer.
     """
     for j in range(len(points)):
         for r in range(3):
@@ -243,7 +250,7 @@ def _search(
     perspective: bool,
     errors: Array,
 ) -> None:
-    """Fill in the errors of all poses; arguments as of :func:`least_farthest`."""
+    """Write the errors of all poses; arguments as in :func:`least_farthest`."""
     targets = np.empty((len(points), 3))
     P, p = np.empty((len(turns), 3, 3)), np.empty((len(turns), 3))
     floors = np.empty(len(turns))
@@ -251,7 +258,7 @@ def _search(
         errors[n] = np.inf
         if not _set_targets(B[n], b[n], points, perspective, targets):
             continue
-        _place(shifts, A[n], a[n], p)
+        _transform(shifts, A[n], a[n], p)
         for s in range(len(turns)):
             for r in range(3):
                 for c in range(3):
@@ -272,9 +279,9 @@ def _search(
 def _least(
     P: Array, p: Array, points: Array, targets: Array, floors: Array, perspective: bool
 ) -> float:
-    """Return the least squared maximum over the symmetries, given as matrices and translations.
+    """Return the smallest squared maximum distance over the symmetries (P, p).
 
-    ``targets`` is where the points should be, ``floors`` of every symmetry the maximum over some.
+    ``floors`` are lower bounds: each symmetry's maximum over the probes.
     """
     promising = floors.argmin()
     best, culprit = np.inf, 0
