@@ -109,7 +109,7 @@ class OneWeight(LightningModule):
 
 
 def test_the_documented_callback_works(monkeypatch):
-    name = "dopepp.training.callbacks.gradient_norm"
+    name = "dopepp.training.gradient_norm"
     module_of("adding-a-callback.md", name, monkeypatch)
     monkeypatch.setattr(CALLBACKS, "_targets", {*CALLBACKS.targets})
     CALLBACKS.register(f"{name}.GradientNorm")

@@ -197,7 +197,7 @@ def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | Non
     from dopepp.experiment.results import display
     from dopepp.experiment.results.folder import FAILURE_FILE, OBJECTIVE, PRUNED_FILE, write_json
     from dopepp.experiment.results.report import Report
-    from dopepp.training.callbacks.trial import PrunedError
+    from dopepp.training.pruning import PrunedError
 
     hydra = HydraConfig.get()
     for name in (FAILURE_FILE, PRUNED_FILE):  # of an attempt before this one

@@ -39,9 +39,9 @@ from dopepp.inference.results import STEPS
 from dopepp.inference.runtimes.runtime import Runtime
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Part
-from dopepp.recovery.calibration import RecoveryOptions, rescored
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import Reason, explain, recover, rejected_refined
+from dopepp.recovery.scoring import RecoveryOptions, rescored
 
 if TYPE_CHECKING:
     from dopepp.geometry.camera_file import Camera

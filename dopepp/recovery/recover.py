@@ -20,8 +20,8 @@ from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS, Cuboid
 from dopepp.maps.codec import Beliefs, Fields, MapGeometry, find_peaks
 from dopepp.recovery.association import ObjectPeaks
-from dopepp.recovery.calibration import RecoveryOptions, calibrated
 from dopepp.recovery.detection import Detection, make_detection, peaks_of_object, pose_instances
+from dopepp.recovery.scoring import RecoveryOptions, calibrated
 
 Cuboids = Float[np.ndarray, "objects 9 3"]
 Cameras = Float[np.ndarray, "batch 3 3"]

@@ -1,7 +1,7 @@
 """PoseSystem: a network, a loss and an optimiser as a LightningModule.
 
 The network knows nothing of training and this module knows nothing of backbones or files: what can
-be swapped is handed in, built. To add a callback, one class in :mod:`dopepp.training.callbacks`, a
+be swapped is handed in, built. To add a callback, one class in :mod:`dopepp.training`, a
 line in ``dopepp/experiment/assembly/registries.py`` and an entry in ``conf/callbacks``.
 """
 
@@ -27,9 +27,9 @@ from dopepp.models.heads import Stage
 from dopepp.models.losses import MapLoss
 from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part
-from dopepp.recovery.calibration import RecoveryOptions
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import recover_batch
+from dopepp.recovery.scoring import RecoveryOptions
 from dopepp.training.loggers import MetricsTable
 from dopepp.training.optimizers import go_on_with_trained
 from dopepp.training.targets import (

@@ -12,7 +12,7 @@ import torch
 
 from dopepp.core.files import read_csv
 from dopepp.experiment.run.resume import read_overrides
-from dopepp.training.checkpointing.files import newest_checkpoint
+from dopepp.training.run_checkpoints import newest_checkpoint
 from dopepp.training.system import PoseSystem
 
 

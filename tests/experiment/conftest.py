@@ -45,7 +45,7 @@ import hydra, torch
 from dopepp.experiment.results.folder import METRICS_FILE, write_json
 from dopepp.experiment.entries import entry, run_job
 from dopepp.experiment.assembly.registries import CALLBACKS
-from dopepp.training.callbacks.trial import raise_if_pruned
+from dopepp.training.pruning import raise_if_pruned
 
 EPOCHS = 4
 

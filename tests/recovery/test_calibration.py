@@ -13,7 +13,8 @@ from scipy.stats import chi2
 from dopepp.geometry.camera import camera_matrix, make_transform, project, transform
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.rotation import rotation_vector_to_matrix
-from dopepp.recovery.calibration import (
+from dopepp.recovery.detection import Detection
+from dopepp.recovery.scoring import (
     CANDIDATE,
     DISTANCE_FACTORS,
     FEATURES,
@@ -26,7 +27,6 @@ from dopepp.recovery.calibration import (
     rescored,
     score,
 )
-from dopepp.recovery.detection import Detection
 
 K = camera_matrix(600, 600, 320, 240)
 CUBOID = cuboid_keypoints(np.array([-0.05, -0.03, -0.02]), np.array([0.05, 0.03, 0.02]))

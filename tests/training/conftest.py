@@ -18,9 +18,9 @@ from dopepp.models.losses import SpatialCrossEntropy
 from dopepp.models.network import build_network
 from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.part import Part
-from dopepp.recovery.calibration import RecoveryOptions
-from dopepp.training.checkpointing.files import AtomicCheckpointIO
+from dopepp.recovery.scoring import RecoveryOptions
 from dopepp.training.loggers import MetricsTable
+from dopepp.training.run_checkpoints import AtomicCheckpointIO
 from dopepp.training.system import PoseSystem
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import PRESETS

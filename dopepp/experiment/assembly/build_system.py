@@ -27,13 +27,13 @@ from dopepp.models.checkpoint import Checkpoint, load_network
 from dopepp.models.network import LOSSES, PoseNetwork, build_network
 from dopepp.parts.part import Part
 from dopepp.parts.size import Seen
-from dopepp.recovery.calibration import RecoveryOptions
-from dopepp.training.callbacks.throughput import RunProgress, make_profiler
-from dopepp.training.checkpointing.files import AtomicCheckpointIO
+from dopepp.recovery.scoring import RecoveryOptions
 from dopepp.training.loggers import MetricsTable
 from dopepp.training.optimizers import AveragedWeights
 from dopepp.training.processes import WatchedDDP
+from dopepp.training.run_checkpoints import AtomicCheckpointIO
 from dopepp.training.system import PoseSystem
+from dopepp.training.throughput import RunProgress, make_profiler
 
 # From glibc's malloc.h.
 _M_TRIM_THRESHOLD: Final = -1

@@ -22,7 +22,7 @@ from dopepp.core.files import write_whole
 from dopepp.core.json import read_json as read_strict_json
 from dopepp.core.pool import cpu_fact
 from dopepp.experiment import program
-from dopepp.training.checkpointing.files import BEST, FOLDER, LAST
+from dopepp.training.run_checkpoints import BEST, FOLDER, LAST
 from dopepp.virtual.factory import code_hash
 
 CONFIG_FILE: Final = "config.yaml"

@@ -27,7 +27,7 @@ from dopepp.experiment.results.frame import markdown, shown_rows
 from dopepp.experiment.results.report import Report
 from dopepp.metrics.row import COLUMNS, PoseRow, shown_columns
 from dopepp.models.checkpoint import SUFFIX, read, write_content
-from dopepp.training.callbacks.validation import best_effort
+from dopepp.training.pose_validation import best_effort
 
 README_FILE: Final = "README.md"
 

@@ -56,14 +56,14 @@ from dopepp.experiment.run.resume import (
 from dopepp.experiment.run.tracking import log_report, tracked
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.parts.part import Parts
-from dopepp.training.callbacks.throughput import FOLDER as PROFILE
-from dopepp.training.callbacks.throughput import profile_rows
-from dopepp.training.callbacks.trial import PrunedError, raise_if_pruned
-from dopepp.training.callbacks.validation import EarlyStop
-from dopepp.training.checkpointing.files import FOLDER, check_room, newest_checkpoint, saved_step
 from dopepp.training.loggers import GuardedLogger
+from dopepp.training.pose_validation import EarlyStop
 from dopepp.training.processes import ProcessDiedError
+from dopepp.training.pruning import PrunedError, raise_if_pruned
+from dopepp.training.run_checkpoints import FOLDER, check_room, newest_checkpoint, saved_step
 from dopepp.training.system import PoseSystem
+from dopepp.training.throughput import FOLDER as PROFILE
+from dopepp.training.throughput import profile_rows
 
 _log = logging.getLogger(__name__)
 

@@ -44,7 +44,7 @@ from dopepp.experiment.results.folder import (
     PRUNED_FILE,
     read_json,
 )
-from dopepp.training.callbacks.trial import MOST, open_storage
+from dopepp.training.pruning import MOST, open_storage
 
 _FACTS: Final = "configuration"
 _NUM_SHOWN: Final = 3

@@ -16,12 +16,12 @@ from torch.optim.lr_scheduler import CosineAnnealingLR
 from dopepp.core.errors import UserError
 from dopepp.core.files import read_csv
 from dopepp.data.batch import Batch
-from dopepp.training.callbacks.throughput import Throughput
-from dopepp.training.callbacks.validation import EarlyStop
-from dopepp.training.checkpointing.files import newest_checkpoint
-from dopepp.training.checkpointing.last import LastCheckpoint
+from dopepp.training.last_checkpoint import LastCheckpoint
 from dopepp.training.optimizers import TRAINED, AveragedWeights
+from dopepp.training.pose_validation import EarlyStop
+from dopepp.training.run_checkpoints import newest_checkpoint
 from dopepp.training.system import PoseSystem
+from dopepp.training.throughput import Throughput
 
 TIMES = ("throughput/images_per_s", "throughput/loader_wait")
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from dopepp.data.batch import Batch
-from dopepp.training.callbacks.guards import EmptyMaps
+from dopepp.training.guards import EmptyMaps
 from dopepp.training.system import PoseSystem, ValidationOutput
 
 CAUSES = ("too little training", "a learning rate", "labels or units")
@@ -60,7 +60,7 @@ def first_cause(caplog: pytest.LogCaptureFixture) -> str:
 
 @pytest.fixture(autouse=True)
 def warnings(caplog):
-    caplog.set_level(logging.WARNING, "dopepp.training.callbacks.guards")
+    caplog.set_level(logging.WARNING, "dopepp.training.guards")
 
 
 def test_a_falling_loss_needs_more_steps(validations, caplog):

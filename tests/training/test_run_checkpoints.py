@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dopepp.core.files import partial_path
-from dopepp.training.checkpointing.files import AtomicCheckpointIO, SavingFailedError, sweep
+from dopepp.training.run_checkpoints import AtomicCheckpointIO, SavingFailedError, sweep
 
 
 @pytest.mark.parametrize("weights_only", [None, False, True])

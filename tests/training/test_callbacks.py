@@ -18,9 +18,8 @@ from dopepp.data.datamodule import PoseDataModule
 from dopepp.drawing.pictures import read_rgb
 from dopepp.metrics.pose import PoseMetrics
 from dopepp.recovery.detection import Detection
-from dopepp.training.callbacks import throughput
-from dopepp.training.callbacks.throughput import Operators, Throughput, make_profiler, profile_rows
-from dopepp.training.callbacks.validation import (
+from dopepp.training import throughput
+from dopepp.training.pose_validation import (
     LOGGED,
     AUCCurves,
     Overlays,
@@ -28,6 +27,7 @@ from dopepp.training.callbacks.validation import (
     batch_instances,
 )
 from dopepp.training.system import PoseSystem, ValidationOutput
+from dopepp.training.throughput import Operators, Throughput, make_profiler, profile_rows
 
 
 class Displaced(PoseSystem):

@@ -20,8 +20,8 @@ from dopepp.core.errors import RunError, UserError
 from dopepp.core.files import read_csv
 from dopepp.data.batch import Batch
 from dopepp.drawing.pictures import read_rgb
-from dopepp.training.callbacks.guards import FOLDER, EmptyMaps, FiniteSteps
-from dopepp.training.checkpointing.files import AtomicCheckpointIO
+from dopepp.training.guards import FOLDER, EmptyMaps, FiniteSteps
+from dopepp.training.run_checkpoints import AtomicCheckpointIO
 from dopepp.training.system import PoseSystem, check_state
 
 NUM_BATCHES = 4
@@ -242,7 +242,7 @@ from pathlib import Path
 import torch
 from lightning.pytorch import LightningModule, Trainer
 from torch.utils.data import DataLoader, TensorDataset
-from dopepp.training.callbacks.guards import FiniteSteps
+from dopepp.training.guards import FiniteSteps
 from dopepp.training.processes import WatchedDDP
 
 class Line(LightningModule):

@@ -33,7 +33,7 @@ from dopepp.core.errors import Interruption
 from dopepp.core.validation import Range, check
 from dopepp.data.batch import Batch
 from dopepp.data.datamodule import PoseLoader
-from dopepp.training.checkpointing import files
+from dopepp.training import run_checkpoints as files
 
 _log = logging.getLogger(__name__)
 

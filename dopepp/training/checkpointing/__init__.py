@@ -1,1 +1,0 @@
-"""Checkpoints that are whole or absent, and the one a run goes on from."""
