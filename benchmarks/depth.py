@@ -23,7 +23,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from dopepp.data.formats.ycb_video import read_classes
-from dopepp.data.formats.ycb_video.reader import YcbVideoReader
+from dopepp.data.formats.ycb_video.ycb_reader import YcbVideoReader
 from dopepp.geometry.camera import camera_matrix, make_transform, transform
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
 from dopepp.inference.refinement.refiner import PartRefiner

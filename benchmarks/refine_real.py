@@ -23,7 +23,7 @@ import torch
 
 from dopepp.core.files import write_png
 from dopepp.core.json import read_json
-from dopepp.data.formats.bop.models import bop_parts, parts_by_id
+from dopepp.data.formats.bop.bop_models import bop_parts, parts_by_id
 from dopepp.drawing.overlay import BLUE, GREEN, YELLOW, Wireframe, overlay
 from dopepp.drawing.pictures import read_rgb
 from dopepp.drawing.sheet import Tile, contact_sheet

@@ -18,7 +18,7 @@ from dopepp.core.errors import NO_SPACE, RunError, UserError
 from dopepp.core.files import PICTURES, check_target, partial_path
 
 if TYPE_CHECKING:
-    from dopepp.data.formats.bop.results import PoseResult as Row
+    from dopepp.data.formats.bop.bop_results import BopResult
     from dopepp.drawing.video import VideoFile
     from dopepp.inference.results import PoseResult
     from dopepp.inference.sources import Source
@@ -159,7 +159,7 @@ class BopCsv:
     def __init__(self, path: Path) -> None:
         check_target(path, (".csv",))
         self._path = path
-        self._rows: list[Row] = []
+        self._rows: list[BopResult] = []
         self._scene = -1
 
     def begin(self, source: Source) -> None:
@@ -168,13 +168,13 @@ class BopCsv:
 
     def take(self, result: PoseResult) -> None:
         """Keep the poses until all are known."""
-        from dopepp.data.formats.bop.models import model_numbers
-        from dopepp.data.formats.bop.results import PoseResult as Row
+        from dopepp.data.formats.bop.bop_models import model_numbers
+        from dopepp.data.formats.bop.bop_results import BopResult
 
         numbers = model_numbers(list(result.shapes))
         seconds = sum(result.speed.values()) / 1000
         self._rows += [
-            Row(self._scene, result.number, numbers[one.object], one.score, one.T_cam_obj,
+            BopResult(self._scene, result.number, numbers[one.object], one.score, one.T_cam_obj,
                 seconds)
             for one in result.detections
         ]  # fmt: skip
@@ -183,7 +183,7 @@ class BopCsv:
         """Write the file, where anything was looked at."""
         if self._scene < 0:
             return
-        from dopepp.data.formats.bop.results import write_results
+        from dopepp.data.formats.bop.bop_results import write_results
 
         write_results(self._path, self._rows)
 

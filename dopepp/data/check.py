@@ -12,12 +12,12 @@ from typing import Final
 
 from dopepp.core.errors import UserError
 from dopepp.data.formats import RECORD_FILE
-from dopepp.data.formats.bop.invariants import check_bop, scene_folders
+from dopepp.data.formats.bop.bop_invariants import check_bop, scene_folders
 from dopepp.data.formats.ndds import OBJECT_SETTINGS, find_items
-from dopepp.data.formats.ndds.invariants import check_ndds
+from dopepp.data.formats.ndds.ndds_invariants import check_ndds
 from dopepp.data.formats.problems import CheckReport
-from dopepp.data.formats.webdataset.invariants import check_webdataset, shard_paths
-from dopepp.data.formats.ycb_video.invariants import check_ycb
+from dopepp.data.formats.webdataset.webdataset_invariants import check_webdataset, shard_paths
+from dopepp.data.formats.ycb_video.ycb_invariants import check_ycb
 
 _LISTED: Final = 8
 """Data sets of a parent folder, at most."""

@@ -15,7 +15,7 @@ from typing import Final
 
 from dopepp.core.errors import UserError
 from dopepp.core.json import read_json
-from dopepp.data.formats.bop.models import (
+from dopepp.data.formats.bop.bop_models import (
     SYMMETRY_FIELDS,
     Continuous,
     Discrete,

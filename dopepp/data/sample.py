@@ -69,7 +69,7 @@ class Sample:
         return self.image.shape[1], self.image.shape[0]
 
 
-class Source(Protocol):
+class SampleSource(Protocol):
     """A map-style data set; item ``index`` is a pure function of (its seed, epoch, index)."""
 
     name: str
@@ -98,7 +98,7 @@ class SourceInfo:
     num_per_epoch: int | None = None
 
 
-class DescribedSource(Source, Protocol):
+class DescribedSource(SampleSource, Protocol):
     """A source that the DataModule can train on: it also says what it holds."""
 
     def describe(self) -> list[SourceInfo]:

@@ -299,9 +299,9 @@ def test_neither_render_nor_check_imports_torch(layout, command, tmp_path):
 import sys
 from typer.testing import CliRunner
 from dopepp.cli import app
-from dopepp.data.jobs.job import make_job
-from dopepp.data.jobs.preview import write_preview
-from dopepp.data.jobs.rendering import RenderTasks, Task
+from dopepp.data.render_jobs.job import make_job
+from dopepp.data.render_jobs.preview import write_preview
+from dopepp.data.render_jobs.rendering import RenderTasks, RenderTask
 from pathlib import Path
 out = {str(tmp_path / "out")!r}
 arguments = ["render", "servoholder", "--preset", "quickstart", "--size", "32x24",
@@ -310,7 +310,7 @@ done = CliRunner().invoke(app, arguments)
 assert done.exit_code == 0, done.output
 job = make_job(["servoholder"], preset="quickstart", size="32x24", layout={layout!r})
 perform = RenderTasks(job, Path(out))
-for task in (Task(0, range(2)), Task(0, range(2), finalizes=True)):
+for task in (RenderTask(0, range(2)), RenderTask(0, range(2), finalizes=True)):
     perform(task)
 write_preview(job, Path(out))
 done = CliRunner().invoke(app, ["check", out])

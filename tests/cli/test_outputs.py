@@ -17,7 +17,7 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from dopepp.cli import app
-from dopepp.data.formats.bop.results import read_results
+from dopepp.data.formats.bop.bop_results import read_results
 from dopepp.inference.sources.files import Video
 from dopepp.parts.catalogue import pivconnector
 

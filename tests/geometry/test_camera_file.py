@@ -220,7 +220,7 @@ def test_its_lens_projects_as_opencvs(tmp_path):
 
 
 def test_reads_what_dopepp_writes(tmp_path):
-    from dopepp.data.formats.ndds.writer import camera_settings
+    from dopepp.data.formats.ndds.ndds_writer import camera_settings
 
     four = {"fx": 601.25, "fy": 602.5, "cx": 318.75, "cy": 242.5}
     content = camera_settings({"width": 640, "height": 480, "intrinsics": four})

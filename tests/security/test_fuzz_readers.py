@@ -30,15 +30,15 @@ from dopepp.core.errors import UserError
 from dopepp.core.yaml import read_yaml
 from dopepp.data.archive import safe_extract
 from dopepp.data.check import check_dataset
-from dopepp.data.formats.bop.models import bop_parts
-from dopepp.data.formats.bop.reader import BopReader
-from dopepp.data.formats.bop.results import read_results
-from dopepp.data.formats.bop.writer import BopWriter
+from dopepp.data.formats.bop.bop_models import bop_parts
+from dopepp.data.formats.bop.bop_reader import BopReader
+from dopepp.data.formats.bop.bop_results import read_results
+from dopepp.data.formats.bop.bop_writer import BopWriter
 from dopepp.data.formats.images import decode_depth, decode_mask, decode_rgb
-from dopepp.data.formats.ndds.reader import NddsReader
-from dopepp.data.formats.ndds.writer import NddsWriter
-from dopepp.data.formats.webdataset.reader import WebdatasetReader
-from dopepp.data.formats.webdataset.writer import WebdatasetWriter
+from dopepp.data.formats.ndds.ndds_reader import NddsReader
+from dopepp.data.formats.ndds.ndds_writer import NddsWriter
+from dopepp.data.formats.webdataset.webdataset_reader import WebdatasetReader
+from dopepp.data.formats.webdataset.webdataset_writer import WebdatasetWriter
 from dopepp.data.formats.ycb_video import read_meta
 from dopepp.data.sample import Instance, Sample
 from dopepp.drawing.pictures import read_image, read_picture, read_rgb

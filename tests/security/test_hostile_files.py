@@ -20,8 +20,8 @@ from typer.testing import CliRunner
 from dopepp.cli import app
 from dopepp.core.errors import UserError
 from dopepp.data.archive import safe_extract
-from dopepp.data.formats.bop.models import read_models
-from dopepp.data.formats.bop.results import read_results
+from dopepp.data.formats.bop.bop_models import read_models
+from dopepp.data.formats.bop.bop_results import read_results
 from dopepp.data.formats.images import decode_depth, decode_mask, decode_rgb
 from dopepp.data.formats.webdataset import index_shard
 from dopepp.data.formats.ycb_video import read_meta

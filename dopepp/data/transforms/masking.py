@@ -3,7 +3,7 @@
 A patch is a crop of the image's own background, never a solid colour, at most 0.8 of the object's
 box high and wide; it is smaller where the background has no such window. Masks and visible
 fractions lose the covered pixels; keypoints stay, as the network still has to place them.
-:class:`BackgroundCrops` also serves the shading protocol (:mod:`dopepp.data.transforms.shading`).
+:class:`BackgroundCrops` also serves :mod:`dopepp.data.transforms.shading_protocol`.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.bop.models import bop_parts
+from dopepp.data.formats.bop.bop_models import bop_parts
 from dopepp.data.formats.ycb_video import read_classes
 from dopepp.data.part_symmetries import choose_symmetries
 from dopepp.experiment.config.data_config import DataConfig

@@ -18,14 +18,14 @@ from dopepp.core import extensions
 from dopepp.core.errors import UserError
 from dopepp.core.pool import available_cores
 from dopepp.data.datamodule import PoseDataModule
-from dopepp.data.formats.bop.reader import BopReader
-from dopepp.data.formats.ndds.reader import NddsReader
-from dopepp.data.formats.webdataset.reader import WebdatasetReader
+from dopepp.data.formats.bop.bop_reader import BopReader
+from dopepp.data.formats.ndds.ndds_reader import NddsReader
+from dopepp.data.formats.webdataset.webdataset_reader import WebdatasetReader
 from dopepp.data.formats.ycb_video import read_image_set
-from dopepp.data.formats.ycb_video.reader import YcbVideoReader
+from dopepp.data.formats.ycb_video.ycb_reader import YcbVideoReader
+from dopepp.data.image_sources.hybrid import HybridSource, WindowedSource
+from dopepp.data.image_sources.rendered import RenderedSource, Split
 from dopepp.data.sample import DescribedSource
-from dopepp.data.sources.hybrid import HybridSource, WindowedSource
-from dopepp.data.sources.rendered import RenderedSource, Split
 from dopepp.data.transforms.augment import Photometric
 from dopepp.data.transforms.jitter import CameraJitter
 from dopepp.data.transforms.masking import RandomMask

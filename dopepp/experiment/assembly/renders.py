@@ -7,8 +7,8 @@ from pathlib import Path
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import cache_folder
+from dopepp.data.image_sources.rendered import CachedSource, RenderedSource, Split
 from dopepp.data.sample import DescribedSource
-from dopepp.data.sources.rendered import CachedSource, RenderedSource, Split
 from dopepp.drawing.pictures import Size
 from dopepp.experiment.assembly.build_parts import build_negatives
 from dopepp.experiment.config.data_config import Cache, DataConfig, chosen_data, trained_on

@@ -23,8 +23,8 @@ from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_csv, write_png, write_whole
-from dopepp.data.sample import Sample, Source
-from dopepp.data.transforms.shading import TOLERANCE, Shaded, shade
+from dopepp.data.sample import Sample, SampleSource
+from dopepp.data.transforms.shading_protocol import TOLERANCE, Shaded, shade
 from dopepp.drawing.curves import figure_image, rates_figure
 from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.experiment.results import display
@@ -213,7 +213,7 @@ def _values(
                 yield from row_values(row, ["num_instances", *fields], rated, level.value)
 
 
-def check_masks(source: Source) -> None:
+def check_masks(source: SampleSource) -> None:
     """Read images until one has an instance mask, before anything takes time.
 
     Raises:
@@ -234,7 +234,7 @@ def check_masks(source: Source) -> None:
 
 def measure_shading(
     methods: Mapping[str, Method],
-    source: Source,
+    source: SampleSource,
     shares: Sequence[float],
     seed: int,
     unmasked: Sequence[Report],
@@ -317,7 +317,7 @@ def _around_masks(sample: Sample) -> tuple[slice, slice]:
 
 def measure_scales(
     methods: Mapping[str, Method],
-    sources: Mapping[float, Source],
+    sources: Mapping[float, SampleSource],
     unmoved: Measured,
     num_examples: int = MAX_EXAMPLES,
 ) -> tuple[list[Level], list[Tile]]:

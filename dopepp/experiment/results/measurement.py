@@ -20,8 +20,8 @@ import torch
 from jaxtyping import Float
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.bop.models import parts_by_id, read_models
-from dopepp.data.formats.bop.results import PoseResult, read_results
+from dopepp.data.formats.bop.bop_models import parts_by_id, read_models
+from dopepp.data.formats.bop.bop_results import BopResult, read_results
 from dopepp.data.formats.ycb_video import read_classes
 from dopepp.data.sample import Sample
 from dopepp.drawing.overlay import BLUE, GREEN, YELLOW, Wireframe, overlay
@@ -136,8 +136,8 @@ class FileMethod:
         self._path = path
         self.parts: Parts = list(parts)
         self._parts = {numbers[part.name]: part for part in parts}
-        self._unused: dict[ImageId, list[PoseResult]] = {}
-        self._used: dict[ImageId, list[PoseResult]] = {}
+        self._unused: dict[ImageId, list[BopResult]] = {}
+        self._used: dict[ImageId, list[BopResult]] = {}
         for row in read_results(path, numbers.values()):
             self._unused.setdefault((row.scene_id, row.im_id), []).append(row)
 

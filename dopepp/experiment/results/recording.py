@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from dopepp.core.files import write_png
-from dopepp.data.formats.bop.results import UNKNOWN_TIME, PoseResult, results_name, write_results
-from dopepp.data.sample import Source
+from dopepp.data.formats.bop.bop_results import UNKNOWN_TIME, BopResult, results_name, write_results
+from dopepp.data.sample import SampleSource
 from dopepp.drawing.curves import save_accuracy_curves
 from dopepp.drawing.sheet import contact_sheet
 from dopepp.experiment.assembly.build_sources import held_out_source
@@ -179,7 +179,7 @@ def _draw(run_dir: Path, measured: Measured, num_images: int) -> None:
 
 
 def _show_silence(
-    methods: Mapping[str, Method], silent: Mapping[str, Sequence[int]], source: Source
+    methods: Mapping[str, Method], silent: Mapping[str, Sequence[int]], source: SampleSource
 ) -> None:
     """Print of every estimator on how many images it found nothing, and why."""
     for name, numbers in silent.items():
@@ -205,5 +205,5 @@ def _write_results(
         for image, pose, seconds in measured:
             time = UNKNOWN_TIME if seconds is None else seconds
             number = numbers[pose.object]
-            rows.append(PoseResult(*image, number, pose.score, pose.T_cam_obj, time))
+            rows.append(BopResult(*image, number, pose.score, pose.T_cam_obj, time))
         write_results(run_dir / results_name(method, dataset, split), rows)

@@ -14,7 +14,7 @@ import numpy as np
 
 from dopepp.core.errors import RunError, UserError
 from dopepp.core.files import draft
-from dopepp.data.sample import Sample, Source
+from dopepp.data.sample import Sample, SampleSource
 from dopepp.experiment.assembly.renders import validation_renders
 from dopepp.experiment.config.data_config import trained_on
 from dopepp.experiment.program import typed
@@ -145,7 +145,7 @@ def _seen(estimator: PoseEstimator, sample: Sample) -> list[Pixels]:
 
 
 def _accuracy(
-    original: PoseEstimator, exported: PoseEstimator, source: Source, count: int
+    original: PoseEstimator, exported: PoseEstimator, source: SampleSource, count: int
 ) -> dict[str, float]:
     """Measure ADD-0.1d of both on the same scenes."""
     _log.info("measuring both on %d other validation scenes", count)
@@ -157,7 +157,7 @@ def _accuracy(
     return {report.name: report.mean.add_01d or 0.0 for report in measured.reports}
 
 
-def _compared(exported: PoseEstimator, original: PoseEstimator, source: Source) -> Agreement:
+def _compared(exported: PoseEstimator, original: PoseEstimator, source: SampleSource) -> Agreement:
     samples: Sequence[Sample] = [source.sample(index) for index in range(NUM_CHECKED)]
     return compare(exported, original, [(sample.image, sample.K) for sample in samples])
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
-from dopepp.data.sample import Sample, Source
+from dopepp.data.sample import Sample, SampleSource
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.runtimes.runtime import Runtime
 from dopepp.models.heads import Stage
@@ -37,7 +37,7 @@ class Memory:
             self._kept[key] = made
         return made
 
-    def of(self, source: Source) -> Source:
+    def of(self, source: SampleSource) -> SampleSource:
         """Return a source whose items of epoch 0 are made once."""
         return _RememberedSource(source, self, source.name)
 
@@ -52,7 +52,7 @@ class Memory:
 
 @dataclass
 class _RememberedSource:
-    source: Source
+    source: SampleSource
     memory: Memory
     name: str
 

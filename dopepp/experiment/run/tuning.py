@@ -18,8 +18,8 @@ import torch
 from jaxtyping import Bool, Float
 
 from dopepp.core.errors import UserError
-from dopepp.data.sample import Instance, Sample, Source
-from dopepp.data.transforms.shading import shade
+from dopepp.data.sample import Instance, Sample, SampleSource
+from dopepp.data.transforms.shading_protocol import shade
 from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.assembly.renders import empty_renders
 from dopepp.experiment.config.data_config import DataConfig
@@ -98,7 +98,7 @@ def tune(
     empty = memory.of(empty_renders(data, parts, "val", count))
     empty_test = memory.of(empty_renders(data, parts, "test", count))
 
-    def scored(options: RecoveryOptions, *sources: Source) -> Scored:
+    def scored(options: RecoveryOptions, *sources: SampleSource) -> Scored:
         estimator.recovery = options
         return score_images(estimator, parts, *sources)
 
@@ -184,7 +184,7 @@ def choose(
     return dict(zip(names, [threshold, *map(float, weights)], strict=True))
 
 
-def score_images(estimator: PoseEstimator, parts: Parts, *sources: Source) -> Scored:
+def score_images(estimator: PoseEstimator, parts: Parts, *sources: SampleSource) -> Scored:
     """Run an estimator over sources and judge every detection; features are of what it does."""
     refined = estimator.refiner is not None
     names = scoring.REFINED_FEATURES if refined else scoring.FEATURES
@@ -211,7 +211,7 @@ def score_images(estimator: PoseEstimator, parts: Parts, *sources: Source) -> Sc
 
 
 def matched_poses(
-    estimator: PoseEstimator, parts: Parts, source: Source
+    estimator: PoseEstimator, parts: Parts, source: SampleSource
 ) -> list[tuple[Detection, Float[np.ndarray, "equivalents 4 4"]]]:
     """Return detections, each with all poses that look like the one of the instance it found."""
     matches = []
@@ -226,7 +226,7 @@ def matched_poses(
 
 
 def _by_object(
-    estimator: PoseEstimator, parts: Parts, *sources: Source
+    estimator: PoseEstimator, parts: Parts, *sources: SampleSource
 ) -> Iterator[tuple[int, Sample, Part, list[Detection], list[Instance]]]:
     """Yield detections and instances of every image, numbered over all sources, and part."""
     images = ((source, index) for source in sources for index in range(len(source)))
@@ -242,7 +242,7 @@ def _by_object(
 class Hidden:
     """Images of a source with :data:`HIDDEN` of every masked object's visible pixels covered."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: SampleSource) -> None:
         self._source, self.name = source, f"{source.name}, hidden"
 
     def __len__(self) -> int:

@@ -18,15 +18,15 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.data.check import check_dataset
-from dopepp.data.formats.bop.models import bop_parts
-from dopepp.data.formats.bop.reader import BopReader
-from dopepp.data.formats.bop.writer import BopWriter
-from dopepp.data.formats.ndds.reader import NddsReader
-from dopepp.data.formats.ndds.writer import NddsWriter
+from dopepp.data.formats.bop.bop_models import bop_parts
+from dopepp.data.formats.bop.bop_reader import BopReader
+from dopepp.data.formats.bop.bop_writer import BopWriter
+from dopepp.data.formats.ndds.ndds_reader import NddsReader
+from dopepp.data.formats.ndds.ndds_writer import NddsWriter
 from dopepp.data.formats.problems import MAX_KEPT, CheckReport
-from dopepp.data.formats.webdataset.reader import WebdatasetReader
-from dopepp.data.formats.webdataset.writer import WebdatasetWriter
-from dopepp.data.formats.ycb_video.reader import YcbVideoReader
+from dopepp.data.formats.webdataset.webdataset_reader import WebdatasetReader
+from dopepp.data.formats.webdataset.webdataset_writer import WebdatasetWriter
+from dopepp.data.formats.ycb_video.ycb_reader import YcbVideoReader
 from dopepp.geometry.camera import camera_matrix
 
 SIZE, NUM_IMAGES = 128, 3

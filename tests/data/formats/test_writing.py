@@ -11,12 +11,12 @@ import pytest
 
 from dopepp.data.check import check_dataset
 from dopepp.data.formats import STAGING, finalizing, stage, staged_items
-from dopepp.data.formats.bop.reader import BopReader
-from dopepp.data.formats.bop.writer import BopWriter
-from dopepp.data.formats.ndds.reader import NddsReader
-from dopepp.data.formats.ndds.writer import NddsWriter
-from dopepp.data.formats.webdataset.reader import WebdatasetReader
-from dopepp.data.formats.webdataset.writer import WebdatasetWriter
+from dopepp.data.formats.bop.bop_reader import BopReader
+from dopepp.data.formats.bop.bop_writer import BopWriter
+from dopepp.data.formats.ndds.ndds_reader import NddsReader
+from dopepp.data.formats.ndds.ndds_writer import NddsWriter
+from dopepp.data.formats.webdataset.webdataset_reader import WebdatasetReader
+from dopepp.data.formats.webdataset.webdataset_writer import WebdatasetWriter
 
 LAYOUTS = {
     "ndds": (NddsWriter, NddsReader),
@@ -94,15 +94,15 @@ def test_bytes_depend_neither_on_the_order_nor_on_kills(
 
 def test_data_sets_are_read_written_and_checked_without_torch(tmp_path):
     modules = (
-        "check", "formats.bop.reader", "formats.bop.writer", "formats.ndds.reader",
-        "formats.ndds.writer", "formats.ycb_video.reader", "sources.hybrid", "sources.rendered",
-        "transforms.masking", "transforms.augment",
+        "check", "formats.bop.bop_reader", "formats.bop.bop_writer", "formats.ndds.ndds_reader",
+        "formats.ndds.ndds_writer", "formats.ycb_video.ycb_reader", "image_sources.hybrid",
+        "image_sources.rendered", "transforms.masking", "transforms.augment",
     )  # fmt: skip
     code = (
         f"import sys, {', '.join(f'dopepp.data.{name}' for name in modules)}\n"
         "import numpy as np\n"
-        "from dopepp.data.formats.webdataset.reader import WebdatasetReader\n"
-        "from dopepp.data.formats.webdataset.writer import WebdatasetWriter\n"
+        "from dopepp.data.formats.webdataset.webdataset_reader import WebdatasetReader\n"
+        "from dopepp.data.formats.webdataset.webdataset_writer import WebdatasetWriter\n"
         "from dopepp.data.sample import Sample\n"
         "from dopepp.parts.catalogue import servoholder\n"
         f"writer = WebdatasetWriter({str(tmp_path)!r}, [servoholder()])\n"

@@ -8,8 +8,8 @@ import pytest
 
 from dopepp.core.errors import StoppedError, UserError
 from dopepp.core.pool import ClusterPool, ProcessPool
-from dopepp.data.jobs.job import WRITERS, begin
-from dopepp.data.jobs.rendering import RenderTasks, Shard, Task, render_dataset
+from dopepp.data.render_jobs.job import WRITERS, begin
+from dopepp.data.render_jobs.rendering import RenderTask, RenderTasks, Shard, render_dataset
 
 NUM = 60
 
@@ -72,7 +72,7 @@ def test_both_nodes_work_and_a_lost_node_costs_nothing(two_nodes, small_job, tmp
     second = two_nodes.add_node(num_cpus=1, object_store_memory=80_000_000)
     done = []
     with ClusterPool(pickle.dumps(RenderTasks(job, tmp_path)), two_nodes.address, 1) as pool:
-        for task, future in pool.run(Task(0, range(i, i + 8)) for i in range(0, 160, 8)):
+        for task, future in pool.run(RenderTask(0, range(i, i + 8)) for i in range(0, 160, 8)):
             future.result()
             done += task.indices
             if len(done) == 40:

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.data.jobs import preview
-from dopepp.data.jobs.job import make_job
-from dopepp.data.jobs.preview import preview_sheet, scene_tiles, write_preview
+from dopepp.data.render_jobs import preview
+from dopepp.data.render_jobs.job import make_job
+from dopepp.data.render_jobs.preview import preview_sheet, scene_tiles, write_preview
 
 SMALL = ("width=96", "height=72")
 

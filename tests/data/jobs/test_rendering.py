@@ -20,9 +20,15 @@ from dopepp.core.errors import StoppedError, UserError
 from dopepp.core.files import partial_path
 from dopepp.core.pool import PickledFunction, Pool, opened
 from dopepp.data.formats import RECORD_FILE
-from dopepp.data.formats.ndds.writer import NddsWriter
-from dopepp.data.jobs.job import WRITERS, make_job, named_part
-from dopepp.data.jobs.rendering import ProgressDisplay, RenderReport, Shard, plan, render_dataset
+from dopepp.data.formats.ndds.ndds_writer import NddsWriter
+from dopepp.data.render_jobs.job import WRITERS, make_job, named_part
+from dopepp.data.render_jobs.rendering import (
+    ProgressDisplay,
+    RenderReport,
+    Shard,
+    plan,
+    render_dataset,
+)
 
 NUM = 10
 

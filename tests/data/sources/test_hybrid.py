@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dopepp.core.errors import UserError
+from dopepp.data.image_sources.hybrid import VIRTUAL, HybridSource
 from dopepp.data.sample import Sample, SourceInfo
-from dopepp.data.sources.hybrid import VIRTUAL, HybridSource
 
 
 class Named:

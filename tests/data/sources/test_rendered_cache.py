@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
+from dopepp.data.image_sources import rendered
+from dopepp.data.image_sources.rendered import CachedSource
 from dopepp.data.sample import Sample, resize_sample
-from dopepp.data.sources import rendered
-from dopepp.data.sources.rendered import CachedSource
 
 
 def assert_same(first: Sample, second: Sample) -> None:

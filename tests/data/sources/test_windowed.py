@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from dopepp.data.image_sources.hybrid import WindowedSource
+from dopepp.data.image_sources.rendered import RenderedSource
 from dopepp.data.sample import Sample, crop_sample, letterbox_sample
-from dopepp.data.sources.hybrid import WindowedSource
-from dopepp.data.sources.rendered import RenderedSource
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.parts.catalogue import pivconnector

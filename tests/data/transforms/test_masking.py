@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopepp.data.formats.ycb_video.reader import YcbVideoReader
+from dopepp.data.formats.ycb_video.ycb_reader import YcbVideoReader
 from dopepp.data.sample import Instance, Sample, silhouette
 from dopepp.data.transforms.masking import RandomMask
-from dopepp.data.transforms.shading import TOLERANCE, shade
+from dopepp.data.transforms.shading_protocol import TOLERANCE, shade
 from dopepp.parts.mesh.read import ycb_part
 
 SIZE = (72, 96)

@@ -9,11 +9,11 @@ import pytest
 import trimesh
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.bop.models import bop_parts
-from dopepp.data.formats.bop.reader import BopReader
-from dopepp.data.formats.bop.results import PoseResult, write_results
-from dopepp.data.formats.bop.writer import BopWriter
-from dopepp.data.sources.rendered import RenderedSource
+from dopepp.data.formats.bop.bop_models import bop_parts
+from dopepp.data.formats.bop.bop_reader import BopReader
+from dopepp.data.formats.bop.bop_results import BopResult, write_results
+from dopepp.data.formats.bop.bop_writer import BopWriter
+from dopepp.data.image_sources.rendered import RenderedSource
 from dopepp.experiment.assembly.build_parts import build_negatives, build_parts
 from dopepp.experiment.assembly.build_sources import (
     build_datamodule,
@@ -179,7 +179,7 @@ def test_true_poses_from_a_file_have_full_marks_in_every_score(call, root, tmp_p
     source = BopReader(root, bop_parts(root), "test", targets="auto")
     numbers = {"red": 1, "blue": 2}
     rows = [
-        PoseResult(0, index, numbers[one.label], 1.0, one.T_cam_obj)
+        BopResult(0, index, numbers[one.label], 1.0, one.T_cam_obj)
         for index in range(len(source))
         for one in source.sample(index).instances
     ]

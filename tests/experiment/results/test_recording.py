@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.bop.models import bop_parts
-from dopepp.data.formats.bop.reader import BopReader
-from dopepp.data.formats.bop.results import PoseResult, read_results, write_results
-from dopepp.data.formats.bop.writer import BopWriter
+from dopepp.data.formats.bop.bop_models import bop_parts
+from dopepp.data.formats.bop.bop_reader import BopReader
+from dopepp.data.formats.bop.bop_results import BopResult, read_results, write_results
+from dopepp.data.formats.bop.bop_writer import BopWriter
+from dopepp.data.image_sources.rendered import rendered_sample
 from dopepp.data.sample import Sample
-from dopepp.data.sources.rendered import rendered_sample
 from dopepp.experiment.results.measurement import image_id, object_numbers
 from dopepp.experiment.run.evaluate import run_evaluation
 from dopepp.parts.catalogue import pivconnector, servoholder
@@ -40,7 +40,7 @@ def root(tmp_path_factory):
     return folder
 
 
-def results(root: Path, offset: float = 0.0) -> list[PoseResult]:
+def results(root: Path, offset: float = 0.0) -> list[BopResult]:
     """Return the truth, moved along x, with scores and times."""
     parts = bop_parts(root)
     numbers = {part.name: number for number, part in enumerate(parts, 1)}
@@ -50,7 +50,7 @@ def results(root: Path, offset: float = 0.0) -> list[PoseResult]:
         for one in source.sample(index).instances:
             T = one.T_cam_obj.copy()
             T[0, 3] += offset
-            poses.append(PoseResult(0, index, numbers[one.label], 0.5, T, 0.25))
+            poses.append(BopResult(0, index, numbers[one.label], 0.5, T, 0.25))
     return poses
 
 
@@ -105,7 +105,7 @@ def test_a_folder_is_the_networks_whatever_file_is_measured_beside_it(root, comp
 
 def test_poses_beside_the_test_set_are_left_out(root, composed, tmp_path, caplog):
     poses = results(root)
-    elsewhere = PoseResult(7, 0, 1, 0.9, poses[0].T_cam_obj)
+    elsewhere = BopResult(7, 0, 1, 0.9, poses[0].T_cam_obj)
     path = tmp_path / "results.csv"
     write_results(path, [*poses, elsewhere])
     arguments = options(root, f"results={path}", "data.objects=[pivconnector]", "num_pictures=0")
@@ -126,7 +126,7 @@ def test_poses_beside_the_test_set_are_left_out(root, composed, tmp_path, caplog
 def test_a_file_that_does_not_fit_the_data(change, message, root, composed, tmp_path):
     path = tmp_path / "results.csv"
     one = vars(results(root)[0])
-    write_results(path, [PoseResult(**{**one, **change})])
+    write_results(path, [BopResult(**{**one, **change})])
     config = composed(*options(root, f"results={path}"), config="evaluate")
     with pytest.raises(UserError, match=message) as error:
         run_evaluation(config, tmp_path / "run")

@@ -240,7 +240,7 @@ def image_files(
 
 
 @dataclass(frozen=True)
-class Scene:
+class BopScene:
     """A scene's images, in the order of their numbers.
 
     Attributes:
@@ -272,7 +272,7 @@ class Scene:
         return slice(int(self.first[row]), int(self.first[row + 1]))
 
 
-def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int] = ()) -> Scene:
+def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int] = ()) -> BopScene:
     """Read a scene's annotation: ``scene_camera.json`` and, if present, its ground truth.
 
     ``wanted`` are the numbers of the objects to keep, ``with_model`` those of the objects with a
@@ -303,7 +303,7 @@ def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int
     is_behind = poses.T_cam_obj[:, 2, 3] <= 0
     keep = is_wanted & ~is_behind
     without_model = poses.of(~is_wanted).without_model(with_model)
-    return Scene(
+    return BopScene(
         folder,
         np.array(images, np.int64),
         _relative_files(folder, IMAGE_FOLDERS, IMAGE_SUFFIXES, images),

@@ -145,7 +145,7 @@ def image_of(annotation: Path) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
-class Settings:
+class NddsSettings:
     """The settings files of a data set, each read once, on first use."""
 
     def __init__(self, root: Path, problems: Problems = STRICT) -> None:
@@ -278,7 +278,7 @@ def read_labels(annotation: Path, shape: Shape) -> NDArray[Any] | None:
 
 
 def label_values(
-    objects: Objects, record: Mapping[str, Any], annotation: Path, settings: Settings
+    objects: Objects, record: Mapping[str, Any], annotation: Path, settings: NddsSettings
 ) -> dict[str, int | None]:
     """Return the value of each object's pixels in ``STEM.seg.png``, by the object's place.
 

@@ -159,7 +159,7 @@ _SAME_POSE: Final = 0.05  # distance of corners, in diameters, of conventions wi
 
 
 @dataclass(frozen=True)
-class Finding:
+class NddsFinding:
     """The convention of a data set, and how sure it is.
 
     Attributes:
@@ -185,7 +185,7 @@ class Finding:
         return text
 
 
-def find_convention(observations: Sequence[Observation], where: str) -> Finding:
+def find_convention(observations: Sequence[Observation], where: str) -> NddsFinding:
     """Find the one convention under which the parts' cuboids land on ``projected_cuboid``.
 
     One observation is enough in most cases.
@@ -210,7 +210,7 @@ def find_convention(observations: Sequence[Observation], where: str) -> Finding:
     if rival_px < _RATIO * errors[best] + _ROUNDING_PX:
         raise _undecidable(where, "two conventions fit alike", [best, *others[:5]], errors)
     undecided = tuple(rival for rival in alike if replace(rival, frame=best.frame) != best)
-    return Finding(best, errors[best], rival_px, undecided, len(observations))
+    return NddsFinding(best, errors[best], rival_px, undecided, len(observations))
 
 
 def check_observation(observation: Observation, convention: PoseConvention) -> Transform:

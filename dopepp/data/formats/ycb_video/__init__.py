@@ -171,7 +171,7 @@ def _pose(value: NDArray[Any], place: Place) -> Transform:
 
 
 @dataclass(frozen=True)
-class Frame:
+class YcbFrame:
     """The files of a frame; None where one cannot be read.
 
     Attributes:
@@ -190,7 +190,7 @@ class Frame:
 
 def read_frame(
     start: str, subset: Subset, problems: Problems = STRICT, read_depth: bool = True
-) -> Frame:
+) -> YcbFrame:
     """Read the frame whose paths begin with ``start``, e.g. ``data/0000/000001``."""
     colour, depth, label = (
         Place(problems, Path(f"{start}-{name}.png")) for name in ("color", "depth", "label")
@@ -200,7 +200,7 @@ def read_frame(
     shape: Shape | None = stated_shape(path) if image is None else image.shape[:2]
     meta = read_meta(Path(f"{start}-meta.mat"), problems)
     units = read_map(depth, shape) if read_depth else None
-    return Frame(image, shape, meta, units, read_map(label, shape))
+    return YcbFrame(image, shape, meta, units, read_map(label, shape))
 
 
 def _read_colour(path: Path, alpha: bool) -> UInt8[np.ndarray, "height width channels"]:

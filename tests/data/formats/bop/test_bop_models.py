@@ -8,7 +8,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.bop.models import (
+from dopepp.data.formats.bop.bop_models import (
     bop_parts,
     model_numbers,
     parts_by_id,

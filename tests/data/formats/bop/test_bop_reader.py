@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from dopepp.core.errors import UserError
 from dopepp.data.check import check_dataset
 from dopepp.data.formats import share
-from dopepp.data.formats.bop.models import bop_parts
-from dopepp.data.formats.bop.reader import BopReader
+from dopepp.data.formats.bop.bop_models import bop_parts
+from dopepp.data.formats.bop.bop_reader import BopReader
 from dopepp.data.formats.images import decode_mask, decode_rgb, encode_png
 
 K = [100.0, 0.0, 31.5, 0.0, 101.0, 23.5, 0.0, 0.0, 1.0]

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.bop import results as bop_results
-from dopepp.data.formats.bop.results import PoseResult, read_results, results_name, write_results
+from dopepp.data.formats.bop import bop_results
+from dopepp.data.formats.bop.bop_results import BopResult, read_results, results_name, write_results
 
 HEADER = "scene_id,im_id,obj_id,score,R,t,time"
 R = "1 0 0 0 0 -1 0 1 0"
@@ -66,7 +66,7 @@ def test_what_is_written_is_read_back(seed, count, tmp_path_factory):
         T = np.eye(4)
         T[:3, :3] = Rotation.random(random_state=rng).as_matrix()
         T[:3, 3] = rng.normal([0, 0, 1], 0.2)
-        results.append(PoseResult(number // 5, number % 5, 1 + number % 3, rng.normal(), T, 0.1))
+        results.append(BopResult(number // 5, number % 5, 1 + number % 3, rng.normal(), T, 0.1))
     path = tmp_path_factory.mktemp("results") / "out.csv"
     write_results(path, results)
     assert path.read_text().splitlines()[0] == HEADER

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.bop.writer import BopWriter, make_labels
+from dopepp.data.formats.bop.bop_writer import BopWriter, make_labels
 from dopepp.data.sample import Instance, Sample
 from dopepp.geometry.camera import camera_matrix, project_keypoints
 from dopepp.parts.part import Mesh, Part, make_part

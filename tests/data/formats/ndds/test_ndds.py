@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.ndds.reader import NddsReader
-from dopepp.data.formats.ndds.writer import NddsWriter
+from dopepp.data.formats.ndds.ndds_reader import NddsReader
+from dopepp.data.formats.ndds.ndds_writer import NddsWriter
 from dopepp.geometry.camera import camera_matrix, project_keypoints
 from dopepp.parts.part import Mesh, Part, make_part
 

@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis.extra import numpy as hnp
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.bop.models import bop_parts
+from dopepp.data.formats.bop.bop_models import bop_parts
 from dopepp.data.formats.images import decode_runs, encode_runs
 from dopepp.data.formats.problems import STRICT, Place
 from dopepp.data.formats.webdataset import index_shard, members
-from dopepp.data.formats.webdataset.reader import WebdatasetReader
-from dopepp.data.formats.webdataset.writer import WebdatasetWriter
+from dopepp.data.formats.webdataset.webdataset_reader import WebdatasetReader
+from dopepp.data.formats.webdataset.webdataset_writer import WebdatasetWriter
 
 K = [100.0, 0.0, 31.5, 0.0, 101.0, 23.5, 0.0, 0.0, 1.0]
 
@@ -238,7 +238,7 @@ def test_shards_are_downloaded_once_and_within_bounds(
     source = WebdatasetReader(tmp_path, [block(2)], url, download_dir=folder)
     assert [source.sample(i).key for i in (0, 1)] == ["000000_000000", "000001_000000"]
     assert contents(folder) == contents(tmp_path / "served")
-    monkeypatch.setattr("dopepp.data.formats.webdataset.reader.MAX_SHARD_BYTES", 1000)
+    monkeypatch.setattr("dopepp.data.formats.webdataset.webdataset_reader.MAX_SHARD_BYTES", 1000)
     again = WebdatasetReader(tmp_path, [block(2)], url, download_dir=folder)
     assert again.describe() == [source.describe()[0]]
     with pytest.raises(UserError, match="of over 0 GB"):

@@ -10,7 +10,7 @@ import scipy.io
 import trimesh
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.ycb_video.reader import YcbVideoReader
+from dopepp.data.formats.ycb_video.ycb_reader import YcbVideoReader
 from dopepp.data.sample import hull_areas
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.parts.part import Part

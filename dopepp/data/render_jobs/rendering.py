@@ -25,8 +25,8 @@ from rich.text import Text
 from dopepp.core.errors import StoppedError, UserError, stopped
 from dopepp.core.pool import ClusterPool, LostWorkerError, Pool, ProcessPool, available_cores
 from dopepp.data.formats import RECORD_FILE, Writer
-from dopepp.data.jobs.job import Job, begin, is_begun
-from dopepp.data.sources.rendered import MAX_ITEMS, rendered_sample
+from dopepp.data.image_sources.rendered import MAX_ITEMS, rendered_sample
+from dopepp.data.render_jobs.job import Job, begin, is_begun
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.renderers.photoreal import THREADS_SETTING
 
@@ -157,7 +157,7 @@ def plan(writer: Writer, shard: Shard, num_items: int) -> Iterator[Chunk]:
 
 
 @dataclass(frozen=True)
-class Task:
+class RenderTask:
     """Images to render and write, or a chunk to finalize."""
 
     chunk: int
@@ -172,7 +172,7 @@ class RenderTasks:
         self._job, self._root = job, root
         self._opened: tuple[Factory, Writer] | None = None
 
-    def __call__(self, task: Task) -> tuple[float, float]:
+    def __call__(self, task: RenderTask) -> tuple[float, float]:
         """Perform a task; return the CPU seconds of rendering and of encoding and writing."""
         factory, writer = self._open()
         if task.finalizes:
@@ -256,20 +256,20 @@ class _Run:
         self._complete = deque(number for number, left in self._left.items() if not left)
         self.num_there = report.num_images - sum(self._left.values())
 
-    def tasks(self, images_per_task: int) -> Iterator[Task]:
+    def tasks(self, images_per_task: int) -> Iterator[RenderTask]:
         """Yield all renders and, between them, the finalizes of chunks that are complete."""
         for chunk in self._chunks.values():
             for first in range(0, len(chunk.missing), images_per_task):
                 yield from self.finalizes()
-                yield Task(chunk.number, chunk.missing[first : first + images_per_task])
+                yield RenderTask(chunk.number, chunk.missing[first : first + images_per_task])
 
-    def finalizes(self) -> Iterator[Task]:
+    def finalizes(self) -> Iterator[RenderTask]:
         """Yield the finalizes of chunks that are complete by now."""
         while self._complete:
             number = self._complete.popleft()
-            yield Task(number, self._chunks[number].required, finalizes=True)
+            yield RenderTask(number, self._chunks[number].required, finalizes=True)
 
-    def note(self, task: Task, render_s: float, write_s: float) -> None:
+    def note(self, task: RenderTask, render_s: float, write_s: float) -> None:
         """Count a task that is done."""
         if task.finalizes:
             return

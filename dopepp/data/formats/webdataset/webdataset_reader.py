@@ -23,7 +23,7 @@ from dopepp.core.errors import UserError
 from dopepp.core.files import partial_path
 from dopepp.core.json import MAX_BYTES
 from dopepp.data.formats import ESTIMATED, bop, make_instance, share
-from dopepp.data.formats.bop.models import parts_by_id
+from dopepp.data.formats.bop.bop_models import parts_by_id
 from dopepp.data.formats.images import decode_depth, decode_rgb, decode_runs
 from dopepp.data.formats.problems import STRICT, Place, Problems, mapping
 from dopepp.data.formats.webdataset import ShardIndex, index_shard

@@ -14,10 +14,10 @@ from typing import Final
 from dopepp.data.formats import STAGING
 from dopepp.data.formats import webdataset as shards
 from dopepp.data.formats.bop import BopPoses
-from dopepp.data.formats.bop.invariants import Models, Oddities, check_image, load_models
+from dopepp.data.formats.bop.bop_invariants import Models, Oddities, check_image, load_models
 from dopepp.data.formats.images import COLOUR_MODES, DEPTH_MODES, one_channel_of, picture_shape
 from dopepp.data.formats.problems import CheckReport, Place
-from dopepp.data.formats.webdataset.reader import ShardRecords
+from dopepp.data.formats.webdataset.webdataset_reader import ShardRecords
 from dopepp.drawing.pictures import Mask, Shape
 
 _MAX_IMAGE_BYTES: Final = 2 * shards.MAX_MEMBER_BYTES

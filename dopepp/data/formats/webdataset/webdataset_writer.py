@@ -18,7 +18,7 @@ from typing import Final
 
 from dopepp.core.files import partial_path, write_whole
 from dopepp.data.formats import STAGING, by_line, finalizing, read_object, stage, staged_items
-from dopepp.data.formats.bop.writer import BopFolder
+from dopepp.data.formats.bop.bop_writer import BopFolder
 from dopepp.data.formats.images import encode_png, encode_runs
 from dopepp.data.formats.webdataset import KEY_FILE, TarMember, members, read_span
 from dopepp.data.sample import Sample

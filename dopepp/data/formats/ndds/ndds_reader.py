@@ -3,7 +3,7 @@
 How the files write their poses is found by reprojection
 (:mod:`~dopepp.data.formats.ndds.conventions`), said in the log and in
 :meth:`NddsReader.describe`, and checked again on every instance that is read. What
-:class:`~dopepp.data.formats.ndds.writer.NddsWriter` writes reads back exactly.
+:class:`~dopepp.data.formats.ndds.ndds_writer.NddsWriter` writes reads back exactly.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Final
 from dopepp.core.errors import UserError
 from dopepp.data.formats import ndds, share
 from dopepp.data.formats.ndds.conventions import (
-    Finding,
+    NddsFinding,
     Observation,
     check_observation,
     find_convention,
@@ -78,14 +78,14 @@ class NddsReader:
         if unknown:
             allowed = f"parts of {sorted(self._parts)}"
             raise UserError(f"classes of the parts {unknown}", allowed, "correct it")
-        self._settings = ndds.Settings(self.folder)
+        self._settings = ndds.NddsSettings(self.folder)
         items = _find(self.folder)
         self.items = items[share(len(items), part_of, self.name)]
         # On all items, so that training and validation shares of one folder are read alike.
         self.finding = self._find_convention(items)
         _log.info("%s: %s items; found: %s", self.name, f"{len(self.items):,}", self.finding)
 
-    def _find_convention(self, items: Sequence[Path]) -> Finding:
+    def _find_convention(self, items: Sequence[Path]) -> NddsFinding:
         seen: list[Observation] = []
         hidden: list[Observation] = []
         others: Counter[str] = Counter()

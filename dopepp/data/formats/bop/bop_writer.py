@@ -25,7 +25,7 @@ from dopepp.core.files import write_whole
 from dopepp.core.json import read_json
 from dopepp.data.formats import STAGING, by_line, finalizing, read_object, stage, staged_items
 from dopepp.data.formats.bop import MAX_SCENE_BYTES, MM
-from dopepp.data.formats.bop.models import INFO_FILE, MODEL_FOLDERS, model_numbers, write_models
+from dopepp.data.formats.bop.bop_models import INFO_FILE, MODEL_FOLDERS, model_numbers, write_models
 from dopepp.data.formats.images import depth_units, encode_png
 from dopepp.data.formats.invariants import Box
 from dopepp.data.sample import Instance, Sample

@@ -37,9 +37,9 @@ from dopepp.virtual.presets.view import View, read_lens
 _log = logging.getLogger(__name__)
 
 WRITERS: Final = {
-    "bop": ("dopepp.data.formats.bop.writer", "BopWriter"),
-    "ndds": ("dopepp.data.formats.ndds.writer", "NddsWriter"),
-    "webdataset": ("dopepp.data.formats.webdataset.writer", "WebdatasetWriter"),
+    "bop": ("dopepp.data.formats.bop.bop_writer", "BopWriter"),
+    "ndds": ("dopepp.data.formats.ndds.ndds_writer", "NddsWriter"),
+    "webdataset": ("dopepp.data.formats.webdataset.webdataset_writer", "WebdatasetWriter"),
 }
 """Module and class of each layout's writer."""
 

@@ -30,7 +30,7 @@ from dopepp.data.formats.bop import (
     image_files,
     read_records,
 )
-from dopepp.data.formats.bop.models import INFO_FILE, info_path, modelled, parse_models, part_of
+from dopepp.data.formats.bop.bop_models import INFO_FILE, info_path, modelled, parse_models, part_of
 from dopepp.data.formats.images import COLOUR_MODES, DEPTH_MODES, one_channel_of, picture_shape
 from dopepp.data.formats.invariants import Box
 from dopepp.data.formats.problems import CheckReport, Place, mapping

@@ -22,8 +22,8 @@ from dopepp.core.errors import UserError
 from dopepp.core.json import read_json
 from dopepp.core.validation import Range, parse
 from dopepp.data.formats import ESTIMATED, bop, make_instance, share
-from dopepp.data.formats.bop import Scene, read_scene
-from dopepp.data.formats.bop.models import modelled, parts_by_id, read_models
+from dopepp.data.formats.bop import BopScene, read_scene
+from dopepp.data.formats.bop.bop_models import modelled, parts_by_id, read_models
 from dopepp.data.formats.images import decode_depth, decode_mask, decode_rgb
 from dopepp.data.sample import Instance, Sample, SourceInfo
 from dopepp.drawing.pictures import DepthMap, Shape, Size, read_content
@@ -164,7 +164,7 @@ class BopReader:
             got = "listed instances have no annotation or no model and are not counted"
             _log.warning("%s: %s %s", self.name, f"{lacking:,}", got)
 
-    def _target_counts(self, scene: Scene, row: int) -> Counter[int] | None:
+    def _target_counts(self, scene: BopScene, row: int) -> Counter[int] | None:
         """Return how many instances of each object the list has on an image; None for all."""
         assert self._targets is not None
         return self._targets[int(scene.folder.name), int(scene.image_ids[row])]
@@ -193,14 +193,16 @@ class BopReader:
         key = f"{scene.folder.name}/{scene.image_ids[row]:06d}"
         return Sample(image, K, instances, depth, self.name, key)
 
-    def _instance(self, scene: Scene, k: int, stem: str, K: CameraMatrix, shape: Shape) -> Instance:
+    def _instance(
+        self, scene: BopScene, k: int, stem: str, K: CameraMatrix, shape: Shape
+    ) -> Instance:
         path = scene.folder / "mask_visib" / f"{stem}_{scene.gt_ids[k]:06d}.png"
         mask = decode_mask(read_content(path), str(path), shape) if path.exists() else None
         poses, part = scene.poses, self._parts[int(scene.poses.obj_ids[k])]
         fraction = float(poses.visible_fractions[k])
         return make_instance(part, poses.T_cam_obj[k].copy(), K, fraction, mask, shape)
 
-    def _depth(self, scene: Scene, row: int, shape: Shape) -> DepthMap | None:
+    def _depth(self, scene: BopScene, row: int, shape: Shape) -> DepthMap | None:
         """Read the depth image; None in a scene without any."""
         if not any(scene.depth_files):
             return None

@@ -17,7 +17,7 @@ import numpy as np
 from dopepp.data.formats import ndds
 from dopepp.data.formats.images import picture_shape, read_map
 from dopepp.data.formats.invariants import camera_problem
-from dopepp.data.formats.ndds import IMAGE_SUFFIXES, Objects, Settings
+from dopepp.data.formats.ndds import IMAGE_SUFFIXES, NddsSettings, Objects
 from dopepp.data.formats.ndds.object_invariants import Majority, ObjectCheck
 from dopepp.data.formats.problems import CheckReport, Place, mapping
 from dopepp.drawing.pictures import Shape
@@ -35,7 +35,7 @@ def check_ndds(report: CheckReport) -> None:
     for path in lonely:
         report.report(path, "image", f"missing: neither {' nor '.join(IMAGE_SUFFIXES)} beside it")
     folders = {path.parent for path in items}
-    settings = Settings(report.root, report)
+    settings = NddsSettings(report.root, report)
     for folder in sorted(folders | {report.root}):
         _check_settings(report, settings, folder)
     # What is there for one image of a folder must be there for all.
@@ -49,7 +49,7 @@ def check_ndds(report: CheckReport) -> None:
     majority.conclude()
 
 
-def _check_settings(report: CheckReport, settings: Settings, folder: Path) -> None:
+def _check_settings(report: CheckReport, settings: NddsSettings, folder: Path) -> None:
     content = settings.read(folder / ndds.OBJECT_SETTINGS) or {}
     listed = content.get("exported_object_classes")
     place = Place(report, folder / ndds.OBJECT_SETTINGS, "exported_objects")
@@ -87,7 +87,7 @@ def _check_unannotated(report: CheckReport, annotations: list[Path]) -> None:
 
 
 def _check_item(
-    report: CheckReport, path: Path, settings: Settings, majority: Majority, maps: list[str]
+    report: CheckReport, path: Path, settings: NddsSettings, majority: Majority, maps: list[str]
 ) -> None:
     """Check an annotation and its images; ``maps`` are the suffixes of the required ones."""
     image = ndds.image_of(path)
@@ -121,7 +121,7 @@ def _check_item(
 
 
 def _check_camera(
-    report: CheckReport, path: Path, settings: Settings, record: Mapping[str, Any],
+    report: CheckReport, path: Path, settings: NddsSettings, record: Mapping[str, Any],
     shape: Shape | None,
 ) -> CameraMatrix | None:  # fmt: skip
     place, data = Place(report, path, "camera_data"), mapping(record.get("camera_data"))

@@ -1,6 +1,6 @@
 """YCB-Video in its own layout: ``data/SSSS/NNNNNN-*`` (real) and ``data_syn/NNNNNN-*`` (synthetic).
 
-One reader reads one of the two subsets; :mod:`dopepp.data.sources.hybrid` mixes them.
+One reader reads one of the two subsets; :mod:`dopepp.data.image_sources.hybrid` mixes them.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
 @dataclass(frozen=True)
-class PoseResult:
+class BopResult:
     """One estimated pose.
 
     Attributes:
@@ -70,7 +70,7 @@ def results_name(method: str, dataset: str, split: str) -> str:
     return f"{method}_{dataset}-{split}.csv"
 
 
-def write_results(path: Path, results: Sequence[PoseResult]) -> None:
+def write_results(path: Path, results: Sequence[BopResult]) -> None:
     """Write a results file, whole, every number with all of its digits."""
     lines = [",".join(FIELDS)]
     for result in results:
@@ -81,7 +81,7 @@ def write_results(path: Path, results: Sequence[PoseResult]) -> None:
     write_whole(path, ("\n".join(lines) + "\n").encode())
 
 
-def read_results(path: Path, objects: Collection[int]) -> list[PoseResult]:
+def read_results(path: Path, objects: Collection[int]) -> list[BopResult]:
     """Read a results file; the header may be missing, and blank lines do not matter.
 
     ``objects`` are the numbers of the data set's objects.
@@ -103,7 +103,7 @@ def read_results(path: Path, objects: Collection[int]) -> list[PoseResult]:
     poses = np.tile(np.eye(4), (len(table), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = table[:, 5:14].reshape(-1, 3, 3), table[:, 14:17] / MM
     return [
-        PoseResult(int(row[1]), int(row[2]), int(row[3]), float(row[4]), T, float(row[17]))
+        BopResult(int(row[1]), int(row[2]), int(row[3]), float(row[4]), T, float(row[17]))
         for row, T in zip(table, poses, strict=True)
     ]
 
