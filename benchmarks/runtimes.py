@@ -40,7 +40,7 @@ def main() -> None:
     limit(asked.isa)
     import torch
 
-    from dopepp.inference.runtimes.runtime import num_threads
+    from dopepp.inference.runtimes import num_threads
 
     torch.set_num_threads(num_threads())
     print(f"{num_threads()} threads, ATen {torch.backends.cpu.get_cpu_capability()}")
@@ -95,7 +95,7 @@ def candidates(network, checkpoint, size: int, folder: Path) -> Iterator[tuple[s
 
     from dopepp.inference import runtimes
     from dopepp.inference.export import EXPORTERS
-    from dopepp.inference.runtimes.runtime import Export
+    from dopepp.inference.runtimes import Export
 
     yield "pytorch fp32", torch_run(network, size)
     rng = np.random.default_rng(0)
@@ -162,9 +162,9 @@ def show_kernels() -> None:
     layer, image = torch.nn.Conv2d(64, 64, 3), torch.zeros(1, 64, 40, 40)
     with torch.inference_mode(), torch.backends.mkldnn.verbose(torch.backends.mkldnn.VERBOSE_ON):
         layer(image)
-    from dopepp.inference.runtimes.openvino import compiled, load_openvino
+    from dopepp.inference.runtimes.openvino import compile_model, load_openvino
 
-    model = compiled(load_openvino("--isa").convert_model(layer.eval(), example_input=image))
+    model = compile_model(load_openvino("--isa").convert_model(layer.eval(), example_input=image))
     kinds = {
         str(one.get_rt_info()["primitiveType"].astype(str))
         for one in model.get_runtime_model().get_ops()

@@ -55,7 +55,7 @@ def export(name: str, layout: str, precision: str, folder: Path) -> Path:
     from dopepp.experiment.assembly.build_parts import build_parts
     from dopepp.experiment.assembly.build_system import build_untrained
     from dopepp.inference.export import EXPORTERS
-    from dopepp.inference.runtimes.runtime import Export
+    from dopepp.inference.runtimes import Export
     from dopepp.models.checkpoint import load_network
 
     exporter, ending = EXPORTERS[layout]
@@ -182,7 +182,7 @@ def measure(isa: str, folder: Path, seconds: float, only: str) -> None:
     limit(None if isa == "native" else isa)
     import torch
 
-    from dopepp.inference.runtimes.runtime import num_threads
+    from dopepp.inference.runtimes import num_threads
 
     torch.set_num_threads(num_threads())
     print(f"\n{isa}: {num_threads()} threads, ATen {torch.backends.cpu.get_cpu_capability()}, "

@@ -280,7 +280,7 @@ def _chosen_views(source: str, board: Board) -> tuple[list[Sighting], tuple[int,
     from contextlib import suppress
 
     from dopepp.core.errors import Interruption, interruptible
-    from dopepp.inference.sources import open_sources
+    from dopepp.inference.frames import open_sources
     from dopepp.robot.calibration.lens import LOOKS_PER_S, Views
 
     views, size, looked = Views(0), None, 0

@@ -28,8 +28,8 @@ from dopepp.core.errors import UserError
 if TYPE_CHECKING:
     from dopepp.drawing.pictures import Picture
     from dopepp.geometry.camera import CameraMatrix
+    from dopepp.inference.benchmark import Timing
     from dopepp.inference.estimator import PoseEstimator
-    from dopepp.inference.timing import Timing
 
 NUM_SCENES: Final = 10
 SIZE: Final = (640, 480)
@@ -46,9 +46,9 @@ def benchmark(
 ) -> None:
     """Print what a frame takes, from picture to poses, with the parts of it, in milliseconds."""
     with report_errors():
+        from dopepp.inference.benchmark import time_frames
         from dopepp.inference.estimator import PoseEstimator
-        from dopepp.inference.runtimes.runtime import num_threads
-        from dopepp.inference.timing import time_frames
+        from dopepp.inference.runtimes import num_threads
         from dopepp.parts.catalogue import with_meshes
 
         if (image is None) != (intrinsics is None):
@@ -127,13 +127,13 @@ def doctor(
     """
     from dopepp.drawing.pictures import read_photo
     from dopepp.geometry.camera import camera_matrix
-    from dopepp.inference.sources.files import Pictures
-    from dopepp.inference.sources.source import Lens, one_camera
+    from dopepp.inference.frames.media import Images
+    from dopepp.inference.frames.source import Lens, choose_camera
 
     with report_errors():
         check_region(refine)
         K = None if intrinsics is None else camera_matrix(*intrinsics)
-        lens = Lens(one_camera(K, camera, Pictures([image])), K_size, crop)
+        lens = Lens(choose_camera(K, camera, Images([image])), K_size, crop)
         picture = read_photo(image)
         from dopepp.inference.diagnosis import Case, Finding, diagnose
         from dopepp.inference.estimator import PoseEstimator
@@ -143,7 +143,7 @@ def doctor(
         known = with_meshes(estimator.parts, parts, unit) if parts else estimator.parts
         estimator = estimator if refine is None else estimator.refining(refine, known)
         try:
-            case = Case(estimator, *lens.seen(picture), known, distance, crop is not None)
+            case = Case(estimator, *lens.undistort(picture), known, distance, crop is not None)
         except UserError as error:
             got = f"{error.got}; allowed: {error.allowed}"
             findings = [Finding("camera", got, error.fix)]

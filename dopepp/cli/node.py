@@ -70,16 +70,16 @@ def node(
         check_region(refine)
 
         from dopepp.geometry.camera import camera_matrix
-        from dopepp.inference.sources.source import given_camera, one_camera
+        from dopepp.inference.frames.source import choose_camera, given_camera
 
         known = given_camera(None if intrinsics is None else camera_matrix(*intrinsics), camera)
 
         from dopepp.inference.estimator import PoseEstimator
-        from dopepp.inference.sources import open_sources
+        from dopepp.inference.frames import open_sources
         from dopepp.robot.nodes.worker import Settings, Worker
 
         sources = open_sources(words, topic) if way in LINES else []
-        cameras = [known or one_camera(None, None, one) for one in sources]
+        cameras = [known or choose_camera(None, None, one) for one in sources]
         refining = "region" if track or refine else None
         estimator = PoseEstimator.load(model, device, refining, max_ms=max_ms)
         settings = Settings(conf, refining is not None, overlay)

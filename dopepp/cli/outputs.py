@@ -20,8 +20,8 @@ from dopepp.core.files import PICTURES, check_target, partial_path
 if TYPE_CHECKING:
     from dopepp.data.formats.bop.bop_results import BopResult
     from dopepp.drawing.video import VideoFile
-    from dopepp.inference.results import PoseResult
-    from dopepp.inference.sources import Source
+    from dopepp.inference.frames import FrameSource
+    from dopepp.inference.pose_result import PoseResult
 
 VIDEO: Final = ".mp4"
 
@@ -29,7 +29,7 @@ VIDEO: Final = ".mp4"
 class Output(Protocol):
     """Takes results one by one, of one source after the other."""
 
-    def begin(self, source: Source) -> None:
+    def begin(self, source: FrameSource) -> None:
         """Expect the results of a source."""
 
     def take(self, result: PoseResult) -> None:
@@ -45,7 +45,7 @@ class Outputs:
     def __init__(self, outputs: Sequence[tuple[Path, Output]]) -> None:
         self._outputs = outputs
 
-    def begin(self, source: Source) -> None:
+    def begin(self, source: FrameSource) -> None:
         """Expect the results of a source."""
         self._each(lambda one: one.begin(source))
 
@@ -77,10 +77,10 @@ class Overlays:
         check_target(folder / "picture.png")
         self._folder, self._stride = folder, stride
         self._taken: set[str] = set()
-        self._source: Source | None = None
+        self._source: FrameSource | None = None
         self._video: VideoFile | None = None
 
-    def begin(self, source: Source) -> None:
+    def begin(self, source: FrameSource) -> None:
         """Complete the last source's video."""
         self.close()
         self._source = source
@@ -129,7 +129,7 @@ class JsonLines:
         self._path, self._partial = path, partial_path(path)
         self._file: FileIO | None = None
 
-    def begin(self, source: Source) -> None:
+    def begin(self, source: FrameSource) -> None:
         """Open the file with the first source."""
         self._file = self._file or self._partial.open("wb", buffering=0)
 
@@ -162,7 +162,7 @@ class BopCsv:
         self._rows: list[BopResult] = []
         self._scene = -1
 
-    def begin(self, source: Source) -> None:
+    def begin(self, source: FrameSource) -> None:
         """Count the next scene."""
         self._scene += 1
 

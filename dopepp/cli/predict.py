@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from dopepp.geometry.camera import CameraMatrix
     from dopepp.geometry.camera_file import Camera
     from dopepp.inference.estimator import PoseEstimator
-    from dopepp.inference.results import PoseResult
-    from dopepp.inference.sources import Source
+    from dopepp.inference.frames import FrameSource
+    from dopepp.inference.pose_result import PoseResult
     from dopepp.inference.stream import StreamOptions
     from dopepp.parts.part import Part
     from dopepp.recovery.detection import Detection
@@ -99,8 +99,8 @@ def predict(
     with resumable("what was written is complete"):
         from dopepp.cli.outputs import Outputs
         from dopepp.geometry.camera import camera_matrix
-        from dopepp.inference.sources import open_sources
-        from dopepp.inference.sources.source import one_camera
+        from dopepp.inference.frames import open_sources
+        from dopepp.inference.frames.source import choose_camera
 
         terms = () if refine is None else tuple(refine.split(","))
         _check_options(terms, depth, track, verify, distance or roi)
@@ -108,7 +108,7 @@ def predict(
         outputs = _outputs(save, json_file, csv, stride)
         sources = open_sources(source, topic)
         K = None if intrinsics is None else camera_matrix(*intrinsics)
-        cameras = [one_camera(K, camera, one) for one in sources]
+        cameras = [choose_camera(K, camera, one) for one in sources]
         estimator, known = _estimator(model, device, terms, verify, parts, unit, max_ms)
         gc.enable()
         outputs += _viewers(estimator, rerun, show)
@@ -205,7 +205,7 @@ class _Session:
     ) -> None:
         self._estimator, self._options, self._verified = estimator, options, verified
 
-    def run(self, source: Source, camera: Camera, outputs: Outputs) -> None:
+    def run(self, source: FrameSource, camera: Camera, outputs: Outputs) -> None:
         """Print and write the poses on every picture of a source."""
         total = source.count and math.ceil(source.count / self._options["stride"])
         outputs.begin(source)
@@ -221,12 +221,12 @@ class _Session:
 
     def _searched(self, result: PoseResult, camera: Camera) -> tuple[PoseResult, str]:
         """Look at any distance where nothing was found, or say why nothing is."""
-        from dopepp.inference.sources.source import Lens
+        from dopepp.inference.frames.source import Lens
         from dopepp.recovery.recover import explained
 
         own, image, K = self._options, result.image, result.K
         depth = own["depth"]
-        metres = None if depth is None else Lens(camera).depth(depth, own["depth_scale"], K)
+        metres = None if depth is None else Lens(camera).read_depth(depth, own["depth_scale"], K)
         where = (own["roi"], own["crop"] is not None)
         if own["distances"] is None:
             found = self._estimator.predict(image, K, None, metres, "any", *where)
@@ -254,8 +254,8 @@ class _Session:
 
 def _in_words(result: PoseResult, why: str) -> str:
     """Say how many poses there are, or why there is none, and where the time went."""
-    from dopepp.inference.results import speed_in_words
+    from dopepp.inference.pose_result import format_speed
 
     count = len(result.detections)
     found = f"{count} pose{'s' * (count > 1)}" if count else "nothing found"
-    return f"{found}{': ' * bool(why)}{why}; speed: {speed_in_words(result.speed)}"
+    return f"{found}{': ' * bool(why)}{why}; speed: {format_speed(result.speed)}"

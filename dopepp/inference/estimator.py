@@ -1,4 +1,4 @@
-"""PoseEstimator: one file in, poses out; needs neither Hydra nor any config."""
+"""PoseEstimator: an image and a camera matrix in, poses out; needs neither Hydra nor a config."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Unpack
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -19,24 +18,19 @@ from dopepp.core.compiled import compile_beside
 from dopepp.core.errors import UserError
 from dopepp.core.extensions import enable
 from dopepp.drawing.pictures import Picture
-from dopepp.geometry.camera import CameraMatrix, Letterbox, project_keypoints
+from dopepp.geometry.camera import CameraMatrix
 from dopepp.inference import runtimes
 from dopepp.inference.picture import (
     Coefficients,
     Depth,
     Distances,
+    NetworkView,
     Region,
-    checked_depth,
-    checked_distortion,
-    checked_picture,
-    cut,
-    letterboxed,
-    letterboxes,
-    merged,
-    undistorted_depth,
+    merge_scales,
+    network_views,
+    prepare_image,
 )
-from dopepp.inference.results import STEPS
-from dopepp.inference.runtimes.runtime import Runtime
+from dopepp.inference.pose_result import STEPS
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
@@ -45,9 +39,9 @@ from dopepp.recovery.scoring import RecoveryOptions, rescored
 
 if TYPE_CHECKING:
     from dopepp.geometry.camera_file import Camera
+    from dopepp.inference.frames import SourceLike
+    from dopepp.inference.pose_result import PoseResult
     from dopepp.inference.refinement.refiner import Refine
-    from dopepp.inference.results import PoseResult
-    from dopepp.inference.sources import SourceLike
     from dopepp.inference.stream import StreamOptions
 
 Maps = tuple[
@@ -56,18 +50,17 @@ Maps = tuple[
 
 
 class PoseEstimator:
-    """Finds the 6D poses of the trained parts on RGB images of any size.
+    """Estimates the 6D poses of the trained parts on RGB images of any size.
 
     Args:
-        network: The trained network, of PyTorch's or out of an exported file.
-        checkpoint: What the network was trained for.
-        device: Where to run it, e.g. ``cpu`` or ``cuda``.
-        refine: What refines poses (:mod:`dopepp.inference.refinement.refiner`): ``region``, the
-            picture; ``depth``, the depth that :meth:`predict` is given; or both, ``("region",
-            "depth")``. None does not.
-        parts: The checkpoint's parts with other meshes, or with some where it has none.
-        max_ms: Milliseconds of refining a picture after which its further detections, the best
-            score first, keep the network's poses; None sets no limit.
+        network: Trained PyTorch network, or exported network.
+        checkpoint: Description of what the network was trained for.
+        device: Device that runs the network, e.g. ``cpu`` or ``cuda``.
+        refine: Evidence that refines poses: ``region`` (the image), ``depth`` (the depth image
+            passed to :meth:`predict`), or both, ``("region", "depth")``. None: no refinement.
+        parts: The checkpoint's parts with other meshes, or with meshes that it lacks.
+        max_ms: Time limit for the refinement of an image, milliseconds. Detections beyond the limit
+            keep the network's pose; the best scores are refined first.
 
     Raises:
         UserError: The refinement is unknown, or a part has no mesh.
@@ -75,7 +68,7 @@ class PoseEstimator:
 
     def __init__(
         self,
-        network: Runtime,
+        network: runtimes.Runtime,
         checkpoint: Checkpoint,
         device: str | torch.device = "cpu",
         refine: Refine | None = None,
@@ -84,7 +77,7 @@ class PoseEstimator:
     ) -> None:
         self.checkpoint = checkpoint
         self.refine, self.refiner = refine, None
-        if refine is not None:  # its solvers take as long to import as all else but torch
+        if refine is not None:  # its solvers take as long to import as everything else but torch
             from dopepp.inference.refinement.refiner import Refiner
 
             self.refiner = Refiner(refine, parts or checkpoint.parts)
@@ -93,9 +86,9 @@ class PoseEstimator:
             compile_beside(f"dopepp.inference.refinement.refiner:{function}")
         self.device = checked_device(device)
         self.solid_parts = tuple(parts or checkpoint.parts)
-        """Its parts, with the meshes that it was given."""
+        """Parts with the meshes that were passed."""
         self.spent_ms = dict.fromkeys(STEPS, 0.0)
-        """Milliseconds since it was made, by step of :data:`~dopepp.inference.results.STEPS`."""
+        """Total milliseconds by step of :data:`~dopepp.inference.pose_result.STEPS`."""
         self.network = runtimes.placed(network, self.device)
         self.cuboids = np.stack([part.cuboid for part in checkpoint.parts])
         self._names = [part.name for part in checkpoint.parts]
@@ -112,13 +105,14 @@ class PoseEstimator:
         max_ms: float | None = None,
         extensions: Sequence[str] = (),
     ) -> PoseEstimator:
-        """Load a checkpoint, or what ``dopepp export`` made of one; see the class for the options.
+        """Load a checkpoint, or a network that ``dopepp export`` wrote; see the class for options.
 
-        ``extensions`` are packages of your own whose classes a checkpoint may name
-        (:mod:`dopepp.core.extensions`); they stay enabled in this process.
+        ``extensions`` lists your packages whose classes a checkpoint may name
+        (:mod:`dopepp.core.extensions`). They stay enabled in this process.
 
-        A :class:`UserError`: the file is missing, is neither of these or not safe to load, its
-        extra is missing, or the refinement is not possible.
+        Raises:
+            UserError: The file is missing, of another kind or not safe to load, its extra is
+                missing, or the refinement is not possible.
         """
         enable(extensions)
         chosen = checked_device(device)
@@ -130,22 +124,21 @@ class PoseEstimator:
 
     @property
     def parts(self) -> Sequence[Part]:
-        """The objects this estimator knows, in the network's order."""
+        """Parts that the network detects, in the order of its outputs."""
         return self.checkpoint.parts
 
     def __repr__(self) -> str:
-        """Say what it finds at which distances, with which network and thresholds."""
-        known, limits = self.checkpoint, self.recovery
-        runtime = type(self.network).__name__
-        width, height = known.input_size
-        name = known.data.get("name", "network")
-        lines = [f"PoseEstimator({name} as {runtime}, {width}×{height} pixels, "
-                 f"{self.device}, refine={self.refine})"]  # fmt: skip
+        """Describe network, parts with their distances in training, and thresholds."""
+        runtime, name = type(self.network).__name__, self.checkpoint.data.get("name", "network")
+        size = "{}×{} pixels".format(*self.checkpoint.input_size)
+        description = f"{name} as {runtime}, {size}, {self.device}, refine={self.refine}"
+        lines = [f"PoseEstimator({description})"]
         for part in self.parts:
-            size = " × ".join(f"{1000 * one:.0f}" for one in np.ptp(part.cuboid, axis=0))
-            seen = known.seen.get(part.name)
+            size = " × ".join(f"{1000 * side:.0f}" for side in np.ptp(part.cuboid, axis=0))
+            seen = self.checkpoint.seen.get(part.name)
             where = f", learned at {seen.nearest:.2g} – {seen.farthest:.2g} m" if seen else ""
             lines.append(f"{part.name}: {size} mm{where}")
+        limits = self.recovery
         lines.append(
             f"thresholds: peak {limits.peak_threshold:.3g}, "
             f"centroid {limits.centroid_threshold:.3g}, score {limits.min_score:.3g}, "
@@ -163,7 +156,7 @@ class PoseEstimator:
         roi: Region | None = None,
         cropped: bool = False,
     ) -> list[Detection]:
-        """Find all known objects on one image.
+        """Detect all trained parts on an image.
 
         The image is resized until parts have the size that they had in training
         (:mod:`dopepp.inference.picture`).
@@ -171,35 +164,41 @@ class PoseEstimator:
         Args:
             image: RGB, uint8, any size.
             K: Camera matrix in pixels of this image.
-            distortion: OpenCV distortion coefficients; the image is undistorted first, with the
-                same K, and pixels of the result refer to the undistorted image.
-            depth: Metres along z, aligned to the image (and distorted as it is), 0 or NaN where
-                unknown; used where the estimator refines with depth.
-            distances: Nearest and farthest depth at which parts are looked for, metres; None is
-                where training had them, ``any`` wherever the network can see them. The farther
-                apart, the more often it looks.
-            roi: Look in this part of the image only: (x, y, width, height), pixels.
-            cropped: The image may be cut out of the camera's, so that the principal point may lie
-                anywhere; elsewhere a K that is off the middle is taken for another size's.
+            distortion: OpenCV distortion coefficients. The image is undistorted first, with the
+                same K; pixels of the result refer to the undistorted image.
+            depth: Metres along z, aligned to the image (and equally distorted), 0 or NaN where
+                unknown; used if the estimator refines with depth.
+            distances: Nearest and farthest depth of the parts, metres. None: distances of training;
+                ``any``: all distances at which the network can see a part. A larger range takes
+                more runs of the network.
+            roi: Region to process: (x, y, width, height), pixels.
+            cropped: Whether the image may be cropped from the camera's, so that the principal point
+                may lie anywhere. Otherwise an off-centre K is rejected as that of another size.
 
         Returns:
-            Detections, best score first, in pixels of the given size and metres. A refined one has
-            the refined pose, its keypoints and covariance, and the score that tuning has fitted to
-            refined poses; all else stays the network's. Where refinement kept the network's pose,
-            ``kept`` says why.
+            Detections, best score first, in metres and pixels of the given size. A refined
+            detection has the refined pose with its keypoints and covariance, and the score that
+            tuning has fitted to refined poses. ``kept`` is the reason if refinement kept the
+            network's pose.
 
         Raises:
-            UserError: The image is no RGB picture, K cannot belong to it, there is no lens model
-                with so many coefficients, or the depth is not aligned or not in metres.
+            UserError: The image is no RGB image, K does not belong to it, the distortion has no
+                OpenCV lens model, or the depth is not aligned or not in metres.
         """
-        image, K = checked_picture(image, K, cropped)
-        if depth is not None:
-            depth = checked_depth(depth, (image.shape[1], image.shape[0]))
-        if distortion is not None:
-            coefficients = checked_distortion(distortion)
-            image = cv2.undistort(image, K, coefficients)
-            depth = None if depth is None else undistorted_depth(depth, K, coefficients)
-        detections = self._detect(image, K, distances, roi)
+        image, K, depth = prepare_image(image, K, distortion, depth, cropped)
+        with self._timed("pre"):
+            views = self.views(image, K, distances, roi)
+        scales: list[list[Detection]] = []
+        for view in views:
+            with self._timed("network"):
+                belief, field = self.maps(view.pixels)
+            with self._timed("decode"):
+                stride, options = self.network.stride, self._recovery_options()
+                detections = recover(
+                    belief, field, self.cuboids, view.K, stride, self._names, **options
+                )
+            scales.append([view.to_image(it, self._cuboid_of[it.object], K) for it in detections])
+        detections = merge_scales(scales)
         if self.refiner is None:
             return detections
         return rescored(self.refined(detections, image, K, depth), self.recovery)
@@ -211,7 +210,7 @@ class PoseEstimator:
         K: CameraMatrix,
         depth: Depth | None = None,
     ) -> list[Detection]:
-        """Refine detections, whoever made them, where the estimator refines at all.
+        """Refine detections of any origin; return them unchanged if the estimator does not refine.
 
         Image, K and depth are as in :meth:`predict`, checked and without distortion.
         """
@@ -220,22 +219,11 @@ class PoseEstimator:
         refined: list[Detection] = []
         start = time.perf_counter()
         with self._timed("refine"):
-            for one in detections:
+            for detection in detections:
                 if self.max_ms is not None and 1000 * (time.perf_counter() - start) > self.max_ms:
-                    refined.append(replace(one, kept=f"max_ms={self.max_ms:g} was spent"))
-                    continue
-                result = self.refiner(one, image, K, depth)
-                if result.covariance is None:
-                    refined.append(replace(one, kept=result.reason, agreement=None, support=None))
-                    continue
-                T = result.T_cam_obj
-                keypoints = project_keypoints(self._cuboid_of[one.object], T, K)
-                refined.append(
-                    replace(
-                        one, T_cam_obj=T, keypoints=keypoints, covariance=result.covariance,
-                        kept="", agreement=result.agreement, support=result.support,
-                    )
-                )  # fmt: skip
+                    refined.append(replace(detection, kept=f"max_ms={self.max_ms:g} was spent"))
+                else:
+                    refined.append(self.refiner(detection, image, K, depth))
         return refined
 
     def stream(
@@ -245,12 +233,15 @@ class PoseEstimator:
         camera: Camera | Path | str | None = None,
         **options: Unpack[StreamOptions],
     ) -> Iterator[PoseResult]:
-        """Find the parts on every picture of a source; see :func:`dopepp.inference.stream.stream`.
+        """Detect the parts on every frame of a source; see :func:`dopepp.inference.stream.stream`.
 
-        The source is a path (a picture, a folder, a video, a ROS bag), a glob pattern, a camera's
-        number or a stream's URL. K, the camera or its file may be left out where a bag has it.
+        Args:
+            source: Path (image, folder, video, ROS recording), glob pattern, camera number or URL.
+            K: Camera matrix; may be omitted for a recording that has one, or if camera is given.
+            camera: Camera or camera file, instead of K.
+            **options: See :class:`~dopepp.inference.stream.StreamOptions`.
         """
-        from dopepp.inference.stream import stream  # which needs sources, drawing and a tracker
+        from dopepp.inference.stream import stream  # imports sources, drawing and the tracker
 
         return stream(self, source, K, camera, **options)
 
@@ -263,94 +254,72 @@ class PoseEstimator:
         roi: Region | None = None,
         cropped: bool = False,
     ) -> list[Reason]:
-        """Say what :meth:`predict` leaves out of an image and why, for each object or centroid.
+        """Explain why :meth:`predict` rejects each object or centroid candidate of an image.
 
-        The image is without distortion. What :meth:`predict` refuses is a :class:`UserError`.
+        The arguments are those of :meth:`predict`; the image is without distortion.
+
+        Raises:
+            UserError: As for :meth:`predict`.
         """
-        image, K = checked_picture(image, K, cropped)
-        window, K_window, _ = cut(image, K, roi)
+        image, K, depth = prepare_image(image, K, None, depth, cropped)
+        stride, options = self.network.stride, self._recovery_options()
         reasons: list[Reason] = []
-        for box in letterboxes(self.checkpoint, K_window, window, distances):
-            belief, field = self._look(window, box)
-            reasons += explain(
-                belief, field, self.cuboids, box.camera(K_window), self.network.stride,
-                self._names, **self._recovery_options(),
-            )  # fmt: skip
-        least = self.recovery.refined_min_score
-        if self.refiner is None or least == 0:
+        for view in self.views(image, K, distances, roi):
+            belief, field = self.maps(view.pixels)
+            reasons += explain(belief, field, self.cuboids, view.K, stride, self._names, **options)
+        threshold = self.recovery.refined_min_score
+        if self.refiner is None or threshold == 0:
             return reasons
         lenient = copy.copy(self)
         lenient.recovery = replace(self.recovery, refined_min_score=0.0)
-        judged = lenient.predict(image, K, None, depth, distances, roi, cropped)
-        return reasons + [rejected_refined(one, least) for one in judged if one.score < least]
+        detections = lenient.predict(image, K, None, depth, distances, roi, cropped)
+        rejected = [detection for detection in detections if detection.score < threshold]
+        return reasons + [rejected_refined(detection, threshold) for detection in rejected]
 
-    def _detect(
+    def views(
         self,
         image: Picture,
         K: CameraMatrix,
-        distances: Distances | None,
-        roi: Region | None,
-    ) -> list[Detection]:
-        """Return the network's detections, in the image's pixels."""
-        window, K_window, corner = cut(image, K, roi)
-        scales: list[list[Detection]] = []
-        for box in letterboxes(self.checkpoint, K_window, window, distances):
-            belief, field = self._look(window, box)
-            with self._timed("decode"):
-                found = recover(
-                    belief, field, self.cuboids, box.camera(K_window), self.network.stride,
-                    self._names, **self._recovery_options(),
-                )  # fmt: skip
-            scales.append([self._in_original(one, box, corner, K) for one in found])
-        return merged(scales)
+        distances: Distances | None = None,
+        roi: Region | None = None,
+    ) -> list[NetworkView]:
+        """Return the inputs that the network is run on; the arguments are those of predict."""
+        multiple = self.network.size_multiple
+        return network_views(self.checkpoint, multiple, image, K, distances, roi)
 
-    def _look(self, window: Picture, box: Letterbox) -> Maps:
-        """Run the network on a window in one of its sizes."""
-        with self._timed("pre"):
-            pixels = letterboxed(window, box, self.network.size_multiple)
-        with self._timed("network"):
-            return self.maps(pixels)
+    def maps(self, image: Picture) -> Maps:
+        """Run the network on an image whose sides are multiples of its size multiple."""
+        pixels = torch.from_numpy(image).to(self.device).permute(2, 0, 1)[None]
+        with torch.inference_mode():
+            belief, field = self.network.maps(pixels)
+        return belief[0].float(), field[0].float()
 
     def _recovery_options(self) -> dict[str, float]:
-        """Return the thresholds; candidates for refinement pass lower ones."""
+        """Return the thresholds; they are lower for candidates that will be refined."""
         return vars(self.recovery if self.refiner is None else self.recovery.of_candidates())
-
-    def _in_original(
-        self, detection: Detection, box: Letterbox, corner: tuple[int, int], K: CameraMatrix
-    ) -> Detection:
-        """Express a detection's pixels in the original image; the pose is the same in both."""
-        cuboid = self._cuboid_of[detection.object]
-        return replace(
-            detection,
-            keypoints=project_keypoints(cuboid, detection.T_cam_obj, K),
-            peaks=box.original_points(detection.peaks) + np.array(corner),
-            reprojection_error_px=detection.reprojection_error_px / box.scale_x,
-        )
 
     @contextmanager
     def _timed(self, step: str) -> Iterator[None]:
-        """Count what a step takes, with what it has left to a GPU to do."""
+        """Add the time of a step, including its pending work on a GPU."""
         start = time.perf_counter()
         yield
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
         self.spent_ms[step] += 1000 * (time.perf_counter() - start)
 
-    def maps(self, image: Picture) -> Maps:
-        """Run the network on one image whose sides are multiples of its size multiple."""
-        pixels = torch.from_numpy(image).to(self.device).permute(2, 0, 1)[None]
-        with torch.inference_mode():
-            belief, field = self.network.maps(pixels)
-        return belief[0].float(), field[0].float()
-
 
 def checked_device(device: str | torch.device) -> torch.device:
-    """Return a device that can compute; a :class:`UserError` where there is none of this name."""
+    """Return the device after a test allocation.
+
+    Raises:
+        UserError: There is no such device.
+    """
     try:
         chosen = torch.device(device)
         torch.zeros(1, device=chosen).item()  # asks the driver
     except (RuntimeError, AssertionError, NotImplementedError) as error:
-        there = "cpu or cuda" if torch.cuda.is_available() else "cpu (this PyTorch has no cuda)"
+        allowed = "cpu or cuda" if torch.cuda.is_available() else "cpu (this PyTorch has no cuda)"
         reason = str(error).partition("\n")[0]
-        raise UserError(f"device {device} ({reason:.100})", there, "pass one of these") from error
+        problem = f"device {device} ({reason:.100})"
+        raise UserError(problem, allowed, "pass one of these") from error
     return chosen

@@ -23,8 +23,8 @@ from torch.export import Dim, ExportedProgram
 
 from dopepp.core.errors import UserError, require
 from dopepp.core.files import write_whole
+from dopepp.inference.runtimes import INPUT, OUTPUTS, Export, Pixels, described, pack
 from dopepp.inference.runtimes.openvino import NAME, load_openvino
-from dopepp.inference.runtimes.runtime import INPUT, OUTPUTS, Export, Pixels, described, pack
 from dopepp.models.checkpoint import KEY, SUFFIX, Checkpoint, write_content
 from dopepp.models.network import PoseNetwork
 

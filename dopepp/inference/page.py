@@ -33,9 +33,7 @@ from dopepp.geometry.camera_file import Camera, read_camera
 from dopepp.geometry.cuboid import NUM_KEYPOINTS
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.overlay import make_shape
-from dopepp.inference.picture import letterboxed, letterboxes
-from dopepp.inference.results import PoseResult
+from dopepp.inference.pose_result import PoseResult, make_shape
 from dopepp.parts.size import part_in_words
 from dopepp.recovery.recover import explained
 
@@ -198,11 +196,11 @@ def _camera(kind: str, given: Sequence[Any], width: int, height: int) -> Camera:
 def belief_sheet(estimator: PoseEstimator, image: Picture, K: CameraMatrix) -> Picture:
     """Draw the belief maps on a picture in every size in which the network looks at it."""
     tiles = []
-    for box in letterboxes(estimator.checkpoint, K, image):
-        seen = letterboxed(image, box, estimator.network.size_multiple)
-        belief = estimator.maps(seen)[0].cpu().numpy()
+    for view in estimator.views(image, K):
+        box = view.box
+        belief = estimator.maps(view.pixels)[0].cpu().numpy()
         strongest = belief.reshape(-1, NUM_KEYPOINTS, *belief.shape[1:]).max(axis=0)
-        shown = seen[: box.height, : box.width]  # without its padding
+        shown = view.pixels[: box.height, : box.width]  # without its padding
         size = f"{box.width}×{box.height}"
         tiles += belief_tiles(shown, strongest, estimator.network.stride, size)
     return contact_sheet(tiles, columns=2)

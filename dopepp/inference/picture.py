@@ -1,15 +1,16 @@
-"""The picture a caller gives: checked, with its depth, and in the sizes in which a network sees it.
+"""From a caller's image to the network's input: checks, lens distortion, and image sizes.
 
-A network knows a part in a range of sizes only. A part of diameter d at depth z is d·f/z pixels
-long in a picture of focal length f. The network has seen it from ``smallest_px`` to ``largest_px``
-long, so a picture is resized until the parts that are looked for have such sizes; where their
-distances vary more than the network's did, several times.
+A network detects a part in a limited range of sizes. A part of diameter d at depth z is d·f/z
+pixels long in an image of focal length f. Training showed it from ``smallest_px`` to ``largest_px``
+long, so the image is resized until parts at the expected distances have such sizes. Several sizes
+are used if the distances vary more than in training.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -28,7 +29,9 @@ from dopepp.geometry.camera import (
     check_camera,
     crop_camera,
     focal_length,
+    project_keypoints,
 )
+from dopepp.geometry.cuboid import Cuboid
 from dopepp.parts.size import Seen
 
 if TYPE_CHECKING:
@@ -38,26 +41,41 @@ if TYPE_CHECKING:
 Region = tuple[int, int, int, int]  # x, y, width and height, pixels
 
 Distances = tuple[float, float] | Literal["any"]
-"""Nearest and farthest depth, metres; ``any``: wherever the network can see a part."""
+"""Nearest and farthest depth, metres; ``any``: all depths at which the network can see a part."""
 
 Depth = Float[np.ndarray, "height width"]
 Depth32 = Float32[np.ndarray, "height width"]  # metres along z of every pixel
 
-Coefficients = Float[np.ndarray, "coefficients"]  # of a lens's distortion, in OpenCV's order
+Coefficients = Float[np.ndarray, "coefficients"]  # lens distortion, in OpenCV's order
 
 FARTHEST: Final = 50.0
-"""Metres. No depth camera for parts sees so far; millimetres taken for metres do."""
+"""Metres: beyond the range of any depth camera for parts, so larger values are millimetres."""
 
-MAX_PIXELS: Final = 640 * 480  # of a resized picture: a part too small for that is not looked for
+MAX_PIXELS: Final = 640 * 480  # of a resized image: a part too small for that is not detected
 MARGIN: Final = 1.1  # factor on a size that makes no difference to a network
 
 
-def checked_picture(
-    image: Picture, K: CameraMatrix, cropped: bool = False
-) -> tuple[Picture, CameraMatrix]:
-    """Check that the arguments are an RGB image and its camera matrix; a UserError if not.
+def prepare_image(
+    image: Picture,
+    K: CameraMatrix,
+    distortion: Coefficients | None = None,
+    depth: Depth | None = None,
+    cropped: bool = False,
+) -> tuple[Picture, CameraMatrix, Depth32 | None]:
+    """Check the arguments of a prediction and remove the lens distortion.
 
-    The principal point of one that was ``cropped`` may lie anywhere.
+    Args:
+        image: RGB, uint8.
+        K: Camera matrix, pixels.
+        distortion: OpenCV's coefficients of image and depth, if they are distorted.
+        depth: Metres along z, aligned to the image.
+        cropped: Whether the principal point may lie anywhere.
+
+    Returns:
+        Image, K and depth, without distortion.
+
+    Raises:
+        UserError: An argument is invalid, or K or depth do not belong to the image.
     """
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
@@ -66,13 +84,12 @@ def checked_picture(
             "(height, width, 3) uint8 in RGB order",
             "convert the image, e.g. cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)",
         )
-    # Flipped views, as of bgr[..., ::-1], have strides that OpenCV and torch do not take.
-    size, off_centre = (image.shape[1], image.shape[0]), ANYWHERE if cropped else WHOLE
-    return np.ascontiguousarray(image), check_camera(K, size, "predict", off_centre)
-
-
-def checked_distortion(distortion: Coefficients) -> Coefficients:
-    """Check that the coefficients are those of one of OpenCV's lens models."""
+    # Flipped views, e.g. bgr[..., ::-1], have strides that OpenCV and torch do not accept.
+    image, size = np.ascontiguousarray(image), (image.shape[1], image.shape[0])
+    K = check_camera(K, size, "predict", ANYWHERE if cropped else WHOLE)
+    checked = None if depth is None else checked_depth(depth, size)
+    if distortion is None:
+        return image, K, checked
     coefficients = np.asarray(distortion, np.float64).ravel()
     if coefficients.size not in (4, 5, 8, 12, 14) or not np.isfinite(coefficients).all():
         raise UserError(
@@ -80,14 +97,20 @@ def checked_distortion(distortion: Coefficients) -> Coefficients:
             "4, 5, 8, 12 or 14 finite numbers in OpenCV's order (k1, k2, p1, p2, k3, …)",
             "pass the camera's calibration, or None for an undistorted image",
         )
-    return coefficients
+    checked = None if checked is None else undistorted_depth(checked, K, coefficients)
+    return cv2.undistort(image, K, coefficients), K, checked
 
 
-def checked_depth(depth: Depth, image_size: tuple[int, int]) -> Depth32:
-    """Return depth, metres along z, as float32, 0 where it is unknown (0, NaN or infinite).
+def checked_depth(depth: Depth, image_size: Size) -> Depth32:
+    """Return depth as float32, with 0 where it is unknown (0, NaN or infinite).
 
-    A :class:`UserError`: it is not aligned to a colour image of (width, height), is no array of
-    floats, has negative values, or its median cannot be in metres.
+    Args:
+        depth: Metres along z.
+        image_size: (width, height) of the colour image.
+
+    Raises:
+        UserError: The depth is not aligned to the image, no array of floats, negative, or
+            implausible in metres.
     """
     depth = np.asarray(depth)
     if depth.shape != image_size[::-1]:
@@ -99,24 +122,30 @@ def checked_depth(depth: Depth, image_size: tuple[int, int]) -> Depth32:
     if not np.issubdtype(depth.dtype, np.floating):
         fix = "convert it, e.g. depth.astype('float32') / 1000 for millimetres"
         raise UserError(f"depth of type {depth.dtype}", "floats in metres", fix)
-    known = np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
-    measured = known[known != 0]
+    depth = np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
+    measured = depth[depth != 0]
     if measured.size and measured.min() < 0:
-        got = f"depth with values down to {measured.min():.4g}"
-        raise UserError(got, "metres along z, 0 where unknown", "check how the depth was decoded")
+        problem = f"depth with values down to {measured.min():.4g}"
+        fix = "check how the depth was decoded"
+        raise UserError(problem, "metres along z, 0 where unknown", fix)
     if measured.size and np.median(measured) > FARTHEST:
         raise UserError(
             f"depth with a median of {np.median(measured):.4g} m",
             f"metres, a median of at most {FARTHEST:g}",
             "divide by 1000 if it is in millimetres (or by the camera's own depth scale)",
         )
-    return known
+    return depth
 
 
-def read_depth(path: Path, scale: float) -> Depth32:
-    """Read a PNG of 16 bits as metres, 0 where unknown; ``scale`` is metres per unit.
+def read_depth_image(path: Path, scale: float) -> Depth32:
+    """Read a 16-bit PNG as depth in metres, 0 where unknown.
 
-    A :class:`UserError`: the scale is no positive number, or the file is no 16-bit image.
+    Args:
+        path: PNG file.
+        scale: Metres per unit.
+
+    Raises:
+        UserError: The scale is not positive, or the file is no 16-bit image of one channel.
     """
     if not 0 < scale < np.inf:
         fix = "pass 0.001 for millimetres"
@@ -132,31 +161,71 @@ def read_depth(path: Path, scale: float) -> Depth32:
 
 
 def undistorted_depth(depth: Depth32, K: CameraMatrix, distortion: Coefficients) -> Depth32:
-    """Undistort depth as the image is, with each pixel's nearest value: a mean is no surface."""
+    """Undistort depth by the nearest pixel: a mean of two depths is on no surface."""
     size = depth.shape[::-1]
     maps = cv2.initUndistortRectifyMap(K, distortion, np.eye(3), K, size, cv2.CV_32FC1)
     return np.asarray(cv2.remap(depth, *maps, cv2.INTER_NEAREST), np.float32)
 
 
-def cut(
-    image: Picture, K: CameraMatrix, roi: Region | None
-) -> tuple[Picture, CameraMatrix, tuple[int, int]]:
-    """Return a region of an image, its K and its upper left corner, pixels."""
-    if roi is None:
-        return image, K, (0, 0)
-    height, width = image.shape[:2]
-    x, y, columns, rows = (round(one) for one in roi)
-    if not (0 <= x < x + columns <= width and 0 <= y < y + rows <= height):
-        allowed = f"(x, y, width, height) within the {width}×{height} image, pixels"
-        raise UserError(f"roi {tuple(roi)}", allowed, "cut it to the image")
-    window = np.ascontiguousarray(image[y : y + rows, x : x + columns])
-    return window, crop_camera(K, x, y), (x, y)
+@dataclass(frozen=True, eq=False)
+class NetworkView:
+    """Region of an image in one of the sizes that the network is run on."""
+
+    pixels: UInt8[np.ndarray, "rows columns 3"]  # resized, padded at the right and bottom
+    box: Letterbox  # resizing of the region
+    K: CameraMatrix  # camera matrix of ``pixels``
+    corner: tuple[int, int]  # x and y of the region in the image, pixels
+
+    def to_image(self, detection: Detection, cuboid: Cuboid, K: CameraMatrix) -> Detection:
+        """Express a detection in pixels of the whole image, whose camera matrix is K."""
+        return replace(
+            detection,
+            keypoints=project_keypoints(cuboid, detection.T_cam_obj, K),
+            peaks=self.box.original_points(detection.peaks) + np.array(self.corner),
+            reprojection_error_px=detection.reprojection_error_px / self.box.scale_x,
+        )
+
+
+def network_views(
+    checkpoint: Checkpoint,
+    multiple: int,
+    image: Picture,
+    K: CameraMatrix,
+    distances: Distances | None = None,
+    roi: Region | None = None,
+) -> list[NetworkView]:
+    """Return the inputs that the network is run on, the smallest first.
+
+    Args:
+        checkpoint: Checkpoint of the network.
+        multiple: Number that divides the sides of the inputs.
+        image: RGB, without distortion.
+        K: Camera matrix, pixels.
+        distances: Expected depths of the parts (default: those of training).
+        roi: Region to process (default: the whole image).
+
+    Raises:
+        UserError: The region leaves the image, or the distances are no range of metres.
+    """
+    x, y = 0, 0
+    if roi is not None:
+        height, width = image.shape[:2]
+        x, y, columns, rows = (round(number) for number in roi)
+        if not (0 <= x < x + columns <= width and 0 <= y < y + rows <= height):
+            allowed = f"(x, y, width, height) within the {width}×{height} image, pixels"
+            raise UserError(f"roi {tuple(roi)}", allowed, "cut it to the image")
+        image = np.ascontiguousarray(image[y : y + rows, x : x + columns])
+        K = crop_camera(K, x, y)
+    return [
+        NetworkView(letterboxed(image, box, multiple), box, box.camera(K), (x, y))
+        for box in letterboxes(checkpoint, K, image, distances)
+    ]
 
 
 def letterboxed(
     image: Picture, letterbox: Letterbox, multiple: int
 ) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Resize an image into a letterbox and pad it, right and bottom, to a multiple."""
+    """Resize an image into a letterbox and pad its sides to a multiple, at the right and bottom."""
     image = letterbox.image(image)
     rows, columns = -image.shape[0] % multiple, -image.shape[1] % multiple
     return np.pad(image, ((0, rows), (0, columns), (0, 0)))
@@ -165,12 +234,11 @@ def letterboxed(
 def letterboxes(
     checkpoint: Checkpoint, K: CameraMatrix, image: Picture, distances: Distances | None = None
 ) -> list[Letterbox]:
-    """Return the sizes in which a network looks at an image, the smallest first.
+    """Return the sizes of an image that the network is run on, the smallest first.
 
-    Without ``distances`` it looks where training had the parts, and at the whole image in the size
-    of the training's, which shows parts that fill it; for the training's camera both are one. A
-    checkpoint that does not know distances has the second look only. A :class:`UserError`: the
-    distances are no range of metres.
+    By default these show parts at the distances of training, and the whole image in the size of
+    training images, which shows parts that fill it. Both are the same for the camera of training. A
+    checkpoint without distances has the second size only.
     """
     size = image.shape[1], image.shape[0]
     learned = Letterbox.fit(size, checkpoint.input_size)
@@ -185,36 +253,36 @@ def letterboxes(
     for scale in sorted(scales):
         if boxes and scale < MARGIN * boxes[-1].scale_x:
             continue
-        # The training's camera gets the training's size to the pixel.
+        # The camera of training gets the size of training to the pixel.
         same = 1 / MARGIN < scale / learned.scale_x < MARGIN
         boxes.append(learned if same else Letterbox.scaled(size, scale))
-    fitting = [one for one in boxes if one.width * one.height <= MAX_PIXELS]
+    fitting = [box for box in boxes if box.width * box.height <= MAX_PIXELS]
     return fitting or [Letterbox.scaled(size, math.sqrt(MAX_PIXELS / (size[0] * size[1])))]
 
 
-def merged(scales: Sequence[Sequence[Detection]]) -> list[Detection]:
-    """Return the detections of all scales, the best one of each instance, best score first.
+def merge_scales(scales: Sequence[Sequence[Detection]]) -> list[Detection]:
+    """Merge the detections of all image sizes, and keep the best of each instance, best first.
 
-    Two of different scales are of one instance where their centres are nearer than half the larger
-    one's extent.
+    Detections of two sizes show the same instance if their centres are nearer than half the larger
+    extent.
     """
-    ranked = [(one, number) for number, found in enumerate(scales) for one in found]
+    ranked = [(detection, scale) for scale, group in enumerate(scales) for detection in group]
     ranked.sort(key=lambda pair: -pair[0].score)
     kept: list[tuple[Detection, int]] = []
-    for one, number in ranked:
-        others = (other for other, scale in kept if scale != number)
-        if not any(_are_same(one, other) for other in others):
-            kept.append((one, number))
-    return [one for one, _ in kept]
+    for detection, scale in ranked:
+        others = (other for other, other_scale in kept if other_scale != scale)
+        if not any(_are_same(detection, other) for other in others):
+            kept.append((detection, scale))
+    return [detection for detection, _ in kept]
 
 
 def _depths(
     seen: Seen, reach: float, size: Size, distances: Distances | None
 ) -> tuple[float, float]:
-    """Return the nearest and farthest depth to look at, metres.
+    """Return the nearest and farthest depth to cover, metres.
 
-    ``reach`` is how many pixels long the part is at one metre. Anywhere is from where it fills the
-    picture to where it is as small as was learned, in the picture as it is or as MAX_PIXELS allow.
+    ``reach`` is the part's length at a depth of one metre, pixels. ``any`` ranges from where the
+    part fills the image to where it is as small as in training, in an image of MAX_PIXELS.
     """
     if distances is None:
         return seen.nearest, seen.farthest
@@ -227,9 +295,9 @@ def _depths(
 
 
 def _scales(seen: Seen, reach: float, depths: tuple[float, float]) -> Sequence[float]:
-    """Return the fewest factors on a picture's sides that show a part in sizes that were learned.
+    """Return the fewest scales of an image that show a part in sizes of training at all depths.
 
-    At the middle depth of its range each shows the part in the middle size.
+    Each scale shows the part in the middle size at the middle depth of its range.
     """
     near, far = depths
     learned = math.log(MARGIN**2 * seen.largest_px / seen.smallest_px)
@@ -239,7 +307,7 @@ def _scales(seen: Seen, reach: float, depths: tuple[float, float]) -> Sequence[f
     return scales
 
 
-def _are_same(one: Detection, other: Detection) -> bool:
-    apart = np.linalg.norm(one.keypoints[-1] - other.keypoints[-1])
-    extent = max(np.ptp(each.keypoints[:-1], axis=0).max() for each in (one, other))
-    return one.object == other.object and bool(apart < extent / 2)
+def _are_same(first: Detection, second: Detection) -> bool:
+    distance = np.linalg.norm(first.keypoints[-1] - second.keypoints[-1])
+    extents = [np.ptp(detection.keypoints[:-1], axis=0).max() for detection in (first, second)]
+    return first.object == second.object and bool(distance < max(extents) / 2)

@@ -34,7 +34,7 @@ from dopepp.geometry.camera import (
     step_between,
     transform,
 )
-from dopepp.inference.picture import Region, checked_picture
+from dopepp.inference.picture import Region, prepare_image
 from dopepp.recovery.detection import Detection
 
 if TYPE_CHECKING:
@@ -218,7 +218,7 @@ class PoseTracker:
         Raises:
             UserError: The image is no RGB picture, or K cannot belong to it.
         """
-        image, K = checked_picture(image, K, cropped)
+        image, K, _ = prepare_image(image, K, cropped=cropped)
         for state in self._states:
             self._follow(state, image, K)
         due = self._frame % self.detect_every == 0

@@ -26,10 +26,8 @@ from dopepp.geometry.camera import crop_camera
 from dopepp.geometry.cuboid import CENTROID, EDGES
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.overlay import AXIS, COLOURS, silhouette
-from dopepp.inference.picture import letterboxed, letterboxes
-from dopepp.inference.results import PoseResult
-from dopepp.inference.sources import Source
+from dopepp.inference.frames import FrameSource
+from dopepp.inference.pose_result import AXIS, COLOURS, PoseResult, silhouette_contours
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 
@@ -81,7 +79,7 @@ class Viewer:
             fix = "--rerun FILE.rrd writes a file, to look at elsewhere"
             raise UserError("--show without a display", "a desktop session", fix)
 
-    def begin(self, source: Source) -> None:
+    def begin(self, source: FrameSource) -> None:
         """Go on with another source on the same timeline."""
 
     def take(self, result: PoseResult) -> None:
@@ -194,14 +192,14 @@ def belief_pictures(estimator: PoseEstimator, result: PoseResult) -> Mapping[str
 
     The network looks again, at the last of the sizes in which it has looked at the picture.
     """
-    box = letterboxes(estimator.checkpoint, result.K, result.image)[-1]
-    beliefs, _ = estimator.maps(letterboxed(result.image, box, estimator.network.size_multiple))
+    view = estimator.views(result.image, result.K)[-1]
+    beliefs, _ = estimator.maps(view.pixels)
     strongest = (
         beliefs.cpu().numpy().reshape(len(estimator.parts), CENTROID + 1, *beliefs.shape[1:])
     )
     levels = np.rint(255 * strongest.max(axis=1).clip(0, 1)).astype(np.uint8)
     stride = estimator.network.stride
-    rows, columns = -(-box.height // stride), -(-box.width // stride)
+    rows, columns = -(-view.box.height // stride), -(-view.box.width // stride)
     return {
         part.name: np.asarray(
             cv2.applyColorMap(level[:rows, :columns], cv2.COLORMAP_INFERNO)[..., ::-1]
@@ -246,7 +244,7 @@ def _outlines(result: PoseResult) -> rr.LineStrips2D:
         edges = [one.keypoints[[a, b]] for a, b in EDGES]
         own = [edge + CENTRE for edge in edges if np.isfinite(edge).all()]
         if (shape := result.shapes.get(one.object)) is not None:
-            contours = silhouette(shape, one.T_cam_obj, result.K, result.image)
+            contours = silhouette_contours(shape, one.T_cam_obj, result.K, result.image)
             own += [np.vstack([line, line[:1]])[:, 0] + CENTRE for line in contours]
         strips += own
         colours += [COLOURS[number % len(COLOURS)]] * len(own)

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from dopepp.cli import app
 from dopepp.data.formats.bop.bop_results import read_results
-from dopepp.inference.sources.files import Video
+from dopepp.inference.frames.media import Video
 from dopepp.parts.catalogue import pivconnector
 
 FRAMES = 5

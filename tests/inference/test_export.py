@@ -16,7 +16,7 @@ from dopepp.core.errors import UserError
 from dopepp.geometry.camera import camera_matrix
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.export import EXPORTERS, check_possible
-from dopepp.inference.runtimes.runtime import Export, num_threads
+from dopepp.inference.runtimes import Export, num_threads
 from dopepp.models import network as specs
 from dopepp.models.backbones import Backbone
 from dopepp.models.checkpoint import Checkpoint, load_network, write_atomic

@@ -21,8 +21,8 @@ from dopepp.inference.picture import (
     MAX_PIXELS,
     checked_depth,
     letterboxes,
-    merged,
-    read_depth,
+    merge_scales,
+    read_depth_image,
     undistorted_depth,
 )
 from dopepp.parts.catalogue import load_part
@@ -106,12 +106,12 @@ def detection(x, score, side=20.0, name="part"):
 def test_the_best_of_all_scales_is_kept():
     near, far = detection(0, 0.5), detection(100, 0.4)
     better, other = detection(4, 0.9), detection(3, 0.8, name="other")
-    assert merged([[near, far], [better, other]]) == [better, other, far]
+    assert merge_scales([[near, far], [better, other]]) == [better, other, far]
 
 
 def test_two_of_one_scale_are_two():
     one, two = detection(0, 0.5), detection(4, 0.4)
-    assert merged([[one, two], []]) == [one, two]
+    assert merge_scales([[one, two], []]) == [one, two]
 
 
 @pytest.fixture(scope="module")
@@ -217,9 +217,9 @@ def test_depth_is_undistorted_without_mixing():
 def test_read_depth(tmp_path):
     path = tmp_path / "depth.png"
     cv2.imwrite(str(path), np.array([[0, 1000], [250, 65535]], np.uint16))
-    assert_allclose(read_depth(path, 0.001), [[0, 1], [0.25, 65.535]])
+    assert_allclose(read_depth_image(path, 0.001), [[0, 1], [0.25, 65.535]])
     with pytest.raises(UserError, match="depth scale 0"):
-        read_depth(path, 0.0)
+        read_depth_image(path, 0.0)
     cv2.imwrite(str(path), np.zeros((2, 2, 3), np.uint8))
     with pytest.raises(UserError, match="16 bits"):
-        read_depth(path, 0.001)
+        read_depth_image(path, 0.001)

@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
-from dopepp.inference.overlay import COLOURS, make_shape, silhouette
-from dopepp.inference.results import PoseResult
+from dopepp.inference.pose_result import COLOURS, PoseResult, make_shape, silhouette_contours
 from dopepp.parts.catalogue import pivconnector
 from dopepp.recovery.detection import Detection
 
@@ -49,7 +48,9 @@ def test_the_silhouette_is_the_renderers(image):
     target = rendered.scene.targets[0]
     T, picture = rendered.scene.objects[target].T_cam_obj, np.zeros_like(rendered.image)
     mask = np.zeros(picture.shape[:2], np.uint8)
-    cv2.drawContours(mask, silhouette(SHAPES[PART.name], T, rendered.scene.K, picture), -1, 1, -1)
+    cv2.drawContours(
+        mask, silhouette_contours(SHAPES[PART.name], T, rendered.scene.K, picture), -1, 1, -1
+    )
     truth = rendered.instances == target
     assert (mask.astype(bool) & truth).sum() / (mask.astype(bool) | truth).sum() > 0.97
 
@@ -132,6 +133,6 @@ def test_the_table_is_the_poses():
 
 
 def test_without_pandas_it_is_named(monkeypatch):
-    monkeypatch.setattr("dopepp.inference.results.find_spec", lambda _: None)
+    monkeypatch.setattr("dopepp.inference.pose_result.find_spec", lambda _: None)
     with pytest.raises(UserError, match="pip install pandas, or use to_json"):
         result(pose()).to_dataframe()

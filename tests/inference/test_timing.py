@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from dopepp.geometry.camera import camera_matrix
+from dopepp.inference.benchmark import WARM_UP, time_frames
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.timing import WARM_UP, time_frames
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.network import build_network
 from dopepp.parts.catalogue import pivconnector

@@ -7,8 +7,7 @@ import pytest
 
 from dopepp import PoseEstimator
 from dopepp.core.errors import UserError
-from dopepp.inference.overlay import make_shape
-from dopepp.inference.results import PoseResult
+from dopepp.inference.pose_result import PoseResult, make_shape
 from dopepp.inference.viewer import Viewer, belief_pictures
 from dopepp.parts.catalogue import pivconnector
 

@@ -31,7 +31,7 @@ from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.results.report import Cost, Fingerprint, Report
 from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.runtimes.runtime import ExportedNetwork
+from dopepp.inference.runtimes import ExportedNetwork
 from dopepp.metrics.localisation import BopScores, Draw, Localisation
 from dopepp.metrics.pose import PoseMetrics, PredictedPose
 from dopepp.models.network import build_network, network_cost

@@ -20,11 +20,10 @@ from dopepp.experiment.config.data_config import trained_on
 from dopepp.experiment.program import typed
 from dopepp.experiment.results.measurement import EstimatorMethod, measure
 from dopepp.inference import runtimes
-from dopepp.inference.agreement import Agreement, compare
+from dopepp.inference.benchmark import ExportAgreement, compare_export
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.export import EXPORTERS, PRECISIONS, check_possible
-from dopepp.inference.picture import letterboxed, letterboxes
-from dopepp.inference.runtimes.runtime import Export, Pixels
+from dopepp.inference.runtimes import Export, Pixels
 from dopepp.models.checkpoint import FOLDER, Checkpoint, load_network
 from dopepp.models.network import network_cost
 
@@ -43,7 +42,7 @@ class Exported:
 
     path: Path
     export: Export
-    agreement: Agreement
+    agreement: ExportAgreement
     commands: tuple[str, str]
 
 
@@ -139,9 +138,8 @@ def _target(path: Path, layout: str, precision: str, out: Path | None) -> Path:
 
 def _seen(estimator: PoseEstimator, sample: Sample) -> list[Pixels]:
     """Return a picture in the sizes in which the network sees it."""
-    boxes = letterboxes(estimator.checkpoint, sample.K, sample.image)
-    pictures = [letterboxed(sample.image, box, estimator.network.size_multiple) for box in boxes]
-    return [np.ascontiguousarray(picture.transpose(2, 0, 1)[None]) for picture in pictures]
+    views = estimator.views(sample.image, sample.K)
+    return [np.ascontiguousarray(view.pixels.transpose(2, 0, 1)[None]) for view in views]
 
 
 def _accuracy(
@@ -157,9 +155,9 @@ def _accuracy(
     return {report.name: report.mean.add_01d or 0.0 for report in measured.reports}
 
 
-def _compared(exported: PoseEstimator, original: PoseEstimator, source: SampleSource) -> Agreement:
+def _compared(exported: PoseEstimator, original: PoseEstimator, source: SampleSource) -> ExportAgreement:
     samples: Sequence[Sample] = [source.sample(index) for index in range(NUM_CHECKED)]
-    return compare(exported, original, [(sample.image, sample.K) for sample in samples])
+    return compare_export(exported, original, [(sample.image, sample.K) for sample in samples])
 
 
 def _commands(path: Path, checkpoint: Checkpoint) -> tuple[str, str]:

@@ -10,7 +10,7 @@ from typing import Any, Final, TypeVar
 
 from dopepp.data.sample import Sample, SampleSource
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.runtimes.runtime import Runtime
+from dopepp.inference.runtimes import Runtime
 from dopepp.models.heads import Stage
 from dopepp.models.network import Images
 

@@ -15,7 +15,7 @@ from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix, Letterbox, focal_length
 from dopepp.geometry.cuboid import NUM_KEYPOINTS
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.picture import letterboxed, letterboxes
+from dopepp.inference.picture import letterboxes
 from dopepp.parts.part import Part
 from dopepp.parts.size import Seen, widest
 from dopepp.recovery.detection import Detection
@@ -138,10 +138,8 @@ class Case:
         number = [part.name for part in estimator.parts].index(self.part.name)
         own = slice(number * NUM_KEYPOINTS, (number + 1) * NUM_KEYPOINTS)
         strongest = np.zeros(NUM_KEYPOINTS)
-        for box in letterboxes(estimator.checkpoint, self.K, self.image, self.distances):
-            belief, _ = estimator.maps(
-                letterboxed(self.image, box, estimator.network.size_multiple)
-            )
+        for view in estimator.views(self.image, self.K, self.distances):
+            belief, _ = estimator.maps(view.pixels)
             strongest = np.maximum(strongest, belief[own].flatten(1).amax(1).cpu().numpy())
         return strongest
 

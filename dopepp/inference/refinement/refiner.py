@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import combinations
 from typing import TYPE_CHECKING, Final
@@ -26,6 +27,7 @@ from dopepp.geometry.camera import (
     camera_matrix,
     make_transform,
     project,
+    project_keypoints,
     transform,
 )
 from dopepp.geometry.cuboid import Cuboid
@@ -73,15 +75,28 @@ class Refiner:
 
     def __call__(
         self, detection: Detection, image: Picture, K: CameraMatrix, depth: Depth | None
-    ) -> Refinement:
-        """Return the refined pose of a detection, or its own and why it was kept."""
-        name, T_cam_obj, covariance = detection.object, detection.T_cam_obj, detection.covariance
-        refine = self._refiners[name].refine
-        if detection.agreement is not None:  # only refinement gives an agreement: it is followed
-            return refine(image, K, T_cam_obj, covariance, depth, followed=True)
-        # A tracker knows how far a part may have moved; a network may be wrong about that.
-        starts = partial(poses_of_four, self._cuboids[name], detection.peaks, K)
-        return refine(image, K, T_cam_obj, LOOSER**2 * covariance, depth, starts=starts)
+    ) -> Detection:
+        """Return the refined detection, or the given one with the reason why it was kept."""
+        cuboid, T_cam_obj = self._cuboids[detection.object], detection.T_cam_obj
+        refine, covariance = self._refiners[detection.object].refine, detection.covariance
+        if detection.agreement is not None:  # set by refinement only: the part is tracked
+            refined = refine(image, K, T_cam_obj, covariance, depth, followed=True)
+        else:
+            # A tracker knows how far a part may have moved; a network's covariance may be wrong.
+            starts = partial(poses_of_four, cuboid, detection.peaks, K)
+            covariance = LOOSER**2 * covariance
+            refined = refine(image, K, T_cam_obj, covariance, depth, starts=starts)
+        if refined.covariance is None:
+            return replace(detection, kept=refined.reason, agreement=None, support=None)
+        return replace(
+            detection,
+            T_cam_obj=refined.T_cam_obj,
+            keypoints=project_keypoints(cuboid, refined.T_cam_obj, K),
+            covariance=refined.covariance,
+            kept="",
+            agreement=refined.agreement,
+            support=refined.support,
+        )
 
 
 def checked_terms(refine: Refine) -> tuple[str, ...]:

@@ -1,50 +1,249 @@
-"""What runs a network: PyTorch, or the runtime that an exported file is for.
+"""Runtimes of a network: PyTorch, or the runtime of an exported file.
 
-To add one, write a module with ``read(path) -> ExportedNetwork`` and a line in :data:`SUFFIXES`.
+An exported file describes itself: the checkpoint's description and how the network was exported are
+one JSON text in its metadata, under ``dopepp``, so a renamed file loads the same. To add a runtime,
+write a module with ``read_network(path) -> ExportedNetwork`` and a line in :data:`SUFFIXES`.
 """
 
 from __future__ import annotations
 
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Any, Final, Protocol
 
+import numpy as np
 import torch
+from jaxtyping import Float, UInt8
 
 from dopepp.core.errors import UserError
-from dopepp.inference.runtimes.runtime import Runtime
-from dopepp.models.checkpoint import Checkpoint, load_network
-from dopepp.models.network import PoseNetwork
+from dopepp.core.json import parse_json
+from dopepp.core.pool import physical_cores
+from dopepp.core.validation import STRICT, Range, check, parse
+from dopepp.geometry.cuboid import NUM_CORNERS, NUM_KEYPOINTS
+from dopepp.models.checkpoint import KEY, Checkpoint, load_network, packed, parse_description
+from dopepp.models.heads import Stage
+from dopepp.models.network import Images, PoseNetwork, check_spec
+from dopepp.models.storage import MAX_HEADER_BYTES
 
 SUFFIXES: Final = {
     ".onnx": "dopepp.inference.runtimes.onnx",
     ".xml": "dopepp.inference.runtimes.openvino",
 }
-"""Module of the runtime of files with a suffix; all others are checkpoints."""
+"""Runtime modules by file suffix; all other files are checkpoints."""
+
+INPUT: Final = "pixels"
+OUTPUTS: Final = ("belief", "field")  # names in every exported graph
+MAX_BYTES: Final = 2**30  # of an exported file: five times the full DOPE in float32
+
+_MAX_PER_PIXEL: Final = 512
+"""Largest number of tensor elements per input pixel; VGG19 has 64."""
+
+_SECTION: Final = "export"
+_FIX: Final = "export the checkpoint again"
+
+Count = Annotated[int, Range(0, 10**12)]
+
+Pixels = UInt8[np.ndarray, "batch 3 height width"]
+Arrays = tuple[
+    Float[np.ndarray, "batch beliefs rows columns"], Float[np.ndarray, "batch fields rows columns"]
+]
+
+
+@dataclass(frozen=True)
+class Export:
+    """How a network was exported."""
+
+    __pydantic_config__ = STRICT
+
+    format: str  # `onnx`, `openvino` or `safetensors`
+    precision: str  # `fp32`, `fp16` (weights) or `int8`
+    size_multiple: Annotated[int, Range(1, 1024)]  # divisor of image height and width
+    parameters: Count  # trained numbers of the network
+    gmacs: Annotated[float, Range(0, 1e12)]  # 10⁹ multiply-accumulates per image of training size
+    # Share of instances with ADD below a tenth of the diameter on validation scenes, by precision
+    # (before and after quantisation)
+    add_01d: Mapping[str, Annotated[float, Range(0, 1)]] = field(default_factory=dict)
+    num_images: Count = 0  # number of those scenes
+
+
+class Runtime(Protocol):
+    """Computes maps from pixels; :class:`~dopepp.models.network.PoseNetwork` is a runtime.
+
+    Attributes:
+        stride: Pixels per map cell, along each axis.
+        size_multiple: Divisor of image height and width.
+    """
+
+    stride: int
+    size_multiple: int
+
+    def maps(self, images: Images) -> Stage:
+        """Return the belief maps, after the activation, and the vector field of RGB images."""
+
+
+class ExportedNetwork(ABC):
+    """A network from a file, run by another runtime than PyTorch; see :class:`Runtime`.
+
+    Args:
+        path: File, for messages.
+        checkpoint: Description of what the network was trained for, without weights.
+        export: How the network was exported.
+    """
+
+    def __init__(self, path: Path, checkpoint: Checkpoint, export: Export) -> None:
+        self.path, self.checkpoint, self.export = path, checkpoint, export
+        self.stride, self.size_multiple = checkpoint.stride, export.size_multiple
+
+    @abstractmethod
+    def run(self, pixels: Pixels) -> Arrays:
+        """Return the outputs of the graph."""
+
+    def maps(self, images: Images) -> Stage:
+        """Return the belief maps, after the activation, and the vector field of images.
+
+        Args:
+            images: RGB, uint8, (batch, 3, height, width); ``size_multiple`` divides the sides.
+
+        Raises:
+            UserError: The graph fails, or its maps contradict its description.
+        """
+        try:
+            belief, field = self.run(images.contiguous().numpy())
+        except Exception as error:  # any error of the runtime, as anybody may have written the file
+            raise invalid_export(self.path, error) from error
+        count, _, height, width = images.shape
+        cells = height // self.stride, width // self.stride
+        num_parts = len(self.checkpoint.parts)
+        expected = [(count, n * num_parts, *cells) for n in (NUM_KEYPOINTS, 2 * NUM_CORNERS)]
+        if [belief.shape, field.shape] != expected:
+            problem = f"maps of shape {belief.shape} and {field.shape}"
+            raise invalid_export(self.path, problem, f"{expected[0]} and {expected[1]}")
+        return torch.from_numpy(belief), torch.from_numpy(field)
 
 
 def is_export(path: Path) -> bool:
-    """Tell whether a path is of an exported network, which runs on the CPU, or of a checkpoint."""
+    """Return whether a path is an exported network, which runs on the CPU, or a checkpoint."""
     return path.is_dir() or path.suffix in SUFFIXES
 
 
 def load(path: Path, device: torch.device) -> tuple[Runtime, Checkpoint]:
-    """Load a checkpoint or an exported network, with what it was trained for.
+    """Load a checkpoint or an exported network (file, or OpenVINO's folder).
 
-    A folder is one that `dopepp export` has written for OpenVINO. A :class:`UserError`: the file is
-    missing, damaged or not safe to load, an extra is missing, or it cannot run on this device.
+    Raises:
+        UserError: The file is missing, damaged or not safe to load, an extra is missing, or the
+            network cannot run on this device.
     """
     if not is_export(path):
         return load_network(path)
     if device.type != "cpu":
         fix = "leave the device out, or load the checkpoint that it was exported from"
         raise UserError(f"device {device} for {path}", "cpu for an exported network", fix)
-    exported = import_module(SUFFIXES[".xml" if path.is_dir() else path.suffix]).read(path)
+    runtime = import_module(SUFFIXES[".xml" if path.is_dir() else path.suffix])
+    exported = runtime.read_network(path)
     return exported, exported.checkpoint
 
 
 def placed(network: Runtime, device: torch.device) -> Runtime:
-    """Return a network ready to run; one of PyTorch's is moved to the device for it."""
+    """Return a network ready for inference; a PyTorch network is moved to the device."""
     if isinstance(network, PoseNetwork):
         network = network.for_inference().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     return network
+
+
+def num_threads() -> int:
+    """Return ``OMP_NUM_THREADS`` if it is set, else the physical cores of this process."""
+    text = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
+    return int(text) if text.isdecimal() and int(text) > 0 else physical_cores()
+
+
+def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
+    """Read a file of an export.
+
+    Raises:
+        UserError: The file is missing, unreadable or too large.
+    """
+    if not path.is_file():
+        raise invalid_export(path, "no such file")
+    try:
+        if path.stat().st_size > max_bytes:
+            raise invalid_export(path, f"{path.stat().st_size} bytes", f"at most {max_bytes}")
+        return path.read_bytes()
+    except OSError as error:
+        raise invalid_export(path, error.strerror or error) from error
+
+
+def check_shapes(path: Path, shapes: Mapping[str, Iterable[int] | None], num_pixels: int) -> None:
+    """Check that no tensor of a graph is out of proportion to the input.
+
+    A few bytes of a malicious file could otherwise allocate all memory.
+
+    Args:
+        path: File, for messages.
+        shapes: Shapes of the tensors by name; None if the graph does not determine a shape.
+        num_pixels: Pixels of the input.
+
+    Raises:
+        UserError: A tensor is too large or has no known shape.
+    """
+    for name, shape in shapes.items():
+        size = -1 if shape is None else int(np.prod([int(side) for side in shape], dtype=object))
+        if not 0 <= size <= _MAX_PER_PIXEL * num_pixels:
+            problem = "unknown size" if shape is None else f"{size} numbers"
+            allowed = f"tensors of at most {_MAX_PER_PIXEL} numbers for each pixel of the input"
+            raise invalid_export(path, f"tensor {name:.60} of {problem}", allowed)
+
+
+def invalid_export(path: Path, problem: object, allowed: str = "") -> UserError:
+    """Return the error about a file that differs from what ``dopepp export`` writes."""
+    reason = " ".join(str(problem).split()) or type(problem).__name__
+    return UserError(
+        f"{path}: {reason:.300}",
+        allowed or "a whole file written by `dopepp export`",
+        f"{_FIX}; load no file that you do not trust",
+    )
+
+
+def pack(checkpoint: Checkpoint, export: Export) -> str:
+    """Return the description for a file's metadata."""
+    return packed(described(checkpoint, export)[KEY])
+
+
+def described(checkpoint: Checkpoint, export: Export) -> dict[str, Any]:
+    """Return a checkpoint's content (:meth:`Checkpoint.to_file`) and how it was exported."""
+    content = checkpoint.to_file()
+    content[KEY][_SECTION] = asdict(export)
+    return content
+
+
+def unpack(text: str | None, path: Path) -> tuple[Checkpoint, Export]:
+    """Read the description in a file's metadata without building anything.
+
+    Args:
+        text: Description, which anybody may have written; None if the file has none.
+        path: File, for messages.
+
+    Raises:
+        UserError: The description is missing, damaged, too long, of a newer version, or names a
+            class that may not be built.
+    """
+    if text is None or len(text) > MAX_HEADER_BYTES:
+        problem = "no description" if text is None else f"a description of {len(text)} characters"
+        allowed = f"one of at most {MAX_HEADER_BYTES} under {KEY!r}, as `dopepp export` writes it"
+        raise UserError(f"{path}: {problem}", allowed, _FIX)
+    payload = parse_json(text, f"{path}, description under {KEY!r}")
+    try:
+        checkpoint = parse_description(payload)
+        check_spec(checkpoint.spec)
+        export = parse(Export, payload.get(_SECTION), _SECTION, _FIX)  # type: ignore[attr-defined]
+        check("stride", checkpoint.stride, int, Range(1, 256))
+        if export.size_multiple % checkpoint.stride or not checkpoint.parts:
+            problem = f"size_multiple {export.size_multiple} and {len(checkpoint.parts)} parts"
+            allowed = f"a multiple of the stride {checkpoint.stride}, and a part at least"
+            raise UserError(problem, allowed, _FIX)
+    except UserError as error:
+        raise UserError(f"{error.got}, in {path}", error.allowed, error.fix) from error
+    return checkpoint, export

@@ -1,7 +1,7 @@
-"""OpenVINO's files, a folder with ``model.xml`` and ``model.bin``, run by OpenVINO on the CPU.
+"""OpenVINO files, a folder with ``model.xml`` and ``model.bin``, run by OpenVINO on the CPU.
 
-The XML can hold graphs within graphs and operators of libraries, and its constants are places in
-the other file; what ours do not have is refused before the runtime sees it.
+The XML can contain nested graphs and operators of libraries, and its constants are offsets into the
+other file. What ``dopepp export`` does not write is rejected before the runtime reads it.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from typing import Any, Final
 from lxml import etree
 
 from dopepp.core.errors import require
-from dopepp.inference.runtimes.runtime import (
+from dopepp.inference.runtimes import (
     Arrays,
     Export,
     ExportedNetwork,
     Pixels,
     check_shapes,
+    invalid_export,
     num_threads,
     read_bytes,
-    refused,
     unpack,
 )
 from dopepp.models.checkpoint import KEY, Checkpoint
@@ -32,14 +32,20 @@ NAME: Final = "model.xml"
 WEIGHTS: Final = ".bin"
 
 MAX_XML_BYTES: Final = 2 * MAX_HEADER_BYTES  # description and graph
-_OWN: Final = re.compile(r"opset\d{1,2}", re.ASCII)  # versions of operators that are OpenVINO's own
+_OPSET: Final = re.compile(r"opset\d{1,2}", re.ASCII)  # versions of OpenVINO's own operators
 
 
 def load_openvino(choice: str) -> Any:
-    """Import OpenVINO; a :class:`~dopepp.core.errors.UserError` where its extra is missing.
+    """Import OpenVINO without its telemetry.
 
-    Its package reports every import to its makers, and NNCF every call, unless the package that
-    does so is missing; so it is hidden from them.
+    OpenVINO reports every import to its makers, and NNCF every call, unless the telemetry package
+    is missing. It is therefore hidden from them.
+
+    Args:
+        choice: The user's choice that requires OpenVINO, for messages.
+
+    Raises:
+        UserError: The extra is missing.
     """
     require("openvino", choice, "openvino")
     sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
@@ -48,13 +54,20 @@ def load_openvino(choice: str) -> Any:
     return openvino
 
 
-def read(path: Path) -> OpenVinoNetwork:
+def read_network(path: Path) -> OpenVinoNetwork:
     """Read a folder that anybody may have written, or the XML in it.
 
-    A :class:`~dopepp.core.errors.UserError`: a file is missing, damaged or too large, the XML has
-    what ours do not have, or a constant is not in the other file.
+    Raises:
+        UserError: A file is missing, damaged or too large, the XML has content that ``dopepp
+            export`` does not write, or a constant lies outside the other file.
     """
-    file = _find(path) if path.is_dir() else path
+    file = path
+    if path.is_dir():
+        candidates = sorted(path.glob("*.xml"))
+        if len(candidates) != 1:
+            allowed = "a folder written by `dopepp export --format openvino`"
+            raise invalid_export(path, f"{len(candidates)} files *.xml in this folder", allowed)
+        file = candidates[0]
     openvino = load_openvino(str(path))
     xml = read_bytes(file, MAX_XML_BYTES)
     weights = read_bytes(file.with_suffix(WEIGHTS))
@@ -67,28 +80,30 @@ def read(path: Path) -> OpenVinoNetwork:
         check_shapes(path, _shapes(sized), width * height)
         return OpenVinoNetwork(model, path, checkpoint, export)
     except RuntimeError as error:
-        raise refused(path, _reason(error)) from error
+        # The last line of OpenVINO's message is the cause.
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+        raise invalid_export(path, lines[-1] if lines else "") from error
 
 
 class OpenVinoNetwork(ExportedNetwork):
-    """See :class:`ExportedNetwork`; the model is one that :func:`read` has checked."""
+    """An OpenVINO model that :func:`read_network` has checked."""
 
     def __init__(self, model: Any, path: Path, checkpoint: Checkpoint, export: Export) -> None:
         super().__init__(path, checkpoint, export)
-        self.request = compiled(model).create_infer_request()
+        self.request = compile_model(model).create_infer_request()
 
     def run(self, pixels: Pixels) -> Arrays:
-        """Return what the graph answers."""
+        """Return the outputs of the graph."""
         self.request.infer([pixels])
         belief, field = (self.request.get_output_tensor(number).data.copy() for number in range(2))
         return belief, field
 
 
-def compiled(model: Any) -> Any:
-    """Compile a model for one image after the other, in float32 where it is not quantised.
+def compile_model(model: Any) -> Any:
+    """Compile a model for single images, in float32 unless it is quantised.
 
-    OpenVINO would otherwise compute in bfloat16 where the processor can, and keep its threads on
-    cores that another program may be using.
+    By default OpenVINO would compute in bfloat16 on some processors, and pin its threads to cores
+    that another program may be using.
     """
     options = {
         "ENABLE_CPU_PINNING": False,
@@ -101,53 +116,38 @@ def compiled(model: Any) -> Any:
 
 
 def _shapes(model: Any) -> dict[str, list[int] | None]:
-    """Return the shape of every tensor of a model, None where it is not known."""
+    """Return the shape of every tensor of a model; None if unknown."""
     return {
-        f"{one.get_friendly_name()}.{number}": None
+        f"{node.get_friendly_name()}.{number}": None
         if output.get_partial_shape().is_dynamic
         else list(output.get_shape())
-        for one in model.get_ops()
-        for number, output in enumerate(one.outputs())
+        for node in model.get_ops()
+        for number, output in enumerate(node.outputs())
     }
 
 
-def _find(folder: Path) -> Path:
-    """Return the only XML of a folder."""
-    found = sorted(folder.glob("*.xml"))
-    if len(found) != 1:
-        allowed = "a folder written by `dopepp export --format openvino`"
-        raise refused(folder, f"{len(found)} files *.xml in this folder", allowed)
-    return found[0]
-
-
 def _check_xml(content: bytes, num_weights: int, path: Path) -> str | None:
-    """Return the description in an XML, which is one plain graph; else it is a UserError."""
+    """Check that an XML is one plain graph, and return its description."""
     if b"<!" in content:
-        raise refused(path, "an XML with declarations or comments", "layers and edges alone")
+        raise invalid_export(path, "an XML with declarations or comments", "layers and edges alone")
     parser = etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True)
     try:
         root = etree.fromstring(content, parser)
     except etree.XMLSyntaxError as error:
-        raise refused(path, f"no XML, or cut short: {error}") from error
+        raise invalid_export(path, f"no XML, or cut short: {error}") from error
     for layer in root.iter("layer"):
         kind, version = layer.get("type", ""), layer.get("version", "")
-        if not _OWN.fullmatch(version):
-            got = f"operator {version:.60}.{kind:.60}"
-            raise refused(path, got, "operators of OpenVINO itself")
+        if not _OPSET.fullmatch(version):
+            problem = f"operator {version:.60}.{kind:.60}"
+            raise invalid_export(path, problem, "operators of OpenVINO itself")
         if any(str(child.tag).endswith("body") for child in layer):
-            raise refused(path, f"operator {kind:.60} with a graph inside", "one graph")
+            raise invalid_export(path, f"operator {kind:.60} with a graph inside", "one graph")
         data = layer.find("data")
         if kind == "Const" and data is not None:
-            ends = [str(data.get(key)) for key in ("offset", "size")]
-            inside = all(one.isdecimal() and len(one) < 16 for one in ends)
-            if not inside or sum(map(int, ends)) > num_weights:
-                got = f"a constant of {ends[1]:.20} bytes at {ends[0]:.20} of {num_weights}"
-                raise refused(path, got, "constants within the weights' file")
+            span = [str(data.get(key)) for key in ("offset", "size")]
+            are_numbers = all(text.isdecimal() and len(text) < 16 for text in span)
+            if not are_numbers or sum(map(int, span)) > num_weights:
+                problem = f"a constant of {span[1]:.20} bytes at {span[0]:.20} of {num_weights}"
+                raise invalid_export(path, problem, "constants within the weights' file")
     entry = root.find(f"rt_info/{KEY}")
     return None if entry is None else entry.get("value")
-
-
-def _reason(error: Exception) -> str:
-    """Return the last line of OpenVINO's message, which says what is wrong."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1] if lines else ""

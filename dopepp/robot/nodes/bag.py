@@ -14,7 +14,7 @@ import numpy as np
 
 from dopepp.core.errors import UserError, require
 from dopepp.core.files import check_target, draft
-from dopepp.inference.sources.bag import Bag
+from dopepp.inference.frames.ros import Bag
 from dopepp.robot.nodes.messages import OVERLAY, VISION, Fields, Speaker, Triangles
 from dopepp.robot.nodes.worker import Answer, Stamp, Worker, stamp_of
 

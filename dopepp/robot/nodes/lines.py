@@ -10,7 +10,7 @@ from contextlib import contextmanager, nullcontext
 
 from dopepp.core.errors import RunError, UserError
 from dopepp.geometry.camera_file import Camera
-from dopepp.inference.sources import Source
+from dopepp.inference.frames import FrameSource
 from dopepp.robot.nodes.worker import Worker
 
 MAX_DATAGRAM = 65_507  # bytes that UDP over IPv4 carries
@@ -19,7 +19,7 @@ logger = logging.getLogger(__name__)
 
 
 def say_lines(
-    worker: Worker, sources: Iterable[tuple[Source, Camera]], address: str | None = None
+    worker: Worker, sources: Iterable[tuple[FrameSource, Camera]], address: str | None = None
 ) -> None:
     """Say the poses on every picture of some sources, a line a picture, found or not.
 

@@ -19,7 +19,7 @@ from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import Transform
 from dopepp.geometry.rotation import matrix_to_quaternion
-from dopepp.inference.overlay import COLOURS
+from dopepp.inference.pose_result import COLOURS
 from dopepp.parts.mesh import face_areas
 from dopepp.parts.mesh.decimate import decimate
 from dopepp.parts.part import Part

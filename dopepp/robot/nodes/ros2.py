@@ -24,7 +24,7 @@ from typing import Any, Final, Generic, TypeVar
 import numpy as np
 
 from dopepp.core.errors import UserError
-from dopepp.inference.sources.message import info_topic
+from dopepp.inference.frames.ros import info_topic
 from dopepp.robot.nodes.messages import (
     DIAGNOSTICS,
     OVERLAY,

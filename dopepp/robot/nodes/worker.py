@@ -16,10 +16,9 @@ from dopepp.core.errors import UserError
 from dopepp.core.validation import Range, check
 from dopepp.geometry.camera_file import Camera
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.overlay import make_shape
-from dopepp.inference.results import PoseResult, spent_between
-from dopepp.inference.sources import Frame
-from dopepp.inference.sources.message import CameraInfo, info_of, is_rectified, picture_of
+from dopepp.inference.frames import CameraFrame
+from dopepp.inference.frames.ros import CameraInfo, decode_image, is_rectified
+from dopepp.inference.pose_result import PoseResult, make_shape, spent_between
 from dopepp.inference.tracker import PoseTracker
 
 PATIENCE: Final = 5
@@ -137,13 +136,13 @@ class Worker:
         None where that is not possible, which was said.
         """
         try:
-            image = picture_of(message)
+            image = decode_image(message)
         except Exception as error:  # whatever is wrong with a message that anybody sent
             fix = "let the driver send rgb8 or bgr8, or JPEG"
             self._trouble("picture", f"a picture of {topic}: {error!s:.300}; fix: {fix}")
             return None
         try:
-            lens = None if info is None else info_of(info)
+            lens = None if info is None else CameraInfo.from_message(info)
         except Exception as error:
             self._trouble("info", f"the camera_info beside {topic}: {error!s:.300}")
             return None
@@ -162,7 +161,7 @@ class Worker:
         try:
             camera = self._camera or lens.camera(f"camera_info of {topic}", is_rectified(topic))  # type: ignore[union-attr]
             cropped = self._camera is None and lens is not None and lens.roi is not None
-            frame = Frame(image, topic, self._number, stamp.seconds)
+            frame = CameraFrame(image, topic, self._number, stamp.seconds)
             result = self.result(frame, camera, cropped)
         except ValueError as error:  # a UserError, or fields of odd lengths
             self._trouble("camera", str(error))
@@ -171,7 +170,7 @@ class Worker:
         self._number += 1
         return Answer(stamp, frame_id, result)
 
-    def result(self, frame: Frame, camera: Camera, cropped: bool = False) -> PoseResult:
+    def result(self, frame: CameraFrame, camera: Camera, cropped: bool = False) -> PoseResult:
         """Return the poses on a picture; a :class:`UserError` where the camera cannot be its.
 
         Pictures that are ``cropped`` may have the principal point anywhere.

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.inference.results import PoseResult
+from dopepp.inference.pose_result import PoseResult
 from dopepp.recovery.detection import Detection
 from dopepp.robot.nodes.messages import MARKER_FACES, Speaker, diagnosis
 from dopepp.robot.nodes.worker import Answer, Stamp

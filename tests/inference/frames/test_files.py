@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from dopepp.core.errors import UserError
-from dopepp.inference.sources import open_sources
+from dopepp.inference.frames import open_sources
 
 
 def grey(level: int, size: tuple[int, int] = (32, 24)) -> np.ndarray:

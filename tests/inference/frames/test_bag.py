@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.inference.sources import open_sources
+from dopepp.inference.frames import open_sources
 
 pytest.importorskip("rosbags")
 from rosbags import rosbag1, rosbag2

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import RunError, UserError
-from dopepp.inference.sources.live import Live
+from dopepp.inference.frames.media import Live
 
 PERIOD = 1 / 30
 INFERENCE = 0.2

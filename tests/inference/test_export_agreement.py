@@ -13,7 +13,7 @@ import torch
 
 from dopepp.geometry.camera import camera_matrix, make_transform
 from dopepp.geometry.rotation import rotation_vector_to_matrix
-from dopepp.inference.agreement import compare
+from dopepp.inference.benchmark import compare_export
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.catalogue import pivconnector
 
@@ -45,7 +45,7 @@ class Answer:
 
 
 def compared(theirs, ours=None, maps_of=0.5):
-    return compare(Answer(theirs, maps_of), Answer(ours or [pose()]), [(PICTURE, K)] * 2)
+    return compare_export(Answer(theirs, maps_of), Answer(ours or [pose()]), [(PICTURE, K)] * 2)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_maps(value, is_exact):
 
 
 def test_maps_that_are_not_numbers_and_no_poses():
-    agreement = compare(Answer([], math.nan), Answer([]), [(PICTURE, K)])
+    agreement = compare_export(Answer([], math.nan), Answer([]), [(PICTURE, K)])
     assert agreement.maps == math.inf
     assert not agreement.is_exact
     assert "no pose found by both" in str(agreement)

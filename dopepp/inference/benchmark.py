@@ -1,0 +1,112 @@
+"""Measurements of estimators on images: time per frame, and agreement of an exported network."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import cycle, islice
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import CameraMatrix
+from dopepp.geometry.rotation import rotation_angle
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.picture import network_views
+from dopepp.inference.pose_result import STEPS
+
+WARM_UP: Final = 3
+"""Frames after the first that are not timed: memory is allocated, kernels are selected."""
+
+# Differences that float32 of another runtime may cause in maps, positions and rotations.
+MAX_MAPS: Final = 1e-4
+MAX_MM: Final = 0.1
+MAX_DEG: Final = 0.05
+
+Pictures = Sequence[tuple[Picture, CameraMatrix]]
+"""Images with their camera matrices."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Time per frame, milliseconds."""
+
+    first: float  # first frame after loading
+    frame: Float[np.ndarray, "frames"]  # each later frame, from image to poses
+    steps: dict[str, Float[np.ndarray, "frames"]]  # share of each step of the frames
+    num_found: float  # mean number of poses per frame
+
+
+def time_frames(estimator: PoseEstimator, pictures: Pictures, num_frames: int) -> Timing:
+    """Time an estimator that was just loaded on images in turn."""
+    rows, num_found = [], []
+    for picture, K in islice(cycle(pictures), 1 + WARM_UP + num_frames):
+        before, start = estimator.spent_ms.copy(), time.perf_counter()
+        num_found.append(len(estimator.predict(picture, K, cropped=True)))
+        frame = 1000 * (time.perf_counter() - start)
+        rows.append([frame, *(estimator.spent_ms[step] - before[step] for step in STEPS)])
+    frame, *steps = np.array(rows[1 + WARM_UP :]).T
+    by_step = dict(zip(STEPS, steps, strict=True))
+    return Timing(rows[0][0], frame, by_step, float(np.mean(num_found)))
+
+
+@dataclass(frozen=True)
+class ExportAgreement:
+    """Largest differences between an exported network and the original."""
+
+    maps: float  # of a map value, relative to the largest value if that exceeds 1
+    position_mm: float
+    rotation_deg: float
+    num_poses: int  # best-scored poses that both networks detect
+    num_single: int  # poses that only one of them detects
+    num_pictures: int
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether rounding in float32 explains all differences."""
+        close = self.maps <= MAX_MAPS and self.position_mm <= MAX_MM
+        return close and self.rotation_deg <= MAX_DEG and not self.num_single
+
+    def __str__(self) -> str:
+        poses = "no pose found by both"
+        if self.num_poses:
+            difference = f"{self.position_mm:.3g} mm and {self.rotation_deg:.3g}°"
+            poses = f"{self.num_poses} poses within {difference}"
+        single = f", {self.num_single} found by one alone" if self.num_single else ""
+        return f"maps within {self.maps:.1e}, {poses}{single}, on {self.num_pictures} pictures"
+
+
+def compare_export(
+    exported: PoseEstimator, original: PoseEstimator, pictures: Pictures
+) -> ExportAgreement:
+    """Compare maps, and the best-scored pose of each object on each image.
+
+    Other poses are left out: clutter may be equally likely at two poses, and rounding decides.
+    """
+    maps, differences, num_single = [0.0], [(0.0, 0.0)], 0
+    for picture, K in pictures:
+        for view in network_views(original.checkpoint, original.network.size_multiple, picture, K):
+            pairs = zip(exported.maps(view.pixels), original.maps(view.pixels), strict=True)
+            for values, expected in pairs:
+                scale = expected.abs().max().clamp(min=1.0)
+                largest = float((values - expected).abs().max() / scale)
+                maps.append(largest if math.isfinite(largest) else math.inf)
+        # Detections are sorted by score: the best of an object overwrites the others.
+        poses, expected_poses = (
+            {it.object: it.T_cam_obj for it in reversed(network.predict(picture, K, cropped=True))}
+            for network in (exported, original)
+        )
+        for name in poses.keys() & expected_poses.keys():
+            T, U = poses[name], expected_poses[name]
+            degrees = math.degrees(float(rotation_angle(T[:3, :3].T @ U[:3, :3])))
+            differences.append((1000 * float(np.linalg.norm(T[:3, 3] - U[:3, 3])), degrees))
+        num_single += len(poses.keys() ^ expected_poses.keys())
+    positions, rotations = zip(*differences, strict=True)
+    largest_pose = max(positions), max(rotations)
+    return ExportAgreement(
+        max(maps), *largest_pose, len(differences) - 1, num_single, len(pictures)
+    )

@@ -1,0 +1,89 @@
+"""Sources of camera frames: image files, folders, videos, cameras, streams and ROS recordings.
+
+To add a kind of source, derive a class from
+:class:`~dopepp.inference.frames.source.FrameSource` and return it from :func:`open_sources`.
+"""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from dopepp.core.errors import UserError
+from dopepp.inference.frames.media import (
+    VIDEOS,
+    Images,
+    Live,
+    Video,
+    is_url,
+    list_images,
+    sort_paths,
+)
+from dopepp.inference.frames.ros import BAGS, Bag
+from dopepp.inference.frames.source import CameraFrame, FrameSource
+
+__all__ = ["CameraFrame", "FrameSource", "SourceLike", "open_sources"]
+
+SourceLike = str | Path | int | FrameSource
+"""Path of an image, folder, video or ROS recording, glob pattern, camera number, device or URL, or
+an open source."""
+
+
+def open_sources(sources: Iterable[SourceLike], topic: str | None = None) -> list[FrameSource]:
+    """Open frame sources in the given order. Consecutive image files form one sequence.
+
+    Args:
+        sources: Paths, glob patterns, camera numbers, URLs and open sources.
+        topic: Image topic of a ROS recording that has several.
+
+    Raises:
+        UserError: A file, camera or topic does not exist, a folder has no images, a video or
+            recording is unreadable, or the extra for recordings is missing.
+    """
+    opened: list[FrameSource] = []
+    image_paths: list[Path] = []
+    for source in _resolve(sources):
+        images = list_images(source) if isinstance(source, Path) else None
+        if images is not None:
+            image_paths += images
+            continue
+        if image_paths:
+            opened.append(Images(image_paths))
+            image_paths = []
+        if isinstance(source, FrameSource):
+            opened.append(source)
+        elif isinstance(source, Path):
+            is_video = source.suffix.lower() in VIDEOS
+            opened.append(Video(source) if is_video else Bag(source, topic))
+        else:
+            opened.append(Live(source))
+    return [*opened, Images(image_paths)] if image_paths else opened
+
+
+def _resolve(sources: Iterable[SourceLike]) -> Iterator[SourceLike]:
+    """Yield paths as Path, cameras as int, devices and URLs as str; expand glob patterns."""
+    for source in sources:
+        if not isinstance(source, str | Path):
+            yield source
+        elif is_url(str(source)) or Path(source).is_char_device():  # e.g. /dev/v4l/by-id/…
+            yield str(source)
+        elif Path(source).exists():
+            yield Path(source)
+        elif str(source).isdecimal() and len(str(source)) < 4:
+            yield int(str(source))
+        else:
+            yield from _expand(str(source))
+
+
+def _expand(pattern: str) -> list[Path]:
+    """Return the paths that match a glob pattern."""
+    if paths := glob.glob(pattern, recursive=True):  # noqa: PTH207
+        return sort_paths(map(Path, paths))
+    problem = "which matches no file" if glob.has_magic(pattern) else "no such file"
+    raise UserError(
+        f"{pattern}, {problem}",
+        f"an image, a folder of images, a pattern like 'frames/*.png', a video or a recording "
+        f"({', '.join((*VIDEOS, *BAGS))}), a camera number, or an rtsp:// or http:// address",
+        "check the path",
+    )

@@ -1,0 +1,257 @@
+"""Frames of ROS: image and camera messages, live or recorded, and recordings (extra ``bags``).
+
+Recordings are ``.bag`` of ROS 1, and ``.mcap``, ``.db3`` and folders of ROS 2. Their messages are
+decoded by ROS's own definitions, never by those in the file. Messages are accessed by field names,
+so any library may have created them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import cv2
+import numpy as np
+
+from dopepp.core.errors import UserError, require
+from dopepp.drawing.pictures import MAX_PIXELS, Picture, whole_picture
+from dopepp.geometry.camera import crop_camera, resize_camera
+from dopepp.geometry.camera_file import Camera, Crop, camera_of_fields
+from dopepp.inference.frames.source import CameraFrame, FrameSource
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+
+RAW: Final = "sensor_msgs/msg/Image"
+COMPRESSED: Final = "sensor_msgs/msg/CompressedImage"
+CAMERA: Final = "sensor_msgs/msg/CameraInfo"
+
+BAGS: Final = (".bag", ".mcap", ".db3")
+"""Suffixes of recordings; ROS 2 also records into folders with a ``metadata.yaml``."""
+
+ENCODINGS: Final[dict[str, tuple[int, int | None]]] = {
+    "rgb8": (3, None),
+    "bgr8": (3, cv2.COLOR_BGR2RGB),
+    "8UC3": (3, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, cv2.COLOR_BGRA2RGB),
+    "mono8": (1, cv2.COLOR_GRAY2RGB),
+    "8UC1": (1, cv2.COLOR_GRAY2RGB),
+    "bayer_rggb8": (1, cv2.COLOR_BayerRGGB2RGB),
+    "bayer_bggr8": (1, cv2.COLOR_BayerBGGR2RGB),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2RGB),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
+    "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
+}
+"""Bytes per pixel, and OpenCV's conversion to RGB."""
+
+
+def decode_image(message: Any) -> Picture:
+    """Return the RGB image of a message.
+
+    Raises:
+        ValueError: The message contradicts itself, or its image is too large.
+    """
+    if hasattr(message, "format"):
+        picture = whole_picture(bytes(message.data), ("JPEG", "PNG"))
+        return np.ascontiguousarray(np.asarray(picture.convert("RGB")))
+    if message.encoding not in ENCODINGS:
+        raise ValueError(f"encoding {message.encoding!r:.40}, none of {', '.join(ENCODINGS)}")
+    pixel_bytes, code = ENCODINGS[message.encoding]
+    height, width, step = message.height, message.width, message.step
+    if not 0 < height * width <= MAX_PIXELS or step < pixel_bytes * width:
+        raise ValueError(f"{width}×{height} pixels in rows of {step} bytes")
+    data = np.frombuffer(message.data, np.uint8)
+    rows = data[: height * step].reshape(height, step)[:, : pixel_bytes * width]
+    pixels = np.ascontiguousarray(rows.reshape(height, width, pixel_bytes))
+    return pixels if code is None else np.asarray(cv2.cvtColor(pixels, code))
+
+
+def is_rectified(topic: str) -> bool:
+    """Return whether a topic's images are undistorted, so that K is the left part of P."""
+    return topic.removesuffix("/compressed").rpartition("/")[2].startswith("image_rect")
+
+
+def info_topic(topic: str) -> str:
+    """Return the ``camera_info`` topic of an image topic."""
+    return f"{topic.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """Content of a ``camera_info`` message."""
+
+    size: tuple[int, int]  # (width, height) of the sensor's image, which K and P belong to, pixels
+    model: str  # distortion model
+    D: Sequence[float]  # distortion coefficients
+    K: Sequence[float]  # camera matrix, 9 numbers row by row
+    P: Sequence[float]  # projection of undistorted images, 12 numbers row by row
+    binning: tuple[int, int] = (1, 1)  # sensor pixels per image pixel, across and down
+    roi: Crop | None = None  # region of the sensor that is read out; None is the whole sensor
+    frame_id: str = ""  # camera frame
+
+    @classmethod
+    def from_message(cls, message: Any) -> CameraInfo:
+        """Read a message of ROS 1 (fields D, K, P) or ROS 2 (d, k, p)."""
+        matrices = {}
+        for name in ("D", "K", "P"):
+            values = getattr(message, name if hasattr(message, name) else name.lower())
+            matrices[name] = [float(value) for value in values]
+        roi = message.roi
+        crop = (int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height))
+        return cls(
+            (int(message.width), int(message.height)),
+            message.distortion_model,
+            **matrices,
+            binning=(max(1, int(message.binning_x)), max(1, int(message.binning_y))),
+            roi=crop if crop[2] and crop[3] else None,
+            frame_id=message.header.frame_id,
+        )
+
+    def camera(self, source: str, rectified: bool) -> Camera:
+        """Return the camera of the images.
+
+        Args:
+            source: Origin, for messages.
+            rectified: Whether the images are undistorted, so that P describes them.
+
+        Raises:
+            UserError: The camera is not calibrated, or no pinhole camera.
+        """
+        if not any(self.K):
+            raise UserError(
+                f"{source} with a K of zeros",
+                "the camera_info of a calibrated camera",
+                "calibrate it (`dopepp calibrate camera`) and give the driver the file, or pass it "
+                "here: --camera camera.yaml",
+            )
+        fields: dict[str, object] = {"image_width": self.size[0], "image_height": self.size[1]}
+        if rectified:
+            fields["K"] = np.reshape(self.P, (3, 4))[:, :3].ravel().tolist()
+        else:
+            fields |= {"K": [*self.K], "D": [*self.D], "distortion_model": self.model}
+        sensor = camera_of_fields(fields, source)
+        if self.roi is None and self.binning == (1, 1):
+            return sensor
+        x, y, width, height = self.roi or (0, 0, *self.size)
+        across, down = self.binning
+        K = resize_camera(crop_camera(sensor.K, x, y), 1 / across, 1 / down)
+        return Camera((width // across, height // down), K, sensor.distortion, source)
+
+
+class Bag(FrameSource):
+    """Images of one topic of a ROS recording.
+
+    Args:
+        path: File or folder.
+        topic: Image topic; required if several topics have images.
+
+    Raises:
+        UserError: The extra is missing, the recording is unreadable or has no images, or several
+            topics have images and none is selected.
+    """
+
+    def __init__(self, path: Path, topic: str | None = None) -> None:
+        require("rosbags", f"{path}, a ROS recording,", "bags")
+        self._path, self.stem = path, path.stem
+        with self._opened() as reader:
+            topics = [link for link in reader.connections if link.msgtype in (RAW, COMPRESSED)]
+            self.topic = self._select(topics, topic)
+            seconds = (reader.end_time - reader.start_time) / 1e9
+        self.name = f"{path} {self.topic}"
+        self.count = sum(link.msgcount for link in topics if link.topic == self.topic)
+        self.rate = max(1.0, (self.count - 1) / seconds) if seconds > 0 else 1.0
+
+    def frames(self, stride: int = 1) -> Iterator[CameraFrame]:
+        """Yield every ``stride``-th image.
+
+        Raises:
+            UserError: An image is damaged.
+        """
+        for number, (seconds, message) in enumerate(self._messages([self.topic], RAW, COMPRESSED)):
+            if number % stride:
+                continue
+            try:
+                image = decode_image(message)
+            except Exception as error:  # anything, as anybody may have written the message
+                raise self._unreadable(f"picture {number} of {self.topic}: {error}") from error
+            yield CameraFrame(image, self.name, number, seconds)
+
+    @cached_property
+    def camera(self) -> Camera | None:
+        """Camera of the images' ``camera_info``; None if the recording has none."""
+        topic = info_topic(self.topic)
+        for _, message in self._messages([topic], CAMERA):
+            info = CameraInfo.from_message(message)
+            return info.camera(f"{self._path} {topic}", is_rectified(self.topic))
+        return None
+
+    def messages(self) -> Iterator[tuple[float, Any, Any | None]]:
+        """Yield the time, image message and latest ``camera_info`` message of each image.
+
+        Images before the first ``camera_info`` have the first one. None: the recording has none.
+        """
+        topic = info_topic(self.topic)
+        info = next((message for _, message in self._messages([topic], CAMERA)), None)
+        for seconds, message in self._messages([self.topic, topic], RAW, COMPRESSED, CAMERA):
+            if hasattr(message, "distortion_model"):
+                info = message
+            else:
+                yield seconds, message, info
+
+    def _messages(self, topics: Sequence[str], *kinds: str) -> Iterator[tuple[float, Any]]:
+        """Yield the time (seconds since 1970) and the content of messages."""
+        from rosbags.typesys import Stores, get_typestore
+
+        is_ros1 = self._path.suffix == ".bag"
+        store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+        decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+        with self._opened() as reader:
+            links = [
+                link
+                for link in reader.connections
+                if link.topic in topics and link.msgtype in kinds
+            ]
+            # Without any connection, a reader would yield the messages of all.
+            for link, recorded_ns, content in reader.messages(links) if links else ():
+                message: Any = decode(content, link.msgtype)
+                stamp = message.header.stamp
+                yield (stamp.sec + stamp.nanosec / 1e9) or recorded_ns / 1e9, message
+
+    @contextmanager
+    def _opened(self) -> Iterator[Any]:
+        """Open the recording, and turn the library's errors about damaged files into UserError."""
+        from rosbags import rosbag1, rosbag2
+
+        try:
+            kind = rosbag1.Reader if self._path.suffix == ".bag" else rosbag2.Reader
+            with kind(self._path) as reader:
+                yield reader
+        except (UserError, GeneratorExit):
+            raise
+        except Exception as error:  # of rosbags, SQLite, YAML, a decompressor …
+            raise self._unreadable(f"{error}") from error
+
+    def _select(self, links: Sequence[Connection], topic: str | None) -> str:
+        """Return the requested image topic, or the only one."""
+        names = sorted({link.topic for link in links})
+        if topic in names or (topic is None and len(names) == 1):
+            return topic or names[0]
+        problem = f"with pictures on {len(names)} topics" if names else "without pictures"
+        problem = problem if topic is None else f"without pictures on {topic}"
+        allowed = f"one of {', '.join(names)}" if names else f"a topic of {RAW} or {COMPRESSED}"
+        raise UserError(f"{self._path} {problem}", allowed, "name it: --topic /camera/image_raw")
+
+    def _unreadable(self, reason: str) -> UserError:
+        allowed = f"a ROS recording ({', '.join(BAGS)}, or a folder with metadata.yaml)"
+        return UserError(f"{self._path}: {reason:.300}", allowed, "copy or record it again")
+
+
+def is_bag_folder(path: Path) -> bool:
+    """Return whether a folder is a ROS 2 recording."""
+    return (path / "metadata.yaml").is_file()

@@ -1,0 +1,102 @@
+"""The interface of frame sources, and the camera that took the frames."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from dopepp.core.errors import UserError
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import CameraMatrix
+from dopepp.geometry.camera_file import Camera, Crop, read_camera
+from dopepp.geometry.camera_formats import Size
+from dopepp.inference.picture import Depth32, read_depth_image, undistorted_depth
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFrame:
+    """One frame of a source."""
+
+    image: Picture  # RGB, with the lens distortion of the camera
+    name: str  # image file, or name of a source of many frames
+    number: int  # index in the source, or the number in the name of every image file (BOP)
+    time: float | None = None  # seconds since a video's start or since 1970; None of an image
+
+
+class FrameSource(ABC):
+    """Sequence of camera frames.
+
+    Attributes:
+        name: Name for messages and output files, without passwords.
+        stem: File name without suffix for outputs about this source.
+        count: Number of frames; None if unknown.
+        rate: Frames per second; None for separate images.
+    """
+
+    name: str
+    stem: str
+    count: int | None = None
+    rate: float | None = None
+
+    @property
+    def camera(self) -> Camera | None:
+        """Camera that the source itself describes, if any."""
+        return None
+
+    @abstractmethod
+    def frames(self, stride: int = 1) -> Iterator[CameraFrame]:
+        """Yield every ``stride``-th frame, in order."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """Camera of a source whose images may have been resized or cropped after calibration."""
+
+    camera: Camera
+    K_size: Size | None = None  # (width, height) that K belongs to, if images were resized
+    crop: Crop | None = None  # region of the calibrated image, if images were cropped
+
+    def undistort(self, image: Picture) -> tuple[Picture, CameraMatrix]:
+        """Return the image without lens distortion, and its K.
+
+        Raises:
+            UserError: K belongs to an image of another size.
+        """
+        size = (image.shape[1], image.shape[0])
+        camera = self.camera.for_picture(size, self.K_size, self.crop)
+        return camera.undistorted(image), camera.K
+
+    def read_depth(self, path: Path, scale: float, K: CameraMatrix) -> Depth32:
+        """Read a depth image in metres and remove the lens distortion."""
+        metres, coefficients = read_depth_image(path, scale), self.camera.coefficients
+        return metres if coefficients is None else undistorted_depth(metres, K, coefficients)
+
+
+def given_camera(K: CameraMatrix | None, camera: Camera | Path | str | None) -> Camera | None:
+    """Return the camera that the user specified by K or by a camera (file), if any.
+
+    Raises:
+        UserError: Both are given, or the camera file cannot be read.
+    """
+    if K is not None and camera is not None:
+        raise UserError("--K and --camera", "one of the two", "leave one of them out")
+    if K is not None:
+        return Camera(None, K, (), "--K")
+    return read_camera(camera) if isinstance(camera, Path | str) else camera
+
+
+def choose_camera(
+    K: CameraMatrix | None, camera: Camera | Path | str | None, source: FrameSource
+) -> Camera:
+    """Return the camera that the user specified, or else the source's own.
+
+    Raises:
+        UserError: As for :func:`given_camera`, or neither has a camera.
+    """
+    chosen = given_camera(K, camera) or source.camera
+    if chosen is None:
+        fix = "pass --K fx fy cx cy (pixels of this image) or --camera FILE"
+        raise UserError(f"neither --K nor --camera for {source.name}", "one of the two", fix)
+    return chosen

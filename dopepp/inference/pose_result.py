@@ -1,0 +1,262 @@
+"""PoseResult: the detections on one frame, which can be drawn, saved and exported.
+
+All poses are in the camera frame (:data:`FRAME`), which every output states. Drawn silhouettes are
+those of the part's mesh: at a right pose they end where the part ends, which a cuboid cannot show.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import cv2
+import numpy as np
+from jaxtyping import Int
+
+from dopepp.core.errors import UserError
+from dopepp.core.files import PICTURES, check_target, write_picture
+from dopepp.drawing.overlay import (
+    MIN_WIDTH_PX,
+    YELLOW,
+    Colour,
+    draw_line,
+    draw_tags,
+    draw_wireframe,
+    enlarge,
+)
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import (
+    CameraMatrix,
+    Transform,
+    crop_camera,
+    project,
+    resize_camera,
+    resize_points,
+    transform,
+)
+from dopepp.geometry.rotation import matrix_to_quaternion
+from dopepp.inference.refinement.outline import OutlineMesh, filled_mask, make_outline_mesh, posed
+from dopepp.parts.part import Part
+from dopepp.recovery.detection import Detection
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+STEPS: Final = ("pre", "network", "decode", "refine")
+"""Steps of a prediction: undistorting and resizing, network, poses from maps, refinement."""
+
+FRAME: Final = "camera, OpenCV: x right, y down, z forward; metres"
+"""Frame of all poses: ``T_cam_obj`` maps from the mesh's frame to this frame."""
+
+COLOURS: Final[tuple[Colour, ...]] = (
+    YELLOW,
+    (255, 120, 200),
+    (90, 230, 240),
+    (255, 150, 50),
+    (170, 140, 255),
+    (170, 230, 80),
+)
+"""Colours of the instances on an image, in turn."""
+
+AXES: Final[tuple[Colour, ...]] = ((240, 50, 50), (50, 200, 50), (70, 110, 255))
+"""Colours of the object's x, y and z axis."""
+
+AXIS: Final = 0.35  # length of a drawn axis, diameters
+LINE: Final = 1 / 640  # width of a line, share of the image width
+
+FINEST: Final = 1 / 60
+"""Widest line, share of the instance's extent: a small part on a large image stays visible."""
+
+COLUMNS: Final = ("image", "number", "time", "identity", "object", "score", "frame")
+COLUMNS_POSE: Final = ("x", "y", "z", "qw", "qx", "qy", "qz")
+"""Columns of :meth:`PoseResult.to_dataframe`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """Geometry of a part for drawing."""
+
+    diameter: float  # metres
+    mesh: OutlineMesh | None  # None: only the cuboid can be drawn
+
+
+def make_shape(part: Part) -> Shape:
+    """Prepare a part for drawing."""
+    mesh = part.mesh
+    outline = None if mesh is None else make_outline_mesh(mesh.vertices, mesh.faces)
+    return Shape(part.diameter, outline)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseResult:
+    """The detections on one frame."""
+
+    image: Picture = field(repr=False)  # RGB, without lens distortion: keypoints and K refer to it
+    K: CameraMatrix  # camera matrix, pixels
+    detections: Sequence[Detection]  # best score first; from a tracker, sorted by identity
+    speed: Mapping[str, float]  # milliseconds of each of STEPS
+    name: str  # image file, or source
+    number: int = 0  # index in the source, from 0
+    time: float | None = None  # seconds since a video's start, or since 1970; None of an image
+    identities: Sequence[int] | None = None  # of the detections, if a tracker follows them
+    shapes: Mapping[str, Shape] = field(default_factory=dict, repr=False)  # by part name
+
+    def plot(self) -> Picture:
+        """Return the image with every part's silhouette, cuboid, axes, name and score.
+
+        An image below 640 pixels in width is enlarged by an integer factor.
+        """
+        labels = [
+            f"{detection.object}{'' if identity is None else f' #{identity}'} {detection.score:.2f}"
+            for detection, identity in self._identified()
+        ]
+        return draw_poses(self.image, self.K, self.detections, labels, self.shapes)
+
+    def save(self, path: Path | str) -> None:
+        """Write :meth:`plot` as PNG or JPEG, according to the suffix.
+
+        Raises:
+            UserError: The suffix is another one, or the file cannot be written.
+        """
+        check_target(Path(path), PICTURES)
+        write_picture(Path(path), self.plot())
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return each detection as plain values, with the name of its image and its frame."""
+        shared: dict[str, Any] = {"image": self.name, "number": self.number}
+        if self.time is not None:
+            shared["time"] = self.time
+        return [
+            {**shared, **({} if identity is None else {"identity": identity}), **record(detection)}
+            for detection, identity in self._identified()
+        ]
+
+    def to_json(self) -> str:
+        """Return image name, K, speed and all detections as one line of JSON."""
+        shared = {"image": self.name, "number": self.number, "time": self.time, "frame": FRAME}
+        detections = [
+            {key: value for key, value in row.items() if key not in shared}
+            for row in self.records()
+        ]
+        speed = {step: round(ms, 3) for step, ms in self.speed.items()}
+        content = {**shared, "K": self.K.tolist(), "speed_ms": speed, "detections": detections}
+        return json.dumps(content, ensure_ascii=False, allow_nan=False)
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """Return a table with one row per detection: position (metres), quaternion (w, x, y, z).
+
+        Raises:
+            UserError: pandas is not installed.
+        """
+        if find_spec("pandas") is None:
+            problem, fix = "to_dataframe() without the package pandas", "pip install pandas"
+            raise UserError(problem, "an installation with pandas", f"{fix}, or use to_json()")
+        import pandas as pd
+
+        rows = []
+        for row, detection in zip(self.records(), self.detections, strict=True):
+            T = detection.T_cam_obj
+            pose = [*T[:3, 3].tolist(), *matrix_to_quaternion(T[:3, :3]).tolist()]
+            rows.append({**row, **dict(zip(COLUMNS_POSE, pose, strict=True))})
+        return pd.DataFrame(rows, columns=[*COLUMNS, *COLUMNS_POSE, "reprojection_error_px"])
+
+    def _identified(self) -> list[tuple[Detection, int | None]]:
+        identities: Sequence[int | None] = self.identities or [None] * len(self.detections)
+        return list(zip(self.detections, identities, strict=True))
+
+
+def record(detection: Detection) -> dict[str, Any]:
+    """Return a detection as plain values for JSON, with None for NaN and infinity."""
+    return {
+        "object": detection.object,
+        "score": detection.score,
+        "frame": FRAME,
+        "T_cam_obj": detection.T_cam_obj.tolist(),
+        "covariance": _finite(detection.covariance.tolist()),
+        "keypoints": _finite(detection.keypoints.tolist()),
+        "reprojection_error_px": _finite(float(detection.reprojection_error_px)),
+        "kept": detection.kept or None,
+    }
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_finite(element) for element in value]
+    return value if math.isfinite(value) else None
+
+
+def format_speed(speed: Mapping[str, float]) -> str:
+    """Format the milliseconds of each step in one line."""
+    return ", ".join(f"{step} {speed.get(step, 0.0):.1f}" for step in STEPS) + " ms"
+
+
+def spent_between(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str, float]:
+    """Return the milliseconds of each step between two readings of the estimator's clock."""
+    return {step: after[step] - before[step] for step in STEPS}
+
+
+def draw_poses(
+    image: Picture,
+    K: CameraMatrix,
+    detections: Sequence[Detection],
+    labels: Sequence[str],
+    shapes: Mapping[str, Shape],
+) -> Picture:
+    """Return a copy of the image with poses drawn on it, enlarged if it is narrow."""
+    factor = max(1, -(-MIN_WIDTH_PX // image.shape[1]))
+    canvas, K = enlarge(image, factor), resize_camera(K, factor, factor)
+    tags = []
+    for number, (detection, label) in enumerate(zip(detections, labels, strict=True)):
+        colour = COLOURS[number % len(COLOURS)]
+        keypoints = resize_points(detection.keypoints, factor, factor)
+        finite = keypoints[np.isfinite(keypoints).all(axis=1)]
+        extent = float(np.ptp(finite, axis=0).max()) if len(finite) else 0.0
+        width = max(1, round(min(LINE * canvas.shape[1], math.ceil(FINEST * extent))))
+        canvas = draw_wireframe(canvas, keypoints, colour, max(1, width // 2))
+        if (shape := shapes.get(detection.object)) is not None:
+            for contour in silhouette_contours(shape, detection.T_cam_obj, K, canvas):
+                cv2.polylines(canvas, [contour], True, colour, width + 1, cv2.LINE_AA)
+            _draw_axes(canvas, detection.T_cam_obj, K, shape.diameter, width + 1)
+        left, top = finite.min(axis=0) if len(finite) else (0.0, 0.0)
+        tags.append((label, (float(left), float(top)), colour))
+    draw_tags(canvas, tags)
+    return canvas
+
+
+def silhouette_contours(
+    shape: Shape, T_cam_obj: Transform, K: CameraMatrix, image: Picture
+) -> list[Int[np.ndarray, "points 1 2"]]:
+    """Return the closed contours of a posed mesh on an image, pixels.
+
+    There are none without a mesh, or if some of the mesh is not in front of the camera.
+    """
+    at = None if shape.mesh is None else posed(shape.mesh, T_cam_obj, K)
+    if at is None or shape.mesh is None:
+        return []
+    # One pixel beyond the image, so that a part that leaves it has no line along the border.
+    limit = np.array(image.shape[1::-1]) + 2
+    low = np.maximum(np.floor(at.pixels.min(axis=0)) - 1, -2).astype(int)
+    high = np.minimum(np.ceil(at.pixels.max(axis=0)) + 2, limit)
+    width, height = (high - low).astype(int)
+    if min(width, height) <= 0:
+        return []
+    at = posed(shape.mesh, T_cam_obj, crop_camera(K, *low))
+    assert at is not None
+    mask = filled_mask(shape.mesh, at, (int(width), int(height)))
+    contours, _ = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    return [np.asarray(contour + low.reshape(1, 1, 2)) for contour in contours]
+
+
+def _draw_axes(
+    canvas: Picture, T_cam_obj: Transform, K: CameraMatrix, diameter: float, width: int
+) -> None:
+    """Draw the object's axes in place, the farthest first."""
+    ends = transform(T_cam_obj, np.vstack([np.zeros(3), AXIS * diameter * np.eye(3)]))
+    pixels = project(ends, K)
+    for axis in np.argsort(-ends[1:, 2]).tolist():
+        draw_line(canvas, pixels[0], pixels[1 + axis], AXES[axis], width)
