@@ -216,9 +216,9 @@ def network_views(
             raise UserError(f"roi {tuple(roi)}", allowed, "cut it to the image")
         image = np.ascontiguousarray(image[y : y + rows, x : x + columns])
         K = crop_camera(K, x, y)
+    boxes = letterboxes(checkpoint, K, image, distances)
     return [
-        NetworkView(letterboxed(image, box, multiple), box, box.camera(K), (x, y))
-        for box in letterboxes(checkpoint, K, image, distances)
+        NetworkView(letterboxed(image, box, multiple), box, box.camera(K), (x, y)) for box in boxes
     ]
 
 

@@ -155,7 +155,9 @@ def _accuracy(
     return {report.name: report.mean.add_01d or 0.0 for report in measured.reports}
 
 
-def _compared(exported: PoseEstimator, original: PoseEstimator, source: SampleSource) -> ExportAgreement:
+def _compared(
+    exported: PoseEstimator, original: PoseEstimator, source: SampleSource
+) -> ExportAgreement:
     samples: Sequence[Sample] = [source.sample(index) for index in range(NUM_CHECKED)]
     return compare_export(exported, original, [(sample.image, sample.K) for sample in samples])
 
