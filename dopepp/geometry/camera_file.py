@@ -1,8 +1,8 @@
-"""Camera files: what a calibration says of a lens, in whichever format its tool wrote it.
+"""Camera files: the calibration of a lens, in the format of the tool that wrote it.
 
-Read are ROS ``camera_info`` (as calibration writes it, or as a message is echoed), OpenCV's
-FileStorage (YAML, XML, JSON), BOP's ``camera.json``, NDDS's ``_camera_settings.json``, COLMAP's
-``cameras.txt`` and plain text with 3×3 or four numbers; see :mod:`dopepp.geometry.camera_formats`.
+Formats are ROS ``camera_info`` (from a calibration or an echoed message), OpenCV's FileStorage
+(YAML, XML, JSON), BOP's ``camera.json``, NDDS's ``_camera_settings.json``, COLMAP's ``cameras.txt``
+and plain text with 3×3 or four numbers; see :mod:`dopepp.geometry.camera_formats`.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ Crop = tuple[int, int, int, int]
 """x and y of the upper left pixel, width and height, pixels."""
 
 MAX_BYTES: Final = 250_000
-"""A calibration with all the points it was made of takes less; YAML of this size takes 10 s."""
+"""Larger than a calibration with all its points; YAML of this size takes 10 s."""
 
 COEFFICIENTS: Final = (0, 4, 5, 8, 12, 14)
-"""How many OpenCV's lens models have."""
+"""Numbers of coefficients of OpenCV's lens models."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +49,9 @@ class Camera:
     """A calibrated camera.
 
     Attributes:
-        size: (width, height) of the pictures that K belongs to, pixels; None if unknown.
-        distortion: Coefficients in OpenCV's order (k1, k2, p1, p2, k3, …); () without any.
+        size: (width, height) of the calibrated images, pixels; None if unknown.
+        K: Camera matrix, pixels.
+        distortion: Coefficients in OpenCV's order (k1, k2, p1, p2, k3, …), or ().
         source: Origin, for messages.
     """
 
@@ -61,13 +62,13 @@ class Camera:
 
     @property
     def coefficients(self) -> Float[np.ndarray, "coefficients"] | None:
-        """The distortion as OpenCV and ``PoseEstimator.predict`` take it, None where is none."""
+        """Distortion for OpenCV and ``PoseEstimator.predict``; None without distortion."""
         return np.array(self.distortion) if self.distortion else None
 
     def undistorted(
         self, picture: UInt8[np.ndarray, "height width 3"]
     ) -> UInt8[np.ndarray, "height width 3"]:
-        """Return a picture of this camera as a lens without distortion takes it, K the same."""
+        """Return a picture of this camera without distortion, with the same K."""
         if self.coefficients is None:
             return picture
         return np.asarray(cv2.undistort(picture, self.K, self.coefficients))
@@ -75,15 +76,16 @@ class Camera:
     def for_picture(
         self, size: Size, K_size: Size | None = None, crop: Crop | None = None
     ) -> Camera:
-        """Return the camera of a picture, its K checked against the picture's size.
+        """Return the camera of a picture, after checking K against the picture's size.
 
         Args:
             size: (width, height) of the picture.
-            K_size: Size that K belongs to, for a picture that was resized.
-            crop: Part of the calibrated picture, for a picture that was cut out.
+            K_size: Size of the calibrated picture, if this picture was resized.
+            crop: Region of the calibrated picture, if this picture was cropped.
 
         Raises:
-            UserError: K belongs to another size and neither is stated, or what is stated is wrong.
+            UserError: K belongs to another size and neither option explains it, or an option is
+                invalid.
         """
         if K_size is not None and crop is not None:
             problem, fix = "--K-size with --crop", "crop first, and pass the K of the crop's size"
@@ -106,7 +108,7 @@ class Camera:
             problem = (
                 f"{self.source}, whose K is of {_by(calibrated)}, for a picture of {_by(size)}"
             )
-            allowed = "K of the picture's size, or how the picture was made of one of the other"
+            allowed = "K of the picture's size, or an option that states how the picture was made"
             raise UserError(problem, allowed, _fix(size, calibrated))
         else:
             K = resize_camera(self.K, size[0] / calibrated[0], size[1] / calibrated[1])
@@ -114,19 +116,20 @@ class Camera:
 
 
 def read_camera(path: Path | str) -> Camera:
-    """Read a camera file; see the module for the formats.
+    """Read a camera file in one of the formats of this module.
 
-    COLMAP, whose pixel (0.5, 0.5) is the centre of the top-left one, is shifted by half a pixel.
+    K of COLMAP, which puts the centre of the top-left pixel at (0.5, 0.5), is shifted by half a
+    pixel.
 
     Raises:
-        UserError: The file is missing, over 250 kB, in none of the formats, of several cameras,
-            without a camera matrix, of a fisheye lens, or has a field that cannot be right.
+        UserError: The file is missing, over 250 kB, in an unknown format, of several cameras,
+            without a camera matrix, of a fisheye lens, or has an invalid field.
     """
     return _camera(parse_calibration(_text(Path(path)), str(path)), str(path))
 
 
 def camera_of_fields(fields: Mapping[str, object], source: str) -> Camera:
-    """Like :func:`read_camera`, for named fields, as of a ROS message."""
+    """Like :func:`read_camera`, for named fields, e.g. of a ROS message."""
     return _camera(calibration_of_fields(fields, source), source)
 
 
@@ -135,7 +138,7 @@ def _camera(calibration: Calibration, source: str) -> Camera:
     K = pinhole_matrix(calibration.K, source)
     if min(K[0, 0], K[1, 1]) <= 0:
         problem = f"{source}: fx={K[0, 0]:g}, fy={K[1, 1]:g}"
-        fix = "calibrate the camera: this one was not"
+        fix = "calibrate the camera"
         raise UserError(problem, "focal lengths above 0 pixels", fix)
     if len(calibration.distortion) not in COEFFICIENTS:
         problem = f"{source}: {len(calibration.distortion)} distortion coefficients"
@@ -146,32 +149,26 @@ def _camera(calibration: Calibration, source: str) -> Camera:
 
 
 def _text(path: Path) -> str:
-    """Return a file's text, within bounds."""
-    allowed = f"a camera file of at most {MAX_BYTES / 1e3:g} kB: {FORMATS}"
+    """Return the text of a file of at most ``MAX_BYTES``."""
     try:
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
-    except (OSError, ValueError) as error:  # ValueError: a null character in its name
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(f"camera file {path!s:.200}: {reason}", allowed, "check it") from error
-    if len(content) > MAX_BYTES:
-        size = f"more than {MAX_BYTES / 1e3:g} kB"
-        raise UserError(f"camera file {path} of {size}", allowed, "pass the camera's file")
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        problem = f"camera file {path}: byte {error.start} is no UTF-8"
+        if len(content) > MAX_BYTES:
+            raise ValueError(f"more than {MAX_BYTES / 1e3:g} kB")
+        return content.decode("utf-8-sig").strip()
+    except (OSError, ValueError) as error:  # ValueError also for a null character in its name
+        problem = f"camera file {path!s:.200}: {getattr(error, 'strerror', None) or error}"
+        allowed = f"a UTF-8 camera file of at most {MAX_BYTES / 1e3:g} kB: {FORMATS}"
         raise UserError(problem, allowed, "pass the camera's file") from error
-    return text.strip()
 
 
 def _cut(K: CameraMatrix, calibrated: Size | None, size: Size, crop: Crop) -> CameraMatrix:
-    """Return the K of what was cut out of a picture."""
+    """Return K of a crop of the calibrated picture."""
     x, y, width, height = crop
     stated = "--crop " + " ".join(map(str, crop))
     if (width, height) != size:
         problem = f"{stated} with a picture of {_by(size)}"
-        raise UserError(problem, "the picture's width and height behind x and y", "correct it")
+        raise UserError(problem, "x y followed by the picture's width and height", "correct it")
     beyond = calibrated is not None and (x + width > calibrated[0] or y + height > calibrated[1])
     if min(x, y) < 0 or beyond:
         inside = f"inside the calibrated picture{f' of {_by(calibrated)}' if calibrated else ''}"
@@ -180,20 +177,21 @@ def _cut(K: CameraMatrix, calibrated: Size | None, size: Size, crop: Crop) -> Ca
 
 
 def _one_shape(a: Size, b: Size) -> bool:
-    """Return whether one size is the other resized, but for rounding to whole pixels."""
+    """Return whether two sizes have one aspect ratio, up to rounding to whole pixels."""
     return min(abs(a[0] - a[1] * b[0] / b[1]), abs(a[1] - a[0] * b[1] / b[0])) <= 1
 
 
 def _fix(size: Size, calibrated: Size) -> str:
-    """Say what to do where a picture's size is not the one that K belongs to."""
+    """Return advice for a picture whose size differs from the calibrated size."""
     fits = size[0] <= calibrated[0] and size[1] <= calibrated[1]
-    cut = f"--crop X Y {size[0]} {size[1]} if it was cut out" if fits else ""
+    cut = f"--crop X Y {size[0]} {size[1]} if it was cropped" if fits else ""
     if _one_shape(size, calibrated):
-        return f"--K-size {calibrated[0]} {calibrated[1]} if the picture was resized" + (
-            cut and f", {cut}"
-        )
+        resized = f"--K-size {calibrated[0]} {calibrated[1]} if the picture was resized"
+        return f"{resized}, {cut}" if cut else resized
     if size == calibrated[::-1]:
-        return "turn the picture back, or calibrate the turned one (EXIF orientation is applied)"
+        return (
+            "rotate the picture back, or calibrate rotated pictures (EXIF orientation is applied)"
+        )
     return cut or f"calibrate the camera at {_by(size)}"
 
 

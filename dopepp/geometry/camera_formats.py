@@ -1,11 +1,11 @@
-"""Formats of camera files: ROS, OpenCV, BOP and NDDS of named fields, COLMAP and K of numbers.
+"""Parsers of camera files: named fields (ROS, OpenCV, BOP, NDDS), COLMAP and plain numbers.
 
-The content tells the format, not the suffix. Every function returns a :class:`Calibration`, whose
-lens the caller checks. A file may come from anybody, so no file is given to ``cv2.FileStorage``,
+The content determines the format, not the suffix. Every function returns a :class:`Calibration`,
+whose lens the caller checks. Files may come from anybody, so none is passed to ``cv2.FileStorage``,
 which is C++.
 
-To read a further format of named fields, add its names to :class:`_Fields`; for any other format,
-add a function and call it in :func:`parse_calibration`.
+To support another format of named fields, add its names to :func:`calibration_of_fields`; for any
+other format, add a function and call it in :func:`parse_calibration`.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ _COLMAP_MODELS: Final = {
     "OPENCV": 8,
     "FULL_OPENCV": 12,
 }
-"""COLMAP's models that are OpenCV's, with their numbers of parameters."""
+"""Number of parameters of COLMAP's models that OpenCV has as well."""
 
 
 class Calibration(NamedTuple):
-    """A picture's (width, height), where the file states it; K; coefficients in OpenCV's order."""
+    """Image size (None if unknown), K, and distortion coefficients in OpenCV's order."""
 
     size: Size | None
     K: CameraMatrix
@@ -54,14 +54,14 @@ class Calibration(NamedTuple):
 def parse_calibration(text: str, source: str) -> Calibration:
     """Parse the text of a camera file.
 
-    In a text of numbers, ``#`` begins a comment, and brackets and commas do not matter.
+    Among plain numbers, ``#`` starts a comment, and brackets and commas are ignored.
 
     Args:
         text: Content of the file.
         source: Path of the file, for messages.
 
     Raises:
-        UserError: The text has none of the formats, or describes several cameras or none.
+        UserError: The format is unknown, or the text does not describe exactly one camera.
     """
     lines = [line.partition("#")[0].split() for line in text.splitlines()]
     lines = [words for words in lines if words]
@@ -75,8 +75,7 @@ def parse_calibration(text: str, source: str) -> Calibration:
     elif text.startswith("{"):
         content = parse_json(text, source)
     else:
-        # OpenCV begins with a line of its own, and its matrices have a tag; behind a message that
-        # was echoed stands a line.
+        # OpenCV writes a first line and tags of its own; an echoed message ends in a line.
         text = re.sub(r"\A%YAML.*\n", "", text).removesuffix("---")
         content = parse_yaml(re.sub(r"!!opencv-(nd-)?matrix\b", "", text), source)
     if not isinstance(content, Mapping):
@@ -85,7 +84,7 @@ def parse_calibration(text: str, source: str) -> Calibration:
 
 
 def _colmap(lines: Sequence[Sequence[str]], source: str) -> Calibration:
-    """Parse ``cameras.txt``: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[], of one camera."""
+    """Parse the line CAMERA_ID MODEL WIDTH HEIGHT PARAMS[] of ``cameras.txt``."""
     if len(lines) > 1:
         numbers = ", ".join(words[0][:20] for words in lines[:10]) + ", …" * (len(lines) > 10)
         fix = "keep the line of the camera that took the picture"
@@ -109,7 +108,7 @@ def _colmap(lines: Sequence[Sequence[str]], source: str) -> Calibration:
 
 
 def _xml(text: str, source: str) -> dict[object, object]:
-    """Return the fields of OpenCV's XML; without a document type it cannot expand anything."""
+    """Return the fields of OpenCV's XML; without a document type, entities cannot expand."""
     allowed = "OpenCV's XML (opencv_storage), without DOCTYPE"
     if "<!DOCTYPE" in text:
         raise UserError(f"{source} with DOCTYPE", allowed, "write the file again")
@@ -129,15 +128,15 @@ def _words(element: ElementTree.Element) -> object:
 
 
 def calibration_of_fields(content: Mapping[Any, object], source: str) -> Calibration:
-    """Return the calibration in named fields, as of a file or a ROS message.
+    """Return the calibration in the named fields of a file or a ROS message.
 
     Args:
-        content: Fields by name; capitals and underscores in the names do not matter.
+        content: Fields by name, regardless of capitals and underscores.
         source: Origin of the fields, for messages.
 
     Raises:
-        UserError: There is no camera matrix, a lens that is not OpenCV's pinhole model, or a field
-            that holds no numbers.
+        UserError: The camera matrix is missing, the lens is not OpenCV's pinhole model, or a field
+            does not hold numbers.
     """
     fields = _Fields(content, source)
     array = fields.find("camera_matrix", "K", "intrinsic_matrix", "cam_K")
@@ -153,7 +152,6 @@ def calibration_of_fields(content: Mapping[Any, object], source: str) -> Calibra
         "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distortion", "D"
     )
     distortion = () if lens is None else tuple(_numbers(*lens))
-    # OpenCV's pinhole model describes no other lens.
     fisheye, model = fields.find("fisheye_model"), fields.find("distortion_model")
     if fisheye is not None and fisheye[1] not in (0, "0"):
         raise UserError(f"{source}: fisheye_model=1", "no fisheye lens", _UNDISTORT)
@@ -166,7 +164,7 @@ def calibration_of_fields(content: Mapping[Any, object], source: str) -> Calibra
 
 
 class _Fields:
-    """Named fields of a file, each with its full name for messages."""
+    """Named fields of a file, with their full names for messages."""
 
     def __init__(self, content: Mapping[Any, object], source: str) -> None:
         self.source = source
@@ -187,10 +185,9 @@ class _Fields:
         return ", ".join(self._names[:10]) or "no field"
 
     def find(self, *names: str) -> tuple[str, object] | None:
-        """Return the full name and the value of the first of these fields that exists."""
-        return next(
-            (self._fields[_key(name)] for name in names if _key(name) in self._fields), None
-        )
+        """Return the full name and the value of the first existing field."""
+        keys = [_key(name) for name in names if _key(name) in self._fields]
+        return self._fields[keys[0]] if keys else None
 
 
 def _key(name: str) -> str:
@@ -214,7 +211,7 @@ def _size(fields: _Fields) -> Size | None:
 
 
 def _numbers(name: str, value: object) -> list[float]:
-    """Return an array's numbers: a list, a list of rows, or a mapping with ``data``."""
+    """Return the numbers of a list, a list of rows, or a mapping with ``data``."""
     if isinstance(value, Mapping):
         numbers = _numbers(f"{name}.data", value.get("data"))
         rows, columns = value.get("rows"), value.get("cols")
@@ -229,7 +226,7 @@ def _numbers(name: str, value: object) -> list[float]:
 
 
 def _number(name: str, value: Any) -> float:
-    """Return a number, which XML has as text."""
+    """Return a number, or the number in a text."""
     numbers = None if isinstance(value, bool) else _floats([value])
     if numbers is None:
         problem = f"{name}={shown(value, 80)}"
@@ -238,7 +235,7 @@ def _number(name: str, value: Any) -> float:
 
 
 def _floats(values: Sequence[Any]) -> list[float] | None:
-    """Return finite numbers, or texts of them, as floats; None if a value is anything else."""
+    """Convert numbers or texts to finite floats; None if that is impossible."""
     try:
         numbers = [float(value) for value in values]
     except (TypeError, ValueError, OverflowError):
@@ -252,11 +249,10 @@ def _side(name: str, value: object) -> int:
 
 
 def _matrix(values: Sequence[float], name: str) -> CameraMatrix:
-    """Return a camera matrix of nine numbers, row by row, or of fx, fy, cx, cy."""
+    """Return the camera matrix of nine numbers, row by row, or of fx, fy, cx, cy."""
     if len(values) == 9:
         return pinhole_matrix([values[:3], values[3:6], values[6:]], name)  # type: ignore[arg-type]
     if len(values) != 4:
         allowed = "nine (K, row by row) or four (fx fy cx cy)"
         raise UserError(f"{name}: {len(values)} numbers", allowed, "write K as 3×3 numbers")
-    fx, fy, cx, cy = values
-    return camera_matrix(fx, fy, cx, cy)
+    return camera_matrix(*values)

@@ -1,6 +1,6 @@
 """The nine keypoints of an object: the corners of its bounding cuboid and its centre.
 
-Corner order is NDDS's, the one order used everywhere: maps, readers, drawings and files.
+The corners are in NDDS order in all maps, readers, drawings and files.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ EDGES: Final[tuple[tuple[int, int], ...]] = tuple(
 def cuboid_keypoints(lower: Vector, upper: Vector) -> Cuboid:
     """Return the eight corners and the centre of an axis-aligned box, metres, object frame.
 
-    A ``ValueError``: a bound is not finite, or ``lower`` exceeds ``upper``.
+    Raises:
+        ValueError: A bound is not finite, or ``lower`` exceeds ``upper``.
     """
     lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
     if not (np.isfinite(lower).all() and np.isfinite(upper).all() and (lower <= upper).all()):

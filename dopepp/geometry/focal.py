@@ -1,7 +1,8 @@
-"""How long a lens's focal length is, told by the perspective of a part whose size is known.
+"""Estimation of a focal length from the perspective of a part of known size.
 
-A lens that is twice as long shows the same part twice as far away in the same size: what differs is
-how much larger its near end is than its far one. A thin part that faces the camera has neither.
+A lens of twice the focal length shows the part at twice the distance in the same size, but with
+less difference between its near and far ends. A thin part that faces the camera has no such
+difference.
 """
 
 from __future__ import annotations
@@ -16,21 +17,21 @@ from scipy.optimize import OptimizeResult, least_squares
 from dopepp.geometry.camera import CameraMatrix, Transform, moved, project_keypoints
 from dopepp.geometry.cuboid import Cuboid
 
-MIN_POINTS: Final = 8  # With fewer of the nine keypoints, one that is off looks like perspective
+MIN_POINTS: Final = 8  # With fewer keypoints, an outlier resembles perspective
 MILD: Final = 0.02
-"""Error of a keypoint, share of the part's extent, from which it counts less than quadratically."""
+"""Error of a keypoint, as a share of the part's extent, above which the loss is not quadratic."""
 
 LENGTHS: Final = (0.5, 1.0, 2.0)
-"""Factors at which the search begins; it ends at half and twice of these."""
+"""Initial factors; each search covers half to twice the factor."""
 
 
 class Focal(NamedTuple):
-    """What keypoints say of a camera matrix.
+    """Correction of the focal lengths of a camera matrix.
 
     Attributes:
-        factor: By which its focal lengths are to be multiplied.
+        factor: Factor on the focal lengths.
         deviation: Standard deviation of the factor's logarithm.
-        gain: How many times as well the keypoints fit then: the ratio of the squared errors.
+        gain: Ratio of the squared keypoint errors before and after the correction.
     """
 
     factor: float
@@ -41,9 +42,16 @@ class Focal(NamedTuple):
 def focal_factor(
     cuboid: Cuboid, keypoints: Float[np.ndarray, "9 2"], T_cam_obj: Transform, K: CameraMatrix
 ) -> Focal | None:
-    """Fit a focal length to an object's keypoints; None where too few of them are known.
+    """Fit a focal length to the keypoints of an object.
 
-    ``keypoints`` are pixels, NaN where unknown; the pose is the one found with K, metres.
+    Args:
+        cuboid: Keypoints of the object, metres.
+        keypoints: Their detected pixels; NaN if unknown.
+        T_cam_obj: Pose estimated with K, metres.
+        K: Camera matrix, pixels.
+
+    Returns:
+        The correction, or None with fewer than eight keypoints.
     """
     is_known = np.isfinite(keypoints).all(axis=1)
     if is_known.sum() < MIN_POINTS:
@@ -54,7 +62,7 @@ def focal_factor(
         step, lens, start = values[:6].copy(), K.copy(), T_cam_obj.copy()
         factor = first * math.exp(values[6]) if len(values) > 6 else first
         lens[[0, 1], [0, 1]] *= factor
-        start[2, 3] *= factor  # where the part appears as large
+        start[2, 3] *= factor  # keeps the size in the image
         step[3:] *= start[2, 3]
         seen = project_keypoints(cuboid, moved(start, step), lens)[is_known]
         return np.asarray(np.nan_to_num((seen - keypoints[is_known]) / extent, nan=10.0).ravel())

@@ -1,8 +1,8 @@
-"""Perspective-n-point: nine or fewer keypoints and K in, one trustworthy pose or a reason out.
+"""Perspective-n-point: estimate a pose from up to nine keypoints and K, or state why not.
 
-OpenCV supplies the closed-form start (SQPnP); our own part is what it lacks: per-point
-covariances, robust weights, the pose's own covariance, the mirrored start that thin plates need,
-and checks that no returned pose is NaN, behind the camera or at a wild distance.
+OpenCV supplies the closed-form start (SQPnP). This module adds covariances of the points, robust
+weights, the covariance of the pose, a mirrored start for thin plates, and checks that no returned
+pose is NaN, behind the camera or implausibly far away.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import combinations
-from typing import Final, TypeAlias
+from typing import Final
 
 import cv2
 import numpy as np
@@ -26,7 +26,6 @@ from dopepp.geometry.refine import (
     GATE,
     MIN_POINTS,
     NO_GATE,
-    Correspondences,
     column_mean,
     copy_pose,
     degenerate,
@@ -38,41 +37,32 @@ from dopepp.geometry.refine import (
 from dopepp.geometry.rotation import RotationMatrix, Vector
 
 MOST_LEFT_OUT: Final = 2
-"""Outliers looked for by leaving points out; the robust cost bears more where these are mild."""
+"""Largest number of points left out of a start; the robust cost tolerates further mild outliers."""
 
-NUM_STARTS: Final = 3  # How many of the poses from subsets are worth refining
+NUM_STARTS: Final = 3  # Starts from subsets that are refined
 MAX_DISTANCE: Final = 500.0
-"""Farthest believable pose in object sizes: with a focal length of 1,000 px that is 2 px wide."""
+"""Farthest plausible pose in object sizes: 2 px wide at a focal length of 1,000 px."""
 
 MAX_TANGENT: Final = 1000.0
-"""Distance from the principal point in focal lengths: 89.9° off the axis, where no pixel is."""
+"""Largest distance from the principal point in focal lengths: 89.9° off the axis."""
 
-ROTATION_TOLERANCE: Final = 1e-6  # Error of a rotation matrix's entries that refinement may leave
+ROTATION_TOLERANCE: Final = 1e-6  # Largest error of a refined rotation matrix's entries
 PLATE: Final = 0.3
-"""Thickness over length up to which a part's mirrored tilt is tried as a start of its own."""
-
-_NO_CAMERA: Final = np.eye(3)
-_UNIT: Final = np.eye(2)
-
-
-Solved: TypeAlias = tuple[
-    Transform | None, float, Bool[np.ndarray, "n"], str, Float[np.ndarray, "6 6"] | None
-]
-"""The attributes of a :class:`PnPResult`, of the points that can be used."""
+"""Largest thickness over length of a part whose mirrored tilt is refined as well."""
 
 
 @dataclass(frozen=True)
 class PnPResult:
-    """A pose, or the reason for having none.
+    """A pose, or the reason why there is none.
 
     Attributes:
-        T_cam_obj: Object-to-camera transform in metres; None when there is no trustworthy pose.
+        T_cam_obj: Object-to-camera transform, metres; None without a plausible pose.
         reprojection_error_px: RMS distance over the inliers, pixels; infinite without a pose.
-        inliers: The given points that agree with the pose within
-            :data:`~dopepp.geometry.refine.GATE` standard deviations.
-        reason: Why there is no pose; empty when there is one.
-        covariance: Of a small turn about the object's origin and a small shift (camera axes,
-            radians, metres), from the inliers' covariances; None without a pose.
+        inliers: Points that agree with the pose within :data:`~dopepp.geometry.refine.GATE`
+            standard deviations.
+        reason: Why there is no pose; empty with a pose.
+        covariance: Covariance of a rotation vector about the object's origin and a shift (camera
+            axes, radians, metres), from the inliers' covariances; None without a pose.
     """
 
     T_cam_obj: Transform | None
@@ -90,21 +80,21 @@ def solve_pnp(
     covariance_px: Float[np.ndarray, "n 2 2"] | None = None,
     widenings: Sequence[float] = (1.0,),
 ) -> PnPResult:
-    """Estimate a pose from point correspondences, tolerating missing and wild points.
+    """Estimate a pose from point correspondences with missing points and outliers.
 
     Args:
         object_points: Points in the object frame, metres.
         image_points: Their pixels; a row with NaN is a missing point.
         K: Camera matrix, pixels; it may have skew.
         sigma_px: Standard deviation of each pixel position (isotropic), pixels.
-        covariance_px: Covariance of each pixel position, pixels², in place of ``sigma_px``. A point
+        covariance_px: Covariance of each pixel position, pixels², instead of ``sigma_px``. A point
             whose deviation or covariance is not finite and positive (definite) is missing.
         widenings: Ascending factors on the standard deviations, tried in turn until two thirds of
-            the points agree on a pose; the pose with the most agreeing points wins.
+            the points agree on a pose. The pose with the most agreeing points is returned.
 
     Returns:
         The pose with the smallest robust cost among the refined starts: SQPnP on all points, its
-        mirror image for a plate and, where outliers show, SQPnP on all but one and all but two.
+        mirror image for a plate and, in case of outliers, SQPnP on all but one and all but two.
 
     Raises:
         ValueError: The arguments differ in length, or K is no invertible pinhole matrix.
@@ -120,25 +110,23 @@ def solve_pnp(
         raise ValueError(f"K must be a finite, invertible pinhole matrix, got {K.tolist()}")
     if covariance_px is None:
         sigma = np.broadcast_to(np.asarray(sigma_px, np.float64), n)
-        # NaN for what is no deviation; an infinite one has no finite square.
+        # Invalid deviations become NaN; infinite ones have no finite square.
         with np.errstate(all="ignore"):
-            covariance_px = np.where(sigma > 0, sigma, np.nan)[:, None, None] ** 2 * _UNIT
+            covariance_px = np.where(sigma > 0, sigma, np.nan)[:, None, None] ** 2 * np.eye(2)
     covariance_px = np.asarray(covariance_px, np.float64).reshape(n, 2, 2)
     rays, whitening, usable = _prepared(object_points, image_points, K, covariance_px)
-    T, error, agree, reason, covariance = _solve(
-        object_points[usable], rays, K[:2, :2].copy(), whitening, widenings
-    )
+    result = _solve(object_points[usable], rays, K[:2, :2].copy(), whitening, widenings)
     inliers = np.zeros(n, bool)
-    inliers[usable] = agree
-    return PnPResult(T, error, inliers, reason, covariance)
+    inliers[usable] = result.inliers
+    return replace(result, inliers=inliers)
 
 
 @compiled()
 def _prepared(
     object_points: Array, image_points: Array, K: Array, covariance: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the usable points' rays and whitenings W (WᵀW = Σ⁻¹), and which points these are."""
-    # Any number may come in and squares may overflow: the results are checked instead. W is the
+    """Return the usable points' rays and whitenings W (WᵀW = Σ⁻¹), and which points are usable."""
+    # Inputs may be any number and squares may overflow, so the results are checked. W is the
     # inverse of Cholesky's L with Σ = LLᵀ.
     n, count = len(object_points), 0
     rays, whitening, usable = np.empty((n, 2)), np.zeros((n, 2, 2)), np.empty(n, np.bool_)
@@ -170,7 +158,7 @@ def _prepared(
 
 @compiled()
 def _is_pinhole(K: Array) -> bool:
-    """Tell a finite, invertible pinhole matrix."""
+    """Return whether K is a finite, invertible pinhole matrix."""
     determinant = K[0, 0] * K[1, 1] - K[0, 1] * K[1, 0]
     last = K[2, 0] == 0.0 and K[2, 1] == 0.0 and K[2, 2] == 1.0
     finite = np.isfinite(K).all() and math.isfinite(determinant)
@@ -183,37 +171,33 @@ def _solve(
     to_px: Float[np.ndarray, "2 2"],
     whitening: Float[np.ndarray, "n 2 2"],
     widenings: Sequence[float],
-) -> Solved:
-    """Solve for points that are all there; rays are their (x/z, y/z)."""
-    nobody = np.zeros(len(rays), bool)
-    reason = degenerate(object_points, rays, to_px, whitening)
-    if reason:
-        return None, math.inf, nobody, reason, None
+) -> PnPResult:
+    """Solve for complete points; ``rays`` are (x/z, y/z), ``to_px`` maps rays to pixels."""
+    no_inliers = np.zeros(len(rays), bool)
+    if reason := degenerate(object_points, rays, to_px, whitening):
+        return PnPResult(None, math.inf, no_inliers, reason)
     centre = object_points.mean(0)
     size = math.hypot(*(object_points.max(0) - object_points.min(0)).tolist())
     centred = (object_points - centre) / size
-    starts = _Starts(centred, rays)
-    best: Solved | None = None
+    starts, results = _Starts(centred, rays), []
     for widening in widenings:
-        points = Correspondences(centred, rays, whitening @ to_px / widening)
-        pose, agree = _best_pose(points, starts)
-        solved: Solved
+        ray_whitening = whitening @ to_px / widening
+        pose, agree = _best_pose(ray_whitening, starts)
         if pose is None:
-            solved = (None, math.inf, nobody, "no start led to a pose in front of the camera", None)
+            reason = "no start led to a pose in front of the camera"
+            result = PnPResult(None, math.inf, no_inliers, reason)
         elif agree.sum() < MIN_POINTS:
-            few = f"only {int(agree.sum())} points agree on one pose, {MIN_POINTS} are needed"
-            solved = (None, math.inf, nobody, few, None)
+            reason = f"only {int(agree.sum())} points agree on one pose, {MIN_POINTS} are needed"
+            result = PnPResult(None, math.inf, no_inliers, reason)
         else:
             T, error, covariance = _concluded(
-                centred[agree], rays[agree], points.whitening[agree], to_px, *pose, size, centre
+                centred[agree], rays[agree], ray_whitening[agree], to_px, *pose, size, centre
             )
-            solved = (T, error, agree, "", covariance)
-        if best is None or solved[2].sum() > best[2].sum():
-            best = solved
-        if 3 * best[2].sum() >= 2 * len(rays):
+            result = PnPResult(T, error, agree, "", covariance)
+        results.append(result)
+        if 3 * result.inliers.sum() >= 2 * len(rays):
             break
-    assert best is not None
-    return best
+    return max(results, key=lambda result: int(result.inliers.sum()))
 
 
 @compiled()
@@ -228,8 +212,8 @@ def _concluded(
     centre: Array,
 ) -> tuple[Array, float, Array]:
     """Return pose (metres), RMS error (pixels) and covariance from the points that agree."""
-    # Among points that agree, least squares is the better estimate. A turn ω about the points'
-    # centre is the same turn about the object's origin and a shift by centre × ω.
+    # Least squares is the best estimate for points that agree. A rotation ω about the points'
+    # centre is the same rotation about the object's origin and a shift by centre × ω.
     refine_pose(object_points, rays, whitening, R, t, NO_GATE)
     residuals = np.empty((len(rays), 2))
     reproject(object_points, rays, whitening, R, t, residuals)
@@ -262,13 +246,13 @@ def _concluded(
     carry[3, 1], carry[3, 2] = -moved[2], moved[1]
     carry[4, 0], carry[4, 2] = moved[2], -moved[0]
     carry[5, 0], carry[5, 1] = -moved[1], moved[0]
-    # Four points that agree but lie on a line leave a direction open: its variance is huge.
+    # Four points on a line leave a direction undetermined: its variance is huge.
     covariance = carry @ np.linalg.pinv(information, 1e-15) @ carry.T
     return T, error, covariance
 
 
 class _Starts:
-    """Closed-form poses of all points, all but one and all but two, for every widening."""
+    """Closed-form poses from all points, all but one and all but two, for every widening."""
 
     def __init__(
         self, object_points: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 2"]
@@ -279,7 +263,7 @@ class _Starts:
         self._steps: list[Float[np.ndarray, "s 6"]] = []
 
     def without(self, left_out: int) -> Float[np.ndarray, "s 6"]:
-        """Return SQPnP's poses (rotation vector, translation) of all points but so many, or NaN."""
+        """Return SQPnP's poses (rotation vector, translation) without so many points, or NaN."""
         while len(self._steps) <= left_out:
             kept = _kept(len(self.rays), len(self._steps))
             steps = np.full((len(kept), 6), np.nan)
@@ -288,7 +272,7 @@ class _Starts:
                     solved, vector, move = cv2.solvePnP(
                         self.object_points[rows],
                         self.rays[rows],
-                        _NO_CAMERA,
+                        np.eye(3),
                         None,
                         flags=cv2.SOLVEPNP_SQPNP,
                     )
@@ -300,22 +284,21 @@ class _Starts:
 
 @cache
 def _kept(count: int, left_out: int) -> list[NDArray[np.intp]]:
-    """Return the rows that stay where so many of them are left out, all ways."""
+    """Return all selections of the rows that leave out so many of them."""
     return [np.array(rows) for rows in combinations(range(count), count - left_out)][::-1]
 
 
 def _best_pose(
-    points: Correspondences, starts: _Starts
+    whitening: Float[np.ndarray, "n 2 2"], starts: _Starts
 ) -> tuple[tuple[RotationMatrix, Vector] | None, Bool[np.ndarray, "n"]]:
     """Return the refined pose with the smallest truncated cost, and which points agree with it."""
     R, t, cost = np.empty((3, 3)), np.empty(3), math.inf
-    count = len(points.rays)
+    points, rays, count = starts.object_points, starts.rays, len(whitening)
+    normal, is_plate = starts.normal, starts.is_plate
     agree = np.zeros(count, bool)
     for left_out in range(min(MOST_LEFT_OUT, count - MIN_POINTS) + 1):
-        cost = _improved(
-            points.object_points, points.rays, points.whitening, starts.without(left_out),
-            starts.normal, starts.is_plate, R, t, cost, agree,
-        )  # fmt: skip
+        poses = starts.without(left_out)
+        cost = _improved(points, rays, whitening, poses, normal, is_plate, R, t, cost, agree)
         if cost < math.inf and agree.sum() >= count - left_out:
             break
     return (None if cost == math.inf else (R, t)), agree
@@ -336,7 +319,7 @@ def _improved(
 ) -> float:
     """Refine the likeliest starts, update the best pose and ``agree``, and return its cost.
 
-    Besides each start of a plate, its other tilt is refined; a thicker part has none.
+    For a plate, the other tilt of each start is refined as well.
     """
     count = len(starts)
     residuals = np.empty((len(rays), 2))
@@ -366,7 +349,7 @@ def _improved(
 
 @compiled()
 def _truncated_cost(residuals: Array) -> float:
-    """Return the MSAC cost that poses are compared by: an outlier costs the gate."""
+    """Return the MSAC cost of a pose: the squared gate for an outlier."""
     cost = 0.0
     for i in range(len(residuals)):
         squared = residuals[i, 0] ** 2 + residuals[i, 1] ** 2
@@ -408,11 +391,11 @@ def _principal_axes(points: Array) -> tuple[Array, Array]:
 
 @compiled()
 def _mirror(R: Array, t: Array, normal: Array) -> None:
-    """Turn a pose into the other tilt under which a plate looks almost the same.
+    """Replace a pose by the other tilt under which a plate looks almost the same.
 
-    Seen from far away, a plate tilted by +θ and by −θ about the same axis have the same image. The
-    second is the first reflected in the plane across the viewing ray r and, since a reflection is
-    no rotation, also in the plate's own plane with normal n: R' = (I − 2rrᵀ) R (I − 2nnᵀ).
+    From far away, plates tilted by +θ and by −θ about the same axis have the same image. The second
+    pose is the first, reflected in the plane across the viewing ray r and, as a reflection is no
+    rotation, also in the plate's plane with normal n: R' = (I − 2rrᵀ) R (I − 2nnᵀ).
     """
     squared = t[0] ** 2 + t[1] ** 2 + t[2] ** 2
     for column in range(3):

@@ -1,14 +1,12 @@
-"""Robust refinement of poses, damped Gauss–Newton on SE(3), and when points cannot fix a pose.
+"""Robust pose refinement by damped Gauss–Newton on SE(3), and tests for degenerate points.
 
-While a pose is refined, object points are centred and of unit size and pixels are rays, so that one
-set of numerical tolerances serves every part and camera. A pose is (R, t) with
-x_cam = R x_obj + t.
+During refinement, object points are centred and of unit size and pixels are rays, so that one set
+of numerical tolerances serves every part and camera. A pose is (R, t) with x_cam = R x_obj + t.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -21,62 +19,58 @@ GATE: Final = 3.0
 
 MAX_STEPS: Final = 15
 CONVERGED: Final = 1e-4
-"""Relative fall of the cost below which a pose has arrived: far less than one point's noise."""
+"""Relative decrease of the cost at convergence: far less than one point's noise."""
 
 ROUNDING: Final = 1e-12
-"""Fall of the cost that is none: a point that moves by a millionth of its deviation."""
+"""Negligible decrease of the cost: a point moves by a millionth of its deviation."""
 
 FIRST_DAMPING: Final = 1e-4
 
 LEAST_DAMPING: Final = 1e-9
-"""Above the rounding of the scaled 6×6 system, so that it is never singular."""
+"""Above the rounding errors of the scaled 6×6 system, so that it is never singular."""
 
 MOST_DAMPING: Final = 1e6
-"""Where steps are a millionth of Gauss–Newton's and still do not help, the pose has arrived."""
+"""Converged: steps of a millionth of Gauss–Newton's do not reduce the cost."""
 
-NO_GATE: Final = 1e3  # So wide a gate that the cost is that of least squares
+NO_GATE: Final = 1e3  # A gate so wide that the cost is the least-squares cost
 _TINY_ANGLE: Final = 1e-8
-"""Radians below which a turn's second-order term is below float64's rounding."""
+"""Angle below which a rotation's second-order term vanishes in float64, radians."""
 
 MIN_POINTS: Final = 4
 
-SMALLEST: Final = 1e-9  # Extent of the object points, metres, below which they are no object
-LARGEST: Final = 1e9  # and above which
-SAME_PIXEL: Final = 1e-3  # Pixels by which two positions must differ to be two
-
-
-@dataclass(frozen=True)
-class Correspondences:
-    """Object points, centred and of unit size, the rays (x/z, y/z) that show them, and whitening.
-
-    A whitening turns a difference of rays into standard deviations of the pixel's position.
-    """
-
-    object_points: Float[np.ndarray, "n 3"]
-    rays: Float[np.ndarray, "n 2"]
-    whitening: Float[np.ndarray, "n 2 2"]
+SMALLEST: Final = 1e-9  # Smallest valid extent of the object points, metres
+LARGEST: Final = 1e9  # Largest valid extent of the object points, metres
+SAME_PIXEL: Final = 1e-3  # Largest difference of two positions that count as equal, pixels
 
 
 @compiled()
 def refine_pose(
     object_points: Array, rays: Array, whitening: Array, R: Array, t: Array, gate: float
 ) -> None:
-    """Minimise the Geman–McClure cost Σ r²/(r² + g²) from one pose, in place; r in deviations.
+    """Minimise the Geman–McClure cost Σ r²/(r² + g²) from a pose, in place.
 
-    A step that does not lower the cost is undone and damped more (Levenberg–Marquardt). A pose
-    with points behind the camera stays as it is.
+    A step that does not reduce the cost is undone and damped more (Levenberg–Marquardt). A pose
+    with points behind the camera remains unchanged.
+
+    Args:
+        object_points: Points, centred and of unit size.
+        rays: The rays (x/z, y/z) that show the points.
+        whitening: Maps of ray differences to standard deviations of the pixel's position.
+        R: Rotation of the pose.
+        t: Translation of the pose.
+        gate: Scale g of the cost, standard deviations.
     """
     n = len(rays)
     residuals, moved_residuals = np.empty((n, 2)), np.empty((n, 2))
     moved_R, moved_t = np.empty((3, 3)), np.empty(3)
     hessian, gradient, step = np.empty((6, 6)), np.empty(6), np.empty(6)
-    room = np.empty((7, 6))
+    workspace = np.empty((7, 6))
     if not reproject(object_points, rays, whitening, R, t, residuals):
         return
     cost, damping = _robust_cost(residuals, gate), FIRST_DAMPING
     normal_equations(object_points, rays, whitening, R, t, residuals, gate, hessian, gradient)
     for _ in range(MAX_STEPS):
-        solve_inside(hessian, gradient, damping, step, room)
+        solve_inside(hessian, gradient, damping, step, workspace)
         turn(step, R, moved_R)
         for r in range(3):
             moved_t[r] = t[r] + step[3 + r]
@@ -104,7 +98,7 @@ def refine_pose(
 def reproject(
     object_points: Array, rays: Array, whitening: Array, R: Array, t: Array, out: Array
 ) -> bool:
-    """Write reprojection errors, NaN behind the camera; tell whether all are in front."""
+    """Write whitened reprojection errors, NaN behind the camera; return whether none is behind."""
     in_front = True
     for i in range(len(rays)):
         x, y, z = object_points[i, 0], object_points[i, 1], object_points[i, 2]
@@ -122,7 +116,7 @@ def reproject(
 
 @compiled()
 def copy_pose(R: Array, t: Array, to_R: Array, to_t: Array) -> None:
-    """Write a pose over another; assigned slices would take a second to compile."""
+    """Copy a pose in place; assigned slices would take a second to compile."""
     for r in range(3):
         to_t[r] = t[r]
         for c in range(3):
@@ -131,7 +125,7 @@ def copy_pose(R: Array, t: Array, to_R: Array, to_t: Array) -> None:
 
 @compiled()
 def _robust_cost(residuals: Array, gate: float) -> float:
-    """Return Σ r²/(r² + g²); an infinite or unknown r counts as 1."""
+    """Return Σ r²/(r² + g²); an infinite or NaN r contributes 1."""
     cost = 0.0
     for i in range(len(residuals)):
         squared = residuals[i, 0] ** 2 + residuals[i, 1] ** 2
@@ -153,9 +147,9 @@ def normal_equations(
 ) -> None:
     """Write JᵀJ and Jᵀr of a left increment (rotation vector, translation), robustly weighted.
 
-    A ray (u, v) = (X, Y)/Z moves with x_cam by the rows [1, 0, −u]/Z and [0, 1, −v]/Z. Since
+    The derivatives of a ray (u, v) = (X, Y)/Z by x_cam are [1, 0, −u]/Z and [0, 1, −v]/Z. Since
     d(Exp(ω) p)/dω = −[p]×, a row a becomes −a [p]× = p × a with p = R x_obj. The weights are the
-    derivative of r²/(r² + g²) by r², up to g². Points behind the camera take no part.
+    derivative of r²/(r² + g²) by r², times g². Points behind the camera are ignored.
     """
     for c in range(6):
         gradient[c] = 0.0
@@ -197,9 +191,11 @@ def solve_damped(hessian: Array, gradient: Array, damping: float, step: Array) -
 
 
 @compiled()
-def solve_inside(hessian: Array, gradient: Array, damping: float, step: Array, room: Array) -> None:
-    """Like :func:`solve_damped`, in a (7, 6) workspace, which saves a loop its allocations."""
-    L, scale = room[:6], room[6]
+def solve_inside(
+    hessian: Array, gradient: Array, damping: float, step: Array, workspace: Array
+) -> None:
+    """Like :func:`solve_damped`, in a (7, 6) workspace, which avoids allocations in a loop."""
+    L, scale = workspace[:6], workspace[6]
     for i in range(6):
         scale[i] = 1.0 / math.sqrt(hessian[i, i] + 1e-12)
     for i in range(6):
@@ -209,7 +205,7 @@ def solve_inside(hessian: Array, gradient: Array, damping: float, step: Array, r
                 value += damping
             for k in range(j):
                 value -= L[i, k] * L[j, k]
-            # Below the damping only by rounding.
+            # A smaller value would be a rounding error.
             L[i, j] = math.sqrt(max(value, LEAST_DAMPING**2)) if i == j else value / L[j, j]
     for i in range(6):
         step[i] = -scale[i] * gradient[i]
@@ -248,9 +244,13 @@ def degenerate(
     to_px: Float[np.ndarray, "2 2"],
     whitening: Float[np.ndarray, "n 2 2"],
 ) -> str:
-    """Say why these points cannot fix a pose, or return an empty string.
+    """Return why these points do not determine a pose, or an empty string.
 
-    ``to_px`` turns rays into pixels, ``whitening`` pixels into standard deviations.
+    Args:
+        object_points: Points in the object frame, metres.
+        rays: The rays (x/z, y/z) that show the points.
+        to_px: Matrix from rays to pixels.
+        whitening: Matrices from pixels to standard deviations.
     """
     if len(object_points) < MIN_POINTS:
         return too_few(len(object_points))
@@ -271,7 +271,7 @@ def degenerate(
 
 
 def too_few(num_points: int) -> str:
-    """Say that so many points fix no pose."""
+    """Return the message for too few points."""
     return f"only {num_points} usable points, {MIN_POINTS} are needed"
 
 
@@ -279,10 +279,10 @@ def too_few(num_points: int) -> str:
 def _spreads(
     object_points: Array, rays: Array, to_px: Array, whitening: Array
 ) -> tuple[float, float, float, float, float, float, float]:
-    """Return the spreads that :func:`degenerate` judges.
+    """Return the spreads that :func:`degenerate` compares.
 
-    The object's extent (metres) and its two largest singular values over that; the number of
-    distinct pixels and the pixels' singular values; the median deviation, (det W)^(−1/2).
+    These are the object's extent (metres), its two largest singular values divided by the extent,
+    the number of distinct pixels, their singular values, and the median deviation (det W)^(−1/2).
     """
     n = len(object_points)
     extent = 0.0
@@ -296,7 +296,7 @@ def _spreads(
     for axis in range(3):
         mean = column_mean(object_points, axis)
         for i in range(n):
-            centred[i, axis] = (object_points[i, axis] - mean) / extent  # NaN for a single place
+            centred[i, axis] = (object_points[i, axis] - mean) / extent  # NaN for a single position
     for i in range(n):
         deviation = (whitening[i, 0, 0] * whitening[i, 1, 1]) ** -0.5
         rank = i
@@ -319,15 +319,8 @@ def _spreads(
             spread[i, axis] -= mean
     solid = np.linalg.svd(centred, False)[1] if np.isfinite(centred).all() else np.zeros(3)
     flat = np.linalg.svd(spread, False)[1] if np.isfinite(spread).all() else np.zeros(2)
-    return (
-        extent,
-        solid[0],
-        solid[1],
-        distinct,
-        flat[0],
-        flat[1],
-        0.5 * (sigma[(n - 1) // 2] + sigma[n // 2]),
-    )
+    median = 0.5 * (sigma[(n - 1) // 2] + sigma[n // 2])
+    return extent, solid[0], solid[1], distinct, flat[0], flat[1], median
 
 
 @compiled()

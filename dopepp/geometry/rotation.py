@@ -12,15 +12,16 @@ RotationMatrix = Float[np.ndarray, "3 3"]
 
 
 def quaternion_to_matrix(quaternion_wxyz: Float[np.ndarray, "4"]) -> RotationMatrix:
-    """Turn a quaternion of any non-zero norm into a rotation matrix.
+    """Convert a quaternion of any non-zero norm to a rotation matrix.
 
-    One that is zero or not finite is a ``ValueError``.
+    Raises:
+        ValueError: The quaternion is zero or not finite.
     """
     quaternion = np.asarray(quaternion_wxyz, np.float64)
     largest = np.abs(quaternion).max()
     if not np.isfinite(largest) or largest == 0.0:
         raise ValueError(f"a quaternion must be finite and non-zero, got {quaternion.tolist()}")
-    quaternion = quaternion / largest  # the square of a tiny or huge number is none
+    quaternion = quaternion / largest  # squares must neither underflow nor overflow
     w, x, y, z = quaternion / np.linalg.norm(quaternion)
     return np.array(
         [
@@ -32,10 +33,10 @@ def quaternion_to_matrix(quaternion_wxyz: Float[np.ndarray, "4"]) -> RotationMat
 
 
 def matrix_to_quaternion(rotation: RotationMatrix) -> Float[np.ndarray, "4"]:
-    """Turn a rotation matrix into its unit quaternion (w, x, y, z) with w >= 0.
+    """Convert a rotation matrix to its unit quaternion (w, x, y, z) with w >= 0.
 
-    The quaternion is the leading eigenvector of Bar-Itzhack's symmetric 4×4 matrix (J. Guidance
-    2000), which has no singular case and projects a slightly non-orthogonal matrix.
+    It is the leading eigenvector of Bar-Itzhack's symmetric 4×4 matrix (J. Guidance 2000), which
+    has no singular case and tolerates slightly non-orthogonal matrices.
     """
     (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, np.float64)
     symmetric = np.array(
@@ -68,11 +69,11 @@ def rotation_vector_to_matrix(
 
 
 def matrix_to_rotation_vector(rotation: RotationMatrix) -> Vector:
-    """Return the vector of a rotation's axis and angle in [0, π]; it undoes the exponential map."""
+    """Return the rotation vector with an angle in [0, π]; inverse of the exponential map."""
     (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, np.float64).tolist()
     axial = 0.5 * np.array([h - f, c - g, d - b])
     cosine = 0.5 * (a + e + i - 1.0)
-    if cosine > 0.0:  # its sine is far from that of any other angle's
+    if cosine > 0.0:  # below 90° the sine determines the angle
         sine = math.hypot(*axial)
         return np.asarray(axial * (math.atan2(sine, cosine) / sine if sine > 0 else 1.0))
     w, *axis = matrix_to_quaternion(rotation)
@@ -94,7 +95,7 @@ def rotation_angle(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarra
 
 
 def rotation_to_z(axis: Vector) -> RotationMatrix:
-    """Return a rotation that turns a unit axis to z, whichever way x and y come to point."""
+    """Return a rotation that maps a unit axis to z; the directions of x and y are arbitrary."""
     right = np.cross(np.eye(3)[np.abs(axis).argmin()], axis)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(axis, right), axis])
@@ -106,10 +107,7 @@ def random_rotation(rng: np.random.Generator) -> RotationMatrix:
 
 
 def nearest_rotation(matrices: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """Return the rotation nearest to each matrix, by the sum of squares (Umeyama 1991).
-
-    That is U diag(1, 1, det U·det V) Vᵀ of the singular value decomposition.
-    """
+    """Return the rotation U diag(1, 1, det U·det V) Vᵀ nearest to each matrix (Umeyama 1991)."""
     left, _, right = np.linalg.svd(matrices)
     sign = np.sign(np.linalg.det(left) * np.linalg.det(right))
     scales = np.ones_like(matrices[..., 0])
@@ -118,7 +116,7 @@ def nearest_rotation(matrices: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndar
 
 
 def is_rotation(rotation: RotationMatrix, tolerance: float = 1e-3) -> bool:
-    """Tell whether a 3×3 matrix is finite, orthogonal within ``tolerance`` and right-handed."""
+    """Return whether a matrix is 3×3, finite, orthogonal within a tolerance and right-handed."""
     rotation = np.asarray(rotation, np.float64)
     return bool(
         rotation.shape == (3, 3)

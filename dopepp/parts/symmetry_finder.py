@@ -15,14 +15,13 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import make_transform
 from dopepp.geometry.rotation import (
     RotationMatrix,
     Vector,
     rotation_angle,
     rotation_vector_to_matrix,
 )
-from dopepp.geometry.symmetry import SAME_TURN, ContinuousSymmetry, exact_group
+from dopepp.geometry.symmetry import SAME_TURN, ContinuousSymmetry, exact_group, rotations_about
 from dopepp.parts.mesh import Points, SurfaceTree, half_sphere, largest_distance
 from dopepp.parts.part import Mesh
 
@@ -117,9 +116,7 @@ class _Shape:
         self, rotations: Float[np.ndarray, "rotations 3 3"]
     ) -> Float[np.ndarray, "rotations 4 4"]:
         """Return rotations about the centre as transforms of the part, metres."""
-        shifts = self.centre - rotations @ self.centre
-        pairs = zip(rotations, shifts, strict=True)
-        return _clean(np.array([make_transform(*pair) for pair in pairs]).reshape(-1, 4, 4))
+        return _clean(rotations_about(self.centre, rotations))
 
     def axis(self, axis: Vector) -> ContinuousSymmetry:
         """Return an axis through the centre with the point on it that is nearest the origin."""

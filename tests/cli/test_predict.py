@@ -136,7 +136,7 @@ def test_the_lens_counts(folder, rendered, tmp_path):
         ("whole.png", ["--camera", "whole.png"], "camera file"),
         ("half.png", ["--camera", "K.txt"], "at 100% of its width"),
         ("half.png", ["--camera", "plain.json"], "--K-size 640 480 if the picture was resized"),
-        ("cut.png", ["--camera", "plain.json"], "--crop X Y 632 400 if it was cut out"),
+        ("cut.png", ["--camera", "plain.json"], "--crop X Y 632 400 if it was cropped"),
         ("4k.png", ["--camera", "plain.json"], "calibrate the camera at 3840×2160"),
         ("4k.png", ["--camera", "K.txt"], "likely of 640×480"),
         ("whole.png", ["--K", "100", "100", "63.5", "63.5"], "likely of 128×128"),
