@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 
 from dopepp.cli import app
 from dopepp.experiment.config.run_config import EvaluationConfig, RunConfig
-from dopepp.recovery.scoring import RecoveryOptions
+from dopepp.recovery.detection import RecoveryOptions
 from dopepp.virtual.presets import Preset
 
 ROOT: Final = Path(__file__).parents[1]

@@ -33,9 +33,8 @@ from dopepp.inference.picture import (
 from dopepp.inference.pose_result import STEPS
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Part
-from dopepp.recovery.detection import Detection
+from dopepp.recovery.detection import Detection, RecoveryOptions, rescored
 from dopepp.recovery.recover import Reason, explain, recover, rejected_refined
-from dopepp.recovery.scoring import RecoveryOptions, rescored
 
 if TYPE_CHECKING:
     from dopepp.geometry.camera_file import Camera

@@ -1,7 +1,6 @@
-"""The one way from maps to poses: peaks, association, PnP."""
+"""Recovery of object poses from belief maps and vector fields: peaks, association, PnP."""
 
-from dopepp.recovery.detection import Detection
+from dopepp.recovery.detection import Detection, RecoveryOptions
 from dopepp.recovery.recover import Reason, explain, recover, recover_batch
-from dopepp.recovery.scoring import RecoveryOptions
 
 __all__ = ["Detection", "Reason", "RecoveryOptions", "explain", "recover", "recover_batch"]

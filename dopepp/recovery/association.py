@@ -1,9 +1,13 @@
-"""From the peaks of one object's maps to groups of keypoints, one group per instance.
+"""Group the peaks of one object into instances and solve the pose of each instance.
 
-Which corners belong together, an affine camera tells: from far enough away, a corner's image is
-c + A s with the centroid's c, a 2×3 matrix A and the corner's signs s. Opposite corners have
-opposite arms A s, and of the four diagonals' arms, three give the fourth: so any three corners no
-two of which are opposite predict the other five.
+:func:`select_peaks` picks an object's peaks on one image. :func:`solve_instances` then alternates
+:func:`associate`, which assigns corner peaks to centroids, and PnP, until the poses no longer
+change a group.
+
+Before there are poses, an affine camera predicts corners: seen from far enough away, a corner with
+signs s lies at c + A s, where c is the centroid and A a 2×3 matrix. Opposite corners have opposite
+arms A s, and the arms of three diagonals give the fourth. So any three corners, no two of them
+opposite, predict the other five.
 """
 
 from __future__ import annotations
@@ -13,38 +17,42 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import scipy  # its parts load when they are used
+import scipy  # loads its submodules on first use
 from jaxtyping import Float
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS
+from dopepp.geometry.camera import CameraMatrix, project_keypoints
+from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS, Cuboid
+from dopepp.geometry.pnp import PnPResult, solve_pnp
+from dopepp.geometry.refine import MIN_POINTS, too_few
+from dopepp.maps.codec import Peaks
 
 Evidence = Float[np.ndarray, "instances 8 peaks"]
 CornerPeaks = Float[np.ndarray, "8 peaks 2"]
 Corners = Float[np.ndarray, "instances 8 2"]
 
-LEAST_DEVIATION: Final = 0.05
-"""Radians by which even a clear vector may be off its centroid's direction."""
-
-POSITION_PX: Final = 1.0
-"""Error of positions, as far as it turns the direction between peak and centroid."""
-
-LEAST_LENGTH: Final = 1e-3  # Of a mean vector; a shorter one has no direction
-
+MIN_DEVIATION: Final = 0.05  # Smallest standard deviation of a vector's direction, radians
+POSITION_PX: Final = 1.0  # Error of positions that turns the direction from peak to centroid
+MIN_LENGTH: Final = 1e-3  # A shorter mean vector has no direction
 PREDICTION_PX: Final = 4.0  # Deviation of a keypoint from its prediction: half a cell of stride 8
-
-CANDIDATES: Final = 3
-"""Peaks of a corner that are tried: the likeliest ones by belief and direction."""
+CANDIDATES: Final = 3  # Most likely peaks of a corner, by belief and direction, that are tried
 
 PERSPECTIVE: Final = 0.1
 """Deviation of corners from the affine camera, over their distance from the centroid: a part seen
 from five times its size away has corners ±10 % nearer or farther."""
 
-DIAGONALS: Final = np.array([(0, 6), (1, 7), (2, 4), (3, 5)])  # Opposite corners
-RIVALS: Final = -2  # In place of a peak that two instances want
+SIGMA_FLOOR_PX: Final = 1.0  # Bounds the weight of a sharp peak against a blurred one
+WIDENINGS: Final = (1.0, 2.0, 4.0)  # Factors on the peaks' deviations, until most keypoints agree
+ROUNDS: Final = 3  # Maximum number of times that poses regroup the keypoints
 
-ALTERNATING: Final = np.array([1.0, -1.0, 1.0, -1.0])
-"""The first corners' arms, signed so, sum to zero."""
+BORDER: Final = 1.0  # Distance from the maps' border within which a keypoint may lie beyond, cells
+BORDER_DEVIATION: Final = 0.75
+"""RMS error of such a peak for trained networks, cells: half of the belief lies beyond the maps, so
+the peak is pulled inward."""
+
+DIAGONALS: Final = np.array([(0, 6), (1, 7), (2, 4), (3, 5)])  # Opposite corners
+ALTERNATING: Final = np.array([1.0, -1.0, 1.0, -1.0])  # Arms of first corners sum to 0 with these
+RIVALS: Final = -2  # Replaces a peak that is the best one of two instances
 
 
 @dataclass(frozen=True)
@@ -53,14 +61,14 @@ class ObjectPeaks:
 
     Attributes:
         position: (x, y) of corners 0–7, input pixels; NaN in slots without a peak.
-        score: Belief at the peak; 0 in slots without one.
-        covariance_px: Of the position, pixels².
-        toward: The field's mean vector at the peak, pointing to the centroid; the shorter, the
-            less certain its direction.
+        score: Belief at the peak; 0 in slots without a peak.
+        covariance_px: Covariance of the position, pixels².
+        toward: The field's mean vector at the peak, pointing to the centroid. The shorter it is,
+            the less certain is its direction.
         centroid: (x, y) of centroids.
-        centroid_score: Their beliefs.
-        centroid_covariance_px: Of their positions.
-        area_px: Of the maps, pixels².
+        centroid_score: Beliefs of centroids.
+        centroid_covariance_px: Covariances of centroids, pixels².
+        area_px: Area of the maps, pixels².
     """
 
     position: CornerPeaks
@@ -75,31 +83,99 @@ class ObjectPeaks:
 
 @dataclass(frozen=True)
 class KeypointGroup:
-    """The keypoints of one instance; NaN positions and zero scores where a corner is missing."""
+    """The keypoints of one instance; missing corners have NaN positions and zero scores."""
 
     position: Float[np.ndarray, "9 2"]
     score: Float[np.ndarray, "9"]
     covariance_px: Float[np.ndarray, "9 2 2"]
 
 
-def direction_evidence(peaks: ObjectPeaks, max_angle: float, coincident_px: float) -> Evidence:
-    """Return how much belief and direction speak for each corner peak to belong to each centroid.
+def select_peaks(
+    peaks: Peaks, image: int, number: int, threshold: float, cells: tuple[int, int], stride: float
+) -> ObjectPeaks:
+    """Return the peaks of one object on one image, with wider covariances at the border.
 
-    The angle's likelihood is taken over that of any angle, so that a vector without a direction
-    speaks for nobody. Unit vectors whose angles deviate by σ have a mean of length exp(−σ²/2).
+    Args:
+        peaks: Peaks of all channels of a batch.
+        image: Index of the image.
+        number: Index of the object.
+        threshold: Belief below which a centroid is no instance.
+        cells: Width and height of the maps.
+        stride: Pixels per cell.
+    """
+    first = number * NUM_KEYPOINTS
+    corners, centroid = (image, slice(first, first + NUM_CORNERS)), (image, first + CENTROID)
+    strong = peaks.score[centroid] >= threshold
+    extent = np.array(cells) * float(stride)
+    position = peaks.position[corners]
+    return ObjectPeaks(
+        position,
+        peaks.score[corners],
+        _border_covariance(position, peaks.covariance_px[corners], extent, float(stride)),
+        peaks.toward[corners],
+        peaks.position[centroid][strong],
+        peaks.score[centroid][strong],
+        peaks.covariance_px[centroid][strong],
+        float(extent.prod()),
+    )
+
+
+def solve_instances(
+    peaks: ObjectPeaks, cuboid: Cuboid, K: CameraMatrix, max_angle: float, coincident_px: float
+) -> list[tuple[KeypointGroup, PnPResult]]:
+    """Group an object's peaks and solve the pose of each group; see :func:`direction_evidence`."""
+    if not len(peaks.centroid):
+        return []
+    evidence = direction_evidence(peaks, max_angle, coincident_px)
+    groups = associate(peaks, evidence)
+    results = [solve_group(group, cuboid, K) for group in groups]
+    for _ in range(ROUNDS):
+        if all(result.inliers.all() for result in results):
+            break  # complete instances have nothing to gain from each other
+        expected = np.full((len(groups), NUM_CORNERS, 2), np.nan)
+        for corners, result in zip(expected, results, strict=True):
+            if result.T_cam_obj is not None:
+                corners[:] = project_keypoints(cuboid, result.T_cam_obj, K)[:NUM_CORNERS]
+        previous, groups = groups, associate(peaks, evidence, expected)
+        changed = False
+        for number, (old, new) in enumerate(zip(previous, groups, strict=True)):
+            if old.position.tobytes() != new.position.tobytes():
+                results[number], changed = solve_group(new, cuboid, K), True
+        if not changed:
+            break
+    return list(zip(groups, results, strict=True))
+
+
+def solve_group(group: KeypointGroup, cuboid: Cuboid, K: CameraMatrix) -> PnPResult:
+    """Solve PnP with each keypoint weighted by its own covariance.
+
+    Covariances are averaged over directions: the width of a network's peak predicts the size of its
+    error, its shape does not predict the direction. The maps of a network are narrower than its
+    errors, so deviations are widened while fewer than two thirds of the keypoints agree on a pose.
+    """
+    count = sum(math.isfinite(x) for x in group.position[:, 0].tolist())
+    if count < MIN_POINTS:  # as for most centroids that noise makes
+        return PnPResult(None, math.inf, np.zeros(NUM_KEYPOINTS, bool), too_few(count))
+    covariance = _averaged(group.covariance_px)
+    return solve_pnp(cuboid, group.position, K, covariance_px=covariance, widenings=WIDENINGS)
+
+
+def direction_evidence(peaks: ObjectPeaks, max_angle: float, coincident_px: float) -> Evidence:
+    """Return how likely belief and direction make each corner peak a part of each instance.
+
+    The likelihood of the angle is divided by that of a uniform angle, so a vector without a
+    direction is neutral. Unit vectors whose angles deviate by σ have a mean of length exp(−σ²/2).
 
     Args:
         peaks: Corner peaks and centroids.
         max_angle: Largest angle between a vector and its centroid, radians.
-        coincident_px: Distance from a centroid within which any angle will do.
+        coincident_px: Distance from a centroid within which any angle is allowed.
 
     Returns:
-        Log-likelihood ratios; −∞ where a pair is not allowed.
+        Log-likelihood ratios; −∞ for pairs that are not allowed.
     """
-    return _direction_evidence(
-        peaks.position, peaks.score, peaks.toward, peaks.centroid, peaks.centroid_score, max_angle,
-        coincident_px,
-    )  # fmt: skip
+    arrays = (peaks.position, peaks.score, peaks.toward, peaks.centroid, peaks.centroid_score)
+    return _direction_evidence(*arrays, max_angle, coincident_px)
 
 
 def associate(
@@ -107,10 +183,15 @@ def associate(
 ) -> list[KeypointGroup]:
     """Group peaks into instances, one per centroid.
 
-    Per corner, peaks are assigned to centroids one-to-one by the greatest total evidence: of belief
-    and direction, and of the distance from where the instance's other corners predict it. A peak
-    without evidence stays alone. ``expected`` is where poses put the corners, pixels, NaN for an
-    instance without a pose; before there are any, triples of corners predict the others.
+    For each corner, peaks are assigned to centroids one-to-one so that the total evidence is
+    greatest: evidence of belief and direction, and of the distance to the expected position. A peak
+    without positive evidence is not assigned.
+
+    Args:
+        peaks: Corner peaks and centroids.
+        evidence: Result of :func:`direction_evidence`.
+        expected: Corners projected with the instances' poses, pixels, NaN for an instance without a
+            pose (default: predicted from triples of corners).
     """
     deviation = np.full(len(evidence), PREDICTION_PX)
     if expected is None:
@@ -137,6 +218,29 @@ def associate(
 
 
 @compiled()
+def _border_covariance(position: Array, covariance: Array, extent: Array, stride: float) -> Array:
+    """Widen the covariance of peaks at the border of the maps; the outermost pixel ends at −½."""
+    widened = covariance.copy()
+    for k, m in np.ndindex(position.shape[:2]):
+        x, y = position[k, m, 0], position[k, m, 1]
+        inward = min(x + 0.5, y + 0.5, extent[0] - 0.5 - x, extent[1] - 0.5 - y)
+        if inward < BORDER * stride:
+            for axis in range(2):
+                widened[k, m, axis, axis] += (BORDER_DEVIATION * stride) ** 2
+    return widened
+
+
+@compiled()
+def _averaged(covariance: Array) -> Array:
+    """Return circular covariances of the same mean variance plus the floor; NaN stays NaN."""
+    averaged = np.zeros(covariance.shape)
+    for k in range(len(covariance)):
+        variance = (covariance[k, 0, 0] + covariance[k, 1, 1]) / 2 + SIGMA_FLOOR_PX**2
+        averaged[k, 0, 0] = averaged[k, 1, 1] = variance
+    return averaged
+
+
+@compiled()
 def _direction_evidence(
     position: Array,
     score: Array,
@@ -146,7 +250,7 @@ def _direction_evidence(
     max_angle: float,
     coincident_px: float,
 ) -> Array:
-    """Return the evidence of every instance, corner and peak."""
+    """Compute :func:`direction_evidence`."""
     evidence = np.full((len(centroid), *score.shape), -math.inf)
     beliefs = np.log(centroid_score)
     for k, m in np.ndindex(score.shape):
@@ -155,9 +259,9 @@ def _direction_evidence(
         belief = math.log(score[k, m])
         u, v = toward[k, m, 0], toward[k, m, 1]
         length = math.sqrt(u * u + v * v)
-        # A vector that is no number, as of a network that diverged, points nowhere.
-        directed = LEAST_LENGTH <= length < math.inf
-        spread = LEAST_DEVIATION**2 - 2 * math.log(min(length, 1.0) if directed else LEAST_LENGTH)
+        # A vector that is not finite, as from a diverged network, has no direction.
+        directed = MIN_LENGTH <= length < math.inf
+        spread = MIN_DEVIATION**2 - 2 * math.log(min(length, 1.0) if directed else MIN_LENGTH)
         for i in range(len(centroid)):
             x, y = centroid[i, 0] - position[k, m, 0], centroid[i, 1] - position[k, m, 1]
             distance = math.sqrt(x * x + y * y)
@@ -182,10 +286,10 @@ def _gain(
     deviation: Array,
     area_px: float,
 ) -> Array:
-    """Add the evidence of the distance from the expected position; 0 where it is negative.
+    """Add the evidence of the distance to the expected position; negative sums become 0.
 
-    It is the ratio of a Gaussian's density there to that of a peak anywhere on the maps, which is 1
-    without an expectation.
+    This evidence is the ratio of a Gaussian density to the density of a peak anywhere on the maps.
+    Without an expected position, the ratio is 1.
     """
     gain = np.zeros(evidence.shape)
     for i, k, m in np.ndindex(evidence.shape):
@@ -204,7 +308,7 @@ def _gain(
 
 @compiled()
 def _unrivalled(gain: Array) -> Array:
-    """Return instances' best peaks of each corner, −1 for none, or RIVALS where two want one."""
+    """Return each instance's best peak per corner: −1 for none, RIVALS if two share a best peak."""
     chosen = np.full(gain.shape[:2], -1, np.int64)
     for k in range(gain.shape[1]):
         for i in range(len(gain)):
@@ -224,15 +328,17 @@ def _unrivalled(gain: Array) -> Array:
 def _predict(
     position: Array, evidence: Array, centroid: Array, area_px: float
 ) -> tuple[Array, Array]:
-    """Return the corner positions that the most and likeliest peaks agree on, and their deviation.
+    """Return the corner positions with which the most and likeliest peaks agree.
 
-    Positions are NaN where no three peaks have a say; deviations are standard deviations, pixels.
+    Returns:
+        Positions, NaN for instances with fewer than three usable corners, and their standard
+        deviations, pixels.
     """
     count = len(evidence)
     expected, deviation = np.full((count, NUM_CORNERS, 2), math.nan), np.empty(count)
     arms = np.empty((NUM_CORNERS, CANDIDATES, 2))
     likeliest = np.empty((NUM_CORNERS, CANDIDATES))
-    # What speaks so much against a peak that no agreement makes up for it.
+    # No agreement with other peaks outweighs evidence below this.
     hopeless = -math.log(area_px / (2 * math.pi * PREDICTION_PX**2))
     usable = np.zeros(NUM_CORNERS, np.int64)
     for i in range(count):
@@ -242,19 +348,19 @@ def _predict(
                 value = evidence[i, k, m]
                 if not value > hopeless:
                     continue
-                place = usable[k]
-                while place > 0 and likeliest[k, place - 1] < value:
-                    place -= 1
-                if place == CANDIDATES:
+                rank = usable[k]
+                while rank > 0 and likeliest[k, rank - 1] < value:
+                    rank -= 1
+                if rank == CANDIDATES:
                     continue
                 usable[k] = min(usable[k] + 1, CANDIDATES)
-                for later in range(usable[k] - 1, place, -1):
+                for later in range(usable[k] - 1, rank, -1):
                     likeliest[k, later] = likeliest[k, later - 1]
                     for axis in range(2):
                         arms[k, later, axis] = arms[k, later - 1, axis]
-                likeliest[k, place] = value
+                likeliest[k, rank] = value
                 for axis in range(2):
-                    arms[k, place, axis] = position[k, m, axis] - centroid[i, axis]
+                    arms[k, rank, axis] = position[k, m, axis] - centroid[i, axis]
         deviation[i] = _best_triple(arms, likeliest, usable, area_px, expected[i])
         for k in range(NUM_CORNERS):
             for axis in range(2):
@@ -266,25 +372,25 @@ def _predict(
 def _best_triple(
     arms: Array, evidence: Array, usable: Array, area_px: float, expected: Array
 ) -> float:
-    """Write the arms that the best three candidates predict; return their standard deviation."""
+    """Write the arms that the best triple of candidates predicts; return their deviation."""
     best, best_variance = -math.inf, PREDICTION_PX**2
-    diagonals, known = np.empty((4, 2)), np.empty(3, np.int64)
+    diagonals, given = np.empty((4, 2)), np.empty(3, np.int64)
     corners, chosen = np.empty(3, np.int64), np.empty(3, np.int64)
     for number in range(4 * 8):
         missing, sides = number // 8, number % 8
         for n in range(3):
-            known[n] = (missing + 1 + n) % 4
-            corners[n] = DIAGONALS[known[n], sides >> n & 1]
+            given[n] = (missing + 1 + n) % 4
+            corners[n] = DIAGONALS[given[n], sides >> n & 1]
         combinations = usable[corners[0]] * usable[corners[1]] * usable[corners[2]]
         chosen[:] = 0
         for _ in range(combinations):
             diagonals[missing] = 0.0
             for n in range(3):
                 sign = -1.0 if sides >> n & 1 else 1.0
-                weight = -ALTERNATING[missing] * ALTERNATING[known[n]]
+                weight = -ALTERNATING[missing] * ALTERNATING[given[n]]
                 for axis in range(2):
                     arm = sign * arms[corners[n], chosen[n], axis]
-                    diagonals[known[n], axis] = arm
+                    diagonals[given[n], axis] = arm
                     diagonals[missing, axis] += weight * arm
             total, variance = _agreement(diagonals, arms, evidence, usable, area_px, best)
             if total > best:
@@ -305,9 +411,9 @@ def _best_triple(
 def _agreement(
     diagonals: Array, arms: Array, evidence: Array, usable: Array, area_px: float, least: float
 ) -> tuple[float, float]:
-    """Return the evidence of all candidates near these diagonals' corners, and their variance.
+    """Return the evidence of all candidates near the corners of these diagonals, and its variance.
 
-    The sum is given up, at whatever it is, once it cannot exceed ``least`` any more.
+    The summation stops early, with an upper bound, once the sum cannot exceed ``least``.
     """
     size = 0.0
     for d in range(4):

@@ -1,34 +1,53 @@
-"""From one object's peaks to its detections: keypoints are grouped, groups posed, by turns."""
+"""Detections with their calibrated scores and covariances, and the options of the recovery.
+
+``evaluate.py tune=true`` fits three corrections on validation images with the functions ``fit_*``:
+
+- Distance: a network's keypoints are means over the poses that it considers possible, and the mean
+  of a rotated shape is smaller. Poses are therefore too far away, by about the same factor.
+- Covariance: peaks predict independent errors of keypoints, not their common errors.
+- Score: a logistic model of the probability that ADD is below a tenth of the diameter. With the
+  default weights, the score is the mean belief.
+
+To add a feature of the score, name it in :data:`FEATURES`, compute it in
+:func:`detection_features` and add its weight to :class:`RecoveryOptions`.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Annotated, Final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
-from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS, Cuboid
-from dopepp.geometry.pnp import PnPResult, solve_pnp
-from dopepp.geometry.refine import MIN_POINTS, too_few
-from dopepp.maps.codec import Peaks
-from dopepp.recovery.association import KeypointGroup, ObjectPeaks, associate, direction_evidence
+from dopepp.core.validation import STRICT, Range, parse
+from dopepp.geometry.camera import CameraMatrix, Transform, project, project_keypoints, transform
+from dopepp.geometry.cuboid import NUM_CORNERS, Cuboid
+from dopepp.geometry.pnp import PnPResult
+from dopepp.recovery.association import KeypointGroup
 
-SIGMA_FLOOR_PX: Final = 1.0  # Bounds the weight of a clean peak against a blurred one
+FEATURES: Final = ("bias", "belief", "spread", "misfit", "found")  # Of the score, in this order
+REFINED_FEATURES: Final = ("bias", "score", "agreement", "support")  # Of a refined pose's score
 
-WIDENINGS: Final = (1.0, 2.0, 4.0)
-"""Factors on the peaks' standard deviations, until most keypoints agree."""
+CANDIDATE: Final = 0.005
+"""Score from which a detection is refined if refined poses have a score of their own: refinement
+distinguishes a false detection from a part that the network was unsure of."""
 
-ROUNDS: Final = 3  # Most turns of grouping and solving
+DISTANCE_FACTORS: Final = (0.5, 2.0)  # Range; factors of trained networks are within a tenth of 1
+COVARIANCE_FACTORS: Final = (0.01, 100.0)  # Range; factors of trained networks are 1 to 4
+PASSING: Final = 0.1  # ADD over the diameter below which a pose is right
 
-BORDER: Final = 1.0  # Distance from the maps' border within which a keypoint may lie beyond, cells
-
-BORDER_DEVIATION: Final = 0.75
-"""Error of such a peak, cells (root mean square of trained networks): half of the belief lies where
-there are no cells, so the peak is pulled inward."""
+_TENTH_BEYOND: Final = 10.645  # Squared Mahalanobis distance in 6D that a tenth exceeds
+_CERTAIN: Final = 1e-3  # Beliefs within this distance of 0 or 1 are treated alike
+_EXPONENTS: Final = 4.0  # Logarithms are clipped beyond this, so that outliers do not dominate
+_TYPICAL_MISFIT: Final = 0.01  # Average reprojection error over the size in the image
+_RIDGE: Final = 0.1  # Weight of the squared weights, in detections, which keeps them finite
+_STEPS: Final = 50  # Maximum number of Newton steps
+_MEAN_BELIEF: Final = tuple(float(name == "belief") for name in FEATURES)
+_NETWORK_SCORE: Final = tuple(float(name == "score") for name in REFINED_FEATURES)
 
 
 @dataclass(frozen=True)
@@ -37,22 +56,22 @@ class Detection:
 
     Attributes:
         object: The part's name.
-        score: How sure the pose is, in [0, 1]: the mean belief or, once the checkpoint is tuned,
-            the probability that ADD is below a tenth of the diameter.
-        belief: Mean belief over the nine keypoints, in [0, 1]; one that is missing or does not
-            agree with the pose counts 0.
+        score: Confidence in the pose, in [0, 1]: the mean belief or, for tuned checkpoints, the
+            probability that ADD is below a tenth of the diameter.
+        belief: Mean belief over the nine keypoints, in [0, 1]; keypoints that are missing or do not
+            agree with the pose count 0.
         T_cam_obj: Object-to-camera transform, metres, OpenCV camera frame.
         keypoints: The cuboid's corners and centroid projected with this pose, pixels.
-        peaks: The measured keypoints, pixels; NaN where the maps have none that agrees with the
-            pose.
-        reprojection_error_px: RMS distance between the two over the PnP inliers, pixels.
-        covariance: Of a small turn about the object's origin (rotation vector in the camera
-            frame, radians) and a small shift (camera frame, metres), from the peaks' covariances.
-        kept: Why a refinement that was asked for kept the network's pose; empty elsewhere.
+        peaks: The measured keypoints, pixels; NaN for keypoints that are missing or do not agree
+            with the pose.
+        reprojection_error_px: RMS distance between ``keypoints`` and ``peaks``, pixels.
+        covariance: Covariance of a small rotation about the object's origin (rotation vector in
+            the camera frame, radians) and a small translation (camera frame, metres).
+        kept: Why the refinement kept the network's pose; empty otherwise.
         agreement: Share of the image's evidence about the refined outline that agrees with it, in
             [0, 1]; None without refinement.
-        support: Share of the refined outline that has agreeing evidence, in [0, 1], which hidden
-            outline has not; None without refinement.
+        support: Share of the refined outline that has agreeing evidence, in [0, 1]; an occluded
+            outline has none. None without refinement.
     """
 
     object: str
@@ -68,112 +87,96 @@ class Detection:
     support: float | None = None
 
 
-def peaks_of_object(
-    peaks: Peaks, image: int, number: int, threshold: float, cells: tuple[int, int], stride: float
-) -> ObjectPeaks:
-    """Pick the peaks of one object on one image; those at the border are less certain.
+_Belief = Annotated[float, Range(1e-6, 1.0)]
+_Score = Annotated[float, Range(0.0, 1.0)]
+_Weight = Annotated[float, Range(-1000.0, 1000.0)]  # fitted weights are a hundred times smaller
 
-    Below the belief ``threshold`` a centroid is no instance; ``cells`` are the maps' width and
-    height.
+
+@dataclass(frozen=True)
+class RecoveryOptions:
+    """Thresholds of the recovery from maps to poses; stored in the checkpoint.
+
+    Attributes:
+        sigma: Width of a perfect belief peak, cells.
+        peak_threshold: Belief below which a corner's maximum is no peak.
+        centroid_threshold: Belief below which there is no instance.
+        max_angle_deg: Largest angle between a corner's vector and its centroid, degrees.
+        max_peaks: Maximum number of peaks per channel.
+        min_score: Detections below this score are dropped.
+        distance_factor: Factor on the distance of every pose, set by ``evaluate.py tune=true``.
+        covariance_factor: Factor on the covariance of every pose, set likewise.
+        score_bias: First weight of the score's features, set by ``evaluate.py tune=true``; with
+            the defaults, the score is the mean belief.
+        refined_min_score: Refined detections below this score are dropped.
+        refined_bias: First weight of the score of refined poses, set by ``evaluate.py tune=true
+            refine=region``; with the defaults, the network's score is kept.
     """
-    first = number * NUM_KEYPOINTS
-    corners, centroid = (image, slice(first, first + NUM_CORNERS)), (image, first + CENTROID)
-    strong = peaks.score[centroid] >= threshold
-    extent = np.array(cells) * float(stride)
-    position, covariance = peaks.position[corners], peaks.covariance_px[corners]
-    covariance = _covariance_px(position, covariance, extent, float(stride))
-    return ObjectPeaks(
-        position,
-        peaks.score[corners],
-        covariance,
-        peaks.toward[corners],
-        peaks.position[centroid][strong],
-        peaks.score[centroid][strong],
-        peaks.covariance_px[centroid][strong],
-        float(extent.prod()),
-    )
 
+    __pydantic_config__ = STRICT
 
-@compiled()
-def _covariance_px(position: Array, covariance: Array, extent: Array, stride: float) -> Array:
-    """Add what a peak at the border of the maps does not know; the outermost pixel ends at −½."""
-    widened = covariance.copy()
-    for k, m in np.ndindex(position.shape[:2]):
-        x, y = position[k, m, 0], position[k, m, 1]
-        inward = min(x + 0.5, y + 0.5, extent[0] - 0.5 - x, extent[1] - 0.5 - y)
-        if inward < BORDER * stride:
-            for axis in range(2):
-                widened[k, m, axis, axis] += (BORDER_DEVIATION * stride) ** 2
-    return widened
+    sigma: Annotated[float, Range(0.1, 100.0, "cells")] = 1.0
+    peak_threshold: _Belief = 0.02
+    centroid_threshold: _Belief = 0.05
+    max_angle_deg: Annotated[float, Range(1e-3, 180.0, "degrees")] = 45.0
+    max_peaks: Annotated[int, Range(1, 1000)] = 16
+    min_score: _Score = 0.0
+    distance_factor: Annotated[float, Range(*DISTANCE_FACTORS)] = 1.0
+    covariance_factor: Annotated[float, Range(*COVARIANCE_FACTORS)] = 1.0
+    score_bias: _Weight = 0.0
+    score_belief: _Weight = 1.0
+    score_spread: _Weight = 0.0
+    score_misfit: _Weight = 0.0
+    score_found: _Weight = 0.0
+    refined_min_score: _Score = 0.0
+    refined_bias: _Weight = 0.0
+    refined_score: _Weight = 1.0
+    refined_agreement: _Weight = 0.0
+    refined_support: _Weight = 0.0
 
+    @classmethod
+    def of(cls, options: Mapping[str, float]) -> RecoveryOptions:
+        """Check the options of a config, a checkpoint or a caller.
 
-def pose_instances(
-    peaks: ObjectPeaks,
-    cuboid: Cuboid,
-    K: CameraMatrix,
-    max_angle_deg: float,
-    coincident_px: float,
-) -> list[tuple[KeypointGroup, PnPResult]]:
-    """Group keypoints and solve poses by turns, until the poses change no group any more."""
-    if not len(peaks.centroid):
-        return []
-    evidence = direction_evidence(peaks, math.radians(max_angle_deg), coincident_px)
-    groups = associate(peaks, evidence)
-    results = [solve_group(group, cuboid, K) for group in groups]
-    for _ in range(ROUNDS):
-        if all(result.inliers.all() for result in results):
-            break  # complete instances have nothing to gain from each other
-        expected = np.full((len(groups), NUM_CORNERS, 2), np.nan)
-        for corners, result in zip(expected, results, strict=True):
-            if result.T_cam_obj is not None:
-                corners[:] = project_keypoints(cuboid, result.T_cam_obj, K)[:NUM_CORNERS]
-        before, groups = groups, associate(peaks, evidence, expected)
-        same = [
-            old.position.tobytes() == new.position.tobytes()
-            for old, new in zip(before, groups, strict=True)
-        ]
-        if all(same):
-            break
-        results = [
-            result if kept else solve_group(group, cuboid, K)
-            for kept, result, group in zip(same, results, groups, strict=True)
-        ]
-    return list(zip(groups, results, strict=True))
+        Raises:
+            UserError: A name is unknown, or a value is out of its range.
+        """
+        return parse(cls, options, "recovery")
 
+    @property
+    def score_weights(self) -> tuple[float, ...]:
+        """Weights of the score's features, in their order."""
+        return tuple(getattr(self, f"score_{name}") for name in FEATURES)
 
-def solve_group(group: KeypointGroup, cuboid: Cuboid, K: CameraMatrix) -> PnPResult:
-    """Solve PnP with each keypoint weighted by its own covariance.
+    @property
+    def refined_weights(self) -> tuple[float, ...]:
+        """Weights of the features of a refined pose's score, in their order."""
+        return tuple(getattr(self, f"refined_{name}") for name in REFINED_FEATURES)
 
-    A covariance is averaged over its directions: how wide a network's peak is tells how far it is
-    off, its shape does not tell whither. A network's maps are narrower than its errors; where fewer
-    than two thirds of the keypoints agree on a pose, the deviations are widened and the pose solved
-    again.
-    """
-    found = sum(math.isfinite(x) for x in group.position[:, 0].tolist())
-    if found < MIN_POINTS:  # as of most centroids that noise makes
-        return PnPResult(None, math.inf, np.zeros(NUM_KEYPOINTS, bool), too_few(found))
-    covariance = _averaged(group.covariance_px)
-    return solve_pnp(cuboid, group.position, K, covariance_px=covariance, widenings=WIDENINGS)
+    def unrefined(self) -> RecoveryOptions:
+        """Return the options with the default score of refined poses."""
+        defaults = {field.name: field.default for field in fields(self)}
+        return replace(self, **{k: v for k, v in defaults.items() if k.startswith("refined_")})  # type: ignore[arg-type]
 
-
-@compiled()
-def _averaged(covariance: Array) -> Array:
-    """Return circular covariances of the same mean variance, and the floor; NaN stays NaN."""
-    averaged = np.zeros(covariance.shape)
-    for k in range(len(covariance)):
-        variance = (covariance[k, 0, 0] + covariance[k, 1, 1]) / 2 + SIGMA_FLOOR_PX**2
-        averaged[k, 0, 0] = averaged[k, 1, 1] = variance
-    return averaged
+    def of_candidates(self) -> RecoveryOptions:
+        """Return the options that keep every detection which refinement may confirm."""
+        if self.refined_weights == _NETWORK_SCORE:
+            return self
+        return replace(self, min_score=min(self.min_score, CANDIDATE))
 
 
 def make_detection(
-    group: KeypointGroup, result: PnPResult, cuboid: Cuboid, K: CameraMatrix, name: str
+    group: KeypointGroup,
+    result: PnPResult,
+    cuboid: Cuboid,
+    K: CameraMatrix,
+    name: str,
+    options: RecoveryOptions,
 ) -> Detection | None:
-    """Turn one group into a detection where PnP finds a pose."""
+    """Return the calibrated detection of a keypoint group; None if PnP found no pose."""
     if result.T_cam_obj is None or result.covariance is None:
         return None
     belief = float(np.where(result.inliers, group.score, 0.0).clip(0.0, 1.0).mean())
-    return Detection(
+    detection = Detection(
         object=name,
         score=belief,
         belief=belief,
@@ -183,3 +186,143 @@ def make_detection(
         reprojection_error_px=result.reprojection_error_px,
         covariance=result.covariance,
     )
+    return calibrated(detection, cuboid, K, options)
+
+
+def calibrated(
+    detection: Detection, cuboid: Cuboid, K: CameraMatrix, options: RecoveryOptions
+) -> Detection:
+    """Return a detection with corrected distance and covariance, and with its score.
+
+    The part moves along the ray through its origin.
+    """
+    if options.distance_factor != 1.0:
+        T = detection.T_cam_obj.copy()
+        T[:3, 3] *= options.distance_factor
+        keypoints = project_keypoints(cuboid, T, K)
+        detection = replace(detection, T_cam_obj=T, keypoints=keypoints)
+    probability = detection.belief
+    if options.score_weights != _MEAN_BELIEF:
+        features = detection_features(detection, cuboid, K)
+        probability = float(score(features, np.array(options.score_weights)))
+    covariance = options.covariance_factor * detection.covariance
+    return replace(detection, score=probability, covariance=covariance)
+
+
+def rescored(refined: Sequence[Detection], options: RecoveryOptions) -> list[Detection]:
+    """Return refined detections with the score of refined poses, best first, without low scores."""
+    if options.refined_weights != _NETWORK_SCORE:
+        weights = np.array(options.refined_weights)
+        refined = [
+            replace(detection, score=float(score(refined_features(detection), weights)))
+            for detection in refined
+        ]
+    passed = [detection for detection in refined if detection.score >= options.refined_min_score]
+    return sorted(passed, key=lambda detection: -detection.score)
+
+
+def refined_features(detection: Detection) -> Float[np.ndarray, "features"]:
+    """Return the features of a refined detection that still has the network's score."""
+    evidence = detection.agreement or 0.0, detection.support or 0.0
+    return np.array([1.0, np.log(_odds(detection.score)), *evidence])
+
+
+def detection_features(
+    detection: Detection, cuboid: Cuboid, K: CameraMatrix
+) -> Float[np.ndarray, "features"]:
+    """Return the features of one detection; they do not depend on its score."""
+    T, corners = detection.T_cam_obj, cuboid[:NUM_CORNERS]
+    size = float(np.linalg.norm(np.ptp(corners, axis=0)))
+    pixels = project(transform(T, corners), K)
+    # A corner without a peak may lie behind the camera, where it has no pixel.
+    visible = pixels[np.isfinite(pixels).all(axis=1)]
+    extent = max(float(np.ptp(visible, axis=0).max()), 1.0) if len(visible) else 1.0
+    spread = _expected_distance(detection.covariance, corners @ T[:3, :3].T) / size
+    misfit = max(detection.reprojection_error_px, 1e-9) / (extent * _TYPICAL_MISFIT)
+    logarithms = np.log([_odds(detection.belief), max(spread, 1e-9) / PASSING, misfit])
+    missing = float(np.isfinite(detection.peaks).all(axis=1).mean()) - 1
+    return np.array([1.0, *np.clip(logarithms, -2 * _EXPONENTS, 2 * _EXPONENTS), missing])
+
+
+def _odds(probability: float) -> float:
+    bounded = float(np.clip(probability, _CERTAIN, 1 - _CERTAIN))
+    return bounded / (1 - bounded)
+
+
+def score(
+    features: Float[np.ndarray, "*n features"], weights: Float[np.ndarray, "features"]
+) -> Float[np.ndarray, "*n"]:
+    """Return the probability that each pose is right, in (0, 1)."""
+    return np.asarray(1 / (1 + np.exp(-np.clip(features @ weights, -30, 30))))
+
+
+def fit_distance_factor(
+    estimated: Float[np.ndarray, "n 4 4"], true: Float[np.ndarray, "n 4 4"]
+) -> float:
+    """Return the median ratio of true to estimated distance; 1 without poses."""
+    if not len(estimated):
+        return 1.0
+    distances = [np.linalg.norm(T[:, :3, 3], axis=1) for T in (true, estimated)]
+    return float(np.clip(np.median(distances[0] / distances[1]), *DISTANCE_FACTORS))
+
+
+def fit_covariance_factor(squared_distances: Float[np.ndarray, "n"]) -> float:
+    """Return the factor on covariances that matches the 90 % quantile of the pose errors.
+
+    The tails are heavier than those of a Gaussian, and refinement, whose prior this is, must reach
+    the true pose.
+
+    Args:
+        squared_distances: Squared Mahalanobis distances of true poses, with a factor of 1.
+    """
+    if not len(squared_distances):
+        return 1.0
+    factor = float(np.quantile(squared_distances, 0.9)) / _TENTH_BEYOND
+    return float(np.clip(factor, *COVARIANCE_FACTORS))
+
+
+def fit_weights(
+    features: Float[np.ndarray, "n features"], correct: Bool[np.ndarray, "n"]
+) -> Float[np.ndarray, "features"]:
+    """Fit the score's weights by maximum likelihood (Newton's method) with a ridge penalty.
+
+    Args:
+        features: Features of the detections.
+        correct: Whether each pose is right; a detection without an instance is not.
+
+    Raises:
+        ValueError: All or no detections are right.
+    """
+    correct = np.asarray(correct, bool)
+    if not correct.any() or correct.all():
+        raise ValueError("a score needs right and wrong detections to learn from")
+    weights = np.zeros(features.shape[1])
+    ridge = _RIDGE * np.eye(len(weights))
+    ridge[0, 0] = 0.0  # the share of right detections is well determined
+    for _ in range(_STEPS):
+        predicted = score(features, weights)
+        gradient = features.T @ (correct - predicted) - ridge @ weights
+        hessian = (features * (predicted * (1 - predicted))[:, None]).T @ features + ridge
+        step = np.linalg.lstsq(hessian, gradient, rcond=None)[0]
+        weights = weights + step * min(1.0, _EXPONENTS / max(float(np.abs(step).max()), 1e-12))
+        if np.abs(step).max() < 1e-9:
+            break
+    return weights
+
+
+@compiled()
+def _expected_distance(covariance: Array, points: Array) -> float:
+    """Return the RMS uncertainty of points (relative to the origin, camera axes), metres."""
+    total = 0.0
+    moves = np.zeros((3, 6))
+    for row in range(3):
+        moves[row, 3 + row] = 1.0
+    for x, y, z in points:
+        # A rotation ω moves p by ω × p.
+        moves[0, 1], moves[0, 2], moves[1, 2] = z, -y, x
+        moves[1, 0], moves[2, 0], moves[2, 1] = -z, y, -x
+        for row in range(3):
+            for a in range(6):
+                for b in range(6):
+                    total += moves[row, a] * covariance[a, b] * moves[row, b]
+    return math.sqrt(max(total, 0.0) / len(points))

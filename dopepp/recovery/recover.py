@@ -1,15 +1,18 @@
-"""The one way from maps to poses; callbacks, estimators and exported runtimes all call it.
+"""Recover object poses from belief maps and vector fields.
 
-A :class:`Reason` says why an object, or one candidate of it, is no detection. To add a reason, name
-its kind in :data:`KINDS`, at its place on the way from maps to poses.
+Training, evaluation, estimators and exported runtimes all call :func:`recover` or
+:func:`recover_batch`: find peaks, associate them to instances, solve PnP, score the detections.
+A :class:`Reason` describes why an object, or one candidate of it, is not detected. To add a reason,
+add its kind to :data:`KINDS`, in the order of these steps.
 """
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Final, Literal
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Literal
 
 import numpy as np
 import torch
@@ -17,11 +20,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dopepp.geometry.camera import CameraMatrix
-from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS, Cuboid
+from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS
+from dopepp.geometry.pnp import PnPResult
 from dopepp.maps.codec import Beliefs, Fields, MapGeometry, find_peaks
-from dopepp.recovery.association import ObjectPeaks
-from dopepp.recovery.detection import Detection, make_detection, peaks_of_object, pose_instances
-from dopepp.recovery.scoring import RecoveryOptions, calibrated
+from dopepp.recovery.association import KeypointGroup, select_peaks, solve_instances
+from dopepp.recovery.detection import Detection, RecoveryOptions, make_detection
 
 Cuboids = Float[np.ndarray, "objects 9 3"]
 Cameras = Float[np.ndarray, "batch 3 3"]
@@ -38,20 +41,20 @@ KINDS: Final[dict[Kind, str]] = {
     "score": "below the threshold (best score {best:.3g})",
     "refined": "below the threshold once refined (best score {best:.3g})",
 }
-"""What ends the way from maps to poses, in its order, as a summary says it."""
+"""Kinds of reasons, in the order of the steps, with the text of a summary."""
 
-LEAST_CELLS: Final = 3.0  # Extent of an object's keypoints below which its maps are one blot, cells
+LEAST_CELLS: Final = 3.0  # Keypoints within fewer cells blend into one peak
 
 
 @dataclass(frozen=True)
 class Reason:
-    """Why an object, or one candidate of it, is no detection.
+    """Why an object, or one candidate of it, is not detected.
 
     Attributes:
         object: The part's name.
-        kind: What ended it.
-        best: The belief or the score that it reached.
-        text: In words, with the threshold.
+        kind: The step that rejected the candidate.
+        best: The belief or score of the candidate.
+        text: Explanation with the threshold.
     """
 
     object: str
@@ -103,7 +106,16 @@ def recover_batch(
 ) -> list[list[Detection]]:
     """Recover the poses on every image of a batch; see :func:`recover`.
 
-    ``reasons`` takes one for each object or centroid that is left out.
+    Args:
+        belief: Belief maps of the images.
+        field: Vector-field maps of the images.
+        cuboids: Nine keypoints of each object, metres.
+        K: Camera matrix of each image, pixels.
+        stride: Pixels per cell.
+        names: Names of the objects (default: their indices).
+        reasons: List to which a reason is appended for each object or candidate without a
+            detection.
+        **options: Fields of :class:`RecoveryOptions`.
 
     Raises:
         ValueError: Maps, cuboids, cameras and names do not fit each other.
@@ -120,18 +132,21 @@ def recover_batch(
     geometry = MapGeometry(stride, chosen.sigma)
     peaks = find_peaks(belief, geometry, chosen.peak_threshold, chosen.max_peaks, field)
     cells = (belief.shape[-1], belief.shape[-2])
-    size = f"{stride * cells[0]}×{stride * cells[1]}"  # of the network's input
+    max_angle = math.radians(chosen.max_angle_deg)
     batch = []
     for image, camera in enumerate(K):
         detections: list[Detection] = []
         for c, (cuboid, name) in enumerate(zip(cuboids, labels, strict=True)):
-            object_peaks = peaks_of_object(
-                peaks, image, c, chosen.centroid_threshold, cells, stride
-            )
-            detections += _recover_object(
-                object_peaks, cuboid, camera, name, chosen, stride, size, reasons
-            )
-            if reasons is not None and not len(object_peaks.centroid):
+            own_peaks = select_peaks(peaks, image, c, chosen.centroid_threshold, cells, stride)
+            instances = solve_instances(own_peaks, cuboid, camera, max_angle, float(stride))
+            for group, result in instances:
+                detection = make_detection(group, result, cuboid, camera, name, chosen)
+                if detection is not None and detection.score >= chosen.min_score:
+                    detections.append(detection)
+                elif reasons is not None:
+                    kind, best, text = _rejected(group, result, detection, chosen, cells, stride)
+                    reasons.append(Reason(name, kind, best, text))
+            if reasons is not None and not instances:
                 beliefs = belief[image, c * NUM_KEYPOINTS : (c + 1) * NUM_KEYPOINTS]
                 reasons.append(_no_centroid(beliefs, name, chosen))
         batch.append(sorted(detections, key=lambda detection: -detection.score))
@@ -139,51 +154,13 @@ def recover_batch(
 
 
 def explain(
-    belief: Belief,
-    field: Field,
-    cuboids: Cuboids,
-    K: CameraMatrix,
-    stride: int = 8,
-    names: Sequence[str] | None = None,
-    **options: float,
+    belief: Belief, field: Field, cuboids: Cuboids, K: CameraMatrix, *layout: Any, **options: Any
 ) -> list[Reason]:
-    """Say what :func:`recover` leaves out of these maps and why, for each object or centroid."""
+    """Return why objects and candidates are not detected; the arguments are those of `recover`."""
     reasons: list[Reason] = []
-    image = np.asarray(K)[None]
-    recover_batch(belief[None], field[None], cuboids, image, stride, names, reasons, **options)
+    maps = (belief[None], field[None], cuboids, np.asarray(K)[None])
+    recover_batch(*maps, *layout, reasons=reasons, **options)
     return reasons
-
-
-def _recover_object(
-    peaks: ObjectPeaks,
-    cuboid: Cuboid,
-    K: CameraMatrix,
-    name: str,
-    options: RecoveryOptions,
-    stride: int,
-    size: str,
-    reasons: list[Reason] | None,
-) -> Iterator[Detection]:
-    """Yield all instances of one object; ``reasons`` takes one for each that is none."""
-    for group, result in pose_instances(peaks, cuboid, K, options.max_angle_deg, float(stride)):
-        detection = make_detection(group, result, cuboid, K, name)
-        if detection is not None:
-            detection = calibrated(detection, cuboid, K, options)
-            if detection.score >= options.min_score:
-                yield detection
-                continue
-        if reasons is None:
-            continue
-        x, y = group.position[CENTROID]
-        where = f"at pixel ({x:.0f}, {y:.0f}) of {size}"
-        if detection is None:
-            best = float(np.nan_to_num(group.score[CENTROID]))
-            reason = Reason(name, "pose", best, f"{where}: {result.reason}")
-            reasons.append(_or_too_small(reason, group.position, stride))
-        else:
-            text = f"{where}: score {detection.score:.3f} below {options.min_score:g}"
-            reason = Reason(name, "score", detection.score, text)
-            reasons.append(_or_too_small(reason, detection.keypoints, stride))
 
 
 def _check_shapes(belief: Beliefs, field: Fields, num_objects: int, K: Cameras) -> None:
@@ -193,8 +170,8 @@ def _check_shapes(belief: Beliefs, field: Fields, num_objects: int, K: Cameras) 
             f"maps are (batch, channels, height, width) with cells, got {tuple(belief.shape)} "
             f"and {tuple(field.shape)}"
         )
-    got = (belief.shape[1], field.shape[1])
-    if got != expected or belief.shape[2:] != field.shape[2:] or len(belief) != len(field):
+    channels = (belief.shape[1], field.shape[1])
+    if channels != expected or belief.shape[2:] != field.shape[2:] or len(belief) != len(field):
         raise ValueError(
             f"{num_objects} objects need {expected} belief and field channels of one size, "
             f"got {tuple(belief.shape)} and {tuple(field.shape)}"
@@ -206,24 +183,37 @@ def _check_shapes(belief: Beliefs, field: Fields, num_objects: int, K: Cameras) 
 def _no_centroid(
     beliefs: Float[Tensor, "9 height width"], name: str, options: RecoveryOptions
 ) -> Reason:
-    """Return how close an object without any centroid came to one."""
+    """Return the reason of an object without any centroid."""
     best = torch.nan_to_num(beliefs.detach().float()).flatten(1).amax(1)
-    if float(best.max()) <= options.peak_threshold:
-        text = f"its maps are empty, no belief above {float(best.max()):.2g}"
-        return Reason(name, "empty", float(best.max()), text)
-    centroid, least = float(best[CENTROID]), options.centroid_threshold
-    text = f"best belief of a centroid {centroid:.2g}, {least:g} is the least"
+    highest, centroid = float(best.max()), float(best[CENTROID])
+    if highest <= options.peak_threshold:
+        return Reason(name, "empty", highest, f"its maps are empty, no belief above {highest:.2g}")
+    text = f"best belief of a centroid {centroid:.2g} below {options.centroid_threshold:g}"
     return Reason(name, "centroid", centroid, text)
 
 
-def _or_too_small(reason: Reason, points: Float[np.ndarray, "9 2"], stride: int) -> Reason:
-    """Return the reason, or that the part is too small for the maps."""
+def _rejected(
+    group: KeypointGroup,
+    result: PnPResult,
+    detection: Detection | None,
+    options: RecoveryOptions,
+    cells: tuple[int, int],
+    stride: int,
+) -> tuple[Kind, float, str]:
+    """Return the kind, value and text of the reason that rejected a candidate."""
+    kind: Kind = "pose"
+    best, text, points = float(np.nan_to_num(group.score[CENTROID])), result.reason, group.position
+    if detection is not None:
+        kind, best, points = "score", detection.score, detection.keypoints
+        text = f"score {best:.3f} below {options.min_score:g}"
     points = points[np.isfinite(points).all(1)]
     extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
-    if len(points) < 2 or extent >= LEAST_CELLS * stride:
-        return reason
-    cell = f"{extent:.0f} px across, where a cell of the maps has {stride}"
-    return replace(reason, kind="small", text=f"{reason.text} (too small: {cell})")
+    if len(points) >= 2 and extent < LEAST_CELLS * stride:
+        kind = "small"
+        text += f" (too small: {extent:.0f} px across, a cell of the maps has {stride} px)"
+    x, y = group.position[CENTROID]
+    size = f"{stride * cells[0]}×{stride * cells[1]}"  # of the network's input
+    return kind, best, f"at pixel ({x:.0f}, {y:.0f}) of {size}: {text}"
 
 
 def rejected_refined(detection: Detection, least: float) -> Reason:
@@ -234,7 +224,7 @@ def rejected_refined(detection: Detection, least: float) -> Reason:
 
 
 def furthest(reasons: Sequence[Reason]) -> list[Reason]:
-    """Return of every object the reason that ended its best candidate, the best one last."""
+    """Return for each object the reason that rejected its best candidate, the best object last."""
     order = list(KINDS)
     best: dict[str, Reason] = {}
     for reason in sorted(reasons, key=lambda reason: (order.index(reason.kind), reason.best)):
@@ -244,7 +234,7 @@ def furthest(reasons: Sequence[Reason]) -> list[Reason]:
 
 
 def explained(reasons: Sequence[Reason]) -> str:
-    """Return one line on an image without detections."""
+    """Return one line for an image without detections."""
     counts = Counter(reason.object for reason in reasons)
     lines = []
     for reason in reversed(furthest(reasons)):
@@ -254,7 +244,7 @@ def explained(reasons: Sequence[Reason]) -> str:
 
 
 def summary(silent: Sequence[Reason], num_images: int) -> str:
-    """Return one line on images without detections, with a reason of each."""
+    """Return one line for images without detections; ``silent`` has one reason for each."""
     groups = []
     for kind, words in KINDS.items():
         values = [reason.best for reason in silent if reason.kind == kind]

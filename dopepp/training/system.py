@@ -27,9 +27,8 @@ from dopepp.models.heads import Stage
 from dopepp.models.losses import MapLoss
 from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part
-from dopepp.recovery.detection import Detection
+from dopepp.recovery.detection import Detection, RecoveryOptions
 from dopepp.recovery.recover import recover_batch
-from dopepp.recovery.scoring import RecoveryOptions
 from dopepp.training.loggers import MetricsTable
 from dopepp.training.optimizers import go_on_with_trained
 from dopepp.training.targets import (

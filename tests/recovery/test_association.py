@@ -15,8 +15,8 @@ from dopepp.recovery.association import (
     _predict,
     associate,
     direction_evidence,
+    solve_group,
 )
-from dopepp.recovery.detection import solve_group
 
 WIDE = math.radians(45)
 

@@ -13,11 +13,11 @@ from scipy.stats import chi2
 from dopepp.geometry.camera import camera_matrix, make_transform, project, transform
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.rotation import rotation_vector_to_matrix
-from dopepp.recovery.detection import Detection
-from dopepp.recovery.scoring import (
+from dopepp.recovery.detection import (
     CANDIDATE,
     DISTANCE_FACTORS,
     FEATURES,
+    Detection,
     RecoveryOptions,
     calibrated,
     detection_features,

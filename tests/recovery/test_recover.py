@@ -12,7 +12,7 @@ from dopepp.geometry.pnp import solve_pnp
 from dopepp.maps import MapGeometry, encode
 from dopepp.maps.codec import Peaks
 from dopepp.recovery import Reason, explain, recover, recover_batch
-from dopepp.recovery.detection import BORDER_DEVIATION, peaks_of_object
+from dopepp.recovery.association import BORDER_DEVIATION, select_peaks
 from dopepp.recovery.recover import explained, furthest, summary
 
 PLACES = [(-0.09, -0.09), (0.09, -0.09), (-0.09, 0.09), (0.09, 0.09)]
@@ -183,7 +183,7 @@ def test_too_few_corners_and_a_part_of_two_cells_are_reasons(make_scene, box, po
     scene = make_scene(box).place(0, make_transform(np.eye(3), np.array([0.0, 0.0, 15.0])))
     (small,) = explain(*scene.maps(), scene.cuboids, scene.K, min_score=1.0)
     assert small.kind == "small"
-    assert "px across, where a cell of the maps has 8" in small.text
+    assert "px across, a cell of the maps has 8 px" in small.text
 
 
 def reason(kind, best, name="plate"):
@@ -244,7 +244,7 @@ def test_peaks_at_the_border_are_less_certain():
     covariance = np.tile(np.diag([2.0, 3.0]), (1, 9, 6, 1, 1))
     score = np.ones((1, 9, 6))
     peaks = Peaks(position, score, covariance, np.zeros((1, 9, 6, 2)), np.ones((1, 9, 6), bool))
-    own = peaks_of_object(peaks, 0, 0, 0.05, (10, 6), 8.0)
+    own = select_peaks(peaks, 0, 0, 0.05, (10, 6), 8.0)
     added = own.covariance_px[0] - covariance[0, 0]
     assert_array_equal(added[:2], 0.0)
     assert_array_equal(added[2:], np.tile((8.0 * BORDER_DEVIATION) ** 2 * np.eye(2), (4, 1, 1)))

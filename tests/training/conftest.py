@@ -18,7 +18,7 @@ from dopepp.models.losses import SpatialCrossEntropy
 from dopepp.models.network import build_network
 from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.part import Part
-from dopepp.recovery.scoring import RecoveryOptions
+from dopepp.recovery.detection import RecoveryOptions
 from dopepp.training.loggers import MetricsTable
 from dopepp.training.run_checkpoints import AtomicCheckpointIO
 from dopepp.training.system import PoseSystem

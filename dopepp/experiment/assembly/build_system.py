@@ -27,7 +27,7 @@ from dopepp.models.checkpoint import Checkpoint, load_network
 from dopepp.models.network import LOSSES, PoseNetwork, build_network
 from dopepp.parts.part import Part
 from dopepp.parts.size import Seen
-from dopepp.recovery.scoring import RecoveryOptions
+from dopepp.recovery.detection import RecoveryOptions
 from dopepp.training.loggers import MetricsTable
 from dopepp.training.optimizers import AveragedWeights
 from dopepp.training.processes import WatchedDDP

@@ -224,7 +224,7 @@ class RunConfig(MeasurementConfig):
         model: The network and its loss.
         maps: The target maps.
         recovery: Thresholds from maps to poses, by the names of
-            :class:`~dopepp.recovery.scoring.RecoveryOptions`.
+            :class:`~dopepp.recovery.detection.RecoveryOptions`.
         symmetry: How symmetric parts are learnt.
         data: Objects, images, and how they are rendered.
         optimizer: Node of an optimiser.

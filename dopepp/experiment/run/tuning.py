@@ -33,9 +33,20 @@ from dopepp.metrics.row import symmetry_transforms
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.storage import write_atomic
 from dopepp.parts.part import Part, Parts
-from dopepp.recovery import scoring
-from dopepp.recovery.detection import Detection
-from dopepp.recovery.scoring import RecoveryOptions
+from dopepp.recovery.detection import (
+    CANDIDATE,
+    FEATURES,
+    PASSING,
+    REFINED_FEATURES,
+    Detection,
+    RecoveryOptions,
+    detection_features,
+    fit_covariance_factor,
+    fit_distance_factor,
+    fit_weights,
+    refined_features,
+    score,
+)
 
 HIDDEN: Final = 0.4
 """Share of each object that is hidden on the validation images that refined poses' scores learn
@@ -116,7 +127,7 @@ def tune(
     if refiner is not None:
         estimator.refiner = refiner
         # Features are of the network's score, which an earlier tuning's would hide.
-        candidate = min(new.min_score, scoring.CANDIDATE)
+        candidate = min(new.min_score, CANDIDATE)
         heard = replace(new.unrefined(), min_score=candidate)
         shown = scored(heard, validation, Hidden(validation))
         refined = choose(shown, scored(heard, empty), rate, refined=True)
@@ -133,7 +144,7 @@ def fit_factors(
     """Fit the factors on distances and covariances to poses that were found with factors of 1."""
     estimated = np.reshape([detection.T_cam_obj for detection, _ in pairs], (-1, 4, 4))
     true = np.reshape([equivalents[0] for _, equivalents in pairs], (-1, 4, 4))
-    distance = scoring.fit_distance_factor(estimated, true)
+    distance = fit_distance_factor(estimated, true)
     surprises = []
     for detection, equivalents in pairs:
         stated = np.broadcast_to(detection.covariance, (len(equivalents), 6, 6)).copy()
@@ -142,7 +153,7 @@ def fit_factors(
         poses = T_est[:, :3, :3], T_est[:, :3, 3], equivalents[:, :3, :3], equivalents[:, :3, 3]
         away = mahalanobis(*map(torch.from_numpy, (*poses, stated)))
         surprises.append(float(away.min()) ** 2)
-    covariance = scoring.fit_covariance_factor(np.array(surprises))
+    covariance = fit_covariance_factor(np.array(surprises))
     return {"distance_factor": distance, "covariance_factor": covariance}
 
 
@@ -169,25 +180,25 @@ def choose(
             "right and wrong ones to learn from",
             "train longer, or raise data.num_val and num_empty",
         )
-    weights = scoring.fit_weights(features, correct)
-    loudest = np.sort(empty.loudest(scoring.score(empty.features, weights)))[::-1]
+    weights = fit_weights(features, correct)
+    loudest = np.sort(empty.loudest(score(empty.features, weights)))[::-1]
     allowed = int(false_positive_rate * empty.num_images)
     # A detection passes from the threshold on, so it lies just above the first that must not.
     threshold = float(np.nextafter(loudest[allowed], 1.0)) if allowed < len(loudest) else 0.0
     if refined:
         names = [
             "refined_min_score",
-            *(f"refined_{feature}" for feature in scoring.REFINED_FEATURES),
+            *(f"refined_{feature}" for feature in REFINED_FEATURES),
         ]
     else:
-        names = ["min_score", *(f"score_{feature}" for feature in scoring.FEATURES)]
+        names = ["min_score", *(f"score_{feature}" for feature in FEATURES)]
     return dict(zip(names, [threshold, *map(float, weights)], strict=True))
 
 
 def score_images(estimator: PoseEstimator, parts: Parts, *sources: SampleSource) -> Scored:
     """Run an estimator over sources and judge every detection; features are of what it does."""
     refined = estimator.refiner is not None
-    names = scoring.REFINED_FEATURES if refined else scoring.FEATURES
+    names = REFINED_FEATURES if refined else FEATURES
     rows: list[tuple[np.ndarray, float, bool, int]] = []
     num_instances = 0
     for number, sample, part, detections, true in _by_object(estimator, parts, *sources):
@@ -195,9 +206,9 @@ def score_images(estimator: PoseEstimator, parts: Parts, *sources: SampleSource)
         right, judged = _judge(part, detections, true)
         for detection, is_right in zip(compress(detections, judged), right[judged], strict=True):
             if refined:
-                features = scoring.refined_features(detection)
+                features = refined_features(detection)
             else:
-                features = scoring.detection_features(detection, part.cuboid, sample.K)
+                features = detection_features(detection, part.cuboid, sample.K)
             rows.append((features, detection.score, bool(is_right), number))
     table, scores, correct, images = zip(*rows, strict=True) if rows else ((), (), (), ())
     return Scored(
@@ -279,7 +290,7 @@ def _judge(
         points = torch.from_numpy(np.asarray(part.points, np.float64))
         error = add_s if len(symmetry_transforms(part)) > 1 else add
         errors = error(T_est[:, :3, :3], T_est[:, :3, 3], T_gt[:, :3, :3], T_gt[:, :3, 3], points)
-        right[matched] = (errors < scoring.PASSING * part.diameter).numpy()
+        right[matched] = (errors < PASSING * part.diameter).numpy()
     return right, counts
 
 

@@ -28,8 +28,7 @@ from dopepp.metrics.functional import expected_calibration_error
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.network import build_network
 from dopepp.parts import load_part
-from dopepp.recovery.detection import Detection
-from dopepp.recovery.scoring import FEATURES, score
+from dopepp.recovery.detection import FEATURES, Detection, score
 
 K = camera_matrix(300, 300, 64, 64)
 NOTHING = Scored(
