@@ -12,7 +12,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 import torch
@@ -154,12 +154,18 @@ def recover_batch(
 
 
 def explain(
-    belief: Belief, field: Field, cuboids: Cuboids, K: CameraMatrix, *layout: Any, **options: Any
+    belief: Belief,
+    field: Field,
+    cuboids: Cuboids,
+    K: CameraMatrix,
+    stride: int = 8,
+    names: Sequence[str] | None = None,
+    **options: float,
 ) -> list[Reason]:
     """Return why objects and candidates are not detected; the arguments are those of `recover`."""
     reasons: list[Reason] = []
     maps = (belief[None], field[None], cuboids, np.asarray(K)[None])
-    recover_batch(*maps, *layout, reasons=reasons, **options)
+    recover_batch(*maps, stride, names, reasons, **options)
     return reasons
 
 
