@@ -164,8 +164,8 @@ def explain(
 ) -> list[Reason]:
     """Return why objects and candidates are not detected; the arguments are those of `recover`."""
     reasons: list[Reason] = []
-    maps = (belief[None], field[None], cuboids, np.asarray(K)[None])
-    recover_batch(*maps, stride, names, reasons, **options)
+    camera = np.asarray(K)[None]
+    recover_batch(belief[None], field[None], cuboids, camera, stride, names, reasons, **options)
     return reasons
 
 
