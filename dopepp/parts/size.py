@@ -1,6 +1,6 @@
-"""How large a part is, and how large and how far away a network has seen it.
+"""Sizes of parts, and the range of sizes and distances that a network has learned.
 
-The log describes each mesh, so that a wrong unit or a stray body is seen before a training.
+The log describes each mesh, so that a wrong unit or a stray body is visible before training.
 """
 
 from __future__ import annotations
@@ -9,34 +9,30 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-import scipy  # its parts load when they are used
-from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.core.validation import Span, check
 from dopepp.geometry.rotation import Vector
-from dopepp.parts.mesh import Faces, Vertices, weld
+from dopepp.parts.mesh.read import body_extents
 from dopepp.parts.part import Part
 
-_PLAUSIBLE: Final = (0.01, 2.0)  # Diameters that a hand or a robot's gripper holds, metres
+_PLAUSIBLE: Final = (0.01, 2.0)  # Diameters that a hand or gripper holds, metres
 _LISTED: Final = 3  # Most bodies whose sizes the log lists
-_MANY_CAVITIES: Final = 1000
-"""More surfaces than a part's cavities have: what else faces inwards counts as a body."""
 
 
 def is_plausible(part: Part) -> bool:
-    """Return whether a part has the size of something that is held and grasped: 1 cm to 2 m."""
+    """Return whether the diameter of a part is between 1 cm and 2 m."""
     return _PLAUSIBLE[0] <= part.diameter <= _PLAUSIBLE[1]
 
 
 def size_in_words(extents: Vector) -> str:
-    """Return the sides of a box (metres) as ``62 × 40 × 31 mm``, the longest first."""
+    """Format the sides of a box (metres) as ``62 × 40 × 31 mm``, the longest first."""
     sides = 1000 * np.sort(extents)[::-1]
     return " × ".join(f"{side:.0f}" if side >= 9.95 else f"{side:.1f}" for side in sides) + " mm"
 
 
 def part_in_words(part: Part) -> str:
-    """Return a part's name and size, the unit of its file, and its bodies where it has several."""
+    """Describe a part: name, size, unit of its file, and bodies if there are several."""
     words = f"{part.name}: {size_in_words(np.ptp(part.cuboid, axis=0))}"
     if part.unit:
         words += f", read in {part.unit}"
@@ -47,47 +43,18 @@ def part_in_words(part: Part) -> str:
     if len(bodies) > 1:
         sizes = [size_in_words(body) for body in bodies]
         listed = ", ".join(sizes) if len(sizes) <= _LISTED else f"the largest {sizes[0]}"
-        words += f"; {len(bodies)} bodies ({listed}), which are rendered and found as one part"
+        words += f"; {len(bodies)} bodies ({listed}), which are rendered and detected as one part"
     return words
 
 
-def body_extents(vertices: Vertices, faces: Faces) -> list[Float[np.ndarray, "3"]]:
-    """Return the sides of the box of each separate body, the largest body first.
-
-    A body is a connected surface (corners at one position are one) that bounds no cavity: one that
-    faces inwards and lies in another one's box is no body.
-    """
-    positions, corners = weld(vertices, faces)
-    start, end = corners.reshape(-1), corners[:, [1, 2, 0]].reshape(-1)
-    joined = scipy.sparse.coo_array(
-        (np.ones(len(start), bool), (start, end)), shape=(len(positions),) * 2
-    )
-    count, of_vertex = scipy.sparse.csgraph.connected_components(joined, directed=False)
-    if count == 1:
-        return [np.ptp(positions, axis=0)]
-    lower, upper = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
-    np.minimum.at(lower, of_vertex, positions)
-    np.maximum.at(upper, of_vertex, positions)
-    bodies = of_vertex[corners[:, 0]]
-    # From its own middle, so that an open surface's sign is its own as well.
-    a, b, c = (positions[corners] - ((lower + upper) / 2)[bodies][:, None]).swapaxes(0, 1)
-    volumes = np.bincount(bodies, np.einsum("ij,ij->i", a, np.cross(b, c)), minlength=count)
-    is_body = np.ones(count, bool)
-    for body in np.flatnonzero(volumes < 0)[:_MANY_CAVITIES]:
-        around = (lower < lower[body]).all(axis=1) & (upper > upper[body]).all(axis=1)
-        is_body[body] = not around.any()
-    extents = (upper - lower)[is_body]
-    return list(extents[np.argsort(-extents.prod(axis=1), kind="stable")])
-
-
 class Seen(NamedTuple):
-    """Range of the views of a part that a network has learned.
+    """Range of sizes and distances of a part that a network has learned.
 
     Attributes:
-        smallest_px: Smallest diameter (times focal length over depth), pixels of its input.
-        largest_px: The largest one.
+        smallest_px: Smallest diameter (times focal length over depth), pixels of the input.
+        largest_px: Largest diameter, pixels of the input.
         nearest: Smallest depth of the cuboid's centre, metres.
-        farthest: The largest one.
+        farthest: Largest depth of the cuboid's centre, metres.
     """
 
     smallest_px: float

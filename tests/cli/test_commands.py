@@ -245,7 +245,7 @@ def test_the_unit_of_a_file_is_guessed_aloud_and_a_wrong_one_named(plate, tmp_pa
     line = refused("render", plate, "--unit", "m", "-n", "5", "--out", out)
     assert "allowed: a diameter of 5 mm – 5 m; fix: state the file's unit: unit=mm" in line
     refused("render", plate, "-n", "0", "--out", out)
-    assert "states no unit: taken as mm" in caplog.text
+    assert "states no unit: assuming mm" in caplog.text
     assert not out.exists()
 
 

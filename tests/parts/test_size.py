@@ -11,7 +11,8 @@ from trimesh.exchange.stl import export_stl
 
 from dopepp.core.errors import UserError
 from dopepp.parts import load_part, servoholder
-from dopepp.parts.size import Seen, body_extents, part_in_words, size_in_words, widest
+from dopepp.parts.mesh.read import body_extents
+from dopepp.parts.size import Seen, part_in_words, size_in_words, widest
 
 
 def box(*extents: float, at: tuple[float, float, float] = (0, 0, 0)) -> trimesh.Trimesh:
@@ -92,7 +93,7 @@ def test_several_bodies_are_said_once(written, caplog):
     lines = [one.getMessage() for one in caplog.records if "bodies" in one.getMessage()]
     assert lines == [
         "bracket: 134 × 40 × 31 mm, read in mm; 2 bodies (62 × 40 × 31 mm, 8.0 × 5.0 × 5.0 mm), "
-        "which are rendered and found as one part"
+        "which are rendered and detected as one part"
     ]
     many = [box(1 + n / 9, 1, 1, at=(5 * n, 0, 0)) for n in range(5)]
     words = part_in_words(load_part(written(*many), "cm"))

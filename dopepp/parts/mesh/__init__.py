@@ -1,8 +1,8 @@
-"""Measures of triangles: areas, samples, the largest distance, a hash, distances from them.
+"""Measures of triangles: areas, samples, the largest distance, a hash, and distances to a surface.
 
-Lengths come out in the unit they go in. Arrays rather than a :class:`~dopepp.parts.part.Mesh`, so
-that a file's raw triangles can be measured before they are known to be a usable mesh. The modules
-of this package read mesh files.
+Lengths are returned in the unit of the input. The functions take arrays instead of a
+:class:`~dopepp.parts.part.Mesh`, so that triangles can be measured before they are checked. The
+modules of this package read mesh files.
 """
 
 from __future__ import annotations
@@ -22,28 +22,27 @@ Vertices = Float[np.ndarray, "vertices 3"]
 Faces = Int[np.ndarray, "faces 3"]
 Points = Float[np.ndarray, "points 3"]
 Colours = UInt8[np.ndarray, "vertices 3"]
-"""Positions of corners, triangles as indices of three of them, positions of anything else, sRGB."""
+"""Positions of vertices, vertex indices of triangles, any positions, sRGB of vertices."""
 
 NUM_SURFACE_POINTS: Final = 2000
-"""ADD points of a CAD part, a fixed number so that the results of two runs compare."""
+"""ADD points of a CAD part, a fixed number so that results are comparable."""
 
 SURFACE_SEED: Final = 2000
-"""Fixed seed of the surface samples: the same mesh has the same ADD points everywhere."""
+"""Seed of the surface samples, fixed so that a mesh always has the same ADD points."""
 
 _FEW_CORNERS: Final = 5000
-"""Corners of a hull whose distances are all computed: a quarter of a second."""
+"""Largest hull with an exhaustive search for the largest distance (a quarter of a second)."""
 
 NUM_COVERING: Final = 60_000
-"""Surface points of a :class:`SurfaceTree` besides vertices: about 0.6 % of a compact part's
-diameter apart."""
+"""Surface points of a :class:`SurfaceTree`, about 0.6 % of a compact part's diameter apart."""
 
 _NUM_NEIGHBOURS: Final = 6
-"""Surface points whose triangles are measured: the nearest point's own is not always the nearest
-triangle along an edge."""
+"""Surface points whose triangles are compared, as near an edge the nearest point's triangle may not
+be the nearest triangle."""
 
 
 class RawMesh(NamedTuple):
-    """Triangles of a file, in the unit that it states, if any; see ``parts.part.Mesh``."""
+    """Triangles of a file with its unit, if stated; see :class:`~dopepp.parts.part.Mesh`."""
 
     vertices: Vertices
     faces: Faces
@@ -63,23 +62,26 @@ def face_areas(vertices: Vertices, faces: Faces) -> Float[np.ndarray, " faces"]:
 def sample_surface(
     vertices: Vertices, faces: Faces, num_points: int = NUM_SURFACE_POINTS, seed: int = SURFACE_SEED
 ) -> Points:
-    """Draw points uniformly over the surface; triangles without area are a ValueError."""
+    """Draw points uniformly over the surface.
+
+    Raises:
+        ValueError: The triangles have no area.
+    """
     rng = np.random.default_rng(seed)
     cumulative = np.cumsum(face_areas(vertices, faces))
     if not cumulative[-1] > 0:
         raise ValueError(f"{len(faces)} triangles with a total area of {cumulative[-1]}")
-    # Without the last bound, a product that rounds up to the total still falls into a triangle.
-    bounds = cumulative[:-1]
-    chosen = np.searchsorted(bounds, rng.random(num_points) * cumulative[-1], side="right")
+    # Without the last bound, a product that rounds up to the total still selects a triangle.
+    chosen = np.searchsorted(cumulative[:-1], rng.random(num_points) * cumulative[-1], side="right")
     return _points_inside(vertices[faces[chosen]], rng)
 
 
 def _points_inside(
     triangles: Float[np.ndarray, "triangles 3 3"], rng: Generator
 ) -> Float[np.ndarray, "triangles 3"]:
-    """Draw a point of each triangle, uniformly."""
+    """Draw a point uniformly from each triangle."""
     a, b, c = triangles.swapaxes(0, 1)
-    # √ makes the share of points between a and a parallel to bc equal to the share of area there.
+    # √ makes the density of points independent of the distance from corner a.
     root, along = np.sqrt(rng.random((len(a), 1))), rng.random((len(a), 1))
     return np.asarray((1 - root) * a + root * (1 - along) * b + root * along * c)
 
@@ -87,13 +89,13 @@ def _points_inside(
 def largest_distance(points: Points) -> float:
     """Return the largest distance between two points.
 
-    It is exact for convex hulls of up to 5,000 corners, else up to 0.09 % too small.
+    It is exact for convex hulls of up to 5,000 corners, otherwise up to 0.09 % too small.
     """
-    # The two farthest points are corners of the convex hull, which flat and straight sets have only
-    # in the subspace that they span.
+    # The farthest points are corners of the convex hull, which flat and straight sets have only in
+    # the subspace that they span.
     offsets = points - points.mean(axis=0)
     _, spread, axes = np.linalg.svd(offsets, full_matrices=False)
-    # Leaving out a thickness of 1e-6 of the length changes the distance by 1e-12 of it.
+    # Ignoring a thickness of 1e-6 of the length changes the distance by a factor of 1 − 1e-12.
     rank = int((spread > 1e-6 * spread[0]).sum())
     if rank == 0:
         return 0.0
@@ -114,30 +116,29 @@ def largest_distance(points: Points) -> float:
 
 
 def _is_round(points: Float[np.ndarray, "points axes"]) -> bool:
-    """Tell whether most of many points are corners of their hull, which then is slow to find."""
+    """Return whether most of many points are corners of their hull, which makes it slow."""
     if len(points) <= _FEW_CORNERS:
         return False
     sample = points[:: len(points) // _FEW_CORNERS + 1]
-    # "QJ" moves points a little, so that a sample in a plane has a hull too.
+    # "QJ" moves points slightly, so that a planar sample has a hull too.
     return 2 * len(scipy.spatial.ConvexHull(sample, qhull_options="QJ").vertices) > len(sample)
 
 
-def _farthest(some: Float[np.ndarray, "some 3"], points: Points) -> tuple[float, int]:
-    """Return the largest distance from one of ``some`` to one of ``points``, and the latter."""
+def _farthest(sources: Float[np.ndarray, "sources 3"], points: Points) -> tuple[float, int]:
+    """Return the largest distance from a source to a point, and the index of the point."""
     best, end = -1.0, 0
     # 512 rows at a time keep the distances of a 100,000-vertex hull under 0.5 GB.
-    for start in range(0, len(some), 512):
-        distances = scipy.spatial.distance.cdist(some[start : start + 512], points)
+    for start in range(0, len(sources), 512):
+        distances = scipy.spatial.distance.cdist(sources[start : start + 512], points)
         if distances.max() > best:
             best, end = float(distances.max()), int(distances.argmax()) % len(points)
     return best, end
 
 
 def _longest_of_directions(points: Points) -> Iterator[tuple[float, int]]:
-    """Yield the distance between the two extreme points along each direction, and one of them."""
-    # Along a direction that is off the diameter's by an angle φ, they are apart by its cos φ at
-    # least, and 2,500 directions leave φ under 2.42°.
-    # Single precision finds the extreme points as well, in half of the time.
+    """Yield distances between extreme points along directions, with the index of one of them."""
+    # Along a direction at an angle φ to the diameter, their distance is at least its cos φ, and
+    # with 2,500 directions φ is below 2.42°. Single precision suffices and halves the time.
     directions = half_sphere(2500).astype(np.float32)
     columns = np.ascontiguousarray((points - points.mean(axis=0)).T, np.float32)
     for start in range(0, len(directions), 16):
@@ -148,7 +149,7 @@ def _longest_of_directions(points: Points) -> Iterator[tuple[float, int]]:
 
 
 def half_sphere(num_directions: int) -> Float[np.ndarray, "directions 3"]:
-    """Return unit vectors spread evenly over half a sphere: a spiral by the golden angle."""
+    """Return unit vectors spread evenly over half a sphere, on a golden-angle spiral."""
     number = np.arange(num_directions) + 0.5
     z, turn = number / num_directions, np.pi * (3 - np.sqrt(5)) * number
     ring = np.sqrt(1 - z * z)
@@ -163,8 +164,8 @@ def hash_triangles(vertices: Vertices, faces: Faces) -> str:
 
 
 def weld(vertices: Vertices, faces: Faces) -> tuple[Float[np.ndarray, "welded 3"], Faces]:
-    """Merge vertices at the same position; faces that lose a corner by it remain, flat."""
-    # Adding 0.0 turns −0.0 into 0.0, which sorting would keep apart.
+    """Merge vertices at the same position; degenerate faces remain."""
+    # Adding 0.0 turns −0.0 into 0.0.
     positions = vertices + 0.0
     order = np.lexsort(positions.T[::-1])  # by x, then y, then z
     ranked = positions[order]
@@ -175,11 +176,24 @@ def weld(vertices: Vertices, faces: Faces) -> tuple[Float[np.ndarray, "welded 3"
     return ranked[new], index[faces]
 
 
-class SurfaceTree:
-    """A triangle mesh that answers how far points are from it.
+def connected(
+    start: Int[np.ndarray, " links"], end: Int[np.ndarray, " links"], num_nodes: int
+) -> tuple[int, Int[np.ndarray, " nodes"]]:
+    """Return the number of connected components of linked nodes, and the component of each."""
+    links = (np.ones(len(start), bool), (start, end))
+    graph = scipy.sparse.coo_array(links, shape=(num_nodes, num_nodes))
+    count, components = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    return int(count), np.asarray(components, np.int64)
 
-    A distance is taken to the triangles of the nearest surface points: it is never too small, and
-    too large by no more than the surface points are apart. Triangles without area: ValueError.
+
+class SurfaceTree:
+    """A triangle mesh for distance queries.
+
+    A distance is computed to the triangles of the nearest surface points: it is never too small,
+    and too large by at most the spacing of the surface points.
+
+    Raises:
+        ValueError: The triangles have no area.
     """
 
     def __init__(self, vertices: Vertices, faces: Faces) -> None:
@@ -192,30 +206,29 @@ class SurfaceTree:
         self.areas = np.linalg.norm(normals, axis=1) / 2
         self.normals = normals / (2 * self.areas[:, None])
         points, self._owners = self.spread(NUM_COVERING, seed=17)
-        numbers = np.arange(len(a))
-        # Corners and centres give each triangle of a fine mesh a point of its own.
+        # With corners and centres, every triangle of a fine mesh has a point.
         self._tree = scipy.spatial.KDTree(
             np.concatenate([points, a, b, c, self.triangles.mean(axis=1)]), balanced_tree=False
         )
-        self._owners = np.concatenate([self._owners, *[numbers] * 4])
+        self._owners = np.concatenate([self._owners, *[np.arange(len(a))] * 4])
 
     def spread(self, num_points: int, seed: int) -> tuple[Points, Int[np.ndarray, " points"]]:
-        """Spread points evenly along the summed area; return them and their triangles."""
+        """Return points spread evenly along the cumulative area, and their triangles."""
         rng = np.random.default_rng(seed)
         cumulative = np.cumsum(self.areas)
-        places = (np.arange(num_points) + rng.random()) / num_points * cumulative[-1]
-        owners = np.searchsorted(cumulative[:-1], places, side="right")
+        positions = (np.arange(num_points) + rng.random()) / num_points * cumulative[-1]
+        owners = np.searchsorted(cumulative[:-1], positions, side="right")
         return _points_inside(self.triangles[owners], rng), owners
 
     def nearest(self, points: Points) -> tuple[Points, Points]:
-        """Return the surface point nearest to each point, roughly, and the normal there."""
+        """Return approximately the nearest surface point to each point, and the normal there."""
         owners = self._owners[self._tree.query(points)[1]]
         return _closest_on_triangles(points, self.triangles[owners]), self.normals[owners]
 
     def distances(
         self, points: Float[np.ndarray, "*batch 3"], neighbours: int = _NUM_NEIGHBOURS
     ) -> Float[np.ndarray, "*batch"]:
-        """Return the distance of each point from the surface."""
+        """Return the distance of each point to the surface."""
         flat = points.reshape(-1, 3)
         neighbour = self._tree.query(flat, k=np.arange(1, neighbours + 1))[1]
         triangles = self.triangles[self._owners[neighbour]]
@@ -228,7 +241,7 @@ def _closest_on_triangles(
     points: Float[np.ndarray, "*#batch 3"], triangles: Float[np.ndarray, "*batch 3 3"]
 ) -> Float[np.ndarray, "*batch 3"]:
     """Return the point of each triangle that is closest to a point."""
-    # It is the foot of the perpendicular where that falls inside, else on one of the three edges.
+    # This is the foot of the perpendicular if it lies inside, otherwise a point on an edge.
     a, b, c = triangles[..., 0, :], triangles[..., 1, :], triangles[..., 2, :]
     normal = np.cross(b - a, c - a)
     offset = points - a

@@ -1,10 +1,9 @@
-"""Fewer triangles for a mesh that has more of them than any image has pixels for.
+"""Decimation of meshes that have more triangles than an image has pixels.
 
-The vertices of each cell of a cubic grid become one, placed where it is nearest, in the least
-squares, to the planes of all triangles that reach into the cell (quadric error metric: Garland and
-Heckbert 1997; in the cells of a grid: Lindstrom 2000), so that flat sides stay flat and edges
-sharp. This takes any triangles at all, with holes or without connection, in seconds, and moves no
-point further than a cell's diagonal.
+The vertices in each cell of a cubic grid become one vertex at the least-squares intersection of the
+planes of all triangles in the cell (quadric error metric: Garland and Heckbert 1997; in grid cells:
+Lindstrom 2000), so that flat sides stay flat and edges sharp. This works in seconds for any
+triangles, also with holes or disconnected, and moves no point by more than a cell's diagonal.
 """
 
 from __future__ import annotations
@@ -12,15 +11,14 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import scipy  # its parts load when they are used
 from jaxtyping import Float, Int
 
-from dopepp.parts.mesh import Faces, Vertices, face_areas
+from dopepp.parts.mesh import Faces, Vertices, connected, face_areas
 
 MAX_FACES: Final = 200_000
-"""Triangles of a part's mesh: on a part that fills 640×480 pixels, over one for two pixels."""
+"""Most triangles of a part's mesh: more than one for two pixels at 640×480."""
 
-_WELL_USED: Final = 0.85  # Share of the limit that is good enough to stop trying
+_WELL_USED: Final = 0.85  # Share of the limit at which the search stops
 
 
 def decimate(
@@ -34,19 +32,25 @@ def decimate(
     Float[np.ndarray, "fewer width"] | None,
     float,
 ]:
-    """Replace triangles, which all have an area, by at most ``max_faces`` larger ones.
+    """Replace triangles by at most ``max_faces`` larger ones.
 
-    ``values`` are texture coordinates or colours; vertices on both sides of a seam keep values of
-    their own. The last of the returned values is the farthest move of a vertex.
+    Args:
+        vertices: Positions.
+        faces: Triangles, all with an area.
+        values: Texture coordinates or colours, which remain separate at seams, or None.
+        max_faces: Largest number of triangles.
+
+    Returns:
+        New vertices, faces and values, and the largest distance that a vertex moved.
 
     Raises:
-        ValueError: No grid leaves a triangle, because all of them are tiny and apart.
+        ValueError: No grid leaves a triangle, because all are tiny and far apart.
     """
     cells, kept = _cluster(vertices, faces, max_faces)
-    placed = _place(vertices, faces, cells)
+    placed = _cell_positions(vertices, faces, cells)
     moved = float(np.sqrt(np.square(placed[cells] - vertices).sum(axis=1).max()))
     owners = cells if values is None else _islands(faces, cells)
-    # One vertex per owner: its cell gives the position, the mean of its vertices the values.
+    # Each owner becomes a vertex, at its cell's position and with its mean values.
     used, index = np.unique(owners[faces[kept]], return_inverse=True)
     first = np.empty(int(owners.max()) + 1, np.int64)
     first[owners] = np.arange(len(owners))
@@ -58,8 +62,8 @@ def decimate(
 def _cluster(
     vertices: Vertices, faces: Faces, max_faces: int
 ) -> tuple[Int[np.ndarray, " vertices"], Int[np.ndarray, " kept"]]:
-    """Return the cells, of the grid that leaves most triangles under the limit, and these."""
-    # A square of a surface that passes through a cell becomes two triangles.
+    """Return the cells of the grid that keeps most triangles below the limit, and the kept ones."""
+    # A surface through a cell becomes two triangles.
     side = float(np.sqrt(2 * face_areas(vertices, faces).sum() / max_faces))
     best_cells, best_kept = np.zeros(len(vertices), np.int64), np.zeros(0, np.int64)
     for _ in range(12):
@@ -69,30 +73,30 @@ def _cluster(
             best_cells, best_kept = cells, kept
         if _WELL_USED * max_faces <= len(kept) <= max_faces:
             break
-        # Their number falls with the square of the side; aim at the middle of the good range.
+        # The number falls with the square of the side; aim at the middle of the good range.
         aim = (1 + _WELL_USED) / 2 * max_faces
         side *= float(np.clip(np.sqrt(len(kept) / aim), 0.25, 4.0))
     if len(best_kept) == 0:
-        raise ValueError(f"no {max_faces} triangles can stand for its {len(faces)}")
+        raise ValueError(f"its {len(faces)} triangles cannot be reduced to {max_faces}")
     return best_cells, best_kept
 
 
 def _cells(vertices: Vertices, side: float) -> Int[np.ndarray, " vertices"]:
-    """Return each vertex's cell in a grid; cells that hold a vertex are numbered from 0."""
+    """Return each vertex's grid cell; cells with vertices are numbered from 0."""
     offsets = vertices - vertices.min(axis=0)
-    # A million cells along the longest side keep the numbers of cells within an int64.
-    places = (offsets / max(side, 1e-6 * float(offsets.max()))).astype(np.int64)
-    counts = places.max(axis=0) + 1
-    keys = (places[:, 0] * counts[1] + places[:, 1]) * counts[2] + places[:, 2]
+    # At most a million cells along the longest side keep cell numbers within an int64.
+    indices = (offsets / max(side, 1e-6 * float(offsets.max()))).astype(np.int64)
+    counts = indices.max(axis=0) + 1
+    keys = (indices[:, 0] * counts[1] + indices[:, 1]) * counts[2] + indices[:, 2]
     return np.asarray(np.unique(keys, return_inverse=True)[1].reshape(-1), np.int64)
 
 
 def _surviving(corners: Faces) -> Int[np.ndarray, " kept"]:
-    """Return one triangle for every three cells and direction around them."""
+    """Return the first triangle of every three cells and orientation."""
     a, b, c = corners.T
     candidates = np.flatnonzero((a != b) & (b != c) & (c != a))
     a, b, c = corners[candidates].T
-    # Start at the lowest corner: a triangle's three ways to be written become one.
+    # Each triangle starts at its lowest corner, so that equal triangles compare equal.
     turn = np.where((b < a) & (b < c), 1, np.where((c < a) & (c < b), 2, 0))[:, None]
     ordered = np.take_along_axis(corners[candidates], (turn + np.arange(3)) % 3, axis=1)
     order = np.lexsort(ordered.T)
@@ -110,12 +114,12 @@ def _means(
     return np.stack(sums, axis=1) / counts[:, None]
 
 
-def _place(
+def _cell_positions(
     vertices: Vertices, faces: Faces, cells: Int[np.ndarray, " vertices"]
 ) -> Float[np.ndarray, "cells 3"]:
-    """Return each cell's point nearest to the planes of the triangles in it, by squared area."""
-    # With normals n of a triangle's area and o from the cell's mean to the triangle, the offset x
-    # from that mean solves Σ n nᵀ x = Σ n (n·o). It stays within the box of the cell's vertices.
+    """Return the point of each cell nearest to the planes of its triangles, weighted by area²."""
+    # With area-weighted normals n and vectors o from the cell's mean to the triangles, the offset x
+    # from the mean solves Σ n nᵀ x = Σ n (n·o). It is clipped to the box of the cell's vertices.
     means = _means(vertices, cells)
     lower, upper = means.copy(), means.copy()
     np.minimum.at(lower, cells, vertices)
@@ -131,9 +135,9 @@ def _place(
             targets[:, i] += np.bincount(owners, normals[:, i] * heights, minlength=len(means))
             for j in range(3):
                 matrices[:, i, j] += np.bincount(owners, products[:, i, j], minlength=len(means))
-    # Where the planes leave a direction open, as on a flat side, the mean of the vertices decides.
+    # The mean of the vertices decides in directions that the planes leave undetermined.
     pull = 1e-3 * np.trace(matrices, axis1=1, axis2=2)
-    # Vertices without any triangle stay at their mean.
+    # Vertices without a triangle stay at their mean.
     pull = np.where(pull > 0, pull, 1.0)
     matrices += pull[:, None, None] * np.eye(3)
     offsets = np.linalg.solve(matrices, targets[..., None])[..., 0]
@@ -141,11 +145,7 @@ def _place(
 
 
 def _islands(faces: Faces, cells: Int[np.ndarray, " vertices"]) -> Int[np.ndarray, " vertices"]:
-    """Number the groups of vertices that edges within one cell connect."""
+    """Number the groups of vertices that are connected by edges within a cell."""
     start, end = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
     inside = cells[start] == cells[end]
-    edges = (np.ones(int(inside.sum()), bool), (start[inside], end[inside]))
-    joined = scipy.sparse.coo_array(edges, shape=(len(cells), len(cells)))
-    return np.asarray(
-        scipy.sparse.csgraph.connected_components(joined, directed=False)[1], np.int64
-    )
+    return connected(start[inside], end[inside], len(cells))[1]

@@ -1,10 +1,10 @@
-"""Mesh files and YCB-Video models, in metres, checked before they are used.
+"""Mesh files and YCB-Video models, in metres, checked before use.
 
-Triangles are made to face the same way, and no vertex is moved. Triangles may pass through each
-other: the depth test of every renderer shows the outermost surface.
+Triangles are oriented consistently, and no vertex is moved. Triangles may intersect each other: the
+depth test of every renderer shows the outermost surface.
 
 To add a format, write a reader that returns a :class:`RawMesh` and raises for a damaged file, and
-one line in :data:`READERS`.
+add it to :data:`READERS`.
 """
 
 from __future__ import annotations
@@ -17,22 +17,21 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import scipy  # its parts load when they are used
 from jaxtyping import Bool, Float, Int
 
 from dopepp.core.errors import UserError
-from dopepp.parts.mesh import Faces, Points, RawMesh, Vertices, face_areas, weld
+from dopepp.parts.mesh import Faces, Points, RawMesh, Vertices, connected, face_areas, weld
 from dopepp.parts.mesh.library import read_3mf, read_glb, read_stl
 from dopepp.parts.mesh.obj import read_obj, read_off
 from dopepp.parts.mesh.ply import read_ply
 from dopepp.parts.part import UNITS, Mesh, Part, make_part
 
 logger = logging.getLogger(__name__)
-ASSUMED_UNIT: Final = "mm"  # What CAD programs write into files that cannot state a unit
+ASSUMED_UNIT: Final = "mm"  # Unit of most CAD files that cannot state a unit
 MAX_BYTES: Final = 250_000_000
-"""Five million triangles: far beyond any use here, and a bound on memory."""
+"""Largest file, about five million triangles; bounds memory."""
 
-MAX_POINTS_BYTES: Final = 20_000_000  # Of a ``points.xyz``: half a million points
+MAX_POINTS_BYTES: Final = 20_000_000  # Largest ``points.xyz``: half a million points
 READERS: Final[dict[str, Callable[[Path], RawMesh]]] = {
     ".stl": read_stl,
     ".obj": read_obj,
@@ -41,31 +40,34 @@ READERS: Final[dict[str, Callable[[Path], RawMesh]]] = {
     ".3mf": read_3mf,
     ".off": read_off,
 }
-"""The reader of each suffix."""
+"""Readers by suffix."""
+
+MANY_CAVITIES: Final = 1000
+"""More cavities than any part has; further inverted surfaces count as bodies."""
 
 
 def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
-    """Read an STL, OBJ, PLY, GLB, 3MF or OFF file, as its suffix says, in metres.
+    """Read an STL, OBJ, PLY, GLB, 3MF or OFF file in metres.
 
-    Duplicate STL vertices are merged, flat triangles dropped, triangles turned to face as their
-    neighbours do. Edges may be open, and triangles may intersect each other. OBJ, PLY and GLB files
-    may have a texture, PLY files colours and normals.
+    Duplicate STL vertices are merged, flat triangles dropped, and triangles oriented consistently.
+    Edges may be open, and triangles may intersect each other. OBJ, PLY and GLB files may have a
+    texture, PLY files also colours and normals.
 
     Args:
-        path: Mesh file; a texture must lie in its folder.
-        unit: mm, cm, m or inch (default: as a 3MF file states, metres for GLB, and millimetres for
-            all others, which the log says).
+        path: Mesh file, whose suffix states the format; a texture must lie in its folder.
+        unit: mm, cm, m or inch (default: as stated by a 3MF file, metres for GLB, and otherwise
+            millimetres, with a warning).
 
     Raises:
         UserError: The file is missing, too large, of another format or damaged; the unit is
             unknown; no face has an area; a coordinate is not finite; a texture is missing, damaged
-            or outside of the mesh's folder.
+            or outside the mesh's folder.
     """
     return read_in_unit(path, unit)[0]
 
 
 def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
-    """Read a file as :func:`read_mesh` does; return the unit that it was read in, too."""
+    """Like :func:`read_mesh`; also return the unit of the file."""
     path = Path(path)
     if unit is not None and unit not in UNITS:
         raise UserError(f"unit={unit!r} for {path}", ", ".join(UNITS), "state the file's unit")
@@ -75,7 +77,7 @@ def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
         raise UserError(f"mesh {path}", f"files ending in {suffixes}", "export one of these")
     try:
         is_file = path.is_file()
-    except OSError:  # a name that is too long, for one
+    except OSError:  # e.g. a name that is too long
         is_file = False
     if not is_file:
         raise UserError(f"mesh {path}, no such file", "a mesh file", "check the path")
@@ -86,26 +88,32 @@ def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
         raw = reader(path)
     except UserError:
         raise
-    except Exception as error:  # whatever a parser makes of a damaged file
+    except Exception as error:  # parsers raise anything for a damaged file
         kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
         raise _damaged(path, f"{kind}{error}") from error
-    taken = unit or raw.unit or ASSUMED_UNIT
-    mesh = _checked(path, raw._replace(vertices=UNITS[taken] * raw.vertices))
+    applied = unit or raw.unit or ASSUMED_UNIT
+    mesh = _checked(path, raw._replace(vertices=UNITS[applied] * raw.vertices))
     if unit is None and raw.unit is None:
-        logger.warning("%s states no unit: taken as %s (unit=… changes it)", path, ASSUMED_UNIT)
-    elif raw.unit not in (None, taken):
-        logger.warning("%s is in %s by its format: taken as %s, as asked", path, raw.unit, taken)
-    return mesh, taken
+        logger.warning("%s states no unit: assuming %s (override with unit=…)", path, ASSUMED_UNIT)
+    elif raw.unit not in (None, applied):
+        logger.warning(
+            "%s is in %s by its format, but read in %s as requested", path, raw.unit, applied
+        )
+    return mesh, applied
 
 
 def ycb_part(root: str | Path, name: str) -> Part:
-    """Make a part from a YCB-Video folder: ``models/NAME/points.xyz`` and ``textured.obj``.
+    """Return the part of the files ``points.xyz`` and ``textured.obj`` of a YCB-Video model.
 
-    Both files are in metres. Without a ``textured.obj`` the part has no mesh, and its ADD points
-    give cuboid and diameter.
+    Both files are in metres. Without a ``textured.obj`` the part has no mesh, and the ADD points
+    determine its cuboid and diameter.
+
+    Args:
+        root: Root folder of YCB-Video.
+        name: Name of the object, a folder in ``models``.
 
     Raises:
-        UserError: The folder has no models, none of that name, or a damaged file.
+        UserError: There are no models, none of that name, or a damaged file.
     """
     models = Path(root) / "models"
     names = sorted(path.parent.name for path in models.glob("*/points.xyz"))
@@ -135,7 +143,7 @@ def _read_points(path: Path) -> Points:
 
 
 def _checked(path: Path, raw: RawMesh) -> Mesh:
-    """Refuse what is no mesh, drop flat triangles and unused vertices, and orient the triangles."""
+    """Check a mesh, drop flat triangles and unused vertices, and orient the triangles."""
     vertices, faces, uv, texture, *_ = raw
     if not len(vertices) or not len(faces):
         raise _damaged(path, f"{len(vertices)} vertices and {len(faces)} faces")
@@ -145,7 +153,7 @@ def _checked(path: Path, raw: RawMesh) -> Mesh:
             raise _damaged(path, f"a coordinate that is not a finite number, vertex {bad + 1}")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise _damaged(path, f"a face index outside of its {len(vertices)} vertices")
-    # A millionth of the mesh wide and long: such a triangle has no meaningful normal.
+    # A triangle of a millionth of the mesh's size has no meaningful normal.
     smallest = 1e-12 * np.square(np.ptp(vertices, axis=0)).sum()
     proper = face_areas(vertices, faces) > smallest
     if not proper.any():
@@ -156,15 +164,11 @@ def _checked(path: Path, raw: RawMesh) -> Mesh:
     vertices, faces = vertices[used], index.reshape(-1, 3)
     topology = find_topology(vertices, faces)
     if not topology.is_closed:
-        logger.info(
-            "%s is not watertight, taken as it is: %d open edges, %d edges of over two triangles",
-            path,
-            topology.num_open,
-            topology.num_crowded,
-        )
+        message = "%s is not watertight: %d open edges, %d edges of more than two triangles"
+        logger.info(message, path, topology.num_open, topology.num_crowded)
     turned = opposed_faces(vertices, faces, topology)
     if turned.any():
-        logger.info("%s: turned over %d triangles that faced the wrong way", path, turned.sum())
+        logger.info("%s: flipped %d triangles that faced the wrong way", path, turned.sum())
     return Mesh(
         vertices=vertices,
         faces=turn_over(faces, turned).astype(np.int32),
@@ -183,13 +187,13 @@ def _damaged(path: Path, problem: str, fix: str = "export the mesh again") -> Us
 
 @dataclass(frozen=True)
 class Topology:
-    """The edges of triangles, where corners at one position are one.
+    """Edges of triangles, with corners at one position merged.
 
     Attributes:
-        num_open: Number of edges of one triangle: the rim of a hole.
+        num_open: Number of edges of a single triangle (rims of holes).
         num_crowded: Number of edges of more than two triangles.
-        neighbours: The two triangles at every other edge.
-        opposed: Whether one of these two shows its inside where the other shows its outside.
+        neighbours: Pairs of triangles at all other edges.
+        opposed: Whether the triangles of each pair face opposite ways.
     """
 
     num_open: int
@@ -207,7 +211,7 @@ def find_topology(vertices: Vertices, faces: Faces) -> Topology:
     """Find the edges of triangles that all have an area."""
     positions, corners = weld(vertices, faces)
     start, end = corners.reshape(-1), corners[:, [1, 2, 0]].reshape(-1)
-    # Both directions of an edge get one number; 2³¹ vertices squared still fit into an int64.
+    # Both directions of an edge have the same number, which fits into an int64.
     edges = np.minimum(start, end) * len(positions) + np.maximum(start, end)
     order = np.argsort(edges, kind="stable")
     first = np.flatnonzero(np.diff(edges[order], prepend=-1))
@@ -225,11 +229,11 @@ def find_topology(vertices: Vertices, faces: Faces) -> Topology:
 def opposed_faces(
     vertices: Vertices, faces: Faces, topology: Topology
 ) -> Bool[np.ndarray, " faces"]:
-    """Find triangles to turn over so that all of a connected surface face the same way.
+    """Find the triangles to flip so that every connected surface faces the same way.
 
-    Of a connected surface, the triangles with less area are turned. A Möbius strip is left as it
-    is. A closed surface that faces inwards is turned as a whole, and so is then every body that
-    faces inwards, except a cavity, which lies in another body's box.
+    Within a connected surface, the orientation with less area is flipped; a Möbius strip remains
+    unchanged. A closed surface that faces inwards is flipped, and then every body that faces
+    inwards, except cavities, which lie in the box of another body.
     """
     turned = np.zeros(len(faces), bool)
     if topology.opposed.any():
@@ -242,29 +246,25 @@ def opposed_faces(
 
 
 def turn_over(faces: Faces, turned: Bool[np.ndarray, " faces"]) -> Faces:
-    """Reverse the corners of the marked triangles."""
+    """Flip the marked triangles."""
     return np.where(turned[:, None], faces[:, ::-1], faces)
 
 
 def _minority(areas: Float[np.ndarray, " faces"], topology: Topology) -> Bool[np.ndarray, " faces"]:
     """Return the triangles that face against most of their connected surface."""
-    # Each triangle is two nodes of a graph, as it is and turned over, and an edge joins the nodes
-    # that face the same way. A surface with two sides falls into two components: each is one way of
-    # facing, and triangle f is to be turned if the component of its turned node is the better one.
+    # Each triangle is two nodes of a graph, as it is and flipped, and links join nodes that face
+    # the same way. An orientable surface has two components, one per orientation, and triangle f is
+    # flipped if the component of its flipped node has more area.
     num_faces = len(areas)
     first_face, second_face = topology.neighbours.T
     swap = np.where(topology.opposed, num_faces, 0)
-    rows = np.concatenate([first_face, first_face + num_faces])
-    columns = np.concatenate([second_face + swap, second_face + num_faces - swap])
-    joined = scipy.sparse.coo_array(
-        (np.ones(len(rows), bool), (rows, columns)), shape=(2 * num_faces,) * 2
-    )
-    as_is, over = scipy.sparse.csgraph.connected_components(joined, directed=False)[1].reshape(
-        2, num_faces
-    )
-    weight = np.bincount(as_is, areas, minlength=int(max(as_is.max(), over.max())) + 1)
-    better = weight[over] > weight[as_is]
-    tied = (weight[over] == weight[as_is]) & (over < as_is)
+    start = np.concatenate([first_face, first_face + num_faces])
+    end = np.concatenate([second_face + swap, second_face + num_faces - swap])
+    count, components = connected(start, end, 2 * num_faces)
+    as_is, flipped = components.reshape(2, num_faces)
+    weight = np.bincount(as_is, areas, minlength=count)
+    better = weight[flipped] > weight[as_is]
+    tied = (weight[flipped] == weight[as_is]) & (flipped < as_is)
     return np.asarray(better | tied)
 
 
@@ -273,23 +273,58 @@ def _inverted_bodies(
 ) -> Bool[np.ndarray, " faces"]:
     """Return the triangles of closed bodies that face inwards and lie in no other body's box."""
     first_face, second_face = topology.neighbours.T
-    joined = scipy.sparse.coo_array(
-        (np.ones(len(first_face), bool), (first_face, second_face)), shape=(len(faces),) * 2
-    )
-    num_bodies, bodies = scipy.sparse.csgraph.connected_components(joined, directed=False)
-    volumes = np.bincount(bodies, _signed_volumes(vertices, faces), minlength=num_bodies)
-    corners = vertices[faces]
-    lower, upper = np.full((num_bodies, 3), np.inf), np.full((num_bodies, 3), -np.inf)
-    np.minimum.at(lower, bodies, corners.min(axis=1))
-    np.maximum.at(upper, bodies, corners.max(axis=1))
-    inverted = np.zeros(num_bodies, bool)
-    for body in np.flatnonzero(volumes < 0):
+    count, bodies = connected(first_face, second_face, len(faces))
+    volumes = np.bincount(bodies, _signed_volumes(vertices, faces), minlength=count)
+    lower, upper = _boxes(vertices[faces].reshape(-1, 3), np.repeat(bodies, 3), count)
+    inwards = volumes < 0
+    return np.asarray((inwards & ~_enclosed(lower, upper, np.flatnonzero(inwards)))[bodies])
+
+
+def body_extents(vertices: Vertices, faces: Faces) -> list[Float[np.ndarray, "3"]]:
+    """Return the sides of the box of each separate body, the largest body first.
+
+    A body is a connected surface (corners at one position are merged) that is no cavity: a cavity
+    faces inwards and lies in the box of another body.
+    """
+    positions, corners = weld(vertices, faces)
+    start, end = corners.reshape(-1), corners[:, [1, 2, 0]].reshape(-1)
+    count, of_vertex = connected(start, end, len(positions))
+    if count == 1:
+        return [np.ptp(positions, axis=0)]
+    lower, upper = _boxes(positions, of_vertex, count)
+    bodies = of_vertex[corners[:, 0]]
+    # Measured from the body's own centre, an open surface has a meaningful sign too.
+    a, b, c = (positions[corners] - ((lower + upper) / 2)[bodies][:, None]).swapaxes(0, 1)
+    volumes = np.bincount(bodies, np.einsum("ij,ij->i", a, np.cross(b, c)), minlength=count)
+    is_body = ~_enclosed(lower, upper, np.flatnonzero(volumes < 0)[:MANY_CAVITIES])
+    extents = (upper - lower)[is_body]
+    return list(extents[np.argsort(-extents.prod(axis=1), kind="stable")])
+
+
+def _boxes(
+    points: Points, bodies: Int[np.ndarray, " points"], count: int
+) -> tuple[Float[np.ndarray, "bodies 3"], Float[np.ndarray, "bodies 3"]]:
+    """Return the lower and upper corners of the box of each body."""
+    lower, upper = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(lower, bodies, points)
+    np.maximum.at(upper, bodies, points)
+    return lower, upper
+
+
+def _enclosed(
+    lower: Float[np.ndarray, "bodies 3"],
+    upper: Float[np.ndarray, "bodies 3"],
+    candidates: Int[np.ndarray, " candidates"],
+) -> Bool[np.ndarray, " bodies"]:
+    """Return which candidates lie in the box of another body."""
+    enclosed = np.zeros(len(lower), bool)
+    for body in candidates:
         around = (lower < lower[body]).all(axis=1) & (upper > upper[body]).all(axis=1)
-        inverted[body] = not around.any()
-    return np.asarray(inverted[bodies])
+        enclosed[body] = around.any()
+    return enclosed
 
 
 def _signed_volumes(vertices: Vertices, faces: Faces) -> Float[np.ndarray, " faces"]:
-    """Return the volume between each triangle and the middle, negative where it faces that."""
+    """Return the volume between each triangle and the centre, negative if facing the centre."""
     a, b, c = (vertices - vertices.mean(axis=0))[faces].swapaxes(0, 1)
     return np.asarray(np.einsum("ij,ij->i", a, np.cross(b, c)) / 6)

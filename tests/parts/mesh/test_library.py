@@ -173,7 +173,7 @@ def test_a_glb_file_is_in_metres_and_another_unit_is_said(write, caplog):
         assert load_part(path).diameter == pytest.approx(np.sqrt(1400) / 1000)
         assert caplog.messages == ["box: 30 × 20 × 10 mm, read in m"]
     assert np.ptp(read_mesh(path, "cm").vertices) == pytest.approx(0.0003)
-    assert f"{path} is in m by its format: taken as cm, as asked" in caplog.text
+    assert f"{path} is in m by its format, but read in cm as requested" in caplog.text
     with pytest.raises(UserError, match=r"37\.42 m, its file read with unit=m; .*unit=mm"):
         load_part(write("large.glb", exported(BOX, "glb")))
 
@@ -288,7 +288,7 @@ def test_a_3mf_file_states_its_unit(write, unit, caplog, volume):
     assert not caplog.records
     if unit != "inch":
         read_mesh(path, "inch")
-        assert f"is in {UNITS_3MF[unit]} by its format: taken as inch" in caplog.text
+        assert f"is in {UNITS_3MF[unit]} by its format, but read in inch" in caplog.text
 
 
 def test_a_3mf_file_in_no_unit_is_in_millimetres_and_in_feet_is_refused(write):

@@ -55,7 +55,7 @@ def test_millimetres_are_assumed_and_said(write, name, caplog):
         assert not caplog.records
         assumed = read_mesh(path)
     assert len(caplog.records) == 1
-    assert f"{path} states no unit: taken as mm" in caplog.text
+    assert f"{path} states no unit: assuming mm" in caplog.text
     np.testing.assert_array_equal(assumed.vertices, stated.vertices)
 
 
@@ -162,7 +162,7 @@ def test_load_part_by_name_and_by_path(write, caplog):
     assert load_part("pivconnector", "inch") is load_part("pivconnector")  # unit is for files
     path = write("My_Box.stl", FILES["binary.stl"])
     assert load_part(path).name == "My_Box"
-    assert "taken as mm" in caplog.text
+    assert "assuming mm" in caplog.text
     assert load_part(str(path), "cm").diameter == pytest.approx(np.sqrt(0.14))
     for wrong, unit, message in (
         ("servo", None, r"unknown part 'servo'; allowed: servoholder, pivconnector, .*\.stl/\.obj"),
