@@ -278,21 +278,10 @@ def test_an_inch_file_comes_out_in_its_size_and_checked(plate, tmp_path):
     assert few[1] == f"… and {len(listed) - 2} more"
 
 
-@pytest.mark.parametrize("corner", ["nan nan nan", "30 0 0", None])
-def test_a_mesh_that_is_none_is_one_line(corner, tmp_path):
-    facet = (
-        "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 60 0 0\n"
-        f"vertex {corner}\nendloop\nendfacet\n"
-    )
-    path, out = tmp_path / "part.stl", tmp_path / "out"
-    path.write_text(f"solid part\n{'' if corner is None else facet}endsolid part\n")
-    line = refused("render", path, "--unit", "mm", "-n", "5", "--out", out)
-    assert line.startswith("got ")
-    assert str(path) in line
-    assert not out.exists()
+SLOW_LAYOUTS = [pytest.param(name, marks=pytest.mark.slow) for name in ("ndds", "webdataset")]
 
 
-@pytest.mark.parametrize("layout", ["bop", pytest.param("ndds", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("layout", ["bop", *SLOW_LAYOUTS])
 def test_neither_render_nor_check_imports_torch(layout, command, tmp_path):
     # One interpreter does everything a worker does, too: workers are other processes.
     code = f"""
@@ -315,7 +304,7 @@ for task in (RenderTask(0, range(2)), RenderTask(0, range(2), finalizes=True)):
 write_preview(job, Path(out))
 done = CliRunner().invoke(app, ["check", out])
 assert done.exit_code == 0, done.output
-print(sorted({{"torch", "lightning", "torchmetrics", "ray"}} & set(sys.modules)))
+print(sorted({{"torch", "lightning", "torchmetrics", "ray", "webdataset"}} & set(sys.modules)))
 """
     done = command("-c", code)
     assert (done.out, done.code) == ("[]\n", 0), done.err

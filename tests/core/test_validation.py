@@ -11,14 +11,7 @@ from typing import Annotated, Any, Literal
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.core.validation import (
-    STRICT,
-    Checked,
-    Range,
-    Span,
-    check,
-    parse,
-)
+from dopepp.core.validation import STRICT, Checked, Range, Span, check, parse
 
 
 @dataclass(frozen=True, kw_only=True)

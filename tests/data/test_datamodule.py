@@ -1,9 +1,6 @@
 import math
 from dataclasses import fields, replace
-from pathlib import Path
-from typing import Any
 
-import lightning.pytorch as pl
 import numpy as np
 import pytest
 import torch
@@ -132,57 +129,6 @@ def test_a_users_mistake_arrives_as_one_line(build, fake_source, num_workers):
     with pytest.raises(UserError, match=r"^got frame 7; allowed: complete frames") as caught:
         batches(build(train=source, num_workers=num_workers), 0)
     assert "\n" not in str(caught.value)
-
-
-class Recorder(pl.LightningModule):
-    def __init__(self) -> None:
-        super().__init__()
-        self.weight = torch.nn.Parameter(torch.zeros(()))
-        self.train_keys, self.val_keys = [], []
-
-    def training_step(self, batch: Batch, batch_index: int) -> Tensor:
-        assert isinstance(batch, Batch)
-        self.train_keys.append((self.current_epoch, batch.keys))
-        return self.weight * batch.images.float().mean()
-
-    def validation_step(self, batch: Batch, batch_index: int) -> None:
-        self.val_keys += batch.keys
-
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        return torch.optim.SGD(self.parameters(), lr=0.0)
-
-
-def trainer_of(path: Path, **options: Any) -> pl.Trainer:
-    quiet = ("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary")
-    options |= {"accelerator": "cpu", "devices": 1, "num_sanity_val_steps": 0}
-    return pl.Trainer(default_root_dir=path, **dict.fromkeys(quiet, False), **options)
-
-
-class SaveAt(pl.Callback):
-    """Saves at the end of one batch, like ``ModelCheckpoint(every_n_train_steps=…)``."""
-
-    def __init__(self, path: Path, step: int) -> None:
-        self.path, self.step = path, step
-
-    def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
-        if trainer.global_step == self.step:
-            trainer.save_checkpoint(self.path)
-
-
-# An epoch has three batches: in the first, at its end, and inside the second.
-@pytest.mark.parametrize(("stop", "num_workers"), [(1, 0), (3, 0), (4, 2), (5, 0)])
-def test_lightning_resumes_where_it_stopped(build, tmp_path, stop, num_workers):
-    expected = [(e, batch.keys) for e in range(3) for batch in batches(build(), e)]
-    path, first, second = tmp_path / "last.ckpt", Recorder(), Recorder()
-    trainer = trainer_of(tmp_path, max_epochs=3, callbacks=[SaveAt(path, stop)])
-    trainer.fit(first, datamodule=build(num_workers=num_workers))
-    assert first.train_keys == expected
-    assert first.val_keys == [f"0/{i}" for i in range(5)] * 3
-    resumed = build(num_workers=num_workers)
-    trainer_of(tmp_path, max_epochs=3).fit(
-        second, datamodule=resumed, ckpt_path=path, weights_only=True
-    )
-    assert second.train_keys == expected[stop:]
 
 
 def test_summary_and_fingerprint(build, fake_source):

@@ -103,24 +103,3 @@ def test_what_a_checkpoint_stores_needs_no_extra(monkeypatch, make_spec):
     network = build_network(architecture(spec))
     network.load_state_dict(trained.state_dict())
     assert network.backbone.down[0].training is False
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (
-            lambda weights: weights.pop("_blocks.7._bn1.bias"),
-            r"nothing under _blocks\.7\._bn1\.bias",
-        ),
-        (
-            lambda weights: weights.update({"_conv_stem.weight": torch.zeros(32, 3, 5, 5)}),
-            r"\(32, 3, 5, 5\) under _conv_stem\.weight",
-        ),
-    ],
-)
-def test_a_file_of_another_network_is_refused(tmp_path, published, change, message):
-    weights = dict(published.state_dict())
-    change(weights)
-    torch.save(weights, tmp_path / "other.pth")
-    with pytest.raises(UserError, match=message):
-        EfficientNetLite(weights_path=str(tmp_path / "other.pth"))

@@ -376,28 +376,11 @@ ARGUMENTS = {
         "set/000000.json": b"[" * 100_000,
         "set/000000.png": BOMB,
     }),
-    "check: a BOP of bombs": ("check set", {
-        "set/models/models_info.json": b"{" * 100_000,
-        "set/train_pbr/000000/scene_gt.json": b"[" * 100_000,
-        "set/train_pbr/000000/scene_camera.json": b"{}",
-        "set/train_pbr/000000/rgb/000000.png": BOMB,
-    }),
-    "check: shards of bombs": ("check set", {
-        "set/train_pbr/shard-000000.tar": ARCHIVES["a name of gigabytes"],
-        "set/models/models_info.json": b'{"1": {"diameter": 1e999}}',
-    }),
-    "render: a part that lies": (
-        "render a.ply --out out -n 1", {"a.ply": MESHES["a.ply|a billion vertices"]}
-    ),
-    "render: another job's record": (RENDER, {"out/_dopepp_render.json": b"[" * 100_000}),
     "render: a change that nests": (f"{RENDER} --set targets_per_image={'[' * 5000}", {}),
     "render: a change that runs": (
         f"{RENDER} --set 'targets_per_image=!!python/object/apply:os.system [touch canary]'", {}
     ),
-    "symmetries: a part that reaches out": (
-        "symmetries a.obj", {"a.obj": MESHES["n.obj|a library elsewhere"]}
-    ),
-    "predict: a picture that explodes": ("predict good.ckpt a.png --K 60 60 2 2", {"a.png": BOMB}),
+
     "predict: a depth that explodes": (
         "predict good.ckpt b.png --K 60 60 8 8 --refine depth --depth a.png",
         {"a.png": BOMB, "b.png": encoded("PNG", SMALL)},

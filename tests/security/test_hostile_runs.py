@@ -1,20 +1,11 @@
 """Run folders from somebody else: what resuming, evaluating and comparing them may do."""
 
-import json
-import os
-import pickle
-from pathlib import Path
-
 import pytest
-from typer.testing import CliRunner
 
-from dopepp.cli import app
 from dopepp.core.yaml import read_yaml
 from dopepp.experiment.run.resume import read_overrides
 
 pytestmark = pytest.mark.timeout(120)
-
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -42,37 +33,6 @@ def run_folder(tmp_path, good):
         return run
 
     return make
-
-
-COMMANDS = {
-    "a callback of Hydra's": [
-        "+hydra.callbacks.x._target_=torch.utils.collect_env.run",
-        "+hydra.callbacks.x.command={command}",
-    ],
-    "a logging handler": [
-        "hydra/job_logging=default", "hydra.job_logging.handlers.console.class=os.system",
-    ],
-    "a launcher": ["hydra.launcher._target_=os.system"],
-    "a package of Hydra's": ["+logger@hydra.callbacks.evil=tensorboard"],
-    "a search path": ["hydra.searchpath=[file:///tmp]"],
-    "the environment": ["+hydra.job.env_set.DOPEPP_CANARY=1"],
-    "a removed setting": ["~hydra.callbacks.compare"],
-    "an option of the command line": ["--config-dir=/tmp"],
-    "a multirun": ["-m"],
-    "a pickle to run again": ["--experimental-rerun={pickle}"],
-    "a blank before it": [" hydra.launcher._target_=os.system"],
-    "a line end before it": ["\nhydra.launcher._target_=os.system"],
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_overrides_that_are_no_options_of_ours(name, run_folder, told, canary, tmp_path, Call):
-    hostile = tmp_path / "job.pickle"
-    hostile.write_bytes(pickle.dumps(Call(os.system, canary)))
-    overrides = [text.format(command=f"'{canary}'", pickle=hostile) for text in COMMANDS[name]]
-    run = run_folder(json.dumps(["seed=1", *overrides]))
-    # Hydra's own settings are left out, with a warning; what is no override at all ends the run.
-    assert str(run) in told("train.py", f"resume={run}")
 
 
 def laughs() -> str:
@@ -150,34 +110,3 @@ def test_a_checkpoint_whose_data_are_none(name, saved, told, tmp_path):
     data = {"name": "x", "seed": 0, "config": STORED[name]}
     path = saved(lambda content: content["dopepp"].update(data=data))
     told("evaluate.py", f"ckpt_path={path}", f"output_dir={tmp_path / 'o'}")
-
-
-RECORDS = {
-    "no JSON": "{",
-    "a list": "[]",
-    "nested brackets": "[" * 100_000,
-    "not a number": '{"name": NaN}',
-    "a key twice": '{"name": "a", "name": "b"}',
-    "nothing in it": "{}",
-    "objects of another kind": '{"name": "a", "num_images": 1, "objects": [], "references": {}}',
-    "a row of other columns": json.dumps(
-        {"name": "a", "num_images": 1, "objects": {"mean": {"x": 1}}, "references": {}, "add": {},
-         "cost": {}}
-    ),
-    "a cost of code": json.dumps(
-        {"name": "a", "num_images": 1, "objects": {}, "references": {}, "add": {},
-         "cost": {"_target_": "os.system"}}
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", RECORDS)
-def test_metrics_of_somebody_else(name, tmp_path, bounded):
-    run = tmp_path / "run"
-    run.mkdir()
-    (run / "metrics.json").write_text(RECORDS[name])
-    with bounded():
-        done = CliRunner().invoke(app, ["compare", str(run), "--out", str(tmp_path / "compare")])
-    # One line for the user, or a row that says what is wrong with this run.
-    assert done.exit_code in (0, 1, 2)
-    assert done.exception is None or isinstance(done.exception, SystemExit)

@@ -2,8 +2,6 @@
 
 import multiprocessing
 import pickle
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -90,29 +88,6 @@ def test_bytes_depend_neither_on_the_order_nor_on_kills(
     again.finalize(0, [998, 999])
     assert contents(root) == contents(whole)
     assert not list(root.rglob(STAGING))
-
-
-def test_data_sets_are_read_written_and_checked_without_torch(tmp_path):
-    modules = (
-        "check", "formats.bop.bop_reader", "formats.bop.bop_writer", "formats.ndds.ndds_reader",
-        "formats.ndds.ndds_writer", "formats.ycb_video.ycb_reader", "image_sources.hybrid",
-        "image_sources.rendered", "transforms.masking", "transforms.augment",
-    )  # fmt: skip
-    code = (
-        f"import sys, {', '.join(f'dopepp.data.{name}' for name in modules)}\n"
-        "import numpy as np\n"
-        "from dopepp.data.formats.webdataset.webdataset_reader import WebdatasetReader\n"
-        "from dopepp.data.formats.webdataset.webdataset_writer import WebdatasetWriter\n"
-        "from dopepp.data.sample import Sample\n"
-        "from dopepp.parts.catalogue import servoholder\n"
-        f"writer = WebdatasetWriter({str(tmp_path)!r}, [servoholder()])\n"
-        "writer.prepare()\n"
-        "image, depth = np.zeros((8, 8, 3), np.uint8), np.zeros((8, 8), np.float32)\n"
-        "writer.write(0, Sample(image, np.eye(3), [], depth))\n"
-        "assert writer.written(0) == {0}\n"
-        "sys.exit(bool({'torch', 'lightning', 'webdataset'} & set(sys.modules)))"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 ITEMS = 300

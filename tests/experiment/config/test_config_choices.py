@@ -192,13 +192,6 @@ def test_a_hostile_target_is_refused(place, target, tiny, tmp_path):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("target", HOSTILE)
-def test_no_registry_builds_a_hostile_target(target):
-    for registry in REGISTRIES.values():
-        with pytest.raises(UserError, match="_target_"):
-            registry.build({"_target_": target})
-
-
 @pytest.mark.parametrize("place", ["optimizer", "callbacks.checkpoint", "data.masking"])
 def test_nested_targets_are_refused(place, tiny, tmp_path):
     argument = {"optimizer": "lr", "data.masking": "probability"}.get(place, "filename")

@@ -53,10 +53,7 @@ def report_of(
 
 
 def write_run(
-    folder: Path,
-    overrides: Sequence[str] = (),
-    result: Report | str | None = None,
-    **config: Any,
+    folder: Path, overrides: Sequence[str] = (), result: Report | str | None = None, **config: Any
 ) -> Path:
     """Write what a run leaves: its report, or the reason of its failure."""
     (folder / ".hydra").mkdir(parents=True)

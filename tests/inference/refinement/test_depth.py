@@ -14,12 +14,7 @@ from dopepp.inference.refinement.depth import DepthEvidence
 from dopepp.inference.refinement.depth.terms import outline_terms, plane_terms
 from dopepp.inference.refinement.refiner import PartRefiner
 from dopepp.inference.refinement.solver import make_prior
-from dopepp.inference.refinement.surface import (
-    lay_over,
-    surface_points,
-    view_around,
-    visible,
-)
+from dopepp.inference.refinement.surface import lay_over, surface_points, view_around, visible
 from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.part import Mesh, Part, make_part
 from dopepp.virtual.body import make_body

@@ -27,12 +27,7 @@ from dopepp.inference.refinement.outline import (
 from dopepp.inference.refinement.refiner import NUM_QUADRUPLES, poses_of_four
 from dopepp.inference.refinement.region import FINE, FOLLOWED, FOUND, SURE, RegionRefiner
 from dopepp.inference.refinement.region.round import Round
-from dopepp.inference.refinement.region.shifts import (
-    OFFSET_PX,
-    Shifts,
-    find_shifts,
-    region_terms,
-)
+from dopepp.inference.refinement.region.shifts import OFFSET_PX, Shifts, find_shifts, region_terms
 from dopepp.inference.refinement.solver import Prior, descend
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.part import Part

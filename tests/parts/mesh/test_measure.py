@@ -6,13 +6,7 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 
 from dopepp.parts import servoholder
-from dopepp.parts.mesh import (
-    SurfaceTree,
-    face_areas,
-    largest_distance,
-    sample_surface,
-    weld,
-)
+from dopepp.parts.mesh import SurfaceTree, face_areas, largest_distance, sample_surface, weld
 
 
 @settings(max_examples=60)

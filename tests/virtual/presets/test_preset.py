@@ -359,8 +359,7 @@ def test_wrong_changes_are_refused_in_one_line(changes, message):
 
 def test_unknown_presets_are_refused():
     with pytest.raises(
-        UserError,
-        match=r"'shelf'; allowed: bin, paper, quickstart, table, upright, wide, ycb, or",
+        UserError, match=r"'shelf'; allowed: bin, paper, quickstart, table, upright, wide, ycb, or"
     ):
         preset_of("shelf", {})
 
