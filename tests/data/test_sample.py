@@ -1,6 +1,5 @@
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -33,17 +32,6 @@ def test_nearest_is_the_source_pixel_under_the_target_centre(shape, target):
             u = (2 * column + 1) * shape[1] // (2 * target[0])
             v = (2 * row + 1) * shape[0] // (2 * target[1])
             assert result[row, column] == image[v, u]
-
-
-def test_nearest_against_opencvs_exact_rule():
-    image = np.random.default_rng(0).integers(0, 256, (480, 640), np.uint8)
-    for width, height in ((416, 312), (128, 96), (640, 480), (1280, 960), (37, 301)):
-        expected = cv2.resize(image, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
-        # A centre on the border of two source pixels is equally near to both.
-        rows = (2 * np.arange(height) + 1) * 480 % (2 * height) != 0
-        columns = (2 * np.arange(width) + 1) * 640 % (2 * width) != 0
-        unique = np.ix_(rows, columns)
-        np.testing.assert_array_equal(nearest(image, width, height)[unique], expected[unique])
 
 
 def dot_sample(size: tuple[int, int], dot: tuple[float, float]) -> Sample:

@@ -286,7 +286,6 @@ def test_the_mirrored_start_saves_plates_from_the_wrong_tilt():
         truth = make_transform(random_rotation(rng), np.array([0.02, -0.01, 0.9]))
         pixels = project_keypoints(cuboid, truth, K) + rng.normal(size=(9, 2)) * 0.3
         found = solve_pnp(cuboid, pixels, K, 0.3).T_cam_obj
-        assert found is not None
         at_truth, at_found = (
             np.fmin(((project(transform(T, cuboid), K) - pixels) ** 2).sum(1) / 0.3**2, 9).sum()
             for T in (truth, found)
@@ -315,7 +314,6 @@ def test_the_covariance_is_that_of_the_poses(name):
         result = solve_pnp(cuboid, pixels + noise, K, covariance_px=sigma)
         if result.T_cam_obj is None or not result.inliers.all():
             continue
-        assert result.covariance is not None
         turn = cv2.Rodrigues(result.T_cam_obj[:3, :3] @ truth[:3, :3].T)[0][:, 0]
         steps.append(np.concatenate([turn, (result.T_cam_obj - truth)[:3, 3]]))
         said.append(result.covariance)
@@ -337,6 +335,4 @@ def test_a_covariance_that_is_a_circle_is_a_sigma():
     by_covariance = solve_pnp(
         cuboid, pixels, K, covariance_px=sigma[:, None, None] ** 2 * np.eye(2)
     )
-    assert by_sigma.T_cam_obj is not None
-    assert by_covariance.T_cam_obj is not None
     assert_allclose(by_sigma.T_cam_obj, by_covariance.T_cam_obj, atol=1e-9)

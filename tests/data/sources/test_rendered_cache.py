@@ -33,26 +33,18 @@ def test_keeps_every_field_renders_once_and_ignores_the_epoch(fake_source):
     assert source.calls == [(0, 0), (0, 1), (0, 2)]
 
 
-def test_without_mask_and_without_instance(fake_source):
+def test_without_mask_and_without_instance_and_what_is_returned_is_a_copy(fake_source):
     source = fake_source(num_items=2)
-    bare = source.sample(1)
-    bare.instances[0].mask = None
-    empty = source.sample(0)
-    empty.instances = []
+    bare, empty = source.sample(1), source.sample(0)
+    bare.instances[0].mask, empty.instances = None, []
     source.sample = lambda index, epoch=0: (empty, bare)[index]
     cached = CachedSource(source, (64, 64))
     for _ in range(2):
-        assert_same(cached.sample(0), empty)
-        assert_same(cached.sample(1), bare)
-
-
-def test_a_returned_sample_is_a_copy(fake_source):
-    cached = CachedSource(fake_source(), (64, 64))
-    sample = cached.sample(0)
-    sample.image[:] = 0
-    sample.K[:] = 0
-    sample.instances[0].keypoints[:] = 0
-    assert_same(cached.sample(0), fake_source().sample(0))
+        for index, expected in enumerate((empty, bare)):
+            sample = cached.sample(index)
+            assert_same(sample, expected)
+            for array in (sample.image, sample.K, *(i.keypoints for i in sample.instances)):
+                array[:] = 0
 
 
 def test_images_are_kept_at_the_input_size(fake_source):
@@ -85,25 +77,20 @@ def test_forked_processes_fill_one_cache(fake_source):
     assert source.calls == [(0, 0)]  # this process rendered the first item only
 
 
-def test_too_large_and_too_many_instances(fake_source, monkeypatch):
+def test_what_does_not_fit_is_refused(fake_source, monkeypatch):
     with pytest.raises(UserError, match=r"data\.cache=memory.*set data\.cache=none"):
         CachedSource(fake_source(num_items=10**9), (64, 64))
+    with pytest.raises(ValueError, match="more than 64 characters"):
+        CachedSource(fake_source(label="x" * 65), (64, 64))
+    for change in ({"size": (48, 64)}, {"name": "another"}):
+        source = fake_source()
+        cached = CachedSource(source, (64, 64))
+        vars(source).update(change)
+        with pytest.raises(ValueError, match="one size and one source"):
+            cached.sample(1)
     monkeypatch.setattr(rendered, "_MAX_INSTANCES", 0)
     with pytest.raises(ValueError, match="1 instances; at most 0"):
         CachedSource(fake_source(), (64, 64))
-
-
-def test_what_does_not_fit_a_slot_is_refused(fake_source):
-    with pytest.raises(ValueError, match="more than 64 characters"):
-        CachedSource(fake_source(label="x" * 65), (64, 64))
-    source = fake_source()
-    cached = CachedSource(source, (64, 64))
-    source.size = (48, 64)
-    with pytest.raises(ValueError, match="one size and one source"):
-        cached.sample(1)
-    source.size, source.name = (64, 48), "another"
-    with pytest.raises(ValueError, match="one size and one source"):
-        cached.sample(1)
 
 
 def test_a_file_lasts_and_is_told_apart(fake_source, tmp_path):

@@ -49,7 +49,6 @@ def part(request: pytest.FixtureRequest) -> Part:
 @pytest.fixture(scope="module")
 def refiner() -> RegionRefiner:
     mesh = pivconnector().mesh
-    assert mesh is not None
     return RegionRefiner(mesh.vertices, mesh.faces)
 
 
@@ -57,7 +56,6 @@ def picture(
     part: Part, T: np.ndarray = TRUE, around: tuple[int, int, int] = AROUND_COLOUR, noise: float = 2
 ) -> np.ndarray:
     """Draw a part in one colour by OpenCV's polygons, four times finer than the pixels."""
-    assert part.mesh is not None
     fine = K.copy()
     fine[:2] *= 4
     fine[:2, 2] += 1.5
@@ -83,11 +81,9 @@ def off(T: np.ndarray, true: np.ndarray = TRUE) -> tuple[float, float]:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_contour_is_the_border_of_the_brute_force_silhouette(part: Part, seed: int) -> None:
-    assert part.mesh is not None
     T = moved(TRUE, np.random.default_rng(seed).normal(size=6) * [1, 1, 1, 0.01, 0.01, 0.01])
     mesh = make_outline_mesh(part.mesh.vertices, part.mesh.faces)
     at = posed(mesh, T, K)
-    assert at is not None
     mask = filled_mask(mesh, at, SIZE)
 
     drawn = picture(part, T, noise=0).astype(np.float64)
@@ -117,7 +113,6 @@ def test_contour_is_the_border_of_the_brute_force_silhouette(part: Part, seed: i
 def test_winding_border_fills_what_all_triangles_fill(seed: int) -> None:
     rng = np.random.default_rng(seed)
     part = servoholder().mesh
-    assert part is not None
     mesh = make_outline_mesh(part.vertices, part.faces)
     assert mesh.is_closed
     # Near and beside the picture too: clipped on all sides.
@@ -145,7 +140,6 @@ def test_holes_and_open_edges_are_outlined_hidden_edges_are_not() -> None:
     radii = []
     for mesh in (alone, both):
         at = posed(mesh, T, K)
-        assert at is not None
         contour = find_contour(mesh, at, filled_mask(mesh, at, SIZE), 2.0)
         radii.append(np.abs(contour.arms[:, :2]).max(axis=1).round(3))
     assert set(radii[0]) == {0.02, 0.04}
@@ -153,10 +147,8 @@ def test_holes_and_open_edges_are_outlined_hidden_edges_are_not() -> None:
 
 
 def test_derivative_against_finite_differences(part: Part) -> None:
-    assert part.mesh is not None
     mesh = make_outline_mesh(part.mesh.vertices, part.mesh.faces)
     at = posed(mesh, TRUE, K)
-    assert at is not None
     contour = find_contour(mesh, at, filled_mask(mesh, at, SIZE), 5.0)
     rows = outline_rows(contour, TRUE, K)
     points = contour.arms @ TRUE[:3, :3]
@@ -191,7 +183,6 @@ def straight_edge() -> tuple[Contour, np.ndarray]:
     )
     T = make_transform(np.eye(3), np.array([0, 0, 40.0]))
     at = posed(mesh, T, camera_matrix(800, 800, 31.5, 31.5))
-    assert at is not None
     contour = find_contour(mesh, at, filled_mask(mesh, at, (64, 64)), 2.0)
     return contour, contour.normals[:, 0] > 0.9
 
@@ -266,7 +257,6 @@ def test_colours_tell_part_from_surroundings() -> None:
     image = np.where(mask[..., None] == 1, PART_COLOUR, AROUND_COLOUR).astype(np.uint8)
     image[35:40, 35:40] = image[5:10, 25:30] = (10, 240, 10)  # seen on both sides
     odds = log_odds(colour_bins(image), mask, 3.0, 20.0, 1)
-    assert odds is not None
     assert odds[50, 50] > 2 > -2 > odds[70, 50]
     assert abs(odds[37, 37]) < 1.5
     assert log_odds(colour_bins(image), np.zeros_like(mask), 3.0, 20.0, 1) is None
@@ -278,8 +268,6 @@ def test_tiles_tell_a_part_of_two_colours_before_the_same_two() -> None:
     left = np.arange(120) < 60
     image = np.where(((mask == 1) == left)[..., None], PART_COLOUR, AROUND_COLOUR).astype(np.uint8)
     whole, tiled = (log_odds(colour_bins(image), mask, 3.0, 20.0, tiles) for tiles in (1, 3))
-    assert whole is not None
-    assert tiled is not None
     assert np.abs(whole).max() < 0.5
     for columns in (slice(0, 45), slice(75, 120)):
         assert np.where(mask == 1, tiled, -tiled)[:, columns].min() > 0.5
@@ -288,14 +276,12 @@ def test_tiles_tell_a_part_of_two_colours_before_the_same_two() -> None:
 def test_descent_without_evidence_returns_to_the_prior() -> None:
     prior = Prior(TRUE, np.diag(1 / DEVIATIONS**2))
     found = descend(started(1), prior, [lambda pose, known: (np.zeros((6, 6)), np.zeros(6))], 8)
-    assert found is not None
     assert_allclose(found.T_cam_obj, TRUE, atol=1e-6)
     assert descend(TRUE, prior, [lambda pose, known: None], 8) is None
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_two_colours_are_solved(part: Part, seed: int) -> None:
-    assert part.mesh is not None
     refined = RegionRefiner(part.mesh.vertices, part.mesh.faces).refine(
         picture(part), K, started(seed), np.diag(DEVIATIONS**2)
     )
@@ -303,10 +289,8 @@ def test_two_colours_are_solved(part: Part, seed: int) -> None:
     degrees, millimetres = off(refined.T_cam_obj)
     assert degrees < 0.3
     assert millimetres < 0.3
-    assert refined.covariance is not None
     assert np.linalg.eigvalsh(refined.covariance).min() > 0
     assert np.linalg.det(refined.covariance) < np.prod(DEVIATIONS**2)
-    assert refined.agreement is not None
     assert refined.agreement > 0.9
 
 
@@ -336,9 +320,7 @@ def test_part_behind_an_occluder_and_over_the_border(refiner: RegionRefiner) -> 
         (picture(pivconnector()), make_transform(TURNED, np.array([0.13, 0, 0.24])), ""),
     ],
 )
-def test_pose_is_kept_with_a_reason(
-    refiner: RegionRefiner, image: np.ndarray, pose: np.ndarray, reason: str
-) -> None:
+def test_pose_is_kept_with_a_reason(refiner, image, pose, reason):
     kept = refiner.refine(image, K, pose, np.diag(DEVIATIONS**2))
     assert kept.reason
     assert reason in kept.reason
@@ -418,17 +400,11 @@ def test_support_falls_with_what_is_hidden_agreement_hardly(refiner: RegionRefin
     )
     assert max(off(bare.T_cam_obj)) < 0.5
     assert max(off(hidden.T_cam_obj)) < 1.5
-    assert bare.agreement is not None
-    assert bare.support is not None
-    assert hidden.agreement is not None
-    assert hidden.support is not None
     assert bare.support > 0.85 > 0.75 > hidden.support > 0.2
     assert hidden.agreement > hidden.support + 0.15
 
 
-def test_far_from_a_covariance_that_is_too_sure_the_part_is_found_where_it_is_asked_for(
-    refiner: RegionRefiner,
-) -> None:
+def test_far_from_a_covariance_that_is_too_sure_the_part_is_found_where_it_is_asked_for(refiner):
     sure = np.diag(np.repeat([math.radians(1.5), 0.0015], 3) ** 2)
     start = moved(TRUE, np.array([0.15, 0.2, -0.2, 0.012, -0.008, 0.02]))
     image = tiled(pivconnector(), 0.3)
@@ -437,7 +413,6 @@ def test_far_from_a_covariance_that_is_too_sure_the_part_is_found_where_it_is_as
     found = refiner.refine(image, K, start, sure, starts=list)
     assert not found.reason
     assert max(off(found.T_cam_obj)) < 1.5
-    assert found.agreement is not None
     assert found.agreement >= SURE
     # Nothing there: the given pose stays, however far one looks.
     nothing = refiner.refine(np.full_like(image, 128), K, start, sure, starts=list)

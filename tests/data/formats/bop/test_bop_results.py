@@ -53,10 +53,6 @@ def test_header_blanks_and_line_ends_may_vary(content, tmp_path):
     assert (result.im_id, result.score, result.seconds) == (4, 0.75, 0.5)
 
 
-def test_a_header_alone_is_a_method_that_found_nothing(tmp_path):
-    assert read_results(write(tmp_path, HEADER + "\n"), {1}) == []
-
-
 @settings(max_examples=40)
 @given(seed=st.integers(0, 10_000), count=st.integers(0, 12))
 def test_what_is_written_is_read_back(seed, count, tmp_path_factory):

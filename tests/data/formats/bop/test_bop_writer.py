@@ -1,9 +1,5 @@
 import json
-import multiprocessing
-import os
-import signal
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,38 +12,6 @@ from dopepp.data.sample import Instance, Sample
 from dopepp.geometry.camera import camera_matrix, project_keypoints
 from dopepp.parts.part import Mesh, Part, make_part
 from dopepp.virtual.surface import make_surface
-
-
-def _write_and_seal(root: Path, parts: list[Part], samples: list[Sample], first: int) -> None:
-    writer = BopWriter(root, parts)
-    for index in range(first, 40, 2):
-        writer.write(index, samples[index % len(samples)])
-        writer.finalize(0, [index])
-
-
-@pytest.mark.ddp
-def test_two_processes_seal_one_scene(boxes, tmp_path):
-    parts, samples = boxes
-    BopWriter(tmp_path, parts).prepare()
-    context = multiprocessing.get_context("fork")
-    processes = [
-        context.Process(target=_write_and_seal, args=(tmp_path, parts, samples, first))
-        for first in (0, 1)
-    ]
-    for process in processes:
-        process.start()
-    killed = context.Process(target=_write_and_seal, args=(tmp_path, parts, samples, 0))
-    killed.start()
-    while not BopWriter(tmp_path, parts).written(0):
-        pass
-    os.kill(killed.pid, signal.SIGKILL)
-    for process in [*processes, killed]:
-        process.join()
-    assert [process.exitcode for process in processes] == [0, 0]
-    assert BopWriter(tmp_path, parts).written(0) == set(range(40))
-    records = json.loads((tmp_path / "train_pbr/000000/scene_gt.json").read_text())
-    assert list(records) == [str(index) for index in range(40)]
-
 
 K = camera_matrix(100.0, 100.0, 15.5, 11.5)
 

@@ -6,7 +6,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import scipy.io
 import trimesh
 
 from dopepp.core.errors import UserError
@@ -99,26 +98,6 @@ def test_hidden_synthetic_object_has_fraction_zero(ycb_tree, box):
     assert not instance.mask.any()
 
 
-def test_image_set_splits_into_subsets(ycb_tree, box):
-    ycb_tree.write("0000/000001")
-    ycb_tree.write("data_syn/000003")
-    ycb_tree.write_list("train", ["0000/000001", "data_syn/000003"])
-    real = YcbVideoReader(ycb_tree.root, [box], "train")
-    synthetic = YcbVideoReader(
-        ycb_tree.root, [box], "train", "synthetic", backgrounds=ProceduralBackgrounds()
-    )
-    assert (real.frames, synthetic.frames) == (["0000/000001"], ["000003"])
-
-
-def test_absent_frames_are_counted_and_named_once(ycb_tree, box, caplog):
-    ycb_tree.write("0000/000001")
-    ycb_tree.write_list("train", ["0000/000001", "0007/000001", "0007/000002"])
-    with caplog.at_level(logging.WARNING):
-        assert len(YcbVideoReader(ycb_tree.root, [box], "train")) == 1
-    (record,) = caplog.records
-    assert "2 of 3 frames listed in train.txt are absent; first: 0007/000001" in record.message
-
-
 def test_describe_and_contains(ycb_tree, box):
     ycb_tree.write("0000/000001", classes=(2,))
     ycb_tree.write("0000/000002", classes=(1,))
@@ -172,29 +151,6 @@ def test_unknown_names_list_the_known_ones_and_wrong_arguments_are_refused(ycb_t
         YcbVideoReader(ycb_tree.root, [box])
     with pytest.raises(ValueError, match="give backgrounds"):
         YcbVideoReader(ycb_tree.root, [box], "train", "synthetic")
-
-
-@pytest.mark.parametrize("compressed", [True, False])
-def test_meta_cut_short_anywhere(ycb_tree, box, compressed):
-    ycb_tree.write("0000/000001")
-    path = ycb_tree.path("0000/000001", "meta.mat")
-    fields = {k: v for k, v in scipy.io.loadmat(path).items() if not k.startswith("__")}
-    scipy.io.savemat(path, fields, do_compression=compressed)
-    content, source = path.read_bytes(), source_of(ycb_tree, box)
-    for length in [0, 60, 128, 130, 200, *range(256, len(content), 4001), len(content) - 1]:
-        path.write_bytes(content[:length])
-        with pytest.raises(UserError, match=r"meta\.mat.*complete MAT-5 file"):
-            source.sample(0)
-    path.unlink()
-    with pytest.raises(UserError, match=r"meta\.mat.*No such file"):
-        source.sample(0)
-
-
-def test_wrong_channels(ycb_tree, box):
-    ycb_tree.write("0000/000001")
-    cv2.imwrite(str(ycb_tree.path("0000/000001", "color.png")), np.zeros((72, 96), np.uint8))
-    with pytest.raises(UserError, match="8 bits and 3 channels"):
-        source_of(ycb_tree, box).sample(0)
 
 
 @pytest.mark.parametrize(
