@@ -29,9 +29,7 @@ def grasped(tmp_path, *words):
 
 
 def test_a_network_and_exact_poses_grip_the_same_parts(tmp_path):
-    content, output = grasped(
-        tmp_path, "-n", 3, "--poses", "network,exact,random", "--workers", 1
-    )  # fmt: skip
+    content, output = grasped(tmp_path, "-n", 3, "--poses", "network,exact,random", "--workers", 1)
     sources = content["sources"]
     assert sources["network"]["recognised"] == 3
     assert sources["network"]["caught"] >= 2

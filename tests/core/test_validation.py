@@ -61,7 +61,7 @@ SHARE = "a number from 0 to 1 (part)"
         ({"number": 1, "path": 3}, "root.path=3", "text"),
         (3, "root=3", "a mapping"),
     ],
-)  # fmt: skip
+)
 def test_a_mistake_names_field_value_and_choices(given, got, allowed):
     with pytest.raises(UserError) as caught:
         parse(Outer, given, "root")
@@ -110,7 +110,7 @@ def test_an_argument_becomes_typed(value, kind, limits, typed):
         pytest.param(10**5000, int, Range(1, 9), "got name", id="endless"),
         (object(), int, Range(1, 9), "got name"),
     ],
-)  # fmt: skip
+)
 def test_an_argument_of_another_kind_is_refused(value, kind, limits, message):
     with pytest.raises(UserError) as caught:
         check("name", value, kind, limits)

@@ -151,9 +151,7 @@ BOP = {
         f"{SCENE}/rgb/000001.png", NOISE[..., 0].astype(np.uint16),
         "rgb/000001.png: image: pixels of type I;16",
     ),
-    "rgb without records": read(
-        f"{SCENE}/rgb/000009.png", NOISE, "scene_camera.json: 9: missing"
-    ),
+    "rgb without records": read(f"{SCENE}/rgb/000009.png", NOISE, "scene_camera.json: 9: missing"),
     "depth cut": Case(f"{SCENE}/depth/000002.png", half, "depth/000002.png: image: unreadable"),
     "depth missing": Case(f"{SCENE}/depth/000002.png", None, "depth/000002.png: file: missing"),
     "depth size": Case(
@@ -209,9 +207,7 @@ BOP = {
     "depth scale": Case(f"{CAMERA}:0.depth_scale", 0, "0.depth_scale: 0"),
     "no depth scale": read(f"{CAMERA}:0.depth_scale", None, "0.depth_scale: missing"),
     "fraction": Case(f"{INFO}:0.0.visib_fract", 1.5, "0[0].visib_fract: 1.5"),
-    "fraction and counts": read(
-        f"{INFO}:0.1.visib_fract", 0.2, "0[1].visib_fract: 0.2, the pixel"
-    ),
+    "fraction and counts": read(f"{INFO}:0.1.visib_fract", 0.2, "0[1].visib_fract: 0.2, the pixel"),
     "counts": read(f"{INFO}:0.1.px_count_visib", times(1.5), "0[1].px_count_visib"),
     "visible box": read(f"{INFO}:0.1.bbox_visib", [0, 0, 20, 20], "0[1].bbox_visib:"),
     "box short": read(f"{INFO}:0.1.bbox_obj", [0], "0[1].bbox_obj: [0]"),
@@ -630,9 +626,7 @@ YCB_VIDEO = {
     "no rotation": (poses(R00=1.1), "meta.mat: poses[0].R: no rotation"),
     "NaN": (poses(R00=np.nan), "meta.mat: poses[0]: not finite"),
     "behind": (poses(tz=-0.3), "meta.mat: poses[0].z: behind the camera"),
-    "class twice": (
-        meta(classes=(2, 3), cls_indexes=[[2], [2]]), "cls_indexes[1]: class 2 twice"
-    ),
+    "class twice": (meta(classes=(2, 3), cls_indexes=[[2], [2]]), "cls_indexes[1]: class 2 twice"),
     "poses and classes": (meta(cls_indexes=[[2], [3]]), "poses: shape"),
     "no poses": (meta(poses=None), "meta.mat: poses: missing"),
     "no factor": (meta(factor_depth=None), "meta.mat: factor_depth: missing"),

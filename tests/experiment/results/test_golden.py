@@ -177,7 +177,7 @@ def test_a_table_of_one_network_a_part(compare_golden, report_of, write_run):
         },
         "recomputed": {"PoseCNN": {"nut": {"pass": 97.5, "add_01d": 25.1}}},
         "notes": ["A remark."],
-    }  # fmt: skip
+    }
     end("sweep", table)
     compare_golden("table_of_parts", "sweep/table.md", "sweep/table.csv", terminal=False)
 

@@ -57,9 +57,7 @@ def test_the_command_line_adds_replaces_and_fixes(loader):
 
 def test_every_choice_is_tried_before_the_search(loader):
     space = read_space(loader, ["a=choice(1, 2)", "b=interval(0, 1)", "c=choice(x, y)"], [])
-    assert examples(space) == [
-        ["a=1", "b=0", "c=x"], ["a=2", "b=0", "c=x"], ["a=1", "b=0", "c=y"],
-    ]  # fmt: skip
+    assert examples(space) == [["a=1", "b=0", "c=x"], ["a=2", "b=0", "c=x"], ["a=1", "b=0", "c=y"]]
 
 
 @pytest.mark.parametrize("bad", ["a=1", "a=", "a=interval(1,", "a=interval(2, 1)", "a"])

@@ -24,9 +24,7 @@ from dopepp.robot.grasping.task import Record, Source, Task
 def record(number, *, recognised=True, caught=True, failure="", source="network", off=0.0):
     seen = failure != "not seen"
     add = 1.0 if seen else float("nan")
-    return Record(
-        number, source, off, seen, recognised, add, add, add, caught, failure, 0.2, 0.02
-    )  # fmt: skip
+    return Record(number, source, off, seen, recognised, add, add, add, caught, failure, 0.2, 0.02)
 
 
 @pytest.fixture

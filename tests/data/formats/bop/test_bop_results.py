@@ -139,7 +139,7 @@ def test_what_is_no_such_file(tmp_path, monkeypatch):
         ("a/../b_c", "../..", "", "a-..-b-c_data-test.csv"),
         ("_", "-", "/", "method_data-test.csv"),
     ],
-)  # fmt: skip
+)
 def test_file_names_have_bops_three_parts(method, dataset, split, name):
     assert results_name(method, dataset, split) == name
     assert name.count("_") == 1
