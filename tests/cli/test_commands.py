@@ -8,10 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from click.testing import Result
-from typer.testing import CliRunner
 
-from dopepp.cli import app
 from dopepp.models.checkpoint import Checkpoint, write_atomic
 from dopepp.models.network import build_network
 from dopepp.parts.catalogue import pivconnector
@@ -19,18 +16,6 @@ from dopepp.virtual.presets import PRESETS
 
 K = ["--K", "100", "100", "31.5", "31.5"]
 RENDER = ["render", "servoholder", "--preset", "quickstart", "--size", "32x24", "--format", "ndds"]
-
-
-def call(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
-
-
-def refused(*arguments: object) -> str:
-    """Call with a mistake and return the one line that tells it."""
-    done = call(*arguments)
-    assert done.exit_code == 2
-    assert done.stderr.count("\n") == 1, done.stderr
-    return done.stderr
 
 
 @pytest.fixture
@@ -48,13 +33,12 @@ def picture(tmp_path):
     return path
 
 
-def test_predict_verifies_and_refines(checkpoint, picture, tmp_path):
+def test_predict_verifies_and_refines(run, checkpoint, picture, tmp_path):
     depth = tmp_path / "depth.png"
     cv2.imwrite(str(depth), np.full((64, 64), 500, np.uint16))
     measured = ("--depth", depth)
     for options in (("depth", *measured), ("region",), ("region,depth", *measured)):
-        done = call("predict", checkpoint, picture, *K, "--verify", "--refine", *options)
-        assert done.exit_code == 0, done.output
+        done = run("predict", checkpoint, picture, *K, "--verify", "--refine", *options)
         for line in done.stdout.splitlines():
             assert 0 <= json.loads(line)["agreement"] <= 1
             assert json.loads(line)["kept"]  # noise shows no part
@@ -72,12 +56,12 @@ def test_predict_verifies_and_refines(checkpoint, picture, tmp_path):
         (["--refine", "depth", "--depth", "missing.png"], "missing.png"),
     ],
 )
-def test_predict_tells_wrong_options(checkpoint, picture, options, message):
+def test_predict_tells_wrong_options(refused, checkpoint, picture, options, message):
     assert message in refused("predict", checkpoint, picture, *K, *options)
     assert refused("predict", picture, picture, *K, *options).startswith("got ")
 
 
-def test_predict_follows_parts_through_a_folder(tmp_path):
+def test_predict_follows_parts_through_a_folder(run, refused, tmp_path):
     from dopepp.parts.catalogue import pivconnector
     from dopepp.virtual import PRESETS, Factory
 
@@ -89,8 +73,7 @@ def test_predict_follows_parts_through_a_folder(tmp_path):
         cv2.imwrite(str(frames / f"{number:03d}.png"), rendered.image[..., ::-1])
     (frames / "notes.txt").write_text("no frame")
     camera = rendered.scene.K[[0, 1, 0, 1], [0, 1, 2, 2]]
-    done = call("predict", released, frames, "--K", *camera, "--track", "--save", drawn)
-    assert done.exit_code == 0, done.output
+    done = run("predict", released, frames, "--K", *camera, "--track", "--save", drawn)
     records = [json.loads(line) for line in done.stdout.splitlines()]
     assert [Path(one["image"]).name for one in records] == ["000.png", "001.png", "002.png"]
     assert {one["identity"] for one in records} == {0}
@@ -101,28 +84,26 @@ def test_predict_follows_parts_through_a_folder(tmp_path):
     assert "without a picture" in refused("predict", released, drawn.parent, "--K", *camera)
 
 
-def test_compare_tells_an_unfinished_run(tmp_path):
+def test_compare_tells_an_unfinished_run(run, refused, tmp_path):
     (tmp_path / "run" / ".hydra").mkdir(parents=True)
-    done = call("compare", tmp_path / "run", "--out", tmp_path / "out")
-    assert done.exit_code == 0, done.output
+    run("compare", tmp_path / "run", "--out", tmp_path / "out")
     assert "unfinished" in (tmp_path / "out" / "compare.md").read_text()
     assert "missing, which holds no run" in refused("compare", tmp_path / "missing")
 
 
-def test_render_writes_goes_on_and_says_so(tmp_path):
+def test_render_writes_goes_on_and_says_so(run, tmp_path):
     arguments = [*RENDER, "--workers", "1", "--out", tmp_path, "-n", "2"]
-    done = call(*arguments, "--shard", "1/2")
-    assert done.exit_code == 0, done.output
+    done = run(*arguments, "--shard", "1/2")
     assert done.stdout.startswith("1 of 1 images rendered in ")
     assert [path.name for path in sorted(tmp_path.glob("0*.json"))] == ["000001.json"]
-    done = call(*arguments)
+    done = run(*arguments)
     assert done.stdout.startswith("1 of 2 images rendered in ")
     assert "CPU-ms an image" in done.stdout
     assert len(list(tmp_path.glob("0*.json"))) == 2
 
 
-def test_the_help_names_every_preset():
-    text = " ".join(call("render", "--help").stdout.replace("│", " ").split())
+def test_the_help_names_every_preset(run):
+    text = " ".join(run("render", "--help").stdout.replace("│", " ").split())
     assert ", ".join(PRESETS) in text
 
 
@@ -132,15 +113,14 @@ camera_matrix: {rows: 3, cols: 3, data: [931.2, 0, 640, 0, 931.2, 360, 0, 0, 1]}
 """
 
 
-def test_render_shows_a_users_camera(tmp_path, caplog):
+def test_render_shows_a_users_camera(run, tmp_path, caplog):
     camera, out = tmp_path / "cam.yaml", tmp_path / "out"
     camera.write_text(CAMERA)
     with caplog.at_level(logging.INFO):
-        done = call(
+        run(
             "render", "servoholder", "--preset", "wide", "--camera", camera, "--format", "ndds",
             "--working-distance", "0.4,0.7", "--workers", "1", "-n", "1", "--out", out,
         )  # fmt: skip
-    assert done.exit_code == 0, done.output
     assert cv2.imread(str(out / "000000.png")).shape == (720, 1280, 3)
     intrinsics = json.loads((out / "000000.json").read_text())["camera_data"]["intrinsics"]
     assert (intrinsics["fx"], intrinsics["cy"]) == (931.2, 360)
@@ -158,17 +138,16 @@ def test_render_shows_a_users_camera(tmp_path, caplog):
         (["--camera", "/nowhere", "--working-distance", "0.5,1"], "got camera file /nowhere: No"),
     ],
 )
-def test_a_camera_that_cannot_be_used_is_one_line(arguments, message, tmp_path):
+def test_a_camera_that_cannot_be_used_is_one_line(refused, arguments, message, tmp_path):
     (tmp_path / "cam.yaml").write_text(CAMERA)
     given = [text.format(camera=tmp_path / "cam.yaml") for text in arguments]
     line = refused("render", "servoholder", "--out", tmp_path / "out", "-n", "1", *given)
     assert line.startswith(message)
 
 
-def test_render_previews_and_stops(tmp_path):
+def test_render_previews_and_stops(run, tmp_path):
     out = tmp_path / "out"
-    done = call(*RENDER, "-n", "5000", "--preview", "--out", out)
-    assert done.exit_code == 0, done.output
+    done = run(*RENDER, "-n", "5000", "--preview", "--out", out)
     assert done.stdout == f"{out.resolve()}.preview.png\n"
     assert not out.exists()
     assert cv2.imread(f"{out}.preview.png").shape[2] == 3
@@ -201,7 +180,7 @@ def test_render_previews_and_stops(tmp_path):
         (["-n", "5", "--out", "/dev/null/x"], "got folder /dev/null/x: Not a directory"),
     ],
 )
-def test_a_wrong_render_option_is_one_line_and_code_2(arguments, message, tmp_path):
+def test_a_wrong_render_option_is_one_line_and_code_2(refused, arguments, message, tmp_path):
     assert refused(*RENDER, "--out", tmp_path / "out", *arguments).startswith(message)
     assert not (tmp_path / "out").exists()
 
@@ -216,22 +195,21 @@ def test_a_wrong_render_option_is_one_line_and_code_2(arguments, message, tmp_pa
         (["download", "coco"], "got unknown data set 'coco'; allowed: voc2007"),
     ],
 )
-def test_a_wrong_command_is_one_line_and_code_2(arguments, message):
+def test_a_wrong_command_is_one_line_and_code_2(refused, arguments, message):
     assert refused(*arguments).startswith(message)
 
 
-def test_download_tells_where_the_photos_are(tmp_path, monkeypatch):
+def test_download_tells_where_the_photos_are(run, tmp_path, monkeypatch):
     photos = tmp_path / "voc2007" / "VOCdevkit" / "VOC2007" / "JPEGImages"
     photos.mkdir(parents=True)
-    done = call("download", "voc2007", "--out", tmp_path)
+    done = run("download", "voc2007", "--out", tmp_path)
     assert (done.exit_code, done.stdout) == (0, f"{photos}\n")
 
     def refuse(*_: object) -> None:
         raise OSError("Network is unreachable")
 
     monkeypatch.setattr("socket.getaddrinfo", refuse)
-    done = call("download", "voc2007", "--out", tmp_path / "other")
-    assert done.exit_code == 2
+    done = run("download", "voc2007", "--out", tmp_path / "other", code=2)
     assert "no connection: Network is unreachable" in done.stderr
 
 
@@ -240,7 +218,7 @@ def plate(shared_data):
     return shared_data / "parts" / "so_arm100" / "Seeedstudio_Mounting_Plate_SO101.stl"
 
 
-def test_the_unit_of_a_file_is_guessed_aloud_and_a_wrong_one_named(plate, tmp_path, caplog):
+def test_the_unit_of_a_file_is_guessed_and_a_wrong_one_named(refused, plate, tmp_path, caplog):
     out = tmp_path / "out"
     line = refused("render", plate, "--unit", "m", "-n", "5", "--out", out)
     assert "allowed: a diameter of 5 mm – 5 m; fix: state the file's unit: unit=mm" in line
@@ -250,30 +228,28 @@ def test_the_unit_of_a_file_is_guessed_aloud_and_a_wrong_one_named(plate, tmp_pa
 
 
 @pytest.mark.slow
-def test_an_inch_file_comes_out_in_its_size_and_checked(plate, tmp_path):
+def test_an_inch_file_comes_out_in_its_size_and_checked(run, plate, tmp_path):
     mesh = trimesh.load_mesh(plate)
     inches, out = tmp_path / "plate.stl", tmp_path / "out"
     corners = mesh.vertices.copy()
     mesh.apply_scale(1 / 25.4).export(inches)
-    done = call(
+    done = run(
         "render", inches, "--unit", "inch", "--out", out, "-n", "2", "--size", "96,72",
         "--preset", "table", "--backgrounds", "skimage", "--workers", "1",
     )  # fmt: skip
-    assert done.exit_code == 0, done.stderr
     (record,) = json.loads((out / "models" / "models_info.json").read_text()).values()
     sizes = [record[f"size_{axis}"] for axis in "xyz"]
     assert sizes == pytest.approx(np.ptp(corners, axis=0).tolist(), rel=1e-5)  # millimetres
     assert cv2.imread(str(next(out.rglob("rgb/*")))).shape == (72, 96, 3)
-    done = call("check", out)
+    done = run("check", out)
     assert (done.exit_code, done.stderr) == (0, "")
     assert done.stdout == f"{out}: BOP, 2 images, 0 defects\n"
     (path,) = out.rglob("scene_gt.json")
     path.write_text(path.read_text().replace('"obj_id": 1', '"obj_id": 7'))
-    done = call("check", out)
-    assert done.exit_code == 1
+    done = run("check", out, code=1)
     assert f"{path.relative_to(out)}: " in done.stdout
     listed = done.stdout.splitlines()
-    few = call("check", out, "--most", "1").stdout.splitlines()
+    few = run("check", out, "--most", "1").stdout.splitlines()
     assert (few[0], few[-1]) == (listed[0], listed[-1])
     assert few[1] == f"… and {len(listed) - 2} more"
 

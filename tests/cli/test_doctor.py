@@ -4,18 +4,12 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from typer.testing import CliRunner
 
-from dopepp.cli import app
 from dopepp.core import errors
 from dopepp.parts.catalogue import pivconnector
 from dopepp.virtual import PRESETS, Factory
 
 MODEL = "pretrained/pivconnector"
-
-
-def doctor(*arguments):
-    return CliRunner().invoke(app, ["doctor", *map(str, arguments), "--model", MODEL])
 
 
 @pytest.fixture(scope="module")
@@ -30,9 +24,17 @@ def folder(tmp_path_factory):
     return folder
 
 
-def test_a_good_picture_is_well(folder):
-    done = doctor(folder / "good.png", "--camera", folder / "K.txt", "--refine", "region")
-    assert done.exit_code == 0, done.output
+def test_a_good_picture_is_well(run, folder):
+    done = run(
+        "doctor",
+        "--model",
+        MODEL,
+        folder / "good.png",
+        "--camera",
+        folder / "K.txt",
+        "--refine",
+        "region",
+    )
     lines = done.stdout.splitlines()
     assert [line.split(":")[0] for line in lines] == [
         f"ok {subject}"
@@ -54,10 +56,9 @@ def test_a_good_picture_is_well(folder):
         ),
     ],
 )
-def test_what_is_wrong_comes_first(folder, options, line):
+def test_what_is_wrong_comes_first(run, folder, options, line):
     paths = [str(folder / one) if "." in one and one[0].isalpha() else one for one in options]
-    done = doctor(*paths)
-    assert done.exit_code == 1, done.output
+    done = run("doctor", "--model", MODEL, *paths, code=1)
     assert done.stdout.startswith(line)
     assert "; fix: " in done.stdout.splitlines()[0]
 
@@ -71,12 +72,9 @@ def test_what_is_wrong_comes_first(folder, options, line):
         (["good.png", "--camera", "K.txt", "--distance", "2", "1"], "distances=(2.0, 1.0)"),
     ],
 )
-def test_wrong_input_is_one_line(folder, options, line):
+def test_wrong_input_is_one_line(refused, folder, options, line):
     paths = [str(folder / one) if one[-4:] in (".png", ".txt") else one for one in options]
-    done = doctor(*paths)
-    assert done.exit_code == 2, done.output
-    assert line in done.stderr
-    assert done.stderr.count("\n") == 1
+    assert line in refused("doctor", "--model", MODEL, *paths)
 
 
 @pytest.mark.parametrize(
@@ -87,9 +85,7 @@ def test_wrong_input_is_one_line(folder, options, line):
         (["--port", "0"], False, "--help"),
     ],
 )
-def test_a_page_that_cannot_be_served_is_one_line(monkeypatch, options, missing, line):
+def test_a_page_that_cannot_be_served_is_one_line(refused, monkeypatch, options, missing, line):
     if missing:
         monkeypatch.setattr(errors, "find_spec", lambda name: None)
-    done = CliRunner().invoke(app, ["serve", MODEL, *options])
-    assert done.exit_code == 2, done.output
-    assert line in done.stderr
+    assert line in refused("serve", MODEL, *options)

@@ -5,9 +5,6 @@ import json
 import mujoco
 import pytest
 import trimesh
-from typer.testing import CliRunner
-
-from dopepp.cli import app
 
 
 @pytest.fixture(autouse=True)
@@ -16,20 +13,17 @@ def _quick_calibration(request, monkeypatch):
         monkeypatch.setattr("dopepp.robot.grasping.rehearsal.VIEWS", 8)
 
 
-def call(*words):
-    done = CliRunner().invoke(app, ["grasp", *map(str, words)])
-    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
-    return done
+@pytest.fixture
+def grasped(run, tmp_path):
+    def grasped(*words):
+        done = run("grasp", "--out", tmp_path / "out", *words)
+        return json.loads((tmp_path / "out" / "grasps.json").read_text()), done.output
+
+    return grasped
 
 
-def grasped(tmp_path, *words):
-    done = call("--out", tmp_path / "out", *words)
-    assert done.exit_code == 0, done.output
-    return json.loads((tmp_path / "out" / "grasps.json").read_text()), done.output
-
-
-def test_a_network_and_exact_poses_grip_the_same_parts(tmp_path):
-    content, output = grasped(tmp_path, "-n", 3, "--poses", "network,exact,random", "--workers", 1)
+def test_a_network_and_exact_poses_grip_the_same_parts(grasped, tmp_path):
+    content, output = grasped("-n", 3, "--poses", "network,exact,random", "--workers", 1)
     sources = content["sources"]
     assert sources["network"]["recognised"] == 3
     assert sources["network"]["caught"] >= 2
@@ -41,8 +35,8 @@ def test_a_network_and_exact_poses_grip_the_same_parts(tmp_path):
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("count", [20, 200])
-def test_nearly_all_single_parts_are_caught(tmp_path, count):
-    content, _ = grasped(tmp_path, "-n", count, "--poses", "network,exact")
+def test_nearly_all_single_parts_are_caught(grasped, tmp_path, count):
+    content, _ = grasped("-n", count, "--poses", "network,exact")
     network, exact = (content["sources"][name] for name in ("network", "exact poses"))
     assert network["recognised"] >= 0.95 * count
     assert network["caught"] >= 0.93 * count
@@ -51,18 +45,19 @@ def test_nearly_all_single_parts_are_caught(tmp_path, count):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", ["distractors", "heap"])
-def test_other_layouts_end_in_a_report(tmp_path, layout):
-    content, _ = grasped(tmp_path, "-n", 3, "--layout", layout, "--poses", "network,exact")
+def test_other_layouts_end_in_a_report(grasped, tmp_path, layout):
+    content, _ = grasped("-n", 3, "--layout", layout, "--poses", "network,exact")
     assert content["layout"] == layout
 
 
-def test_proposed_grasps_hold_a_part_of_ones_own(tmp_path):
+def test_proposed_grasps_hold_a_part_of_ones_own(grasped, run, tmp_path):
     trimesh.creation.box((60, 30, 20)).export(tmp_path / "block.stl")
-    done = call("propose", tmp_path / "block.stl", "--unit", "mm", "--out", tmp_path / "block.yaml")
-    assert done.exit_code == 0, done.output
+    done = run(
+        "grasp", "propose", tmp_path / "block.stl", "--unit", "mm", "--out", tmp_path / "block.yaml"
+    )
     assert "grasps" in done.output
     content, _ = grasped(
-        tmp_path, "--part", tmp_path / "block.stl", "--unit", "mm", "--poses", "exact", "-n", 2,
+        "--part", tmp_path / "block.stl", "--unit", "mm", "--poses", "exact", "-n", 2,
         "--grasps", tmp_path / "block.yaml", "--rest", "any", "--workers", 1,
     )  # fmt: skip
     assert content["sources"]["exact poses"]["caught"] == 2
@@ -83,53 +78,46 @@ def test_proposed_grasps_hold_a_part_of_ones_own(tmp_path):
         (["--grasps", "none.yaml"], "none.yaml"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(tmp_path, words, named):
-    done = call("--out", tmp_path, "--workers", 1, *words)
-    assert done.exit_code == 2
-    assert named in done.output
-    assert len(done.output.strip().splitlines()) == 1
+def test_what_cannot_be_is_refused_in_one_line(refused, tmp_path, words, named):
+    assert named in refused("grasp", "--out", tmp_path, "--workers", 1, *words)
 
 
-def test_a_part_without_a_grasp_or_a_network_is_refused(tmp_path):
+def test_a_part_without_a_grasp_or_a_network_is_refused(refused, tmp_path):
     trimesh.creation.box((60, 30, 20)).export(tmp_path / "block.stl")
     words = ["--part", tmp_path / "block.stl", "--unit", "mm", "--out", tmp_path]
-    assert "without a network" in call(*words).output
-    assert "part block without a grasp" in call(*words, "--poses", "exact").output
+    assert "without a network" in refused("grasp", *words)
+    assert "part block without a grasp" in refused("grasp", *words, "--poses", "exact")
 
 
-def test_grasps_that_are_not_reached_are_told(tmp_path):
+def test_grasps_that_are_not_reached_are_told(run, tmp_path):
     below = "{point: [0, 0, 0], closing: [0, 1, 0], approach: [0, 0, 1], width: 0.052}"
     (tmp_path / "below.yaml").write_text(f"part: pivconnector\ngrasps: [{below}]\n")
     words = ["--poses", "exact", "-n", 2, "--grasps", tmp_path / "below.yaml", "--workers", 1]
-    done = call(*words, "--out", tmp_path / "out")
-    assert done.exit_code == 2
+    done = run("grasp", *words, "--out", tmp_path / "out", code=2)
     assert "none of its grasps is reached" in done.output
 
 
-def test_without_the_extra_it_says_which(tmp_path, monkeypatch):
+def test_without_the_extra_it_says_which(refused, tmp_path, monkeypatch):
     monkeypatch.setattr("dopepp.core.errors.find_spec", lambda name: None)
-    done = call("--out", tmp_path)
-    assert done.exit_code == 2
-    assert "dopepp[robot]" in done.output
+    assert "dopepp[robot]" in refused("grasp", "--out", tmp_path)
 
 
 @pytest.mark.parametrize("words", [["--video", "film.mp4"], ["--renderer", "mujoco"]])
-def test_without_a_display_it_says_so_before_the_first_grasp(tmp_path, monkeypatch, words):
+def test_without_a_display_it_says_so_before_the_first_grasp(run, tmp_path, monkeypatch, words):
     def fail(*_):
         raise RuntimeError("no EGL display")
 
     monkeypatch.setattr(mujoco, "Renderer", fail)
     monkeypatch.chdir(tmp_path)
-    done = call("--out", tmp_path / "out", "--workers", 1, *words)
-    assert done.exit_code == 2
+    done = run("grasp", "--out", tmp_path / "out", "--workers", 1, *words, code=2)
     assert "without OpenGL (RuntimeError: no EGL display)" in done.output
     assert not (tmp_path / "out" / "grasps.json").exists()
 
 
 @pytest.mark.slow
-def test_a_film_and_a_recording_show_the_first_grasp(tmp_path):
+def test_a_film_and_a_recording_show_the_first_grasp(grasped, tmp_path):
     grasped(
-        tmp_path, "--poses", "exact", "-n", 1, "--workers", 1,
+        "--poses", "exact", "-n", 1, "--workers", 1,
         "--video", tmp_path / "film.mp4", "--rerun", tmp_path / "film.rrd",
     )  # fmt: skip
     assert (tmp_path / "film.mp4").stat().st_size > 50_000

@@ -13,10 +13,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from click.testing import Result
-from typer.testing import CliRunner
 
-from dopepp.cli import app
 from dopepp.data.formats.bop.bop_results import read_results
 from dopepp.inference.frames.media import Video
 from dopepp.parts.catalogue import pivconnector
@@ -47,9 +44,10 @@ def files(rendered, tmp_path_factory):
     return folder
 
 
-def predict(files: Path, *arguments: object) -> Result:
-    given = ["predict", "pretrained/pivconnector", *arguments, "--camera", files / "K.txt"]
-    return CliRunner().invoke(app, [str(one) for one in given])
+@pytest.fixture
+def predict(run, files):
+    camera = ("--camera", files / "K.txt")
+    return lambda *words, **code: run("predict", "pretrained/pivconnector", *words, *camera, **code)
 
 
 def frames(path: Path) -> int:
@@ -63,11 +61,10 @@ def lines(path: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def test_everything_about_pictures_and_a_video(files, rendered, tmp_path):
+def test_everything_about_pictures_and_a_video(predict, files, rendered, tmp_path):
     out, poses, csv = tmp_path / "out", tmp_path / "poses.jsonl", tmp_path / "poses.csv"
     sources = (f"{files}/0*", files / "clip.avi")
-    done = predict(files, *sources, "--save", out, "--json", poses, "--csv", csv, "--stride", 2)
-    assert done.exit_code == 0, done.output
+    done = predict(*sources, "--save", out, "--json", poses, "--csv", csv, "--stride", 2)
     assert sorted(one.name for one in out.iterdir()) == ["000007.jpg", "clip.mp4"]
     assert frames(out / "clip.mp4") == 3
     true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj
@@ -89,20 +86,22 @@ def test_everything_about_pictures_and_a_video(files, rendered, tmp_path):
     assert told[1].startswith("1/3 clip.avi: 1 pose; ")
 
 
-def test_a_picture_without_the_part_is_a_line_of_its_own(files, tmp_path):
+def test_a_picture_without_the_part_is_a_line_of_its_own(predict, files, tmp_path):
     done = predict(
-        files, files / "000009.png", "--json", tmp_path / "poses.jsonl", "--csv", tmp_path / "p.csv"
+        files / "000009.png", "--json", tmp_path / "poses.jsonl", "--csv", tmp_path / "p.csv"
     )
     assert (done.exit_code, done.stdout) == (0, "")
     assert done.stderr.startswith("nothing found: pivconnector: ")
     assert lines(tmp_path / "poses.jsonl")[0]["detections"] == []
     assert (tmp_path / "p.csv").read_text() == "scene_id,im_id,obj_id,score,R,t,time\n"
-    done = predict(files, files / "000007.jpg", "--conf", "1")
+    done = predict(files / "000007.jpg", "--conf", "1")
     assert done.stderr.startswith("nothing found: no score of 1; ")
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_an_interruption_leaves_what_was_written(files, tmp_path, monkeypatch, number, code):
+def test_an_interruption_leaves_what_was_written(
+    predict, files, tmp_path, monkeypatch, number, code
+):
     whole = Video.frames
 
     def interrupted(self, stride):
@@ -111,8 +110,7 @@ def test_an_interruption_leaves_what_was_written(files, tmp_path, monkeypatch, n
 
     monkeypatch.setattr(Video, "frames", interrupted)
     out, poses, csv = tmp_path / "out", tmp_path / "poses.jsonl", tmp_path / "poses.csv"
-    done = predict(files, files / "clip.avi", "--save", out, "--json", poses, "--csv", csv)
-    assert done.exit_code == code, done.output
+    done = predict(files / "clip.avi", "--save", out, "--json", poses, "--csv", csv, code=code)
     assert done.stderr.splitlines()[-1] == "interrupted; what was written is complete"
     assert frames(out / "clip.mp4") == 3
     assert len(lines(poses)) == len(read_results(csv, [1])) == 3
@@ -121,11 +119,10 @@ def test_an_interruption_leaves_what_was_written(files, tmp_path, monkeypatch, n
     ]  # fmt: skip
 
 
-def test_a_full_disk_is_one_line_and_code_1(files, tmp_path, monkeypatch):
+def test_a_full_disk_is_one_line_and_code_1(predict, files, tmp_path, monkeypatch):
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=0))
     poses = tmp_path / "poses.jsonl"
-    done = predict(files, files / "clip.avi", "--save", tmp_path / "out", "--json", poses)
-    assert done.exit_code == 1
+    done = predict(files / "clip.avi", "--save", tmp_path / "out", "--json", poses, code=1)
     assert done.stderr.splitlines()[-1].startswith(f"no space left for {tmp_path}/out/clip.mp4")
     monkeypatch.undo()
 
@@ -133,40 +130,35 @@ def test_a_full_disk_is_one_line_and_code_1(files, tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("dopepp.core.files.Path.write_bytes", full)
-    done = predict(files, files / "000007.jpg", "--save", tmp_path / "out", "--json", poses)
-    assert done.exit_code == 1
+    done = predict(files / "000007.jpg", "--save", tmp_path / "out", "--json", poses, code=1)
     assert done.stderr.splitlines()[-1] == f"no space left for {tmp_path}/out: free some"
     assert poses.exists()
     assert not list(tmp_path.rglob("*.partial"))
 
 
-def test_pictures_are_not_overwritten_by_their_overlays(files):
+def test_pictures_are_not_overwritten_by_their_overlays(predict, files):
     before = (files / "000007.jpg").read_bytes()
-    done = predict(files, files / "000007.jpg", "--save", files)
-    assert done.exit_code == 2
+    done = predict(files / "000007.jpg", "--save", files, code=2)
     assert "the folder of" in done.stderr.splitlines()[-1]
     assert (files / "000007.jpg").read_bytes() == before
 
 
-def test_names_that_come_twice_are_both_kept(files, tmp_path):
+def test_names_that_come_twice_are_both_kept(predict, files, tmp_path):
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "000007.jpg").write_bytes((files / "000007.jpg").read_bytes())
-    done = predict(files, files / "000007.jpg", tmp_path / "b", "--save", tmp_path / "out")
-    assert done.exit_code == 0, done.output
+    predict(files / "000007.jpg", tmp_path / "b", "--save", tmp_path / "out")
     assert len(list((tmp_path / "out").iterdir())) == 2
 
 
-def test_a_folder_stops_at_a_damaged_picture_with_what_was_written(files, tmp_path):
+def test_a_folder_stops_at_a_damaged_picture_with_what_was_written(predict, files, tmp_path):
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "1.jpg").write_bytes((files / "000007.jpg").read_bytes())
     (tmp_path / "in" / "2.jpg").write_bytes((files / "000007.jpg").read_bytes()[:900])
-    done = predict(files, tmp_path / "in", "--json", tmp_path / "poses.jsonl")
-    assert done.exit_code == 2
+    done = predict(tmp_path / "in", "--json", tmp_path / "poses.jsonl", code=2)
     assert "2.jpg" in done.stderr.splitlines()[-1]
     assert len(lines(tmp_path / "poses.jsonl")) == 1
 
 
-def test_a_camera_that_is_not_there(files):
-    done = predict(files, 97)
-    assert done.exit_code == 2
+def test_a_camera_that_is_not_there(predict, files):
+    done = predict(97, code=2)
     assert done.stderr.startswith("got camera 97, which does not open")

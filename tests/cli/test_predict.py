@@ -4,39 +4,25 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from click.testing import Result
-from typer.testing import CliRunner
 
-from dopepp.cli import app
 from dopepp.parts.catalogue import pivconnector
 
 RELEASED = "pretrained/pivconnector"
 LENS = np.array([-0.25, 0.1, 0.001, -0.002, 0.0])
 
 
-def predict(*arguments: object, checkpoint: object = RELEASED) -> Result:
-    return CliRunner().invoke(app, ["predict", *map(str, (checkpoint, *arguments))])
+@pytest.fixture(scope="session")
+def poses(run):
+    def poses(*words):
+        lines = run("predict", RELEASED, *words).stdout.splitlines()
+        return [np.array(json.loads(line)["T_cam_obj"]) for line in lines]
 
-
-def poses(*arguments: object) -> list[np.ndarray]:
-    done = predict(*arguments)
-    assert done.exit_code == 0, done.output
-    return [np.array(json.loads(line)["T_cam_obj"]) for line in done.stdout.splitlines()]
-
-
-def line(done: Result, code: int) -> str:
-    """Return the one line that is all a command had to say."""
-    assert done.exit_code == code, done.output
-    assert done.stderr.count("\n") == 1, done.stderr
-    assert "Traceback" not in done.stderr
-    return done.stderr
+    return poses
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +79,7 @@ def folder(rendered, K, tmp_path_factory):
     return folder
 
 
-def test_a_camera_file_says_what_k_says(folder, four):
+def test_a_camera_file_says_what_k_says(poses, folder, four):
     (expected,) = poses(folder / "whole.png", *four)
     for name in ("K.txt", "plain.json"):
         (found,) = poses(folder / "whole.png", "--camera", folder / name)
@@ -102,7 +88,7 @@ def test_a_camera_file_says_what_k_says(folder, four):
     np.testing.assert_allclose(deep, expected, atol=1e-9)
 
 
-def test_resized_and_cut_pictures_give_the_whole_ones_pose(folder, four, rendered):
+def test_resized_and_cut_pictures_give_the_whole_ones_pose(poses, folder, four, rendered):
     true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj[:3, 3]
     plain = ("--camera", folder / "plain.json", "--refine", "region")
     for name, said in (
@@ -113,7 +99,7 @@ def test_resized_and_cut_pictures_give_the_whole_ones_pose(folder, four, rendere
         assert np.linalg.norm(found[:3, 3] - true) < 0.001
 
 
-def test_the_lens_counts(folder, rendered, tmp_path):
+def test_the_lens_counts(poses, folder, rendered, tmp_path):
     true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj[:3, 3]
     picture, refine = folder / "lens.png", ("--refine", "region")
     lens = ("--camera", folder / "lens.yaml", *refine, "--save", tmp_path)
@@ -147,17 +133,18 @@ def test_the_lens_counts(folder, rendered, tmp_path):
         ("whole.png", ["--camera", "K.txt", "--device", "nope"], "device nope ("),
     ],
 )
-def test_what_cannot_be_is_one_line(folder, name, options, message, monkeypatch):
+def test_what_cannot_be_is_one_line(refused, folder, name, options, message, monkeypatch):
     monkeypatch.chdir(folder)
-    said = line(predict(name, *options), 2)
-    assert said.startswith("got ")
-    assert message in said
+    line = refused("predict", RELEASED, name, *options)
+    assert line.startswith("got ")
+    assert message in line
 
 
-def test_a_device_that_is_not_there(folder, four):
+def test_a_device_that_is_not_there(refused, folder, four):
     if torch.cuda.is_available():
         pytest.skip("this machine has CUDA")
-    assert "device cuda (" in line(predict(folder / "whole.png", *four, "--device", "cuda"), 2)
+    line = refused("predict", RELEASED, folder / "whole.png", *four, "--device", "cuda")
+    assert "device cuda (" in line
 
 
 @pytest.mark.parametrize(
@@ -170,15 +157,15 @@ def test_a_device_that_is_not_there(folder, four):
     ],
 )
 def test_a_place_for_what_is_written_is_checked_before_the_work(
-    folder, four, option, name, message, tmp_path, monkeypatch
+    refused, folder, four, option, name, message, tmp_path, monkeypatch
 ):
     def load(*_: object, **__: object) -> None:
         raise AssertionError("the work has begun")
 
     monkeypatch.setattr("dopepp.inference.estimator.PoseEstimator.load", load)
     (tmp_path / "file").touch()
-    done = predict(folder / "whole.png", *four, option, tmp_path / name)
-    assert message in line(done, 2)
+    words = (folder / "whole.png", *four, option, tmp_path / name)
+    assert message in refused("predict", RELEASED, *words)
 
 
 @pytest.mark.parametrize(
@@ -193,26 +180,13 @@ def test_a_place_for_what_is_written_is_checked_before_the_work(
         ("whole.png", (277, 208, 319.5, 239.5), False),
     ],
 )
-def test_any_picture_has_an_answer_in_time(folder, name, camera, silent):
+def test_any_picture_has_an_answer_in_time(run, folder, name, camera, silent):
     """With refinement: poses, or why there are none; ``silent`` where there is no part."""
     start = time.process_time()
-    done = predict(folder / name, "--K", *camera, "--refine", "region")
+    done = run("predict", RELEASED, folder / name, "--K", *camera, "--refine", "region")
     assert time.process_time() - start < 60
-    assert done.exit_code == 0, done.output
     assert not (silent and done.stdout)
     if not done.stdout:
-        why = line(done, 0)
-        assert why.startswith("nothing found: pivconnector: ")
-        assert any(word in why for word in ("belief", "score", "points", "pose"))
-
-
-def test_an_old_checkpoint_without_meshes_names_the_option(folder, four, tmp_path):
-    from dopepp.models.checkpoint import read, write_atomic
-
-    own = read(Path(RELEASED))
-    bare = replace(own, parts=[replace(own.parts[0], name="bracket", mesh=None)])
-    path = tmp_path / "old.ckpt"
-    write_atomic(bare.to_file(), path)
-    done = predict(folder / "whole.png", *four, "--refine", "region", checkpoint=path)
-    assert "no mesh of bracket" in line(done, 2)
-    assert "--part bracket=FILE" in line(done, 2)
+        assert done.stderr.startswith("nothing found: pivconnector: ")
+        assert any(word in done.stderr for word in ("belief", "score", "points", "pose"))
+        assert done.stderr.count("\n") == 1
