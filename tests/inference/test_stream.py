@@ -8,7 +8,6 @@ import pytest
 
 from dopepp import PoseEstimator
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera_file import Camera
 from dopepp.parts.catalogue import pivconnector
 
 
@@ -51,18 +50,6 @@ def test_a_picture_gives_what_predict_gives(estimator, rendered, K, tmp_path):
     assert min(result.speed.values()) > 0
     (none,) = estimator.stream(tmp_path / "a.png", K, least_score=1.0)
     assert none.detections == []
-
-
-def test_a_lens_is_taken_out_first(estimator, rendered, K, tmp_path):
-    lens = np.array([-0.25, 0.1, 0.001, -0.002, 0.0])
-    pixels = np.stack(np.meshgrid(np.arange(320.0), np.arange(240.0)), -1).reshape(-1, 1, 2)
-    straight = cv2.undistortPoints(pixels, K, lens, P=K).reshape(240, 320, 2).astype(np.float32)
-    bent = cv2.remap(rendered.image, straight, None, cv2.INTER_LINEAR)
-    cv2.imwrite(str(tmp_path / "bent.png"), bent[..., ::-1])
-    camera = Camera((320, 240), K, tuple(lens), "test")
-    (result,) = estimator.stream(tmp_path / "bent.png", camera=camera)
-    true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj
-    assert np.linalg.norm(result.detections[0].T_cam_obj[:3, 3] - true[:3, 3]) < 0.002
 
 
 def test_a_video_is_followed(estimator, clip, K):

@@ -205,10 +205,9 @@ ATTACK = {"_target_": "os.system", "command": "touch canary"}
 DESCRIPTIONS = {
     "none": (lambda payload: None, "no description"),
     "cut": (lambda payload: json.dumps(payload)[:500], "line 1, column"),
-    "empty": (lambda payload: "", "line 1, column"),
+
     "a list": (lambda payload: "[1]", "a list under 'dopepp'"),
-    "nested": (lambda payload: "[" * 10_000, "nested more than 64 deep"),
-    "NaN": (lambda payload: '{"sigma": NaN}', "no finite number"),
+
     "too long": (lambda payload: " " * (MAX_HEADER_BYTES + 1), "a description of 16000001"),
     "a call": (
         lambda payload: edited(payload, spec=payload["spec"] | {"backbone": ATTACK}),

@@ -329,17 +329,12 @@ TABLES = {
     "a line of megabytes": (HEADER + "1" * 5_000_000).encode(),
     "a rotation of a million numbers": f"{HEADER}1,1,2,1,{'1 ' * 1_000_000},0 0 9,1".encode(),
     "quotes without an end": f'{HEADER}"1,1,2,1,{POSE}'.encode(),
-    "bytes that are no text": HEADER.encode() + b"\xff\xfe\x00",
     "zero bytes": HEADER.encode() + bytes(1000),
-    "a score of nothing": f"{HEADER}1,1,2,nan,{POSE}".encode(),
 }
 
 
 RECORDS = {
-    "nested brackets": b'{"1": ' + b"[" * 100_000,
-    "a number of a million digits": b'{"1": {"diameter": ' + b"9" * 1_000_000 + b"}}",
     "a number beyond all": b'{"1": {"diameter": 1e999}}',
-    "a key twice": b'{"1": {}, "1": {}}',
     "a model of a million digits": b'{"' + b"9" * 5000 + b'": {"diameter": 1}}',
     "a model of other digits": '{"\u0661": {"diameter": 1}}'.encode(),
     "a path for a number": b'{"../../etc/passwd": {"diameter": 1}}',

@@ -1,7 +1,6 @@
 """The factory: a pure function of (seed, epoch, index), in any process and order, without torch."""
 
 import hashlib
-import pickle
 import subprocess
 import sys
 from dataclasses import replace
@@ -70,14 +69,6 @@ def test_same_bytes_in_another_process_and_order(name):
     )
     assert result.stdout.strip() == str(expected)
     assert len(set(expected)) == len(items)
-
-
-@pytest.mark.parametrize("name", sorted(PRESETS))
-def test_a_pickled_factory_renders_the_same(name):
-    factory = make_factory(preset=small(name))
-    factory.render(0, 1)  # what it keeps for later images must change none
-    copy = pickle.loads(pickle.dumps(factory))
-    assert digest(copy.render(2, 5)) == digest(factory.render(2, 5))
 
 
 def test_the_sensor_takes_the_renderers_picture():

@@ -144,13 +144,6 @@ def test_a_p_of_another_length_ends_nothing(take, said):
     assert len(said) == 1
 
 
-def test_rectified_pictures_have_the_lens_of_p(take, seen):
-    P = np.c_[seen.K * [[0.98], [0.98], [1]], np.zeros(3)].ravel().tolist()
-    answer = take(topic="/camera/image_rect", p=P)
-    assert answer.result.K[0, 0] == pytest.approx(0.98 * seen.K[0, 0])
-    np.testing.assert_array_equal(answer.result.image, seen.pictures[0])
-
-
 def test_settings_change_while_it_runs(worker, take):
     plain = take().result.detections[0]
     worker.set(replace(worker.settings, refine=True))
