@@ -77,15 +77,8 @@ def test_wrong_input_is_one_line(refused, folder, options, line):
     assert line in refused("doctor", "--model", MODEL, *paths)
 
 
-@pytest.mark.parametrize(
-    ("options", "missing", "line"),
-    [
-        ([], True, "pip install 'dopepp[web]'"),
-        (["--refine", "depth"], False, "region, or none"),
-        (["--port", "0"], False, "--help"),
-    ],
-)
-def test_a_page_that_cannot_be_served_is_one_line(refused, monkeypatch, options, missing, line):
-    if missing:
-        monkeypatch.setattr(errors, "find_spec", lambda name: None)
-    assert line in refused("serve", MODEL, *options)
+def test_a_page_that_cannot_be_served_is_one_line(refused, monkeypatch):
+    assert "region, or none" in refused("serve", MODEL, "--refine", "depth")
+    assert "--help" in refused("serve", MODEL, "--port", "0")
+    monkeypatch.setattr(errors, "find_spec", lambda name: None)
+    assert "pip install 'dopepp[web]'" in refused("serve", MODEL)

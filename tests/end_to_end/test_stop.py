@@ -47,15 +47,9 @@ def send(*numbers: int) -> Callable[[], None]:
     return act
 
 
-@pytest.mark.parametrize(
-    ("number", "code"),
-    [pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow), (signal.SIGTERM, 143)],
-    ids=["SIGINT", "SIGTERM"],
-)
-def test_a_signal_saves_the_step(number, code, call, find_run, tiny, tmp_path):
-    with at_step(0, send(number)):
-        done = call("train.py", *tiny, f"output_dir={tmp_path}")
-    assert done.code == code, done.err
+def test_a_signal_saves_the_step(call, find_run, tiny, tmp_path):
+    with at_step(0, send(signal.SIGTERM)):
+        done = call("train.py", *tiny, f"output_dir={tmp_path}", code=143)
     run = find_run(tmp_path)
     assert "step 1" in done.last_line
     assert done.last_line.endswith(f"resume={run}")

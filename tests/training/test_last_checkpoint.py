@@ -241,12 +241,6 @@ def test_an_average_may_begin_with_a_resume(runs, whole, tmp_path):
     assert_same(again.state_dict(), whole[1].state_dict())
 
 
-@pytest.mark.parametrize("decay", [1, -0.1, True, "much"])
-def test_a_decay_out_of_its_range(decay):
-    with pytest.raises(UserError, match="ema="):
-        AveragedWeights(decay)
-
-
 @pytest.mark.parametrize("options", [{"every_s": -1.0}, {"max_share": 0.0}, {"max_share": 1.5}])
 def test_arguments_out_of_range(options):
     with pytest.raises(UserError, match=f"{next(iter(options))}="):
