@@ -79,6 +79,6 @@ def _refuse_parent(root: Path, layout: str | None) -> None:
         return
     listed = [f"{name} ({kind})" for name, kind in layouts.items()]
     more = f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
-    got = f"{root}, a folder of {len(listed)} data sets: {', '.join(listed[:_LISTED])}{more}"
+    problem = f"{root}, a folder of {len(listed)} data sets: {', '.join(listed[:_LISTED])}{more}"
     fix = f"check one of them, e.g. dopepp check {root / next(iter(layouts))}"
-    raise UserError(got, "one data set", fix)
+    raise UserError(problem, "one data set", fix)

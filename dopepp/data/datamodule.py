@@ -7,6 +7,7 @@ hands out (epoch, index) pairs, so persistent workers cannot go stale.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import signal
 from collections.abc import Callable, Iterator, Sequence
@@ -73,9 +74,9 @@ class PoseDataModule(LightningDataModule):
         if masking is not None and backgrounds is None:
             raise ValueError("masking needs backgrounds, for objects that fill their picture")
         if len(train) < batch_size:
-            got = f"{len(train)} training images for batches of {batch_size}"
+            problem = f"{len(train)} training images for batches of {batch_size}"
             fix = "lower data.batch_size or raise data.samples_per_epoch"
-            raise UserError(got, "at least one full batch per epoch", fix)
+            raise UserError(problem, "at least one full batch per epoch", fix)
         self.train_source, self.val_source, self.test_source = train, val, test
         self.object_names, self.input_size = list(object_names), input_size
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
@@ -125,9 +126,9 @@ class PoseDataModule(LightningDataModule):
         missing = [name for name in self.object_names if not self.train_source.contains(name)]
         if missing:
             sources = ", ".join(info.name for info in self.train_source.describe())
-            got = f"no instance of {', '.join(missing)} in the training data ({sources})"
+            problem = f"no instance of {', '.join(missing)} in the training data ({sources})"
             fix = "take the object out, or add a source that shows it (e.g. renders)"
-            raise UserError(got, "objects with at least one instance in a training source", fix)
+            raise UserError(problem, "objects with at least one instance in a training source", fix)
 
     def seen(self, parts: Sequence[Part]) -> dict[str, Seen]:
         """Measure how large and how far away the parts are on validation, else training images."""
@@ -137,13 +138,13 @@ class PoseDataModule(LightningDataModule):
             for index in range(min(len(source), _SEEN_ITEMS) if missing else 0):
                 sample = source.sample(index)
                 scale = Letterbox.fit(sample.size, self.input_size).scale_x
-                pairs = ((part, one) for part in missing for one in sample.instances)
+                pairs = itertools.product(missing, sample.instances)
                 for part, instance in pairs:
                     if instance.label == part.name:
                         depth = float(transform(instance.T_cam_obj, part.cuboid[CENTROID])[2])
                         pixels = scale * focal_length(sample.K) * part.diameter / depth
                         views[part.name].append(Seen(pixels, pixels, depth, depth))
-        return {name: widest(found) for name, found in views.items() if found}
+        return {name: widest(sizes) for name, sizes in views.items() if sizes}
 
     def summary(self) -> list[tuple[str, SourceInfo]]:
         """Return (split, source) for the start-up print."""

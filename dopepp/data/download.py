@@ -106,8 +106,8 @@ def fetch(
             _verify(partial, url, sha256)
             partial.replace(path)
         elif path.stat().st_size != num_bytes:
-            got = f"{path} of {path.stat().st_size} bytes"
-            raise UserError(got, f"{num_bytes} bytes", "delete it")
+            problem = f"{path} of {path.stat().st_size} bytes"
+            raise UserError(problem, f"{num_bytes} bytes", "delete it")
         else:
             _verify(path, url, sha256)
     except urllib.error.HTTPError as error:
@@ -194,6 +194,6 @@ def _failed(url: str, reason: str) -> UserError:
     )
 
 
-def _other_file(url: str, got: str, expected: str) -> UserError:
+def _other_file(url: str, problem: str, expected: str) -> UserError:
     fix = "try again; if it stays so, the file on the server has changed"
-    return UserError(f"{url}: {got}", expected, fix)
+    return UserError(f"{url}: {problem}", expected, fix)

@@ -55,8 +55,11 @@ def choose_symmetries(
     infos = _read_infos(choice)
     for part in parts:
         if part.name not in infos:
-            got, allowed = f"data.symmetries={choice}, which has no {part.name}", ", ".join(infos)
-            raise UserError(got, allowed, f'add an entry with "name": "{part.name}"')
+            problem, allowed = (
+                f"data.symmetries={choice}, which has no {part.name}",
+                ", ".join(infos),
+            )
+            raise UserError(problem, allowed, f'add an entry with "name": "{part.name}"')
     return [
         _with(part, infos[part.name].symmetries_discrete, infos[part.name].symmetries_continuous)
         for part in parts
@@ -70,22 +73,20 @@ def _with(part: Part, discrete: Discrete | None, continuous: Continuous) -> Part
 def with_found_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
     """Return a part with the symmetries of its mesh, which the log states."""
     if part.mesh is None:
-        got = f"part {part.name} without a mesh to find symmetries on"
+        problem = f"part {part.name} without a mesh to find symmetries on"
         fix = "state its symmetries in a file, or leave them out"
-        raise UserError(got, "parts with a mesh", fix)
+        raise UserError(problem, "parts with a mesh", fix)
     discrete, continuous = find_symmetries(part.mesh, tolerance)
-    _log.info(
-        "%s: %d discrete symmetries and %d axes of continuous symmetry within %.3g mm",
-        part.name, len(discrete), len(continuous), 1000 * tolerance * part.diameter,
-    )  # fmt: skip
+    counts = (
+        f"{len(discrete)} discrete symmetries and {len(continuous)} axes of continuous symmetry"
+    )
+    tolerance_mm = 1000 * tolerance * part.diameter
+    _log.info("%s: %s within %.3g mm", part.name, counts, tolerance_mm)
     is_coloured = part.mesh.texture is not None or part.mesh.colours is not None
     if is_coloured and (len(discrete) or continuous):
-        _log.warning(
-            "%s has colours, which are not looked at: a print that tells the sides apart "
-            "leaves no symmetry", part.name,
-        )  # fmt: skip
-    found = discrete if len(discrete) else None
-    return replace(part, symmetries_discrete=found, symmetries_continuous=continuous)
+        reason = "a print that distinguishes the sides leaves no symmetry"
+        _log.warning("%s has colours, which the search ignores: %s", part.name, reason)
+    return _with(part, discrete if len(discrete) else None, continuous)
 
 
 def describe_symmetries(path: Path | str, unit: str | None, tolerance: float) -> str:

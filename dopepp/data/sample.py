@@ -155,8 +155,8 @@ def less_visible(
         scale: Pixels of the view for one of the image.
     """
     whole, left = (
-        hull_areas(one.keypoints, shape)[0] if one.mask is None else float(one.mask.sum())
-        for one, shape in zip((before, after), shapes, strict=True)
+        hull_areas(view.keypoints, shape)[0] if view.mask is None else float(view.mask.sum())
+        for view, shape in zip((before, after), shapes, strict=True)
     )
     share = min(left / (scale**2 * whole), 1.0) if whole else 0.0
     return replace(after, visible_fraction=before.visible_fraction * share)
@@ -206,8 +206,8 @@ def resize_sample(sample: Sample, input_size: Size) -> Sample:
         K=box.camera(sample.K),
         depth=resized(sample.depth),
         instances=[
-            replace(one, keypoints=box.points(one.keypoints), mask=resized(one.mask))
-            for one in sample.instances
+            replace(instance, keypoints=box.points(instance.keypoints), mask=resized(instance.mask))
+            for instance in sample.instances
         ],
     )
 
@@ -223,7 +223,8 @@ def pad_sample(sample: Sample, input_size: Size) -> Sample:
         return np.pad(array, beyond + [(0, 0)] * (array.ndim - 2))
 
     instances = [
-        replace(one, mask=None if one.mask is None else pad(one.mask)) for one in sample.instances
+        replace(instance, mask=None if instance.mask is None else pad(instance.mask))
+        for instance in sample.instances
     ]
     depth = None if sample.depth is None else pad(sample.depth)
     return replace(sample, image=pad(sample.image), depth=depth, instances=instances)
@@ -236,17 +237,17 @@ def crop_sample(sample: Sample, left: int, top: int, size: Size) -> Sample:
     def cut(pixels: NDArray[Any]) -> NDArray[Any]:
         return pixels[top : top + height, left : left + width]
 
-    def kept(one: Instance) -> Instance:
-        mask = None if one.mask is None else cut(one.mask)
-        moved = replace(one, keypoints=one.keypoints - (left, top), mask=mask)
-        return less_visible(one, moved, (sample.image.shape[:2], (height, width)))
+    def cropped(instance: Instance) -> Instance:
+        mask = None if instance.mask is None else cut(instance.mask)
+        moved = replace(instance, keypoints=instance.keypoints - (left, top), mask=mask)
+        return less_visible(instance, moved, (sample.image.shape[:2], (height, width)))
 
     return replace(
         sample,
         image=cut(sample.image),
         K=crop_camera(sample.K, left, top),
         depth=None if sample.depth is None else cut(sample.depth),
-        instances=[kept(one) for one in sample.instances],
+        instances=[cropped(instance) for instance in sample.instances],
     )
 
 

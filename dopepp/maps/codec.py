@@ -154,11 +154,12 @@ def find_peaks(
         vectors = _on_host(field).reshape(-1, height, width)
     half = min(max(math.ceil(REACH * geometry.sigma), HALF_WIDTHS[0]), HALF_WIDTHS[1])
     least = float(np.float32(threshold))  # as exact as beliefs are
-    _find(
-        maps.reshape(-1, height, width), vectors, least, half, geometry.sigma,
-        geometry.field_radius, score.reshape(-1, slots[2]), position.reshape(-1, slots[2], 2),
-        covariance.reshape(-1, slots[2], 2, 2), toward.reshape(-1, slots[2], 2),
-    )  # fmt: skip
+    inputs = maps.reshape(-1, height, width), vectors, least, half, geometry.sigma
+    # The views by channel share the memory of the arrays, which are filled.
+    outputs = (
+        array.reshape(-1, *array.shape[2:]) for array in (score, position, covariance, toward)
+    )
+    _find(*inputs, geometry.field_radius, *outputs)
     pixels = position * geometry.stride + (geometry.stride - 1) / 2
     return Peaks(pixels, score, covariance * geometry.stride**2, toward, score > 0.0)
 
@@ -187,12 +188,12 @@ def _find(
         count = _strongest(belief[channel], threshold, score[channel], cells)
         if not count:
             continue
-        own = position[channel, :count]
-        fit_peaks(belief[channel], cells[:count], half, sigma, own, covariance[channel, :count])
+        centres = position[channel, :count]
+        fit_peaks(belief[channel], cells[:count], half, sigma, centres, covariance[channel, :count])
         number, corner = channel // NUM_KEYPOINTS, channel % NUM_KEYPOINTS
         if len(field) and corner < NUM_CORNERS:
             first = 2 * (number * NUM_CORNERS + corner)
-            mean_vectors(field[first : first + 2], cells[:count], own, radius, toward[channel])
+            mean_vectors(field[first : first + 2], cells[:count], centres, radius, toward[channel])
 
 
 @compiled()
@@ -228,8 +229,8 @@ def _is_highest(belief: Array, y: int, x: int) -> bool:
                 continue
             if value != other:  # higher, or no number
                 return False
-            own, its = _tie_break(belief, y, x), _tie_break(belief, v, u)
-            if not (own > its or (own == its and (v > y or (v == y and u > x)))):
+            rank, other_rank = _tie_break(belief, y, x), _tie_break(belief, v, u)
+            if not (rank > other_rank or (rank == other_rank and (v > y or (v == y and u > x)))):
                 return False
     return True
 

@@ -68,7 +68,7 @@ def fit_peaks(
     theta, hessian = np.zeros((count, 6)), np.zeros((count, 6, 6))
     noise, freedom = 0.0, 0.0
     scores, work, room = np.empty(count), np.empty((5, 10)), np.empty((11, 6))
-    windows, own = np.empty((count, side, side)), np.empty((count, side, side), np.bool_)
+    windows, usable = np.empty((count, side, side)), np.empty((count, side, side), np.bool_)
     logarithms = np.empty((count, side, side))
     for i in range(count):
         scores[i] = belief[cells[i, 1], cells[i, 0]]
@@ -78,24 +78,24 @@ def fit_peaks(
                 logarithms[i, y, x] = math.log(max(windows[i, y, x], FLOOR))
         position[i, 0], position[i, 1] = cells[i, 0], cells[i, 1]
     for i in range(count):
-        _own_cells(i, windows, cells, position, scores, sigma, FIRST_MARGIN, own[i])
+        _own_cells(i, windows, cells, position, scores, sigma, FIRST_MARGIN, usable[i])
     for i in range(count):
-        _fit_logarithm(windows[i], logarithms[i], own[i], sigma, 0.0, work, room, theta[i])
+        _fit_logarithm(windows[i], logarithms[i], usable[i], sigma, 0.0, work, room, theta[i])
         u, v, _ = _mode(windows[i], theta[i])
         position[i, 0], position[i, 1] = cells[i, 0] + u, cells[i, 1] + v
     for i in range(count):
-        _own_cells(i, windows, cells, position, scores, sigma, MARGIN, own[i])
+        _own_cells(i, windows, cells, position, scores, sigma, MARGIN, usable[i])
         squared, used = _linearised(
-            windows[i], own[i], theta[i], 0.0, sigma, work, room[0], hessian[i]
+            windows[i], usable[i], theta[i], 0.0, sigma, work, room[0], hessian[i]
         )
         noise += squared * scores[i] ** 2
         freedom += max(used - 6.0, 0.0)
     noise /= max(freedom, 1.0)
     for i in range(count):
         relative = noise / scores[i] ** 2
-        _fit_logarithm(windows[i], logarithms[i], own[i], sigma, relative, work, room, theta[i])
+        _fit_logarithm(windows[i], logarithms[i], usable[i], sigma, relative, work, room, theta[i])
         for _ in range(STEPS if theta[i].any() else 0):
-            _linearised(windows[i], own[i], theta[i], relative, sigma, work, room[0], hessian[i])
+            _linearised(windows[i], usable[i], theta[i], relative, sigma, work, room[0], hessian[i])
             if _step(theta[i], hessian[i], room) < ARRIVED:
                 break
         u, v, sound = _mode(windows[i], theta[i])
@@ -168,7 +168,7 @@ def _own_cells(
     scores: Array,
     sigma: float,
     margin: float,
-    own: Array,
+    usable: Array,
 ) -> None:
     """Mark the finite cells of a window that no other peak reaches and no plateau has cut off.
 
@@ -178,7 +178,7 @@ def _own_cells(
     half = side // 2
     for y in range(side):
         for x in range(side):
-            own[y, x] = math.isfinite(windows[i, y, x])
+            usable[y, x] = math.isfinite(windows[i, y, x])
             highest += windows[i, y, x] == 1.0
     for j in range(len(cells)):
         far = max(abs(position[j, 0] - position[i, 0]), abs(position[j, 1] - position[i, 1]))
@@ -198,18 +198,18 @@ def _own_cells(
                 mine = (column - position[i, 0]) ** 2 + (row - position[i, 1]) ** 2
                 other = (column - position[j, 0]) ** 2 + (row - position[j, 1]) ** 2
                 if mine - handicap >= other:
-                    own[y, x] = False
+                    usable[y, x] = False
     if highest >= PLATEAU:
         for y in range(side):
             for x in range(side):
-                own[y, x] &= windows[i, y, x] != 1.0
+                usable[y, x] &= windows[i, y, x] != 1.0
 
 
 @compiled()
 def _fit_logarithm(
     window: Array,
     logarithm: Array,
-    own: Array,
+    usable: Array,
     sigma: float,
     noise: float,
     work: Array,
@@ -224,7 +224,7 @@ def _fit_logarithm(
     for y in range(side):
         for x in range(side):
             value = window[y, x]
-            if own[y, x] and value > FLOOR:
+            if usable[y, x] and value > FLOOR:
                 expected = -curvature * ((x - half) ** 2 + (y - half) ** 2)
                 weight = value * value
                 _add(work, x - half, weight, weight * (expected - logarithm[y, x]))
@@ -240,7 +240,7 @@ def _fit_logarithm(
 @compiled()
 def _linearised(
     window: Array,
-    own: Array,
+    usable: Array,
     theta: Array,
     noise: float,
     sigma: float,
@@ -260,7 +260,7 @@ def _linearised(
         level = theta[0] + v * (theta[2] - theta[5] * v)
         slope = theta[1] - theta[4] * v
         for x in range(side):
-            if own[y, x]:
+            if usable[y, x]:
                 u = float(x - half)
                 # Beyond it the fit is far off already, and its square must stay a number.
                 model = math.exp(min(level + u * (slope - theta[3] * u), STEEPEST))
@@ -377,11 +377,11 @@ def _covariance(
     slopes, moved, mean = room[:2], room[2], room[3]
     for k in range(2):
         # Down to the minus sign, as the equations are solved for the negative.
-        one, other = (-xx, -xy) if k == 0 else (-xy, -yy)
-        slopes[k, 0], slopes[k, 1], slopes[k, 2] = 0.0, one, other
-        slopes[k, 3] = -2 * x * one
-        slopes[k, 4] = -y * one - x * other
-        slopes[k, 5] = -2 * y * other
+        across, down = (-xx, -xy) if k == 0 else (-xy, -yy)
+        slopes[k, 0], slopes[k, 1], slopes[k, 2] = 0.0, across, down
+        slopes[k, 3] = -2 * x * across
+        slopes[k, 4] = -y * across - x * down
+        slopes[k, 5] = -2 * y * down
     for k in range(2):
         solve_inside(hessian, slopes[k], 0.0, moved, room[4:])
         for m in range(2):
@@ -404,8 +404,8 @@ def _covariance(
 
 
 @compiled()
-def _product(one: Array, other: Array) -> float:
+def _product(left: Array, right: Array) -> float:
     total = 0.0
     for k in range(6):
-        total += one[k] * other[k]
+        total += left[k] * right[k]
     return total

@@ -83,11 +83,13 @@ def share(num_items: int, part_of: tuple[float, float], name: str) -> slice:
     """
     first, last = part_of
     if not 0 <= first < last <= 1:
-        raise ValueError(f"part_of must be ascending in [0, 1], got {part_of}")
+        raise ValueError(f"part_of must be ascending in [0, 1], problem {part_of}")
     chosen = slice(round(first * num_items), round(last * num_items))
     if chosen.start == chosen.stop:
-        got = f"{name}: no image in the share {first:.3g} – {last:.3g} of {num_items} images"
-        raise UserError(got, "a folder with more images", "give every split a folder of its own")
+        problem = f"{name}: no image in the share {first:.3g} – {last:.3g} of {num_items} images"
+        raise UserError(
+            problem, "a folder with more images", "give every split a folder of its own"
+        )
     return chosen
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from dopepp.data.formats.problems import STRICT, Place, mapping
+from dopepp.data.formats.problems import STRICT, Node, mapping
 from dopepp.drawing.pictures import (
     MAX_PIXELS,
     DepthMap,
@@ -45,7 +45,7 @@ _MAX_UNITS: Final = 65_535
 
 
 def picture(
-    place: Place, content: bytes | None = None, modes: Sequence[str] = ()
+    node: Node, content: bytes | None = None, modes: Sequence[str] = ()
 ) -> Image.Image | None:
     """Decode a BOP image; return None where it is missing, damaged, too large or of another kind.
 
@@ -53,30 +53,30 @@ def picture(
     Pillow's names, none for any.
     """
     if content is None:
-        content = place["image"].attempt(lambda: read_content(Path(place.path)))
+        content = node["image"].attempt(lambda: read_content(Path(node.path)))
     if content is None:
         return None
     try:
         image = whole_picture(content, FORMATS)
     except ValueError as error:
-        got = f"unreadable or truncated, {len(content):,} bytes ({error})"
+        problem = f"unreadable or truncated, {len(content):,} bytes ({error})"
         allowed = f"a whole {', '.join(FORMATS)} image of at most {MAX_PIXELS / 1e6:.0f} megapixels"
-        place["image"].report(got, allowed)
+        node["image"].report(problem, allowed)
         return None
     if modes and image.mode not in modes:
-        place["image"].report(f"pixels of type {image.mode}", "colour or grey of 8 bits")
+        node["image"].report(f"pixels of type {image.mode}", "colour or grey of 8 bits")
         return None
     return image
 
 
 def picture_shape(
-    place: Place, content: bytes | None = None, modes: Sequence[str] = ()
+    node: Node, content: bytes | None = None, modes: Sequence[str] = ()
 ) -> Shape | None:
     """Return the (height, width) of an image after decoding it like :func:`picture`."""
-    image = picture(place, content, modes)
+    image = picture(node, content, modes)
     if image is not None:
         return image.height, image.width
-    return stated_shape(Path(place.path) if content is None else io.BytesIO(content))
+    return stated_shape(Path(node.path) if content is None else io.BytesIO(content))
 
 
 def stated_shape(file: Path | io.BytesIO) -> Shape | None:
@@ -95,7 +95,7 @@ def decode_rgb(content: bytes, where: str) -> Picture:
     Raises:
         UserError: The image is no PNG, JPEG or TIFF, damaged, too large, or not of 8 bits.
     """
-    image = picture(Place(STRICT, where), content, COLOUR_MODES)
+    image = picture(Node(STRICT, where), content, COLOUR_MODES)
     assert image is not None
     return np.array(image.convert("RGB"))
 
@@ -109,11 +109,11 @@ def decode_depth(content: bytes, where: str, depth_scale: float, shape: Shape) -
     Raises:
         UserError: As for :func:`decode_rgb`, or another size, no whole numbers, or no scale.
     """
-    place = Place(STRICT, where)
-    units = one_channel_of(place, shape, content, DEPTH_MODES)
+    node = Node(STRICT, where)
+    units = one_channel_of(node, shape, content, DEPTH_MODES)
     assert units is not None
     if np.isnan(depth_scale):
-        place["image"].report("no depth_scale", "depth_scale (mm a unit) beside the image's cam_K")
+        node["image"].report("no depth_scale", "depth_scale (mm a unit) beside the image's cam_K")
     return (units.astype(np.float64) * (depth_scale / 1000)).astype(np.float32)
 
 
@@ -123,50 +123,50 @@ def decode_mask(content: bytes, where: str, shape: Shape) -> Mask:
     Raises:
         UserError: As for :func:`decode_rgb`, or another size, or several channels.
     """
-    mask = one_channel_of(Place(STRICT, where), shape, content)
+    mask = one_channel_of(Node(STRICT, where), shape, content)
     assert mask is not None
     return np.asarray(mask != 0)
 
 
 def one_channel_of(
-    place: Place, shape: Shape | None, content: bytes | None = None, modes: tuple[str, ...] = ()
+    node: Node, shape: Shape | None, content: bytes | None = None, modes: tuple[str, ...] = ()
 ) -> NDArray[Any] | None:
     """Decode a BOP depth image or mask like :func:`picture`; return None where it is reported."""
-    image = picture(place, content)
+    image = picture(node, content)
     if image is None:
         return None
     if len(image.getbands()) > 1 or (modes and image.mode not in modes):
         allowed = "one channel of 16-bit whole numbers" if modes else "one channel"
-        place["channels"].report(f"pixels of type {image.mode}", allowed)
+        node["channels"].report(f"pixels of type {image.mode}", allowed)
         return None
-    return one_channel(place, np.asarray(image), shape)
+    return one_channel(node, np.asarray(image), shape)
 
 
-def read_map(place: Place, shape: Shape | None, colour: bool = False) -> NDArray[Any] | None:
+def read_map(node: Node, shape: Shape | None, colour: bool = False) -> NDArray[Any] | None:
     """Read a map (depth, labels) of YCB-Video, NDDS or FAT; return None where it is reported.
 
     ``shape`` is the colour image's (height, width), None for any. Where ``colour`` is allowed, a
     map of several channels, whose meaning no file states, returns None without a report.
     """
-    image = place["image"].attempt(lambda: read_image(Path(place.path)))
+    image = node["image"].attempt(lambda: read_image(Path(node.path)))
     if image is not None and image.ndim > 2 and colour:
-        one_channel(place, image[..., 0], shape)
+        one_channel(node, image[..., 0], shape)
         return None
-    return one_channel(place, image, shape)
+    return one_channel(node, image, shape)
 
 
 def one_channel(
-    place: Place, image: NDArray[Any] | None, shape: tuple[int, ...] | None
+    node: Node, image: NDArray[Any] | None, shape: tuple[int, ...] | None
 ) -> NDArray[Any] | None:
     """Return a map, or None where it has several channels or another size than the image."""
     if image is None:
         return None
     if image.ndim != 2:
-        place["channels"].report(f"an image of {image.shape[2]}", "one channel")
+        node["channels"].report(f"an image of {image.shape[2]}", "one channel")
         return None
     if shape is not None and image.shape != tuple(shape[:2]):
-        got = f"{image.shape[1]}×{image.shape[0]} pixels"
-        place["size"].report(got, f"{shape[1]}×{shape[0]}, the colour image's size")
+        problem = f"{image.shape[1]}×{image.shape[0]} pixels"
+        node["size"].report(problem, f"{shape[1]}×{shape[0]}, the colour image's size")
         return None
     return image
 
@@ -199,7 +199,7 @@ def encode_runs(mask: Mask) -> dict[str, list[int]]:
     return {"counts": [0, *runs] if pixels.size and pixels[0] else runs, "size": list(mask.shape)}
 
 
-def decode_runs(record: object, shape: Shape, place: Place) -> Mask | None:
+def decode_runs(record: object, shape: Shape, node: Node) -> Mask | None:
     """Decode the run lengths of a mask; return None where they are reported.
 
     ``record`` must have the image's ``shape`` (height, width) as its size, so a file cannot ask for
@@ -209,11 +209,11 @@ def decode_runs(record: object, shape: Shape, place: Place) -> Mask | None:
     counts, size = fields.get("counts"), fields.get("size")
     whole = isinstance(counts, list) and all(type(n) is int and n >= 0 for n in counts)
     if size != list(shape):
-        got = "missing" if record is None else f"size {size!r:.40}"
-        place.report(got, f"runs of size [{shape[0]}, {shape[1]}], the image's")
+        problem = "missing" if record is None else f"size {size!r:.40}"
+        node.report(problem, f"runs of size [{shape[0]}, {shape[1]}], the image's")
     elif not whole or counts is None or sum(counts) != shape[0] * shape[1]:
         allowed = f"a list of run lengths that add up to {shape[0] * shape[1]} pixels"
-        place.report(f"counts {counts!r:.40}", allowed)
+        node.report(f"counts {counts!r:.40}", allowed)
     else:
         pixels = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
         return np.asarray(pixels.reshape(shape, order="F"))

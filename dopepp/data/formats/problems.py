@@ -1,6 +1,6 @@
 """Problems of a data set's files: raised one by one, or collected by a check.
 
-A reader reports what is wrong at a :class:`Place` and goes on with a neutral value (NaN, None, an
+A reader reports what is wrong at a :class:`Node` and goes on with a neutral value (NaN, None, an
 empty list). :class:`Problems` raises the first problem: a data source reads like this.
 :class:`CheckReport` keeps all problems: ``dopepp check`` runs the same reader with it, so a data
 set that passes a check can be read.
@@ -38,10 +38,12 @@ T = TypeVar("T")
 class Problems:
     """Raises the first problem."""
 
-    def report(self, path: Path | str, where: str, got: str, allowed: str = "") -> None:
-        """Take a problem at a :class:`Place`; ``allowed`` is empty where ``got`` implies it."""
+    def report(self, path: Path | str, where: str, message: str, allowed: str = "") -> None:
+        """Take a problem at a :class:`Node`; ``allowed`` is empty where ``message`` implies it."""
         fix = "correct the file or get it again; `dopepp check` lists all problems of a data set"
-        raise UserError(": ".join(filter(None, (str(path), where.lstrip("."), got))), allowed, fix)
+        raise UserError(
+            ": ".join(filter(None, (str(path), where.lstrip("."), message))), allowed, fix
+        )
 
     def take(self, path: Path | str, where: str, error: UserError) -> None:
         """Take a problem that a function of another package has raised."""
@@ -73,22 +75,22 @@ class CheckReport(Problems):
         """Whether there is no defect."""
         return self.num_defects == 0
 
-    def report(self, path: Path | str, where: str, got: str, allowed: str = "") -> None:
+    def report(self, path: Path | str, where: str, message: str, allowed: str = "") -> None:
         """Keep a defect."""
         where = where.lstrip(".") or "top level"
         self.num_defects += 1
         self.counts[where.rpartition(".")[2]] += 1
         if len(self.defects) < MAX_KEPT:
-            message = f"{got}; allowed: {allowed}" if allowed else got
+            full_message = f"{message}; allowed: {allowed}" if allowed else message
             path = Path(path)
             is_inside = self.root in path.parents
             shown = path.relative_to(self.root).as_posix() if is_inside else str(path)
-            self.defects.append(" ".join(f"{shown}: {where}: {message}".split()))
+            self.defects.append(" ".join(f"{shown}: {where}: {full_message}".split()))
 
     def take(self, path: Path | str, where: str, error: UserError) -> None:
         """Keep an error as a defect, without the file's name in its message."""
-        got = error.got.rpartition(str(path))[2].lstrip(" ,:") or error.got
-        self.report(path, where, "missing" if where == "file" else got, error.allowed)
+        message = error.got.rpartition(str(path))[2].lstrip(" ,:") or error.got
+        self.report(path, where, "missing" if where == "file" else message, error.allowed)
 
     def note(self, text: str) -> None:
         """Add, once, something that is worth knowing and no defect."""
@@ -115,7 +117,7 @@ class CheckReport(Problems):
 
 
 @dataclass(frozen=True)
-class Place:
+class Node:
     """A file or a field of it, with the receiver of its problems.
 
     Attributes:
@@ -127,14 +129,14 @@ class Place:
     path: Path | str
     where: str = ""
 
-    def __getitem__(self, key: str | int) -> Place:
-        """Return the place of a mapping's field, or of a list's entry."""
+    def __getitem__(self, key: str | int) -> Node:
+        """Return the node of a mapping's field, or of a list's entry."""
         step = f"[{key}]" if isinstance(key, int) else f".{key}"
-        return Place(self.problems, self.path, self.where + step)
+        return Node(self.problems, self.path, self.where + step)
 
-    def report(self, got: str, allowed: str = "") -> None:
+    def report(self, message: str, allowed: str = "") -> None:
         """Report a problem."""
-        self.problems.report(self.path, self.where, got, allowed)
+        self.problems.report(self.path, self.where, message, allowed)
 
     def attempt(self, read: Callable[[], T]) -> T | None:
         """Return the result of ``read``, or None where it raises, which is reported."""
@@ -185,11 +187,11 @@ class Place:
             fits = False
         if fits and (np.abs(array.astype(np.float64)) <= FARTHEST).all():
             return array.astype(np.float64).reshape(shape)
-        got = "missing" if value is None else f"{value!r:.60}"
+        message = "missing" if value is None else f"{value!r:.60}"
         if fits and not np.isfinite(array).all():
-            got = f"not finite (NaN or infinite): {got}"
+            message = f"not finite (NaN or infinite): {message}"
         noun = "number" if shape == (1,) else "numbers"
-        self.report(got, f"{'×'.join(map(str, shape))} finite {noun} up to {FARTHEST:.0e}")
+        self.report(message, f"{'×'.join(map(str, shape))} finite {noun} up to {FARTHEST:.0e}")
         return np.full(shape, np.nan)
 
     def scalar(self, value: object) -> float:

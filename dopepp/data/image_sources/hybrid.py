@@ -110,8 +110,8 @@ class HybridSource:
         position = epoch * self.counts[role] + int(ranks[index])
         source = self._sources[role]
         assert source is not None
-        cycle, place = divmod(position, len(source))
-        return role, cycle, int(self._order(role, cycle, len(source))[place])
+        cycle, rank = divmod(position, len(source))
+        return role, cycle, int(self._order(role, cycle, len(source))[rank])
 
     def _make_plan(self, epoch: int) -> tuple[Order, Order]:
         """Return each item's source and its rank among that source's items."""
@@ -166,7 +166,9 @@ class WindowedSource:
         sample = resize_sample(self._source.sample(index, epoch), self._picture)
         rng = item_rng(self._seed, Purpose.WINDOW, epoch, index)
         size = np.minimum(self._window, sample.size)
-        centres = np.array([one.keypoints[CENTROID] for one in sample.instances]).reshape(-1, 2)
+        centres = np.array([instance.keypoints[CENTROID] for instance in sample.instances]).reshape(
+            -1, 2
+        )
         shown = centres[((centres >= 0) & (centres < sample.size)).all(axis=1)]
         middle = rng.uniform(0, 1, 2) * sample.size - 0.5
         if len(shown):

@@ -51,7 +51,7 @@ class RenderedSource:
         scale: float = 1.0,
     ) -> None:
         if not 0 < scale < math.inf:
-            raise ValueError(f"scale must be positive and finite, got {scale}")
+            raise ValueError(f"scale must be positive and finite, problem {scale}")
         self.factory, self.split, self.name, self.scale = factory, split, name, scale
         self._num_items = num_items
 
@@ -128,9 +128,9 @@ def _in_file(path: Path, dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndar
         with path.open("r+b") as file:
             return np.frombuffer(mmap.mmap(file.fileno(), size), dtype)
     except OSError as error:
-        got = f"data.cache=disk, {size / 1e9:.2f} GB in {path.parent}: {error.strerror}"
+        problem = f"data.cache=disk, {size / 1e9:.2f} GB in {path.parent}: {error.strerror}"
         fix = "set data.cache_dir to another disk, or data.cache=none"
-        raise UserError(got, "a folder with as much free space", fix) from error
+        raise UserError(problem, "a folder with as much free space", fix) from error
 
 
 class CachedSource:
@@ -170,10 +170,10 @@ class CachedSource:
             available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
             if self.num_bytes > available / 2:
                 size = f"{self.num_bytes / 1e9:.1f} GB"
-                got = f"data.cache=memory for {len(source)} images of {source.name}: {size}"
+                problem = f"data.cache=memory for {len(source)} images of {source.name}: {size}"
                 allowed = f"at most half of this machine's {available / 1e9:.1f} GB"
                 fix = "set data.cache=none or disk, a smaller input size or fewer samples per epoch"
-                raise UserError(got, allowed, fix)
+                raise UserError(problem, allowed, fix)
             self._slots = _in_memory(slot, len(source))
             self._checksums = _in_memory(np.dtype("u8"), len(source))
         else:

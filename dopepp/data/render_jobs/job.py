@@ -178,10 +178,8 @@ def _nested(changes: Sequence[str]) -> dict[str, Any]:
         except (yaml.YAMLError, ValueError, RecursionError) as error:
             sign, value = "", error
         if not sign or not all((*groups, field)):
-            raise UserError(
-                f"--set {change:.200}", "FIELD.FIELD=VALUE, the value in YAML",
-                "write it like lighting.num_lights=[1,3]",
-            )  # fmt: skip
+            allowed, fix = "FIELD.FIELD=VALUE, the value in YAML", "write lighting.num_lights=[1,3]"
+            raise UserError(f"--set {change:.200}", allowed, fix)
         node: Any = tree
         for group in groups:
             node = node.setdefault(group, {}) if isinstance(node, dict) else None

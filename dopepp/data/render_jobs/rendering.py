@@ -103,10 +103,8 @@ def _engine(engine: str, workers: int | None, ray_address: str | None) -> OpenPo
     if engine == "ray":
         return lambda content: ClusterPool(content, ray_address, workers)
     if ray_address is not None:
-        raise UserError(
-            f"--ray-address {ray_address} with --engine local", "it goes with ray",
-            "add --engine ray",
-        )  # fmt: skip
+        problem = f"--ray-address {ray_address} with --engine local"
+        raise UserError(problem, "an address together with --engine ray", "add --engine ray")
     return lambda content: ProcessPool(content, workers)
 
 

@@ -50,27 +50,27 @@ class CameraJitter(Checked):
         warp[:, 2] += offset
 
         def warped(pixels: NDArray[np.uint8], border: int, how: int) -> NDArray[np.uint8]:
-            moved = cv2.warpAffine(pixels, warp, sample.size, flags=how, borderMode=border)
-            return np.asarray(moved, np.uint8)
+            image = cv2.warpAffine(pixels, warp, sample.size, flags=how, borderMode=border)
+            return np.asarray(image, np.uint8)
 
-        def seen(one: Instance) -> Instance:
-            mask = one.mask
+        def moved(instance: Instance) -> Instance:
+            mask = instance.mask
             if mask is not None:
                 codes = warped(mask.astype(np.uint8), cv2.BORDER_CONSTANT, cv2.INTER_NEAREST)
                 mask = codes.astype(bool)
-            moved = replace(
-                one,
-                T_cam_obj=make_transform(turn, np.zeros(3)) @ one.T_cam_obj,
-                keypoints=one.keypoints @ warp[:, :2].T + warp[:, 2],
+            shown = replace(
+                instance,
+                T_cam_obj=make_transform(turn, np.zeros(3)) @ instance.T_cam_obj,
+                keypoints=instance.keypoints @ warp[:, :2].T + warp[:, 2],
                 mask=mask,
             )
             shape = sample.image.shape[:2]
-            return less_visible(one, moved, (shape, shape), zoom)
+            return less_visible(instance, shown, (shape, shape), zoom)
 
         return replace(
             sample,
             image=warped(sample.image, cv2.BORDER_REPLICATE, cv2.INTER_LINEAR),
             K=crop_camera(K, *-offset),
-            instances=[seen(one) for one in sample.instances],
+            instances=[moved(instance) for instance in sample.instances],
             depth=None,  # no training reads it
         )

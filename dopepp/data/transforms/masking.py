@@ -54,9 +54,9 @@ class BackgroundCrops:
 
     def draw(self, size: Size, rng: Generator) -> Picture | None:
         """Return a crop of (height, width), or None when a few draws gave none with contrast."""
-        places = np.flatnonzero(self._is_free(size).ravel())
-        for _ in range(self.max_draws if len(places) else 0):
-            crop = self._crop(int(rng.choice(places)), size)
+        windows = np.flatnonzero(self._is_free(size).ravel())
+        for _ in range(self.max_draws if len(windows) else 0):
+            crop = self._crop(int(rng.choice(windows)), size)
             if has_contrast(crop, self.min_contrast):
                 return crop
         return None
@@ -72,9 +72,9 @@ class BackgroundCrops:
         spread = (num * _windows(squares, size) - _windows(sums, size) ** 2).max(axis=2)
         spread[~free] = 0
         for least in ((num * self.min_contrast) ** 2, 1.0):
-            places = np.flatnonzero(spread.ravel() >= least)
-            if len(places):
-                return self._crop(int(rng.choice(places)), size)
+            windows = np.flatnonzero(spread.ravel() >= least)
+            if len(windows):
+                return self._crop(int(rng.choice(windows)), size)
         return None
 
     def largest(self, size: Size, rng: Generator) -> Picture | None:
@@ -98,9 +98,9 @@ class BackgroundCrops:
         sums, squares = cv2.integral2(self.image, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
         return sums, squares
 
-    def _crop(self, place: int, size: Size) -> Picture:
+    def _crop(self, window: int, size: Size) -> Picture:
         """Return the window that is counted row by row."""
-        row, column = divmod(place, self.image.shape[1] - size[1] + 1)
+        row, column = divmod(window, self.image.shape[1] - size[1] + 1)
         return self.image[row : row + size[0], column : column + size[1]]
 
 

@@ -56,9 +56,9 @@ def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> lis
     own share alone, not on the others asked for. ``index`` is its place in the test set.
     """
     if not all(0 <= share <= 1 for share in shares):
-        raise ValueError(f"shares must be in [0, 1], got {list(shares)}")
+        raise ValueError(f"shares must be in [0, 1], problem {list(shares)}")
     shape = sample.image.shape[:2]
-    silhouettes = [silhouette(one, shape) for one in sample.instances]
+    silhouettes = [silhouette(instance, shape) for instance in sample.instances]
     crops = BackgroundCrops(sample.image, silhouettes)
     # Of its own for every instance: how much of one is covered changes no patch of another.
     rngs = item_rng(seed, Purpose.SHADING, 0, index).spawn(len(silhouettes))
@@ -148,11 +148,11 @@ class _Cover:
             first, last = max(0, position - length + 1), min(position, extent - length)
             start = int(rng.integers(first, last + 1))
             slices.append(slice(start, start + length))
-        place = slices[0], slices[1]
-        new = (self.order[place] == _NEVER) & ~self._spared[place]
+        patch = slices[0], slices[1]
+        new = (self.order[patch] == _NEVER) & ~self._spared[patch]
         num_new = int(np.count_nonzero(new))
-        self.order[place][new] = np.arange(self._num_laid, self._num_laid + num_new)
-        self.pixels[place][new] = crop[new]
+        self.order[patch][new] = np.arange(self._num_laid, self._num_laid + num_new)
+        self.pixels[patch][new] = crop[new]
         self._num_laid += num_new
 
 

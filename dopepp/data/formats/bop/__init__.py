@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dopepp.data.formats.invariants import rotation_problem
-from dopepp.data.formats.problems import FARTHEST, STRICT, Place, Problems, mapping
+from dopepp.data.formats.problems import FARTHEST, STRICT, Node, Problems, mapping
 from dopepp.geometry.rotation import nearest_rotation
 
 _log = logging.getLogger(__name__)
@@ -45,8 +45,8 @@ DEPTH_SUFFIXES: Final = (".png", ".tif", ".tiff")
 
 Record = Mapping[str, Any]
 
-Places = Callable[[str, int], Place]
-"""Maps ``camera``, ``gt`` or ``gt_info`` and a record's number to the record's place."""
+Nodes = Callable[[str, int], Node]
+"""Maps ``camera``, ``gt`` or ``gt_info`` and a record's number to the record's node."""
 
 
 @dataclass(frozen=True)
@@ -77,18 +77,18 @@ class BopPoses:
 
 
 def read_cameras(
-    records: Sequence[object], places: Places
+    records: Sequence[object], nodes: Nodes
 ) -> tuple[Float[np.ndarray, "images 3 3"], Float[np.ndarray, " images"]]:
     """Return every image's K in pixels and its ``depth_scale`` (mm a unit; NaN if not stated)."""
-    place = partial(places, "camera")
-    K = _column(records, "cam_K", 9, place).reshape(-1, 3, 3)
-    scales = _stated_column(records, "depth_scale", place)
+    node = partial(nodes, "camera")
+    K = _column(records, "cam_K", 9, node).reshape(-1, 3, 3)
+    scales = _stated_column(records, "depth_scale", node)
     for number in np.flatnonzero(scales <= 0).tolist():
-        place(number)["depth_scale"].report(f"{scales[number]:g}", "millimetres above 0")
+        node(number)["depth_scale"].report(f"{scales[number]:g}", "millimetres above 0")
     return K, scales
 
 
-def pair_infos(truths: Sequence[Record], stated: object, place: Place) -> list[Record | None]:
+def pair_infos(truths: Sequence[Record], stated: object, node: Node) -> list[Record | None]:
     """Return one ``gt_info`` record for each of an image's objects, None where there is none.
 
     ``stated`` is the image's entry; null and an empty list state nothing.
@@ -97,59 +97,57 @@ def pair_infos(truths: Sequence[Record], stated: object, place: Place) -> list[R
         return [None] * len(truths)
     if isinstance(stated, list):
         stated = [{} if info is None else info for info in stated]
-    infos = place.entries(stated)
+    infos = node.entries(stated)
     if len(infos) != len(truths):
-        place.report(f"{len(infos)} objects", f"{len(truths)}, as many as have a pose")
+        node.report(f"{len(infos)} objects", f"{len(truths)}, as many as have a pose")
     return [*infos[: len(truths)], *[None] * (len(truths) - len(infos))]
 
 
-def read_poses(
-    truths: Sequence[Record], infos: Sequence[Record | None], places: Places
-) -> BopPoses:
+def read_poses(truths: Sequence[Record], infos: Sequence[Record | None], nodes: Nodes) -> BopPoses:
     """Return the objects of ``gt`` and ``gt_info`` records.
 
     Args:
         truths: Records of ``cam_R_m2c`` (row by row), ``cam_t_m2c`` (mm) and ``obj_id``.
         infos: A record for each object or None; it may have ``visib_fract``.
-        places: Places of the records, where each wrong field is reported.
+        nodes: Nodes of the records, where each wrong field is reported.
     """
-    place, info_place = partial(places, "gt"), partial(places, "gt_info")
-    rotations = _column(truths, "cam_R_m2c", 9, place).reshape(-1, 3, 3)
+    node, info_node = partial(nodes, "gt"), partial(nodes, "gt_info")
+    rotations = _column(truths, "cam_R_m2c", 9, node).reshape(-1, 3, 3)
     errors = _orthogonality(rotations)
     inexact = (errors > EXACT) & (errors <= INEXACT)
     rotations[inexact] = nearest_rotation(rotations[inexact])
     poses = np.tile(np.eye(4), (len(truths), 1, 1))
     poses[:, :3, :3] = rotations
-    poses[:, :3, 3] = _column(truths, "cam_t_m2c", 3, place) / MM
-    ids = _column(truths, "obj_id", 1, place)[:, 0]
+    poses[:, :3, 3] = _column(truths, "cam_t_m2c", 3, node) / MM
+    ids = _column(truths, "obj_id", 1, node)[:, 0]
     for number in np.flatnonzero(~(errors <= INEXACT)).tolist():
         if problem := rotation_problem(rotations[number], INEXACT):
-            place(number)["cam_R_m2c"].report(problem, "a rotation matrix, row by row")
+            node(number)["cam_R_m2c"].report(problem, "a rotation matrix, row by row")
         poses[number, :3, :3] = math.nan
     for number in np.flatnonzero((ids % 1 != 0) | (ids < 0)).tolist():
         if math.isfinite(ids[number]):
-            place(number)["obj_id"].report(f"{ids[number]:g}", "an object's number")
+            node(number)["obj_id"].report(f"{ids[number]:g}", "an object's number")
         ids[number] = -1
-    fractions = _stated_column(infos, "visib_fract", info_place)
+    fractions = _stated_column(infos, "visib_fract", info_node)
     for number in np.flatnonzero((fractions < -_ROUNDING) | (fractions > 1 + _ROUNDING)).tolist():
-        info_place(number)["visib_fract"].report(f"{fractions[number]:.6g}", "0 – 1")
+        info_node(number)["visib_fract"].report(f"{fractions[number]:.6g}", "0 – 1")
         fractions[number] = math.nan
     return BopPoses(ids.astype(np.int64), poses, np.clip(fractions, 0.0, 1.0), inexact)
 
 
 def _stated_column(
-    records: Sequence[object], field: str, place: Callable[[int], Place]
+    records: Sequence[object], field: str, node: Callable[[int], Node]
 ) -> Float[np.ndarray, " records"]:
     """Return a number of the records that state it, NaN for the others."""
     stated = [n for n, record in enumerate(records) if field in mapping(record)]
     values = np.full(len(records), math.nan)
     rows = [records[n] for n in stated]
-    values[stated] = _column(rows, field, 1, lambda n: place(stated[n]))[:, 0]
+    values[stated] = _column(rows, field, 1, lambda n: node(stated[n]))[:, 0]
     return values
 
 
 def _column(
-    records: Sequence[object], field: str, count: int, place: Callable[[int], Place]
+    records: Sequence[object], field: str, count: int, node: Callable[[int], Node]
 ) -> Float[np.ndarray, "records count"]:
     """Return a field of all records at once; record by record only to report the wrong ones.
 
@@ -168,7 +166,7 @@ def _column(
         if (np.abs(table) <= FARTHEST).all():
             return table
     rows = [mapping(record).get(field) for record in records]
-    return np.array([place(n)[field].numbers(value, count) for n, value in enumerate(rows)])
+    return np.array([node(n)[field].numbers(value, count) for n, value in enumerate(rows)])
 
 
 def _orthogonality(matrices: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
@@ -197,7 +195,7 @@ class SceneRecords(NamedTuple):
 def read_records(folder: Path, problems: Problems = STRICT) -> SceneRecords:
     """Read a scene's JSON files; the two with ground truth may be missing."""
     camera, gt, gt_info = (
-        Place(problems, folder / f"scene_{name}.json") for name in ("camera", "gt", "gt_info")
+        Node(problems, folder / f"scene_{name}.json") for name in ("camera", "gt", "gt_info")
     )
     cameras = _by_image(camera)
     truths, infos = (_by_image(p) if Path(p.path).exists() else {} for p in (gt, gt_info))
@@ -208,14 +206,14 @@ def read_records(folder: Path, problems: Problems = STRICT) -> SceneRecords:
     return SceneRecords(cameras, objects, paired)
 
 
-def _by_image(place: Place) -> dict[int, Any]:
+def _by_image(node: Node) -> dict[int, Any]:
     allowed = 'images by number: {"0": …, "1": …}'
     by_image: dict[int, Any] = {}
-    for key, record in (place.load(allowed, MAX_SCENE_BYTES) or {}).items():
+    for key, record in (node.load(allowed, MAX_SCENE_BYTES) or {}).items():
         if not is_number(key):
-            place[f"{key!r:.40}"].report("no image's number", allowed)
+            node[f"{key!r:.40}"].report("no image's number", allowed)
         elif int(key) in by_image:
-            place[f"{key!r:.40}"].report(f"image {int(key)} twice", "each once")
+            node[f"{key!r:.40}"].report(f"image {int(key)} twice", "each once")
         else:
             by_image[int(key)] = record
     return by_image
@@ -232,8 +230,8 @@ def image_files(
             continue
         number = int(path.stem)
         if number in files:
-            got = f"image {number} twice, also as {files[number].name}"
-            problems.report(path, "file", got, "one file an image")
+            problem = f"image {number} twice, also as {files[number].name}"
+            problems.report(path, "file", problem, "one file an image")
         else:
             files[number] = path
     return files
@@ -281,22 +279,22 @@ def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int
     cameras, truths, infos = read_records(folder)
     images = sorted(cameras)
     if without := truths.keys() - cameras.keys():
-        got = f"{len(without)} images have ground truth and no camera, and are left out"
-        _log.warning("%s: %s; first: %d", folder, got, min(without))
+        problem = f"{len(without)} images have ground truth and no camera, and are left out"
+        _log.warning("%s: %s; first: %d", folder, problem, min(without))
     owners = [(row, n) for row, i in enumerate(images) for n in range(len(truths.get(i, ())))]
 
-    def places(what: str, number: int) -> Place:
-        place = Place(STRICT, folder / f"scene_{what}.json")
+    def nodes(what: str, number: int) -> Node:
+        node = Node(STRICT, folder / f"scene_{what}.json")
         if what == "camera":
-            return place[f"{images[number]}"]
+            return node[f"{images[number]}"]
         row, n = owners[number]
-        return place[f"{images[row]}"][n]
+        return node[f"{images[row]}"][n]
 
-    K, scales = read_cameras([cameras[i] for i in images], places)
+    K, scales = read_cameras([cameras[i] for i in images], nodes)
     poses = read_poses(
         [truths[images[row]][n] for row, n in owners],
         [infos[images[row]][n] for row, n in owners],
-        places,
+        nodes,
     )
     table = np.array(owners, np.int64).reshape(-1, 2)
     is_wanted = np.isin(poses.obj_ids, sorted(wanted))

@@ -25,7 +25,7 @@ from dopepp.data.formats.bop import (
     IMAGE_SUFFIXES,
     MM,
     BopPoses,
-    Places,
+    Nodes,
     Record,
     image_files,
     read_records,
@@ -33,7 +33,7 @@ from dopepp.data.formats.bop import (
 from dopepp.data.formats.bop.bop_models import INFO_FILE, info_path, modelled, parse_models, part_of
 from dopepp.data.formats.images import COLOUR_MODES, DEPTH_MODES, one_channel_of, picture_shape
 from dopepp.data.formats.invariants import Box
-from dopepp.data.formats.problems import CheckReport, Place, mapping
+from dopepp.data.formats.problems import CheckReport, Node, mapping
 from dopepp.drawing.pictures import Mask, Shape
 from dopepp.geometry.camera import CameraMatrix, transform
 from dopepp.geometry.cuboid import cuboid_keypoints
@@ -123,31 +123,31 @@ class _SceneCheck:
     def _check_image(self, image: int) -> BopPoses:
         report, folder, (cameras, truths, infos) = self._report, self._folder, self._records
         path = self._pictures.get(image, folder / "rgb" / f"{image:06d}.png")
-        shape = picture_shape(Place(report, path), modes=COLOUR_MODES)
+        shape = picture_shape(Node(report, path), modes=COLOUR_MODES)
         if self._depths:
             path = self._depths.get(image, folder / "depth" / f"{image:06d}.png")
-            one_channel_of(Place(report, path), shape, modes=DEPTH_MODES)
+            one_channel_of(Node(report, path), shape, modes=DEPTH_MODES)
         objects = truths.get(image, [])
         masks = {name: by_image.get(image, {}) for name, by_image in self._masks.items()}
         for by_number in masks.values() if self._has_truth else ():
             for number in sorted(by_number.keys() - set(range(len(objects)))):
                 report.report(by_number[number], "file", f"no object {number} on the image")
 
-        def places(what: str, number: int) -> Place:
-            place = Place(report, folder / f"scene_{what}.json")[f"{image}"]
-            return place if what == "camera" else place[number]
+        def nodes(what: str, number: int) -> Node:
+            node = Node(report, folder / f"scene_{what}.json")[f"{image}"]
+            return node if what == "camera" else node[number]
 
         def read_mask(name: str, number: int) -> Mask | None:
             if not self._masks[name]:
                 return None
             path = masks[name].get(number, folder / name / f"{image:06d}_{number:06d}.png")
-            mask = one_channel_of(Place(report, path), shape)
+            mask = one_channel_of(Node(report, path), shape)
             return None if mask is None else mask != 0
 
         objects_infos = infos.get(image, [None] * len(objects))
         camera, has_depth = cameras.get(image), bool(self._depths)
         return check_image(
-            places, camera, objects, objects_infos, shape, has_depth, self._models, read_mask
+            nodes, camera, objects, objects_infos, shape, has_depth, self._models, read_mask
         )
 
 
@@ -191,14 +191,14 @@ class Oddities:
     def note(self, report: CheckReport, where: Path | str) -> None:
         """Note the oddities and how a reader handles them."""
         if self.inexact:
-            got = f"{self.inexact:,} rotations are orthogonal to {bop.INEXACT:g} only"
-            report.note(f"{where}: {got}; the nearest rotation is taken")
+            message = f"{self.inexact:,} rotations are orthogonal to {bop.INEXACT:g} only"
+            report.note(f"{where}: {message}; the nearest rotation is taken")
         if self.without_fraction:
-            got = f"{self.without_fraction:,} objects without visib_fract"
-            report.note(f"{where}: {got}; how much of them is visible is estimated")
+            message = f"{self.without_fraction:,} objects without visib_fract"
+            report.note(f"{where}: {message}; how much of them is visible is estimated")
         for number, count in sorted(self.without_model.items()):
-            got = f"object {number} is annotated {count:,} times and has no model"
-            report.note(f"{where}: {got}; it is left out")
+            message = f"object {number} is annotated {count:,} times and has no model"
+            report.note(f"{where}: {message}; it is left out")
 
 
 @dataclass(frozen=True)
@@ -223,8 +223,8 @@ def load_models(report: CheckReport, roots: Sequence[Path]) -> Models | None:
     if path is None:
         report.note(f"no {INFO_FILE}: objects' numbers, sizes and boxes are not checked")
         return None
-    place = Place(report, path)
-    records = place.load()
+    node = Node(report, path)
+    records = node.load()
     if records is None:
         return None
     infos = parse_models(path, records, report)
@@ -233,41 +233,41 @@ def load_models(report: CheckReport, roots: Sequence[Path]) -> Models | None:
         numbers = ", ".join(map(str, sorted(absent)))
         report.note(f"{path.parent}: no file of object {numbers}, left out where it is annotated")
     for number in sorted(present):
-        Place(report, infos[number].path)["mesh"].attempt(partial(part_of, infos[number]))
+        Node(report, infos[number].path)["mesh"].attempt(partial(part_of, infos[number]))
     sizes = {
-        int(key): _model(place[key], record, infos[int(key)].diameter)
+        int(key): _model(node[key], record, infos[int(key)].diameter)
         for key, record in records.items()
         if bop.is_number(key)
     }
     return {number: size for number, size in sizes.items() if number in present}
 
 
-def _model(place: Place, record: object, stated: float) -> Model:
+def _model(node: Node, record: object, stated: float) -> Model:
     fields, diameter = mapping(record), None if np.isnan(stated) else stated
     if fields and "diameter" not in fields:
-        place["diameter"].report("missing")
+        node["diameter"].report("missing")
     if diameter is not None and not DIAMETERS_MM[0] <= diameter * MM <= DIAMETERS_MM[1]:
         least, most = DIAMETERS_MM
         allowed = f"{least:g} … {most:g} mm: is it in another unit?"
-        place["unit"].report(f"{diameter * MM:.4g} mm", allowed)
+        node["unit"].report(f"{diameter * MM:.4g} mm", allowed)
         diameter = None
     bounds = [fields.get(f"{what}_{axis}") for what in ("min", "size") for axis in "xyz"]
     if all(value is None for value in bounds):
         return Model(diameter)
-    low, size = place["min_x … size_z"].numbers(bounds, 2, 3) / MM
+    low, size = node["min_x … size_z"].numbers(bounds, 2, 3) / MM
     if (size < 0).any():
-        place["size_x … size_z"].report(f"{(size * MM).tolist()}", "0 and above")
+        node["size_x … size_z"].report(f"{(size * MM).tolist()}", "0 and above")
     if not (size >= 0).all():
         return Model(diameter)
     length = float(np.linalg.norm(size))
     if diameter is not None and not size.max() / _ROUNDING <= diameter <= length * _ROUNDING:
-        got = f"{diameter * MM:.5g} mm for a box of {np.round(size * MM, 3).tolist()} mm"
-        place["diameter"].report(got)
+        message = f"{diameter * MM:.5g} mm for a box of {np.round(size * MM, 3).tolist()} mm"
+        node["diameter"].report(message)
     return Model(diameter, cuboid_keypoints(low, low + size)[:8])
 
 
 def check_image(
-    places: Places,
+    nodes: Nodes,
     camera: object,
     truths: Sequence[Record],
     infos: Sequence[Record | None],
@@ -281,80 +281,80 @@ def check_image(
     ``shape`` is the image's (height, width), None where it cannot be read; ``has_depth`` tells
     whether the camera must state the scale of a depth image.
     """
-    K = None if camera is None else _check_camera(places, camera, shape, has_depth)
-    poses = bop.read_poses(truths, infos, places)
+    K = None if camera is None else _check_camera(nodes, camera, shape, has_depth)
+    poses = bop.read_poses(truths, infos, nodes)
     for n, info in enumerate(infos):
-        place, T_cam_obj, stated = places("gt", n), poses.T_cam_obj[n], poses.visible_fractions[n]
+        node, T_cam_obj, stated = nodes("gt", n), poses.T_cam_obj[n], poses.visible_fractions[n]
         fraction = None if np.isnan(stated) else float(stated)
         model = (models or {}).get(int(poses.obj_ids[n]), Model())
         problem = invariants.translation_problem(T_cam_obj[:3, 3], model.diameter)
         if problem is not None:
-            place["cam_t_m2c"][problem[0]].report(problem[1])
+            node["cam_t_m2c"][problem[0]].report(problem[1])
         whole, visible = read_mask("mask", n), read_mask("mask_visib", n)
         if whole is not None and visible is not None and whole.shape == visible.shape:
             outside = int(np.count_nonzero(visible & ~whole))
             if outside > PIXEL_TOLERANCE * visible.sum():
-                place["mask_visib"].report(f"{outside} visible pixels outside the whole mask")
+                node["mask_visib"].report(f"{outside} visible pixels outside the whole mask")
         seen = None if visible is None else Box.of_mask(visible)
         if info is not None:
-            _check_counts(places("gt_info", n), info, visible, fraction)
-            seen = _check_boxes(places("gt_info", n), info, seen)
+            _check_counts(nodes("gt_info", n), info, visible, fraction)
+            seen = _check_boxes(nodes("gt_info", n), info, seen)
         is_posed = problem is None and bool(np.isfinite(T_cam_obj).all())
         if is_posed and K is not None and model.corners is not None:
             apart = invariants.box_problem(transform(T_cam_obj, model.corners), K, seen, fraction)
             if apart is not None:
-                place["box"].report(apart)
+                node["box"].report(apart)
     return poses
 
 
 def _check_camera(
-    places: Places, camera: object, shape: Shape | None, has_depth: bool
+    nodes: Nodes, camera: object, shape: Shape | None, has_depth: bool
 ) -> CameraMatrix | None:
-    place = places("camera", 0)
-    K: CameraMatrix = bop.read_cameras([camera], places)[0][0]
+    node = nodes("camera", 0)
+    K: CameraMatrix = bop.read_cameras([camera], nodes)[0][0]
     if has_depth and "depth_scale" not in mapping(camera):
-        place["depth_scale"].report("missing", "millimetres a unit of the depth")
+        node["depth_scale"].report("missing", "millimetres a unit of the depth")
     if not np.isfinite(K).all():
         return None
     problem = None if shape is None else invariants.camera_problem(K, shape)
     if problem is None:
         return K
-    place["cam_K"].report(problem)
+    node["cam_K"].report(problem)
     return None
 
 
 def _check_counts(
-    place: Place, info: Mapping[str, Any], visible: Mask | None, fraction: float | None
+    node: Node, info: Mapping[str, Any], visible: Mask | None, fraction: float | None
 ) -> None:
     """Compare pixel counts with each other, the visible fraction and the mask."""
     total, count = (
-        place[field].scalar(info[field]) if field in info else np.nan
+        node[field].scalar(info[field]) if field in info else np.nan
         for field in ("px_count_all", "px_count_visib")
     )
     if count < 0 or count > total:
-        place["px_count_visib"].report(f"{count:g} of {total:g} pixels")
+        node["px_count_visib"].report(f"{count:g} of {total:g} pixels")
     elif fraction is not None and total > 0:
         slack = FRACTION_TOLERANCE + 1 / np.sqrt(total)
         if abs(count / total - fraction) > slack:
-            got = f"{fraction:.3g}, the pixel counts say {count / total:.3g}"
-            place["visib_fract"].report(got)
+            message = f"{fraction:.3g}, the pixel counts say {count / total:.3g}"
+            node["visib_fract"].report(message)
     if visible is not None:
         pixels = int(np.count_nonzero(visible))
         if abs(pixels - count) > PIXEL_TOLERANCE * max(pixels, count) + np.sqrt(pixels):
-            place["px_count_visib"].report(f"{count:g}, mask_visib has {pixels} pixels")
+            node["px_count_visib"].report(f"{count:g}, mask_visib has {pixels} pixels")
 
 
-def _check_boxes(place: Place, info: Mapping[str, Any], seen: Box | None) -> Box | None:
+def _check_boxes(node: Node, info: Mapping[str, Any], seen: Box | None) -> Box | None:
     """Compare ``bbox_visib`` with the mask's box; return the latter, or else the former."""
     boxes: dict[str, Box] = {}
     for field_name in ("bbox_visib", "bbox_obj"):
         if field_name in info:
-            x, y, width, height = place[field_name].numbers(info[field_name], 4).tolist()
+            x, y, width, height = node[field_name].numbers(info[field_name], 4).tolist()
             if width >= 0 and height >= 0:  # −1 where nothing is visible
                 boxes[field_name] = Box(x, y, x + width, y + height)
     box = boxes.get("bbox_visib")
     if seen is not None and box is not None:
         distance = max(abs(a - b) for a, b in zip(seen, box, strict=True))
         if distance > BOX_EDGE_PX:
-            place["bbox_visib"].report(f"{box}, mask_visib has {seen}")
+            node["bbox_visib"].report(f"{box}, mask_visib has {seen}")
     return seen or box

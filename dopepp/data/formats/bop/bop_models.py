@@ -24,7 +24,7 @@ from dopepp.core.files import write_whole
 from dopepp.data.formats.bop import EXACT, INEXACT, MM, is_number
 from dopepp.data.formats.images import encode_png
 from dopepp.data.formats.invariants import rotation_problem
-from dopepp.data.formats.problems import STRICT, Place, Problems, mapping
+from dopepp.data.formats.problems import STRICT, Node, Problems, mapping
 from dopepp.geometry.rotation import is_rotation, nearest_rotation
 from dopepp.parts.mesh.read import read_mesh
 from dopepp.parts.part import MAX_SYMMETRIES, Mesh, Part, check_name, make_part
@@ -74,9 +74,9 @@ def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Pa
     """
     infos = read_models(Path(root))
     if not infos:
-        got = f"{root}, which has no {INFO_FILE} in {', '.join(MODEL_FOLDERS)}"
+        problem = f"{root}, which has no {INFO_FILE} in {', '.join(MODEL_FOLDERS)}"
         fix = "check data.root, or unpack the data set's models into it"
-        raise UserError(got, "the root folder of a BOP data set", fix)
+        raise UserError(problem, "the root folder of a BOP data set", fix)
     by_name = {info.name: info for info in infos.values()}
     wanted = list(objects or by_name)
     absent = [name for name in wanted if objects is None and not by_name[name].path.is_file()]
@@ -85,8 +85,8 @@ def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Pa
         wanted = [name for name in wanted if name not in absent]
     for name in wanted:
         if name not in by_name:
-            got, allowed = f"data.objects with {name!r}", ", ".join(by_name)
-            raise UserError(got, allowed, "choose from this list")
+            problem, allowed = f"data.objects with {name!r}", ", ".join(by_name)
+            raise UserError(problem, allowed, "choose from this list")
     return [part_of(by_name[name]) for name in wanted]
 
 
@@ -138,17 +138,16 @@ def part_of(info: ModelInfo) -> Part:
         fix = "correct the model, or convert its file to millimetres"
         raise UserError(f"{info.path}: {error.got}", allowed, fix) from error
     if abs(info.diameter - part.diameter) > _DIAMETER_TOLERANCE * part.diameter:
-        _log.warning(
-            "%s: %s states a diameter of %.6g m, its vertices have %.6g m, which is used",
-            info.path, INFO_FILE, info.diameter, part.diameter,
-        )  # fmt: skip
+        stated = f"{INFO_FILE} states a diameter of {info.diameter:.6g} m"
+        used = f"its vertices have {part.diameter:.6g} m, which is used"
+        _log.warning("%s: %s, %s", info.path, stated, used)
     return part
 
 
 def read_models(root: Path) -> dict[int, ModelInfo]:
     """Return the objects of ``models_info.json`` by number; none where there is no such file."""
     path = info_path(root)
-    return {} if path is None else parse_models(path, Place(STRICT, path).load(_ALLOWED))
+    return {} if path is None else parse_models(path, Node(STRICT, path).load(_ALLOWED))
 
 
 def modelled(infos: Mapping[int, ModelInfo]) -> set[int]:
@@ -165,41 +164,41 @@ def info_path(root: Path) -> Path | None:
 
 def parse_models(path: Path, records: object, problems: Problems = STRICT) -> dict[int, ModelInfo]:
     """Return the objects of what a ``models_info.json`` holds, by number."""
-    place = Place(problems, path)
+    node = Node(problems, path)
     if not isinstance(records, dict):
-        place["top level"].report(f"{records!r:.60}", _ALLOWED)
+        node["top level"].report(f"{records!r:.60}", _ALLOWED)
     infos: dict[int, ModelInfo] = {}
     names: set[str] = set()
     for key, record in mapping(records).items():
         if not is_number(key) or int(key) in infos:
-            place[f"{key!r:.40}"].report("no object's number, or one twice", _ALLOWED)
+            node[f"{key!r:.40}"].report("no object's number, or one twice", _ALLOWED)
             continue
-        info = _info(place[key], path.parent / f"obj_{int(key):06d}.ply", record)
+        info = _info(node[key], path.parent / f"obj_{int(key):06d}.ply", record)
         if info.name in names:
-            place[key]["name"].report(f"{info.name!r:.60} twice", "each name once")
+            node[key]["name"].report(f"{info.name!r:.60} twice", "each name once")
         names.add(info.name)
         infos[int(key)] = info
     return dict(sorted(infos.items()))
 
 
-def _info(place: Place, model: Path, record: object) -> ModelInfo:
+def _info(node: Node, model: Path, record: object) -> ModelInfo:
     if not isinstance(record, dict):
-        place.report(f"{record!r:.60}", "an object with diameter and symmetries")
+        node.report(f"{record!r:.60}", "an object with diameter and symmetries")
     fields, diameter = mapping(record), math.nan
     if "diameter" in fields:
-        diameter = place["diameter"].scalar(fields["diameter"]) / MM
+        diameter = node["diameter"].scalar(fields["diameter"]) / MM
         if diameter <= 0:
-            place["diameter"].report(f"{fields['diameter']!r:.40}", "millimetres above 0")
+            node["diameter"].report(f"{fields['diameter']!r:.40}", "millimetres above 0")
             diameter = math.nan
-    name = place["name"].attempt(lambda: check_name(fields.get("name", model.stem)))
-    return ModelInfo(name or model.stem, model, diameter, *_symmetries(place, fields))
+    name = node["name"].attempt(lambda: check_name(fields.get("name", model.stem)))
+    return ModelInfo(name or model.stem, model, diameter, *_symmetries(node, fields))
 
 
-def _symmetries(place: Place, fields: Mapping[str, Any]) -> tuple[Discrete | None, Continuous]:
+def _symmetries(node: Node, fields: Mapping[str, Any]) -> tuple[Discrete | None, Continuous]:
     discrete, continuous = SYMMETRY_FIELDS
     return (
-        _discrete(place[discrete], fields.get(discrete)),
-        _continuous(place[continuous], fields.get(continuous)),
+        _discrete(node[discrete], fields.get(discrete)),
+        _continuous(node[continuous], fields.get(continuous)),
     )
 
 
@@ -209,22 +208,22 @@ def parse_symmetries(name: str, fields: object) -> tuple[Discrete | None, Contin
     Raises:
         UserError: There is no such entry, or one is no rigid transform or no axis.
     """
-    place = Place(STRICT, f"data.symmetries.{name}")
+    node = Node(STRICT, f"data.symmetries.{name}")
     if not isinstance(fields, Mapping) or not {*fields} <= {*SYMMETRY_FIELDS}:
-        place.report(f"{fields!r:.80}", f"{' and '.join(SYMMETRY_FIELDS)} as BOP has them")
-    return _symmetries(place, mapping(fields))
+        node.report(f"{fields!r:.80}", f"{' and '.join(SYMMETRY_FIELDS)} as BOP has them")
+    return _symmetries(node, mapping(fields))
 
 
-def _discrete(place: Place, value: object) -> Discrete | None:
+def _discrete(node: Node, value: object) -> Discrete | None:
     transforms = []
-    for number, row in enumerate(_rows(place, value)):
-        matrix = place[number].numbers(row, 4, 4)
+    for number, row in enumerate(_rows(node, value)):
+        matrix = node[number].numbers(row, 4, 4)
         problem = rotation_problem(matrix[:3, :3], INEXACT)
         if problem is None and (matrix[3] != [0, 0, 0, 1]).any():
             problem = f"a last row of {matrix[3].tolist()}"
         if problem is not None:
             if np.isfinite(matrix).all():
-                place[number].report(problem, "rigid transforms [R t; 0 0 0 1], row by row")
+                node[number].report(problem, "rigid transforms [R t; 0 0 0 1], row by row")
             continue
         if not is_rotation(matrix[:3, :3], EXACT):
             matrix[:3, :3] = nearest_rotation(matrix[:3, :3])
@@ -234,10 +233,10 @@ def _discrete(place: Place, value: object) -> Discrete | None:
     return np.array(transforms) if transforms else None
 
 
-def _continuous(place: Place, value: object) -> Continuous:
+def _continuous(node: Node, value: object) -> Continuous:
     pairs = []
-    for number, row in enumerate(place.entries(_rows(place, value))):
-        entry = place[number]
+    for number, row in enumerate(node.entries(_rows(node, value))):
+        entry = node[number]
         axis, offset = (entry[name].numbers(row.get(name), 3) for name in ("axis", "offset"))
         if not axis.any():
             entry["axis"].report("zero", "an axis other than 0")
@@ -245,10 +244,10 @@ def _continuous(place: Place, value: object) -> Continuous:
     return tuple(pairs)
 
 
-def _rows(place: Place, value: object) -> list[Any]:
+def _rows(node: Node, value: object) -> list[Any]:
     if value is None or (isinstance(value, list) and len(value) <= MAX_SYMMETRIES):
         return value or []
-    place.report(f"{value!r:.60}", f"a list of at most {MAX_SYMMETRIES}")
+    node.report(f"{value!r:.60}", f"a list of at most {MAX_SYMMETRIES}")
     return []
 
 
@@ -262,11 +261,10 @@ def write_models(root: Path, parts: Sequence[Part]) -> None:
     """
     for part in parts:
         if part.mesh is None:
-            got, allowed = (
-                f"part {part.name} without a mesh",
-                "parts that were read from a mesh file",
+            allowed = "parts that were read from a mesh file"
+            raise UserError(
+                f"part {part.name} without a mesh", allowed, "give the part's mesh file"
             )
-            raise UserError(got, allowed, "give the part's mesh file")
     folder, names = root / MODEL_FOLDERS[0], [part.name for part in parts]
     numbers = model_numbers(names)
     entries = {str(numbers[part.name]): model_info(part) for part in parts}
@@ -274,8 +272,8 @@ def write_models(root: Path, parts: Sequence[Part]) -> None:
     path = folder / INFO_FILE
     if path.exists():
         if path.read_bytes() != content:
-            got, allowed = f"{path}, written for other parts", f"a folder for {names}"
-            raise UserError(got, allowed, "choose an empty folder")
+            problem, allowed = f"{path}, written for other parts", f"a folder for {names}"
+            raise UserError(problem, allowed, "choose an empty folder")
         return
     for part in parts:
         model = folder / f"obj_{numbers[part.name]:06d}.ply"

@@ -126,9 +126,9 @@ class BopReader:
         present = [(number, row) for number, row in listed if self._scenes[number].files[row]]
         num_wanted = len(listed) if self._targets is None else len(self._targets)
         if not present:
-            got = f"no image under {self.root / self.split} ({num_wanted:,} listed)"
+            problem = f"no image under {self.root / self.split} ({num_wanted:,} listed)"
             allowed = "at least one listed image in rgb/ or gray/"
-            raise UserError(got, allowed, "unpack the data set fully")
+            raise UserError(problem, allowed, "unpack the data set fully")
         if len(present) < num_wanted:
             absent = f"{num_wanted - len(present):,} of {num_wanted:,}"
             _log.warning("%s: %s listed images are absent", self.name, absent)
@@ -142,11 +142,13 @@ class BopReader:
         left_out = other + without.total()
         self._left_out = {"other_objects": left_out, "behind_the_camera": behind}
         if other or behind:
-            got = f"{other:,} objects that are none of the parts and {behind:,} behind the camera"
-            _log.info("%s: left out %s", self.name, got)
+            problem = (
+                f"{other:,} objects that are none of the parts and {behind:,} behind the camera"
+            )
+            _log.info("%s: left out %s", self.name, problem)
         if inexact := sum(int(scene.poses.inexact.sum()) for scene in self._scenes):
-            got = f"{inexact:,} rotations are orthogonal to {bop.INEXACT:g} only"
-            _log.warning("%s: %s; the nearest are taken", self.name, got)
+            problem = f"{inexact:,} rotations are orthogonal to {bop.INEXACT:g} only"
+            _log.warning("%s: %s; the nearest are taken", self.name, problem)
         if without:
             listed = ", ".join(f"{number} ({count:,})" for number, count in sorted(without.items()))
             _log.warning("%s: left out objects without a model: %s", self.name, listed)
@@ -161,8 +163,8 @@ class BopReader:
             counted = self._parts.keys() | (counts.keys() - with_model if with_model else set())
             lacking += sum(max(0, counts[obj_id] - present[obj_id]) for obj_id in counted)
         if lacking:
-            got = "listed instances have no annotation or no model and are not counted"
-            _log.warning("%s: %s %s", self.name, f"{lacking:,}", got)
+            problem = "listed instances have no annotation or no model and are not counted"
+            _log.warning("%s: %s %s", self.name, f"{lacking:,}", problem)
 
     def _target_counts(self, scene: BopScene, row: int) -> Counter[int] | None:
         """Return how many instances of each object the list has on an image; None for all."""
@@ -269,6 +271,6 @@ def _scene_folders(root: Path, split: str) -> list[Path]:
         )
     folders = [p for p in (root / split).iterdir() if bop.is_number(p.name) and p.is_dir()]
     if not folders:
-        got, allowed = f"{root / split}, which has no scene", "folders 000000, 000001, …"
-        raise UserError(got, allowed, "unpack the data set's images into it")
+        problem, allowed = f"{root / split}, which has no scene", "folders 000000, 000001, …"
+        raise UserError(problem, allowed, "unpack the data set's images into it")
     return sorted(folders, key=lambda path: (int(path.name), path.name))

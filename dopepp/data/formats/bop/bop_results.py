@@ -118,8 +118,8 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
         while content := file.readline(_MAX_LINE_BYTES + 1):
             number += 1
             if len(content) > _MAX_LINE_BYTES:
-                got = f"{path}: line {number} of more than {_MAX_LINE_BYTES} bytes"
-                raise _bad(got, allowed)
+                problem = f"{path}: line {number} of more than {_MAX_LINE_BYTES} bytes"
+                raise _bad(problem, allowed)
             try:
                 text = content.decode("utf-8-sig" if number == 1 else "ascii").strip()
             except UnicodeDecodeError as error:
@@ -180,10 +180,9 @@ def _check_repeats(path: Path, table: Table) -> None:
     same = (keys[order[1:]] == keys[order[:-1]]).all(axis=1)
     if same.any():
         first, second = table[order[:-1][same][0], 0], table[order[1:][same][0], 0]
-        raise _bad(
-            f"{path}: line {second:.0f}, which repeats line {first:.0f}", "each pose once",
-            "remove one: the second would count as a false positive",
-        )  # fmt: skip
+        problem = f"{path}: line {second:.0f}, which repeats line {first:.0f}"
+        fix = "remove one: the second would count as a false positive"
+        raise _bad(problem, "each pose once", fix)
 
 
 def _check_unit(path: Path, table: Table) -> None:
@@ -202,6 +201,6 @@ def _check_unit(path: Path, table: Table) -> None:
 
 
 def _bad(
-    got: str, allowed: str, fix: str = "correct the line or write the file again"
+    problem: str, allowed: str, fix: str = "correct the line or write the file again"
 ) -> UserError:
-    return UserError(got, allowed, fix)
+    return UserError(problem, allowed, fix)

@@ -63,9 +63,9 @@ class BopFolder:
         """Write the models; a UserError where the split holds images made without them."""
         info = f"{MODEL_FOLDERS[0]}/{INFO_FILE}"
         if (self.root / self.split).exists() and not (self.root / info).exists():
-            got = f"{self.root}, which has {self.split}/ and no {info}"
+            problem = f"{self.root}, which has {self.split}/ and no {info}"
             allowed = "an empty folder, or one that this layout was begun in"
-            raise UserError(got, allowed, "choose another folder")
+            raise UserError(problem, allowed, "choose another folder")
         write_models(self.root, self._parts)
 
     @cached_property

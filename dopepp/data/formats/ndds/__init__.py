@@ -21,7 +21,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from dopepp.data.formats.images import one_channel, read_map
-from dopepp.data.formats.problems import STRICT, Place, Problems, mapping
+from dopepp.data.formats.problems import STRICT, Node, Problems, mapping
 from dopepp.drawing.pictures import DepthMap, Shape, read_image
 from dopepp.geometry.camera import CameraMatrix, camera_matrix
 from dopepp.geometry.rotation import Vector
@@ -39,8 +39,8 @@ DEPTH_UNIT: Final = 0.0001
 _NORM_TOLERANCE: Final = 0.1
 """Of a quaternion's norm from 1."""
 
-Objects = list[tuple[Place, Mapping[str, Any], str]]
-"""(place, object, class) of every object of an annotation."""
+Objects = list[tuple[Node, Mapping[str, Any], str]]
+"""(node, object, class) of every object of an annotation."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class NddsObject:
         visibility: In [0, 1], or −1 for unknown; None where it is not given.
     """
 
-    place: Place
+    node: Node
     label: str
     location: Vector
     quaternion: Float[np.ndarray, "4"]
@@ -67,26 +67,26 @@ class NddsObject:
 
 def read_record(path: Path, problems: Problems = STRICT) -> Mapping[str, Any] | None:
     """Read an annotation or a settings file; None where that is impossible."""
-    return Place(problems, path).load(max_bytes=MAX_ITEM_BYTES)
+    return Node(problems, path).load(max_bytes=MAX_ITEM_BYTES)
 
 
 def objects_of(record: Mapping[str, Any], path: Path, problems: Problems = STRICT) -> Objects:
     """Return the objects of an annotation; each needs a class."""
     objects: Objects = []
-    place = Place(problems, path, "objects")
-    for number, item in enumerate(place.entries(record.get("objects"))):
+    node = Node(problems, path, "objects")
+    for number, item in enumerate(node.entries(record.get("objects"))):
         label = item.get("class")
         if not isinstance(label, str):
-            place[number]["class"].report(f"{label!r:.60}", "a name")
-        objects.append((place[number], item, label if isinstance(label, str) else ""))
+            node[number]["class"].report(f"{label!r:.60}", "a name")
+        objects.append((node[number], item, label if isinstance(label, str) else ""))
     return objects
 
 
-def parse_object(item: Mapping[str, Any], place: Place) -> NddsObject:
+def parse_object(item: Mapping[str, Any], node: Node) -> NddsObject:
     """Read the fields of one object; it needs a location and a quaternion."""
 
     def take(name: str, *shape: int) -> NDArray[np.float64]:
-        return place[name].numbers(item.get(name), *shape)
+        return node[name].numbers(item.get(name), *shape)
 
     def take_corners(name: str, axes: int) -> NDArray[np.float64] | None:
         value = item.get(name)
@@ -97,7 +97,7 @@ def parse_object(item: Mapping[str, Any], place: Place) -> NddsObject:
     quaternion = take("quaternion_xyzw", 4)
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > _NORM_TOLERANCE:
-        place["quaternion_xyzw"].report(f"no rotation: norm {norm:.4g}", "a quaternion of norm 1")
+        node["quaternion_xyzw"].report(f"no rotation: norm {norm:.4g}", "a quaternion of norm 1")
         quaternion = np.full(4, np.nan)
     corners_px, cuboid = take_corners("projected_cuboid", 2), take_corners("cuboid", 3)
     centroid = None if cuboid is None else cuboid.mean(axis=0)
@@ -105,10 +105,10 @@ def parse_object(item: Mapping[str, Any], place: Place) -> NddsObject:
         centroid = take("cuboid_centroid", 3)
     visibility = None if item.get("visibility") is None else float(take("visibility", 1)[0])
     if visibility is not None and (visibility > 1 or (visibility < 0 and visibility != -1)):
-        place["visibility"].report(f"{visibility:g}", "0 … 1, or −1 for unknown")
+        node["visibility"].report(f"{visibility:g}", "0 … 1, or −1 for unknown")
         visibility = None
     label, location = str(item.get("class", "")), take("location", 3)
-    return NddsObject(place, label, location, quaternion, corners_px, cuboid, centroid, visibility)
+    return NddsObject(node, label, location, quaternion, corners_px, cuboid, centroid, visibility)
 
 
 def stated(record: Mapping[str, Any], name: str) -> object:
@@ -175,16 +175,16 @@ class NddsSettings:
         Of several cameras in the settings, the one counts whose name ends the stem (FAT's ``left``
         and ``right``). Without one camera, a problem is reported, and K is NaN.
         """
-        place = Place(problems, annotation, "camera_data.intrinsics")
+        node = Node(problems, annotation, "camera_data.intrinsics")
         stated_here = mapping(record.get("camera_data")).get("intrinsics")
         if isinstance(stated_here, dict):
-            return _intrinsics(stated_here, place)
+            return _intrinsics(stated_here, node)
         path, settings = self._of(annotation, CAMERA_SETTINGS)
         side = annotation.name.removesuffix(".json").rpartition(".")[2]
         cameras = _entries(settings, "camera_settings")
         cameras = [camera for camera in cameras if camera.get("name") == side] or cameras
         if len(cameras) == 1 and isinstance(cameras[0].get("intrinsic_settings"), dict):
-            there = Place(problems, path, "camera_settings[].intrinsic_settings")
+            there = Node(problems, path, "camera_settings[].intrinsic_settings")
             return _intrinsics(cameras[0]["intrinsic_settings"], there)
         # A settings file that cannot be read is one problem, not one for every image.
         files = annotation.with_name(CAMERA_SETTINGS), self._root / CAMERA_SETTINGS
@@ -192,7 +192,7 @@ class NddsSettings:
             allowed = (
                 f"fx, fy, cx, cy there or, of one camera or one named {side!r}, in {path.name}"
             )
-            place.report(f"{len(cameras)} cameras' to take", allowed)
+            node.report(f"{len(cameras)} cameras' to take", allowed)
         return np.full((3, 3), np.nan)
 
     def fixed_transform(self, annotation: Path, label: str) -> NDArray[np.float64] | None:
@@ -247,9 +247,9 @@ def _entries(settings: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
     return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
 
 
-def _intrinsics(values: Mapping[str, Any], place: Place) -> CameraMatrix:
+def _intrinsics(values: Mapping[str, Any], node: Node) -> CameraMatrix:
     """Return K of ``fx``, ``fy``, ``cx`` and ``cy``, pixels; NaN where one is missing."""
-    return camera_matrix(*place.numbers([values.get(n) for n in ("fx", "fy", "cx", "cy")], 4))
+    return camera_matrix(*node.numbers([values.get(n) for n in ("fx", "fy", "cx", "cy")], 4))
 
 
 def read_depth(record: Mapping[str, Any], annotation: Path, shape: Shape) -> DepthMap | None:
@@ -264,7 +264,7 @@ def read_depth(record: Mapping[str, Any], annotation: Path, shape: Shape) -> Dep
     path = companion(annotation, ".depth.png")
     if not isinstance(unit, (int, float)) or not 0 < unit <= 1 or not path.is_file():
         return None
-    values = read_map(Place(STRICT, path), shape)
+    values = read_map(Node(STRICT, path), shape)
     assert values is not None
     return values.astype(np.float32) * np.float32(unit)
 
@@ -274,13 +274,13 @@ def read_labels(annotation: Path, shape: Shape) -> NDArray[Any] | None:
     path = companion(annotation, ".seg.png")
     image = read_image(path) if path.is_file() else None
     is_map = image is not None and image.ndim == 2
-    return one_channel(Place(STRICT, path), image, shape) if is_map else None
+    return one_channel(Node(STRICT, path), image, shape) if is_map else None
 
 
 def label_values(
     objects: Objects, record: Mapping[str, Any], annotation: Path, settings: NddsSettings
 ) -> dict[str, int | None]:
-    """Return the value of each object's pixels in ``STEM.seg.png``, by the object's place.
+    """Return the value of each object's pixels in ``STEM.seg.png``, by the object's node.
 
     None where it is unknown or not only this object's. An object without ``segmentation_id`` may
     have its class's value, unless the annotation states that the values are ids.
@@ -290,11 +290,11 @@ def label_values(
     of_class = [settings.class_id(annotation, label) for _, _, label in objects]
     counts, class_counts = Counter(of_object), Counter(of_class)
     values: dict[str, int | None] = {}
-    for (place, _, _), value, class_id in zip(objects, of_object, of_class, strict=True):
+    for (node, _, _), value, class_id in zip(objects, of_object, of_class, strict=True):
         is_alone = counts[value] == 1
         if value is None and not has_object_ids(record):
             value, is_alone = class_id, class_counts[class_id] == 1
-        values[place.where] = value if is_alone else None
+        values[node.where] = value if is_alone else None
     return values
 
 

@@ -221,22 +221,22 @@ def check_observation(observation: Observation, convention: PoseConvention) -> T
             by more than 5 px and 5 % of the cuboid's longer side.
     """
     item = observation.item
-    T_cam_obj, place = observation.T_cam_obj(convention), item.place
+    T_cam_obj, node = observation.T_cam_obj(convention), item.node
     if T_cam_obj is None:
-        got = f"no fixed_model_transform of {item.label} in the object settings"
-        place["class"].report(got, f"one as for the others ({convention})")
+        problem = f"no fixed_model_transform of {item.label} in the object settings"
+        node["class"].report(problem, f"one as for the others ({convention})")
     assert T_cam_obj is not None
     if T_cam_obj[2, 3] <= 0:
-        got = f"an object behind the camera (z = {T_cam_obj[2, 3]:.3g} m)"
-        place["location"].report(got, f"one before it ({convention})")
+        problem = f"an object behind the camera (z = {T_cam_obj[2, 3]:.3g} m)"
+        node["location"].report(problem, f"one before it ({convention})")
     predicted = observation.predicted_px(convention)
     # Projections of a hidden object, or of one that reaches behind the camera, mean nothing.
     if predicted is None or not np.isfinite(predicted).all() or item.visibility == 0:
         return T_cam_obj
     error, extent = observation.error_px(convention), float(np.ptp(predicted, axis=0).max())
     if item.corners_px is not None and error > max(MAX_ERROR_PX, _MAX_SHARE * extent):
-        got = f"{error:.3g} px from where the pose puts the cuboid of {observation.part.name}"
-        place["projected_cuboid"].report(got, f"the data set's {convention}")
+        problem = f"{error:.3g} px from where the pose puts the cuboid of {observation.part.name}"
+        node["projected_cuboid"].report(problem, f"the data set's {convention}")
     return T_cam_obj
 
 

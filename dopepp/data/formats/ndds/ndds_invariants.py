@@ -19,7 +19,7 @@ from dopepp.data.formats.images import picture_shape, read_map
 from dopepp.data.formats.invariants import camera_problem
 from dopepp.data.formats.ndds import IMAGE_SUFFIXES, NddsSettings, Objects
 from dopepp.data.formats.ndds.object_invariants import Majority, ObjectCheck
-from dopepp.data.formats.problems import CheckReport, Place, mapping
+from dopepp.data.formats.problems import CheckReport, Node, mapping
 from dopepp.drawing.pictures import Shape
 from dopepp.geometry.camera import CameraMatrix
 
@@ -52,18 +52,18 @@ def check_ndds(report: CheckReport) -> None:
 def _check_settings(report: CheckReport, settings: NddsSettings, folder: Path) -> None:
     content = settings.read(folder / ndds.OBJECT_SETTINGS) or {}
     listed = content.get("exported_object_classes")
-    place = Place(report, folder / ndds.OBJECT_SETTINGS, "exported_objects")
-    objects = place.entries(content.get("exported_objects", []))
+    node = Node(report, folder / ndds.OBJECT_SETTINGS, "exported_objects")
+    objects = node.entries(content.get("exported_objects", []))
     if isinstance(listed, list) and objects:
         names = {str(entry.get("class")) for entry in objects}
         for name in sorted(set(map(str, listed)) - names):
-            place.report(f"no entry for class {name!r:.60}")
+            node.report(f"no entry for class {name!r:.60}")
     cameras = settings.read(folder / ndds.CAMERA_SETTINGS)
     if cameras is not None:
-        place = Place(report, folder / ndds.CAMERA_SETTINGS, "camera_settings")
-        entries = place.entries(cameras.get("camera_settings"))
+        node = Node(report, folder / ndds.CAMERA_SETTINGS, "camera_settings")
+        entries = node.entries(cameras.get("camera_settings"))
         for camera_name in _twice(str(camera.get("name")) for camera in entries):
-            place["name"].report(f"{camera_name!r:.60} twice")
+            node["name"].report(f"{camera_name!r:.60} twice")
 
 
 def _twice(values: Iterable[Hashable]) -> list[Hashable]:
@@ -91,58 +91,57 @@ def _check_item(
 ) -> None:
     """Check an annotation and its images; ``maps`` are the suffixes of the required ones."""
     image = ndds.image_of(path)
-    shape = None if image is None else picture_shape(Place(report, image))
+    shape = None if image is None else picture_shape(Node(report, image))
     images = {
-        suffix: read_map(Place(report, ndds.companion(path, suffix)), shape, colour=True)
+        suffix: read_map(Node(report, ndds.companion(path, suffix)), shape, colour=True)
         for suffix in maps
     }
     labels = images.get(".seg.png")
     record = ndds.read_record(path, report)
     if record is None:
         return
-    K = _check_camera(report, path, settings, record, shape)
+    K = _check_camera(Node(report, path, "camera_data"), settings, record, shape)
     objects = ndds.objects_of(record, path, report)
-    ids = _check_ids(Place(report, path, "objects"), objects)
+    ids = _check_ids(Node(report, path, "objects"), objects)
     if labels is not None and ndds.has_object_ids(record):
         strangers = sorted(set(np.unique(labels).tolist()) - ids - {0})
         if strangers:
-            got = f"{strangers[:10]}: no object's segmentation_id"
-            report.report(ndds.companion(path, ".seg.png"), "values", got)
+            message = f"{strangers[:10]}: no object's segmentation_id"
+            report.report(ndds.companion(path, ".seg.png"), "values", message)
     values = ndds.label_values(objects, record, path, settings)
     classes = settings.classes(path)
-    for place, item, label in objects:
+    for node, item, label in objects:
         if classes is not None and label and label not in classes:
-            got = f"unknown object {label!r:.60}; known: {', '.join(sorted(classes)[:10])}"
-            place["class"].report(got)
-        value = values[place.where]
+            message = f"unknown object {label!r:.60}; known: {', '.join(sorted(classes)[:10])}"
+            node["class"].report(message)
+        value = values[node.where]
         mask = None if labels is None or value is None else labels == value
-        parsed, sides = ndds.parse_object(item, place), settings.dimensions(path, label)
+        parsed, sides = ndds.parse_object(item, node), settings.dimensions(path, label)
         ObjectCheck(parsed, item, majority).check(K, shape, mask, sides)
 
 
 def _check_camera(
-    report: CheckReport, path: Path, settings: NddsSettings, record: Mapping[str, Any],
-    shape: Shape | None,
-) -> CameraMatrix | None:  # fmt: skip
-    place, data = Place(report, path, "camera_data"), mapping(record.get("camera_data"))
+    node: Node, settings: NddsSettings, record: Mapping[str, Any], shape: Shape | None
+) -> CameraMatrix | None:
+    data = mapping(record.get("camera_data"))
     width, height = data.get("width"), data.get("height")
     if shape is not None and None not in (width, height) and (height, width) != shape:
-        place["size"].report(f"{width}×{height}; the image has {shape[1]}×{shape[0]}")
-    K = settings.camera(record, path, report)
+        node["size"].report(f"{width}×{height}; the image has {shape[1]}×{shape[0]}")
+    K = settings.camera(record, Path(node.path), node.problems)
     if not np.isfinite(K).all():
         return None
     problem = None if shape is None else camera_problem(K, shape)
     if problem is None:
         return K
-    place["intrinsics"].report(problem)
+    node["intrinsics"].report(problem)
     return None
 
 
-def _check_ids(place: Place, objects: Objects) -> set[int]:
+def _check_ids(node: Node, objects: Objects) -> set[int]:
     """Report ids that two objects share; return the segmentation ids."""
     for name in ("instance_id", "segmentation_id"):
         stated = [item.get(name) for _, item, _ in objects]
         ids = [value for value in stated if type(value) is int and value > 0]  # −1, 0: none
         for value in _twice(ids):
-            place[name].report(f"{value} twice")
+            node[name].report(f"{value} twice")
     return set(ids)

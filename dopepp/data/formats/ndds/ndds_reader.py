@@ -123,14 +123,14 @@ class NddsReader:
         observations: list[Observation] = []
         others: list[str] = []
         K: CameraMatrix | None = None
-        for place, item, label in ndds.objects_of(record, path):
+        for node, item, label in ndds.objects_of(record, path):
             part = self._part(label)
             if part is None:
                 others.append(label)
                 continue
             K = self._settings.camera(record, path) if K is None else K
             fixed = self._settings.fixed_transform(path, label)
-            observations.append(Observation(ndds.parse_object(item, place), part, K, fixed))
+            observations.append(Observation(ndds.parse_object(item, node), part, K, fixed))
         return observations, others
 
     def __len__(self) -> int:
@@ -151,7 +151,7 @@ class NddsReader:
         for observation in self._read(path)[0]:
             if not self._is_out_of_view(observation):
                 instance = self._instance(observation, shape, counts_truncation)
-                value = values[observation.item.place.where]
+                value = values[observation.item.node.where]
                 if value is not None and (map_of_labels := labels()) is not None:
                     instance.mask = map_of_labels == value
                 instances.append(instance)

@@ -85,14 +85,14 @@ class NddsWriter:
         if path.is_file():
             if path.read_bytes() == settings:
                 return
-            got = f"{path} of other parts"
+            problem = f"{path} of other parts"
         elif foreign:
-            got = f"{foreign[0].name} in {self._root}, which no NDDS writer prepared"
+            problem = f"{foreign[0].name} in {self._root}, which no NDDS writer prepared"
         else:
             write_whole(path, settings)
             return
         allowed = "an empty folder, or one begun with the same parts"
-        raise UserError(got, allowed, "name another")
+        raise UserError(problem, allowed, "name another")
 
     def write(self, index: int, sample: Sample) -> None:
         """Write an item's images and then its annotation, which marks it as complete."""

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from dopepp.data.formats.invariants import Box, box_problem, translation_problem
 from dopepp.data.formats.ndds import NddsObject
 from dopepp.data.formats.ndds.conventions import OPENGL
-from dopepp.data.formats.problems import CheckReport, Place, mapping
+from dopepp.data.formats.problems import CheckReport, Node, mapping
 from dopepp.drawing.pictures import Mask, Shape
 from dopepp.geometry.camera import CameraMatrix, project
 from dopepp.geometry.rotation import (
@@ -74,14 +74,14 @@ class Majority:
     def __init__(self, report: CheckReport) -> None:
         self._report = report
         self._votes: dict[str, Counter[str]] = {}
-        self._places: dict[tuple[str, str], list[Place]] = {}
+        self._nodes: dict[tuple[str, str], list[Node]] = {}
 
-    def vote(self, subject: str, way: str, place: Place) -> None:
+    def vote(self, subject: str, way: str, node: Node) -> None:
         """Count the convention of one object."""
         self._votes.setdefault(subject, Counter())[way] += 1
-        places = self._places.setdefault((subject, way), [])
-        if len(places) < _MAX_MINORITY:
-            places.append(place)
+        nodes = self._nodes.setdefault((subject, way), [])
+        if len(nodes) < _MAX_MINORITY:
+            nodes.append(node)
 
     def conclude(self) -> None:
         """Note each convention that is not NDDS's own, and report the objects of the others."""
@@ -90,15 +90,15 @@ class Majority:
             if common != _DOCUMENTED[subject]:
                 self._report.note(f"{subject}: {common} ({number:,} objects)")
             for way, _ in rest:
-                for place in self._places[subject, way]:
-                    place.report(f"{way}; {number:,} objects have {common}")
+                for node in self._nodes[subject, way]:
+                    node.report(f"{way}; {number:,} objects have {common}")
 
 
 class ObjectCheck:
     """One object; lengths are in the file's unit, whatever it is. Damaged fields are None."""
 
     def __init__(self, parsed: NddsObject, item: Mapping[str, Any], majority: Majority) -> None:
-        self._place, self._item, self._majority = parsed.place, item, majority
+        self._node, self._item, self._majority = parsed.node, item, majority
         self._visibility = parsed.visibility
         self._location, self._quaternion = _finite(parsed.location), _finite(parsed.quaternion)
         self._projected, self._cuboid = _finite(parsed.corners_px), _finite(parsed.cuboid)
@@ -139,13 +139,13 @@ class ObjectCheck:
         if self._is_location_possible(self._location, axes) and K is not None:
             self._check_image(axes, K, shape, seen, None if mask is None else self._visibility)
 
-    def _add(self, field: str, got: str) -> None:
-        self._place[field].report(got)
+    def _add(self, field: str, message: str) -> None:
+        self._node[field].report(message)
 
     def _numbers(self, field: str, *shape: int) -> Float[np.ndarray, "..."] | None:
         """Read a field that the reader does not need; None where it is missing or damaged."""
         value = self._item.get(field)
-        return None if value is None else _finite(self._place[field].numbers(value, *shape))
+        return None if value is None else _finite(self._node[field].numbers(value, *shape))
 
     def _rotations(self) -> dict[str, RotationMatrix]:
         """Return the rotation by either order of ``quaternion_xyzw``; empty if it is damaged."""
@@ -154,8 +154,8 @@ class ObjectCheck:
             return {}
         norm = float(np.linalg.norm(stored))
         if abs(norm - 1) > NORM_TOLERANCE:
-            got = f"no rotation: norm {norm:.4g}; allowed: 1 ± {NORM_TOLERANCE}"
-            self._add("quaternion_xyzw", got)
+            message = f"no rotation: norm {norm:.4g}; allowed: 1 ± {NORM_TOLERANCE}"
+            self._add("quaternion_xyzw", message)
             return {}
         orders = {"x, y, z, w": np.roll(stored, 1), "w, x, y, z": stored}
         return {order: quaternion_to_matrix(values) for order, values in orders.items()}
@@ -166,7 +166,7 @@ class ObjectCheck:
             self._add(field, problem)
         elif not all(fits.values()):
             way = next(way for way, fit in fits.items() if fit)
-            self._majority.vote(field, way, self._place[field])
+            self._majority.vote(field, way, self._node[field])
 
     def _check_transforms(self, rotations: Mapping[str, RotationMatrix]) -> None:
         """Check NDDS's matrix: rows P·Rᵀ (mirrored: Unreal is left-handed), the location below."""
@@ -189,23 +189,25 @@ class ObjectCheck:
                 candidates = matrix[3, :3], matrix[:3, 3]
                 scale = max(1.0, float(np.abs(self._location).max()))
                 if min(np.abs(c - self._location).max() for c in candidates) > EDGE_SHARE * scale:
-                    got = f"translation {_text(candidates[0])}; location {_text(self._location)}"
-                    self._add(name, got)
+                    message = (
+                        f"translation {_text(candidates[0])}; location {_text(self._location)}"
+                    )
+                    self._add(name, message)
 
     def _check_bounding_box(self, seen: Box | None) -> None:
         """Compare the stated box, which may be the whole object's, with the visible pixels'."""
         stated = mapping(self._item.get("bounding_box"))
         if not stated:
             return
-        place = self._place["bounding_box"]
+        node = self._node["bounding_box"]
         first, last = (
-            _finite(place[name].numbers(stated.get(name), 2))
+            _finite(node[name].numbers(stated.get(name), 2))
             for name in ("top_left", "bottom_right")
         )
         if first is None or last is None:
             return
         if (first > last).any():
-            place.report(f"top_left {first.tolist()}, bottom_right {last.tolist()}")
+            node.report(f"top_left {first.tolist()}, bottom_right {last.tolist()}")
         elif seen is not None:
             (a, b), (c, d) = first.tolist(), last.tolist()
             boxes = {"row, column": Box(b, a, d, c), "column, row": Box(a, b, c, d)}
@@ -224,7 +226,7 @@ class ObjectCheck:
             low, high = projected.min(axis=0) - slack, projected.max(axis=0) + slack
             is_opengl = bool(((low <= middle) & (middle <= high)).all())
         way = "OpenGL" if is_opengl else "OpenCV"
-        self._majority.vote("camera axes", way, self._place["location"])
+        self._majority.vote("camera axes", way, self._node["location"])
         return OPENGL if is_opengl else np.eye(3)
 
     def _is_location_possible(self, location: Vector, axes: RotationMatrix) -> bool:
@@ -242,8 +244,8 @@ class ObjectCheck:
             self._add("cuboid_centroid", f"{_text(centroid)}; the cuboid's is {_text(middle)}")
         if np.linalg.norm(location - middle) <= 2 * diagonal:
             return True
-        got = f"{_text(location)}, far from its cuboid at {_text(middle)}: in another unit?"
-        self._add("location.unit", got)
+        message = f"{_text(location)}, far from its cuboid at {_text(middle)}: in another unit?"
+        self._add("location.unit", message)
         return False
 
     def _check_image(
@@ -279,8 +281,8 @@ class ObjectCheck:
         for name, stated, true in pairs:
             distance = 0.0 if stated is None else np.linalg.norm(stated - true, axis=-1).max()
             if distance > allowed:
-                got = f"{distance:.3g} px from the cuboid's image (allowed {allowed:.2g} px)"
-                self._add(name, got)
+                message = f"{distance:.3g} px from the cuboid's image (allowed {allowed:.2g} px)"
+                self._add(name, message)
 
 
 def _finite(values: Float[np.ndarray, "..."] | None) -> Float[np.ndarray, "..."] | None:

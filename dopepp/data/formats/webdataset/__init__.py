@@ -20,7 +20,7 @@ from jaxtyping import Int64
 
 from dopepp.core.errors import UserError
 from dopepp.data.archive import Bounded
-from dopepp.data.formats.problems import STRICT, Place, Problems
+from dopepp.data.formats.problems import STRICT, Node, Problems
 
 FIELDS: Final = ("image", "depth", "camera", "gt", "gt_info", "mask_visib")
 """What is read of an image."""
@@ -68,7 +68,7 @@ class ShardIndex:
 
 def read_span(path: Path, offset: int, size: int) -> bytes:
     """Return a part of a file; a UserError where the file is shorter now or missing."""
-    got = f"cut short within the member at byte {offset}"
+    problem = f"cut short within the member at byte {offset}"
     try:
         with path.open("rb") as file:
             file.seek(offset)
@@ -76,8 +76,8 @@ def read_span(path: Path, offset: int, size: int) -> bytes:
         if len(content) == size:
             return content
     except OSError as error:
-        got = str(error.strerror)
-    raise UserError(f"shard {path}: {got}", _ALLOWED, "copy, unzip or download the shard again")
+        problem = str(error.strerror)
+    raise UserError(f"shard {path}: {problem}", _ALLOWED, "copy, unzip or download the shard again")
 
 
 def index_shard(path: Path) -> ShardIndex:
@@ -87,7 +87,7 @@ def index_shard(path: Path) -> ShardIndex:
         UserError: :func:`members` reports a problem, or an image lacks its picture or its camera,
             or has two of them.
     """
-    place = Place(STRICT, path, "archive")
+    node = Node(STRICT, path, "archive")
     rows: dict[str, int] = {}
     spans: dict[tuple[int, int], tuple[int, int]] = {}
     for member in members(path):
@@ -95,7 +95,7 @@ def index_shard(path: Path) -> ShardIndex:
         if field is not None:
             slot = rows.setdefault(member.key, len(rows)), FIELDS.index(field)
             if slot in spans:
-                place.report(f"{member.key} with two members for its {field}", _ALLOWED)
+                node.report(f"{member.key} with two members for its {field}", _ALLOWED)
             spans[slot] = member.offset, member.size
     table = np.full((len(rows), len(FIELDS), 2), -1, np.int64)
     if spans:
@@ -103,7 +103,7 @@ def index_shard(path: Path) -> ShardIndex:
     for name, noun in (("image", "rgb or gray"), ("camera", "camera")):
         for key, row in rows.items():
             if table[row, FIELDS.index(name), 0] < 0:
-                place.report(f"{key} without {noun}", _ALLOWED)
+                node.report(f"{key} without {noun}", _ALLOWED)
     return ShardIndex(path, list(rows), table)
 
 
@@ -113,24 +113,24 @@ def members(path: Path, problems: Problems = STRICT) -> Iterator[TarMember]:
     Reported and skipped are an archive that is compressed, cut short or damaged, and a member that
     is no plain file, leads out of the archive, has no extension, comes twice or is too large.
     """
-    place = Place(problems, path, "archive")
+    node = Node(problems, path, "archive")
     try:
         with path.open("rb") as file:
             if file.read(2) == b"\x1f\x8b":
-                place.report("a compressed archive, in which no member can be found", _ALLOWED)
+                node.report("a compressed archive, in which no member can be found", _ALLOWED)
                 return
             size = file.seek(0, io.SEEK_END)
             file.seek(0)
-            yield from _walk(place, file, size)
+            yield from _walk(node, file, size)
     except UserError:
         raise
     except OSError as error:
-        place.report(str(error.strerror or error), _ALLOWED)
+        node.report(str(error.strerror or error), _ALLOWED)
     except (tarfile.TarError, ValueError, OverflowError) as error:
-        place.report(f"damaged: {error}", _ALLOWED)
+        node.report(f"damaged: {error}", _ALLOWED)
 
 
-def _walk(place: Place, file: io.BufferedReader, size: int) -> Iterator[TarMember]:
+def _walk(node: Node, file: io.BufferedReader, size: int) -> Iterator[TarMember]:
     names: set[str] = set()
     with tarfile.open(fileobj=Bounded(file), mode="r:") as archive:
         while (info := archive.next()) is not None:
@@ -140,10 +140,10 @@ def _walk(place: Place, file: io.BufferedReader, size: int) -> Iterator[TarMembe
             if (info.isdir() or is_meta) and not _leads_out(info):
                 continue
             if len(names) == MAX_MEMBERS:
-                place.report(f"over {MAX_MEMBERS:,} members", _ALLOWED)
+                node.report(f"over {MAX_MEMBERS:,} members", _ALLOWED)
                 return
-            if got := "twice" if info.name in names else _refusal(info, size):
-                place.report(f"member {info.name!r:.80} {got}", _ALLOWED)
+            if problem := "twice" if info.name in names else _refusal(info, size):
+                node.report(f"member {info.name!r:.80} {problem}", _ALLOWED)
                 continue
             names.add(info.name)
             key, _, extension = name.name.partition(".")
@@ -154,7 +154,7 @@ def _walk(place: Place, file: io.BufferedReader, size: int) -> Iterator[TarMembe
     # tarfile takes a damaged header after the first, and the end of the file, for the archive's.
     file.seek(end)
     if file.read(tarfile.BLOCKSIZE) != bytes(tarfile.BLOCKSIZE):
-        place.report(f"cut short or damaged at byte {end}", _ALLOWED)
+        node.report(f"cut short or damaged at byte {end}", _ALLOWED)
 
 
 def _leads_out(info: tarfile.TarInfo) -> bool:

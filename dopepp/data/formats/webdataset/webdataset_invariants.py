@@ -16,7 +16,7 @@ from dopepp.data.formats import webdataset as shards
 from dopepp.data.formats.bop import BopPoses
 from dopepp.data.formats.bop.bop_invariants import Models, Oddities, check_image, load_models
 from dopepp.data.formats.images import COLOUR_MODES, DEPTH_MODES, one_channel_of, picture_shape
-from dopepp.data.formats.problems import CheckReport, Place
+from dopepp.data.formats.problems import CheckReport, Node
 from dopepp.data.formats.webdataset.webdataset_reader import ShardRecords
 from dopepp.drawing.pictures import Mask, Shape
 
@@ -43,8 +43,8 @@ def check_webdataset(report: CheckReport) -> None:
         for key, group in groupby(shards.members(path, report), key=lambda member: member.key):
             if key in keys:
                 same = keys[key] == path.name
-                got = "its members are not together" if same else f"also in {keys[key]}"
-                report.report(f"{path}/{key}", "key", got)
+                problem = "its members are not together" if same else f"also in {keys[key]}"
+                report.report(f"{path}/{key}", "key", problem)
             keys[key] = path.name
             content = _content(report, path, group)
             oddities.count(_check_image(report, f"{path}/{key}", content, models), models)
@@ -53,12 +53,12 @@ def check_webdataset(report: CheckReport) -> None:
         if staged := len(list((path.parent / STAGING).glob("**/[0-9]*.tar"))):
             report.note(f"{path.parent}: {staged} images written and not yet finalized")
     for folder, keys in seen.items():
-        place = Place(report, folder / shards.KEY_FILE)
-        listed = place.load() if (folder / shards.KEY_FILE).is_file() else None
+        node = Node(report, folder / shards.KEY_FILE)
+        listed = node.load() if (folder / shards.KEY_FILE).is_file() else None
         for key in sorted(keys.keys() - listed.keys()) if listed else ():
-            place[key].report(f"missing; it is in {keys[key]}")
+            node[key].report(f"missing; it is in {keys[key]}")
         for key in sorted(listed.keys() - keys.keys()) if listed else ():
-            place[key].report("in no shard")
+            node[key].report("in no shard")
 
 
 def _content(report: CheckReport, path: Path, group: Iterator[shards.TarMember]) -> Content:
@@ -68,7 +68,7 @@ def _content(report: CheckReport, path: Path, group: Iterator[shards.TarMember])
     for _, extension, *span in group:
         total += span[1]
         if total <= _MAX_IMAGE_BYTES:
-            data = Place(report, path, "archive").attempt(partial(shards.read_span, path, *span))
+            data = Node(report, path, "archive").attempt(partial(shards.read_span, path, *span))
             content |= {} if data is None else {extension: data}
     return content
 
@@ -80,11 +80,11 @@ def _check_image(
     names = {shards.field_of(name): name for name in reversed(content)}
     shape: Shape | None = None
     if name := names.get("image"):
-        shape = picture_shape(Place(report, f"{start}.{name}"), content[name], COLOUR_MODES)
+        shape = picture_shape(Node(report, f"{start}.{name}"), content[name], COLOUR_MODES)
     else:
         report.report(f"{start}.rgb.png", "member", "missing")
     if name := names.get("depth"):
-        one_channel_of(Place(report, f"{start}.{name}"), shape, content[name], DEPTH_MODES)
+        one_channel_of(Node(report, f"{start}.{name}"), shape, content[name], DEPTH_MODES)
     if "camera.json" not in content:
         report.report(f"{start}.camera.json", "member", "missing")
     if "gt.json" not in content:
@@ -98,4 +98,4 @@ def _check_image(
         return records.mask(name, number, shape) if shape and name in present else None
 
     has_depth = "depth" in names
-    return check_image(records.places, camera, truths, infos, shape, has_depth, models, read_mask)
+    return check_image(records.nodes, camera, truths, infos, shape, has_depth, models, read_mask)

@@ -25,7 +25,7 @@ from dopepp.core.json import MAX_BYTES
 from dopepp.data.formats import ESTIMATED, bop, make_instance, share
 from dopepp.data.formats.bop.bop_models import parts_by_id
 from dopepp.data.formats.images import decode_depth, decode_rgb, decode_runs
-from dopepp.data.formats.problems import STRICT, Place, Problems, mapping
+from dopepp.data.formats.problems import STRICT, Node, Problems, mapping
 from dopepp.data.formats.webdataset import ShardIndex, index_shard
 from dopepp.data.sample import Sample, SourceInfo
 from dopepp.drawing.pictures import Mask, Shape
@@ -94,14 +94,14 @@ class WebdatasetReader:
         assert content is not None  # the index holds no image without
         picture = decode_rgb(content, records.start)
         shape: Shape = picture.shape[:2]
-        K, scales = bop.read_cameras([records.json("camera")], records.places)
+        K, scales = bop.read_cameras([records.json("camera")], records.nodes)
         camera = check_camera(K[0], (shape[1], shape[0]), records.start)
         has_masks = records.json("mask_visib") is not None
         poses = records.poses()
         if poses.inexact.any() and not self._logged_inexact:
             self._logged_inexact = True
-            got = f"rotations orthogonal to {bop.INEXACT:g} only"
-            _log.warning("%s: %s; the nearest are taken", records.start, got)
+            problem = f"rotations orthogonal to {bop.INEXACT:g} only"
+            _log.warning("%s: %s; the nearest are taken", records.start, problem)
         instances = []
         for number in self._chosen(poses):
             mask = records.mask("mask_visib", number, shape) if has_masks else None
@@ -159,11 +159,11 @@ class ShardRecords:
         self.start, self._read, self._problems = start, read, problems
         self.json = cache(self._json)
 
-    def _member(self, name: str) -> Place:
-        return Place(self._problems, f"{self.start}.{name}.json")
+    def _member(self, name: str) -> Node:
+        return Node(self._problems, f"{self.start}.{name}.json")
 
-    def places(self, what: str, number: int) -> Place:
-        """Return a record's place."""
+    def nodes(self, what: str, number: int) -> Node:
+        """Return a record's node."""
         member = self._member(what)
         return member if what == "camera" else member[number]
 
@@ -189,7 +189,7 @@ class ShardRecords:
 
     def poses(self) -> bop.BopPoses:
         """Return the ground truth; empty where there is none."""
-        return bop.read_poses(self.truths, self.infos, self.places)
+        return bop.read_poses(self.truths, self.infos, self.nodes)
 
     def mask(self, name: str, number: int, shape: Shape) -> Mask | None:
         """Return an object's mask in ``mask`` or ``mask_visib``, None where it is damaged."""
@@ -208,8 +208,8 @@ def _check_keys(shards: Sequence[ShardIndex]) -> None:
     owners: dict[str, Path] = {}
     for shard in shards:
         if twice := [key for key in shard.keys if key in owners]:
-            got = f"{shard.path} with {len(twice)} keys of {owners[twice[0]]}, e.g. {twice[:3]}"
-            raise UserError(got, "each key in one shard", "write or download the shard again")
+            problem = f"{shard.path} with {len(twice)} keys of {owners[twice[0]]}, e.g. {twice[:3]}"
+            raise UserError(problem, "each key in one shard", "write or download the shard again")
         owners |= dict.fromkeys(shard.keys, shard.path)
 
 
@@ -246,8 +246,8 @@ def _expanded(text: str) -> list[str]:
             if len(expanded) <= MAX_SHARDS:
                 return expanded
     except ValueError as error:
-        got, allowed = f"shards {text!r:.100}: {error}", "braces as in shard-{00..09}.tar"
-        raise UserError(got, allowed, "close the brace") from error
+        problem, allowed = f"shards {text!r:.100}: {error}", "braces as in shard-{00..09}.tar"
+        raise UserError(problem, allowed, "close the brace") from error
     allowed = f"at most {MAX_SHARDS:,} shards"
     raise UserError(f"shards {text!r:.100}", allowed, "correct the range")
 
@@ -264,13 +264,15 @@ def _local(path: Path) -> list[Path]:
 
 
 def _fetched(url: str, scheme: str, folder: Path | None) -> Path:
-    got = f"shards {url!r:.100}"
+    problem = f"shards {url!r:.100}"
     if scheme == "pipe":  # a path in a stranger's config would run with the user's rights
         allowed = "files, folders and URLs of shards"
-        raise UserError(f"{got}, a command to run", allowed, "download the shards")
+        raise UserError(f"{problem}, a command to run", allowed, "download the shards")
     if folder is None:
         allowed = "local shards, or a folder to download them into"
-        raise UserError(f"{got}, which are not on this machine", allowed, "set data.download_dir")
+        raise UserError(
+            f"{problem}, which are not on this machine", allowed, "set data.download_dir"
+        )
     name = PurePosixPath(urlsplit(url).path).name
     if not name.endswith(".tar"):
         name = hashlib.sha256(url.encode()).hexdigest()[:16] + ".tar"
@@ -296,13 +298,13 @@ def _download(url: str, scheme: str, path: Path) -> None:
                 size += len(piece)
                 if size > MAX_SHARD_BYTES:
                     allowed = f"shards of at most {MAX_SHARD_BYTES / 1e9:.0f} GB"
-                    got = f"{url} of over {size / 1e9:.0f} GB"
-                    raise UserError(got, allowed, "download it by hand")
+                    problem = f"{url} of over {size / 1e9:.0f} GB"
+                    raise UserError(problem, allowed, "download it by hand")
                 file.write(piece)
         draft.replace(path)
     except OSError as error:
-        got = f"shard {url}, which cannot be fetched into {path.parent}: {error!s:.200}"
+        problem = f"shard {url}, which cannot be fetched into {path.parent}: {error!s:.200}"
         allowed = "a URL that can be read and enough space"
-        raise UserError(got, allowed, "check the URL and the connection") from error
+        raise UserError(problem, allowed, "check the URL and the connection") from error
     finally:
         draft.unlink(missing_ok=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dopepp.core.errors import UserError
 from dopepp.data.formats.images import read_map, stated_shape
 from dopepp.data.formats.invariants import rotation_problem
-from dopepp.data.formats.problems import STRICT, Place, Problems
+from dopepp.data.formats.problems import STRICT, Node, Problems
 from dopepp.drawing.pictures import Shape, read_image
 from dopepp.geometry.camera import CameraMatrix, Transform, make_transform
 
@@ -86,48 +86,48 @@ def read_meta(path: Path, problems: Problems = STRICT) -> FrameMeta:
     Reported are a file that is missing, cut short or lacks a field, and a pose that is not finite,
     no rotation, or behind the camera.
     """
-    place = Place(problems, path)
-    fields = _load(path, place["file"])
+    node = Node(problems, path)
+    fields = _load(path, node["file"])
     if fields is None:
         return FrameMeta({}, {}, None, np.nan)
     for name in ("cls_indexes", "poses", "factor_depth"):
         if name not in fields:
-            place[name].report("missing", _ALLOWED)
+            node[name].report("missing", _ALLOWED)
     factor_depth = np.nan
     if "factor_depth" in fields:
-        factor_depth = place["factor_depth"].scalar(fields["factor_depth"])
+        factor_depth = node["factor_depth"].scalar(fields["factor_depth"])
     if factor_depth <= 0:
-        place["factor_depth"].report(f"{factor_depth:g}", "above 0")
+        node["factor_depth"].report(f"{factor_depth:g}", "above 0")
     poses: dict[int, Transform] = {}
     columns: dict[int, int] = {}
-    for column, (index, pose) in enumerate(_columns(place, fields)):
+    for column, (index, pose) in enumerate(_columns(node, fields)):
         if index in poses:
-            place["cls_indexes"][column].report(f"class {index} twice", "each once")
+            node["cls_indexes"][column].report(f"class {index} twice", "each once")
             continue
-        poses[index] = _pose(pose, place["poses"][column])
+        poses[index] = _pose(pose, node["poses"][column])
         columns[index] = column
     K = fields.get("intrinsic_matrix")
-    K = None if K is None else place["intrinsic_matrix"].numbers(K, 3, 3)
+    K = None if K is None else node["intrinsic_matrix"].numbers(K, 3, 3)
     return FrameMeta(poses, columns, K, factor_depth)
 
 
-def _load(path: Path, place: Place) -> dict[str, NDArray[Any]] | None:
+def _load(path: Path, node: Node) -> dict[str, NDArray[Any]] | None:
     try:
         size = path.stat().st_size
         content = path.read_bytes() if size <= _MAX_META_BYTES else None
     except OSError as error:
-        place.report(str(error.strerror), _ALLOWED)
+        node.report(str(error.strerror), _ALLOWED)
         return None
     if content is None:
-        place.report(f"{size:,} bytes", f"at most {_MAX_META_BYTES:,}")
+        node.report(f"{size:,} bytes", f"at most {_MAX_META_BYTES:,}")
         return None
     if not _is_complete(content):
-        place.report(f"cut short after {size} bytes", _ALLOWED)
+        node.report(f"cut short after {size} bytes", _ALLOWED)
     try:
         # vertmap and the like are megabytes that nobody needs.
         return dict(scipy.io.loadmat(path, variable_names=_FIELDS))
     except Exception as error:  # SciPy lets through whatever a damaged byte happens to cause
-        place.report(f"damaged ({error})", _ALLOWED)
+        node.report(f"damaged ({error})", _ALLOWED)
         return None
 
 
@@ -141,31 +141,31 @@ def _is_complete(content: bytes) -> bool:
     return start == len(content) > _HEADER_BYTES
 
 
-def _columns(place: Place, fields: Mapping[str, NDArray[Any]]) -> list[tuple[int, NDArray[Any]]]:
+def _columns(node: Node, fields: Mapping[str, NDArray[Any]]) -> list[tuple[int, NDArray[Any]]]:
     """Return each object's class index and 3×4 pose; none where the two fields do not match."""
     if "cls_indexes" not in fields or "poses" not in fields:
         return []
     stored = np.asarray(fields["cls_indexes"])
-    indices = place["cls_indexes"].numbers(stored, stored.size)
+    indices = node["cls_indexes"].numbers(stored, stored.size)
     odd = indices[indices % 1 != 0]
     if np.isfinite(odd).any():
-        place["cls_indexes"].report(f"{odd.tolist()!r:.60}", "whole numbers")
+        node["cls_indexes"].report(f"{odd.tolist()!r:.60}", "whole numbers")
     stack = np.asarray(fields["poses"])
     stack = stack[..., None] if stack.shape == (3, 4) else stack  # MATLAB drops a last axis of 1
     if stack.shape != (3, 4, len(indices)):
-        place["poses"].report(f"shape {stack.shape} for {len(indices)} classes", "(3, 4, N)")
+        node["poses"].report(f"shape {stack.shape} for {len(indices)} classes", "(3, 4, N)")
     elif not len(odd):
         return [(int(index), stack[..., n]) for n, index in enumerate(indices)]
     return []
 
 
-def _pose(value: NDArray[Any], place: Place) -> Transform:
-    pose = place.numbers(value, 3, 4)
+def _pose(value: NDArray[Any], node: Node) -> Transform:
+    pose = node.numbers(value, 3, 4)
     if problem := rotation_problem(pose[:, :3]):
-        place["R"].report(problem, "a rigid transform")
+        node["R"].report(problem, "a rigid transform")
         pose[:, :3] = np.nan
     if pose[2, 3] <= 0:
-        place["z"].report(f"behind the camera (z = {pose[2, 3]:.3g} m)", "above 0")
+        node["z"].report(f"behind the camera (z = {pose[2, 3]:.3g} m)", "above 0")
         pose[:, 3] = np.nan
     return make_transform(pose[:, :3], pose[:, 3])
 
@@ -193,7 +193,7 @@ def read_frame(
 ) -> YcbFrame:
     """Read the frame whose paths begin with ``start``, e.g. ``data/0000/000001``."""
     colour, depth, label = (
-        Place(problems, Path(f"{start}-{name}.png")) for name in ("color", "depth", "label")
+        Node(problems, Path(f"{start}-{name}.png")) for name in ("color", "depth", "label")
     )
     path = Path(colour.path)
     image = colour["image"].attempt(lambda: _read_colour(path, alpha=subset == "synthetic"))
@@ -206,6 +206,6 @@ def read_frame(
 def _read_colour(path: Path, alpha: bool) -> UInt8[np.ndarray, "height width channels"]:
     image = read_image(path)
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 + alpha:
-        got, allowed = f"shape {image.shape}, {image.dtype}", f"8 bits and {3 + alpha} channels"
-        raise UserError(f"image {path} of {got}", allowed, "copy or download the file again")
+        problem, allowed = f"shape {image.shape}, {image.dtype}", f"8 bits and {3 + alpha} channels"
+        raise UserError(f"image {path} of {problem}", allowed, "copy or download the file again")
     return image

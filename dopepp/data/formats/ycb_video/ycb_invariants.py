@@ -15,7 +15,7 @@ import numpy as np
 
 from dopepp.core.errors import UserError
 from dopepp.data.formats.invariants import Box, box_problem, camera_problem, translation_problem
-from dopepp.data.formats.problems import CheckReport, Place
+from dopepp.data.formats.problems import CheckReport, Node
 from dopepp.data.formats.ycb_video import (
     FOLDERS,
     FrameMeta,
@@ -101,41 +101,41 @@ class _FrameCheck:
         """Check the files of the frame whose paths begin like this."""
         frame = read_frame(start, subset, self._report)
         meta, label = frame.meta, frame.labels
-        place = Place(self._report, Path(f"{start}-meta.mat"))
+        node = Node(self._report, Path(f"{start}-meta.mat"))
         K = meta.K if meta.K is not None and np.isfinite(meta.K).all() else None
         problem = None if K is None or frame.shape is None else camera_problem(K, frame.shape)
         if problem is not None:
-            place["intrinsic_matrix"].report(problem)
+            node["intrinsic_matrix"].report(problem)
             K = None
         self._check_box_file(Path(f"{start}-box.txt"), frame.shape)
         is_read = bool(meta.poses) or np.isfinite(meta.factor_depth)
         if label is not None and is_read:
             strangers = sorted(set(np.unique(label).tolist()) - {0, *meta.poses})
             if strangers:
-                got = f"classes {strangers} without a pose in meta.mat"
-                self._report.report(Path(f"{start}-label.png"), "values", got)
+                message = f"classes {strangers} without a pose in meta.mat"
+                self._report.report(Path(f"{start}-label.png"), "values", message)
         for index in meta.poses:
             seen = None if label is None else Box.of_mask(label == index)
-            self._check_pose(place, meta, index, K, seen)
+            self._check_pose(node, meta, index, K, seen)
 
     def _check_pose(
-        self, place: Place, meta: FrameMeta, index: int, K: CameraMatrix | None, seen: Box | None
+        self, node: Node, meta: FrameMeta, index: int, K: CameraMatrix | None, seen: Box | None
     ) -> None:
         column, T_cam_obj = meta.columns[index], meta.poses[index]
         if not 1 <= index <= len(self._classes):
             allowed = f"1 … {len(self._classes)}, the lines of classes.txt"
-            place["cls_indexes"][column].report(f"unknown class {index}", allowed)
+            node["cls_indexes"][column].report(f"unknown class {index}", allowed)
             return
-        place = place["poses"][column]
+        node = node["poses"][column]
         size = self._size(self._classes[index - 1])
         apart = translation_problem(T_cam_obj[:3, 3], None if size is None else size[1])
         if apart is not None:
-            place[apart[0]].report(apart[1])
+            node[apart[0]].report(apart[1])
         if apart or size is None or K is None or not np.isfinite(T_cam_obj).all():
             return
         problem = box_problem(transform(T_cam_obj, size[0]), K, seen)
         if problem is not None:
-            place["box"].report(problem)
+            node["box"].report(problem)
 
     def _check_box_file(self, path: Path, shape: Shape | None) -> None:
         """Check ``box.txt``, if present: name, left, top, right and bottom a line."""
@@ -144,17 +144,17 @@ class _FrameCheck:
             name, *values = line.split() or [""]
             if not name:
                 continue
-            place, got = Place(self._report, path, f"line {number}"), f"{line!r:.60}"
+            node, message = Node(self._report, path, f"line {number}"), f"{line!r:.60}"
             try:
                 left, top, right, bottom = map(float, values)
             except ValueError:
-                place.report(got, "a name and four numbers")
+                node.report(message, "a name and four numbers")
                 continue
             if name not in self._classes:
-                place.report(f"unknown object {name!r:.60}")
+                node.report(f"unknown object {name!r:.60}")
             if not (left < right and top < bottom):
-                place.report(got, "left < right and top < bottom")
+                node.report(message, "left < right and top < bottom")
             elif shape is not None:
                 height, width = shape
                 if left >= width or top >= height or right < 0 or bottom < 0:
-                    place.report(f"{got} outside the {width}×{height} image")
+                    node.report(f"{message} outside the {width}×{height} image")

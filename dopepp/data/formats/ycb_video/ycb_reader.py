@@ -96,9 +96,9 @@ class YcbVideoReader:
         is_there = {frame: Path(f"{self._start(frame)}-color.png").is_file() for frame in listed}
         absent = [frame for frame in listed if not is_there[frame]]
         if len(absent) == len(listed):
-            got = f"no frame of {where} under {folder} ({len(absent):,} listed)"
+            problem = f"no frame of {where} under {folder} ({len(absent):,} listed)"
             fix = "unpack the data set fully, or choose another image set"
-            raise UserError(got, "at least one listed frame on disk", fix)
+            raise UserError(problem, "at least one listed frame on disk", fix)
         if absent:
             counts = f"{len(absent):,} of {len(listed):,}"
             message = "%s: %s frames listed in %s are absent; first: %s"

@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 from dopepp.core.errors import UserError
 from dopepp.data.formats.bop.bop_models import bop_parts
 from dopepp.data.formats.images import decode_runs, encode_runs
-from dopepp.data.formats.problems import STRICT, Place
+from dopepp.data.formats.problems import STRICT, Node
 from dopepp.data.formats.webdataset import index_shard, members
 from dopepp.data.formats.webdataset.webdataset_reader import WebdatasetReader
 from dopepp.data.formats.webdataset.webdataset_writer import WebdatasetWriter
@@ -73,13 +73,13 @@ def test_the_library_and_tarfile_read_the_shards(written, samples):
 def test_runs_round_trip(mask):
     record = encode_runs(mask)
     assert sum(record["counts"]) == mask.size
-    np.testing.assert_array_equal(decode_runs(record, mask.shape, Place(STRICT, "x")), mask)
+    np.testing.assert_array_equal(decode_runs(record, mask.shape, Node(STRICT, "x")), mask)
 
 
 def test_runs_go_down_the_columns_and_begin_with_zeros():
     mask = np.array([[1, 0, 0], [1, 1, 0]], bool)
     assert encode_runs(mask) == {"counts": [0, 2, 1, 1, 2], "size": [2, 3]}
-    assert decode_runs({"counts": [6], "size": [2, 3]}, (2, 3), Place(STRICT, "x")).sum() == 0
+    assert decode_runs({"counts": [6], "size": [2, 3]}, (2, 3), Node(STRICT, "x")).sum() == 0
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def test_runs_go_down_the_columns_and_begin_with_zeros():
 )
 def test_damaged_runs(record, message):
     with pytest.raises(UserError, match=message):
-        decode_runs(record, (2, 3), Place(STRICT, "x"))
+        decode_runs(record, (2, 3), Node(STRICT, "x"))
 
 
 def image_files(key: str, **changes: object) -> list[tuple[str, bytes]]:
