@@ -15,6 +15,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
+from dopepp.data.formats.problems import Node
 from dopepp.drawing.pictures import Shape
 from dopepp.geometry.camera import CameraMatrix, check_camera, project
 from dopepp.geometry.rotation import RotationMatrix, Vector, is_rotation
@@ -75,48 +76,72 @@ def rotation_problem(rotation: RotationMatrix, tolerance: float = 1e-3) -> str |
     return f"no rotation: R·Rᵀ off by {allowed}, determinant {np.linalg.det(rotation):.3g}"
 
 
-def translation_problem(translation: Vector, diameter: float | None) -> tuple[str, str] | None:
-    """Return what is wrong with an object's position as (kind, message), or None.
+def check_translation(node: Node, translation: Vector, diameter: float | None) -> bool:
+    """Report an object behind the camera (``z``) or at an implausible distance (``unit``).
 
-    ``translation`` is in the camera frame, in the unit of ``diameter``, which may be unknown.
+    Args:
+        node: Parent of the two reported fields.
+        translation: Camera frame, in the unit of ``diameter``.
+        diameter: The object's diameter; None where it is unknown.
+
+    Returns:
+        Whether nothing is reported; a NaN is reported elsewhere.
     """
     depth = float(translation[2])
     if depth <= 0:
-        return "z", f"behind the camera (z = {depth:.4g})"
+        node["z"].report(f"behind the camera (z = {depth:.4g})")
+        return False
     if diameter is None or not diameter > 0 or not np.isfinite(translation).all():
-        return None
+        return True
     distance = float(np.linalg.norm(translation)) / diameter
     least, most = DIAMETERS_AWAY
     if least <= distance <= most:
-        return None
-    return "unit", (
+        return True
+    node["unit"].report(
         f"{distance:.3g} diameters ({diameter:.4g}) from the camera; {least:g} … {most:g} allowed: "
         "is one of the two in another unit (mm, m)?"
     )
+    return False
 
 
-def camera_problem(K: CameraMatrix, shape: Shape) -> str | None:
-    """Return why K cannot belong to an image of (height, width), or None."""
+def plausible_camera(
+    node: Node, K: CameraMatrix | None, shape: Shape | None
+) -> CameraMatrix | None:
+    """Return K, or None where it is missing, damaged or reported as implausible for the image.
+
+    Args:
+        node: The camera matrix's field.
+        K: Camera matrix in pixels.
+        shape: (height, width) of the image; None where it is unknown.
+    """
+    if K is None or not np.isfinite(K).all():
+        return None
+    if shape is None:
+        return K
     try:
         check_camera(K, shape[::-1], "this image")
     except UserError as error:
-        return f"{error.got}; allowed: {error.allowed}"
+        node.report(error.got, error.allowed)
+        return None
     ratio = float(K[0, 0] / K[1, 1])
-    if not PIXEL_ASPECT[0] <= ratio <= PIXEL_ASPECT[1]:
-        return f"fx/fy = {ratio:.3g}; allowed: {PIXEL_ASPECT[0]} … {PIXEL_ASPECT[1]}"
+    if PIXEL_ASPECT[0] <= ratio <= PIXEL_ASPECT[1]:
+        return K
+    node.report(f"fx/fy = {ratio:.3g}", f"{PIXEL_ASPECT[0]} … {PIXEL_ASPECT[1]}")
     return None
 
 
-def box_problem(
+def check_box(
+    node: Node,
     points_cam: Points,
     K: CameraMatrix,
     seen: Box | None,
     visible_fraction: float | None = None,
     shape: Shape | None = None,
-) -> str | None:
-    """Return how an object's visible pixels contradict its pose, or None.
+) -> None:
+    """Report visible pixels that contradict the object's pose.
 
     Args:
+        node: The box's field.
         points_cam: Points in the camera frame whose hull contains the object.
         K: Camera matrix in pixels.
         seen: Box of the visible pixels; None where nothing is visible.
@@ -125,25 +150,20 @@ def box_problem(
     """
     predicted = Box.of_points(project(points_cam, K))
     if predicted is None or seen is None:
-        return None
+        return
     width, height = predicted.right - predicted.left, predicted.bottom - predicted.top
     tolerance = max(BOX_TOLERANCE_PX, BOX_TOLERANCE_SHARE * max(width, height))
     beyond = predicted.beyond(seen)
     if beyond > tolerance:
-        return (
-            f"seen at {seen}, {beyond:.0f} px outside the reprojected box {predicted} "
-            f"(allowed {tolerance:.0f} px)"
-        )
-    if visible_fraction is None or visible_fraction < FULLY_VISIBLE:
-        return None
-    if shape is not None and not predicted.is_inside(shape):
-        return None
-    cover = max(
-        (seen.right - seen.left + 1) / (width + 1), (seen.bottom - seen.top + 1) / (height + 1)
-    )
-    if cover >= SMALLEST_COVER:
-        return None
-    return (
-        f"fully visible at {seen}, {cover:.0%} of the reprojected box {predicted} "
-        f"(allowed: at least {SMALLEST_COVER:.0%} of its width or height)"
-    )
+        distance = f"{beyond:.0f} px outside the reprojected box {predicted}"
+        node.report(f"seen at {seen}, {distance} (allowed {tolerance:.0f} px)")
+        return
+    is_whole = visible_fraction is not None and visible_fraction >= FULLY_VISIBLE
+    if not is_whole or (shape is not None and not predicted.is_inside(shape)):
+        return
+    across, down = seen.right - seen.left + 1, seen.bottom - seen.top + 1
+    cover = max(across / (width + 1), down / (height + 1))
+    if cover < SMALLEST_COVER:
+        allowed = f"(allowed: at least {SMALLEST_COVER:.0%} of its width or height)"
+        share = f"{cover:.0%} of the reprojected box {predicted}"
+        node.report(f"fully visible at {seen}, {share} {allowed}")

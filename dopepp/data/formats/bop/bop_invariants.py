@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.data.formats import STAGING, bop, invariants, staged_items
+from dopepp.data.formats import STAGING, bop, staged_items
 from dopepp.data.formats.bop import (
     DEPTH_SUFFIXES,
     IMAGE_FOLDERS,
@@ -32,7 +32,7 @@ from dopepp.data.formats.bop import (
 )
 from dopepp.data.formats.bop.bop_models import INFO_FILE, info_path, modelled, parse_models, part_of
 from dopepp.data.formats.images import COLOUR_MODES, DEPTH_MODES, one_channel_of, picture_shape
-from dopepp.data.formats.invariants import Box
+from dopepp.data.formats.invariants import Box, check_box, check_translation, plausible_camera
 from dopepp.data.formats.problems import CheckReport, Node, mapping
 from dopepp.drawing.pictures import Mask, Shape
 from dopepp.geometry.camera import CameraMatrix, transform
@@ -287,9 +287,7 @@ def check_image(
         node, T_cam_obj, stated = nodes("gt", n), poses.T_cam_obj[n], poses.visible_fractions[n]
         fraction = None if np.isnan(stated) else float(stated)
         model = (models or {}).get(int(poses.obj_ids[n]), Model())
-        problem = invariants.translation_problem(T_cam_obj[:3, 3], model.diameter)
-        if problem is not None:
-            node["cam_t_m2c"][problem[0]].report(problem[1])
+        is_posed = check_translation(node["cam_t_m2c"], T_cam_obj[:3, 3], model.diameter)
         whole, visible = read_mask("mask", n), read_mask("mask_visib", n)
         if whole is not None and visible is not None and whole.shape == visible.shape:
             outside = int(np.count_nonzero(visible & ~whole))
@@ -299,11 +297,9 @@ def check_image(
         if info is not None:
             _check_counts(nodes("gt_info", n), info, visible, fraction)
             seen = _check_boxes(nodes("gt_info", n), info, seen)
-        is_posed = problem is None and bool(np.isfinite(T_cam_obj).all())
+        is_posed &= bool(np.isfinite(T_cam_obj).all())
         if is_posed and K is not None and model.corners is not None:
-            apart = invariants.box_problem(transform(T_cam_obj, model.corners), K, seen, fraction)
-            if apart is not None:
-                node["box"].report(apart)
+            check_box(node["box"], transform(T_cam_obj, model.corners), K, seen, fraction)
     return poses
 
 
@@ -314,13 +310,7 @@ def _check_camera(
     K: CameraMatrix = bop.read_cameras([camera], nodes)[0][0]
     if has_depth and "depth_scale" not in mapping(camera):
         node["depth_scale"].report("missing", "millimetres a unit of the depth")
-    if not np.isfinite(K).all():
-        return None
-    problem = None if shape is None else invariants.camera_problem(K, shape)
-    if problem is None:
-        return K
-    node["cam_K"].report(problem)
-    return None
+    return plausible_camera(node["cam_K"], K, shape)
 
 
 def _check_counts(

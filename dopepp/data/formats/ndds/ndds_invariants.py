@@ -16,7 +16,7 @@ import numpy as np
 
 from dopepp.data.formats import ndds
 from dopepp.data.formats.images import picture_shape, read_map
-from dopepp.data.formats.invariants import camera_problem
+from dopepp.data.formats.invariants import plausible_camera
 from dopepp.data.formats.ndds import IMAGE_SUFFIXES, NddsSettings, Objects
 from dopepp.data.formats.ndds.object_invariants import Majority, ObjectCheck
 from dopepp.data.formats.problems import CheckReport, Node, mapping
@@ -128,13 +128,7 @@ def _check_camera(
     if shape is not None and None not in (width, height) and (height, width) != shape:
         node["size"].report(f"{width}×{height}; the image has {shape[1]}×{shape[0]}")
     K = settings.camera(record, Path(node.path), node.problems)
-    if not np.isfinite(K).all():
-        return None
-    problem = None if shape is None else camera_problem(K, shape)
-    if problem is None:
-        return K
-    node["intrinsics"].report(problem)
-    return None
+    return plausible_camera(node["intrinsics"], K, shape)
 
 
 def _check_ids(node: Node, objects: Objects) -> set[int]:

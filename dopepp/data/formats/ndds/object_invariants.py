@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.data.formats.invariants import Box, box_problem, translation_problem
+from dopepp.data.formats.invariants import Box, check_box, check_translation
 from dopepp.data.formats.ndds import NddsObject
 from dopepp.data.formats.ndds.conventions import OPENGL
 from dopepp.data.formats.problems import CheckReport, Node, mapping
@@ -233,9 +233,7 @@ class ObjectCheck:
         """Check location, centroid and unit; tell whether projections can mean anything."""
         cuboid, centroid = self._cuboid, self._centroid
         diagonal = None if cuboid is None else float(np.linalg.norm(cuboid[0] - cuboid[6]))
-        problem = translation_problem(axes @ location, diagonal)
-        if problem is not None:
-            self._add(f"location.{problem[0]}", problem[1])
+        if not check_translation(self._node["location"], axes @ location, diagonal):
             return False
         if cuboid is None or diagonal is None:
             return True
@@ -265,9 +263,7 @@ class ObjectCheck:
             points = np.column_stack([self._projected, np.ones(8)]) @ np.linalg.inv(K).T
         else:
             return
-        problem = box_problem(points, K, seen, fraction, shape)
-        if problem is not None:
-            self._add("box", problem)
+        check_box(self._node["box"], points, K, seen, fraction, shape)
 
     def _check_projections(self, cuboid: Corners, K: CameraMatrix) -> None:
         expected = project(np.vstack([cuboid, cuboid.mean(axis=0)]), K)

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.invariants import Box, box_problem, camera_problem, translation_problem
+from dopepp.data.formats.invariants import Box, check_box, check_translation, plausible_camera
 from dopepp.data.formats.problems import CheckReport, Node
 from dopepp.data.formats.ycb_video import (
     FOLDERS,
@@ -102,11 +102,7 @@ class _FrameCheck:
         frame = read_frame(start, subset, self._report)
         meta, label = frame.meta, frame.labels
         node = Node(self._report, Path(f"{start}-meta.mat"))
-        K = meta.K if meta.K is not None and np.isfinite(meta.K).all() else None
-        problem = None if K is None or frame.shape is None else camera_problem(K, frame.shape)
-        if problem is not None:
-            node["intrinsic_matrix"].report(problem)
-            K = None
+        K = plausible_camera(node["intrinsic_matrix"], meta.K, frame.shape)
         self._check_box_file(Path(f"{start}-box.txt"), frame.shape)
         is_read = bool(meta.poses) or np.isfinite(meta.factor_depth)
         if label is not None and is_read:
@@ -128,14 +124,11 @@ class _FrameCheck:
             return
         node = node["poses"][column]
         size = self._size(self._classes[index - 1])
-        apart = translation_problem(T_cam_obj[:3, 3], None if size is None else size[1])
-        if apart is not None:
-            node[apart[0]].report(apart[1])
-        if apart or size is None or K is None or not np.isfinite(T_cam_obj).all():
-            return
-        problem = box_problem(transform(T_cam_obj, size[0]), K, seen)
-        if problem is not None:
-            node["box"].report(problem)
+        points, diameter = (None, None) if size is None else size
+        is_posed = check_translation(node, T_cam_obj[:3, 3], diameter)
+        is_posed &= bool(np.isfinite(T_cam_obj).all())
+        if is_posed and points is not None and K is not None:
+            check_box(node["box"], transform(T_cam_obj, points), K, seen)
 
     def _check_box_file(self, path: Path, shape: Shape | None) -> None:
         """Check ``box.txt``, if present: name, left, top, right and bottom a line."""
