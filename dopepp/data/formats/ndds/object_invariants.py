@@ -113,21 +113,8 @@ class ObjectCheck:
         An unknown argument is None; ``sides`` are the class's ``cuboid_dimensions``.
         """
         rotations = self._rotations()
-        if self._cuboid is not None and not _is_box(self._cuboid):
-            self._add("cuboid", "no box in NDDS order: edges not parallel, equal or perpendicular")
-            self._cuboid = None
         if self._cuboid is not None:
-            problem = None if sides is None else _size_problem(self._cuboid, sides)
-            if problem is not None:
-                self._add(f"cuboid.{problem[0]}", problem[1])
-            axes = _box_axes(self._cuboid)
-            if axes is not None and rotations:
-                fits = {
-                    order: _quarter_turn_distance(rotation.T @ axes) <= ORIENTATION_RAD
-                    for order, rotation in rotations.items()
-                }
-                problem_text = "not the cuboid's orientation in either order"
-                self._judge("quaternion_xyzw", fits, problem_text)
+            self._check_cuboid(self._cuboid, rotations, sides)
         self._check_transforms(rotations)
         # The file itself may state that nobody sees the object, or not know.
         is_hidden = self._visibility is not None and self._visibility <= 0
@@ -167,6 +154,36 @@ class ObjectCheck:
         elif not all(fits.values()):
             way = next(way for way, fit in fits.items() if fit)
             self._majority.vote(field, way, self._node[field])
+
+    def _check_cuboid(
+        self, corners: Corners, rotations: Mapping[str, RotationMatrix], sides: Vector | None
+    ) -> None:
+        """Compare the cuboid with a box, its class's sides and the quaternion."""
+        edges = corners[_EDGES[..., 1]] - corners[_EDGES[..., 0]]
+        means = edges.mean(axis=1)
+        lengths = np.linalg.norm(means, axis=1)
+        smallest = EDGE_SHARE * lengths.max()
+        is_box, axes = np.abs(edges - means[:, None]).max() <= smallest, None
+        if lengths.min() > smallest:  # a flat box has no third direction
+            axes = np.asarray((means / lengths[:, None]).T)
+            is_box &= np.abs(axes.T @ axes - np.eye(3)).max() <= EDGE_SHARE
+        if not is_box:
+            self._add("cuboid", "no box in NDDS order: edges not parallel, equal or perpendicular")
+            self._cuboid = None
+            return
+        lengths = np.linalg.norm(edges[:, 0], axis=1)
+        if sides is not None and np.abs(lengths - sides).max() > SIZE_SHARE * sides.max():
+            power = np.log10(max(lengths.max(), 1e-12) / sides.max())
+            is_power = abs(round(power)) >= 1 and abs(power - round(power)) < SIZE_SHARE
+            message = f"edges {_text(lengths)}; its class has cuboid_dimensions {_text(sides)}"
+            self._add("cuboid.unit" if is_power else "cuboid.size", message)
+        if axes is not None and rotations:
+            fits = {
+                order: _quarter_turn_distance(rotation.T @ axes) <= ORIENTATION_RAD
+                for order, rotation in rotations.items()
+            }
+            message = "not the cuboid's orientation in either order"
+            self._judge("quaternion_xyzw", fits, message)
 
     def _check_transforms(self, rotations: Mapping[str, RotationMatrix]) -> None:
         """Check NDDS's matrix: rows P·Rᵀ (mirrored: Unreal is left-handed), the location below."""
@@ -283,37 +300,6 @@ class ObjectCheck:
 
 def _finite(values: Float[np.ndarray, "..."] | None) -> Float[np.ndarray, "..."] | None:
     return values if values is not None and np.isfinite(values).all() else None
-
-
-def _is_box(corners: Corners) -> bool:
-    """Tell whether eight points are the corners of a box in NDDS order."""
-    edges = corners[_EDGES[..., 1]] - corners[_EDGES[..., 0]]
-    means = edges.mean(axis=1)
-    lengths = np.linalg.norm(means, axis=1)
-    if np.abs(edges - means[:, None]).max() > EDGE_SHARE * lengths.max():
-        return False
-    axes = _box_axes(corners)
-    return axes is None or bool(np.abs(axes.T @ axes - np.eye(3)).max() <= EDGE_SHARE)
-
-
-def _box_axes(corners: Corners) -> RotationMatrix | None:
-    """Return the directions of a box's edges as columns; None for a flat box."""
-    means = (corners[_EDGES[..., 1]] - corners[_EDGES[..., 0]]).mean(axis=1)
-    lengths = np.linalg.norm(means, axis=1)
-    if lengths.min() <= EDGE_SHARE * lengths.max():
-        return None
-    return np.asarray((means / lengths[:, None]).T)
-
-
-def _size_problem(corners: Corners, sides: Vector) -> tuple[str, str] | None:
-    """Return how a box differs from its class's sides as (kind, message), or None."""
-    edges = np.linalg.norm(corners[_EDGES[:, 0, 1]] - corners[_EDGES[:, 0, 0]], axis=1)
-    if np.abs(edges - sides).max() <= SIZE_SHARE * sides.max():
-        return None
-    power = np.log10(max(edges.max(), 1e-12) / sides.max())
-    in_another_unit = abs(round(power)) >= 1 and abs(power - round(power)) < SIZE_SHARE
-    message = f"edges {_text(edges)}; its class has cuboid_dimensions {_text(sides)}"
-    return ("unit" if in_another_unit else "size"), message
 
 
 def _quarter_turn_distance(rotation: RotationMatrix) -> float:
