@@ -1,8 +1,8 @@
-"""BOP's annotations as checked arrays: camera, poses, visible fractions; millimetres to metres.
+"""Read BOP's annotations into arrays: cameras, poses and visible fractions, in metres.
 
-The same records stand in a scene's ``scene_*.json`` (by image) and in a shard's ``KEY.*.json``. A
-wrong record goes to the :class:`~dopepp.data.formats.problems.Problems` and leaves NaN in the
-arrays. A scene has the folders ``rgb`` (or ``gray``), ``depth``, ``mask`` and ``mask_visib``.
+A scene's ``scene_*.json`` (by image) and a shard's ``KEY.*.json`` hold the same records. A wrong
+record is reported and leaves NaN in the arrays. A scene has the folders ``rgb`` (or ``gray``),
+``depth``, ``mask`` and ``mask_visib``.
 """
 
 from __future__ import annotations
@@ -29,19 +29,20 @@ MM: Final = 1000.0
 """Millimetres per metre."""
 
 EXACT: Final = 1e-3
+"""Largest deviation of R·Rᵀ from the identity of a rotation that is kept as stated."""
+
 INEXACT: Final = 1e-2
-"""Largest deviation of R·Rᵀ from the identity of a matrix that is kept, and of one that the nearest
-rotation replaces. LM-O's published poses are off by up to 2e-3."""
+"""Largest deviation of a matrix that the nearest rotation replaces; LM-O's reach 2e-3."""
 
 _ROUNDING: Final = 1e-3
-"""By which a visible fraction may leave [0, 1]."""
+"""Distance by which a visible fraction may lie outside [0, 1]."""
 
 MAX_SCENE_BYTES: Final = 128_000_000
 """Largest JSON file of a scene: 40,000 images with ten objects each."""
 
-IMAGE_FOLDERS: Final = ("rgb", "gray")
-IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-DEPTH_SUFFIXES: Final = (".png", ".tif", ".tiff")
+PICTURES: Final = ("rgb", "gray"), (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+DEPTHS: Final = ("depth",), (".png", ".tif", ".tiff")
+"""Folders, of which the first existing one counts, and suffixes of a scene's images."""
 
 Record = Mapping[str, Any]
 
@@ -54,10 +55,10 @@ class BopPoses:
     """The posed objects of one or more images.
 
     Attributes:
-        obj_ids: BOP's object numbers; −1 where damaged.
-        T_cam_obj: Rigid transforms, metres; with NaN where damaged.
-        visible_fractions: As stated; NaN where not stated.
-        inexact: Whether the stated matrix was replaced by the nearest rotation (``INEXACT``).
+        obj_ids: BOP's object numbers; −1 for a damaged one.
+        T_cam_obj: Rigid transforms, metres; NaN in a damaged one.
+        visible_fractions: Stated fractions; NaN for a missing one.
+        inexact: Whether the nearest rotation replaces the stated matrix (``INEXACT``).
     """
 
     obj_ids: Int[np.ndarray, " objects"]
@@ -66,12 +67,12 @@ class BopPoses:
     inexact: Bool[np.ndarray, " objects"]
 
     def of(self, chosen: Bool[np.ndarray, " objects"]) -> BopPoses:
-        """Return some of the objects."""
+        """Return the chosen objects."""
         fields = (self.obj_ids, self.T_cam_obj, self.visible_fractions, self.inexact)
         return BopPoses(*(values[chosen] for values in fields))
 
     def without_model(self, modelled: Collection[int]) -> Counter[int]:
-        """Count the objects without a model by number; ``modelled`` is empty without any model."""
+        """Count by number the objects outside ``modelled``; none if ``modelled`` is empty."""
         ids = self.obj_ids[self.obj_ids >= 0].tolist()
         return Counter(number for number in ids if modelled and number not in modelled)
 
@@ -79,7 +80,7 @@ class BopPoses:
 def read_cameras(
     records: Sequence[object], nodes: Nodes
 ) -> tuple[Float[np.ndarray, "images 3 3"], Float[np.ndarray, " images"]]:
-    """Return every image's K in pixels and its ``depth_scale`` (mm a unit; NaN if not stated)."""
+    """Return each image's K in pixels and ``depth_scale`` in mm a unit (NaN if not stated)."""
     node = partial(nodes, "camera")
     K = _column(records, "cam_K", 9, node).reshape(-1, 3, 3)
     scales = _stated_column(records, "depth_scale", node)
@@ -89,9 +90,12 @@ def read_cameras(
 
 
 def pair_infos(truths: Sequence[Record], stated: object, node: Node) -> list[Record | None]:
-    """Return one ``gt_info`` record for each of an image's objects, None where there is none.
+    """Return the ``gt_info`` record of each object of an image; None for a missing one.
 
-    ``stated`` is the image's entry; null and an empty list state nothing.
+    Args:
+        truths: The image's ``gt`` records.
+        stated: The image's ``gt_info`` entry; null and an empty list state nothing.
+        node: The entry's node.
     """
     if stated is None or stated == []:
         return [None] * len(truths)
@@ -107,9 +111,9 @@ def read_poses(truths: Sequence[Record], infos: Sequence[Record | None], nodes: 
     """Return the objects of ``gt`` and ``gt_info`` records.
 
     Args:
-        truths: Records of ``cam_R_m2c`` (row by row), ``cam_t_m2c`` (mm) and ``obj_id``.
-        infos: A record for each object or None; it may have ``visib_fract``.
-        nodes: Nodes of the records, where each wrong field is reported.
+        truths: Records with ``cam_R_m2c`` (row by row), ``cam_t_m2c`` (mm) and ``obj_id``.
+        infos: Each object's record, which may have ``visib_fract``, or None.
+        nodes: Nodes of the records.
     """
     node, info_node = partial(nodes, "gt"), partial(nodes, "gt_info")
     rotations = _column(truths, "cam_R_m2c", 9, node).reshape(-1, 3, 3)
@@ -138,7 +142,7 @@ def read_poses(truths: Sequence[Record], infos: Sequence[Record | None], nodes: 
 def _stated_column(
     records: Sequence[object], field: str, node: Callable[[int], Node]
 ) -> Float[np.ndarray, " records"]:
-    """Return a number of the records that state it, NaN for the others."""
+    """Return one number per record; NaN for a record that does not state the number."""
     stated = [n for n, record in enumerate(records) if field in mapping(record)]
     values = np.full(len(records), math.nan)
     rows = [records[n] for n in stated]
@@ -149,10 +153,9 @@ def _stated_column(
 def _column(
     records: Sequence[object], field: str, count: int, node: Callable[[int], Node]
 ) -> Float[np.ndarray, "records count"]:
-    """Return a field of all records at once; record by record only to report the wrong ones.
+    """Convert a field of all records at once, or record by record to report the wrong ones.
 
-    Nested lists of the right size, ``[[…], […], […]]`` for a matrix, are accepted as by other
-    tools.
+    Nested lists of the right size, e.g. ``[[…], […], […]]`` for a matrix, are accepted.
     """
     if not records:
         return np.empty((0, count))
@@ -170,7 +173,7 @@ def _column(
 
 
 def _orthogonality(matrices: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
-    """Return the deviation of R·Rᵀ from the identity; infinite for a mirror image, NaN for NaN."""
+    """Return each matrix's deviation of R·Rᵀ from the identity; infinite for a reflection."""
     with np.errstate(invalid="ignore", over="ignore"):
         error = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
         return np.where(np.linalg.det(matrices) < 0, np.inf, error)
@@ -182,10 +185,7 @@ def is_number(text: str) -> bool:
 
 
 class SceneRecords(NamedTuple):
-    """The content of a scene's JSON files, by image.
-
-    ``infos`` has one record for each of ``truths``, None where it is missing.
-    """
+    """The content of a scene's JSON files, by image; each truth has an info, or None."""
 
     cameras: Mapping[int, object]
     truths: Mapping[int, list[Record]]
@@ -220,9 +220,10 @@ def _by_image(node: Node) -> dict[int, Any]:
 
 
 def image_files(
-    scene: Path, folders: tuple[str, ...], suffixes: tuple[str, ...], problems: Problems = STRICT
+    scene: Path, kind: tuple[tuple[str, ...], tuple[str, ...]], problems: Problems = STRICT
 ) -> dict[int, Path]:
-    """Return the images in the first existing one of some folders, by number."""
+    """Return a scene's :data:`PICTURES` or :data:`DEPTHS` by image number."""
+    folders, suffixes = kind
     folder = next((scene / name for name in folders if (scene / name).is_dir()), None)
     files: dict[int, Path] = {}
     for path in sorted(folder.iterdir()) if folder is not None else ():
@@ -242,14 +243,14 @@ class BopScene:
     """A scene's images, in the order of their numbers.
 
     Attributes:
-        files: File of every image, relative to the folder; empty where it is not on disk.
-        depth_files: File of every depth image likewise.
-        depth_scales: Millimetres a unit of its depth image; NaN where not stated.
-        first: Objects ``first[i] … first[i + 1] − 1`` are on image i.
+        files: Image files relative to the folder; empty for an image that is not on disk.
+        depth_files: Depth images likewise.
+        depth_scales: Millimetres a unit of the depth images; NaN where not stated.
+        first: Image i has the objects ``first[i] … first[i + 1] − 1``.
         gt_ids: Each object's index in its image's list, which names its masks.
-        num_other: Number of other parts' objects that have a model.
-        without_model: Numbers of objects without a model, by object number.
-        num_behind: Number of objects behind the camera, which are left out like the others.
+        num_other: Number of objects that have a model and are not wanted.
+        without_model: Counts of objects without a model, by object number.
+        num_behind: Number of wanted objects behind the camera, which are left out too.
     """
 
     folder: Path
@@ -273,8 +274,10 @@ class BopScene:
 def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int] = ()) -> BopScene:
     """Read a scene's annotation: ``scene_camera.json`` and, if present, its ground truth.
 
-    ``wanted`` are the numbers of the objects to keep, ``with_model`` those of the objects with a
-    model, empty where the data set has no models.
+    Args:
+        folder: The scene.
+        wanted: Numbers of the objects to keep.
+        with_model: Numbers of the objects with a model; empty in a data set without models.
     """
     cameras, truths, infos = read_records(folder)
     images = sorted(cameras)
@@ -304,8 +307,8 @@ def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int
     return BopScene(
         folder,
         np.array(images, np.int64),
-        _relative_files(folder, IMAGE_FOLDERS, IMAGE_SUFFIXES, images),
-        _relative_files(folder, ("depth",), DEPTH_SUFFIXES, images),
+        _relative_files(folder, PICTURES, images),
+        _relative_files(folder, DEPTHS, images),
         K,
         scales,
         np.searchsorted(table[keep, 0], np.arange(len(images) + 1)),
@@ -318,8 +321,7 @@ def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int
 
 
 def _relative_files(
-    folder: Path, folders: tuple[str, ...], suffixes: tuple[str, ...], images: Sequence[int]
+    folder: Path, kind: tuple[tuple[str, ...], tuple[str, ...]], images: Sequence[int]
 ) -> list[str]:
-    """Return the file of every image, relative to the scene; empty where there is none."""
-    files = image_files(folder, folders, suffixes)
+    files = image_files(folder, kind)
     return [files[i].relative_to(folder).as_posix() if i in files else "" for i in images]

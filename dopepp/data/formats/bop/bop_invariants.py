@@ -1,9 +1,9 @@
-"""Invariants of BOP data: records, models, masks and images of one data set agree.
+"""Check that the records, models, masks and images of a BOP data set agree.
 
-The records are parsed by the reader, whose problems are defects. What is optional in BOP (depth,
-masks) must be there for every image of a scene as soon as it is there for one. Noted are a scene
-without ``scene_gt.json`` (data sets keep the ground truth of their tests private), objects without
-``visib_fract``, objects without a model and inexact rotations.
+The reader parses the records, and its problems are defects. Optional files (depth, masks) must
+exist for every image of a scene or for none. The report notes scenes without ``scene_gt.json``
+(the ground truth of tests may be private), objects without ``visib_fract`` or a model, and inexact
+rotations.
 """
 
 from __future__ import annotations
@@ -20,10 +20,9 @@ from jaxtyping import Float
 
 from dopepp.data.formats import STAGING, bop, staged_items
 from dopepp.data.formats.bop import (
-    DEPTH_SUFFIXES,
-    IMAGE_FOLDERS,
-    IMAGE_SUFFIXES,
+    DEPTHS,
     MM,
+    PICTURES,
     BopPoses,
     Nodes,
     Record,
@@ -41,26 +40,26 @@ from dopepp.geometry.cuboid import cuboid_keypoints
 DIAMETERS_MM: Final = (5.0, 5000.0)
 
 FRACTION_TOLERANCE: Final = 0.05
-"""Between ``visib_fract`` and the quotient of the pixel counts, which renderers round apart."""
+"""Allowed difference of ``visib_fract`` from the quotient of the pixel counts."""
 
 PIXEL_TOLERANCE: Final = 0.01
-"""Share of a mask's pixels by which a stated count may differ (plus one row, of a border)."""
+"""Allowed difference of a stated count from a mask's pixels, as a share (plus a border row)."""
 
 BOX_EDGE_PX: Final = 2.0
-"""Between ``bbox_visib`` and the box of ``mask_visib``: tools differ on whether ends count."""
+"""Allowed distance of ``bbox_visib`` from the mask's box: tools disagree on whether ends count."""
 
 _ROUNDING: Final = 1.001
-"""Diameters and boxes are rounded to a few digits."""
+"""Factor by which a diameter may contradict a box: both are rounded to a few digits."""
 
 _CAMERA, _TRUTH, _INFO = "scene_camera.json", "scene_gt.json", "scene_gt_info.json"
 _MASKS: Final = ("mask", "mask_visib")
 
 ReadMask = Callable[[str, int], Mask | None]
-"""Reads ``mask`` or ``mask_visib`` of an object by its number; None where there is none."""
+"""Reads the ``mask`` or ``mask_visib`` of an object by number; None without a readable mask."""
 
 
 def scene_folders(root: Path) -> Iterator[Path]:
-    """Yield the scenes of a data set, a split, or the scene that ``root`` is, in order."""
+    """Yield in order the scenes of a data set or split, or ``root`` itself if it is a scene."""
     if _is_scene(root):
         yield root
         return
@@ -87,15 +86,23 @@ def check_bop(report: CheckReport) -> None:
 
 
 class _SceneCheck:
-    """One scene: its JSON files and the files in its folders."""
+    """Checks one scene: its JSON files and the files in its folders."""
 
     def __init__(self, report: CheckReport, folder: Path, models: Models | None) -> None:
         self._report, self._folder, self._models = report, folder, models
-        self._pictures = _image_files(report, folder, IMAGE_FOLDERS, IMAGE_SUFFIXES)
-        self._depths = _image_files(report, folder, ("depth",), DEPTH_SUFFIXES)
+        self._pictures, self._depths = (self._image_files(kind) for kind in (PICTURES, DEPTHS))
         self._masks = {name: _mask_files(folder / name) for name in _MASKS}
         self._records = read_records(folder, report)
         self._has_truth = (folder / _TRUTH).is_file()
+
+    def _image_files(self, kind: tuple[tuple[str, ...], tuple[str, ...]]) -> dict[int, Path]:
+        """Return numbered images; report images of another name beside them."""
+        files = image_files(self._folder, kind, self._report)
+        for folder in {path.parent for path in files.values()}:
+            for path in sorted(folder.glob("[!.]*")):
+                if path.suffix.lower() in kind[1] and not bop.is_number(path.stem):
+                    self._report.report(path, "file", "no image's number")
+        return files
 
     def check(self) -> None:
         report, folder, (cameras, truths, infos) = self._report, self._folder, self._records
@@ -151,19 +158,6 @@ class _SceneCheck:
         )
 
 
-def _image_files(
-    report: CheckReport, scene: Path, folders: tuple[str, ...], suffixes: tuple[str, ...]
-) -> dict[int, Path]:
-    """Return numbered images; report images of another name beside them."""
-    files = image_files(scene, folders, suffixes, report)
-    for folder in {path.parent for path in files.values()}:
-        for path in sorted(folder.iterdir()):
-            hidden = path.name.startswith(".")
-            if path.suffix.lower() in suffixes and not hidden and not bop.is_number(path.stem):
-                report.report(path, "file", "no image's number")
-    return files
-
-
 def _mask_files(folder: Path) -> dict[int, dict[int, Path]]:
     """Return the masks in a folder by image and object."""
     files: dict[int, dict[int, Path]] = {}
@@ -176,7 +170,7 @@ def _mask_files(folder: Path) -> dict[int, dict[int, Path]]:
 
 @dataclass
 class Oddities:
-    """Counts of what every reader copes with: notes, not defects."""
+    """Counts of deviations that every reader handles: notes, not defects."""
 
     inexact: int = 0
     without_fraction: int = 0
@@ -203,7 +197,7 @@ class Oddities:
 
 @dataclass(frozen=True)
 class Model:
-    """An object's size, metres; None where it is not stated or damaged."""
+    """An object's size in metres; None for a missing or damaged field."""
 
     diameter: float | None = None
     corners: Float[np.ndarray, "8 3"] | None = None
@@ -216,8 +210,8 @@ def load_models(report: CheckReport, roots: Sequence[Path]) -> Models | None:
     """Check the first ``models*/models_info.json`` below one of the folders, and its meshes.
 
     Returns:
-        The sizes of the objects with a mesh, of all objects where there is no mesh; None without
-        such a file.
+        Sizes of the objects with a mesh, or of all objects if none has a mesh; None without a
+        readable file.
     """
     path = next(filter(None, map(info_path, roots)), None)
     if path is None:
@@ -278,8 +272,15 @@ def check_image(
 ) -> BopPoses:
     """Check camera, poses, boxes, counts and masks of one image; return the poses.
 
-    ``shape`` is the image's (height, width), None where it cannot be read; ``has_depth`` tells
-    whether the camera must state the scale of a depth image.
+    Args:
+        nodes: Nodes of the records.
+        camera: The image's camera record; None if it is missing.
+        truths: The objects' ``gt`` records.
+        infos: The objects' ``gt_info`` records.
+        shape: (height, width) of the image; None if it cannot be read.
+        has_depth: Whether the camera must state the scale of a depth image.
+        models: Sizes by object number; None without models.
+        read_mask: Reader of the objects' masks.
     """
     K = None if camera is None else _check_camera(nodes, camera, shape, has_depth)
     poses = bop.read_poses(truths, infos, nodes)

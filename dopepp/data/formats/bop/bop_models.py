@@ -1,7 +1,7 @@
-"""BOP's object models, read and written: ``obj_000001.ply`` and ``models_info.json``, millimetres.
+"""Read and write BOP's object models: ``obj_000001.ply`` and ``models_info.json``, millimetres.
 
-``models_info.json`` has, beside BOP's own keys, the part's ``name``, which other tools ignore; an
-object without a name is named after its file, ``obj_000001``.
+In addition to BOP's keys, ``models_info.json`` has the part's ``name``, which other tools ignore.
+An object without a name is named after its file, ``obj_000001``.
 """
 
 from __future__ import annotations
@@ -34,31 +34,27 @@ _log = logging.getLogger(__name__)
 _NUMBERED: Final = re.compile(r"obj_(\d{1,9})")
 
 MODEL_FOLDERS: Final = ("models", "models_cad", "models_reconst", "models_eval")
-"""Where data sets keep their models, the full ones first."""
+"""Folders of models in BOP's data sets, the full models first."""
 
 INFO_FILE: Final = "models_info.json"
 
 SYMMETRY_FIELDS: Final = ("symmetries_discrete", "symmetries_continuous")
 
 Discrete = Float[np.ndarray, "symmetries 4 4"]
+"""Rigid transforms without the identity, metres."""
+
 Continuous = tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]
-"""Rigid transforms without the identity, and (axis, offset) pairs; metres."""
+"""(axis, offset) pairs, metres."""
 
 _ALLOWED: Final = 'objects by number, each once: {"1": {"diameter": …}, …}'
 
 _DIAMETER_TOLERANCE: Final = 0.01
-"""Share by which a stated diameter may differ from the mesh's: decimated models differ by less."""
+"""Allowed relative difference of a stated diameter from the mesh's; decimation causes less."""
 
 
 @dataclass(frozen=True)
 class ModelInfo:
-    """One object of ``models_info.json``.
-
-    Attributes:
-        diameter: Metres; NaN where it is not stated.
-        symmetries_discrete: Rigid transforms without the identity, (S, 4, 4), metres; or None.
-        symmetries_continuous: (axis, offset) pairs, metres.
-    """
+    """One object of ``models_info.json``; the diameter is in metres, NaN if not stated."""
 
     name: str
     path: Path
@@ -68,9 +64,14 @@ class ModelInfo:
 
 
 def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Part]:
-    """Make parts from a BOP data set's models, with their symmetries.
+    """Make parts, with their symmetries, from the models of a BOP data set.
 
-    ``objects`` are names in the wanted order; None takes all objects with a file, by number.
+    Args:
+        root: Folder of the data set.
+        objects: Names in the wanted order; None takes all objects with a file, by number.
+
+    Raises:
+        UserError: The folder has no models, or no object of such a name.
     """
     infos = read_models(Path(root))
     if not infos:
@@ -93,7 +94,9 @@ def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Pa
 def parts_by_id(root: Path, parts: Sequence[Part]) -> dict[int, Part]:
     """Return the parts by BOP's object numbers.
 
-    Without models in ``root``, parts must be named ``obj_000001`` as BOP's files are.
+    Raises:
+        UserError: A part is not in ``models_info.json`` or, without such a file, not named like
+            ``obj_000001``.
     """
     names = {info.name: number for number, info in read_models(root).items()}
     numbered: dict[int, Part] = {}
@@ -116,9 +119,9 @@ def number_in_name(name: str) -> int | None:
 
 
 def model_numbers(names: Sequence[str]) -> dict[str, int]:
-    """Return the number of each object by name: 1, 2, … unless all are named like BOP's files.
+    """Number objects by name: 1, 2, …, or as their names state if all are named like BOP's files.
 
-    So renders of another data set's models keep that data set's numbers.
+    Renders of a BOP data set's models thus keep the numbers of that data set.
     """
     stated = {name: number_in_name(name) for name in names}
     numbers = {name: number for name, number in stated.items() if number}
@@ -128,12 +131,16 @@ def model_numbers(names: Sequence[str]) -> dict[str, int]:
 
 
 def part_of(info: ModelInfo) -> Part:
-    """Read an object's mesh; a UserError where it is missing, damaged or not in millimetres."""
+    """Make a part from an object's mesh.
+
+    Raises:
+        UserError: The mesh is missing, damaged or not in millimetres.
+    """
     symmetries: dict[str, Any] = {name: getattr(info, name) for name in SYMMETRY_FIELDS}
     mesh = read_mesh(info.path, unit="mm")
     try:
         part = make_part(info.name, mesh, unit="mm", **symmetries)
-    except UserError as error:  # of its size or its triangles; BOP's files have one unit
+    except UserError as error:  # a wrong size may mean a wrong unit; BOP has only one
         allowed = f"{error.allowed}, from a file in millimetres as all of BOP's"
         fix = "correct the model, or convert its file to millimetres"
         raise UserError(f"{info.path}: {error.got}", allowed, fix) from error
@@ -145,25 +152,25 @@ def part_of(info: ModelInfo) -> Part:
 
 
 def read_models(root: Path) -> dict[int, ModelInfo]:
-    """Return the objects of ``models_info.json`` by number; none where there is no such file."""
+    """Return the objects of ``models_info.json`` by number; none without such a file."""
     path = info_path(root)
     return {} if path is None else parse_models(path, Node(STRICT, path).load(_ALLOWED))
 
 
 def modelled(infos: Mapping[int, ModelInfo]) -> set[int]:
-    """Return which objects have their model's file, all of them where none has."""
+    """Return the objects with a model file, or all objects if none has a file."""
     there = {number for number, info in infos.items() if info.path.is_file()}
     return there or set(infos)
 
 
 def info_path(root: Path) -> Path | None:
-    """Return where a data set's ``models_info.json`` is, None where there is none."""
+    """Return the path of a data set's ``models_info.json``, or None without such a file."""
     paths = (root / folder / INFO_FILE for folder in MODEL_FOLDERS)
     return next((path for path in paths if path.is_file()), None)
 
 
 def parse_models(path: Path, records: object, problems: Problems = STRICT) -> dict[int, ModelInfo]:
-    """Return the objects of what a ``models_info.json`` holds, by number."""
+    """Return the objects in the content of a ``models_info.json``, by number."""
     node = Node(problems, path)
     if not isinstance(records, dict):
         node["top level"].report(f"{records!r:.60}", _ALLOWED)
@@ -203,10 +210,10 @@ def _symmetries(node: Node, fields: Mapping[str, Any]) -> tuple[Discrete | None,
 
 
 def parse_symmetries(name: str, fields: object) -> tuple[Discrete | None, Continuous]:
-    """Return the symmetries of an entry like ``models_info.json``'s, given for a part by name.
+    """Return the symmetries in a config's entry, which is written as in ``models_info.json``.
 
     Raises:
-        UserError: There is no such entry, or one is no rigid transform or no axis.
+        UserError: The entry has other fields, or a value is no rigid transform or no axis.
     """
     node = Node(STRICT, f"data.symmetries.{name}")
     if not isinstance(fields, Mapping) or not {*fields} <= {*SYMMETRY_FIELDS}:
@@ -252,9 +259,7 @@ def _rows(node: Node, value: object) -> list[Any]:
 
 
 def write_models(root: Path, parts: Sequence[Part]) -> None:
-    """Write the parts' models, numbered by :func:`model_numbers`.
-
-    ``models_info.json`` is written last, as a sign.
+    """Write the parts' models, numbered by :func:`model_numbers`; ``models_info.json`` comes last.
 
     Raises:
         UserError: A part has no mesh, or the folder holds models of other parts.
@@ -286,7 +291,7 @@ def write_models(root: Path, parts: Sequence[Part]) -> None:
 
 
 def model_info(part: Part) -> dict[str, object]:
-    """Return a part's entry in ``models_info.json``: millimetres, transforms row by row."""
+    """Return a part's entry of ``models_info.json``: millimetres, transforms row by row."""
     lower = part.cuboid[:8].min(axis=0) * MM
     size = part.cuboid[:8].max(axis=0) * MM - lower
     record: dict[str, object] = {"name": part.name, "diameter": part.diameter * MM}
@@ -305,8 +310,8 @@ def model_info(part: Part) -> dict[str, object]:
 
 
 def ply_bytes(mesh: Mesh, texture_name: str) -> bytes:
-    """Return a mesh as binary PLY; ``texture_name`` is the file of its texture, if it has one."""
-    import trimesh  # slow to import: only for those who write models
+    """Encode a mesh as binary PLY that names its texture's file, if it has a texture."""
+    import trimesh  # slow to import, and only needed for writing
 
     # Weighted by the angles of the faces around a vertex, as BOP's are (Thürmer, Wüthrich 1998).
     normals = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).vertex_normals

@@ -1,6 +1,6 @@
-"""BOP data sets in their scenewise layout: LM-O, T-LESS, YCB-V, ITODD, or a rendered one.
+"""Read BOP data sets in their scenewise layout: LM-O, T-LESS, YCB-V, ITODD, or a rendered one.
 
-``SPLIT/NNNNNN/`` are scenes, see :mod:`~dopepp.data.formats.bop`.
+The folders ``SPLIT/NNNNNN/`` are scenes, see :mod:`~dopepp.data.formats.bop`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from dopepp.parts.part import Part
 _log = logging.getLogger(__name__)
 
 TARGETS_FILE: Final = "test_targets_bop19.json"
-"""BOP's own list of targets."""
+"""The list of targets that BOP publishes."""
 
 AUTO: Final = "auto"
 """Value of ``targets``: :data:`TARGETS_FILE` for a split like ``test_primesense``, if present."""
@@ -51,7 +51,7 @@ class _Target:
 
 
 Targets = dict[tuple[int, int], Counter[int] | None]
-"""Number of instances of each object to find, by scene and image; None for all objects."""
+"""Counts of instances to find by object number, by (scene, image); None for all objects."""
 
 
 def read_targets(path: Path) -> Targets:
@@ -77,19 +77,19 @@ class BopReader:
     """The images of a split, by scene and number.
 
     Opening reads the scenes' JSON files and checks every record; images are read one by one. An
-    image without ground truth has no instances. Objects that are none of the parts, and objects
-    behind the camera (rendered sets pose them too), are left out and counted. The visible fraction
-    is ``visib_fract`` of ``scene_gt_info.json``; without it, see
+    image without ground truth has no instances. The reader leaves out and counts objects that are
+    none of the parts, and objects behind the camera (rendered sets have some). The visible fraction
+    is ``visib_fract`` of ``scene_gt_info.json``, or an estimate of
     :func:`~dopepp.data.formats.make_instance`.
 
     Args:
-        parts: The objects to return, named as in ``models_info.json`` or ``obj_000001``.
+        parts: Objects to return, named as in ``models_info.json`` or ``obj_000001``.
         split: Folder of the scenes, e.g. ``test``, ``train_pbr``, ``train_real``.
-        targets: File in ``root`` that selects images and, in them, so many instances of an object,
-            the most visible ones, e.g. ``test_targets_bop19.json``; ``auto`` uses that file where
-            it exists.
-        part_of: Consecutive share of the images, as (first, last) fractions: disjoint shares of
-            one folder serve training, validation and test.
+        targets: File in ``root`` that selects images and the number of instances of each object,
+            e.g. ``test_targets_bop19.json``. The most visible instances count. ``auto`` uses that
+            file if it exists.
+        part_of: Consecutive share of the images as (first, last) fractions, so that disjoint
+            shares of a folder serve training, validation and test.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class BopReader:
         self._log_oddities(with_model)
 
     def _present(self) -> Int[np.ndarray, "items 2"]:
-        """Return (scene, row) of the images that are selected and on disk, in order."""
+        """Return (scene, row) of the selected images on disk, in order."""
         listed = [
             (number, row)
             for number, scene in enumerate(self._scenes)
@@ -135,7 +135,7 @@ class BopReader:
         return np.array(present, np.int64)
 
     def _log_oddities(self, with_model: Collection[int]) -> None:
-        """Log what is left out, estimated or replaced."""
+        """Log which objects are left out and which values are estimated or replaced."""
         other = sum(scene.num_other for scene in self._scenes)
         behind = sum(scene.num_behind for scene in self._scenes)
         without: Counter[int] = sum((scene.without_model for scene in self._scenes), Counter())
@@ -167,7 +167,7 @@ class BopReader:
             _log.warning("%s: %s %s", self.name, f"{lacking:,}", problem)
 
     def _target_counts(self, scene: BopScene, row: int) -> Counter[int] | None:
-        """Return how many instances of each object the list has on an image; None for all."""
+        """Return the listed number of instances of each object on an image; None for all."""
         assert self._targets is not None
         return self._targets[int(scene.folder.name), int(scene.image_ids[row])]
 
@@ -213,10 +213,10 @@ class BopReader:
         return decode_depth(read_content(path), str(path), float(scene.depth_scales[row]), shape)
 
     def view(self) -> tuple[Size, CameraMatrix, tuple[float, float] | None]:
-        """Return the first image's (width, height), its K, and the range of the objects' depths.
+        """Return the first image's (width, height) and K, and the range of the objects' depths.
 
-        The range is the nearest and the farthest depth of a cuboid's centre over all images,
-        metres, rounded outwards to centimetres; None where no object is annotated.
+        The range holds the depths of the cuboids' centres over all images, metres, rounded
+        outwards to centimetres; None without an annotated object.
         """
         depths = [
             float(transform(T_cam_obj, self._parts[int(number)].cuboid[[CENTROID]])[0, 2])
@@ -229,11 +229,11 @@ class BopReader:
         return first.size, first.K, (floor(100 * min(depths)) / 100, ceil(100 * max(depths)) / 100)
 
     def contains(self, label: str) -> bool:
-        """Tell whether an image holds this object."""
+        """Tell whether any image shows this object."""
         return bool(self._num_instances.get(label))
 
     def describe(self) -> list[SourceInfo]:
-        """Return the hash of the annotation, the objects and the origin of visible fractions."""
+        """Describe the images by hashes of annotation and objects, and the fractions' origin."""
         digest = hashlib.sha256()
         unknown = 0
         for number, row in self._items.tolist():
@@ -260,7 +260,7 @@ class BopReader:
 
 
 def _scene_folders(root: Path, split: str) -> list[Path]:
-    """Return a split's scenes by number: the folders whose names are numbers."""
+    """Return a split's scenes in order: the folders whose names are numbers."""
     if not (root / split).is_dir():
         splits = sorted({path.parent.parent.name for path in root.glob("*/*/scene_camera.json")})
         raise UserError(
