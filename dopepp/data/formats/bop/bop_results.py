@@ -1,7 +1,7 @@
-"""Poses as a BOP challenge CSV: written for the field's tools, read from any other method.
+"""Write poses as a BOP challenge CSV, and read those of any other method.
 
-Lines are ``scene_id,im_id,obj_id,score,R,t,time``: R row by row and t as numbers between spaces, t
-in millimetres, time in seconds for the whole image, −1 where unknown. BOP calls such a file
+Lines are ``scene_id,im_id,obj_id,score,R,t,time``. R (row by row) and t (millimetres) are numbers
+between spaces; time is in seconds for the whole image, −1 if unknown. BOP calls such a file
 ``METHOD_DATASET-SPLIT.csv``.
 """
 
@@ -28,19 +28,18 @@ FIELDS: Final = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 UNKNOWN_TIME: Final = -1.0
 
 MAX_ROWS: Final = 500_000
-"""Several times the largest submission; read, a row takes 0.8 kB."""
+"""Several times the largest submission; a row takes 0.8 kB of memory."""
 
 _MAX_LINE_BYTES: Final = 4096  # fourteen numbers of 25 digits take 400
 _FARTHEST: Final = 1e9  # mm; squares of such distances stay finite
 
 _PLAUSIBLE_MM: Final = (10.0, 100_000.0)
-"""Median distance of objects from the camera if t is in millimetres."""
+"""Range of the objects' median distance from the camera; another median means another unit."""
 
 _COUNTS: Final = {"score": 1, "R": 9, "t": 3, "time": 1}
-_COLUMNS: Final = 18
-"""A line's number and its 17 numbers."""
 
 Table = Float[np.ndarray, "rows 18"]
+"""A line's number and its 17 numbers."""
 
 _ID: Final = re.compile(r"\d{1,9}", re.ASCII)
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
@@ -48,11 +47,7 @@ _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 @dataclass(frozen=True)
 class BopResult:
-    """One estimated pose.
-
-    Attributes:
-        seconds: What the whole image took; −1 where unknown.
-    """
+    """One estimated pose; ``seconds`` is the time for the whole image, −1 if unknown."""
 
     scene_id: int
     im_id: int
@@ -63,7 +58,7 @@ class BopResult:
 
 
 def results_name(method: str, dataset: str, split: str) -> str:
-    """Return BOP's name of a results file; characters that separate its parts are replaced."""
+    """Return BOP's name of a results file, with separators in the three parts replaced."""
     method = re.sub(r"[^A-Za-z0-9.+]+", "-", method).strip("-") or "method"
     dataset = re.sub(r"[^A-Za-z0-9]+", "", dataset) or "data"
     split = re.sub(r"[^A-Za-z0-9]+", "-", split).strip("-") or "test"
@@ -71,7 +66,7 @@ def results_name(method: str, dataset: str, split: str) -> str:
 
 
 def write_results(path: Path, results: Sequence[BopResult]) -> None:
-    """Write a results file, whole, every number with all of its digits."""
+    """Write a results file atomically, each number with all of its digits."""
     lines = [",".join(FIELDS)]
     for result in results:
         R = " ".join(repr(float(value)) for value in result.T_cam_obj[:3, :3].ravel())
@@ -82,22 +77,24 @@ def write_results(path: Path, results: Sequence[BopResult]) -> None:
 
 
 def read_results(path: Path, objects: Collection[int]) -> list[BopResult]:
-    """Read a results file; the header may be missing, and blank lines do not matter.
+    """Read a results file; the header is optional, and blank lines are skipped.
 
-    ``objects`` are the numbers of the data set's objects.
+    Args:
+        path: The CSV file.
+        objects: Numbers of the data set's objects.
 
     Raises:
         UserError: The file is missing, not text, or has more than 500,000 poses; a line has
             another form, a number that is not finite or an unknown object; R is no rotation within
-            1e-3; a line comes twice; or t is so small or large that it is not in millimetres.
+            1e-3; a line repeats another; or the size of t contradicts millimetres.
     """
     values = array("d")
     for number, text in _lines(path):
         where = f"{path}: line {number}"
         values.extend((number, *_row(text, where, objects)))
-        if len(values) > _COLUMNS * MAX_ROWS:
+        if len(values) > 18 * MAX_ROWS:
             raise _bad(where, f"at most {MAX_ROWS:,} poses", "split the file by scene")
-    table = np.array(values, np.float64).reshape(-1, _COLUMNS)
+    table = np.array(values, np.float64).reshape(-1, 18)
     _check_repeats(path, table)
     _check_unit(path, table)
     poses = np.tile(np.eye(4), (len(table), 1, 1))
@@ -109,7 +106,7 @@ def read_results(path: Path, objects: Collection[int]) -> list[BopResult]:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield the numbered lines with poses."""
+    """Yield the lines with poses and their numbers."""
     allowed = f"a CSV file of {','.join(FIELDS)}"
     if not path.is_file():
         raise _bad(f"{path}, no such file", allowed, "check the path")
@@ -174,7 +171,7 @@ def _numbers(name: str, field: str, where: str) -> list[float]:
 
 
 def _check_repeats(path: Path, table: Table) -> None:
-    """Refuse the same pose of the same object twice; time may differ."""
+    """Reject a pose that repeats another pose of its object, whatever the time."""
     keys = table[:, 1:17]
     order = np.lexsort(keys.T[::-1])  # stable: of equal rows the earlier line stands first
     same = (keys[order[1:]] == keys[order[:-1]]).all(axis=1)

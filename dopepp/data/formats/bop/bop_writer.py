@@ -1,9 +1,9 @@
-"""BOP's scenewise layout, written item by item and finalized scene by scene.
+"""Write BOP's scenewise layout item by item, and finalize it scene by scene.
 
 ``train_pbr/000012/`` holds images 12,000 – 12,999: rgb, depth, mask and mask_visib as PNG, and
-``scene_camera.json``, ``scene_gt.json`` and ``scene_gt_info.json``. An image's records lie in the
-scene's hidden folder ``.items`` until the scene is finalized. They are defined as in BOP's own
-toolkit, see :func:`make_labels`.
+``scene_camera.json``, ``scene_gt.json`` and ``scene_gt_info.json``. The scene's hidden folder
+``.items`` keeps an image's records until the scene is finalized. :func:`make_labels` defines the
+records as BOP's toolkit does.
 """
 
 from __future__ import annotations
@@ -37,22 +37,21 @@ from dopepp.virtual.scene import SceneObject
 from dopepp.virtual.surface import Surface, make_surface
 
 IMAGES_A_SCENE: Final = 1000
-"""The number in BOP's own rendered training sets."""
+"""As in the rendered training sets of BOP."""
 
 SCENE_FILES: Final = {
     "scene_gt.json": "gt",
     "scene_gt_info.json": "gt_info",
     "scene_camera.json": "camera",
 }
-"""A scene's files and the field of a staged item that goes into each; the last one lists what is
-finalized, so it is written last."""
+"""Field of a staged item for each file of a scene. The last file lists the finalized images, so it
+is written last."""
 
 Record = dict[str, Any]
-NO_BOX = [-1, -1, -1, -1]
 
 
 class BopFolder:
-    """A folder with models, numbered by :func:`model_numbers`, beside a split of images."""
+    """A folder of models, numbered by :func:`model_numbers`, and a split of images."""
 
     chunk_size = IMAGES_A_SCENE
 
@@ -60,7 +59,11 @@ class BopFolder:
         self.root, self.split, self._parts = Path(root), split, tuple(parts)
 
     def prepare(self) -> None:
-        """Write the models; a UserError where the split holds images made without them."""
+        """Write the models.
+
+        Raises:
+            UserError: The split has images, and the folder has no models or those of other parts.
+        """
         info = f"{MODEL_FOLDERS[0]}/{INFO_FILE}"
         if (self.root / self.split).exists() and not (self.root / info).exists():
             problem = f"{self.root}, which has {self.split}/ and no {info}"
@@ -129,7 +132,7 @@ class BopWriter(BopFolder):
         return self.root / self.split / f"{chunk:06d}"
 
     def _write_camera(self, chunk: int, image: int, camera: Mapping[str, Any]) -> None:
-        """Write ``camera.json``, which tells tools about the sensor: that of the first image."""
+        """Write ``camera.json``, by which tools know the sensor, from the first image."""
         folders = (self.root / self.split).iterdir()
         if chunk > min(int(path.name) for path in folders if path.name.isdecimal()):
             return
@@ -167,13 +170,13 @@ def make_labels(
 ) -> Labels:
     """Annotate a sample as BOP's toolkit does.
 
-    A box is (x, y, width, height) with width and height the differences of the outermost pixels'
-    coordinates (a single pixel has width 0), −1 for an object without a visible pixel; the
-    silhouette counts beyond the image's border.
+    A box is (x, y, width, height), where the sides are differences of the outermost pixels'
+    coordinates (a single pixel has width 0); −1 for an object without a visible pixel. The
+    silhouette includes pixels beyond the image's border.
 
     Args:
-        sample: An image with depth and a mask of every instance, as every rendered one.
-        object_ids: BOP's numbers by label.
+        sample: A rendered image, with depth and a mask of each instance.
+        object_ids: BOP's object numbers by label.
         parts: Parts and surfaces by label.
     """
     visible = [instance.mask for instance in sample.instances if instance.mask is not None]
@@ -199,9 +202,9 @@ def _info(
 ) -> Record:
     seen, inside = Box.of_mask(visible), Box.of_mask(whole.mask)
     return {
-        "bbox_obj": NO_BOX if seen is None else _bop_box(_beyond_the_border(inside, whole)),
+        "bbox_obj": _bop_box(None if seen is None else _beyond_the_border(inside, whole)),
         "bbox_visib": _bop_box(seen),
-        # A silhouette around the camera has no finite size: its pixels within the image stand.
+        # A silhouette around the camera has no finite size; then its pixels in the image count.
         "px_count_all": int(whole.num_px if math.isfinite(whole.num_px) else whole.mask.sum()),
         "px_count_valid": int(np.count_nonzero(depth[whole.mask])),
         "px_count_visib": int(np.count_nonzero(visible)),
@@ -210,14 +213,14 @@ def _info(
 
 
 def _bop_box(box: Box | None) -> list[int]:
-    """Return BOP's (x, y, width, height)."""
+    """Return BOP's (x, y, width, height); −1 without a box."""
     if box is None:
-        return NO_BOX
+        return [-1] * 4
     return [int(n) for n in (box.left, box.top, box.right - box.left, box.bottom - box.top)]
 
 
 def _beyond_the_border(inside: Box | None, whole: Silhouette) -> Box | None:
-    """Return the outermost pixels of a silhouette, also beyond the image's border."""
+    """Return the box of a silhouette, including its pixels beyond the image's border."""
     # Its box bounds the vertices; where no vertex lies beyond the border, the pixels are exact.
     if inside is None or whole.box is None:
         return inside

@@ -1,9 +1,9 @@
-"""The files of an NDDS or FAT data set: which belong together, and their content.
+"""Find and parse the files of an NDDS or FAT data set.
 
-An item is ``STEM.json`` with its image ``STEM.png`` or ``STEM.jpg`` beside it; ``STEM`` is
-``000000`` (NDDS) or ``000000.left`` (FAT), in the folder or anywhere below it. Each folder may hold
-``_object_settings.json`` and ``_camera_settings.json``; if not, those of the data set's folder
-count. Formats: the readme of the Falling Things data set (Tremblay et al., 2018).
+An item is ``STEM.json`` with an image ``STEM.png`` or ``STEM.jpg``; ``STEM`` is ``000000`` (NDDS)
+or ``000000.left`` (FAT), in the folder or anywhere below it. Each folder may hold
+``_object_settings.json`` and ``_camera_settings.json``; otherwise those of the data set's folder
+count. The readme of the Falling Things data set (Tremblay et al., 2018) documents the formats.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ CAMERA_SETTINGS: Final = "_camera_settings.json"
 IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg")
 
 MAX_ITEM_BYTES: Final = 16_000_000
-"""Largest annotation of an image; a hundred objects take 0.5 MB."""
+"""Largest annotation file; a hundred objects take 0.5 MB."""
 
 DEPTH_UNIT: Final = 0.0001
-"""Metres per value of a 16-bit ``.depth.png``: FAT's unit, and the writer's; 0 is unknown."""
+"""Metres per value of a 16-bit ``.depth.png`` of FAT and of the writer; 0 is unknown."""
 
 _NORM_TOLERANCE: Final = 0.1
-"""Of a quaternion's norm from 1."""
+"""Allowed deviation of a quaternion's norm from 1."""
 
 Objects = list[tuple[Node, Mapping[str, Any], str]]
 """(node, object, class) of every object of an annotation."""
@@ -45,14 +45,14 @@ Objects = list[tuple[Node, Mapping[str, Any], str]]
 
 @dataclass(frozen=True)
 class NddsObject:
-    """One object as an annotation states it, units and orders still unknown; NaN where damaged.
+    """One object as annotated, in unknown units and orders; NaN for damaged numbers.
 
     Attributes:
-        quaternion: The four numbers under ``quaternion_xyzw``, in whatever order.
-        corners_px: ``projected_cuboid`` without its centroid; None where it is not given.
-        cuboid: The same corners in space; None where they are not given.
-        centroid: ``cuboid_centroid`` or, without one, the mean of ``cuboid``; None without both.
-        visibility: In [0, 1], or −1 for unknown; None where it is not given.
+        quaternion: The four numbers of ``quaternion_xyzw`` as they stand in the file.
+        corners_px: ``projected_cuboid`` without its centroid, if stated.
+        cuboid: The same corners in space, if stated.
+        centroid: ``cuboid_centroid``, or else the mean of ``cuboid``; None without both.
+        visibility: In [0, 1], or −1 for unknown, if stated.
     """
 
     node: Node
@@ -66,12 +66,12 @@ class NddsObject:
 
 
 def read_record(path: Path, problems: Problems = STRICT) -> Mapping[str, Any] | None:
-    """Read an annotation or a settings file; None where that is impossible."""
+    """Read an annotation or a settings file; None if the file is damaged."""
     return Node(problems, path).load(max_bytes=MAX_ITEM_BYTES)
 
 
 def objects_of(record: Mapping[str, Any], path: Path, problems: Problems = STRICT) -> Objects:
-    """Return the objects of an annotation; each needs a class."""
+    """Return an annotation's objects, and report those without a class."""
     objects: Objects = []
     node = Node(problems, path, "objects")
     for number, item in enumerate(node.entries(record.get("objects"))):
@@ -83,14 +83,14 @@ def objects_of(record: Mapping[str, Any], path: Path, problems: Problems = STRIC
 
 
 def parse_object(item: Mapping[str, Any], node: Node) -> NddsObject:
-    """Read the fields of one object; it needs a location and a quaternion."""
+    """Parse one object, and report a missing location or quaternion."""
 
     def take(name: str, *shape: int) -> NDArray[np.float64]:
         return node[name].numbers(item.get(name), *shape)
 
     def take_corners(name: str, axes: int) -> NDArray[np.float64] | None:
         value = item.get(name)
-        # A writer may have appended the centroid as the ninth point.
+        # Some writers append the centroid as the ninth point.
         count = 9 if isinstance(value, list) and len(value) == 9 else 8
         return None if value in (None, []) else take(name, count, axes)[:8]
 
@@ -112,14 +112,14 @@ def parse_object(item: Mapping[str, Any], node: Node) -> NddsObject:
 
 
 def stated(record: Mapping[str, Any], name: str) -> object:
-    """Return what an annotation states in the writer's ``conventions``, else None."""
+    """Return an entry of the ``conventions`` that our writer adds, or None."""
     return mapping(record.get("conventions")).get(name)
 
 
 def find_items(folder: Path) -> tuple[list[Path], list[Path]]:
     """Return the annotations with an image and those without, sorted.
 
-    Settings (``_*.json``) and hidden files are no annotations.
+    The search skips settings (``_*.json``) and hidden files.
     """
     with_image: list[Path] = []
     without: list[Path] = []
@@ -135,32 +135,32 @@ def find_items(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def companion(annotation: Path, suffix: str) -> Path:
-    """Return a file beside an annotation: its stem with a suffix such as ``.seg.png``."""
+    """Return the path of an annotation's stem with another suffix, e.g. ``.seg.png``."""
     return annotation.with_name(annotation.name.removesuffix(".json") + suffix)
 
 
 def image_of(annotation: Path) -> Path | None:
-    """Return an annotation's image, None where there is none."""
+    """Return the path of an annotation's image, or None without an image."""
     paths = [companion(annotation, suffix) for suffix in IMAGE_SUFFIXES]
     return next((path for path in paths if path.is_file()), None)
 
 
 class NddsSettings:
-    """The settings files of a data set, each read once, on first use."""
+    """The settings files of a data set, each read once on first use."""
 
     def __init__(self, root: Path, problems: Problems = STRICT) -> None:
         self._root, self._problems = root, problems
         self._files: dict[Path, Mapping[str, Any] | None] = {}
 
     def read(self, path: Path) -> Mapping[str, Any] | None:
-        """Return the content of a settings file, None where there is none or it is damaged."""
+        """Return the content of a settings file; None if it is missing or damaged."""
         if path not in self._files:
             is_there = path.is_file()
             self._files[path] = read_record(path, self._problems) if is_there else None
         return self._files[path]
 
     def _of(self, annotation: Path, name: str) -> tuple[Path, Mapping[str, Any]]:
-        """Return the settings of the annotation's folder or else of the data set's, or nothing."""
+        """Return path and content of the settings in the annotation's folder or the data set's."""
         for path in (annotation.with_name(name), self._root / name):
             content = self.read(path)
             if content is not None:
@@ -170,10 +170,10 @@ class NddsSettings:
     def camera(
         self, record: Mapping[str, Any], annotation: Path, problems: Problems = STRICT
     ) -> CameraMatrix:
-        """Return K: the annotation's own ``camera_data.intrinsics`` or the camera settings'.
+        """Return K from the annotation's ``camera_data.intrinsics`` or the camera settings.
 
-        Of several cameras in the settings, the one counts whose name ends the stem (FAT's ``left``
-        and ``right``). Without one camera, a problem is reported, and K is NaN.
+        Among several cameras in the settings, the stem's end names the camera (FAT's ``left`` and
+        ``right``). K is NaN if no camera or several cameras remain, which is reported.
         """
         node = Node(problems, annotation, "camera_data.intrinsics")
         stated_here = mapping(record.get("camera_data")).get("intrinsics")
@@ -186,7 +186,7 @@ class NddsSettings:
         if len(cameras) == 1 and isinstance(cameras[0].get("intrinsic_settings"), dict):
             there = Node(problems, path, "camera_settings[].intrinsic_settings")
             return _intrinsics(cameras[0]["intrinsic_settings"], there)
-        # A settings file that cannot be read is one problem, not one for every image.
+        # An unreadable settings file is reported once, not for each image.
         files = annotation.with_name(CAMERA_SETTINGS), self._root / CAMERA_SETTINGS
         if not any(file.is_file() and self.read(file) is None for file in files):
             allowed = (
@@ -198,9 +198,9 @@ class NddsSettings:
     def fixed_transform(self, annotation: Path, label: str) -> NDArray[np.float64] | None:
         """Return a class's ``fixed_model_transform`` as a rigid 4×4 matrix for column vectors.
 
-        It maps the mesh into the object frame. The file holds the transpose, scaled by the mesh's
-        unit over the file's (100 for metres and centimetres); the translation is in the file's
-        unit. None where there is no rotation, scale and translation.
+        The matrix maps the mesh into the object frame. The file holds its transpose, scaled by the
+        mesh's unit over the file's (100 for metres and centimetres); the translation is in the
+        file's unit. None if the file has no such rotation, scale and translation.
         """
         for matrix in self._arrays(annotation, label, "fixed_model_transform", 4, 4):
             rigid = matrix.T
@@ -212,7 +212,7 @@ class NddsSettings:
         return None
 
     def dimensions(self, annotation: Path, label: str) -> NDArray[np.float64] | None:
-        """Return a class's ``cuboid_dimensions`` (x, y, z), file's unit; None where not usable."""
+        """Return a class's usable ``cuboid_dimensions`` (x, y, z) in the file's unit, or None."""
         for sides in self._arrays(annotation, label, "cuboid_dimensions", 3):
             if np.isfinite(sides).all() and (sides >= 0).all() and sides.any():
                 return sides
@@ -224,19 +224,19 @@ class NddsSettings:
         return next((value for value in ids if isinstance(value, int) and value > 0), None)
 
     def classes(self, annotation: Path) -> set[str] | None:
-        """Return the names of the exported classes, None where no settings name them."""
+        """Return the names of the exported classes, or None if no settings list them."""
         listed = self._of(annotation, OBJECT_SETTINGS)[1].get("exported_object_classes")
         return {str(name) for name in listed} if isinstance(listed, list) else None
 
     def _objects(self, annotation: Path, label: str) -> list[dict[str, Any]]:
-        """Return the entries of a class."""
+        """Return the settings' entries of a class."""
         entries = _entries(self._of(annotation, OBJECT_SETTINGS)[1], "exported_objects")
         return [entry for entry in entries if entry.get("class") == label]
 
     def _arrays(
         self, annotation: Path, label: str, name: str, *shape: int
     ) -> Iterator[NDArray[np.float64]]:
-        """Yield a field of a class's entries, where it has such numbers."""
+        """Yield a field of a class's entries if its numbers have the shape."""
         for entry in self._objects(annotation, label):
             with suppress(KeyError, TypeError, ValueError, OverflowError):
                 yield np.array(entry[name], np.float64).reshape(shape)
@@ -248,15 +248,17 @@ def _entries(settings: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
 
 
 def _intrinsics(values: Mapping[str, Any], node: Node) -> CameraMatrix:
-    """Return K of ``fx``, ``fy``, ``cx`` and ``cy``, pixels; NaN where one is missing."""
+    """Return K from ``fx``, ``fy``, ``cx`` and ``cy`` in pixels; NaN if a number is missing."""
     return camera_matrix(*node.numbers([values.get(n) for n in ("fx", "fy", "cx", "cy")], 4))
 
 
 def read_depth(record: Mapping[str, Any], annotation: Path, shape: Shape) -> DepthMap | None:
-    """Read depth in metres along z, or None where there is none or its unit is not known.
+    """Read depth in metres along z; None without a depth image of known unit.
 
-    The unit is known where the annotation states it, or from FAT's naming. ``shape`` is the
-    image's (height, width).
+    Args:
+        record: The annotation, which may state the unit.
+        annotation: Its path; FAT's naming also implies a unit.
+        shape: (height, width) of the image.
     """
     unit = stated(record, "depth_unit_m")
     if unit is None and annotation.name.endswith((".left.json", ".right.json")):
@@ -270,7 +272,7 @@ def read_depth(record: Mapping[str, Any], annotation: Path, shape: Shape) -> Dep
 
 
 def read_labels(annotation: Path, shape: Shape) -> NDArray[Any] | None:
-    """Read ``STEM.seg.png``; None where there is none, or colours, which no file explains."""
+    """Read ``STEM.seg.png``; None if it is missing or in colours, which no file explains."""
     path = companion(annotation, ".seg.png")
     image = read_image(path) if path.is_file() else None
     is_map = image is not None and image.ndim == 2
@@ -280,10 +282,10 @@ def read_labels(annotation: Path, shape: Shape) -> NDArray[Any] | None:
 def label_values(
     objects: Objects, record: Mapping[str, Any], annotation: Path, settings: NddsSettings
 ) -> dict[str, int | None]:
-    """Return the value of each object's pixels in ``STEM.seg.png``, by the object's node.
+    """Return the value of each object's pixels in ``STEM.seg.png``, by the field of the object.
 
-    None where it is unknown or not only this object's. An object without ``segmentation_id`` may
-    have its class's value, unless the annotation states that the values are ids.
+    The value is None if it is unknown or belongs to several objects. An object without
+    ``segmentation_id`` has its class's value, unless the annotation states that values are ids.
     """
     ids = [item.get("segmentation_id") for _, item, _ in objects]
     of_object = [value if isinstance(value, int) and value > 0 else None for value in ids]
@@ -299,5 +301,5 @@ def label_values(
 
 
 def has_object_ids(record: Mapping[str, Any]) -> bool:
-    """Tell whether an annotation states that labels in ``.seg.png`` are objects', not classes'."""
+    """Tell whether an annotation states that ``.seg.png`` labels objects, not classes."""
     return stated(record, "segmentation") == "segmentation_id"

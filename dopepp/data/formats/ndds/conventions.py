@@ -1,12 +1,12 @@
-"""The pose convention of an NDDS data set, found by trying all conventions on its own images.
+"""Determine the pose convention of an NDDS data set by reprojection.
 
 ``quaternion_xyzw`` holds x, y, z, w or w, x, y, z; lengths are centimetres (NDDS, FAT), metres
-(nvisii) or millimetres; camera axes are OpenCV's or, in old nvisii files, OpenGL's; and the pose is
-the mesh's own or that of a frame into which ``fixed_model_transform`` turns the mesh (FAT). No
-field states which. But every object states ``projected_cuboid``, its box in the image.
+(nvisii) or millimetres; camera axes are OpenCV's or, in old nvisii files, OpenGL's. The pose is
+that of the mesh, or of a frame into which ``fixed_model_transform`` maps the mesh (FAT). No field
+states the choice, but every object states ``projected_cuboid``, its box in the image.
 :func:`find_convention` applies each :class:`PoseConvention` to objects with known meshes and keeps
-the one under which the mesh's box lands there; :func:`check_observation` later compares every
-object.
+the convention that projects the mesh's box onto the stated box. :func:`check_observation` later
+compares every object.
 
 To add a convention, add its value to a ``Literal`` below, and its meaning to
 :meth:`Observation.T_cam_obj`.
@@ -34,12 +34,12 @@ Quaternion = Literal["xyzw", "wxyz"]
 Unit = Literal["cm", "m", "mm"]
 CameraAxes = Literal["opencv", "opengl"]
 Frame = Literal["mesh", "mesh, front x", "centred", "fixed", "fixed, centred"]
-"""The frame that the stated pose moves.
+"""The object frame of the stated pose.
 
-- ``mesh``: the mesh as it is.
-- ``mesh, front x``: the mesh as it is; corners listed as seen along its x axis, z up (nvisii).
-- ``centred``: the mesh with its box's centre in the origin, which the pose moves to
-  ``cuboid_centroid``, or to ``location`` where there is none.
+- ``mesh``: the mesh frame.
+- ``mesh, front x``: the mesh frame; corners in the order seen along its x axis, z up (nvisii).
+- ``centred``: the mesh with its box's centre at the origin, which the pose moves to
+  ``cuboid_centroid``, or else to ``location``.
 - ``fixed``: the mesh after ``fixed_model_transform``.
 - ``fixed, centred``: the mesh after the rotation of ``fixed_model_transform``, then centred.
 """
@@ -54,7 +54,7 @@ OPENGL: Final = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True)
 class PoseConvention:
-    """One way to write poses, a choice in each of four questions; the defaults are NDDS's own."""
+    """One way to write poses; the defaults are those of NDDS."""
 
     quaternion: Quaternion = "xyzw"
     unit: Unit = "cm"
@@ -75,14 +75,14 @@ POSE_CONVENTIONS: Final = tuple(
     for unit in METRES
     for quaternion in get_args(Quaternion)
 )
-"""All combinations, the documented ones first: of two that fit alike, the first one counts."""
+"""All combinations, the documented ones first; the first of equally good fits wins."""
 
 
 @dataclass(frozen=True)
 class Observation:
-    """An annotated object whose part is known: what a convention can be tried on.
+    """An annotated object of a known part, on which a convention can be tested.
 
-    ``fixed`` is the class's ``fixed_model_transform``, rigid, translation in the file's unit.
+    ``fixed`` is the class's rigid ``fixed_model_transform``, with a translation in the file's unit.
     """
 
     item: NddsObject
@@ -91,7 +91,7 @@ class Observation:
     fixed: Transform | None
 
     def T_cam_obj(self, convention: PoseConvention) -> Transform | None:  # noqa: N802
-        """Return the mesh's pose, metres, under a convention; None where it cannot apply."""
+        """Return the mesh's pose in metres; None if the convention needs a missing ``fixed``."""
         fixed = convention.frame.startswith("fixed")
         if fixed and self.fixed is None:
             return None
@@ -110,14 +110,14 @@ class Observation:
         return make_transform(axes @ rotation, axes @ location)
 
     def predicted_px(self, convention: PoseConvention) -> Float[np.ndarray, "8 2"] | None:
-        """Return where the convention puts the file's corners, NaN behind the camera."""
+        """Project the file's corners under a convention; NaN behind the camera."""
         T_cam_obj = self.T_cam_obj(convention)
         if T_cam_obj is None:
             return None
         return project(transform(T_cam_obj, self._corners[convention.frame]), self.K)
 
     def error_px(self, convention: PoseConvention) -> float:
-        """Return the median distance from ``projected_cuboid``, infinite behind the camera."""
+        """Return the median distance from ``projected_cuboid``; infinite behind the camera."""
         predicted = self.predicted_px(convention)
         if predicted is None or self.item.corners_px is None:
             return np.inf
@@ -126,7 +126,7 @@ class Observation:
 
     @cached_property
     def _corners(self) -> dict[Frame, NDArray[np.float64]]:
-        """The corners the file lists, in its order, in the mesh frame, metres."""
+        """Corners in the mesh frame by object frame, in the file's order, metres."""
         usual, front = self.part.cuboid[:8], _turned_corners(self.part, _FRONT_X)
         rotation = np.eye(3) if self.fixed is None else self.fixed[:3, :3]
         fixed = _turned_corners(self.part, rotation)
@@ -134,8 +134,8 @@ class Observation:
 
 
 def _turned_corners(part: Part, rotation: RotationMatrix) -> Float[np.ndarray, "8 3"]:
-    """Return the corners of the box along turned axes, in NDDS order, in the part's frame."""
-    # A turn by other than right angles needs the shape itself; the cuboid's box would be too large.
+    """Return the corners of the part's box along rotated axes, in NDDS order, part frame."""
+    # The box of the turned cuboid is too large unless the turn is by right angles.
     quarter_turns = np.abs(np.abs(rotation).max(axis=0) - 1).max() < 1e-6
     shape = part.points if part.mesh is None else part.mesh.vertices
     turned = (part.cuboid[:8] if quarter_turns else shape) @ rotation.T
@@ -143,16 +143,16 @@ def _turned_corners(part: Part, rotation: RotationMatrix) -> Float[np.ndarray, "
 
 
 MAX_ERROR_PX: Final = 5.0
-"""Largest error of most instances under the right convention: annotations of photos need it."""
+"""Largest error of most instances under the right convention; real photos need this much."""
 
 _MAX_SHARE: Final = 0.05
-"""Allowed error of one instance as a share of its projected cuboid's longer side, if larger."""
+"""Allowed error of one instance as a share of its projected cuboid's longer side."""
 
 _MOST: Final = 0.75
-"""Share of the instances that must fit: a few damaged ones decide nothing."""
+"""Share of the instances that must fit, so that a few damaged instances do not decide."""
 
 _RATIO: Final = 3.0
-"""Any convention with other poses must fit this many times worse."""
+"""Factor by which any convention with other poses must fit worse."""
 
 _ROUNDING_PX: Final = 0.05  # between equally good fits: files round to a few digits
 _SAME_POSE: Final = 0.05  # distance of corners, in diameters, of conventions with the same poses
@@ -160,13 +160,13 @@ _SAME_POSE: Final = 0.05  # distance of corners, in diameters, of conventions wi
 
 @dataclass(frozen=True)
 class NddsFinding:
-    """The convention of a data set, and how sure it is.
+    """The convention of a data set with its evidence.
 
     Attributes:
         error_px: Largest error of three quarters of the instances.
-        rival_px: The same of the best convention that gives other poses.
-        undecided: Conventions that give the same poses in these instances, e.g. of a turn whose
-            quaternion reads the same in both orders.
+        rival_px: That error under the best convention with other poses.
+        undecided: Conventions with the same poses on these instances, e.g. if the quaternions read
+            the same in both orders.
     """
 
     convention: PoseConvention
@@ -214,7 +214,7 @@ def find_convention(observations: Sequence[Observation], where: str) -> NddsFind
 
 
 def check_observation(observation: Observation, convention: PoseConvention) -> Transform:
-    """Return an instance's pose after comparing it with its own ``projected_cuboid``.
+    """Return an instance's pose after a comparison with its ``projected_cuboid``.
 
     Raises:
         UserError: The instance is behind the camera, lacks a ``fixed_model_transform``, or is off
@@ -230,7 +230,7 @@ def check_observation(observation: Observation, convention: PoseConvention) -> T
         problem = f"an object behind the camera (z = {T_cam_obj[2, 3]:.3g} m)"
         node["location"].report(problem, f"one before it ({convention})")
     predicted = observation.predicted_px(convention)
-    # Projections of a hidden object, or of one that reaches behind the camera, mean nothing.
+    # Projections of hidden objects, and of objects partly behind the camera, are meaningless.
     if predicted is None or not np.isfinite(predicted).all() or item.visibility == 0:
         return T_cam_obj
     error, extent = observation.error_px(convention), float(np.ptp(predicted, axis=0).max())
@@ -241,7 +241,7 @@ def check_observation(observation: Observation, convention: PoseConvention) -> T
 
 
 def _same_poses(observations: Sequence[Observation], a: PoseConvention, b: PoseConvention) -> bool:
-    """Tell whether two conventions put most instances' cuboids at the same place in space."""
+    """Tell whether two conventions give most instances the same pose."""
     distances = []
     for observation in observations:
         T_a, T_b, part = observation.T_cam_obj(a), observation.T_cam_obj(b), observation.part
@@ -253,7 +253,7 @@ def _same_poses(observations: Sequence[Observation], a: PoseConvention, b: PoseC
 
 
 def _most(values: Sequence[float]) -> float:
-    """Return the bound of three quarters of the values: a few damaged items do not count."""
+    """Return the bound of three quarters of the values, which a few damaged items do not change."""
     return float(np.quantile(values, _MOST, method="higher"))
 
 

@@ -1,8 +1,8 @@
-"""Invariants of NDDS and FAT: annotations agree with their own cuboids, images and settings.
+"""Check that NDDS and FAT annotations agree with their cuboids, images and settings.
 
-The meshes need not be known. Data sets differ in their conventions: x, y, z, w or w, x, y, z; boxes
-as (row, column) or (column, row); OpenCV's or OpenGL's camera axes. A convention of the whole data
-set is noted, and objects that differ from the majority are defects.
+No mesh is needed. Data sets differ in their conventions: x, y, z, w or w, x, y, z; boxes as (row,
+column) or (column, row); OpenCV's or OpenGL's camera axes. The report notes the convention of most
+objects; deviating objects are defects.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from dopepp.geometry.camera import CameraMatrix
 
 _MAPS: Final = (".depth.png", ".seg.png")
 _DERIVED: Final = (".depth", ".seg", ".cs", ".is", ".16", ".8")
-"""Ends of stems of images that belong to another image: no annotation is missing there."""
+"""Ends of the stems of derived images, which need no annotation."""
 
 
 def check_ndds(report: CheckReport) -> None:
@@ -38,7 +38,7 @@ def check_ndds(report: CheckReport) -> None:
     settings = NddsSettings(report.root, report)
     for folder in sorted(folders | {report.root}):
         _check_settings(report, settings, folder)
-    # What is there for one image of a folder must be there for all.
+    # A map that one image of a folder has is required for all images.
     expected = {
         folder: [suffix for suffix in _MAPS if any(folder.glob(f"*{suffix}"))] for folder in folders
     }
@@ -67,7 +67,7 @@ def _check_settings(report: CheckReport, settings: NddsSettings, folder: Path) -
 
 
 def _twice(values: Iterable[Hashable]) -> list[Hashable]:
-    """Return the values that come more than once."""
+    """Return the repeated values."""
     return [value for value, number in Counter(values).items() if number > 1]
 
 
@@ -89,7 +89,7 @@ def _check_unannotated(report: CheckReport, annotations: list[Path]) -> None:
 def _check_item(
     report: CheckReport, path: Path, settings: NddsSettings, majority: Majority, maps: list[str]
 ) -> None:
-    """Check an annotation and its images; ``maps`` are the suffixes of the required ones."""
+    """Check an annotation, its image and the required ``maps``, given by suffix."""
     image = ndds.image_of(path)
     shape = None if image is None else picture_shape(Node(report, image))
     images = {

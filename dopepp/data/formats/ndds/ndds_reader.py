@@ -1,9 +1,8 @@
-"""NDDS and FAT data sets: JSON annotations beside PNG or JPEG images, one pair an item.
+"""Read NDDS and FAT data sets: pairs of a JSON annotation and a PNG or JPEG image.
 
-How the files write their poses is found by reprojection
-(:mod:`~dopepp.data.formats.ndds.conventions`), said in the log and in
-:meth:`NddsReader.describe`, and checked again on every instance that is read. What
-:class:`~dopepp.data.formats.ndds.ndds_writer.NddsWriter` writes reads back exactly.
+The reader determines the data set's pose convention by reprojection
+(:mod:`~dopepp.data.formats.ndds.conventions`), logs it, and checks it on each instance. Data from
+:class:`~dopepp.data.formats.ndds.ndds_writer.NddsWriter` are read back exactly.
 """
 
 from __future__ import annotations
@@ -32,10 +31,10 @@ from dopepp.parts.part import Part
 _log = logging.getLogger(__name__)
 
 _FAT_SUFFIX: Final = "_16k"
-"""FAT names a class after the part and its mesh: ``003_cracker_box_16k``."""
+"""End of a class name in FAT, which names the part and its mesh: ``003_cracker_box_16k``."""
 
 _MAX_OBSERVATIONS: Final = 60
-"""Instances, evenly spread over the items, on which the convention is found."""
+"""Instances, evenly spread over the items, that determine the convention."""
 
 _MAX_COUNTED_ITEMS: Final = 1000
 """Reading this many annotations takes about a second."""
@@ -44,22 +43,24 @@ _MAX_COUNTED_ITEMS: Final = 1000
 class NddsReader:
     """The items of an NDDS or FAT folder and of the folders below it.
 
-    ``visibility`` in the wild is 1 or 0 (visible at all or not), or the share of the visible
-    silhouette; either way the image's border is not counted, so the share of the projected cuboid
-    inside the image multiplies it, unless the file states that it is. Where it is missing or −1
-    (nvisii: unknown), only the border counts. Objects behind the camera that the file itself calls
-    invisible are left out, and so are those of other classes; both are counted.
+    Most files state a ``visibility`` that ignores the image's border: 1 or 0 for visible or not, or
+    the visible share of the silhouette. The reader then multiplies it by the share of the projected
+    cuboid inside the image. If it is missing or −1 (nvisii: unknown), only that share counts. The
+    reader leaves out and counts objects of other classes, and objects behind the camera that the
+    file calls invisible.
 
-    A mask is taken from ``STEM.seg.png`` where its values are known to be one instance's: by the
-    object's ``segmentation_id``, or by its class's ``segmentation_class_id`` where the image holds
-    one object of that id. Depth is taken from ``STEM.depth.png`` where the unit is stated, or where
-    FAT's naming (``.left``, ``.right``) says it is 0.1 mm.
+    An instance has a mask if a value in ``STEM.seg.png`` is its alone: its ``segmentation_id``, or
+    the ``segmentation_class_id`` of its class. An item has depth if the annotation states the unit
+    of ``STEM.depth.png``, or if FAT's naming (``.left``, ``.right``) implies 0.1 mm.
 
     Args:
-        parts: The objects to return; an instance's ``class`` is a part's name, or FAT's form of it
-            (``NAME_16k``), or one that ``classes`` translates.
+        parts: Objects to return. An instance's ``class`` is a part's name, FAT's form of that name
+            (``NAME_16k``), or a key of ``classes``.
         part_of: First and last share of the sorted items to use, e.g. (0, 0.9) and (0.9, 1).
-        classes: Names of parts by the class names that the files use for them.
+        classes: Names of parts by class names in the files.
+
+    Raises:
+        UserError: The folder has no items, no instance of the parts, or no clear convention.
     """
 
     def __init__(
@@ -81,7 +82,7 @@ class NddsReader:
         self._settings = ndds.NddsSettings(self.folder)
         items = _find(self.folder)
         self.items = items[share(len(items), part_of, self.name)]
-        # On all items, so that training and validation shares of one folder are read alike.
+        # From all items, so that training and validation shares have the same convention.
         self.finding = self._find_convention(items)
         _log.info("%s: %s items; found: %s", self.name, f"{len(self.items):,}", self.finding)
 
@@ -90,7 +91,7 @@ class NddsReader:
         hidden: list[Observation] = []
         others: Counter[str] = Counter()
         step = max(1, len(items) // _MAX_OBSERVATIONS)
-        # Evenly spread items first, so that a few of them stand for the whole.
+        # Evenly spread items come first, so that a few represent the whole data set.
         for path in (path for start in range(step) for path in items[start::step]):
             observations, labels = self._read(path)
             others.update(labels)
@@ -107,11 +108,11 @@ class NddsReader:
                 "at least one, whose class is a part's name",
                 "name the parts as the classes, or give classes={class: part}",
             )
-        # Hidden objects may be behind the camera, where projections mean nothing.
+        # Hidden objects may be behind the camera, where projections are meaningless.
         return find_convention(seen or hidden, str(self.folder))
 
     def _part(self, label: str) -> Part | None:
-        """Return the part of a class name, without FAT's suffix where that hides a part's name."""
+        """Return the part of a class name, after removing FAT's suffix if necessary."""
         label = self._classes.get(label, label)
         if label not in self._parts and label.lower().endswith(_FAT_SUFFIX):
             label = label[: -len(_FAT_SUFFIX)]
@@ -137,7 +138,7 @@ class NddsReader:
         return len(self.items)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Read an item; the epoch does not matter."""
+        """Read an item; the epoch is ignored."""
         path = self.items[index]
         image = read_rgb(ndds.image_of(path) or ndds.companion(path, ndds.IMAGE_SUFFIXES[0]))
         shape: Shape = image.shape[:2]
@@ -162,7 +163,7 @@ class NddsReader:
         return path.relative_to(self.folder).as_posix().removesuffix(".json")
 
     def _is_out_of_view(self, observation: Observation) -> bool:
-        """Tell whether an object is behind the camera, and the file calls it invisible."""
+        """Tell whether an object is behind the camera and invisible according to the file."""
         T_cam_obj = observation.T_cam_obj(self.finding.convention)
         behind = T_cam_obj is not None and T_cam_obj[2, 3] <= 0
         visibility = observation.item.visibility
@@ -182,7 +183,7 @@ class NddsReader:
         return Instance(part.name, T_cam_obj, keypoints, float(fraction))
 
     def contains(self, label: str) -> bool:
-        """Tell whether an item holds this object, reading annotations until one does."""
+        """Tell whether any item shows this object, reading annotations until one does."""
         return label in self._parts and any(
             self._part(name) is self._parts[label]
             for path in self.items
@@ -190,10 +191,7 @@ class NddsReader:
         )
 
     def describe(self) -> list[SourceInfo]:
-        """Return the item list's hash, the objects and the convention; a small set is counted.
-
-        ``left out`` counts the objects of other classes and those behind the camera.
-        """
+        """Describe the items, objects and convention; count the instances of a small data set."""
         identity: dict[str, object] = {
             "items": hashlib.sha256("\n".join(map(self._key, self.items)).encode()).hexdigest(),
             "objects": {part.name: part.mesh_hash for part in self._parts.values()},

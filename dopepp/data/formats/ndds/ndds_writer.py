@@ -1,6 +1,6 @@
 """Write NDDS: ``000000.png``, ``.depth.png``, ``.seg.png`` and, last, ``000000.json``.
 
-What NDDS documents is written as NDDS writes it, and every annotation repeats it under
+Files follow the conventions that NDDS documents. Every annotation repeats them under
 ``conventions``, which other readers ignore:
 
 - Lengths are centimetres. The camera frame is OpenCV's. ``quaternion_xyzw`` is x, y, z, w.
@@ -43,7 +43,7 @@ CM: Final = 100.0
 """Centimetres per metre."""
 
 UNREAL_AXES: Final = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""P of ``pose_transform``: from the readme of Falling Things."""
+"""P of ``pose_transform``, from the readme of Falling Things."""
 
 CONVENTIONS: Final = {
     "length_unit": "cm",
@@ -57,13 +57,13 @@ CONVENTIONS: Final = {
 }
 
 CAMERA_FIELDS: Final = ("width", "height", "intrinsics")
-"""What two images of one camera share in ``camera_data``."""
+"""Fields of ``camera_data`` that images of one camera share."""
 
 _FARTHEST_PX: Final = 1e6
-"""Projections of points beside the camera are cut off here."""
+"""Limit of projections, which are huge for points beside the camera."""
 
 _DATA_SUFFIXES: Final = (".json", ".png", ".jpg", ".tar")
-"""A folder that holds such files, or folders, is somebody's data set."""
+"""Suffixes of files that, like a subfolder, mark another data set."""
 
 
 class NddsWriter:
@@ -77,7 +77,11 @@ class NddsWriter:
         self._parts = {part.name: part for part in parts}
 
     def prepare(self) -> None:
-        """Write ``_object_settings.json``, idempotently; a UserError in a folder of other data."""
+        """Write ``_object_settings.json``, idempotently.
+
+        Raises:
+            UserError: The folder holds other data, or settings of other parts.
+        """
         path = self._root / OBJECT_SETTINGS
         settings = _encode(object_settings(list(self._parts.values())))
         present = sorted(self._root.glob("[!._]*")) if self._root.is_dir() else []
@@ -95,7 +99,7 @@ class NddsWriter:
         raise UserError(problem, allowed, "name another")
 
     def write(self, index: int, sample: Sample) -> None:
-        """Write an item's images and then its annotation, which marks it as complete."""
+        """Write an item's images and then its annotation, which marks the item as complete."""
         segmentation = segmentation_map(sample.instances, sample.image.shape[:2])
         record = {
             "conventions": CONVENTIONS,
@@ -123,10 +127,10 @@ class NddsWriter:
         return {index for index in indices if self._path(index, ".json").is_file()}
 
     def finalize(self, chunk: int, indices: Sequence[int]) -> None:
-        """Write ``_camera_settings.json`` when the chunk's images share one camera.
+        """Write ``_camera_settings.json`` if the chunk's images share one camera.
 
-        Every annotation has its own intrinsics; this file is for readers that look only here. A
-        preset has one camera, so every chunk writes the same bytes.
+        The file serves readers that ignore the intrinsics of annotations. A preset has one camera,
+        so every chunk writes the same bytes.
         """
         records: list[Any] = [read_json(self._path(index, ".json")) for index in sorted(indices)]
         cameras = [record["camera_data"] for record in records]
@@ -151,7 +155,7 @@ def object_settings(parts: Sequence[Part]) -> dict[str, Any]:
 
 
 def camera_settings(camera: dict[str, Any]) -> dict[str, Any]:
-    """Return ``_camera_settings.json`` of one camera, given as an annotation's ``camera_data``."""
+    """Return ``_camera_settings.json`` for the camera of an annotation's ``camera_data``."""
     width, height, values = (camera[name] for name in CAMERA_FIELDS)
     return {
         "camera_settings": [
@@ -171,7 +175,7 @@ def camera_data(sample: Sample) -> dict[str, Any]:
     return {
         "width": sample.size[0],
         "height": sample.size[1],
-        # The camera frame is the world frame: a sample knows no other.
+        # A sample has no other world frame than the camera frame.
         "location_worldframe": [0.0, 0.0, 0.0],
         "quaternion_xyzw_worldframe": [0.0, 0.0, 0.0, 1.0],
         "intrinsics": {"fx": fx, "fy": fy, "cx": cx, "cy": cy},
@@ -181,16 +185,20 @@ def camera_data(sample: Sample) -> dict[str, Any]:
 def object_record(
     number: int, instance: Instance, cuboid_obj: Float[np.ndarray, "9 3"], K: CameraMatrix
 ) -> dict[str, Any]:
-    """Return one of an annotation's ``objects``.
+    """Return an entry of an annotation's ``objects``.
 
-    ``number``, from 1, is its id and its value in ``.seg.png``; ``cuboid_obj`` its part's, metres.
+    Args:
+        number: Id of the instance, from 1, and its value in ``.seg.png``.
+        instance: The instance.
+        cuboid_obj: Cuboid of its part, object frame, metres.
+        K: Camera matrix in pixels.
     """
     cuboid = transform(instance.T_cam_obj, cuboid_obj)
     rotation, location = instance.T_cam_obj[:3, :3], CM * instance.T_cam_obj[:3, 3]
     w, x, y, z = matrix_to_quaternion(rotation).tolist()
     pose = np.eye(4)
     pose[:3, :3], pose[3, :3] = UNREAL_AXES @ rotation.T, location
-    # Through the camera's centre: a corner behind it has a finite projection too.
+    # Projection through the camera's centre is finite for a corner behind it too.
     pixels = cuboid @ K.T
     depth = np.where(pixels[:, 2:] == 0, np.finfo(np.float64).tiny, pixels[:, 2:])
     with np.errstate(over="ignore"):
@@ -219,7 +227,7 @@ def object_record(
 def segmentation_map(
     instances: Sequence[Instance], shape: Shape
 ) -> Integer[np.ndarray, "height width"]:
-    """Return 1, 2, … where the first, second, … instance is visible, 0 elsewhere."""
+    """Return a map with 1, 2, … on the visible pixels of the instances and 0 elsewhere."""
     labels = np.zeros(shape, np.uint8 if len(instances) <= np.iinfo(np.uint8).max else np.uint16)
     for number, instance in enumerate(instances, 1):
         if instance.mask is not None:

@@ -1,9 +1,8 @@
-"""Invariants of one NDDS object: its fields agree with each other and with the image.
+"""Check that the fields of an NDDS object agree with each other and with the image.
 
-Tolerances beside those of :mod:`~dopepp.data.formats.invariants`: a stated projection lies within
-2 px and 2 % of the cuboid's longer side of the projected 3-D point; edges of a cuboid are
-perpendicular and equal within 2 %, and its class's within 5 %; an orientation agrees with the
-cuboid's within 2 degrees.
+Tolerances in addition to those of :mod:`~dopepp.data.formats.invariants`: 2 px plus 2 % of the
+cuboid's longer side for a stated projection; 2 % for perpendicular and equal edges of a cuboid, 5 %
+for the sides of its class; 2 degrees for an orientation.
 """
 
 from __future__ import annotations
@@ -36,14 +35,14 @@ PROJECTION_SHARE: Final = 0.02
 """Allowed error of a stated projection: pixels, plus a share of the cuboid's longer side."""
 
 ORIENTATION_RAD: Final = np.deg2rad(2.0)
-"""Between orientations that a file states twice."""
+"""Allowed angle between two statements of an orientation."""
 
 MATRIX_TOLERANCE: Final = 5e-3
 NORM_TOLERANCE: Final = 0.01
-"""Of ``pose_transform`` from a rotation, of a quaternion's norm from 1: FAT has four digits."""
+"""Allowed deviations of ``pose_transform`` from a rotation and of a quaternion's norm from 1."""
 
 EDGE_SHARE: Final = 0.02
-"""Of the longest edge: allowed inequality and slant of edges, and size of one without direction."""
+"""Allowed inequality and slant of edges; shorter edges, relative to the longest, are flat."""
 
 SIZE_SHARE: Final = 0.05
 """Allowed difference of edges from the class's ``cuboid_dimensions``."""
@@ -62,40 +61,40 @@ _DOCUMENTED: Final = {
     "bounding_box": "row, column",
     "camera axes": "OpenCV",
 }
-"""NDDS's own conventions."""
+"""Conventions that NDDS documents."""
 
 _MAX_MINORITY: Final = 1000
-"""Objects of each convention that are remembered, in case they are the minority."""
+"""Objects of each convention to keep, in case the convention loses."""
 
 
 class Majority:
-    """Conventions of a data set: the one of most objects is noted, the others are defects."""
+    """Notes the convention of most objects, and reports the objects of other conventions."""
 
     def __init__(self, report: CheckReport) -> None:
         self._report = report
         self._votes: dict[str, Counter[str]] = {}
         self._nodes: dict[tuple[str, str], list[Node]] = {}
 
-    def vote(self, subject: str, way: str, node: Node) -> None:
+    def vote(self, subject: str, convention: str, node: Node) -> None:
         """Count the convention of one object."""
-        self._votes.setdefault(subject, Counter())[way] += 1
-        nodes = self._nodes.setdefault((subject, way), [])
+        self._votes.setdefault(subject, Counter())[convention] += 1
+        nodes = self._nodes.setdefault((subject, convention), [])
         if len(nodes) < _MAX_MINORITY:
             nodes.append(node)
 
     def conclude(self) -> None:
-        """Note each convention that is not NDDS's own, and report the objects of the others."""
+        """Note each undocumented convention, and report the objects of the minorities."""
         for subject, votes in self._votes.items():
             (common, number), *rest = votes.most_common()
             if common != _DOCUMENTED[subject]:
                 self._report.note(f"{subject}: {common} ({number:,} objects)")
-            for way, _ in rest:
-                for node in self._nodes[subject, way]:
-                    node.report(f"{way}; {number:,} objects have {common}")
+            for convention, _ in rest:
+                for node in self._nodes[subject, convention]:
+                    node.report(f"{convention}; {number:,} objects have {common}")
 
 
 class ObjectCheck:
-    """One object; lengths are in the file's unit, whatever it is. Damaged fields are None."""
+    """Checks one object, with lengths in the file's unknown unit; damaged fields are None."""
 
     def __init__(self, parsed: NddsObject, item: Mapping[str, Any], majority: Majority) -> None:
         self._node, self._item, self._majority = parsed.node, item, majority
@@ -110,13 +109,17 @@ class ObjectCheck:
     ) -> None:
         """Check pose, cuboid, projections and boxes.
 
-        An unknown argument is None; ``sides`` are the class's ``cuboid_dimensions``.
+        Args:
+            K: Camera matrix in pixels, if known.
+            shape: (height, width) of the image, if known.
+            mask: Visible pixels, if known.
+            sides: The class's ``cuboid_dimensions``, if known.
         """
         rotations = self._rotations()
         if self._cuboid is not None:
             self._check_cuboid(self._cuboid, rotations, sides)
         self._check_transforms(rotations)
-        # The file itself may state that nobody sees the object, or not know.
+        # The file may state that the object is hidden (0) or its visibility unknown (−1).
         is_hidden = self._visibility is not None and self._visibility <= 0
         seen = None if mask is None else Box.of_mask(mask)
         self._check_bounding_box(None if is_hidden else seen)
@@ -130,12 +133,12 @@ class ObjectCheck:
         self._node[field].report(message)
 
     def _numbers(self, field: str, *shape: int) -> Float[np.ndarray, "..."] | None:
-        """Read a field that the reader does not need; None where it is missing or damaged."""
+        """Read a field that readers ignore; None if it is missing or damaged."""
         value = self._item.get(field)
         return None if value is None else _finite(self._node[field].numbers(value, *shape))
 
     def _rotations(self) -> dict[str, RotationMatrix]:
-        """Return the rotation by either order of ``quaternion_xyzw``; empty if it is damaged."""
+        """Return the rotation by each order of ``quaternion_xyzw``; empty if damaged."""
         stored = self._quaternion
         if stored is None:
             return {}
@@ -148,12 +151,12 @@ class ObjectCheck:
         return {order: quaternion_to_matrix(values) for order, values in orders.items()}
 
     def _judge(self, field: str, fits: dict[str, bool], problem: str) -> None:
-        """Report a field that fits no convention, and vote where it fits only one."""
+        """Report a field that fits no convention, and vote if it fits only one convention."""
         if not any(fits.values()):
             self._add(field, problem)
         elif not all(fits.values()):
-            way = next(way for way, fit in fits.items() if fit)
-            self._majority.vote(field, way, self._node[field])
+            convention = next(convention for convention, fit in fits.items() if fit)
+            self._majority.vote(field, convention, self._node[field])
 
     def _check_cuboid(
         self, corners: Corners, rotations: Mapping[str, RotationMatrix], sides: Vector | None
@@ -186,7 +189,7 @@ class ObjectCheck:
             self._judge("quaternion_xyzw", fits, message)
 
     def _check_transforms(self, rotations: Mapping[str, RotationMatrix]) -> None:
-        """Check NDDS's matrix: rows P·Rᵀ (mirrored: Unreal is left-handed), the location below."""
+        """Check NDDS's matrix: rows P·Rᵀ (P mirrors, as Unreal is left-handed) above location."""
         for name in ("pose_transform", "pose_transform_permuted"):
             matrix = self._numbers(name, 4, 4)
             if matrix is None:
@@ -212,7 +215,7 @@ class ObjectCheck:
                     self._add(name, message)
 
     def _check_bounding_box(self, seen: Box | None) -> None:
-        """Compare the stated box, which may be the whole object's, with the visible pixels'."""
+        """Compare the stated box, which may hold the whole object, with the visible pixels."""
         stated = mapping(self._item.get("bounding_box"))
         if not stated:
             return
@@ -233,21 +236,20 @@ class ObjectCheck:
             self._judge("bounding_box", fits, problem)
 
     def _camera_axes(self, location: Vector, K: CameraMatrix | None) -> RotationMatrix:
-        """Return the file's camera axes as a matrix into OpenCV's."""
-        # A point behind an OpenCV camera is before an OpenGL one if it projects to the stated
-        # corners there.
+        """Return the rotation from the file's camera axes into OpenCV's."""
+        # A point behind the camera has OpenGL axes if it then projects to the stated corners.
         projected, is_opengl = self._projected, False
         is_before = self._cuboid is not None and self._cuboid[:, 2].mean() > 0
         if location[2] < 0 and not is_before and projected is not None and K is not None:
             middle, slack = project(OPENGL @ location, K), np.ptp(projected, axis=0)
             low, high = projected.min(axis=0) - slack, projected.max(axis=0) + slack
             is_opengl = bool(((low <= middle) & (middle <= high)).all())
-        way = "OpenGL" if is_opengl else "OpenCV"
-        self._majority.vote("camera axes", way, self._node["location"])
+        axes = "OpenGL" if is_opengl else "OpenCV"
+        self._majority.vote("camera axes", axes, self._node["location"])
         return OPENGL if is_opengl else np.eye(3)
 
     def _is_location_possible(self, location: Vector, axes: RotationMatrix) -> bool:
-        """Check location, centroid and unit; tell whether projections can mean anything."""
+        """Check location, centroid and unit; return whether projections are meaningful."""
         cuboid, centroid = self._cuboid, self._centroid
         diagonal = None if cuboid is None else float(np.linalg.norm(cuboid[0] - cuboid[6]))
         if not check_translation(self._node["location"], axes @ location, diagonal):
@@ -271,7 +273,7 @@ class ObjectCheck:
         seen: Box | None,
         fraction: float | None,
     ) -> None:
-        """Compare projections and visible pixels with the cuboid, or with each other."""
+        """Compare projections and visible pixels with the cuboid or, without it, each other."""
         if self._cuboid is not None:
             points = self._cuboid @ axes.T
             self._check_projections(points, K)
@@ -285,7 +287,7 @@ class ObjectCheck:
     def _check_projections(self, cuboid: Corners, K: CameraMatrix) -> None:
         expected = project(np.vstack([cuboid, cuboid.mean(axis=0)]), K)
         if not np.isfinite(expected).all():
-            return  # projections of an object that reaches behind the camera mean nothing
+            return  # projections of an object partly behind the camera are meaningless
         allowed = PROJECTION_PX + PROJECTION_SHARE * float(np.ptp(expected, axis=0).max())
         pairs = (
             ("projected_cuboid", self._projected, expected[:8]),
@@ -303,9 +305,9 @@ def _finite(values: Float[np.ndarray, "..."] | None) -> Float[np.ndarray, "..."]
 
 
 def _quarter_turn_distance(rotation: RotationMatrix) -> float:
-    """Return the angle to the nearest orthogonal matrix that maps axes onto axes, mirrored or not.
+    """Return the angle to the nearest matrix that permutes and flips axes.
 
-    Tools' frames of one object differ by such matrices.
+    The frames that tools give to one object differ by such matrices.
     """
     nearest = np.where(np.abs(rotation) == np.abs(rotation).max(axis=0), np.sign(rotation), 0.0)
     if abs(np.linalg.det(nearest)) != 1:

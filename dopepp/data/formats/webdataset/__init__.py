@@ -1,8 +1,7 @@
-"""BOP-WebDataset: tar shards of ``KEY.rgb.jpg``, ``KEY.gt.json``, … and where each member lies.
+"""Index BOP-WebDataset shards: tar files of ``KEY.rgb.jpg``, ``KEY.gt.json`` and so on.
 
-Only headers are read, so any image can be read without those before it. A shard comes from a
-stranger: names that lead out of it, links, holes, members that are too large or cut off, and names
-that come twice are refused.
+Indexing reads headers only, and gives random access to the images. Shards are untrusted: paths out
+of the archive, links, holes, truncated or too large members, and repeated names are rejected.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ from dopepp.data.archive import Bounded
 from dopepp.data.formats.problems import STRICT, Node, Problems
 
 FIELDS: Final = ("image", "depth", "camera", "gt", "gt_info", "mask_visib")
-"""What is read of an image."""
+"""Members of an image that are read."""
 
 MAX_MEMBER_BYTES: Final = 256_000_000
 MAX_MEMBERS: Final = 1_000_000
-"""Of a shard; one of BOP's has 1,000 images of seven members each."""
+"""Limit of a shard; BOP's shards have 1,000 images of seven members each."""
 
 KEY_FILE: Final = "key_to_shard.json"
-"""File beside the shards: the shard of every key."""
+"""File in the folder of the shards that lists the shard of every key."""
 
 _IMAGE: Final = re.compile(r"(rgb|gray)\.(png|jpe?g|tiff?)")
 _DEPTH: Final = re.compile(r"depth\.(png|tiff?)")
@@ -41,7 +40,7 @@ _ALLOWED: Final = (
 
 
 class TarMember(NamedTuple):
-    """A file in a shard: ``KEY.EXTENSION``, its first byte and its size."""
+    """A file ``KEY.EXTENSION`` in a shard, with the offset of its first byte and its size."""
 
     key: str
     extension: str
@@ -53,7 +52,7 @@ class TarMember(NamedTuple):
 class ShardIndex:
     """The images of a shard, in its order.
 
-    ``spans`` has first byte and size of every image's :data:`FIELDS`, −1 where it has none.
+    ``spans`` holds offset and size of each image's :data:`FIELDS`, −1 for a missing member.
     """
 
     path: Path
@@ -61,13 +60,17 @@ class ShardIndex:
     spans: Int64[np.ndarray, "images 6 2"]
 
     def read(self, image: int, field: str) -> bytes | None:
-        """Return a member's content; None where the image has none."""
+        """Return the content of an image's member, or None without such a member."""
         offset, size = self.spans[image, FIELDS.index(field)].tolist()
         return None if offset < 0 else read_span(self.path, offset, size)
 
 
 def read_span(path: Path, offset: int, size: int) -> bytes:
-    """Return a part of a file; a UserError where the file is shorter now or missing."""
+    """Read a part of a shard.
+
+    Raises:
+        UserError: The file is missing or has become shorter.
+    """
     problem = f"cut short within the member at byte {offset}"
     try:
         with path.open("rb") as file:
@@ -81,11 +84,11 @@ def read_span(path: Path, offset: int, size: int) -> bytes:
 
 
 def index_shard(path: Path) -> ShardIndex:
-    """Find a shard's images.
+    """Index a shard's images.
 
     Raises:
-        UserError: :func:`members` reports a problem, or an image lacks its picture or its camera,
-            or has two of them.
+        UserError: :func:`members` reports a problem, an image lacks its picture or camera, or a
+            member is repeated.
     """
     node = Node(STRICT, path, "archive")
     rows: dict[str, int] = {}
@@ -108,10 +111,10 @@ def index_shard(path: Path) -> ShardIndex:
 
 
 def members(path: Path, problems: Problems = STRICT) -> Iterator[TarMember]:
-    """Yield the files of a shard; folders and WebDataset's own ``__meta__`` are skipped.
+    """Yield the files of a shard, without folders and WebDataset's ``__meta__``.
 
-    Reported and skipped are an archive that is compressed, cut short or damaged, and a member that
-    is no plain file, leads out of the archive, has no extension, comes twice or is too large.
+    A compressed, truncated or damaged archive is reported. So is a member that is no plain file,
+    leads out of the archive, has no extension, is repeated or is too large; it is skipped.
     """
     node = Node(problems, path, "archive")
     try:
@@ -134,7 +137,7 @@ def _walk(node: Node, file: io.BufferedReader, size: int) -> Iterator[TarMember]
     names: set[str] = set()
     with tarfile.open(fileobj=Bounded(file), mode="r:") as archive:
         while (info := archive.next()) is not None:
-            archive.members = []  # type: ignore[attr-defined]  # it keeps every header it has read
+            archive.members = []  # type: ignore[attr-defined]  # which collects all headers
             name = PurePosixPath(info.name)
             is_meta = name.name.startswith("__") and name.name.endswith("__")
             if (info.isdir() or is_meta) and not _leads_out(info):
@@ -151,7 +154,7 @@ def _walk(node: Node, file: io.BufferedReader, size: int) -> Iterator[TarMember]
                 str(name.with_name(key)), extension.lower(), info.offset_data, info.size
             )
         end = archive.offset
-    # tarfile takes a damaged header after the first, and the end of the file, for the archive's.
+    # tarfile stops without an error at a damaged header and at the end of a truncated file.
     file.seek(end)
     if file.read(tarfile.BLOCKSIZE) != bytes(tarfile.BLOCKSIZE):
         node.report(f"cut short or damaged at byte {end}", _ALLOWED)
@@ -164,7 +167,7 @@ def _leads_out(info: tarfile.TarInfo) -> bool:
 
 
 def _refusal(info: tarfile.TarInfo, archive_size: int) -> str:
-    """Return why a member is refused; empty where it is not."""
+    """Return why a member is rejected, or an empty string."""
     key, dot, _ = PurePosixPath(info.name).name.partition(".")
     if _leads_out(info):
         return "which leads out of the archive"
@@ -178,7 +181,7 @@ def _refusal(info: tarfile.TarInfo, archive_size: int) -> str:
 
 
 def field_of(extension: str) -> str | None:
-    """Return which of :data:`FIELDS` a member's extension stands for, None for another."""
+    """Return the entry of :data:`FIELDS` for a member's extension, or None."""
     if _IMAGE.fullmatch(extension):
         return "image"
     if _DEPTH.fullmatch(extension):

@@ -1,6 +1,6 @@
 """Check BOP-WebDataset: tar shards of ``KEY.rgb.jpg``, ``KEY.gt.json`` and so on.
 
-A shard is walked from its first to its last member; one image's members are in memory at a time.
+A check reads a shard from start to end, with the members of one image in memory at a time.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from dopepp.data.formats.webdataset.webdataset_reader import ShardRecords
 from dopepp.drawing.pictures import Mask, Shape
 
 _MAX_IMAGE_BYTES: Final = 2 * shards.MAX_MEMBER_BYTES
-"""Of all members of an image together."""
+"""Limit of the sum over the members of an image."""
 
 Content = dict[str, bytes]
 """An image's members by extension."""
 
 
 def shard_paths(root: Path) -> Iterator[Path]:
-    """Yield the shards in a folder and in those below it, in order, but no hidden ones."""
+    """Yield the visible shards in a folder and its subfolders, in order."""
     for folder in (root, *sorted(path for path in root.glob("*") if path.is_dir())):
         if folder == root or not folder.name.startswith("."):
             yield from sorted(p for p in folder.glob("*.tar") if not p.name.startswith("."))
@@ -62,7 +62,7 @@ def check_webdataset(report: CheckReport) -> None:
 
 
 def _content(report: CheckReport, path: Path, group: Iterator[shards.TarMember]) -> Content:
-    """Read an image's members, as many as may be in memory."""
+    """Read an image's members up to the limit."""
     content: Content = {}
     total = 0
     for _, extension, *span in group:

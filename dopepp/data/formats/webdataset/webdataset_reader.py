@@ -1,7 +1,7 @@
-"""BOP-WebDataset: tar shards of which any image can be read, so a run resumes exactly.
+"""Read BOP-WebDataset: tar shards with random access, so a run resumes exactly.
 
 Members are ``KEY.rgb.png`` (or jpg, or gray), ``KEY.depth.png``, ``KEY.camera.json``,
-``KEY.gt.json``, ``KEY.gt_info.json`` and ``KEY.mask_visib.json``; lengths are millimetres there.
+``KEY.gt.json``, ``KEY.gt_info.json`` and ``KEY.mask_visib.json``; lengths are in millimetres.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ MAX_SHARD_BYTES: Final = 20_000_000_000
 """Largest shard to download; BOP's have about 1 GB."""
 
 _MAX_TEXT: Final = 4000
-"""Characters of a path; Python reads no number with more digits."""
+"""Characters of a path; Python parses no number with more digits."""
 
 _MAX_BRACES: Final = 10
 _PIECE_BYTES: Final = 1 << 20
@@ -49,17 +49,17 @@ _SCHEME: Final = re.compile(r"([a-z][a-z0-9+.-]+):", re.IGNORECASE)
 
 
 class WebdatasetReader:
-    """The images of some shards, shard by shard in the shards' own order.
+    """The images of some shards, in the order of the shards.
 
-    Opening reads the archives' headers; an image's members are read and checked with the image. An
-    image without ``gt.json`` has no instances. Objects that are none of the parts, and objects
-    behind the camera, are left out. The visible fraction is ``visib_fract`` of ``gt_info.json``;
-    without it, see :func:`~dopepp.data.formats.make_instance`.
+    Opening reads the archives' headers; members are read and checked with their image. An image
+    without ``gt.json`` has no instances. The reader leaves out objects that are none of the parts,
+    and objects behind the camera. The visible fraction is ``visib_fract`` of ``gt_info.json``, or
+    an estimate of :func:`~dopepp.data.formats.make_instance`.
 
     Args:
-        parts: The objects to return, named as in ``models_info.json`` or ``obj_000001``.
+        parts: Objects to return, named as in ``models_info.json`` or ``obj_000001``.
         shards: A folder in ``root``, a file or a URL; see :func:`find_shards`.
-        download_dir: Folder for shards from URLs; None refuses URLs.
+        download_dir: Folder for shards from URLs; None rejects URLs.
     """
 
     def __init__(
@@ -87,11 +87,11 @@ class WebdatasetReader:
         return len(self._items)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Read an image; the epoch does not matter."""
+        """Read an image; the epoch is ignored."""
         shard, image = self._shards[self._items[index, 0]], int(self._items[index, 1])
         records = _records(shard, image)
         content = shard.read(image, "image")
-        assert content is not None  # the index holds no image without
+        assert content is not None  # every indexed image has a picture
         picture = decode_rgb(content, records.start)
         shape: Shape = picture.shape[:2]
         K, scales = bop.read_cameras([records.json("camera")], records.nodes)
@@ -114,12 +114,12 @@ class WebdatasetReader:
         return Sample(picture, camera, instances, depth, self.name, shard.keys[image])
 
     def _chosen(self, poses: bop.BopPoses) -> list[int]:
-        """Return the indices of the objects of interest before the camera."""
+        """Return the indices of the parts' objects in front of the camera."""
         wanted = np.isin(poses.obj_ids, list(self._parts)) & (poses.T_cam_obj[:, 2, 3] > 0)
         return [int(number) for number in np.flatnonzero(wanted)]
 
     def contains(self, label: str) -> bool:
-        """Tell whether an image holds this object, reading ground truth until one does."""
+        """Tell whether any image shows this object, reading ground truth until one does."""
         wanted = {number for number, part in self._parts.items() if part.name == label}
         for number, image in self._items.tolist() if wanted else ():
             poses = _records(self._shards[number], image).poses()
@@ -128,7 +128,7 @@ class WebdatasetReader:
         return False
 
     def describe(self) -> list[SourceInfo]:
-        """Return the hash of the members' sizes, the objects and the origin of fractions."""
+        """Describe the images by hashes of sizes and objects, and the fractions' origin."""
         digest, stated = hashlib.sha256(), True
         for number, image in self._items.tolist():
             shard = self._shards[number]
@@ -148,9 +148,9 @@ class ShardRecords:
     """The JSON members of one image, each parsed on first use.
 
     Args:
-        start: Beginning of the members' paths, ``SHARD/KEY``.
-        read: Returns a member's content by its name, e.g. ``gt``; None where there is none.
-        problems: Receives what is wrong.
+        start: Start of the members' paths, ``SHARD/KEY``.
+        read: Returns a member's content by its name, e.g. ``gt``; None without such a member.
+        problems: Receiver of problems.
     """
 
     def __init__(
@@ -163,12 +163,12 @@ class ShardRecords:
         return Node(self._problems, f"{self.start}.{name}.json")
 
     def nodes(self, what: str, number: int) -> Node:
-        """Return a record's node."""
+        """Return the node of a record."""
         member = self._member(what)
         return member if what == "camera" else member[number]
 
     def _json(self, name: str) -> Any:
-        """Return a member's content; None where there is none or it cannot be read."""
+        """Return a member's content; None if it is missing or unreadable."""
         content, member = self._read(name), self._member(name)
         if content is None or len(content) <= MAX_BYTES:
             return None if content is None else member.decode(content)
@@ -184,17 +184,17 @@ class ShardRecords:
 
     @cached_property
     def infos(self) -> list[bop.Record | None]:
-        """The ``gt_info`` record of each object, None where there is none."""
+        """The ``gt_info`` record of each object; None for a missing one."""
         return bop.pair_infos(self.truths, self.json("gt_info"), self._member("gt_info"))
 
     def poses(self) -> bop.BopPoses:
-        """Return the ground truth; empty where there is none."""
+        """Return the ground truth, which may be empty."""
         return bop.read_poses(self.truths, self.infos, self.nodes)
 
     def mask(self, name: str, number: int, shape: Shape) -> Mask | None:
-        """Return an object's mask in ``mask`` or ``mask_visib``, None where it is damaged."""
+        """Return an object's mask from ``mask`` or ``mask_visib``; None if it is damaged."""
         runs = self.json(name)
-        # Objects by number, or (older shards) a list of them.
+        # A mapping by number or, in older shards, a list.
         listed = dict(enumerate(runs)) if isinstance(runs, list) else {}
         record = listed.get(number, mapping(runs).get(f"{number}"))
         return decode_runs(record, shape, self._member(name)[f"{number}"])
@@ -216,8 +216,14 @@ def _check_keys(shards: Sequence[ShardIndex]) -> None:
 def find_shards(root: Path, shards: str, download_dir: Path | None = None) -> list[Path]:
     """Return the shards as local files, in order.
 
-    ``shards`` is a folder in ``root`` (its ``*.tar`` by name), a file or a URL; braces as in
-    ``shard-{000000..000009}.tar`` are expanded. Shards from URLs are kept in ``download_dir``.
+    Args:
+        root: Folder of the data set.
+        shards: A folder in ``root`` (its ``*.tar`` by name), a file or a URL; braces as in
+            ``shard-{000000..000009}.tar`` are expanded.
+        download_dir: Folder that keeps shards from URLs; None rejects URLs.
+
+    Raises:
+        UserError: A shard is missing or listed twice, a brace is wrong, or a download fails.
     """
     paths = []
     for text in _expanded(shards):
@@ -237,7 +243,7 @@ def find_shards(root: Path, shards: str, download_dir: Path | None = None) -> li
 def _expanded(text: str) -> list[str]:
     from braceexpand import braceexpand  # comes with the webdataset library
 
-    # The library lists a whole range at once, and nothing bounds the product of many braces.
+    # The library builds a whole range at once and does not limit the product of braces.
     lengths = [abs(int(m[2]) - int(m[1])) for m in _RANGE.finditer(text[:_MAX_TEXT])]
     is_short = len(text) <= _MAX_TEXT and text.count("{") <= _MAX_BRACES
     try:
@@ -265,7 +271,7 @@ def _local(path: Path) -> list[Path]:
 
 def _fetched(url: str, scheme: str, folder: Path | None) -> Path:
     problem = f"shards {url!r:.100}"
-    if scheme == "pipe":  # a path in a stranger's config would run with the user's rights
+    if scheme == "pipe":  # an untrusted config must not run commands
         allowed = "files, folders and URLs of shards"
         raise UserError(f"{problem}, a command to run", allowed, "download the shards")
     if folder is None:
@@ -284,7 +290,7 @@ def _fetched(url: str, scheme: str, folder: Path | None) -> Path:
 
 
 def _download(url: str, scheme: str, path: Path) -> None:
-    """Download a whole shard, within bounds, through the library's own opener."""
+    """Download a whole shard of limited size through the library's opener."""
     from webdataset.gopen import gopen, gopen_schemes  # imports torch where it is installed
 
     if scheme not in gopen_schemes:

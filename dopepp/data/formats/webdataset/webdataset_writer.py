@@ -1,8 +1,8 @@
-"""BOP-WebDataset shards, staged item by item and finalized shard by shard.
+"""Write BOP-WebDataset shards: stage items, and finalize shard by shard.
 
-``train_pbr/shard-000012.tar`` holds images 12,000 – 12,999 in order, ``key_to_shard.json`` tells
-each key's shard, ``models/`` lies beside the split as in BOP's scenewise layout. Until its shard is
-finalized, an image is a small archive of its own in the hidden folder ``.items``.
+``train_pbr/shard-000012.tar`` holds images 12,000 – 12,999 in order. ``key_to_shard.json`` lists
+the shard of each key. ``models/`` lies next to the split as in BOP's scenewise layout. Until the
+shard is finalized, each image is a small archive in the hidden folder ``.items``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from dopepp.data.formats.webdataset import KEY_FILE, TarMember, members, read_sp
 from dopepp.data.sample import Sample
 
 _OWNER: Final = "dopepp"
-"""A fixed owner and a modification time of 0 make the same images the same bytes."""
+"""A fixed owner and a modification time of 0 give equal images equal bytes."""
 
 Content = dict[str, bytes]
 """An image's members by extension."""
@@ -68,11 +68,11 @@ class WebdatasetWriter(BopFolder):
             staged = {image: path for image, path in staged.items() if image in wanted}
             if staged:
                 self._write_shard(chunk, staged)
-            # Also of a shard that was finalized elsewhere and copied here.
+            # This also adds a shard that was finalized elsewhere and copied here.
             self._write_keys(chunk)
             for path in staged.values():
                 path.unlink()
-            with suppress(OSError):  # there is none, or not all items were finalized
+            with suppress(OSError):  # the folder is missing, or has items left
                 self._staging(chunk).rmdir()
 
     def _write_shard(self, chunk: int, staged: dict[int, Path]) -> None:

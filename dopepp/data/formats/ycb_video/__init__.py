@@ -1,4 +1,4 @@
-"""The files of YCB-Video: lists of classes and frames, and a frame's images and ``meta.mat``."""
+"""Read the files of YCB-Video: lists of classes and frames, a frame's images and ``meta.mat``."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from dopepp.geometry.camera import CameraMatrix, Transform, make_transform
 
 Subset = Literal["real", "synthetic"]
 FOLDERS: Final[dict[Subset, str]] = {"real": "data", "synthetic": "data_syn"}
-"""Where each subset's frames are."""
+"""Folder of each subset's frames."""
 
 
 def read_classes(root: Path) -> list[str]:
-    """Return the object names of ``image_sets/classes.txt``; a class index is the line from 1."""
+    """Return the names in ``image_sets/classes.txt``; a class index is the line number from 1."""
     path = root / "image_sets" / "classes.txt"
     for is_there, lack in (
         (root.is_dir(), "is no folder"),
@@ -69,9 +69,9 @@ class FrameMeta:
     """Ground truth of a frame.
 
     Attributes:
-        poses: T_cam_obj of every object, by class index (from 1), metres; with NaN where damaged.
-        columns: Index of each object in the file's ``poses``.
-        K: Camera matrix in pixels; None where the file has none.
+        poses: T_cam_obj by class index (from 1), metres; NaN in a damaged pose.
+        columns: Position of each object in the file's ``poses``.
+        K: Camera matrix in pixels; None if the file does not state it.
     """
 
     poses: Mapping[int, Transform]
@@ -83,8 +83,8 @@ class FrameMeta:
 def read_meta(path: Path, problems: Problems = STRICT) -> FrameMeta:
     """Read a ``meta.mat``.
 
-    Reported are a file that is missing, cut short or lacks a field, and a pose that is not finite,
-    no rotation, or behind the camera.
+    Problems are a missing or truncated file, a missing field, and a pose that is not finite, not
+    rigid, or behind the camera.
     """
     node = Node(problems, path)
     fields = _load(path, node["file"])
@@ -124,16 +124,16 @@ def _load(path: Path, node: Node) -> dict[str, NDArray[Any]] | None:
     if not _is_complete(content):
         node.report(f"cut short after {size} bytes", _ALLOWED)
     try:
-        # vertmap and the like are megabytes that nobody needs.
+        # The other fields, e.g. vertmap, are large and not needed.
         return dict(scipy.io.loadmat(path, variable_names=_FIELDS))
-    except Exception as error:  # SciPy lets through whatever a damaged byte happens to cause
+    except Exception as error:  # damage makes SciPy raise any type
         node.report(f"damaged ({error})", _ALLOWED)
         return None
 
 
 def _is_complete(content: bytes) -> bool:
     """Tell whether the last MAT-5 element (type, length, data) ends where the file ends."""
-    # SciPy reads a file that was cut off between or inside variables it is not asked for.
+    # SciPy accepts a file that is truncated between or inside other variables.
     start = _HEADER_BYTES
     order = "<" if content[126:128] == b"IM" else ">"
     while start + 8 <= len(content):
@@ -142,7 +142,7 @@ def _is_complete(content: bytes) -> bool:
 
 
 def _columns(node: Node, fields: Mapping[str, NDArray[Any]]) -> list[tuple[int, NDArray[Any]]]:
-    """Return each object's class index and 3×4 pose; none where the two fields do not match."""
+    """Return each object's class index and 3×4 pose; none if the two fields do not match."""
     if "cls_indexes" not in fields or "poses" not in fields:
         return []
     stored = np.asarray(fields["cls_indexes"])
@@ -172,13 +172,13 @@ def _pose(value: NDArray[Any], node: Node) -> Transform:
 
 @dataclass(frozen=True)
 class YcbFrame:
-    """The files of a frame; None where one cannot be read.
+    """The files of a frame; None for an unreadable file.
 
     Attributes:
         image: RGB, with alpha in a synthetic frame.
-        shape: (height, width), also of a damaged image that states its size.
+        shape: (height, width), even of a damaged image that states its size.
         depth: Units of ``1 / factor_depth`` metres.
-        labels: Class index of every pixel, 0 elsewhere.
+        labels: Class index of each pixel; 0 is the background.
     """
 
     image: UInt8[np.ndarray, "height width channels"] | None
@@ -191,7 +191,7 @@ class YcbFrame:
 def read_frame(
     start: str, subset: Subset, problems: Problems = STRICT, read_depth: bool = True
 ) -> YcbFrame:
-    """Read the frame whose paths begin with ``start``, e.g. ``data/0000/000001``."""
+    """Read the frame whose paths start with ``start``, e.g. ``data/0000/000001``."""
     colour, depth, label = (
         Node(problems, Path(f"{start}-{name}.png")) for name in ("color", "depth", "label")
     )

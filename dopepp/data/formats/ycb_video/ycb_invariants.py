@@ -67,7 +67,7 @@ def _check_lists(report: CheckReport) -> None:
 
 
 def _frames(folder: Path) -> Iterator[str]:
-    """Yield the start of every frame's paths, ``…/000001``, also where files are missing."""
+    """Yield the start of each frame's paths, ``…/000001``, even if files are missing."""
     scenes = [folder, *sorted(path for path in folder.glob("*") if path.is_dir())]
     for scene in scenes:
         names = {path.name.partition("-")[0] for path in scene.glob("*-*.*")}
@@ -75,13 +75,13 @@ def _frames(folder: Path) -> Iterator[str]:
 
 
 class _FrameCheck:
-    """Checks frames; an object's points are read when they are first needed."""
+    """Checks frames; reads an object's points on first use."""
 
     def __init__(self, report: CheckReport, classes: list[str]) -> None:
         self._report, self._classes, self._size = report, classes, cache(self._read_size)
 
     def _read_size(self, name: str) -> tuple[Points, float] | None:
-        """Return an object's points and diameter, metres; None where it has no points."""
+        """Return an object's points and diameter in metres; None without readable points."""
         path = self._report.root / "models" / name / "points.xyz"
         if not path.is_file():
             self._report.note(f"models/{name}/points.xyz is missing: its boxes are not checked")
@@ -98,7 +98,7 @@ class _FrameCheck:
         return points, largest_distance(points)
 
     def check(self, start: str, subset: Subset) -> None:
-        """Check the files of the frame whose paths begin like this."""
+        """Check the files of the frame whose paths start with ``start``."""
         frame = read_frame(start, subset, self._report)
         meta, label = frame.meta, frame.labels
         node = Node(self._report, Path(f"{start}-meta.mat"))
@@ -131,7 +131,7 @@ class _FrameCheck:
             check_box(node["box"], transform(T_cam_obj, points), K, seen)
 
     def _check_box_file(self, path: Path, shape: Shape | None) -> None:
-        """Check ``box.txt``, if present: name, left, top, right and bottom a line."""
+        """Check ``box.txt``, if present, with lines of name, left, top, right and bottom."""
         lines = path.read_text(errors="replace").splitlines() if path.is_file() else []
         for number, line in enumerate(lines, 1):
             name, *values = line.split() or [""]

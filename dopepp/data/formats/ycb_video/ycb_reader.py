@@ -1,6 +1,6 @@
-"""YCB-Video in its own layout: ``data/SSSS/NNNNNN-*`` (real) and ``data_syn/NNNNNN-*`` (synthetic).
+"""Read YCB-Video: ``data/SSSS/NNNNNN-*`` (real) or ``data_syn/NNNNNN-*`` (synthetic).
 
-One reader reads one of the two subsets; :mod:`dopepp.data.image_sources.hybrid` mixes them.
+A reader reads one of the two subsets; :mod:`dopepp.data.image_sources.hybrid` mixes them.
 """
 
 from __future__ import annotations
@@ -41,25 +41,28 @@ _CAMERAS: Final = (
     camera_matrix(1066.778, 1067.487, 312.9869, 241.3109),
     camera_matrix(1077.836, 1078.189, 323.7872, 279.6921),
 )
-"""The data set's two colour cameras: scenes 0000–0059 and data_syn, scenes 0060–0091."""
+"""Colour cameras of the data set: scenes 0000–0059 and data_syn; scenes 0060–0091."""
 
 
 class YcbVideoReader:
     """Real or synthetic frames of a YCB-Video folder.
 
-    Visible fractions: label pixels over the area of the convex hull of the projected ADD points,
-    border ignored. The hull is more than the silhouette of a concave object (drill, mug), so its
-    fraction comes out too small there. An object with a pose but without one label pixel is
-    unlabelled on a real frame (some releases label only some objects): it gets no mask, and only
-    the image border counts. In ``data_syn`` labels are complete, so it is hidden: fraction 0.
+    The visible fraction is the number of label pixels over the area of the convex hull of the
+    projected ADD points. The fraction is too small for a concave object (drill, mug), whose hull is
+    larger than the silhouette. Some releases label only some objects, so a posed object without a
+    label pixel has no mask on a real frame, and only the image border counts. Labels in
+    ``data_syn`` are complete, so such an object is hidden and has fraction 0.
 
     Args:
-        parts: The objects to return, named as in ``classes.txt``.
+        parts: Objects to return, named as in ``classes.txt``.
         image_set: Name of the list in ``image_sets/``; exclusive with ``frames``.
         subset: ``real`` reads ``data/``, ``synthetic`` reads ``data_syn/``.
         frames: Frames instead of a list: ``0050/000003`` (real) or ``000000`` (synthetic).
-        backgrounds: Pictures behind synthetic frames, whose own background is transparent.
-        seed: Seed of those backgrounds; they change with the epoch.
+        backgrounds: Pictures for the transparent background of synthetic frames.
+        seed: Seed of the backgrounds, which change with the epoch.
+
+    Raises:
+        UserError: The folder, the list or a part's class is missing, or no frame is on disk.
     """
 
     def __init__(
@@ -109,7 +112,7 @@ class YcbVideoReader:
         return len(self.frames)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Read a frame; only the background of a synthetic one depends on the epoch."""
+        """Read a frame; only the background of a synthetic frame depends on the epoch."""
         name, is_real = self.frames[index], self.subset == "real"
         frame = read_frame(self._start(name), self.subset, read_depth=self._read_depth)
         assert frame.image is not None
@@ -135,7 +138,7 @@ class YcbVideoReader:
         return read_meta(Path(f"{self._start(frame)}-meta.mat"))
 
     def _rgb(self, image: NDArray[Any], frame: str, epoch: int) -> Picture:
-        """Composite a synthetic frame on a background drawn for (seed, epoch, frame)."""
+        """Composite a synthetic frame on a background drawn by (seed, epoch, frame)."""
         if self.subset == "real" or self._backgrounds is None:
             return image
         rng = item_rng(self._seed, Purpose.BACKGROUND, epoch, int(frame))
@@ -145,14 +148,14 @@ class YcbVideoReader:
         return np.asarray(np.rint(blend), np.uint8)
 
     def contains(self, label: str) -> bool:
-        """Tell whether a frame holds this object, reading frames until one does."""
+        """Tell whether any frame shows this object, reading frames until one does."""
         wanted = {index for index, part in self._parts.items() if part.name == label}
         return bool(wanted) and any(
             not wanted.isdisjoint(self._meta(frame).poses) for frame in self.frames
         )
 
     def describe(self) -> list[SourceInfo]:
-        """Return the frame list's hash and the objects; instances of a small list are counted."""
+        """Describe the frames and objects; count the instances of a small list."""
         identity: dict[str, object] = {
             "frames": hashlib.sha256("\n".join(self.frames).encode()).hexdigest(),
             "objects": {part.name: part.mesh_hash for part in self._parts.values()},
