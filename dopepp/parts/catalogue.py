@@ -1,9 +1,10 @@
-"""Parts by the text a user writes: the path of a mesh file, or a built-in part's name.
+"""Parts by mesh file or by name of a built-in part.
 
-Built in are the paper's two parts (§2.1): Servoholder, 77×77×7 mm, and PivConnector, 105×52×7 mm.
-Their shapes are this project's: a 4 mm plate with raised features on its front (+z) and recesses in
-its back (−z), so that no rotation maps a part onto itself and any side shows how the part is
-turned. All numbers here are millimetres; parts are in metres about the bounding box's centre.
+The built-in parts are those of the paper (§2.1): Servoholder, 77×77×7 mm, and PivConnector,
+105×52×7 mm. The shapes are our own: a 4 mm plate with raised features on its front (+z) and
+recesses in its back (−z), so that no rotation maps a part onto itself and every side reveals the
+orientation.
+Numbers in this module are millimetres; parts are in metres about the bounding box's centre.
 
 To add a built-in part, write its solid with the shapes below and a function like ``servoholder``.
 """
@@ -31,13 +32,13 @@ _log = logging.getLogger(__name__)
 BACK: Final = -3.5
 PLATE: Final = 0.5
 FRONT: Final = 3.5
-"""Heights along z: the back face, the plate's front face, the top of the raised features."""
+"""Heights along z of the back face, the plate's front face and the top of the features."""
 
 RECESS: Final = 2.5  # Depth of a recess
-SLOPE: Final = 1.5  # How far a feature's walls lean inwards over its height
-SEGMENTS: Final = 64  # Sides of a circle: 0.03 mm of deviation on the largest one
+SLOPE: Final = 1.5  # Inward lean of a feature's walls over its height
+SEGMENTS: Final = 64  # Sides of a circle: deviates by at most 0.03 mm
 TOLERANCE: Final = 1e-3
-"""Edges shorter than this are the cuts' rounding, and would only make degenerate triangles."""
+"""Shorter edges are rounding errors of cuts and would make degenerate triangles."""
 
 
 @cache
@@ -93,14 +94,14 @@ BUILTIN: Final[dict[str, Callable[[], Part]]] = {
 def load_part(path_or_name: str | Path, unit: str | None = None) -> Part:
     """Return a built-in part, or the part in a mesh file, named after the file.
 
-    The log states the part's size, and warns of an unlikely one.
+    The part's size is logged, with a warning if it is unlikely.
 
     Args:
-        path_or_name: Mesh file, or name of a built-in part, which needs no unit.
-        unit: Unit of the file (default: of its format, else millimetres, which the log says).
+        path_or_name: Mesh file, or name of a built-in part.
+        unit: Unit of the file (default: the unit of its format, otherwise millimetres).
 
     Raises:
-        UserError: There is no such part or file, or the file cannot be used (see
+        UserError: The part or file does not exist, or the file is invalid (see
             :func:`~dopepp.parts.mesh.read.read_mesh`).
     """
     text = str(path_or_name)
@@ -110,8 +111,8 @@ def load_part(path_or_name: str | Path, unit: str | None = None) -> Part:
     if path.suffix.lower() not in READERS:
         allowed = f"{', '.join(BUILTIN)}, or a path to {'/'.join(READERS)}"
         raise UserError(f"unknown part {text!r}", allowed, "check the spelling")
-    mesh, taken = read_in_unit(path, unit)
-    part = replace(make_part(path.stem, mesh, unit=taken), unit=taken)
+    mesh, file_unit = read_in_unit(path, unit)
+    part = replace(make_part(path.stem, mesh, unit=file_unit), unit=file_unit)
     _log.log(logging.INFO if is_plausible(part) else logging.WARNING, "%s", part_in_words(part))
     return part
 
@@ -123,15 +124,15 @@ def with_meshes(
 
     Args:
         parts: Parts of the checkpoint.
-        given: Meshes that replace the checkpoint's: ``NAME=FILE``, where NAME may be left out if it
-            is the file's stem or there is one part only.
-        unit: Unit of the mesh files; None takes the unit that their format states.
+        given: Meshes that replace those of the checkpoint, as ``NAME=FILE``; NAME may be omitted if
+            it is the file's stem or if there is a single part.
+        unit: Unit of the mesh files; None for the unit of their format.
 
     Returns:
-        The parts in order. The log warns of a mesh that was not trained on.
+        The parts in order. A warning is logged if a mesh is not the trained one.
 
     Raises:
-        UserError: A part has no mesh, a given one is not known, or a file cannot be used.
+        UserError: A part has no mesh, a name is unknown, or a file is invalid.
     """
     names = [part.name for part in parts]
     chosen: dict[str, str] = {}
@@ -142,7 +143,7 @@ def with_meshes(
             name = names[0] if single else text if text in BUILTIN else Path(text).stem
         if name not in names:
             problem, allowed = (
-                f"--part {text}, which is no part of the checkpoint",
+                f"--part {text}, which is not in the checkpoint",
                 ", ".join(names),
             )
             raise UserError(problem, allowed, "name the part: --part NAME=FILE")
@@ -151,7 +152,7 @@ def with_meshes(
 
 
 def _with_mesh(part: Part, chosen: str | None, unit: str | None) -> Part:
-    """Return a part with the chosen mesh, or with its own one."""
+    """Return a part with the chosen mesh, or with its own mesh."""
     if chosen is None:
         if part.mesh is not None:
             return part
@@ -160,15 +161,13 @@ def _with_mesh(part: Part, chosen: str | None, unit: str | None) -> Part:
         raise UserError(problem, "a mesh file for every part without one", fix)
     loaded = load_part(chosen, unit)
     if part.mesh_hash and loaded.mesh_hash != part.mesh_hash:
-        _log.warning(
-            "the mesh of %s (%s) is not the one the checkpoint was trained on", part.name, chosen
-        )
+        _log.warning("the checkpoint was not trained on this mesh of %s (%s)", part.name, chosen)
     return replace(part, mesh=loaded.mesh, mesh_deviation=loaded.mesh_deviation)
 
 
 def _tapered(foot: float, top: float, *sections: CrossSection) -> Manifold:
-    """Extrude convex sections along z while they shrink by ``SLOPE`` all around."""
-    # Walls of another direction than the plate's make the features visible from straight above.
+    """Extrude convex sections along z, shrinking them by ``SLOPE`` all around."""
+    # Walls that lean make the features visible from straight above.
     solids = []
     for section in sections:
         outlines = ((section, foot), (section.offset(-SLOPE, JoinType.Miter), top))
@@ -208,10 +207,10 @@ def _prism(section: CrossSection, bottom: float = BACK, top: float = FRONT) -> M
 
 
 def _mesh(solid: Manifold) -> Mesh:
-    """Turn a solid in millimetres into triangles in metres."""
+    """Convert a solid in millimetres to triangles in metres."""
     triangles = solid.as_original().simplify(TOLERANCE).to_mesh64()
-    # Rounding to a nanometre (1e-6 mm) hides the last digits of sin and cos, which differ between
-    # platforms, so that a part has one hash everywhere; vertices that meet by it become one.
+    # Rounding to a nanometre (1e-6 mm) removes the last digits of sin and cos, which differ between
+    # platforms, so that a part has one hash everywhere. Vertices that coincide then are merged.
     rounded = np.round(np.asarray(triangles.vert_properties)[:, :3], 6)
     vertices, faces = weld(rounded, np.asarray(triangles.tri_verts))
     a, b, c = faces.T

@@ -1,6 +1,6 @@
 """A part: a rigid object with its mesh, size, cuboid and symmetries, all in metres.
 
-A part's record, a plain mapping, may come from a file that anybody has written, so
+A record is the plain mapping of a part in a file. Files may come from anybody, so
 :meth:`Part.from_record` checks every field.
 """
 
@@ -40,21 +40,20 @@ logger = logging.getLogger(__name__)
 UNITS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}  # Metres per unit of a mesh file
 SMALLEST_DIAMETER: Final = 0.005
 LARGEST_DIAMETER: Final = 5.0
-"""Metres. Outside these, a part is far more likely to have been read in the wrong unit."""
+"""Metres. Other diameters nearly always mean a wrong unit."""
 
 MAX_NAME: Final = 200
-"""Characters: far above any real part, and a bound on what a hostile file prints."""
+"""Characters; bounds what a hostile file prints."""
 
 MAX_POINTS: Final = 100_000
 MAX_SYMMETRIES: Final = 1000
-"""Far above any real part (YCB-Video: 2,621 points); they bound memory for a hostile file."""
+"""Far more than any real part has; bounds on the memory of a hostile file."""
 
 MAX_LIGHT_FACES: Final = 4000
-"""Triangles of a record's mesh, and of an outline's: their edges are two pixels long on a part of
-100 pixels."""
+"""Triangles of a record's mesh: edges of two pixels on a part of 100 pixels."""
 
 _FARTHEST: Final = 1e6
-"""Metres. No part reaches out this far, and squares of such lengths stay finite."""
+"""Largest coordinate, metres; its square stays finite."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +63,10 @@ class Mesh:
     Attributes:
         vertices: Positions in metres, float64.
         faces: Vertex indices of each triangle, counter-clockwise from outside, int32.
-        uv: Texture coordinates per vertex, v upwards as in OBJ, with a texture.
+        uv: Texture coordinates per vertex, v upwards as in OBJ; None without a texture.
         texture: RGB texture image, first row on top.
-        colours: sRGB of each vertex, without a texture.
-        normals: Normal of each vertex as the file has it, of any length, not checked.
+        colours: sRGB of each vertex; None with a texture.
+        normals: Normal of each vertex in the file, of any length, not checked.
     """
 
     vertices: Vertices
@@ -86,13 +85,13 @@ class Part:
         cuboid: Eight bounding-box corners in NDDS order and the centre, metres, object frame.
         diameter: Largest distance between two vertices, metres.
         points: ADD points in the object frame, metres.
-        mesh: Triangles to render, at most 200,000; out of a checkpoint, its :attr:`light_mesh`;
-            None for an object known by its ADD points only.
+        mesh: At most 200,000 triangles to render (from a checkpoint: :attr:`light_mesh`); None for
+            an object with ADD points only.
         mesh_deviation: Largest distance of the mesh from the file's triangles, metres.
-        mesh_hash: SHA-256 of the vertices and faces that the part was made from, hex.
+        mesh_hash: SHA-256 of the original vertices and faces, hex.
         symmetries_discrete: BOP-style rigid transforms (S, 4, 4) without the identity.
         symmetries_continuous: BOP-style axes of rotational symmetry as (axis, offset) pairs.
-        unit: Unit that the part's own file was read in; empty for all other parts.
+        unit: Unit of the part's file; empty without a file.
     """
 
     name: str
@@ -110,7 +109,7 @@ class Part:
     def light_mesh(self) -> tuple[Mesh, float] | None:
         """At most 4,000 untextured triangles for a checkpoint, and their largest deviation, metres.
 
-        Lengths are rounded to 0.1 µm. None without a mesh, or where so few triangles cannot be.
+        Lengths are rounded to 0.1 µm. None without a mesh, or if it cannot be decimated.
         """
         if self.mesh is None:
             return None
@@ -120,14 +119,14 @@ class Part:
             try:
                 fewer, corners, *_ = decimate(vertices, faces, None, MAX_LIGHT_FACES)
             except ValueError as error:
-                logger.warning("part %r goes without a mesh into checkpoints: %s", self.name, error)
+                logger.warning("part %r has no mesh in checkpoints: %s", self.name, error)
                 return None
             deviation += float(SurfaceTree(fewer, corners).distances(vertices).max())
             vertices, faces = weld(np.round(fewer, 7), corners)
         return Mesh(vertices, faces.astype(np.int32)), deviation
 
     def to_record(self) -> dict[str, Any]:
-        """Return plain values, the light mesh among them, for a checkpoint's objects table."""
+        """Return plain values, including the light mesh, for a checkpoint's objects table."""
         discrete = self.symmetries_discrete
         mesh = None
         if self.light_mesh is not None:
@@ -147,10 +146,10 @@ class Part:
 
     @classmethod
     def from_record(cls, record: object) -> Part:
-        """Make a part from the plain values of :meth:`to_record`.
+        """Create a part from the plain values of :meth:`to_record`.
 
         Raises:
-            UserError: A field is missing, unknown, or not what ``to_record`` writes.
+            UserError: A field is missing, unknown or invalid.
         """
         values = parse(_Record, record, "part", _FIX)
         if not all(any(axis) for axis, _ in values.symmetries_continuous):
@@ -177,7 +176,7 @@ class Part:
         )
 
 
-_FIX: Final = "load a file that this version of dopepp has written"
+_FIX: Final = "load a file written by this version of dopepp"
 
 _Metres: TypeAlias = Annotated[float, Field(ge=-_FARTHEST, le=_FARTHEST)]
 _Point: TypeAlias = tuple[_Metres, _Metres, _Metres]
@@ -187,7 +186,7 @@ _Row: TypeAlias = tuple[_Metres, _Metres, _Metres, _Metres]
 
 @dataclass(frozen=True)
 class _MeshRecord:
-    """Triangles of a record, and how far any vertex had been moved, metres."""
+    """Triangles of a record, and the largest move of a vertex, metres."""
 
     __pydantic_config__ = STRICT
     vertices: Annotated[list[_Point], Field(min_length=3, max_length=3 * MAX_LIGHT_FACES)]
@@ -217,9 +216,12 @@ class _Record:
 def _checked_cuboid(rows: Sequence[_Point]) -> Float[np.ndarray, "9 3"]:
     cuboid = np.array(rows, np.float64)
     expected = cuboid_keypoints(cuboid.min(axis=0), cuboid.max(axis=0))
-    # Another order of corners would give wrong poses without any error; 1e-6 is float32's rounding.
+    # Another order of corners would silently give wrong poses; 1e-6 is float32's rounding.
     if not np.abs(cuboid - expected).max() <= 1e-6 * np.ptp(cuboid):
-        problem, allowed = "part.cuboid that is no axis-aligned box", "eight corners in NDDS order"
+        problem, allowed = (
+            "part.cuboid that is not an axis-aligned box",
+            "eight corners in NDDS order",
+        )
         raise UserError(problem, f"{allowed}, then the centre", _FIX)
     return cuboid
 
@@ -232,7 +234,7 @@ def _checked_transforms(
     transforms = np.array(matrices, np.float64).reshape(-1, 4, 4)
     for matrix in transforms:
         if not is_rotation(matrix[:3, :3]) or (matrix[3] != [0, 0, 0, 1]).any():
-            problem = "part.symmetries_discrete with a matrix that is no rigid transform"
+            problem = "part.symmetries_discrete with a matrix that is not a rigid transform"
             raise UserError(problem, "[R t; 0 0 0 1] with a rotation R", _FIX)
     return transforms
 
@@ -249,14 +251,21 @@ def make_part(
     symmetries_continuous: tuple[ContinuousSymmetry, ...] = (),
     unit: str = "m",
 ) -> Part:
-    """Measure a mesh and make the part it describes.
+    """Create a part from a mesh or from ADD points.
 
-    A mesh of over 200,000 triangles is measured first and then decimated for rendering. ADD points
-    are by default 2,000 fixed-seed samples of the surface; ``unit`` is the file's, for messages.
+    A mesh of over 200,000 triangles is measured first and then decimated for rendering.
+
+    Args:
+        name: Name of the part.
+        mesh: Triangles, metres; None for a part with ADD points only.
+        points: ADD points, metres (default: 2,000 fixed-seed samples of the surface).
+        symmetries_discrete: As in :class:`Part`.
+        symmetries_continuous: As in :class:`Part`.
+        unit: Unit of the file, for messages.
 
     Raises:
-        UserError: The name is empty or too long, the diameter lies outside 5 mm – 5 m, or the mesh
-            has too many triangles of which no larger ones can be made.
+        UserError: The name is empty or too long, the diameter is outside 5 mm – 5 m, or the mesh
+            cannot be decimated.
     """
     check_name(name)
     outline = points if mesh is None else mesh.vertices
@@ -282,23 +291,17 @@ def make_part(
 
 
 def _renderable(mesh: Mesh, name: str) -> tuple[Mesh, float]:
-    """Return a mesh of at most ``MAX_FACES`` triangles, and the farthest move of a vertex."""
+    """Return a mesh of at most ``MAX_FACES`` triangles, and the largest move of a vertex."""
     if len(mesh.faces) <= MAX_FACES:
         return mesh, 0.0
     values = mesh.uv if mesh.colours is None else mesh.colours.astype(np.float64)
     try:
         vertices, faces, values, moved = decimate(mesh.vertices, mesh.faces, values)
     except ValueError as error:
-        raise UserError(
-            f"part {name!r}: {error}", f"up to {MAX_FACES} triangles", "reduce its triangles"
-        ) from error
-    logger.warning(
-        "part %r: %d triangles decimated to %d to render; no point moved by more than %.2g mm",
-        name,
-        len(mesh.faces),
-        len(faces),
-        1000 * moved,
-    )
+        allowed, fix = f"up to {MAX_FACES} triangles", "reduce its triangles"
+        raise UserError(f"part {name!r}: {error}", allowed, fix) from error
+    counts = f"{len(mesh.faces)} triangles decimated to {len(faces)}"
+    logger.warning("part %r: %s; vertices moved by up to %.2g mm", name, counts, 1000 * moved)
     if mesh.colours is None or values is None:
         return Mesh(vertices, faces.astype(np.int32), values, mesh.texture), moved
     colours = np.rint(values).astype(np.uint8)
@@ -306,7 +309,7 @@ def _renderable(mesh: Mesh, name: str) -> tuple[Mesh, float]:
 
 
 def _check_diameter(diameter: float, name: str, unit: str) -> None:
-    """Refuse a diameter (metres) that nearly always means a wrong unit, and name likely ones."""
+    """Refuse a diameter (metres) that nearly always means a wrong unit, and suggest units."""
     if SMALLEST_DIAMETER <= diameter <= LARGEST_DIAMETER:
         return
     written = diameter / UNITS[unit]
@@ -319,7 +322,11 @@ def _check_diameter(diameter: float, name: str, unit: str) -> None:
 
 
 def check_name(name: object) -> str:
-    """Return a name that can label instances: a text of 1 to 200 printable characters."""
+    """Return a valid part name: a text of 1 to 200 printable characters.
+
+    Raises:
+        UserError: The name is invalid.
+    """
     if isinstance(name, str) and 0 < len(name) <= MAX_NAME and name.isprintable():
         return name
     allowed = f"1–{MAX_NAME} printable characters"

@@ -1,9 +1,9 @@
-"""The symmetries of a part, found on its mesh.
+"""Search for the symmetries of a part on its mesh.
 
-A rotation is a symmetry when it takes no point of the surface farther from the surface than a
-tolerance, a share of the diameter. Mirror images are none: no motion makes one out of a part.
-Texture is not looked at. The search is on a normalised shape: its surface's centroid, which every
-symmetry leaves where it is, at the origin, and a diameter of 1.
+A rotation is a symmetry if it moves no point of the surface farther from the surface than a
+tolerance, a share of the diameter. Reflections are no rigid motions and do not count; textures are
+ignored. The search uses a normalised shape of diameter 1 about the centroid of its surface, which
+every symmetry preserves.
 """
 
 from __future__ import annotations
@@ -26,36 +26,39 @@ from dopepp.parts.mesh import Points, SurfaceTree, half_sphere, largest_distance
 from dopepp.parts.part import Mesh
 
 _ROUGH: Final = 0.06
-"""Mean distance, in diameters, from which on a turn is no symmetry seen from 2.6° beside it."""
+"""Mean distance that excludes a symmetry within 2.6° of the axis, diameters."""
 
 _GIVE: Final = 0.02
-"""Distance, in diameters, from which on a point pulls with constant force: it may belong to a
-feature that has no counterpart."""
+"""Distance above which a point pulls with constant force, diameters: its feature may have no
+counterpart."""
 
-TOLERANCE: Final = 0.01  # Share of the diameter by which a symmetry may miss the surface
+TOLERANCE: Final = 0.01  # Largest distance from the surface, diameters
 LARGEST_TOLERANCE: Final = 0.1
 SMALLEST_TOLERANCE: Final = 1e-4
 
-MAX_ORDER: Final = 12  # Turns in a full one about an axis of discrete symmetry, at most
+MAX_ORDER: Final = 12  # Highest order of a discrete axis
 _NUM_PROBES: Final = 8000
 
 Symmetries = tuple[Float[np.ndarray, "symmetries 4 4"], tuple[ContinuousSymmetry, ...]]
 
 
 def find_symmetries(mesh: Mesh, tolerance: float = TOLERANCE) -> Symmetries:
-    """Find the rigid transforms that map a mesh onto itself, however its surface is cut.
+    """Find the rigid transforms that map a surface onto itself, for any triangulation.
+
+    Args:
+        mesh: Triangles, metres.
+        tolerance: Largest distance of a moved surface point from the surface, diameters.
 
     Returns:
-        The discrete ones without the identity, metres (with it they form a group; a round part's
-        flip stands for all its flips), and the axes of continuous symmetry, three for a ball.
+        Discrete symmetries without the identity, metres (one flip for a round part), and axes of
+        continuous symmetry (three for a ball).
 
     Raises:
-        UserError: ``tolerance``, the largest distance of a moved surface point from the surface in
-            diameters, is not in 1e-4 … 0.1.
+        UserError: ``tolerance`` is outside 1e-4 … 0.1.
     """
     if not SMALLEST_TOLERANCE <= tolerance <= LARGEST_TOLERANCE:
         allowed = f"{SMALLEST_TOLERANCE} – {LARGEST_TOLERANCE} diameters"
-        fix = "choose how far a symmetry may miss the surface"
+        fix = "choose a tolerance in this range"
         raise UserError(f"a tolerance of {tolerance}", allowed, fix)
     shape = _Shape(mesh, tolerance)
     axis, generators = _search(shape)
@@ -70,7 +73,7 @@ def find_symmetries(mesh: Mesh, tolerance: float = TOLERANCE) -> Symmetries:
 
 
 class _Shape:
-    """A mesh about its surface's centroid with a diameter of 1, and points to try turns on."""
+    """A mesh of diameter 1 about the centroid of its surface, with probes for rotations."""
 
     def __init__(self, mesh: Mesh, tolerance: float) -> None:
         vertices = np.asarray(mesh.vertices, np.float64)
@@ -81,34 +84,34 @@ class _Shape:
         centroid = scaled.areas @ scaled.triangles.mean(axis=1) / scaled.areas.sum()
         self.centre = middle + self.diameter * centroid
         self.surface = SurfaceTree((vertices - self.centre) / self.diameter, mesh.faces)
-        corners = _some(self.surface.triangles.reshape(-1, 3))
-        centres = _some(self.surface.triangles.mean(axis=1))
+        corners = _subset(self.surface.triangles.reshape(-1, 3))
+        centres = _subset(self.surface.triangles.mean(axis=1))
         self._few = self.surface.spread(500, seed=3)[0]
         self._many = np.concatenate([corners, centres, self.surface.spread(_NUM_PROBES, seed=4)[0]])
 
     def fits(self, rotation: RotationMatrix) -> bool:
-        """Tell whether the turned surface lies on the surface."""
+        """Return whether the rotated surface coincides with the surface."""
         for probes in (self._few, self._many):
             moved = probes @ rotation.T
-            # One triangle a point is quick, and never too near; misses get a closer look.
+            # One triangle per point is quick and never underestimates; misses are refined.
             rough = self.surface.distances(moved, neighbours=1)
             doubtful = moved[np.argsort(-rough)[: (rough > self.tolerance).sum()]]
             for start in range(0, len(doubtful), 300):
-                some = doubtful[start : start + 300]
-                if self.surface.distances(some, neighbours=48).max() > self.tolerance:
+                batch = doubtful[start : start + 300]
+                if self.surface.distances(batch, neighbours=48).max() > self.tolerance:
                     return False
         return True
 
     def is_round(self, axis: Vector) -> bool:
-        """Tell whether every turn about an axis fits."""
-        # Spread over all angles by the golden ratio, 36 turns hit the worst angle of a prism with
-        # any number of sides within a few per cent of a side.
+        """Return whether every rotation about an axis fits."""
+        # By the golden ratio, 36 angles come within a few per cent of a side of the worst angle of
+        # any prism.
         golden = (np.sqrt(5) - 1) / 2
         angles = 2 * np.pi * (golden * np.arange(1, 37) % 1)
         return all(self.fits(axis_rotation(axis, float(angle))) for angle in angles)
 
     def order(self, axis: Vector, prime: int) -> int:
-        """Return the most equal turns about an axis that fit, a multiple of a prime."""
+        """Return the highest order of an axis, a multiple of a prime."""
         orders = range(MAX_ORDER - MAX_ORDER % prime, prime, -prime)
         return next((n for n in orders if self.fits(axis_rotation(axis, 2 * np.pi / n))), prime)
 
@@ -119,7 +122,7 @@ class _Shape:
         return _clean(rotations_about(self.centre, rotations))
 
     def axis(self, axis: Vector) -> ContinuousSymmetry:
-        """Return an axis through the centre with the point on it that is nearest the origin."""
+        """Return an axis through the centre and its point nearest the origin."""
         offset = self.centre - (self.centre @ axis) * axis
         return tuple(_clean(axis).tolist()), tuple(_clean(offset).tolist())
 
@@ -129,7 +132,7 @@ def _search(shape: _Shape) -> tuple[Vector | None, list[RotationMatrix]]:
     candidates = Candidates(shape.surface)
     generators: list[tuple[int, RotationMatrix]] = []
     group = np.eye(3)[None]
-    # Every axis of up to twelve turns has one of these. The largest first: it finds round shapes.
+    # Every order up to twelve has one of these factors; the largest finds round shapes first.
     for prime in (11, 7, 5, 3, 2):
         for axis in candidates.axes(prime):
             rotation = axis_rotation(axis, 2 * np.pi / prime)
@@ -137,7 +140,7 @@ def _search(shape: _Shape) -> tuple[Vector | None, list[RotationMatrix]]:
             if away <= SAME_TURN or not shape.fits(rotation):
                 continue
             if shape.is_round(axis):
-                # Its largest coordinate is positive.
+                # The largest coordinate of the axis is made positive.
                 return axis * np.sign(axis[np.abs(axis).argmax()]), []
             order = shape.order(axis, prime)
             generators.append((order, axis_rotation(axis, 2 * np.pi / order)))
@@ -151,7 +154,7 @@ def _largest_group(
     shape: _Shape, generators: list[RotationMatrix]
 ) -> Float[np.ndarray, "rotations 3 3"]:
     """Return a group of rotations that all fit, without the identity."""
-    # A rotation that fits only just may bring others with it that do not; then it is left out.
+    # A rotation that barely fits may generate rotations that do not fit; it is left out then.
     group = np.eye(3)[None]
     for rotation in generators:
         larger = exact_group(np.concatenate([group, rotation[None]]))
@@ -161,7 +164,7 @@ def _largest_group(
 
 
 class Candidates:
-    """Axes about which a turn by 2π / order may be a symmetry."""
+    """Axes about which a rotation by 2π / order may be a symmetry."""
 
     def __init__(self, surface: SurfaceTree) -> None:
         self._surface = surface
@@ -172,11 +175,11 @@ class Candidates:
         self._probes = surface.spread(400, seed=2)[0]
 
     def axes(self, order: int) -> Iterator[Vector]:
-        """Yield refined axes of a prime order, those with the smallest rough distance first."""
+        """Yield refined axes of a prime order by ascending rough distance."""
         turns = axis_rotation(self._axes, 2 * np.pi / order)
         change = turns @ self._moments @ np.swapaxes(turns, 1, 2) - self._moments
         scale = np.linalg.norm(self._moments)
-        # A half turn that is 2.6° off changes the moments of a rod by 0.13 of them.
+        # A half turn about an axis off by 2.6° changes the moments of a rod by 13 %.
         possible = np.linalg.norm(change, axis=(1, 2)) <= 0.2 * scale
         index = np.flatnonzero(possible)
         moved = self._rough_probes @ np.swapaxes(turns[index], 1, 2)
@@ -185,38 +188,38 @@ class Candidates:
         taken: list[Vector] = []
         for number in index[np.argsort(rough, kind="stable")]:
             axis = self._axes[number]
-            # Of axes within 8°, the best is refined.
+            # Among axes within 8°, only the best is refined.
             if taken and np.abs(np.array(taken) @ axis).max() > np.cos(np.radians(8.0)):
                 continue
             taken.append(axis)
             yield self._refined(axis, order, special=number < len(self._special))
-            if len(taken) == 24:  # the most that a solid has are the icosahedron's 15
+            if len(taken) == 24:  # the icosahedron has the most, 15
                 return
 
     def _refined(self, axis: Vector, order: int, special: bool) -> Vector:
-        """Aim an axis so that the turned surface lies on the surface as well as it can."""
+        """Refine an axis so that the rotated surface coincides best with the surface."""
         rotation = axis_rotation(axis, 2 * np.pi / order)
         for _ in range(12):
             step = self._step(rotation)
             rotation = axis_rotation(step, 1.0) @ rotation
             if np.linalg.norm(step) < 1e-6:  # a thousandth of any tolerance
                 break
-        # The axis as an eigenvector: a half turn's skew part, which others would give, vanishes.
+        # The axis is an eigenvector, because the skew part of a half turn vanishes.
         better = np.asarray(np.linalg.eigh(rotation + rotation.T)[1][:, -1])
         better = better if better @ axis > 0 else -better
-        # Special axes are exact, such as one along an edge: only a much smaller error tells more.
+        # Special axes, e.g. along edges, are exact and give way only to a much smaller error.
         if special and self._error(better, order) > 0.8 * self._error(axis, order):
             return axis
         return better
 
     def _step(self, rotation: RotationMatrix) -> Vector:
-        """Return the rotation vector that brings the turned points nearest to their planes."""
+        """Return the rotation vector that moves the rotated points towards their planes."""
         moved = self._probes @ rotation.T
         closest, normals = self._surface.nearest(moved)
         away = ((closest - moved) * normals).sum(axis=1)
         weight = np.minimum(1.0, _GIVE / np.maximum(np.abs(away), _GIVE))
         lever = np.cross(moved, normals)
-        # The damping stands still in directions that slide the surface along itself.
+        # Damping prevents steps that slide the surface along itself.
         normal_matrix = (lever * weight[:, None]).T @ lever + 1e-4 * np.eye(3)
         return np.asarray(np.linalg.solve(normal_matrix, lever.T @ (weight * away)))
 
@@ -244,7 +247,7 @@ def second_moments(surface: SurfaceTree) -> Float[np.ndarray, "3 3"]:
 def special_axes(surface: SurfaceTree) -> Float[np.ndarray, "axes 3"]:
     """Return the axes of coordinates, of the moments and of the largest flat areas.
 
-    These directions' sums, differences and cross products are the axes of regular solids.
+    Sums, differences and cross products of normals are the axes of regular solids.
     """
     normals = _main_normals(surface)
     first, second = np.triu_indices(len(normals), 1)
@@ -257,8 +260,8 @@ def special_axes(surface: SurfaceTree) -> Float[np.ndarray, "axes 3"]:
 
 
 def _main_normals(surface: SurfaceTree) -> Float[np.ndarray, "clusters 3"]:
-    """Return the directions with the most area, opposite ones as one."""
-    # The largest triangles suffice: flat areas that matter have some among them.
+    """Return the directions with the most area, up to sign."""
+    # The largest triangles suffice, as relevant flat areas have large triangles.
     largest = np.argsort(-surface.areas, kind="stable")[:3000]
     normals, areas = surface.normals[largest], surface.areas[largest].copy()
     directions: list[Vector] = []
@@ -270,17 +273,17 @@ def _main_normals(surface: SurfaceTree) -> Float[np.ndarray, "clusters 3"]:
 
 
 def _across(axis: Vector) -> Vector:
-    """Return a direction across an axis, a coordinate axis where one is."""
+    """Return a direction perpendicular to an axis, a coordinate axis if possible."""
     nearest = np.eye(3)[np.abs(axis).argmin()]
     across = nearest - (nearest @ axis) * axis
     return np.asarray(across / np.linalg.norm(across))
 
 
-def _some(points: Points) -> Float[np.ndarray, "some 3"]:
-    """Return at most ``_NUM_PROBES`` of the points, evenly."""
+def _subset(points: Points) -> Float[np.ndarray, "subset 3"]:
+    """Return at most ``_NUM_PROBES`` of the points, evenly spaced."""
     return points[:: -(-len(points) // _NUM_PROBES)]
 
 
 def _clean(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Round away what sine and cosine leave of zeros and ones."""
+    """Round away the errors of sine and cosine at zeros and ones."""
     return np.asarray(np.round(values, 12) + 0.0)

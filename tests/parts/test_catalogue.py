@@ -22,7 +22,7 @@ def test_a_given_mesh_is_taken_and_compared(caplog):
     assert not caplog.records
     with caplog.at_level(logging.WARNING):
         with_meshes([without_mesh("bracket", mesh_hash)], ["pivconnector"])
-    assert "is not the one the checkpoint was trained on" in caplog.text
+    assert "the checkpoint was not trained on this mesh" in caplog.text
 
 
 def test_a_checkpoints_own_mesh_is_taken_unless_another_is_given():

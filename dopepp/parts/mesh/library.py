@@ -1,11 +1,12 @@
-"""STL, 3MF and GLB files: checked to be whole and harmless, then read by trimesh.
+"""STL, 3MF and GLB files: checked to be complete and harmless, then read by trimesh.
 
-trimesh takes a file that ends too early for a smaller mesh, passes over what it does not know, and
-spends what memory and time a file asks for (``tests/parts/mesh/test_library.py``,
-``tests/security/test_hostile_scenes.py``). So of GLB, glTF in one file, compressed, quantised and
-sparse data, triangle fans and moved textures are refused. All but shape and texture is left out.
+trimesh reads a truncated file as a smaller mesh, ignores what it does not know, and uses as much
+memory and time as a file requests (``tests/parts/mesh/test_library.py``,
+``tests/security/test_hostile_scenes.py``). GLB files with compressed, quantised or sparse data,
+triangle fans or transformed textures are refused, and so is glTF in several files. Only shape and
+texture are read.
 
-To add a format that trimesh reads, check its file first and hand it to :func:`read_scene`.
+To add a format of trimesh, check its file first and pass it to :func:`read_scene`.
 """
 
 from __future__ import annotations
@@ -27,49 +28,49 @@ from dopepp.geometry.camera import Transform
 from dopepp.parts.mesh import RawMesh, Vertices, weld
 
 MAX_UNPACKED_BYTES: Final = 50_000_000
-"""Of the text in a 3MF file: trimesh takes 17 times as much memory."""
+"""Largest text in a 3MF file: trimesh uses 17 times as much memory."""
 
 MAX_PIECES: Final = 1000
-"""Meshes that make up one part: far above any part's bodies, and a bound on time."""
+"""Most meshes of a part; bounds time."""
 
-MAX_TRIANGLES: Final = 5_000_000  # Of all pieces, each counted as often as it is shown
+MAX_TRIANGLES: Final = 5_000_000  # Of all pieces, counted once per instance
 UNITS_3MF: Final = {"millimeter": "mm", "centimeter": "cm", "meter": "m", "inch": "inch"}
-"""Ours by 3MF's name, which also has feet and micrometres."""
+"""Unit by 3MF's name; 3MF also has feet and micrometres."""
 
 _STL_HEADER: Final = 84
 _STL_TRIANGLE: Final = 50
-"""Bytes. A binary STL file is a title, the number of triangles (uint32), and the triangles."""
+"""Bytes of a binary STL file's header (title and uint32 count) and of each triangle."""
 
-MAX_HEADER_BYTES: Final = 10_000_000  # Of the JSON: Python takes twenty times as much memory
+MAX_HEADER_BYTES: Final = 10_000_000  # Of the JSON: Python uses twenty times as much memory
 MAX_VALUES: Final = 30_000_000
-"""Numbers and vectors that primitives use: each gets a copy, of an array that others use too."""
+"""Most numbers and vectors of all primitives, which copy shared arrays."""
 
-_FLOAT: Final = 5126  # glTF's number of the type
-_TRIANGLES: Final = 4  # glTF's number of the mode; lower ones are points and lines
+_FLOAT: Final = 5126  # glTF's number of float32
+_TRIANGLES: Final = 4  # glTF's number of the mode; lower numbers are points and lines
 
 
 def read_stl(path: Path) -> RawMesh:
-    """Read a binary or text STL file, with the corners that its triangles share merged.
+    """Read a binary or text STL file, with equal corners merged.
 
     Raises:
-        ValueError: It is not as long as the number of its triangles says, or not finite.
+        ValueError: The length disagrees with the number of triangles, or a number is not finite.
     """
     data = path.read_bytes()
     num_triangles = int.from_bytes(data[_STL_HEADER - 4 : _STL_HEADER], "little")
     promised = _STL_HEADER + _STL_TRIANGLE * num_triangles
-    # Binary headers may begin with the text format's "solid"; the length cannot be mistaken.
+    # Binary headers may begin with the text format's "solid", so the length decides.
     is_text = len(data) != promised or not num_triangles
     if is_text and b"\0" in data:  # never in text
-        said = f"{num_triangles} triangles, {promised} bytes"
-        raise ValueError(f"{len(data)} bytes where its header promises {said}")
+        stated = f"{num_triangles} triangles, {promised} bytes"
+        raise ValueError(f"{len(data)} bytes where its header promises {stated}")
     (vertices, faces, *_), _ = read_scene(data, "stl")
-    # trimesh leaves out a text file's last solid if it is cut short.
+    # trimesh omits a text file's last solid if it is truncated.
     facets = re.finditer(rb"\bfacet\s+normal\b", data, re.IGNORECASE)
     begun = sum(1 for _ in facets) if is_text else len(faces)
     if begun != len(faces):
         raise ValueError(f"{begun} facets begun and {len(faces)} ended")
     finite = np.isfinite(vertices).all(axis=1)
-    if not finite.all():  # named here, where triangles have their numbers
+    if not finite.all():  # reported here, where triangles have their original numbers
         triangle, vertex = divmod(int(np.flatnonzero(~finite[faces.reshape(-1)])[0]), 3)
         location = f"triangle {triangle + 1}, vertex {vertex + 1}"
         raise ValueError(f"a coordinate that is not a finite number, {location}")
@@ -77,12 +78,12 @@ def read_stl(path: Path) -> RawMesh:
 
 
 def read_3mf(path: Path) -> RawMesh:
-    """Read what a 3MF file's build shows, in the unit that it states.
+    """Read the build of a 3MF file, with its unit.
 
     Raises:
-        UserError: The unit is none of :data:`UNITS_3MF`.
-        ValueError: The file is no whole archive, unpacks to too much, declares a document type,
-            shows objects of other files, or ones that are not above their users.
+        UserError: The unit is not one of :data:`UNITS_3MF`.
+        ValueError: The archive is incomplete or too large, declares a document type, or its build
+            uses objects of other files or objects that are defined later.
     """
     size = path.stat().st_size
     _check_size(size)
@@ -98,9 +99,9 @@ def read_3mf(path: Path) -> RawMesh:
         raise ValueError("a document type, which 3MF forbids")
     num_pieces = _count_pieces(model)
     mesh, num_read = read_scene(path.read_bytes(), "3mf")
-    if num_read != num_pieces:  # trimesh gives up on crowded assemblies
+    if num_read != num_pieces:  # trimesh gives up on large assemblies
         raise ValueError(f"{num_pieces} objects shown, {num_read} read")
-    unit = str(mesh.unit).removesuffix("s")  # it calls the default one "millimeters"
+    unit = str(mesh.unit).removesuffix("s")  # trimesh calls the default unit "millimeters"
     if unit not in UNITS_3MF:
         problem, allowed = f"mesh {path} in the unit {unit!r}", ", ".join(UNITS_3MF)
         raise UserError(problem, allowed, "export it in millimetres")
@@ -108,9 +109,9 @@ def read_3mf(path: Path) -> RawMesh:
 
 
 def _count_pieces(model: bytes) -> int:
-    """Count the meshes that a 3MF build shows."""
-    # trimesh follows objects that contain themselves, and one that is doubled twenty times over,
-    # for hours. Of objects in another file it takes all where one is meant.
+    """Count the mesh instances of a 3MF build."""
+    # trimesh spends hours on objects that contain themselves or are doubled twenty times, and reads
+    # all objects of another file instead of the named one.
     from lxml import etree
 
     pieces: dict[str, int] = {}
@@ -139,11 +140,11 @@ def _check_size(num_bytes: int, most: int = MAX_UNPACKED_BYTES) -> None:
 
 
 def read_glb(path: Path) -> RawMesh:
-    """Read what a GLB file's scene shows, in metres, with its one texture.
+    """Read the scene of a GLB file, in metres, with at most one texture.
 
     Raises:
-        UserError: It needs other files, or its faces have several textures.
-        ValueError: It is cut short, damaged or too large, or has what is not read.
+        UserError: The file needs other files, or its faces have several textures.
+        ValueError: The file is truncated, damaged, too large, or uses an unsupported feature.
     """
     header, binary = _chunks(path.read_bytes())
     files = [entry for kind in ("buffers", "images") for entry in header.get(kind, ())]
@@ -169,14 +170,14 @@ def read_glb(path: Path) -> RawMesh:
         except ValueError as error:
             raise ValueError(f"a texture that cannot be read: {error}") from error
         texture = np.asarray(image.convert("RGB"))
-    # trimesh would open pictures of any kind; for texture coordinates it needs but a material.
+    # trimesh would open pictures of any kind; texture coordinates only need a material.
     header |= {"images": [], "materials": [{} for _ in header.get("materials", ())]}
     mesh, _ = read_scene(_packed(header, binary), "glb")
     return mesh._replace(uv=None if texture is None else mesh.uv, texture=texture, unit="m")
 
 
 def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """Return the JSON and the binary chunk, without which trimesh takes a file as well."""
+    """Return the JSON and the binary chunk; trimesh accepts files without the latter."""
     magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)
     if (magic, version, kind, length) != (b"glTF", 2, b"JSON", len(data)):
         raise ValueError(f"{len(data)} bytes, not the {length} of a GLB file of version 2")
@@ -190,7 +191,7 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def _packed(header: dict[str, Any], binary: bytes) -> bytes:
-    """Make a GLB file."""
+    """Return the bytes of a GLB file."""
     text = json.dumps(header).encode()
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
     chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
@@ -198,7 +199,7 @@ def _packed(header: dict[str, Any], binary: bytes) -> bytes:
 
 
 def _check(header: dict[str, Any], primitives: list[dict[str, Any]], num_bytes: int) -> None:
-    """Refuse what trimesh leaves out, and what takes it far more memory or time than the file."""
+    """Refuse what trimesh ignores, and what costs far more memory or time than the file."""
     required = [name for name in header.get("extensionsRequired", ()) if "_materials_" not in name]
     if required:
         raise ValueError(f"the extension {required[0]}, which is not read")
@@ -211,7 +212,7 @@ def _check(header: dict[str, Any], primitives: list[dict[str, Any]], num_bytes: 
     counts = [array["count"] for array in accessors]
     used = [i for p in primitives for i in (*p["attributes"].values(), p.get("indices"))]
     num_values = sum(counts[i] for i in used if i is not None)
-    # An item is a byte at least; views of the same bytes, and arrays of the same items, are rare.
+    # An item has at least one byte; overlapping views and arrays are rare.
     too_many = max(sum(sizes) // 2, sum(counts)) > num_bytes or num_values > MAX_VALUES
     if min(sizes + counts, default=0) < 0 or too_many:
         raise ValueError(f"arrays of more than its {num_bytes} bytes, or over {MAX_VALUES} values")
@@ -226,7 +227,7 @@ def _check(header: dict[str, Any], primitives: list[dict[str, Any]], num_bytes: 
 
 
 def _picture(header: dict[str, Any], primitive: dict[str, Any]) -> int | None:
-    """Return which picture gives a primitive its colours, None for one without."""
+    """Return the index of a primitive's colour texture, or None."""
     material = header["materials"][primitive["material"]] if "material" in primitive else {}
     info = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
     if info is None:
@@ -240,20 +241,24 @@ def _picture(header: dict[str, Any], primitive: dict[str, Any]) -> int | None:
 
 
 def read_scene(data: bytes, kind: str) -> tuple[RawMesh, int]:
-    """Let trimesh read a file's content; without a path it can reach no other file.
+    """Read a file's content with trimesh, which cannot access other files without a path.
+
+    Args:
+        data: Content of the file.
+        kind: Suffix of the format, without the dot.
 
     Returns:
-        The meshes as one, with the unit as trimesh names it, and their number.
+        The merged meshes, with trimesh's name of the unit, and the number of meshes.
 
     Raises:
-        ValueError: A face has a vertex that its mesh has not, or there are too many triangles.
-        Exception: Whatever trimesh makes of a damaged file.
+        ValueError: A face refers to a missing vertex, or there are too many triangles.
+        Exception: Any exception of trimesh for a damaged file.
     """
-    import trimesh  # takes a while: only for those who read such a file
+    import trimesh  # imported late, because it is slow
 
-    # An infinite corner is named later, not in trimesh's own sums.
+    # Infinite corners are reported later, not by trimesh.
     with warnings.catch_warnings(), np.errstate(invalid="ignore", over="ignore"):
-        # numpy stops at a damaged number with nothing but this warning.
+        # For a damaged number, numpy only stops with this warning.
         warnings.simplefilter("error", DeprecationWarning)
         scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False)
     vertices, faces = [np.empty((0, 3))], [np.empty((0, 3), np.int64)]
@@ -282,7 +287,7 @@ def read_scene(data: bytes, kind: str) -> tuple[RawMesh, int]:
 
 def _moved(vertices: Vertices, transform: Transform) -> Vertices:
     if (transform == np.eye(4)).all():
-        return vertices  # as they are: a product would make NaN of an infinite one's neighbours
-    # Not a product of matrices, whose last digits depend on the processor.
+        return vertices  # a product would spread infinite coordinates as NaN
+    # The last digits of a matrix product would depend on the processor.
     rows = zip(vertices.T, transform[:3, :3].T, strict=True)
     return np.asarray(sum(x[:, None] * row for x, row in rows) + transform[:3, 3])

@@ -1,11 +1,10 @@
-"""OBJ files with one texture, OFF files, and polygons cut into triangles.
+"""OBJ files with one texture, OFF files, and triangulation of polygons.
 
-trimesh does not read them (``tests/parts/mesh/test_library.py``). Of OBJ files it leaves out faces
-that are cut short or written with tabs, takes index 0 for a vertex and relative indices from the
-file's end, loses a texture without a word, and splits vertices where normals differ. Of an OFF file
-that is cut short it makes a smaller mesh, and it fails at pentagons. Here a damaged line is an
-error that names it. All but shape and ``map_Kd`` texture is left out. The files that a mesh names
-are looked for in its own folder only.
+trimesh is not used here (``tests/parts/mesh/test_library.py``). In OBJ files it omits faces that are
+truncated or written with tabs, misreads index 0 and relative indices, silently loses textures,
+and splits vertices where normals differ. It reads a truncated OFF file as a smaller mesh and fails
+at pentagons. Here a damaged line is an error that names the line. Only shape and the ``map_Kd``
+texture are read. Files named by a mesh must lie in its own folder.
 """
 
 from __future__ import annotations
@@ -24,30 +23,28 @@ from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import FORMATS, MAX_SIDE, Picture, read_picture
 from dopepp.parts.mesh import Faces, RawMesh, Vertices
 
-MAX_OFF_BYTES: Final = 50_000_000  # Of an OFF file: its words take fifteen times as much memory
+MAX_OFF_BYTES: Final = 50_000_000  # Of an OFF file: its words use fifteen times as much memory
 MAX_MATERIAL_BYTES: Final = 10_000_000
-"""Size of a material file: a hundred thousand materials, and a bound on memory."""
+"""Largest material file (a hundred thousand materials); bounds memory."""
 
-NO_COORDINATE: Final = -1  # Index of the texture coordinate of a corner that has none
+NO_COORDINATE: Final = -1  # Texture coordinate index of a corner without coordinates
 
 
 def read_obj(path: Path) -> RawMesh:
-    """Read an OBJ file; a vertex with several texture coordinates (on a seam) becomes several.
+    """Read an OBJ file; vertices with several texture coordinates (on seams) are split.
 
     Raises:
         UserError: A line is damaged, a polygon is not convex, a material file or a texture is
-            missing, outside of the folder or damaged, or there is more than one texture.
+            missing, outside the folder or damaged, or there is more than one texture.
     """
     obj = ObjFile()
     for number, line in enumerate(_text(path).replace("\\\n", " ").split("\n"), start=1):
         try:
             obj.add(line, number)
         except ValueError as error:
-            raise UserError(
-                f"mesh {path} with the damaged line {number} {line.strip()[:60]!r} ({error})",
-                "a whole OBJ file whose faces name vertices above them",
-                "export the mesh again",
-            ) from error
+            problem = f"mesh {path} with the damaged line {number} {line.strip()[:60]!r} ({error})"
+            allowed = "a complete OBJ file whose faces refer to preceding vertices"
+            raise UserError(problem, allowed, "export the mesh again") from error
     positions = np.array(obj.positions, np.float64).reshape(-1, 3)
     corners = np.array(obj.corners, np.int64).reshape(-1, 2)
     try:
@@ -70,7 +67,7 @@ def read_obj(path: Path) -> RawMesh:
 
 @dataclass
 class ObjFile:
-    """An OBJ file's statements, indices from 0; arrays take a tenth of the memory of lists."""
+    """Statements of an OBJ file, indices from 0, in arrays (a tenth of the memory of lists)."""
 
     positions: array[float] = field(default_factory=lambda: array("d"))  # x, y, z of each v
     coordinates: array[float] = field(default_factory=lambda: array("d"))  # u, v of each vt
@@ -82,7 +79,11 @@ class ObjFile:
     _material: str | None = None
 
     def add(self, line: str, number: int) -> None:
-        """Take in one line; a damaged one is a ValueError."""
+        """Add one line.
+
+        Raises:
+            ValueError: The line is damaged.
+        """
         match line.split():
             case ["v", *words]:
                 self.positions.extend(_numbers(words, 3))
@@ -115,7 +116,7 @@ def _numbers(words: list[str], count: int) -> list[float]:
 
 
 def _index(word: str, count: int) -> int:
-    """Turn an index from 1, or from the end if negative, into one from 0."""
+    """Convert an index from 1, or from the end if negative, to an index from 0."""
     index = int(word)
     if not 1 <= abs(index) <= count:
         raise ValueError(f"index {index} among {count}")
@@ -123,7 +124,7 @@ def _index(word: str, count: int) -> int:
 
 
 def _texture(obj: ObjFile, path: Path) -> Picture | None:
-    """Read the one texture that the used materials name, or return None if they name none."""
+    """Read the texture of the used materials; None without a texture."""
     if not obj.libraries:
         return None
     maps: dict[str | None, str | None] = {None: None}
@@ -145,7 +146,7 @@ def _texture(obj: ObjFile, path: Path) -> Picture | None:
 
 
 def _colour_maps(path: Path) -> dict[str | None, str | None]:
-    """Return the file name of each MTL material's colour map, None for one without."""
+    """Return the file name of each MTL material's colour map, or None."""
     if (size := path.stat().st_size) > MAX_MATERIAL_BYTES:
         allowed = f"up to {MAX_MATERIAL_BYTES / 1e6:.0f} MB"
         fix = "keep only the materials that the mesh uses"
@@ -158,7 +159,7 @@ def _colour_maps(path: Path) -> dict[str | None, str | None]:
             material = " ".join(rest.split())
             maps[material] = None
         elif keyword.lower() == "map_kd":
-            if rest.strip().startswith("-"):  # options change how a map lies on the part
+            if rest.strip().startswith("-"):  # options transform the texture
                 problem = f"material file {path} with map_Kd {rest.strip()!r}"
                 fix = "bake scale and offset into the texture coordinates"
                 raise UserError(problem, "a file name without options", fix)
@@ -167,15 +168,20 @@ def _colour_maps(path: Path) -> dict[str | None, str | None]:
 
 
 def _text(path: Path) -> str:
-    """Return a text file with plain line ends; a file name in any encoding in it stays intact."""
+    """Return a text with plain line ends; file names in any encoding remain intact."""
     return path.read_bytes().decode("utf-8", "surrogateescape").replace("\r\n", "\n")
 
 
 def companion_path(mesh_path: Path, name: str, statement: str) -> Path:
-    """Return the path of a file that a statement of a mesh file names.
+    """Return the path of a file that a mesh file names.
+
+    Args:
+        mesh_path: The mesh file.
+        name: Name of the other file.
+        statement: Keyword before the name, for messages.
 
     Raises:
-        UserError: The name leads out of the mesh's folder, or there is no such file.
+        UserError: The file is missing or outside the mesh's folder.
     """
     folder = mesh_path.parent.resolve()
     written = PureWindowsPath(name)  # splits at / and at \, and knows C:
@@ -191,7 +197,11 @@ def companion_path(mesh_path: Path, name: str, statement: str) -> Path:
 
 
 def read_texture(path: Path) -> Picture:
-    """Return an image as RGB; a UserError for a damaged one or one over 8,192 pixels a side."""
+    """Return an image as RGB.
+
+    Raises:
+        UserError: The image is damaged or larger than 8,192 pixels a side.
+    """
     try:
         return read_picture(path)
     except ValueError as error:
@@ -200,7 +210,11 @@ def read_texture(path: Path) -> Picture:
 
 
 def read_off(path: Path) -> RawMesh:
-    """Read an OFF file of triangles and convex polygons, without colours; else a ValueError."""
+    """Read the shape of an OFF file of triangles and convex polygons.
+
+    Raises:
+        ValueError: The file is damaged or too large, or a polygon is not convex.
+    """
     if path.stat().st_size > MAX_OFF_BYTES:
         raise ValueError(f"over {MAX_OFF_BYTES / 1e6:.0f} MB of text")
     header, mark, text = re.sub("#.*", "", path.read_text("utf-8")).partition("OFF")
@@ -209,10 +223,8 @@ def read_off(path: Path) -> RawMesh:
     promised, *rows = [line.split() for line in text.splitlines() if line.strip()]
     num_vertices, num_faces = map(int, promised[:2])
     if min(num_vertices, num_faces) < 0 or len(rows) != num_vertices + num_faces:
-        raise ValueError(
-            f"{len(rows)} lines where its header promises {num_vertices} vertices and "
-            f"{num_faces} faces"
-        )
+        stated = f"{num_vertices} vertices and {num_faces} faces"
+        raise ValueError(f"{len(rows)} lines where its header promises {stated}")
     vertices = np.array([row[:3] for row in rows[:num_vertices]], np.float64).reshape(-1, 3)
     polygons = [[int(word) for word in row[: int(row[0]) + 1]] for row in rows[num_vertices:]]
     for number, (count, *corners) in enumerate(polygons):
@@ -226,10 +238,15 @@ def read_off(path: Path) -> RawMesh:
 def fans(
     vertices: Vertices, corners: Int[np.ndarray, " corners"], counts: Int[np.ndarray, " polygons"]
 ) -> Int[np.ndarray, "triangles 3"]:
-    """Cut polygons into fans of triangles around their first corners, as places in ``corners``.
+    """Triangulate polygons as fans around their first corners.
 
-    ``corners`` has the vertex at each corner, polygon by polygon, and ``counts`` their numbers of
-    corners. The caller refuses vertices that do not exist.
+    Args:
+        vertices: Positions.
+        corners: Vertex index of each corner, polygon by polygon; checked by the caller.
+        counts: Number of corners of each polygon.
+
+    Returns:
+        Triangles as indices into ``corners``.
 
     Raises:
         FoldedPolygonError: A polygon is not convex.
@@ -239,9 +256,9 @@ def fans(
         raise ValueError(f"face {int((counts < 3).argmax())} of fewer than 3 corners")
     polygons = np.repeat(np.arange(len(counts)), counts - 2)
     first = (np.cumsum(counts) - counts)[polygons]
-    # The how-many-th triangle of its polygon each one is.
-    turn = np.arange(len(polygons)) - (np.cumsum(counts - 2) - (counts - 2))[polygons]
-    triangles = np.stack([first, first + turn + 1, first + turn + 2], axis=1)
+    # Number of each triangle within its polygon.
+    number = np.arange(len(polygons)) - (np.cumsum(counts - 2) - (counts - 2))[polygons]
+    triangles = np.stack([first, first + number + 1, first + number + 2], axis=1)
     faces = corners[triangles]
     if (counts > 3).any() and 0 <= faces.min() <= faces.max() < len(vertices):
         folded = _folded(vertices, faces, polygons)
@@ -251,7 +268,7 @@ def fans(
 
 
 class FoldedPolygonError(ValueError):
-    """The polygon of a number, from 0, is not convex: its fan of triangles is not its area."""
+    """A polygon, numbered from 0, is not convex, so a fan does not cover it."""
 
     def __init__(self, number: int) -> None:
         super().__init__(f"a polygon that is not convex, face {number}")
@@ -261,15 +278,15 @@ class FoldedPolygonError(ValueError):
 def _folded(
     vertices: Vertices, faces: Faces, polygons: Int[np.ndarray, " faces"]
 ) -> Bool[np.ndarray, " faces"]:
-    """Tell triangles that face against their polygon, or whose polygon cancels out."""
+    """Return which triangles face against their polygon, or whose polygon cancels out."""
     a, b, c = vertices[faces].swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
     totals = np.zeros((int(polygons[-1]) + 1, 3))
     np.add.at(totals, polygons, normals)
     squared = np.einsum("pi,pi->p", totals, totals)
-    # A triangle that is flat but for rounding may point anywhere.
+    # The normal of a degenerate triangle is arbitrary.
     folded = np.einsum("fi,fi->f", normals, totals[polygons]) < -1e-9 * squared[polygons]
-    # A bow tie's two halves cancel out.
+    # The halves of a bow tie cancel out.
     parts = np.bincount(polygons, np.einsum("fi,fi->f", normals, normals))
     tiny = 1e-12 * np.square(np.ptp(vertices, axis=0)).sum()
     cancelled = (squared <= 1e-9 * parts) & (parts > tiny * tiny)

@@ -1,9 +1,8 @@
 """PLY files: text and both byte orders, polygons, any further elements and properties.
 
-trimesh does not read them (``tests/parts/mesh/test_library.py``): it refuses a binary file of
-triangles and quads, or takes it for others where their sizes agree, makes a smaller mesh of a text
-that ends too early, and puts a quad's triangles in another order, which changes the mesh's hash.
-plyfile's licence is the GPL.
+trimesh is not used here (``tests/parts/mesh/test_library.py``): it refuses or misreads binary files
+of triangles and quads, reads a truncated text as a smaller mesh, and orders a quad's triangles
+differently, which changes the mesh's hash. plyfile's licence is the GPL.
 """
 
 from __future__ import annotations
@@ -27,25 +26,25 @@ TYPES: Final = {
 """Numpy's names of PLY's types."""
 
 ORDERS: Final = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
-"""Byte order of each format; text is turned into little-endian doubles before it is read."""
+"""Byte order of each format; text is converted to little-endian doubles first."""
 
 _MAX_HEADER_BYTES: Final = 100_000
-"""Hundreds of properties, and comments; a longer header would take hours to be understood."""
+"""Hundreds of properties and comments; a longer header could take hours to parse."""
 
 MAX_UNEVEN_ROWS: Final = 2_000_000
-"""Rows with lists of different lengths are read one by one: seconds, and 0.5 GB, for so many."""
+"""Most rows with lists of different lengths, which are read singly (seconds, 0.5 GB)."""
 
 COLOURS: Final = ("red", "green", "blue")
 NORMALS: Final = ("nx", "ny", "nz")
 COORDINATES: Final = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
-"""Names of a vertex's colour, of its normal and, several, of its texture coordinates."""
+"""Names of a vertex's colour, normal and texture coordinates."""
 
 _ROUNDING: Final = 1e-3
-"""Share of its range by which a colour may leave it: programs compute with floats."""
+"""Share of the range by which a colour may exceed it, due to rounding."""
 
 
 class PlyProperty(NamedTuple):
-    """A property: its name, the type of its numbers (doubles in a text) and of a list's length."""
+    """A property: name, types of its numbers (doubles in a text) and of a list's length."""
 
     name: str
     number: np.dtype[Any]
@@ -54,7 +53,7 @@ class PlyProperty(NamedTuple):
 
 
 class Element(NamedTuple):
-    """A table of vertices, faces or anything else, and how many rows the header promises."""
+    """A table of vertices, faces or other items, with the number of rows in the header."""
 
     name: str
     num_rows: int
@@ -62,18 +61,18 @@ class Element(NamedTuple):
 
 
 Table = dict[str, NDArray[Any]]
-"""Values of each property; of a list all values in a row, and its lengths under ``NAME#``."""
+"""Values of each property; for a list, all values concatenated, and lengths under ``NAME#``."""
 
 
 def read_ply(path: Path) -> RawMesh:
     """Read a PLY file with its vertices' colours and normals.
 
-    A texture, named by a ``TextureFile`` comment, takes the colours' place.
+    A texture, named by a ``TextureFile`` comment, replaces the colours.
 
     Raises:
-        UserError: The texture is missing, damaged or outside of the folder.
-        ValueError: The file is damaged, has no vertices or faces, a polygon that is not convex, a
-            colour out of range, several textures, or one without coordinates per vertex.
+        UserError: The texture is missing, damaged or outside the folder.
+        ValueError: The file is damaged or has no vertices or faces, a polygon is not convex, a
+            colour is out of range, or there are several textures or no texture coordinates.
     """
     header, body = _split(path.read_bytes())
     lines = [line.split() for line in header.decode("utf-8", "surrogateescape").splitlines()]
@@ -91,7 +90,7 @@ def read_ply(path: Path) -> RawMesh:
     vertices = np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float64)
     corners = face[list_name].astype(np.int64)
     if (corners != face[list_name]).any():
-        raise ValueError("a vertex index that is no integer")
+        raise ValueError("a vertex index that is not an integer")
     faces = corners[fans(vertices, corners, face[f"{list_name}#"].astype(np.int64))]
     names = [" ".join(words[2:]) for words in lines if words[:2] == ["comment", "TextureFile"]]
     normals = _vectors(vertex, NORMALS)
@@ -107,16 +106,16 @@ def read_ply(path: Path) -> RawMesh:
 
 
 def _vectors(vertex: Table, names: Sequence[str]) -> NDArray[np.float64] | None:
-    """Return a vertex property of several numbers, None where it is not there."""
+    """Return a vertex property of several numbers, or None."""
     if not {*names} <= set(vertex):
         return None
     return np.stack([vertex[name] for name in names], axis=1).astype(np.float64)
 
 
 def _colours(vertex: Table, elements: Sequence[Element]) -> NDArray[np.uint8] | None:
-    """Return the vertices' colours, 0 – 255; None where there are none.
+    """Return the vertices' colours, 0 – 255, or None.
 
-    One grey everywhere counts as none: programs write it where nobody has chosen a colour.
+    A uniform grey counts as no colour, because programs write it by default.
     """
     values = _vectors(vertex, COLOURS)
     if values is None or not len(values):
@@ -135,7 +134,7 @@ def _colours(vertex: Table, elements: Sequence[Element]) -> NDArray[np.uint8] | 
 
 
 def _split(data: bytes) -> tuple[bytes, bytes]:
-    """Cut behind the header's last line, which ends in LF, CR LF or CR."""
+    """Split the header, whose last line ends in LF, CR LF or CR, from the body."""
     header, mark, rest = data.partition(b"end_header")
     if not mark or not data.startswith(b"ply"):
         raise ValueError("no PLY header")
@@ -151,7 +150,7 @@ def _parse_header(lines: list[list[str]]) -> tuple[bool, list[Element]]:
     """Return whether the body is text, and its elements."""
     formats = [words[1] for words in lines if words[:1] == ["format"]]
     if len(formats) != 1 or formats[0] not in ORDERS:
-        raise ValueError(f"format {formats} where one of {', '.join(ORDERS)} must stand")
+        raise ValueError(f"format {formats}, not one of {', '.join(ORDERS)}")
     is_text, order = formats[0] == "ascii", ORDERS[formats[0]]
     elements: list[Element] = []
     for words in lines:
@@ -171,16 +170,16 @@ def _parse_header(lines: list[list[str]]) -> tuple[bool, list[Element]]:
 
 
 def _doubles(text: bytes) -> bytes:
-    """Turn a text body into its numbers, one behind the other."""
+    """Convert a text body to the bytes of its numbers."""
     with warnings.catch_warnings():
-        # Numpy stops at what is no number with nothing but this warning.
+        # For a damaged number, numpy only stops with this warning.
         warnings.simplefilter("error", DeprecationWarning)
         numbers = np.fromstring(text.decode("ascii").strip() or "0", np.float64, sep=" ")
     return numbers.astype("<f8").tobytes() if text.strip() else b""
 
 
 def _read_table(body: bytes, start: int, element: Element) -> tuple[Table, int]:
-    """Read a table at once if its lists are as long in every row as in the first, else by rows."""
+    """Read a table at once if all rows have lists of equal length, otherwise row by row."""
     name, num_rows, columns = element
     too_short = ValueError(f"less data than {num_rows} rows of element {name}")
     smallest = sum((c.number if c.length is None else c.length).itemsize for c in columns)
@@ -222,7 +221,7 @@ def _read_table(body: bytes, start: int, element: Element) -> tuple[Table, int]:
 
 
 def _length(body: bytes, start: int, kind: np.dtype[Any]) -> int:
-    """Return a list's length as it is written, which may be a fraction or negative."""
+    """Return the length of a list, which a damaged file may write as a fraction or negative."""
     written = np.frombuffer(body, kind, 1, start)[0].item()
     if written != int(written) or not 0 <= written <= len(body):
         raise ValueError(f"a list of {written} values")
