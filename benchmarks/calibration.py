@@ -64,16 +64,16 @@ def calibrated(seed: int, num: int):
             seen.append(sighting)
     found_lens = calibrate_lens(seen, SIZE)
     off = 100 * abs(found_lens.camera.K[0, 0] / focal - 1)
-    boards = [board_pose(one, found_lens.camera) for one in seen]
+    boards = [board_pose(view, found_lens.camera) for view in seen]
     tilts = Rotation.from_euler("xyz", rng.uniform(-0.6, 0.6, (8, 3))).as_matrix()
     touches = [noisy(make_transform(R, np.array([0.4, 0, 0.1]) - R @ TIP), rng) for R in tilts]
     tip = 1000 * np.linalg.norm(find_tip(np.array(touches)).position - TIP)
     for mount in ("hand", "bench"):
         flanges = [M if mount == "hand" else invert_transform(M) for M in robot]
         said = np.array([noisy(M, rng) for M in flanges])
-        found = calibrate_hand_eye(said, boards, mount)
-        worth = explain(said, boards, found)
-        yield [*apart(X, found.T_mount_cam), 1000 * worth.shift, off, tip, len(worth.findings)]
+        estimate = calibrate_hand_eye(said, boards, mount)
+        worth = explain(said, boards, estimate)
+        yield [*apart(X, estimate.T_mount_cam), 1000 * worth.shift, off, tip, len(worth.findings)]
 
 
 def main() -> None:
@@ -83,13 +83,17 @@ def main() -> None:
     parser.add_argument("--pictures", type=int, default=24)
     options = parser.parse_args()
     heads = ["°", "mm", "expected mm", "focal length %", "tip mm"]
-    print("| camera | " + " | ".join(f"{one}, median (worst)" for one in heads) + " | doubted |")
+    print(
+        "| camera | "
+        + " | ".join(f"{heading}, median (worst)" for heading in heads)
+        + " | doubted |"
+    )
     print("| --- |" + " ---: |" * 6)
     rows = np.array([[*calibrated(seed, options.pictures)] for seed in range(options.seeds)])
-    for name, own in zip(("in the hand", "on the bench"), rows.transpose(1, 0, 2), strict=True):
-        middle, worst = np.median(own, axis=0), own.max(axis=0)
+    for name, errors in zip(("in the hand", "on the bench"), rows.transpose(1, 0, 2), strict=True):
+        middle, worst = np.median(errors, axis=0), errors.max(axis=0)
         cells = [f"{middle[k]:.3f} ({worst[k]:.3f})" for k in range(5)]
-        doubted = f"{np.count_nonzero(own[:, 5])} of {len(own)}"
+        doubted = f"{np.count_nonzero(errors[:, 5])} of {len(errors)}"
         print(f"| {name} | {' | '.join(cells)} | {doubted} |")
 
 

@@ -128,13 +128,13 @@ def differences(run: Path, whole: Path) -> Iterator[str]:
     if table(run) != table(whole):
         yield "metrics.csv"
     for name in ("last.ckpt", "best.ckpt"):
-        one, other = (
+        killed, undisturbed = (
             torch.load(folder / "checkpoints" / name, weights_only=True) for folder in (run, whole)
         )
-        if one["global_step"] != other["global_step"]:
-            yield f"{name}: step {one['global_step']} for {other['global_step']}"
-        for key, value in other["state_dict"].items():
-            if not torch.equal(one["state_dict"][key], value):
+        if killed["global_step"] != undisturbed["global_step"]:
+            yield f"{name}: step {killed['global_step']} for {undisturbed['global_step']}"
+        for key, value in undisturbed["state_dict"].items():
+            if not torch.equal(killed["state_dict"][key], value):
                 yield f"{name}: {key}"
                 break
 

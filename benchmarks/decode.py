@@ -67,8 +67,8 @@ def disturbed(rng: np.random.Generator, wrong: bool) -> tuple[torch.Tensor, torc
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
     noises = (0.005, 0.05) if wrong else (0.02, 0.05)
     belief, field = (
-        one[0] + noise * torch.randn(one[0].shape, generator=generator)
-        for one, noise in zip(maps, noises, strict=True)
+        clean[0] + noise * torch.randn(clean[0].shape, generator=generator)
+        for clean, noise in zip(maps, noises, strict=True)
     )
     return belief, field
 
@@ -109,8 +109,8 @@ def main() -> None:
     print("\nTest images: on the network's own maps, and on true ones with the noise of job=cost")
     print(f"{'network':>20}{'own ms':>10}{'peaks':>8}{'noisy ms':>10}{'peaks':>8}")
     for name, preset in RELEASED.items():
-        own, own_peaks, noisy, noisy_peaks = released(name, preset, seed)
-        print(f"{name:>20}{own:10.2f}{own_peaks:8.1f}{noisy:10.2f}{noisy_peaks:8.1f}")
+        clean, own_peaks, noisy, noisy_peaks = released(name, preset, seed)
+        print(f"{name:>20}{clean:10.2f}{own_peaks:8.1f}{noisy:10.2f}{noisy_peaks:8.1f}")
 
 
 def released(name: str, preset: str, seed: int) -> tuple[float, ...]:
@@ -123,9 +123,9 @@ def released(name: str, preset: str, seed: int) -> tuple[float, ...]:
     rows = []
     for index in range(IMAGES):
         sample = source.sample(index)  # of the network's own size: nothing to resize
-        own = estimator.maps(sample.image)
+        maps = estimator.maps(sample.image)
         noisy = likely_maps(sample, estimator, geometry, generator)
-        rows.append([*decoding(own, sample.K, estimator), *decoding(noisy, sample.K, estimator)])
+        rows.append([*decoding(maps, sample.K, estimator), *decoding(noisy, sample.K, estimator)])
     own_ms, own_peaks, noisy_ms, noisy_peaks = np.array(rows).T
     return np.median(own_ms), own_peaks.mean(), np.median(noisy_ms), noisy_peaks.mean()
 
@@ -133,11 +133,11 @@ def released(name: str, preset: str, seed: int) -> tuple[float, ...]:
 def decoding(maps: Maps, K: np.ndarray, estimator: PoseEstimator) -> tuple[float, int]:
     """Time recovery from an image's maps, and count their peaks."""
     options, stride = estimator.recovery, estimator.network.stride
-    found = find_peaks(
+    peaks = find_peaks(
         maps[0][None], MapGeometry(stride, options.sigma), options.peak_threshold
     ).found
     spent = milliseconds(lambda: recover(*maps, estimator.cuboids, K, stride, **vars(options)))
-    return spent, int(found.sum())
+    return spent, int(peaks.sum())
 
 
 def row(count: int, belief: torch.Tensor, field: torch.Tensor) -> tuple[str, ...]:
@@ -149,7 +149,7 @@ def row(count: int, belief: torch.Tensor, field: torch.Tensor) -> tuple[str, ...
 
     spent = milliseconds(whole)
     peaks = milliseconds(lambda: find_peaks(belief[None], geometry, 0.02, 16, field[None]))
-    smoothing = milliseconds(lambda: [gaussian_filter(one, 3.0) for one in maps])
+    smoothing = milliseconds(lambda: [gaussian_filter(belief_map, 3.0) for belief_map in maps])
     times = (spent, peaks, smoothing, spent / smoothing)
     return str(count), str(whole()), *(f"{value:.2f}" for value in times)
 

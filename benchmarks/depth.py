@@ -64,9 +64,12 @@ def sensed(depth: Array, rng: np.random.Generator) -> Array:
 
 
 def started(
-    T: Array, rng: np.random.Generator, shift: tuple[float, float], turn_deg: tuple[float, float],
+    T: Array,
+    rng: np.random.Generator,
+    shift: tuple[float, float],
+    turn_deg: tuple[float, float],
     along: float,
-) -> Array:  # fmt: skip
+) -> Array:
     """Return a pose off by a shift (metres) and a turn; ``along`` weighs the viewing ray."""
     ray = T[:3, 3] / np.linalg.norm(T[:3, 3])
     direction = rng.normal(size=3)
@@ -78,20 +81,20 @@ def started(
 
 
 def scenes(
-    part: Part, place: str, count: int, seed: int
+    part: Part, setting: str, count: int, seed: int
 ) -> Iterator[tuple[Array, Array, Array, np.random.Generator]]:
     """Yield (noisy depth, K, true pose, generator) of a part."""
-    body, other = (make_body(one, is_target=False) for one in (part, servoholder()))
+    body, other = (make_body(solid, is_target=False) for solid in (part, servoholder()))
     K = camera_matrix(600, 600, SIZE[0] / 2 - 0.5, SIZE[1] / 2 - 0.5)
     background = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
-    number, found = 0, 0
-    while found < count:
-        rng = np.random.default_rng([seed, number, PLACES.index(place)])
+    number, num_scenes = 0, 0
+    while num_scenes < count:
+        rng = np.random.default_rng([seed, number, PLACES.index(setting)])
         number += 1
         pixel = rng.uniform(0.3, 0.7, 2) * SIZE
         z = rng.uniform(0.45, 0.9)
         t = z * np.array([*((pixel - K[:2, 2]) / 600), 1.0])
-        T, plane = _posed(part, t, place, rng)
+        T, plane = _posed(part, t, setting, rng)
         objects = [SceneObject(body.surface, T, part=part)]
         if rng.random() < 0.5:
             angle = rng.uniform(0, 2 * math.pi)
@@ -101,18 +104,18 @@ def scenes(
             objects.append(SceneObject(other.surface, T_other))
         rendered = render(Scene(K, background, tuple(objects), plane=plane))
         if rendered.visible_fractions[0] >= LEAST_VISIBLE:
-            found += 1
+            num_scenes += 1
             yield sensed(rendered.depth, rng), K, T, rng
 
 
 def _posed(
-    part: Part, t: Array, place: str, rng: np.random.Generator
+    part: Part, t: Array, setting: str, rng: np.random.Generator
 ) -> tuple[Array, Plane | None]:
     """Return a pose at t and the plane behind or under the part."""
     T = make_transform(random_rotation(rng), t)
-    if place == "air":
+    if setting == "air":
         return T, None
-    if place == "wall":
+    if setting == "wall":
         return T, Plane((0.0, 0.0, -1.0), -float(t[2] + rng.uniform(0.15, 0.6)))
     tilt, azimuth = math.radians(rng.uniform(0, 50)), rng.uniform(0, 2 * math.pi)
     across = math.sin(tilt) * np.array([math.cos(azimuth), math.sin(azimuth)])
@@ -130,16 +133,16 @@ def _posed(
     )
 
 
-def add(part: Part, one: Array, other: Array) -> float:
+def add(part: Part, pose: Array, other: Array) -> float:
     """Return the mean distance of the part's points under two poses, metres."""
-    off = transform(one, part.points) - transform(other, part.points)
+    off = transform(pose, part.points) - transform(other, part.points)
     return float(np.linalg.norm(off, axis=1).mean())
 
 
-def virtual(part: Part, place: str, count: int, seed: int) -> str:
+def virtual(part: Part, setting: str, count: int, seed: int) -> str:
     """Return a row for a part at a place."""
     refiner, rows = PartRefiner(part, ["depth"]), []
-    for depth, K, T, rng in scenes(part, place, count, seed):
+    for depth, K, T, rng in scenes(part, setting, count, seed):
         start = started(T, rng, (0.012, 0.016), (3, 5), along=4)
         begin = time.process_time()
         refined = refiner.refine(NO_PICTURE, K, start, depth=depth)
@@ -148,12 +151,10 @@ def virtual(part: Part, place: str, count: int, seed: int) -> str:
         rows.append((*both, took, bool(refined.reason)))
     before, after, took, kept = np.array(rows).T
     limit = 0.05 * part.diameter
-    cells = [
-        part.name, place, f"{np.mean(before < limit):.2f}", f"{np.mean(after < limit):.2f}",
-        f"{1000 * np.median(before):.1f}", f"{1000 * np.median(after):.1f}",
-        f"{np.mean(after > before):.1%}", f"{np.mean(kept):.0%}", f"{np.median(took):.1f}",
-    ]  # fmt: skip
-    return "| " + " | ".join(cells) + " |"
+    accuracy = f"{np.mean(before < limit):.2f} | {np.mean(after < limit):.2f}"
+    medians = f"{1000 * np.median(before):.1f} | {1000 * np.median(after):.1f}"
+    rest = f"{np.mean(after > before):.1%} | {np.mean(kept):.0%} | {np.median(took):.1f}"
+    return f"| {part.name} | {setting} | {accuracy} | {medians} | {rest} |"
 
 
 def real(root: Path, draws: int, seed: int) -> Iterator[str]:
@@ -206,8 +207,8 @@ def main() -> None:
     )
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     for part in (box(), servoholder(), pivconnector()):
-        for place in PLACES:
-            print(virtual(part, place, arguments.poses, arguments.seed), flush=True)
+        for setting in PLACES:
+            print(virtual(part, setting, arguments.poses, arguments.seed), flush=True)
     if arguments.ycb is not None:
         print("\n| frame | object | ADD mm before | after | ADD-S before | after |")
         print("| --- | --- | --- | --- | --- | --- |")

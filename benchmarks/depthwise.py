@@ -44,7 +44,7 @@ def compare(name: str, plain: nn.Module, ours: nn.Module, inputs: Tensor) -> Non
     for _ in range(ROUNDS + 1):
         times["plain"].append(seconds(plain, inputs))
         times["ours"].append(seconds(ours, inputs))
-    before, after = (1e3 * statistics.median(one[1:]) for one in times.values())
+    before, after = (1e3 * statistics.median(samples[1:]) for samples in times.values())
     print(f"{name:<24}{before:>12.1f}{after:>12.1f}{before / after:>9.2f}x")
 
 

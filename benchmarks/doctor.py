@@ -66,8 +66,8 @@ class Studio:
         low, high = (np.clip(f(points, axis=0), 0, size).astype(int) for f in (np.min, np.max))
         cover = ((high - low) * np.sqrt(2 / 3)).astype(int)
         x, y = np.random.default_rng(index).integers(low, high - cover + 1)
-        place = np.s_[y : y + cover[1], x : x + cover[0]]
-        image[place] = self.empty.render(0, index).image[place]
+        region = np.s_[y : y + cover[1], x : x + cover[0]]
+        image[region] = self.empty.render(0, index).image[region]
         return Taken(image, scene.K)
 
     def lens(self, factor: float) -> Callable[[int], Taken]:
@@ -132,7 +132,11 @@ def main() -> None:
         firsts: Counter[str] = Counter()
         for index in range(arguments.images):
             image, K = take(index)
-            wrong = [one for one in diagnose(Case(estimator, image, K, estimator.parts)) if one.fix]
+            wrong = [
+                finding
+                for finding in diagnose(Case(estimator, image, K, estimator.parts))
+                if finding.fix
+            ]
             firsts[wrong[0].subject if wrong else ""] += 1
             if arguments.show:
                 print(index, *wrong, sep="\n    ")

@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,8 +40,12 @@ from dopepp.inference import runtimes
 from dopepp.training.system import PoseSystem
 
 MODELS = ("dope", "dopepp", "dopepp_fast")
-DTYPES = {"fp32": torch.float32, "tf32": torch.float32, "fp16": torch.float16,
-          "bf16": torch.bfloat16}  # fmt: skip
+DTYPES = {
+    "fp32": torch.float32,
+    "tf32": torch.float32,
+    "fp16": torch.float16,
+    "bf16": torch.bfloat16,
+}
 WARM_UP = 3
 
 Values = dict[str, float | str]
@@ -82,7 +87,7 @@ class Workshop:
         """Yield all lines; what is asked most comes first."""
         on_gpu = self.device.type == "cuda"
         eager, compiled = ([*DTYPES], ["tf32", "bf16"]) if on_gpu else (["fp32", "bf16"], ["fp32"])
-        ways = [*((one, "eager") for one in eager), *((one, "compiled") for one in compiled)]
+        ways = [*product(eager, ["eager"]), *product(compiled, ["compiled"])]
         cores = available_cores()
         for table, measure in (("inference", self.inference), ("training", self.training)):
             for precision, how in ways:
@@ -122,7 +127,7 @@ class Workshop:
         """Time training steps on one batch of renders that lies on the device."""
         system, data = self._system(model, compiled)
         items = [data.train_item(0, index) for index in range(self.size.training_batch)]
-        batch = collate(items, {name: place for place, name in enumerate(data.object_names)})
+        batch = collate(items, {name: number for number, name in enumerate(data.object_names)})
         step = self._step(system, precision)
         with self._precision(precision):
             seconds = self._times(partial(step, batch.to(self.device)))
@@ -145,9 +150,13 @@ class Workshop:
         """Return an untrained network with its loss and optimiser, and rendered data."""
         side, count = self.size.pixels, self.size.training_batch
         config = config_of(
-            model, f"data.input_size=[{side},{side}]", f"data.batch_size={count}",
-            f"model.width={self.size.width}", f"data.num_workers={workers}", f"compile={compiled}",
-        )  # fmt: skip
+            model,
+            f"data.input_size=[{side},{side}]",
+            f"data.batch_size={count}",
+            f"model.width={self.size.width}",
+            f"data.num_workers={workers}",
+            f"compile={compiled}",
+        )
         parts = build_parts(config.data)
         system = build_system(config, parts, "").to(self.device).train()
         return system, build_datamodule(config.data, parts, config.seed)

@@ -16,8 +16,12 @@ import torch
 from dopepp.models.network import PoseNetwork, build_network, network_cost
 
 FRAMES = {128: 30, 416: 4}
-CASES = (("dopepp_fast", 128, 0.5), ("dopepp", 128, 0.25), ("dopepp_fast", 416, 1.0),
-         ("dopepp", 416, 1.0))  # fmt: skip
+CASES = (
+    ("dopepp_fast", 128, 0.5),
+    ("dopepp", 128, 0.25),
+    ("dopepp_fast", 416, 1.0),
+    ("dopepp", 416, 1.0),
+)
 """Model, input size, pixels, and width: the quickstart's, and the full networks."""
 
 
@@ -62,16 +66,16 @@ def main() -> None:
         folded = trained.for_inference()
         pixels = torch.randint(0, 256, (1, size, size, 3), dtype=torch.uint8).permute(0, 3, 1, 2)
         worst = max(
-            float((one - other).abs().max())
-            for one, other in zip(trained.maps(pixels), folded.maps(pixels), strict=True)
+            float((output - other).abs().max())
+            for output, other in zip(trained.maps(pixels), folded.maps(pixels), strict=True)
         )
         cost = network_cost(trained, (size, size))[1]
         for threads in (1, 2):
             torch.set_num_threads(threads)
-            sides = [partial(one.maps, pixels) for one in (trained, folded)]
+            sides = [partial(side.maps, pixels) for side in (trained, folded)]
             before, after = milliseconds(sides, FRAMES[size])
-            row = (model, size, f"{cost:.2f}", threads, f"{before:.1f}", f"{after:.1f}",
-                   f"{before / after:.2f}", f"{worst:.1e}")  # fmt: skip
+            times = f"{before:.1f}", f"{after:.1f}", f"{before / after:.2f}"
+            row = (model, size, f"{cost:.2f}", threads, *times, f"{worst:.1e}")
             print("".join(f"{value:>12}" for value in row), flush=True)
 
 

@@ -43,13 +43,23 @@ class Camera:
         factory = Factory([load_part(PART)], PRESETS["quickstart"].reframed(*size), 2)
         rendered = [factory.render(0, number) for number in range(9, 15)]
         header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": FRAME}
-        self.images = [native("sensor_msgs/Image", picture(one.image, header)) for one in rendered]
+        self.images = [
+            native("sensor_msgs/Image", picture(rendering.image, header)) for rendering in rendered
+        ]
         K = rendered[0].scene.K
-        self.info = native("sensor_msgs/CameraInfo", {
-            "header": header, "width": size[0], "height": size[1],
-            "distortion_model": "plumb_bob", "d": array.array("d", [0.0] * 5),
-            "k": K.ravel(), "p": np.c_[K, np.zeros(3)].ravel(), "r": np.eye(3).ravel(),
-        })  # fmt: skip
+        self.info = native(
+            "sensor_msgs/CameraInfo",
+            {
+                "header": header,
+                "width": size[0],
+                "height": size[1],
+                "distortion_model": "plumb_bob",
+                "d": array.array("d", [0.0] * 5),
+                "k": K.ravel(),
+                "p": np.c_[K, np.zeros(3)].ravel(),
+                "r": np.eye(3).ravel(),
+            },
+        )
         self.node = rclpy.create_node("camera")
         self.publisher = self.node.create_publisher(
             type(self.images[0]), TOPIC, QoSProfile(depth=10)
@@ -57,13 +67,15 @@ class Camera:
         self.beside = self.node.create_publisher(
             type(self.info), "/camera/camera_info", QoSProfile(depth=10)
         )
-        poses, told = (type(native(kind, {})) for kind in
-                       ("geometry_msgs/PoseArray", "diagnostic_msgs/DiagnosticArray"))  # fmt: skip
+        poses, diagnostics = (
+            type(native(kind, {}))
+            for kind in ("geometry_msgs/PoseArray", "diagnostic_msgs/DiagnosticArray")
+        )
         self.sent: dict[int, float] = {}
         self.late: dict[int, float] = {}
         self.told: dict[str, str] = {}
         self.node.create_subscription(poses, f"/{NODE_NAME}/poses_{PART}", self.hear, 100)
-        self.node.create_subscription(told, "/diagnostics", self.note, 10)
+        self.node.create_subscription(diagnostics, "/diagnostics", self.note, 10)
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
         self.thread = threading.Thread(target=self.executor.spin, daemon=True)
@@ -77,7 +89,7 @@ class Camera:
 
     def note(self, message) -> None:
         """Keep what the node says of itself."""
-        self.told = {one.key: one.value for one in message.status[0].values}
+        self.told = {entry.key: entry.value for entry in message.status[0].values}
 
     def counted(self) -> dict[str, int]:
         """Return the node's counts of now."""

@@ -57,21 +57,20 @@ def measure(
     for scene in scenes:
         image = capture(render(scene).image, scene.sensor)
         start = time.perf_counter()
-        found = estimator.predict(image, scene.K, distances=distances)[:1]
+        detections = estimator.predict(image, scene.K, distances=distances)[:1]
         seconds.append(time.perf_counter() - start)
-        missed += not found
-        for one in found:
+        missed += not detections
+        for detection in detections:
             true = scene.objects[scene.targets[0]].T_cam_obj
-            away = transform(one.T_cam_obj, part.points) - transform(true, part.points)
+            away = transform(detection.T_cam_obj, part.points) - transform(true, part.points)
             passed += float(np.linalg.norm(away, axis=1).mean()) < 0.1 * part.diameter
-            turn = rotation_angle(one.T_cam_obj[:3, :3] @ true[:3, :3].T)
+            turn = rotation_angle(detection.T_cam_obj[:3, :3] @ true[:3, :3].T)
             turns.append(math.degrees(float(turn)))
     boxes = letterboxes(estimator.checkpoint, scenes[0].K, image, distances)
     sizes = ", ".join(f"{box.width}×{box.height}" for box in boxes)
     turn = f"{statistics.median(turns):.1f}" if turns else "–"
-    cells = [sizes, f"{passed / len(scenes):.1%}", turn, f"{missed / len(scenes):.1%}",
-             f"{1e3 * statistics.median(seconds):.0f}"]  # fmt: skip
-    return " | ".join(cells)
+    rates = f"{passed / len(scenes):.1%} | {turn} | {missed / len(scenes):.1%}"
+    return f"{sizes} | {rates} | {1e3 * statistics.median(seconds):.0f}"
 
 
 def main() -> None:
@@ -91,9 +90,9 @@ def main() -> None:
     size = preset.width, preset.height
     print(f"| training's, {size[0]}×{size[1]} | {measure(estimator, scenes)} |", flush=True)
     for size in SIZES:
-        row = measure(estimator, [through(one, size) for one in scenes])
+        row = measure(estimator, [through(scene, size) for scene in scenes])
         print(f"| {size[0]}×{size[1]} | {row} |", flush=True)
-    large = [through(one, (640, 480)) for one in scenes]
+    large = [through(scene, (640, 480)) for scene in scenes]
     print(f"| 640×480, any | {measure(estimator, large, 'any')} |")
 
 

@@ -49,22 +49,22 @@ def windows(config: RunConfig, parts: Parts, rng: np.random.Generator) -> list[t
     """Cut windows around unhidden parts out of the test's frames, with the number of each part."""
     source = labelled_images(config.data, parts, config.seed, "test")
     scale, size = config.data.virtual.camera_scale or 1.0, np.array(config.data.network_input)
-    names, found = [part.name for part in parts], []
+    names, cut = [part.name for part in parts], []
     for index in range(len(source)):
         sample = source.sample(index)
         width, height = (round(scale * side) for side in sample.size)
         sample = resize_sample(sample, (width, height))
-        for one in sample.instances:
-            if one.label not in names or one.visible_fraction < UNHIDDEN:
+        for instance in sample.instances:
+            if instance.label not in names or instance.visible_fraction < UNHIDDEN:
                 continue
-            corner = one.keypoints[CENTROID] - size / 2 + rng.uniform(-0.15, 0.15, 2) * size
+            corner = instance.keypoints[CENTROID] - size / 2 + rng.uniform(-0.15, 0.15, 2) * size
             left, top = np.clip(corner, 0, np.array(sample.size) - size).astype(int)
             window = crop_sample(sample, left, top, (int(size[0]), int(size[1])))
             # Another part in the window would be one of its surroundings and to be found as well.
             there = [near for near in window.instances if near.visible_fraction > 0]
-            if len(there) == 1 and there[0].visible_fraction > 0.9 * one.visible_fraction:
-                found.append((replace(window, instances=there), names.index(one.label)))
-    return found
+            if len(there) == 1 and there[0].visible_fraction > 0.9 * instance.visible_fraction:
+                cut.append((replace(window, instances=there), names.index(instance.label)))
+    return cut
 
 
 def variants(config: RunConfig, parts: Parts, rng: np.random.Generator) -> dict[str, list[Sample]]:
@@ -75,11 +75,15 @@ def variants(config: RunConfig, parts: Parts, rng: np.random.Generator) -> dict[
     bodies, render = [make_body(part, is_target=True) for part in parts], find_renderer("raster")
     made: dict[str, list[Sample]] = {}
     for window, number in windows(config, parts, rng):
-        (one,), body, real = window.instances, bodies[number], np.ascontiguousarray(window.image)
+        (instance,), body, real = (
+            window.instances,
+            bodies[number],
+            np.ascontiguousarray(window.image),
+        )
         learned = behind.draw(rng, *window.size)
-        lights, ambient = preset.lighting.draw(rng, one.T_cam_obj[:3, 3])
+        lights, ambient = preset.lighting.draw(rng, instance.T_cam_obj[:3, 3])
         material = preset.materials.draw(rng, body.surface)
-        item = SceneObject(body.surface, one.T_cam_obj, material, body.part)
+        item = SceneObject(body.surface, instance.T_cam_obj, material, body.part)
         drawn = render(Scene(window.K, learned, (item,), lights, ambient))
         part = drawn.instances == drawn.scene.targets[0]
         opaque = cv2.GaussianBlur(part.astype(np.float32), (0, 0), 0.6)[..., None]
@@ -106,12 +110,12 @@ def laid(part: Picture, opaque: np.ndarray, behind: Picture) -> Picture:
 def losses(system: PoseSystem, samples: Sequence[Sample]) -> np.ndarray:
     """Return the training's loss on each window."""
     numbers = {part.name: number for number, part in enumerate(system.parts)}
-    found = []
+    values = []
     for first in range(0, len(samples), 32):
         batch = collate(samples[first : first + 32], numbers)
         stages = system(batch.images)
-        found.append(system.loss.per_image(stages, *system.targets(batch, stages)).numpy())
-    return np.concatenate(found)
+        values.append(system.loss.per_image(stages, *system.targets(batch, stages)).numpy())
+    return np.concatenate(values)
 
 
 def main() -> None:

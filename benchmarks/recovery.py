@@ -102,17 +102,17 @@ def crowds(seed: int, frames: int) -> None:
         for sigma in (2.0, 0.5):
             for sizes in ((60.0, 100.0), (60.0, 150.0), (100.0, 150.0)):
                 rng = np.random.default_rng(seed)
-                right = found = 0
+                right = num_detections = 0
                 for _ in range(frames):
                     poses, belief, field = crowd(solid, rng, sigma, sizes)
                     detections = recover(belief, field, solid.cuboid[None], K, STRIDE, sigma=sigma)
-                    found += len(detections)
+                    num_detections += len(detections)
                     right += sum(
                         any(solid.right(d.T_cam_obj, T) for d in detections) for T in poses
                     )
                 span = f"{sizes[0]:.0f}-{sizes[1]:.0f}"
-                total = 10 * frames
-                print(f"{name:14}{sigma:6}{span:>12}{right / total:10.3f}{found / frames:12.1f}")
+                recall, mean = right / (10 * frames), num_detections / frames
+                print(f"{name:14}{sigma:6}{span:>12}{recall:10.3f}{mean:12.1f}")
 
 
 def noisy_maps(keypoints: np.ndarray, covariance: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
@@ -174,17 +174,17 @@ def noise(seed: int, frames: int) -> None:
             _, turned, moved = cv2.solvePnP(
                 solid.cuboid, np.ascontiguousarray(pixels), K, None, flags=cv2.SOLVEPNP_EPNP
             )
-            known = solve_pnp(solid.cuboid, pixels, K, covariance_px=covariance).T_cam_obj
-            found = recover(*noisy_maps(pixels, covariance), solid.cuboid[None], K, STRIDE)
+            weighted = solve_pnp(solid.cuboid, pixels, K, covariance_px=covariance).T_cam_obj
+            detections = recover(*noisy_maps(pixels, covariance), solid.cuboid[None], K, STRIDE)
             poses = (
                 make_transform(cv2.Rodrigues(turned)[0], moved[:, 0]),
-                known,
+                weighted,
                 reference(solid.cuboid, pixels, covariance, truth),
-                found[0].T_cam_obj if found else None,
+                detections[0].T_cam_obj if detections else None,
             )
             right += [T is not None and solid.right(T, truth) for T in poses]
-        epnp, known, best, maps = right / frames
-        print(f"{name:14}{epnp:8.3f}{known:8.3f}{best:11.3f}{maps:11.3f}")
+        epnp, weighted, best, maps = right / frames
+        print(f"{name:14}{epnp:8.3f}{weighted:8.3f}{best:11.3f}{maps:11.3f}")
 
 
 def clean(seed: int, frames: int) -> None:
@@ -194,7 +194,7 @@ def clean(seed: int, frames: int) -> None:
     solid = Solid("can")
     for sigma in (0.5, 1.0, 2.0):
         for count in (1, 3, 10):
-            rng, errors, off, found = np.random.default_rng(seed), [], [], 0
+            rng, errors, off, num_found = np.random.default_rng(seed), [], [], 0
             for _ in range(frames):
                 centres = rng.uniform(0, CELLS * STRIDE, (count, 2))
                 poses = [random_pose(rng, *c, rng.uniform(0.5, 1.5)) for c in centres]
@@ -215,7 +215,7 @@ def clean(seed: int, frames: int) -> None:
                     misses = [np.abs(d.keypoints - truth).mean() for d in detections]
                     nearest = detections[int(np.argmin(misses))]
                     if min(misses) < 20:
-                        found += 1
+                        num_found += 1
                         errors.append(nearest.keypoints - truth)
                         off.append(nearest.peaks - truth)
             row = []
@@ -226,7 +226,7 @@ def clean(seed: int, frames: int) -> None:
                     np.abs(values.mean(0)).max(),
                     np.quantile(np.linalg.norm(values, axis=1), 0.99),
                 ]
-            share = found / (frames * count)
+            share = num_found / (frames * count)
             print(f"{sigma:6}{count:6}" + "".join(f"{v:9.4f}" for v in row) + f"{share:8.3f}")
 
 
@@ -242,20 +242,22 @@ def missing(seed: int, poses: int) -> None:
                 project_keypoints(solid.cuboid, truth, K), np.zeros((9, 2, 2))
             )
             beliefs = belief.repeat(56, 1, 1, 1)
-            for one, gone in zip(beliefs, combinations(range(CENTROID), 3), strict=True):
-                one[list(gone)] = 0
+            for detections, gone in zip(beliefs, combinations(range(CENTROID), 3), strict=True):
+                detections[list(gone)] = 0
             fields = field.expand(56, -1, -1, -1)
-            found = recover_batch(beliefs, fields, solid.cuboid[None], np.stack([K] * 56), STRIDE)
-            right += [len(one) > 0 and solid.right(one[0].T_cam_obj, truth) for one in found]
+            batch = recover_batch(beliefs, fields, solid.cuboid[None], np.stack([K] * 56), STRIDE)
+            right += [
+                len(detections) > 0 and solid.right(detections[0].T_cam_obj, truth)
+                for detections in batch
+            ]
         print(f"{name:14}{right.mean() / poses:8.3f}{right.min() / poses:8.3f}")
 
 
 def main() -> None:
     """Print the tables asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    tables: dict[str, Callable[[int, int], None]] = {
-        "noise": noise, "clean": clean, "missing": missing, "crowds": crowds,
-    }  # fmt: skip
+    functions: tuple[Callable[[int, int], None], ...] = (noise, clean, missing, crowds)
+    tables = {function.__name__: function for function in functions}
     parser.add_argument("tables", nargs="*", default=list(tables), choices=list(tables))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--frames", type=int, default=100, help="images of a row")

@@ -90,10 +90,8 @@ def measure(name: str, preset: str, num_images: int, seed: int, unit: str, terms
     ]
     worse = float(np.mean(new[:, 2] > old[:, 2] + 1e3 * WORSE))
     times = f"{np.median(took):.1f} | {np.percentile(took, 95):.1f}"
-    return " | ".join(
-        [f"| {part.name} | {preset} | {len(took)}", *shares, *middle,
-         f"{worse:.0%} | {kept / len(took):.0%} | {times} |"]
-    )  # fmt: skip
+    counts = f"{worse:.0%} | {kept / len(took):.0%} | {times}"
+    return f"| {part.name} | {preset} | {len(took)} | {' | '.join([*shares, *middle])} | {counts} |"
 
 
 def main() -> None:
@@ -114,10 +112,8 @@ def main() -> None:
     print("|" + " --- |" * 12)
     for name in arguments.parts:
         for preset in arguments.presets:
-            row = measure(
-                name, preset, arguments.images, arguments.seed, arguments.unit,
-                arguments.refine.split(","),
-            )  # fmt: skip
+            terms, options = arguments.refine.split(","), arguments
+            row = measure(name, preset, options.images, options.seed, options.unit, terms)
             print(row, flush=True)
 
 

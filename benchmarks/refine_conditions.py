@@ -48,8 +48,8 @@ def on_target(change: Callable[[Material], Material]) -> Callable[[Scene], Scene
 
     def changed(scene: Scene) -> Scene:
         objects = tuple(
-            replace(one, material=change(one.material)) if one.is_target else one
-            for one in scene.objects
+            replace(item, material=change(item.material)) if item.is_target else item
+            for item in scene.objects
         )
         return replace(scene, objects=objects)
 
@@ -72,9 +72,9 @@ def blurred(scene: Scene) -> Scene:
 LAYERS = Grooves(axis=(0.0, 0.0, 1.0), pitch=0.0002, slope=0.4)
 SCENES: dict[str, Callable[[Scene], Scene]] = {
     "as it is": lambda scene: scene,
-    "printed layers": on_target(lambda one: replace(one, grooves=LAYERS)),
+    "printed layers": on_target(lambda material: replace(material, grooves=LAYERS)),
     "polished metal": on_target(
-        lambda one: replace(one, metallic=1.0, roughness=0.25, colour=(0.75, 0.75, 0.78))
+        lambda material: replace(material, metallic=1.0, roughness=0.25, colour=(0.75, 0.75, 0.78))
     ),
     "background of the part's colour": camouflaged,
     "motion blur 5 px": blurred,
@@ -91,14 +91,14 @@ def paired(scene: Scene, hidden: float, rng: np.random.Generator) -> Scene:
 
     One that is partly hidden lies under the first. Distractors are left out.
     """
-    one = scene.objects[scene.targets[0]]
-    part, (width, height) = one.part, scene.size
+    target = scene.objects[scene.targets[0]]
+    part, (width, height) = target.part, scene.size
     assert part is not None
     assert part.mesh is not None
     outline = make_outline_mesh(part.mesh.vertices, part.mesh.faces)
     K, size = crop_camera(scene.K, -width // 2, -height // 2), (2 * width, 2 * height)
     # In its plane the second one is turned to the other side as far as the first one is.
-    first, turned, (a, b) = one.T_cam_obj, np.eye(4), one.T_cam_obj[:2, 0]
+    first, turned, (a, b) = target.T_cam_obj, np.eye(4), target.T_cam_obj[:2, 0]
     turned[:3, :3] = rotation_vector_to_matrix(np.array([0.0, 0.0, 2.0 * math.atan2(b, a)]))
     way, middle = rng.uniform(0.0, 2.0 * math.pi), part.cuboid[CENTROID]
     thickness = np.ptp(part.cuboid[:, 2]) if hidden else 0.0
@@ -122,7 +122,7 @@ def paired(scene: Scene, hidden: float, rng: np.random.Generator) -> Scene:
     for _ in range(12):
         apart = (near + far) / 2
         near, far = (apart, far) if share(apart) > hidden else (near, apart)
-    objects = tuple(replace(one, T_cam_obj=T) for T in poses(far))
+    objects = tuple(replace(target, T_cam_obj=T) for T in poses(far))
     background = ProceduralBackgrounds().draw(rng, *size)
     return replace(scene, K=K, objects=objects, background=background)
 
@@ -153,25 +153,33 @@ def measure(
             Instance(part.name, scene.objects[number].T_cam_obj, scene.keypoints(number))
             for number in scene.targets
         ]
-        frames = [Wireframe(one.keypoints, GREEN, "true") for one in shown]
+        frames = [Wireframe(instance.keypoints, GREEN, "true") for instance in shown]
         errors = np.full((2, len(shown), 2), np.inf)
-        for method, colour, own in zip((network, estimator), (BLUE, YELLOW), errors, strict=True):
-            found = method.predict(image, K)
-            for one, number in zip(found, assign(part.cuboid[CENTROID], found, shown), strict=True):
-                kept += bool(one.kept)
+        for method, colour, pose_errors in zip(
+            (network, estimator), (BLUE, YELLOW), errors, strict=True
+        ):
+            detections = method.predict(image, K)
+            for detection, number in zip(
+                detections, assign(part.cuboid[CENTROID], detections, shown), strict=True
+            ):
+                kept += bool(detection.kept)
                 frames.append(
-                    Wireframe(one.keypoints, colour, "network" if colour == BLUE else "refined")
+                    Wireframe(
+                        detection.keypoints, colour, "network" if colour == BLUE else "refined"
+                    )
                 )
                 if number >= 0:
-                    own[number] = _errors(one.T_cam_obj, shown[number].T_cam_obj, part)
+                    pose_errors[number] = _errors(
+                        detection.T_cam_obj, shown[number].T_cam_obj, part
+                    )
         rows.append(errors)
         title = ", ".join(
-            f"{one[1]:.1f} to {other[1]:.1f}" for one, other in zip(*errors, strict=True)
+            f"{before[1]:.1f} to {after[1]:.1f}" for before, after in zip(*errors, strict=True)
         )
         tiles.append(Tile(overlay(image, frames), f"{name}: {title}"))
     both = np.concatenate(rows, axis=1)
-    found = np.isfinite(both[..., 1])
-    twice = both[:, found.all(axis=0)]
+    is_found = np.isfinite(both[..., 1])
+    twice = both[:, is_found.all(axis=0)]
 
     def pair(values: Iterable[float], text: str) -> str:
         return " → ".join(f"{value:{text}}" for value in values)
@@ -180,7 +188,7 @@ def measure(
     limits = [1e3 * share * part.diameter for share in (0.1, 0.05)]
     cells = [
         name,
-        pair((~found).mean(axis=1), ".0%"),
+        pair((~is_found).mean(axis=1), ".0%"),
         *(pair((both[..., 1] < limit).mean(axis=1), ".0%") for limit in limits),
         *(pair(np.median(twice[..., c], axis=1), ".1f") for c in (0, 1)),
         f"{worse:.0%}",

@@ -57,11 +57,11 @@ def instances(scene: Path, least: float, every: int) -> Iterator[tuple]:
     for image in list(truth)[::every]:
         picture = read_rgb(next((scene / "rgb").glob(f"{int(image):06d}.*")))
         K = np.reshape(cameras[image]["cam_K"], (3, 3)).astype(float)
-        for number, one in enumerate(truth[image]):
+        for number, annotation in enumerate(truth[image]):
             if not seen or seen[image][number]["visib_fract"] >= least:
-                U, _, Vt = np.linalg.svd(np.reshape(one["cam_R_m2c"], (3, 3)))
-                T = make_transform(U @ Vt, np.array(one["cam_t_m2c"]) / 1000)
-                yield picture, K, one["obj_id"], T
+                U, _, Vt = np.linalg.svd(np.reshape(annotation["cam_R_m2c"], (3, 3)))
+                T = make_transform(U @ Vt, np.array(annotation["cam_t_m2c"]) / 1000)
+                yield picture, K, annotation["obj_id"], T
 
 
 def main() -> None:
@@ -71,8 +71,11 @@ def main() -> None:
     parser.add_argument("--split", default="test")
     parser.add_argument("--every", type=int, default=1, help="every so manieth frame")
     parser.add_argument("--from-truth", action="store_true", help="start at the published poses")
-    parser.add_argument("--pictures", type=Path, help="a sheet of every 20th: truth green, start "
-                        "blue, refined yellow")  # fmt: skip
+    parser.add_argument(
+        "--pictures",
+        type=Path,
+        help="a sheet of every 20th: truth green, start blue, refined yellow",
+    )
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     parts = parts_by_id(arguments.folder, bop_parts(arguments.folder))
@@ -100,28 +103,34 @@ def main() -> None:
         before, after = (add_mm(part, T, equivalents) for T in (start, end.T_cam_obj))
         surprise = math.nan
         if end.covariance is not None:
-            both = (one for T in (end.T_cam_obj, true) for one in (T[:3, :3], T[:3, 3]))
-            batch = (torch.from_numpy(one)[None] for one in (*both, end.covariance))
+            both = (array for T in (end.T_cam_obj, true) for array in (T[:3, :3], T[:3, 3]))
+            batch = (torch.from_numpy(array)[None] for array in (*both, end.covariance))
             surprise = float(mahalanobis(*batch, torch.from_numpy(group))) ** 2 / 6
         rows.setdefault(part.name, []).append(
             (before, after, after > before + 1e3 * WORSE, bool(end.reason), surprise, took)
         )
         if count % 20 == 0:
-            poses = ((true, GREEN, "true"), (start, BLUE, "start"),
-                     (end.T_cam_obj, YELLOW, "refined"))  # fmt: skip
-            frames = [Wireframe(project_keypoints(part.cuboid, T, K), colour, name)
-                      for T, colour, name in poses]  # fmt: skip
+            poses = (
+                (true, GREEN, "true"),
+                (start, BLUE, "start"),
+                (end.T_cam_obj, YELLOW, "refined"),
+            )
+            frames = [
+                Wireframe(project_keypoints(part.cuboid, T, K), colour, name)
+                for T, colour, name in poses
+            ]
             caption = f"{part.name}: {before:.1f} to {after:.1f} mm"
             tiles.append(Tile(overlay(picture, frames), caption))
     titles = "object | poses | ADD mm before | after | worse by 1 mm | kept | normalised error | ms"
     print(f"| {titles} |\n" + "| --- " * 8 + "|")
-    rows["all"] = [row for found in rows.values() for row in found]
-    for name, found in rows.items():
-        before, after, worse, kept, surprise, took = np.array(found, float).T
-        cells = [name, str(len(found)), f"{np.median(before):.1f}", f"{np.median(after):.1f}",
-                 f"{worse.mean():.0%}", f"{kept.mean():.0%}",
-                 f"{math.sqrt(np.nanmean(surprise)):.2f}", f"{np.median(took):.1f}"]  # fmt: skip
-        print("| " + " | ".join(cells) + " |")
+    rows["all"] = [row for poses in rows.values() for row in poses]
+    for name, poses in rows.items():
+        before, after, worse, kept, surprise, took = np.array(poses, float).T
+        medians = f"{np.median(before):.1f} | {np.median(after):.1f}"
+        shares = f"{worse.mean():.0%} | {kept.mean():.0%}"
+        normalised = f"{math.sqrt(np.nanmean(surprise)):.2f}"
+        cells = f"{len(poses)} | {medians} | {shares} | {normalised} | {np.median(took):.1f}"
+        print(f"| {name} | {cells} |")
     if arguments.pictures is not None:
         write_png(arguments.pictures, contact_sheet(tiles, 4))
 

@@ -136,11 +136,9 @@ def measure(part: Part, preset: Preset, num_images: int) -> list[str]:
     totals = stages.sum(axis=0)
     shares = stages.sum(axis=1) / stages.sum()
     low, high = preset.distractors.number
-    return [
-        preset.name, f"{preset.width}×{preset.height}", f"{low}–{high}" if high else "0",
-        f"{np.median(totals):.1f}", f"{totals.mean():.1f}",
-        *(f"{share:.0%}" for share in shares), f"{np.mean(painted):.0f}",
-    ]  # fmt: skip
+    labels = [preset.name, f"{preset.width}×{preset.height}", f"{low}–{high}" if high else "0"]
+    times = [f"{np.median(totals):.1f}", f"{totals.mean():.1f}"]
+    return [*labels, *times, *(f"{share:.0%}" for share in shares), f"{np.mean(painted):.0f}"]
 
 
 def first_image() -> tuple[float, float]:
@@ -186,12 +184,11 @@ def main() -> None:
     part = refined(pivconnector(), arguments.faces)
     assert part.mesh is not None
     print(f"{part.name}, {len(part.mesh.faces):,} faces, CPU-ms an image (process time)")
-    header = [
-        "preset", "size", "distractors", "median", "mean", "scene", "rasterise and shade",
-        "sensor", "painter",
-    ]  # fmt: skip
+    headings = (
+        "preset, size, distractors, median, mean, scene, rasterise and shade, sensor, painter"
+    )
     presets = (preset_of(name, size) for name in PRESET_NAMES for size in SIZES)
-    show(header, (measure(part, preset, arguments.images) for preset in presets))
+    show(headings.split(", "), (measure(part, preset, arguments.images) for preset in presets))
     print(f"\n{REFERENCES}")
     show(["a surface, once", "CPU-ms"], bake_rows(part, WARM_UP))
     first_image()  # compiles what is not compiled yet

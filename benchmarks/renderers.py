@@ -42,21 +42,20 @@ def timed(
     return images, (time.process_time() - cpu) / count, (time.perf_counter() - wall) / count
 
 
-def compare(name: str, preset: str, size: tuple[int, int], num_images: int) -> list[str]:
+def compare(name: str, preset: str, size: tuple[int, int], num_images: int) -> str:
     """Return one row of the table."""
     renderer = find_renderer("photoreal")
     parts = [make() for make in BUILTIN.values()]
     factory = Factory(parts, PRESETS[preset].resized(*size), SEED)
     scenes = [factory.scene(0, index) for index in range(num_images + 1)]
     expected, base, _ = timed(render, scenes)
-    found, cpu, wall = timed(renderer, scenes)
-    pairs = list(zip(found, expected, strict=True))
-    depth = [(np.abs(one.depth - other.depth) < LIMIT_M).mean() for one, other in pairs]
-    masks = [(one.instances == other.instances).mean() for one, other in pairs]
-    return [
-        name, preset, f"{size[0]}×{size[1]}", f"{cpu:.3f}", f"{wall:.3f}", f"{1e3 * base:.1f}",
-        f"{cpu / base:.0f}×", f"{100 * min(depth):.3f} %", f"{100 * min(masks):.3f} %",
-    ]  # fmt: skip
+    images, cpu, wall = timed(renderer, scenes)
+    pairs = list(zip(images, expected, strict=True))
+    depth = [(np.abs(image.depth - reference.depth) < LIMIT_M).mean() for image, reference in pairs]
+    masks = [(image.instances == reference.instances).mean() for image, reference in pairs]
+    times = f"{cpu:.3f} | {wall:.3f} | {1e3 * base:.1f} | {cpu / base:.0f}×"
+    agreement = f"{100 * min(depth):.3f} % | {100 * min(masks):.3f} %"
+    return f"| {name} | {preset} | {size[0]}×{size[1]} | {times} | {agreement} |"
 
 
 def main() -> None:
@@ -71,16 +70,13 @@ def main() -> None:
         try:
             for preset in SCENES:
                 row = compare(arguments.only, preset, tuple(arguments.size), arguments.images)
-                print("| " + " | ".join(row) + " |", flush=True)
+                print(row, flush=True)
         except UserError as error:
             print(f"{arguments.only}: not measured: {error}")
         return
-    header = [
-        "variant", "preset", "size", "CPU-s", "wall-s", "rasteriser CPU-ms", "ratio",
-        "depth within 1 mm (worst image)", "same mask (worst image)",
-    ]  # fmt: skip
-    print("| " + " | ".join(header) + " |")
-    print("| " + " | ".join("---" for _ in header) + " |", flush=True)
+    headings = "variant | preset | size | CPU-s | wall-s | rasteriser CPU-ms | ratio"
+    print(f"| {headings} | depth within 1 mm (worst image) | same mask (worst image) |")
+    print("| --- " * 9 + "|", flush=True)
     for name in VARIANTS:
         settings = {"OMP_NUM_THREADS": "1", VARIANT_SETTING: name}
         command = [sys.executable, __file__, "--only", name, "--images", str(arguments.images)]

@@ -166,8 +166,8 @@ def show_kernels() -> None:
 
     model = compile_model(load_openvino("--isa").convert_model(layer.eval(), example_input=image))
     kinds = {
-        str(one.get_rt_info()["primitiveType"].astype(str))
-        for one in model.get_runtime_model().get_ops()
+        str(node.get_rt_info()["primitiveType"].astype(str))
+        for node in model.get_runtime_model().get_ops()
     }
     print("openvino:", *sorted(kinds))
 

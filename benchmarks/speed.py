@@ -33,8 +33,13 @@ from runtimes import config_of, limit, show_kernels
 
 SIZE = (640, 480)
 SCENES, ROUNDS, TRACKED = 8, 3, range(30, 130)
-EVERY = (("safetensors", "fp32"), ("openvino", "fp32"), ("openvino", "int8"), ("onnx", "fp32"),
-         ("onnx", "int8"))  # fmt: skip
+EVERY = (
+    ("safetensors", "fp32"),
+    ("openvino", "fp32"),
+    ("openvino", "int8"),
+    ("onnx", "fp32"),
+    ("onnx", "int8"),
+)
 NETWORKS = {
     "pivconnector": EVERY,
     "dopepp_fast": EVERY,
@@ -66,7 +71,7 @@ def export(name: str, layout: str, precision: str, folder: Path) -> Path:
         network, checkpoint = load_network(f"pretrained/{RELEASED[name]}")
     else:
         model, *width = name.split()
-        config = config_of(model, *(f"model.{one}" for one in width))
+        config = config_of(model, *(f"model.{option}" for option in width))
         torch.manual_seed(0)
         network, checkpoint = build_untrained(config, build_parts(config.data))
         checkpoint.state_dict.update(network.state_dict())
@@ -105,12 +110,12 @@ class Side:
     def next(self) -> None:
         """Time a frame."""
         call, before = next(self.calls), self.estimator.spent_ms.copy()
-        start, own = time.perf_counter(), time.process_time()
-        found = call()
+        start, cpu_start = time.perf_counter(), time.process_time()
+        detections = call()
         self.frame.append(1000 * (time.perf_counter() - start))
-        self.cpu.append(1000 * (time.process_time() - own))
+        self.cpu.append(1000 * (time.process_time() - cpu_start))
         self.steps.append([spent - before[step] for step, spent in self.estimator.spent_ms.items()])
-        self.num_found += len(found)
+        self.num_found += len(detections)
 
     def row(self) -> list[str]:
         """Return first frame, median, 95th percentile, CPU, parts, frames a second, found."""
@@ -120,10 +125,10 @@ class Side:
             statistics.quantiles(later, n=20, method="inclusive")[-1],
         )
         spent = (self.cpu[2:], *zip(*self.steps[2:], strict=True))
-        least = [statistics.quantiles(one, n=10, method="inclusive")[0] for one in spent]
+        least = [statistics.quantiles(times, n=10, method="inclusive")[0] for times in spent]
         values = [self.frame[0], p50, p95, *least]
-        found = f"{self.num_found} of {len(self.frame)}"
-        return [*(f"{value:.1f}" for value in values), f"{1000 / p50:.1f}", found]
+        detected = f"{self.num_found} of {len(self.frame)}"
+        return [*(f"{value:.1f}" for value in values), f"{1000 / p50:.1f}", detected]
 
     def _frames(self, trained: bool) -> Iterator[Callable[[], list]]:
         """Yield a prediction on one rendered scene after the other."""
@@ -132,15 +137,16 @@ class Side:
         from dopepp.experiment.results.cost import likely_maps
         from dopepp.maps.codec import MapGeometry
 
-        own, generator = self.estimator, torch.Generator().manual_seed(0)
-        geometry = MapGeometry(own.network.stride, own.recovery.sigma)
+        estimator, generator = self.estimator, torch.Generator().manual_seed(0)
+        geometry = MapGeometry(estimator.network.stride, estimator.recovery.sigma)
         answers = [
-            None if trained else likely_maps(one, own, geometry, generator) for one in scenes()
+            None if trained else likely_maps(sample, estimator, geometry, generator)
+            for sample in scenes()
         ]
 
         def predict(number: int) -> list:
-            own.answer, sample = answers[number], scenes()[number]
-            return own.predict(sample.image, sample.K, cropped=True)
+            estimator.answer, sample = answers[number], scenes()[number]
+            return estimator.predict(sample.image, sample.K, cropped=True)
 
         for number in count():
             yield lambda number=number: predict(number % SCENES)
@@ -151,8 +157,8 @@ class Side:
 
         while True:
             tracker = PoseTracker(self.estimator)
-            for one in motion():
-                yield lambda one=one, tracker=tracker: tracker.track(one.image, one.K)
+            for frame in motion():
+                yield lambda frame=frame, tracker=tracker: tracker.track(frame.image, frame.K)
 
 
 @cache
@@ -185,8 +191,10 @@ def measure(isa: str, folder: Path, seconds: float, only: str) -> None:
     from dopepp.inference.runtimes import num_threads
 
     torch.set_num_threads(num_threads())
-    print(f"\n{isa}: {num_threads()} threads, ATen {torch.backends.cpu.get_cpu_capability()}, "
-          f"load {os.getloadavg()[0]:.1f}")  # fmt: skip
+    print(
+        f"\n{isa}: {num_threads()} threads, ATen {torch.backends.cpu.get_cpu_capability()}, "
+        f"load {os.getloadavg()[0]:.1f}"
+    )
     show_kernels()
     sides = {}
     for name, formats in NETWORKS.items():
@@ -203,8 +211,21 @@ def measure(isa: str, folder: Path, seconds: float, only: str) -> None:
             side.next()
             while time.perf_counter() < until:
                 side.next()
-    heads = ("network", "runtime", "precision", "first", "p50", "p95", "CPU", "pre", "maps",
-             "decode", "refine", "frames/s", "found")  # fmt: skip
+    heads = (
+        "network",
+        "runtime",
+        "precision",
+        "first",
+        "p50",
+        "p95",
+        "CPU",
+        "pre",
+        "maps",
+        "decode",
+        "refine",
+        "frames/s",
+        "found",
+    )
     print(f"\n| {' | '.join(heads)} |\n|{' --- |' * 3}{' ---: |' * 10}")
     for names, side in sides.items():
         print(f"| {' | '.join([*names, *side.row()])} |")
@@ -228,8 +249,8 @@ def main() -> None:
         for layout, precision in formats if asked.only in name else ():
             export(name, layout, precision, asked.exports)
     for isa in asked.isa:
-        own = ["--isa", isa, "--seconds", str(asked.seconds), "--only", asked.only]
-        command = [sys.executable, __file__, *own, "--exports", str(asked.exports), "--here"]
+        options = ["--isa", isa, "--seconds", str(asked.seconds), "--only", asked.only]
+        command = [sys.executable, __file__, *options, "--exports", str(asked.exports), "--here"]
         lines = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
         for line in lines.splitlines():
             if not line.startswith("onednn_verbose") or ",convolution," in line:

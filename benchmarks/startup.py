@@ -51,13 +51,13 @@ def imports(code: str, folder: Path) -> dict[str, float]:
     """Return the seconds that the largest packages take of an import, by name."""
     command = [sys.executable, "-X", "importtime", "-c", code]
     lines = subprocess.run(command, cwd=folder, capture_output=True, text=True).stderr.splitlines()
-    own: dict[str, float] = {}
+    seconds: dict[str, float] = {}
     for line in lines:
         fields = line.removeprefix("import time:").split("|")
         if len(fields) == 3 and fields[0].strip().isdigit():
             package = fields[2].strip().partition(".")[0]
-            own[package] = own.get(package, 0.0) + int(fields[0]) / 1e6
-    return dict(sorted(own.items(), key=lambda item: -item[1])[:6])
+            seconds[package] = seconds.get(package, 0.0) + int(fields[0]) / 1e6
+    return dict(sorted(seconds.items(), key=lambda item: -item[1])[:6])
 
 
 def main() -> None:

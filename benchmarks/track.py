@@ -65,14 +65,16 @@ def pose_at(frame: float, frames: int, rng: np.random.Generator) -> np.ndarray:
     length = max(frames - 2 * REST, 1)
     warped = moving - length / (2 * math.pi) * math.sin(2 * math.pi * moving / length)
     periods = (110, 90, 75, 140, 65, 120)
-    swing = [math.sin(2 * math.pi * warped / period + phase)
-             for period, phase in zip(periods, phases, strict=True)]  # fmt: skip
+    swing = [
+        math.sin(2 * math.pi * warped / period + phase)
+        for period, phase in zip(periods, phases, strict=True)
+    ]
     tilt = rotation_vector_to_matrix(np.array([0.45 * swing[0], 0.45 * swing[1], 0.0]))
     turn = rotation_vector_to_matrix(np.array([0.0, 0.0, 0.65 * swing[2]]))
     z = 0.19 + 0.04 * swing[3]
-    place = np.array([0.25 * z * swing[4], 0.15 * z * swing[5], z])
+    position = np.array([0.25 * z * swing[4], 0.15 * z * swing[5], z])
     facing = np.diag([1.0, -1.0, -1.0])
-    return make_transform(tilt @ turn @ facing, place)
+    return make_transform(tilt @ turn @ facing, position)
 
 
 def sequence(part: Part, seed: int, frames: int) -> Iterator[Frame]:
@@ -90,17 +92,21 @@ def sequence(part: Part, seed: int, frames: int) -> Iterator[Frame]:
         objects = [replace(target, T_cam_obj=T)]
         if frame in PASSING:
             share = (frame - PASSING.start) / len(PASSING)
-            place = T[:3, 3] * 0.8 + np.array([0.16 * (share - 0.5), 0.0, 0.0])
-            objects.append(SceneObject(hand, make_transform(np.eye(3), place), skin))
+            position = T[:3, 3] * 0.8 + np.array([0.16 * (share - 0.5), 0.0, 0.0])
+            objects.append(SceneObject(hand, make_transform(np.eye(3), position), skin))
         if frame in COVERED:
             objects.append(SceneObject(wall, make_transform(np.eye(3), T[:3, 3] * 0.5), skin))
         wave = math.sin(2 * math.pi * frame / 80)
         lights = tuple(
-            replace(one, position=(one.position[0] + 0.3 * wave, *one.position[1:]))
-            for one in base.lights
+            replace(light, position=(light.position[0] + 0.3 * wave, *light.position[1:]))
+            for light in base.lights
         ) or (Light((0.3 * wave, -0.5, -0.2)),)
-        sensor = replace(base.sensor, exposure_ev=base.sensor.exposure_ev + 0.4 * wave,
-                         noise_seed=frame, motion_px=(0.0, 0.0))  # fmt: skip
+        sensor = replace(
+            base.sensor,
+            exposure_ev=base.sensor.exposure_ev + 0.4 * wave,
+            noise_seed=frame,
+            motion_px=(0.0, 0.0),
+        )
         rendered = render(
             Scene(base.K, base.background, tuple(objects), lights, base.ambient, sensor=sensor)
         )
@@ -118,7 +124,7 @@ def is_right(pose: np.ndarray | None, true: np.ndarray) -> bool:
 
 def measure(
     estimator: PoseEstimator, part: Part, seed: int, frames: int, pictures: Path | None
-) -> list[str]:
+) -> str:
     """Return one row of the table."""
     tracker = PoseTracker(estimator)
     right: list[bool] = []
@@ -127,9 +133,9 @@ def measure(
     recovery = None
     for number, frame in enumerate(sequence(part, seed, frames)):
         began = time.process_time()
-        found = tracker.track(frame.image, frame.K)
+        tracks = tracker.track(frame.image, frame.K)
         times.append(1e3 * (time.process_time() - began))
-        pose = found[0].detection.T_cam_obj if found else None
+        pose = tracks[0].detection.T_cam_obj if tracks else None
         good = is_right(pose, frame.T)
         if frame.visible >= LEAST_VISIBLE:
             right.append(good)
@@ -139,28 +145,29 @@ def measure(
             recovery = number - COVERED.stop + 1
         if pictures is not None and (number % 10 == 0 or not good):
             true = Wireframe(project_keypoints(part.cuboid, frame.T, frame.K), GREEN, "true")
-            seen = [Wireframe(one.detection.keypoints, YELLOW, f"{one.identity}") for one in found]
+            seen = [
+                Wireframe(track.detection.keypoints, YELLOW, f"{track.identity}")
+                for track in tracks
+            ]
             write_png(pictures / f"{seed}_{number:03d}.png", overlay(frame.image, [true, *seen]))
     # Steps from frame to frame over √2: a slow drift is no trembling.
-    shifts = [float(np.linalg.norm(after[:3, 3] - before[:3, 3]))
-              for before, after in pairwise(resting)]  # fmt: skip
-    turns = [float(rotation_angle(after[:3, :3] @ before[:3, :3].T))
-             for before, after in pairwise(resting)]  # fmt: skip
-    return [
-        str(seed),
-        f"{np.mean(right):.1%}",
-        f"{1e3 * _trembling(shifts):.2f}",
-        f"{math.degrees(_trembling(turns)):.2f}",
-        "never" if recovery is None else str(recovery),
-        f"{1e3 / np.mean(times[1:]):.0f}",
-        f"{np.median(times):.1f}",
-        f"{np.percentile(times, 95):.1f}",
+    shifts = [
+        float(np.linalg.norm(after[:3, 3] - before[:3, 3])) for before, after in pairwise(resting)
     ]
+    turns = [
+        float(rotation_angle(after[:3, :3] @ before[:3, :3].T))
+        for before, after in pairwise(resting)
+    ]
+    steadiness = f"{1e3 * _trembling(shifts):.2f} | {math.degrees(_trembling(turns)):.2f}"
+    recovered = "never" if recovery is None else str(recovery)
+    rate = f"{1e3 / np.mean(times[1:]):.0f}"
+    spent = f"{np.median(times):.1f} | {np.percentile(times, 95):.1f}"
+    return f"| {seed} | {np.mean(right):.1%} | {steadiness} | {recovered} | {rate} | {spent} |"
 
 
 def _trembling(steps: list[float]) -> float:
     """Return the root mean square of what one frame adds to a step; NaN where there is none."""
-    return math.sqrt(sum(one**2 for one in steps) / len(steps) / 2) if steps else math.nan
+    return math.sqrt(sum(step**2 for step in steps) / len(steps) / 2) if steps else math.nan
 
 
 def main() -> None:
@@ -180,8 +187,7 @@ def main() -> None:
     titles = "seed | within 5 mm and 2° | at rest mm | at rest ° | frames to recover | frames/s"
     print(f"| {titles} | ms p50 | p95 |\n" + "| --- " * 8 + "|")
     for seed in range(arguments.first, arguments.first + arguments.seeds):
-        row = measure(estimator, part, seed, arguments.frames, arguments.pictures)
-        print("| " + " | ".join(row) + " |", flush=True)
+        print(measure(estimator, part, seed, arguments.frames, arguments.pictures), flush=True)
 
 
 if __name__ == "__main__":

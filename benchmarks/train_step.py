@@ -94,8 +94,12 @@ def main(models: tuple[str, ...]) -> None:
     """Print a line per model: its size, and each rate with its ratio to the first model's."""
     networks = {model: make_network(model) for model in models}
     calls = {
-        model: (make_step(one, half=False), make_step(one, half=True), make_prediction(one))
-        for model, one in networks.items()
+        model: (
+            make_step(network, half=False),
+            make_step(network, half=True),
+            make_prediction(network),
+        )
+        for model, network in networks.items()
     }
     half = choose_precision("auto", "cpu")[0].startswith("bf16")
     # Of each model: a step and a picture with glibc's default, steps with memory kept.
@@ -115,7 +119,7 @@ def main(models: tuple[str, ...]) -> None:
     first = None
     for model, rounds in times.items():
         default, picture, single_s, half_s = (
-            statistics.median(one) for one in zip(*rounds, strict=True)
+            statistics.median(samples) for samples in zip(*rounds, strict=True)
         )
         kept = half_s if half else single_s
         num_parameters, gmacs = network_cost(networks[model], (SIZE, SIZE))

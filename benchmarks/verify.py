@@ -48,22 +48,25 @@ def measure(
         for number in rendered.scene.targets:
             if rendered.visible_fractions[number] < LEAST_VISIBLE:
                 continue
-            item, own = rendered.scene.objects[number], []
+            item, pairs = rendered.scene.objects[number], []
             for pose in range(poses):
                 T = perturbed(item.T_cam_obj, rng, min(1.0, float(pose)))
                 start = time.process_time()
                 value = agreement(rendered.image, rendered.scene.K, T, item.surface)
                 took.append(1000 * (time.process_time() - start))
                 moved = transform(T, part.points) - transform(item.T_cam_obj, part.points)
-                own.append((float(np.linalg.norm(moved, axis=1).mean()), value))
-            rows += own
-            single.append(spearmanr(*zip(*own, strict=True)).statistic)
+                pairs.append((float(np.linalg.norm(moved, axis=1).mean()), value))
+            rows += pairs
+            single.append(spearmanr(*zip(*pairs, strict=True)).statistic)
     errors, values = np.array(rows).T
     pooled = spearmanr(errors, values).statistic
     return (
-        pooled, float(np.nanmedian(single)), float(np.median(values[errors < 1e-9])),
-        float(np.median(values[errors > 0.015])), float(np.median(took)),
-    )  # fmt: skip
+        pooled,
+        float(np.nanmedian(single)),
+        float(np.median(values[errors < 1e-9])),
+        float(np.median(values[errors > 0.015])),
+        float(np.median(took)),
+    )
 
 
 def main() -> None:

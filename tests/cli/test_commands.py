@@ -52,7 +52,7 @@ def test_predict_verifies_and_refines(run, checkpoint, picture, tmp_path):
         (["--refine", "icp"], "refine=('icp',)"),
         (["--refine", "region,"], "refine=('region', '')"),
         (["--track", "--verify"], "--track with --verify"),
-        (["--verify", "--part", "x=servoholder"], "no part of the checkpoint"),
+        (["--verify", "--part", "x=servoholder"], "not in the checkpoint"),
         (["--refine", "depth", "--depth", "missing.png"], "missing.png"),
     ],
 )

@@ -34,5 +34,5 @@ def test_a_checkpoints_own_mesh_is_taken_unless_another_is_given():
 def test_missing_or_unknown_meshes():
     with pytest.raises(UserError, match=r"no mesh of bracket.*--part bracket=FILE"):
         with_meshes([without_mesh("bracket")])
-    with pytest.raises(UserError, match="no part of the checkpoint"):
+    with pytest.raises(UserError, match="not in the checkpoint"):
         with_meshes([servoholder(), pivconnector()], ["wrong=servoholder"])

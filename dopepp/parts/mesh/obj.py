@@ -1,7 +1,7 @@
 """OBJ files with one texture, OFF files, and triangulation of polygons.
 
-trimesh is not used here (``tests/parts/mesh/test_library.py``). In OBJ files it omits faces that are
-truncated or written with tabs, misreads index 0 and relative indices, silently loses textures,
+trimesh is not used here (``tests/parts/mesh/test_library.py``). In OBJ files it omits faces that
+are truncated or written with tabs, misreads index 0 and relative indices, silently loses textures,
 and splits vertices where normals differ. It reads a truncated OFF file as a smaller mesh and fails
 at pentagons. Here a damaged line is an error that names the line. Only shape and the ``map_Kd``
 texture are read. Files named by a mesh must lie in its own folder.

@@ -49,7 +49,7 @@ WRONG: dict[str, tuple[str | bytes, int, int | str]] = {
     # A file, the triangles that trimesh finds in it (-1: refused), and ours or why not.
     "cut.ply": (TEXT_PLY[: TEXT_PLY.rindex(b"\n3 ")], 11, "less data|buffer is smaller"),
     "count.ply": (TEXT_PLY.replace(b"\n3 7", b"\n2 7"), 12, "fewer than 3|bytes more"),
-    "fraction.ply": (TEXT_PLY.replace(b"3 1 3 0", b"3 1 3 0.5"), 12, "no integer"),
+    "fraction.ply": (TEXT_PLY.replace(b"3 1 3 0", b"3 1 3 0.5"), 12, "not an integer"),
     "mixed.ply": (ply_faces(*QUADS[:3], [2, 3, 7], [2, 7, 6], *QUADS[4:]), -1, 12),
     "agree.ply": (ply_faces(*PENTAGON_AND_TRIANGLE), 8, 7),
     "line_ends.ply": (TEXT_PLY.replace(b"\n", b"\r"), -1, 12),

@@ -127,8 +127,8 @@ def test_a_header_or_a_list_that_lies_is_refused(refused, form, options, message
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("format ascii 1.0", "", "where one of binary_little_endian"),
-        ("format ascii", "format text", "where one of binary_little_endian"),
+        ("format ascii 1.0", "", "not one of binary_little_endian"),
+        ("format ascii", "format text", "not one of binary_little_endian"),
         ("property float z", "property float w", "no vertex table with x, y, z"),
         ("property float z", "property float y", "element vertex with 8 rows"),
         ("vertex_indices", "corners", "no face table with vertex_indices"),
