@@ -1,7 +1,7 @@
-"""Attention between backbone and head: takes ``channels`` and keeps the shape.
+"""Attention modules between backbone and head, which keep the shape of feature maps.
 
-To add one: a subclass of :class:`Attention` in this module and one YAML file in
-``conf/model/attention``.
+To add an attention module, write a subclass of :class:`Attention` in this module, with a parameter
+``channels``, and a YAML file in ``conf/model/attention``.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Attention(nn.Module, ABC):
 
 
 class Identity(Attention):
-    """Leaves the features as they are."""
+    """Returns the features unchanged."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -50,11 +50,11 @@ class SE(Attention):
 
 
 class CBAM(Attention):
-    """The paper's attention (Eq. 5, 6): first by channel, then by place.
+    """The paper's attention (Eq. 5, 6): channel attention, then spatial attention.
 
-    Channel: features · σ(MLP(mean) + MLP(maximum)) over the map (Eq. 5). Place: features ·
-    σ(conv([mean; maximum])) over the channels (Eq. 6). ``reduction`` narrows the MLP's hidden
-    layer; the spatial convolution's ``kernel_size`` is odd.
+    Channel: features · σ(MLP(mean) + MLP(maximum)) over the map (Eq. 5). Spatial: features ·
+    σ(conv([mean; maximum])) over the channels (Eq. 6). ``reduction`` divides the width of the MLP's
+    hidden layer; the ``kernel_size`` of the spatial convolution is odd.
     """
 
     def __init__(self, channels: int, reduction: int = 16, kernel_size: int = 3) -> None:
@@ -66,16 +66,16 @@ class CBAM(Attention):
         initialise(self)
 
     def forward(self, features: Features) -> Features:
-        """Return the features weighted by channel and by place."""
+        """Return the features weighted by channel and cell."""
         squeezed = self.mlp(features.mean(dim=(2, 3))) + self.mlp(features.amax(dim=(2, 3)))
         features = features * squeezed.sigmoid()[:, :, None, None]
-        place = torch.cat([features.mean(1, keepdim=True), features.amax(1, keepdim=True)], dim=1)
-        weights: Tensor = self.spatial(place).sigmoid()
+        pooled = torch.cat([features.mean(1, keepdim=True), features.amax(1, keepdim=True)], dim=1)
+        weights: Tensor = self.spatial(pooled).sigmoid()
         return features * weights
 
 
 def _bottleneck(channels: int, reduction: int) -> nn.Sequential:
-    """Return W1·ReLU(W0·x), without biases as in both papers, at least one hidden unit."""
+    """Return W1·ReLU(W0·x) with at least one hidden unit and, as in both papers, no biases."""
     hidden = max(1, channels // check("reduction", reduction, int, Range(1, 1024)))
     return nn.Sequential(
         nn.Linear(channels, hidden, bias=False),

@@ -1,13 +1,14 @@
-"""Backbones: an RGB image to feature maps at stride 8.
+"""Backbones, which turn an RGB image into feature maps at stride 8.
 
-To add one: a subclass of :class:`Backbone` in this module and one YAML file in
+To add a backbone, write a subclass of :class:`Backbone` in this module and a YAML file in
 ``conf/model/backbone`` (``docs/how-to/adding-a-backbone.md``).
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import ClassVar, Final
 
@@ -30,12 +31,12 @@ from dopepp.models.storage import read_mapping
 
 Images = Float[Tensor, "batch 3 height width"]
 
-POOL: Final = "pool"
-Plan = tuple[int | str, ...]
+POOL: Final = 0
+Plan = tuple[int, ...]  # Channels of convolutions, POOL for poolings
 
 
 class Backbone(nn.Module, ABC):
-    """What a head builds upon.
+    """Base class of backbones.
 
     Attributes:
         out_channels: Channels of the feature maps.
@@ -53,9 +54,24 @@ class Backbone(nn.Module, ABC):
 
 
 class _Chain(Backbone):
-    """Convolutions and poolings in a row."""
+    """A sequence of convolution blocks and poolings."""
 
-    layers: nn.Sequential
+    def __init__(
+        self, plan: Plan, width: float, make_block: Callable[[int, int], list[nn.Module]]
+    ) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        channels = 3
+        for step in plan:
+            if step == POOL:
+                layers.append(nn.MaxPool2d(2))
+                continue
+            wider = scaled_channels(step, width)
+            layers += make_block(channels, wider)
+            channels = wider
+        self.layers = nn.Sequential(*layers)
+        self.out_channels = channels
+        initialise(self)
 
     def forward(self, images: Images) -> Float[Tensor, "batch channels height/8 width/8"]:
         """Return the feature maps of normalised images."""
@@ -67,12 +83,12 @@ class VGG19(_Chain):
 
     Args:
         width: Factor on every channel count; 1 is the paper's.
-        batch_norm: Put batch norm behind every convolution, in place of its bias.
-        weights_path: A ``state_dict`` of torchvision's ``vgg19`` to start the VGG layers from. It
-            is where training starts, not part of the architecture: checkpoints do not repeat it.
+        batch_norm: Whether batch norm replaces the bias of every convolution.
+        weights_path: File with a ``state_dict`` of torchvision's ``vgg19`` that initialises the VGG
+            layers. It is not part of the architecture, so checkpoints do not store it.
 
     Raises:
-        UserError: An argument is out of range, or the file does not fit.
+        UserError: An argument is out of range, or the file does not match the layers.
     """
 
     plan: ClassVar[Plan] = (64, 64, POOL, 128, 128, POOL, 256, 256, 256, 256, POOL, 512, 512)
@@ -81,45 +97,30 @@ class VGG19(_Chain):
     def __init__(
         self, width: float = 1.0, batch_norm: bool = False, weights_path: str | None = None
     ) -> None:
-        super().__init__()
         check("batch_norm", batch_norm, bool)
-        layers: list[nn.Module] = []
-        channels = 3
-        for step in (*self.plan, *self.reduction):
-            if isinstance(step, str):
-                layers.append(nn.MaxPool2d(2))
-                continue
-            wider = scaled_channels(step, width)
-            layers.append(conv_block(channels, wider, 3, batch_norm=batch_norm))
-            channels = wider
-        self.layers = nn.Sequential(*layers)
-        self.out_channels = channels
-        initialise(self)
-        if weights_path is not None:
-            if width != 1 or batch_norm or not isinstance(weights_path, str):
-                got = (
-                    f"weights_path={weights_path!r:.200}, width={width:g}, batch_norm={batch_norm}"
-                )
-                allowed = "a file's path, and only with width=1 and batch_norm=false"
-                raise UserError(got, allowed, "drop weights_path, or set the other two so")
-            self._load_pretrained(weights_path)
-
-    def _load_pretrained(self, path: str) -> None:
-        weights = read_mapping(Path(path), "a torchvision-format state_dict of vgg19 (.pth)")
-        convolutions = [layer for layer in self.modules() if isinstance(layer, nn.Conv2d)]
-        # torchvision numbers every layer: a convolution and its ReLU count two, a pooling one.
-        position, number = 0, 0
-        for step in self.plan:
-            if step == POOL:
-                position += 1
-                continue
-            name = f"features.{position}"
-            copy_layer(weights, name, convolutions[number], path, "torchvision.models.vgg19")
-            position, number = position + 2, number + 1
+        super().__init__(
+            (*self.plan, *self.reduction),
+            width,
+            lambda inputs, outputs: [conv_block(inputs, outputs, 3, batch_norm=batch_norm)],
+        )
+        if weights_path is None:
+            return
+        if width != 1 or batch_norm or not isinstance(weights_path, str):
+            values = f"weights_path={weights_path!r:.200}, width={width:g}, batch_norm={batch_norm}"
+            allowed = "the path of a file, with width=1 and batch_norm=false"
+            raise UserError(values, allowed, "omit weights_path, or set width and batch_norm so")
+        weights = read_mapping(Path(weights_path), "a torchvision state_dict of vgg19 (.pth)")
+        convolutions = (layer for layer in self.modules() if isinstance(layer, nn.Conv2d))
+        # torchvision numbers all layers: a convolution counts with its ReLU, a pooling alone.
+        positions = accumulate((1 if step == POOL else 2 for step in self.plan), initial=0)
+        for step, position in zip(self.plan, positions, strict=False):
+            if step != POOL:
+                name = f"features.{position}"
+                copy_layer(weights, name, next(convolutions), weights_path, "torchvision's vgg19")
 
 
 class VGG19Original(VGG19):
-    """Table 4's "original": VGG19's first 24 layers (one convolution more), then the same two."""
+    """Backbone "original" of Table 4: :class:`VGG19` with one more VGG convolution."""
 
     plan: ClassVar[Plan] = (*VGG19.plan, 512)
 
@@ -128,46 +129,39 @@ class DSC(_Chain):
     """The paper's light backbone of depthwise separable convolutions (Fig. 7).
 
     A 3×3 convolution, then pairs of a depthwise 3×3 and a pointwise 1×1 convolution with ReLU after
-    each; three poolings bring 416×416 pixels to 52×52 cells of 128 channels. ``width`` and
-    ``batch_norm`` are those of :class:`VGG19`.
+    each. Three poolings reduce 416×416 pixels to 52×52 cells of 128 channels. ``width`` and
+    ``batch_norm`` are as in :class:`VGG19`.
     """
 
     plan: ClassVar[Plan] = (
-        *(64, POOL, 128, 128, POOL, 256, 256, 256, 256, POOL, 512, 512, 512, 256, 128),
+        *(64, 64, POOL, 128, 128, POOL, 256, 256, 256, 256, POOL, 512, 512, 512, 256, 128),
     )
 
     def __init__(self, width: float = 1.0, batch_norm: bool = False) -> None:
-        super().__init__()
         check("batch_norm", batch_norm, bool)
-        channels = scaled_channels(64, width)
-        layers: list[nn.Module] = [conv_block(3, channels, 3, batch_norm=batch_norm)]
-        for step in self.plan:
-            if isinstance(step, str):
-                layers.append(nn.MaxPool2d(2))
-                continue
-            wider = scaled_channels(step, width)
-            depthwise = conv_block(channels, channels, 3, groups=channels, batch_norm=batch_norm)
-            layers += [depthwise, conv_block(channels, wider, 1, batch_norm=batch_norm)]
-            channels = wider
-        self.layers = nn.Sequential(*layers)
-        self.out_channels = channels
-        initialise(self)
+
+        def make_block(inputs: int, outputs: int) -> list[nn.Module]:
+            if inputs == 3:
+                return [conv_block(3, outputs, 3, batch_norm=batch_norm)]
+            depthwise = conv_block(inputs, inputs, 3, groups=inputs, batch_norm=batch_norm)
+            return [depthwise, conv_block(inputs, outputs, 1, batch_norm=batch_norm)]
+
+        super().__init__(self.plan, width, make_block)
 
 
 class Pyramid(Backbone):
     """Residual blocks at strides 4, 8, 16 and 32, summed top-down into stride 8.
 
-    Made for time, on CPUs too: nothing is computed at the image's own resolution, where half of
-    :class:`DSC`'s time goes, and every 3×3 convolution is a full one. 4×4 pixels become 48 channels
-    (Shi et al. 2016), then a 3×3 convolution and the residual blocks (He et al. 2016) of each
-    stride. From the coarsest back to stride 8: a 1×1 convolution, doubling, a sum with the finer
-    stride's features (Lin et al. 2017), then residual blocks again. Batch norm behind every
-    convolution.
+    Fast also on CPUs: no layer works at the resolution of the image, and no 3×3 convolution is
+    depthwise. 4×4 pixels become 48 channels (Shi et al. 2016), followed by a 3×3 convolution and
+    the residual blocks (He et al. 2016) of each stride. From stride 32 to stride 8, a 1×1
+    convolution and upsampling by 2 precede the sum with the finer features (Lin et al. 2017) and
+    further residual blocks. Every convolution has batch norm.
 
     Args:
         channels: Channels at strides 4, 8, 16 and 32, each 8–1024.
-        blocks: Number of residual blocks there on the way down, each 1–16.
-        top_down: Number of residual blocks at strides 16 and 8 on the way back, each 0–16.
+        blocks: Number of residual blocks at these strides, each 1–16.
+        top_down: Number of residual blocks after the sums at strides 16 and 8, each 0–16.
         width: Factor on every channel count.
     """
 
@@ -223,12 +217,23 @@ class Pyramid(Backbone):
 def copy_layer(
     weights: Mapping[str, object], name: str, layer: nn.Module, path: str, network: str
 ) -> None:
-    """Copy a file's tensors of a layer; a :class:`UserError` where they do not fit."""
+    """Copy the tensors of a layer from a file's weights.
+
+    Args:
+        weights: Content of the file.
+        name: Name of the layer in the file.
+        layer: Layer to fill.
+        path: Path of the file, for messages.
+        network: Network of the file, for messages.
+
+    Raises:
+        UserError: A tensor is missing or has another shape.
+    """
     for key, parameter in layer.state_dict().items():
         value = weights.get(f"{name}.{key}")
         if not isinstance(value, Tensor) or value.shape != parameter.shape:
             shape = tuple(value.shape) if isinstance(value, Tensor) else "nothing"
-            got, allowed = f"{shape} under {name}.{key} in {path}", tuple(parameter.shape)
-            fix = f"pass a state_dict of {network}"
-            raise UserError(got, f"a tensor of shape {allowed}", fix)
+            problem = f"{shape} under {name}.{key} in {path}"
+            allowed = f"a tensor of shape {tuple(parameter.shape)}"
+            raise UserError(problem, allowed, f"pass a state_dict of {network}")
         parameter.copy_(value)

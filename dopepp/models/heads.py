@@ -1,6 +1,7 @@
-"""Heads: feature maps to belief logits and vector fields, one pair per stage.
+"""Heads, which turn feature maps into belief logits and vector fields, one pair per stage.
 
-To add one: a subclass of :class:`Head` in this module and one YAML file in ``conf/model/head``.
+To add a head, write a subclass of :class:`Head` in this module and a YAML file in
+``conf/model/head``.
 """
 
 from __future__ import annotations
@@ -33,31 +34,39 @@ Fields = Float[Tensor, "batch 16*objects height width"]
 Stage: TypeAlias = tuple[Beliefs, Fields]  # Belief logits and vector field of one stage
 
 _OUTPUT_STD: Final = 0.01
-"""Standard deviation of the output convolutions' weights: an untrained head answers its bias,
-give or take a tenth, and still passes a gradient on."""
+"""Standard deviation of the output convolutions' weights: an untrained head returns its bias with
+deviations of about a tenth, and still propagates gradients."""
 
 
 class Branch(nn.Module, ABC):
-    """Feature maps to one kind of maps: a stage's beliefs or its field."""
+    """Turns feature maps into the maps of one kind: the beliefs or the field of a stage."""
 
     @property
     @abstractmethod
     def outputs(self) -> list[nn.Conv2d]:
-        """The convolutions that answer maps."""
+        """The convolutions that produce maps."""
 
     @abstractmethod
     def forward(self, features: Features) -> list[Features]:
-        """Return the branch's maps as the last; before them, what else is to be learned from."""
+        """Return auxiliary maps for the loss, if any, and the branch's maps last."""
 
 
 class Head(nn.Module):
     """A chain of stages, each a belief branch and a field branch.
 
-    Stage 1 reads the features; every later one reads them together with the belief maps (after the
-    activation, so that both losses feed it the same thing) and the field of the stage before. For C
-    objects there are 9·C belief and 16·C field channels. ``make_branch`` takes input channels,
-    output channels and the stage's number (from 0). ``cell_multiple`` is what the feature map's
-    height and width must be multiples of.
+    Stage 1 reads the features. Later stages also read the belief maps of the previous stage, after
+    the activation so that both losses give the same input, and its field. C objects have 9·C belief
+    and 16·C field channels.
+
+    Args:
+        in_channels: Channels of the feature maps.
+        num_objects: Number of objects, 1–64.
+        activation: Name of the belief activation.
+        stages: Number of stages, 1–12.
+        make_branch: Builds a branch from input channels, output channels and stage (from 0).
+
+    Attributes:
+        cell_multiple: The feature map's height and width are multiples of this.
     """
 
     cell_multiple: int = 1
@@ -83,21 +92,18 @@ class Head(nn.Module):
             for out_channels in outputs
         )
         initialise(self)
-        for branches, bias in (
-            (self.belief_branches, self.activate.initial_logit),
-            (self.field_branches, 0.0),
-        ):
-            for output in (one for branch in branches for one in cast(Branch, branch).outputs):
+        biases = (self.activate.initial_logit, 0.0)
+        for branches, bias in zip((self.belief_branches, self.field_branches), biases, strict=True):
+            for output in (conv for branch in branches for conv in cast(Branch, branch).outputs):
                 if not output.weight.is_meta:  # see layers.initialise
                     nn.init.normal_(output.weight, std=_OUTPUT_STD)
                 nn.init.constant_(cast(Tensor, output.bias), bias)
 
     def forward(self, features: Features) -> list[Stage]:
-        """Return every stage's belief logits and vector field, the head's answer as the last."""
+        """Return the belief logits and vector field of every stage; the last pair is the result."""
         stages: list[Stage] = []
-        for belief_branch, field_branch in zip(
-            self.belief_branches, self.field_branches, strict=True
-        ):
+        branches = zip(self.belief_branches, self.field_branches, strict=True)
+        for belief_branch, field_branch in branches:
             inputs = features
             if stages:
                 logits, field = stages[-1]
@@ -108,11 +114,11 @@ class Head(nn.Module):
 
 
 class Cascade(Head):
-    """DOPE's cascade of 1–12 stages: six in DOPE, from the second on with 7×7 convolutions.
+    """DOPE's cascade of 1–12 stages; DOPE has six.
 
-    Stage 1: three 3×3 convolutions (128), 1×1 to 512, 1×1 to the maps. Later stages: five 7×7
-    (128), 1×1 (128), 1×1 to the maps. ReLU after all but the last. ``width`` is a factor on the
-    channel counts; batch norm stands behind every convolution but the last, in place of its bias.
+    Stage 1 has three 3×3 convolutions (128), a 1×1 (512) and a 1×1 to the maps; later stages have
+    five 7×7 convolutions (128), a 1×1 (128) and a 1×1 to the maps. ReLU, and batch norm if
+    ``batch_norm``, follow all convolutions but the last. ``width`` is a factor on the channels.
     """
 
     def __init__(
@@ -139,7 +145,7 @@ class Cascade(Head):
 
 
 class ChainBranch(nn.Sequential, Branch):
-    """Layers in order; the last answers the maps."""
+    """A sequence of layers; the last one produces the maps."""
 
     @property
     def outputs(self) -> list[nn.Conv2d]:
@@ -154,10 +160,10 @@ class ChainBranch(nn.Sequential, Branch):
 class MultiScale(Head):
     """The paper's MultiScaleDOPEstage (§3.3), 1 to 12 of them.
 
-    ``width`` is a factor on the channel counts, 1 is 128 channels; batch norm stands behind every
-    convolution but those of maps. ``maps`` is what the three scales hand to the fusion: ``plain``
-    for maps of 9 or 16 channels each, as §3.3 has them; ``learned`` for the same, which the loss
-    sees as well, before the fused ones; None for features.
+    ``width`` is a factor on the channels; 1 means 128. If ``batch_norm``, batch norm follows every
+    convolution but those of maps. ``maps`` selects the input of the fusion from each scale:
+    ``plain`` for maps of 9 or 16 channels (§3.3), ``learned`` for such maps with a loss of their
+    own, None for features.
     """
 
     cell_multiple = 4
@@ -186,10 +192,10 @@ class MultiScale(Head):
 class MultiScaleBranch(Branch):
     """One branch of a MultiScaleDOPEstage: three scales down, then top-down fusion.
 
-    Down: five 3×3 convolutions at full scale, three to one half, three to one quarter. Up: convset
-    at a quarter, 1×1, ×2 nearest, concatenated with the half scale; the same again into full scale;
-    convset; 1×1 to the maps. ReLU after every convolution but those of maps: without one between
-    them a convset's five would be one linear map.
+    Down: five 3×3 convolutions at full scale, three at half and three at quarter scale. Up: a
+    convset and a 1×1 convolution at quarter scale, upsampling by 2, concatenation with the half
+    scale; likewise into full scale; a convset; 1×1 to the maps. ReLU follows every convolution but
+    those of maps: without ReLU, the five convolutions of a convset would be one linear map.
     """
 
     def __init__(
@@ -201,10 +207,8 @@ class MultiScaleBranch(Branch):
 
         def chain(inputs: int, kernel_sizes: tuple[int, ...], stride: int = 1) -> nn.Sequential:
             blocks = []
-            for kernel_size in kernel_sizes:
-                block = conv_block(
-                    inputs, channels, kernel_size, stride=stride, batch_norm=batch_norm
-                )
+            for size in kernel_sizes:
+                block = conv_block(inputs, channels, size, stride=stride, batch_norm=batch_norm)
                 blocks.append(block)
                 inputs, stride = channels, 1
             return nn.Sequential(*blocks)
@@ -226,9 +230,9 @@ class MultiScaleBranch(Branch):
 
     @property
     def outputs(self) -> list[nn.Conv2d]:
-        """The fused maps' convolution, and those of the scales' where they are learned."""
+        """The convolutions of the scales' maps, if learned, and of the fused maps."""
         scales = [self.down_quarter, self.down_half, self.down_full] if self.learned else []
-        return [*(cast(nn.Conv2d, one[-1]) for one in scales), self.output]
+        return [*(cast(nn.Conv2d, scale[-1]) for scale in scales), self.output]
 
     def forward(self, features: Features) -> list[Features]:
         """Return the maps; height and width must be multiples of 4."""
@@ -243,10 +247,10 @@ class MultiScaleBranch(Branch):
 
 
 class SharedTrunk(Head):
-    """One stage whose beliefs and field come from one trunk, by a short branch each.
+    """One stage with a shared trunk and a short branch each for beliefs and field.
 
-    Trunk: ``blocks`` residual blocks of two 3×3 convolutions, 1–16. Branch: 3×3, then 1×1 to the
-    maps. Both have ``channels`` · ``width`` channels, and batch norm behind every convolution but
+    The trunk has ``blocks`` (1–16) residual blocks, a branch a 3×3 convolution and a 1×1 to the
+    maps. Both have ``channels`` · ``width`` channels; batch norm follows every convolution but
     those of maps.
     """
 

@@ -1,7 +1,7 @@
-"""Convolution blocks, their width and initialisation, and activations of all network parts.
+"""Convolution blocks, width factors, initialisation and belief activations of networks.
 
-An activation turns a head's belief output into a belief map that peaks at 1. To add one, name it in
-:data:`ACTIVATIONS`; the loss that it is paired with publishes that name.
+A belief activation turns belief logits into a belief map that peaks at 1. To add an activation, add
+it to :data:`ACTIVATIONS` and name it in the ``activation`` of its loss.
 """
 
 from __future__ import annotations
@@ -25,15 +25,13 @@ MAX_WIDTH: Final = 4.0
 CHANNELS: Final = Range(8, 1024)
 BLOCKS: Final = Range(1, 16)
 BLOCKS_OR_NONE: Final = Range(0, 16)
-"""Bounds of the width factor, and of channels and blocks where they are options, so that a hostile
-spec cannot ask for unlimited memory."""
+"""Bounds of options, so that a hostile spec cannot request unlimited memory."""
 
 IMAGENET_MEAN: Final = tuple(255 * value for value in (0.485, 0.456, 0.406))
 IMAGENET_STD: Final = tuple(255 * value for value in (0.229, 0.224, 0.225))
-"""Of red, green and blue on the 0–255 scale, which torchvision's weights expect."""
+"""Statistics of red, green and blue, 0–255, that torchvision's weights expect."""
 
-_CHANNEL_STEP: Final = 8
-"""Channel counts are multiples of this: what vectorised convolutions block by."""
+_CHANNEL_STEP: Final = 8  # Channel counts are multiples of this block size of SIMD convolutions
 
 
 def scaled_channels(channels: int, width: float) -> int:
@@ -52,7 +50,7 @@ def conv_block(
     batch_norm: bool = False,
     relu: bool = True,
 ) -> nn.Sequential:
-    """Return convolution, batch norm (or a bias in its place) and ReLU; size kept for stride 1."""
+    """Return a convolution with batch norm or bias, and ReLU; stride 1 keeps the size."""
     sizes = (kernel_size, stride, kernel_size // 2)
     conv = nn.Conv2d(in_channels, out_channels, *sizes, groups=groups, bias=not batch_norm)
     norm = [nn.BatchNorm2d(out_channels)] if batch_norm else []
@@ -62,8 +60,8 @@ def conv_block(
 class ResidualBlock(nn.Module):
     """Two 3×3 convolutions with batch norm, added to their input (He et al. 2016, Fig. 2).
 
-    Where the shape changes, a 1×1 convolution with batch norm brings the input to the sum. The
-    stride is that of the first convolution.
+    If the shape changes, a 1×1 convolution with batch norm adapts the input. ``stride`` is that of
+    the first convolution.
     """
 
     def __init__(self, in_channels: int, out_channels: int, stride: int = 1) -> None:
@@ -74,9 +72,8 @@ class ResidualBlock(nn.Module):
         )
         self.shortcut: nn.Module = nn.Identity()
         if stride != 1 or in_channels != out_channels:
-            self.shortcut = conv_block(
-                in_channels, out_channels, 1, stride=stride, batch_norm=True, relu=False
-            )
+            shape = (in_channels, out_channels, 1)
+            self.shortcut = conv_block(*shape, stride=stride, batch_norm=True, relu=False)
 
     def forward(self, features: Features) -> Features:
         """Return the sum, after a ReLU."""
@@ -84,16 +81,16 @@ class ResidualBlock(nn.Module):
 
 
 def double(maps: Features) -> Float[Tensor, "batch channels 2*height 2*width"]:
-    """Return maps of twice the size, every value repeated."""
+    """Return maps of twice the size by nearest-neighbour upsampling."""
     return functional.interpolate(maps, scale_factor=2.0, mode="nearest")
 
 
 def initialise(module: nn.Module) -> None:
-    """Draw every convolution and linear weight from He's normal law for ReLU; biases start at 0.
+    """Draw convolution and linear weights from He's normal distribution; set biases to 0.
 
-    The variance 2 / fan_in (He et al. 2015, Eq. 10) keeps the activations' scale through a network
-    without batch norm as deep as the DOPE cascade. Weights on ``meta`` hold nothing; to draw them,
-    PyTorch would import its whole compiler.
+    The variance 2 / fan_in (He et al. 2015, Eq. 10) preserves the scale of activations in networks
+    without batch norm that are as deep as DOPE's cascade. Weights on ``meta`` are skipped: drawing
+    them would import PyTorch's compiler.
     """
     for layer in module.modules():
         if isinstance(layer, (nn.Conv2d, nn.Linear)) and not layer.weight.is_meta:
@@ -104,7 +101,7 @@ def initialise(module: nn.Module) -> None:
 
 @dataclass(frozen=True)
 class Activation:
-    """A belief activation: elementwise, and the bias that an untrained head starts from."""
+    """An elementwise belief activation and the initial bias of an untrained head."""
 
     function: Callable[[Tensor], Tensor]
     initial_logit: float
@@ -115,7 +112,7 @@ class Activation:
 
 
 ACTIVATIONS: Final[Mapping[str, Activation]] = {
-    # The output is the belief itself, as in DOPE: what MSE is paired with.
+    # The output is the belief itself, as in DOPE; paired with MSE.
     "identity": Activation(lambda logits: logits, 0.0),
     # belief = exp(logit), at most 1 and in float32: the log link of `losses.SpatialCrossEntropy`.
     # An untrained map starts at 0.01 in every cell, so its sum is that of one Gaussian of 2 cells
@@ -125,8 +122,12 @@ ACTIVATIONS: Final[Mapping[str, Activation]] = {
 
 
 def find_activation(name: object) -> Activation:
-    """Return an activation by name; a :class:`UserError` if there is none of that name."""
+    """Return an activation by name.
+
+    Raises:
+        UserError: No activation has this name.
+    """
     if not isinstance(name, str) or name not in ACTIVATIONS:
-        fix = "use the one your loss publishes"
+        fix = "use the activation of your loss"
         raise UserError(f"activation {name!r:.100}", ", ".join(ACTIVATIONS), fix)
     return ACTIVATIONS[name]

@@ -1,6 +1,7 @@
-"""Losses on the stages' maps; each publishes the belief activation that it is paired with.
+"""Losses on the maps of all stages; each names the belief activation that it requires.
 
-To add one: a subclass of :class:`MapLoss` in this module and one YAML file in ``conf/model/loss``.
+To add a loss, write a subclass of :class:`MapLoss` in this module and a YAML file in
+``conf/model/loss``.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from dopepp.models.heads import Beliefs, Fields, Stage
 
 
 class MapLoss(nn.Module, ABC):
-    """A loss summed over the stages; its activation is what the network must be built with."""
+    """A loss summed over the stages; the network must have the belief ``activation`` named here."""
 
     activation: ClassVar[str]
 
@@ -28,14 +29,14 @@ class MapLoss(nn.Module, ABC):
     def parts(
         self, logits: Beliefs, field: Fields, belief_target: Beliefs, field_target: Fields
     ) -> dict[str, Float[Tensor, "batch"]]:
-        """Return one stage's weighted terms of each image; the loss is the mean of their sums."""
+        """Return the weighted terms of one stage per image; the loss is the mean of their sums."""
 
     def forward(
         self, stages: Sequence[Stage], belief_target: Beliefs, field_target: Fields
     ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
-        """Return the loss and its terms, detached; each is summed over the stages.
+        """Return the loss and its detached terms, each summed over the stages.
 
-        They are float32 also under autocast: sums over exponentials lose their digits in 16 bits.
+        Loss and terms are float32 also under autocast: sums of exponentials need the precision.
         """
         summed = self._summed(stages, belief_target, field_target)
         terms = {name: value.mean() for name, value in summed.items()}
@@ -46,7 +47,7 @@ class MapLoss(nn.Module, ABC):
     def per_image(
         self, stages: Sequence[Stage], belief_target: Beliefs, field_target: Fields
     ) -> Float[Tensor, "batch"]:
-        """Return each image's loss, to choose among targets that are equally right."""
+        """Return the loss of each image, to choose among equally valid targets."""
         terms = self._summed(stages, belief_target, field_target)
         return torch.stack(list(terms.values())).sum(dim=0)
 
@@ -73,7 +74,7 @@ class MapMSE(MapLoss):
     def parts(
         self, logits: Beliefs, field: Fields, belief_target: Beliefs, field_target: Fields
     ) -> dict[str, Float[Tensor, "batch"]]:
-        """Return one stage's ``belief`` and ``field`` terms of each image."""
+        """Return the ``belief`` and ``field`` terms of one stage per image."""
         return {
             "belief": (logits - belief_target).square().mean(dim=(1, 2, 3)),
             "field": (field - field_target).square().mean(dim=(1, 2, 3)),
@@ -83,12 +84,12 @@ class MapMSE(MapLoss):
 _WEIGHTS: Final = Range(0, 1e6)
 
 _LINEAR_FROM: Final = 2.0
-"""The exponential goes on as its tangent from e² ≈ 7 times too much mass on, so gradients stay
-bounded whatever the logits."""
+"""Logarithm of the excess mass (e² ≈ 7) beyond which the exponential continues as its tangent, so
+that gradients stay bounded."""
 
 
 class SpatialCrossEntropy(MapLoss):
-    r"""Where a keypoint is and how much of it there is, each with a gradient from the start on.
+    r"""Poisson divergence of belief maps, split into position and mass, and L1 loss of the field.
 
     The belief is exp(z). Its Poisson (generalised Kullback–Leibler) divergence from a target g,
     Σ exp(z) − g·z − g + g·log g, splits exactly, with N = Σg and Λ = Σexp(z), into
@@ -96,14 +97,16 @@ class SpatialCrossEntropy(MapLoss):
     - *where*: N · KL(g/N ‖ softmax(z)), and
     - *how much*: Λ − N − N·log(Λ/N).
 
-    Both are divided by one Gaussian's mass 2πσ², so a visible keypoint weighs about 1, one cut off
-    by the border less, and an absent one leaves just Λ. MSE on such sparse maps starts on a
-    plateau: an all-zero map is nearly as good as any. The *where* term does not see how large the
-    beliefs are, only which cells have them, so it pulls from the first step on.
+    Both are divided by the mass 2πσ² of one Gaussian: a visible keypoint weighs about 1, a keypoint
+    cut off by the border less, and an absent keypoint contributes only Λ. MSE on such sparse maps
+    starts on a plateau, because an all-zero map is a good solution. The *where* term depends only
+    on the distribution of beliefs over cells, so it has a gradient from the first step.
 
-    ``sigma`` is the standard deviation of the target's Gaussians, cells. ``count_weight`` is of the
-    *how much* term, ``field_weight`` of the field's: smooth L1 per cell inside the keypoints'
-    discs, the only place where the field is defined and read.
+    Args:
+        sigma: Standard deviation of the target's Gaussians, cells.
+        count_weight: Weight of the *how much* term.
+        field_weight: Weight of the field's term: smooth L1 per cell inside the keypoints' discs,
+            where alone the field is defined and read.
     """
 
     activation = "exp"
@@ -118,7 +121,7 @@ class SpatialCrossEntropy(MapLoss):
     def parts(
         self, logits: Beliefs, field: Fields, belief_target: Beliefs, field_target: Fields
     ) -> dict[str, Float[Tensor, "batch"]]:
-        """Return one stage's ``where``, ``count`` and ``field`` terms of each image."""
+        """Return the ``where``, ``count`` and ``field`` terms of one stage per image."""
         z, g = logits.flatten(2), belief_target.flatten(2)
         # Unit of both terms: one Gaussian's mass; `count` is N and `log_total` log Λ in that unit.
         share = g / self.mass
@@ -138,16 +141,16 @@ class SpatialCrossEntropy(MapLoss):
 
 
 def _capped_exp(value: Tensor, count: Tensor) -> Tensor:
-    """Return exp, and its tangent beyond e² times the expected count (at least one)."""
+    """Return exp, continued as its tangent beyond e² times the expected count (at least 1)."""
     limit = count.clamp(min=1.0).log() + _LINEAR_FROM
     excess = (value - limit).clamp(min=0.0)
     return torch.minimum(value, limit).exp() * (1 + excess)
 
 
 def _field_error(field: Tensor, target: Tensor) -> Tensor:
-    """Return each image's smooth-L1 distance of the vectors inside the discs.
+    """Return the smooth L1 distance of the vectors inside the discs per image.
 
-    Divided by the discs' mean number of cells: the mean over images is that over all cells.
+    It is divided by the mean number of cells, so that its mean over images is that over cells.
     """
     corners = (field.shape[0], field.shape[1] // 2, 2, *field.shape[2:])
     field, target = field.view(corners), target.view(corners)

@@ -1,9 +1,8 @@
-"""The network: normalisation, backbone, attention and head, built from a plain spec.
+"""The pose network: normalisation, backbone, attention and head, built from a plain spec.
 
-A spec, which configs and checkpoints share, holds ``backbone``, ``attention`` and ``head`` nodes
-(``_target_`` and arguments), ``activation`` and ``num_objects``. Channel counts are not in it: the
-builder hands on what each part publishes. To make a class of another package buildable,
-``BACKBONES.register(dotted name)``.
+A spec, in configs and checkpoints alike, holds the nodes ``backbone``, ``attention`` and ``head``
+(``_target_`` and arguments), ``activation`` and ``num_objects``. Channel counts follow from the
+backbone. To allow a class of another package, call ``BACKBONES.register(dotted name)``.
 """
 
 from __future__ import annotations
@@ -37,11 +36,13 @@ SPEC_KEYS = ("backbone", "attention", "head", "activation", "num_objects")
 
 
 class PoseNetwork(nn.Module):
-    """RGB images to belief maps and vector fields: backbone, attention and head.
+    """Turns RGB images into belief maps and vector fields.
 
-    The normalisation is part of the network, so training, inference and exported files cannot
-    disagree about it. ``stride`` is pixels per map cell, ``size_multiple`` what image height and
-    width must be multiples of.
+    The network normalises images itself, so that training, inference and exported files agree.
+
+    Attributes:
+        stride: Pixels per map cell.
+        size_multiple: Image height and width are multiples of this.
     """
 
     mean: Tensor
@@ -61,7 +62,7 @@ class PoseNetwork(nn.Module):
         self.activate = find_activation(activation)
         self.stride = backbone.stride
         self.size_multiple = backbone.stride * math.lcm(backbone.cell_multiple, head.cell_multiple)
-        # Not persistent: they are constants of the code, and a checkpoint must not alter them.
+        # Not persistent, because a checkpoint must not alter constants of the code.
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
 
@@ -72,25 +73,26 @@ class PoseNetwork(nn.Module):
             images: RGB, 0–255, uint8 or floating point.
 
         Raises:
-            UserError: The shape does not fit the network.
+            UserError: The shape does not match the network.
         """
         height, width = images.shape[-2:]
         fits = images.ndim == 4 and images.shape[1] == 3
         if not fits or height % self.size_multiple or width % self.size_multiple:
+            problem = f"images of shape {tuple(images.shape)}"
             sides = f"height and width multiples of {self.size_multiple}"
-            got, allowed = f"images of shape {tuple(images.shape)}", "(batch, 3, height, width)"
             fix = "pad the images on the right and at the bottom"
-            raise UserError(got, f"{allowed}, {sides}", fix)
+            raise UserError(problem, f"(batch, 3, height, width), {sides}", fix)
         normalised = (images.to(self.mean.dtype) - self.mean) / self.std
         return self.head(self.attention(self.backbone(normalised)))  # type: ignore[no-any-return]
 
     def for_inference(self) -> PoseNetwork:
-        """Return a copy for evaluation, batch norm multiplied into the convolutions before it.
+        """Return a faster copy with batch norm fused into convolutions.
 
-        Its maps are the same but for rounding; it takes fewer passes and cannot be trained.
+        The maps are equal up to rounding; the copy cannot be trained.
         """
         network = copy.deepcopy(self).eval()
-        for chain in [one for one in network.modules() if isinstance(one, nn.Sequential)]:
+        chains = [module for module in network.modules() if isinstance(module, nn.Sequential)]
+        for chain in chains:
             for number in reversed(range(len(chain) - 1)):
                 convolution, norm = chain[number], chain[number + 1]
                 if isinstance(convolution, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
@@ -105,15 +107,19 @@ class PoseNetwork(nn.Module):
 
 
 def network_cost(network: nn.Module, input_size: tuple[int, int]) -> tuple[int, float]:
-    """Return a network's parameters and 10⁹ multiply–accumulates for one (width, height) image.
+    """Return the number of parameters and of 10⁹ multiply–accumulates for one image.
 
-    The forward pass runs on the ``meta`` device, so it takes milliseconds and leaves the network
-    and its statistics alone. Convolutions and matrix products are counted, elementwise work is not.
+    The forward pass runs on the ``meta`` device, so it takes milliseconds and changes no
+    statistics. Convolutions and matrix products are counted, elementwise operations are not.
+
+    Args:
+        network: Network to measure.
+        input_size: (width, height) of the image, pixels.
     """
     tensors = {**dict(network.named_parameters()), **dict(network.named_buffers())}
     shapes = {name: tensor.to("meta") for name, tensor in tensors.items()}
     width, height = input_size
-    # Batch norm refuses to train on a single value, which a small input's coarsest map may have.
+    # In training mode, batch norm rejects maps of one cell, as small inputs have.
     training = {module: module.training for module in network.modules()}
     network.eval()
     counter = FlopCounterMode(display=False)
@@ -131,7 +137,7 @@ def build_network(spec: Mapping[str, Any]) -> PoseNetwork:
     """Build the network that a spec describes.
 
     Raises:
-        UserError: A key is missing or unknown, or a target or an argument is not allowed.
+        UserError: A key is missing or unknown, or a target or argument is not allowed.
     """
     _check_keys(spec)
     activation, num_objects = spec["activation"], spec["num_objects"]
@@ -144,27 +150,29 @@ def build_network(spec: Mapping[str, Any]) -> PoseNetwork:
 
 
 def check_spec(spec: Mapping[str, Any]) -> None:
-    """Raise a :class:`UserError` if a spec has wrong keys or targets; build nothing."""
+    """Check the keys and targets of a spec without building a network.
+
+    Raises:
+        UserError: A key is missing or unknown, or a target is not allowed.
+    """
     _check_keys(spec)
-    registries: dict[str, Registry[Any]] = {
-        "backbone": BACKBONES, "attention": ATTENTIONS, "head": HEADS,
-    }  # fmt: skip
-    for key, registry in registries.items():
-        node = spec[key]
+    registries: tuple[Registry[Any], ...] = (BACKBONES, ATTENTIONS, HEADS)
+    for registry in registries:
+        node = spec[registry.kind]
         registry.resolve(node.get(TARGET) if isinstance(node, Mapping) else node)
 
 
 def _check_keys(spec: object) -> None:
     if not isinstance(spec, Mapping) or set(spec) != set(SPEC_KEYS):
-        got = sorted(map(str, spec)) if isinstance(spec, Mapping) else repr(spec)[:200]
-        keys = f"exactly {', '.join(SPEC_KEYS)}"
-        raise UserError(f"a model spec with {got!s:.200}", keys, "add or remove keys")
+        keys = sorted(map(str, spec)) if isinstance(spec, Mapping) else repr(spec)[:200]
+        allowed = f"exactly {', '.join(SPEC_KEYS)}"
+        raise UserError(f"a model spec with {keys!s:.200}", allowed, "add or remove keys")
 
 
 def architecture(spec: Mapping[str, Any]) -> dict[str, Any]:
     """Return a deep copy of a spec without ``weights_path``.
 
-    A checkpoint holds trained weights; its reader must not open a file of somebody else's machine.
+    Readers of a checkpoint must not open a file of the machine that trained it.
     """
     plain: dict[str, Any] = copy.deepcopy(dict(spec))
     if isinstance(plain.get("backbone"), dict):

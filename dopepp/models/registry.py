@@ -1,13 +1,12 @@
-"""Registries: allow-lists of the classes that a config or a checkpoint may name and have built.
+"""Registries: allow-lists of the classes that a config or checkpoint may instantiate.
 
 A node is a plain dict ``{"_target_": "package.module.Class", argument: value, …}``. The dotted name
-is compared with the allow-list before anything is imported, and what it resolves to is checked
-again, so neither a path through another module (``dopepp.models.network.os.system``) nor a re-bound
-name gets through; Hydra's own block-list of names can be walked around, an allow-list cannot.
+must be in the allow-list before anything is imported, and the resolved class is checked again. This
+excludes paths through other modules (``dopepp.models.network.os.system``) and re-bound names;
+Hydra's own block-list can be circumvented.
 
-A class of a package of your own is allowed once the package is enabled
-(:mod:`dopepp.core.extensions`), or after ``register("package.module.Class")`` of the registry of
-its kind (``BACKBONES.register(…)``).
+To allow your own class, enable its package (:mod:`dopepp.core.extensions`), or call ``register`` of
+the registry of its kind (``BACKBONES.register("package.module.Class")``).
 """
 
 from __future__ import annotations
@@ -24,17 +23,22 @@ from dopepp.core.errors import UserError
 T = TypeVar("T")
 TARGET = "_target_"
 
-_GROUPS: Final = {kind: kind + "s" for kind in ("backbone", "attention", "head")} | {
-    "loss": "losses"
+_GROUPS: Final = {
+    "backbone": "backbones",
+    "attention": "attentions",
+    "head": "heads",
+    "loss": "losses",
 }
-"""Entry points of enabled packages, by kind (:mod:`dopepp.core.extensions`)."""
+"""Groups of entry points by kind (:mod:`dopepp.core.extensions`)."""
 
 
 class Registry(Generic[T]):
-    """Builds objects of one kind, and nothing else, from plain nodes.
+    """Builds objects of one kind from plain nodes.
 
-    Messages name the kind, such as ``"backbone"``; every target inherits from ``base`` and is one
-    of the dotted names of allowed classes, or of those that enabled packages add.
+    Args:
+        kind: Name of the kind for messages, such as ``"backbone"``.
+        base: Base class of all targets.
+        targets: Dotted names of allowed classes; enabled packages may add others.
     """
 
     def __init__(self, kind: str, base: type[T], targets: Iterable[str] = ()) -> None:
@@ -43,14 +47,17 @@ class Registry(Generic[T]):
 
     @classmethod
     def of_module(cls, kind: str, base: type[T], module: ModuleType) -> Registry[T]:
-        """Allow the public classes that ``module`` itself defines below ``base``."""
-        own = {
-            name: value
-            for name, value in vars(module).items()
-            if inspect.isclass(value) and value.__module__ == module.__name__ and name[0] != "_"
-        }
-        allowed = (name for name, one in own.items() if issubclass(one, base) and one is not base)
-        return cls(kind, base, (f"{module.__name__}.{name}" for name in allowed))
+        """Return a registry of the public subclasses of ``base`` that ``module`` defines."""
+        classes = [value for value in vars(module).values() if inspect.isclass(value)]
+        allowed = [
+            f"{module.__name__}.{value.__name__}"
+            for value in classes
+            if issubclass(value, base)
+            and value is not base
+            and value.__module__ == module.__name__
+            and not value.__name__.startswith("_")
+        ]
+        return cls(kind, base, allowed)
 
     @property
     def targets(self) -> tuple[str, ...]:
@@ -59,18 +66,19 @@ class Registry(Generic[T]):
         return tuple(sorted(self._targets.union(added)))
 
     def register(self, dotted: str) -> None:
-        """Allow one more class; it is checked now, so a wrong name fails where it was written.
+        """Allow a further class.
 
-        A name that does not lead to a class of this registry's kind is a :class:`UserError`.
+        Raises:
+            UserError: The name does not resolve to a subclass of this registry's base class.
         """
         self._load(dotted)
         self._targets.add(dotted)
 
     def resolve(self, dotted: object) -> type[T]:
-        """Return the class that an allowed name stands for.
+        """Return the class of an allowed name.
 
-        A :class:`UserError`: the name is not text or not in the allow-list, or it leads to
-        something other than the class that the allow-list names.
+        Raises:
+            UserError: The name is not in the allow-list, or does not resolve to the allowed class.
         """
         if not isinstance(dotted, str) or dotted not in self.targets:
             advice = f"register your own {self.kind} in code"
@@ -84,11 +92,15 @@ class Registry(Generic[T]):
         return self._load(dotted)
 
     def build(self, node: object, **provided: Any) -> T:
-        """Build a node's object.
+        """Build the object of a node.
 
-        The node is ``{"_target_": dotted name, argument: plain value, …}``; it may not repeat what
-        the caller provides. A :class:`UserError`: the target is refused, an argument is unknown,
-        missing, nested or provided twice, or the class refuses a value.
+        Args:
+            node: ``{"_target_": dotted name, argument: plain value, …}``.
+            **provided: Further arguments, which the node must not repeat.
+
+        Raises:
+            UserError: The target is not allowed, an argument is unknown, missing, nested or
+                provided twice, or the class rejects a value.
         """
         if not isinstance(node, Mapping):
             raise UserError(
@@ -120,8 +132,8 @@ class Registry(Generic[T]):
                 f"the dotted name of an importable {self.base.__name__}",
                 "install or import the module that defines it, or correct the name",
             ) from error
-        # A package may re-export a class from a module below itself; from anywhere else, or under
-        # another name, it is not the class that was allowed.
+        # A package may re-export a class of its submodules. A class from elsewhere, or with another
+        # name, is not the allowed one.
         genuine = (
             inspect.isclass(value)
             and value.__qualname__ == name
@@ -148,15 +160,15 @@ class Registry(Generic[T]):
             for name, parameter in parameters.items()
             if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
         }
-        # Lightning's loggers hand further keywords on, so theirs cannot be listed.
+        # Lightning's loggers forward further keywords, which are unknown here.
         open_ended = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
         free = [name for name in named if name not in provided]
         allowed = ", ".join(free) + (", …" if open_ended else "") or "no arguments"
         for key, value in arguments.items():
             unknown = key not in free and (not open_ended or key in provided)
             if not isinstance(key, str) or key.startswith("_") or unknown:
-                got = f"argument {key!r:.100} of {dotted}"
-                raise UserError(got, allowed, "remove or rename it")
+                problem = f"argument {key!r:.100} of {dotted}"
+                raise UserError(problem, allowed, "remove or rename it")
             _check_plain(value, f"{dotted}, argument {key}")
         empty = inspect.Parameter.empty
         needed = [name for name in free if named[name].default is empty]
@@ -165,12 +177,12 @@ class Registry(Generic[T]):
 
 
 def _check_plain(value: object, where: str) -> None:
-    """Refuse everything but plain data: an argument is never itself something to build."""
+    """Reject all values but plain data: arguments are never built themselves."""
     if isinstance(value, Mapping):
         for key, item in value.items():
             if not isinstance(key, str) or key.startswith("_"):
-                got = f"key {key!r:.100} in {where}"
-                raise UserError(got, "plain values", "nested targets are not built")
+                problem = f"key {key!r:.100} in {where}"
+                raise UserError(problem, "plain values", "nested targets are not built")
             _check_plain(item, where)
     elif isinstance(value, (list, tuple)):
         for item in value:
