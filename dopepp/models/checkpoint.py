@@ -1,10 +1,9 @@
-"""The checkpoint: one self-describing file, read under ``weights_only=True``.
+"""Self-describing checkpoints, read under ``weights_only=True``.
 
-A ``.ckpt`` is a Lightning checkpoint (or just these two keys): the weights under ``state_dict``,
-prefixed ``network.``, and under ``dopepp`` everything that turns them into a pose estimator. A
-released ``.safetensors`` holds the weights in half precision and the same description as JSON in
-its metadata; ``pretrained/NAME`` stands for a file of the package's folder ``dopepp/pretrained``.
-This module alone knows the files; training writes them, inference and experiment read them.
+A ``.ckpt`` is a Lightning checkpoint, or has just two of its keys: ``state_dict`` holds the weights,
+prefixed ``network.``, and ``dopepp`` the description that turns them into a pose estimator. A
+released ``.safetensors`` holds the weights in half precision and the description as JSON in its
+metadata; ``pretrained/NAME`` names a file in the folder ``dopepp/pretrained``.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from dopepp.parts.size import Seen
 
 __all__ = ["Checkpoint", "load_network", "parse_description", "read", "write_atomic"]
 
-KEY: Final = "dopepp"  # Of the description in a file of either kind
+KEY: Final = "dopepp"  # Key of the description in files of both kinds
 
 STATE_PREFIX: Final = "network."
 FORMAT_VERSION: Final = 2
@@ -43,15 +42,15 @@ FORMAT_VERSION: Final = 2
 SUFFIX: Final = ".safetensors"
 FOLDER: Final = "pretrained"
 
-MAX_SIDE: Final = 8192  # Pixels of an input: an image is enlarged to it, so it decides about memory
+MAX_SIDE: Final = 8192  # Pixels; images are enlarged to the input size, which determines memory
 
 _MAX_VALUES: Final = 4_000_000
 _MAX_DEPTH: Final = 32
 _MAX_BITS: Final = 128
-"""Values, levels of nesting, bits of an integer: more than any description of ours has."""
+"""Limits of values, levels of nesting and bits of integers, above those of any real description."""
 
 _FOLDER_KEYS: Final = ("root", "cache_dir", "backgrounds")
-"""Keys of a data configuration that name folders of the machine it was trained on."""
+"""Keys of a data configuration that name folders of the training machine."""
 
 _WHAT: Final = "a checkpoint (.ckpt) written by train.py"
 _FIX: Final = "write the file with train.py"
@@ -59,19 +58,19 @@ _FIX: Final = "write the file with train.py"
 
 @dataclass(eq=False)
 class Checkpoint:
-    """A trained network and all that is needed to use it.
+    """A trained network with everything needed to use it.
 
     Attributes:
-        spec: The network's spec (:mod:`dopepp.models.network`), without pretrained weights' path.
+        spec: The network's spec (:mod:`dopepp.models.network`), without ``weights_path``.
         state_dict: The network's weights, without prefix.
         parts: The objects, in channel order.
-        input_size: (width, height) the network was trained at, pixels.
+        input_size: (width, height) of training images, pixels.
         stride: Pixels per map cell.
         sigma: Standard deviation of the belief targets, cells.
         recovery: Thresholds that turn maps into detections.
-        data: The data and camera configuration it was trained on.
-        data_fingerprint: Hash that changes whenever the training data would.
-        seen: How large and how far away the network has seen its parts, by name.
+        data: The data and camera configuration of the training.
+        data_fingerprint: Hash of everything that determines the training data.
+        seen: Sizes and distances of the parts in the training data, by name.
     """
 
     spec: dict[str, Any]
@@ -86,7 +85,7 @@ class Checkpoint:
     seen: dict[str, Seen] = field(default_factory=dict)
 
     def to_payload(self) -> dict[str, Any]:
-        """Return everything but the weights as plain values, for the file's ``dopepp`` key.
+        """Return the description as plain values, for the file's ``dopepp`` key.
 
         Raises:
             TypeError: A value is neither plain nor a numpy scalar or array.
@@ -102,14 +101,14 @@ class Checkpoint:
         return payload
 
     def to_file(self) -> dict[str, Any]:
-        """Return the content of a file that holds this checkpoint and no training state."""
+        """Return the content of a file with this checkpoint and without training state."""
         weights = {STATE_PREFIX + name: value for name, value in self.state_dict.items()}
         return {"state_dict": weights, KEY: self.to_payload()}
 
 
 @dataclass(frozen=True)
 class _Header:
-    """A description's fields, except the version; unknown ones are ignored."""
+    """The fields of a description except the version; unknown fields are ignored."""
 
     spec: dict[str, Any]
     parts: list[Any]
@@ -123,11 +122,14 @@ class _Header:
 
 
 def read(path: Path) -> Checkpoint:
-    """Read a checkpoint, a file or ``pretrained/NAME``, and compare its weights with its own spec.
+    """Read a checkpoint and compare its weights with its spec.
+
+    Args:
+        path: A file or ``pretrained/NAME``.
 
     Raises:
-        UserError: The file is missing, damaged, foreign, too large, of another version, names
-            something that may not be built, or is inconsistent.
+        UserError: The file is missing, damaged, too large, inconsistent, of another version or
+            not a checkpoint, or its spec names a class that is not allowed.
     """
     path = find(Path(path))
     if path.suffix == SUFFIX:
@@ -154,7 +156,7 @@ def read(path: Path) -> Checkpoint:
 
 
 def load_network(path: Path) -> tuple[PoseNetwork, Checkpoint]:
-    """Read a checkpoint as :func:`read`; return its network, evaluating on the CPU, and itself."""
+    """Return the network of a checkpoint, in evaluation mode on the CPU, and the checkpoint."""
     checkpoint = read(path)
     network = build_network(checkpoint.spec)
     network.load_state_dict(checkpoint.state_dict)
@@ -162,10 +164,10 @@ def load_network(path: Path) -> tuple[PoseNetwork, Checkpoint]:
 
 
 def parse_description(payload: object) -> Checkpoint:
-    """Parse the result of :meth:`Checkpoint.to_payload`: a checkpoint without weights.
+    """Parse the result of :meth:`Checkpoint.to_payload` into a checkpoint without weights.
 
     Raises:
-        UserError: A field is missing, of the wrong type or out of its range. Nothing is built.
+        UserError: A field is missing, of the wrong type or out of range.
     """
     if not isinstance(payload, dict):
         raise UserError(f"a {type(payload).__name__} under {KEY!r}", "a mapping", "train again")
@@ -174,7 +176,7 @@ def parse_description(payload: object) -> Checkpoint:
     if type(version) is not int or version != FORMAT_VERSION:
         fix = "read the file with the dopepp that wrote it, or train again"
         raise UserError(f"format_version {version!r:.100}", f"{FORMAT_VERSION}", fix)
-    # Containers whose content has a reader of its own are not copied: empty ones stand for them.
+    # Containers with a parser of their own are not copied; empty ones replace them here.
     kept = {name: payload[name] for name in ("spec", "parts", "data") if name in payload}
     empty = {name: type(value)() for name, value in kept.items() if isinstance(value, (dict, list))}
     fields = vars(parse(_Header, {**payload, **empty}, fix=_FIX))
@@ -185,7 +187,7 @@ def parse_description(payload: object) -> Checkpoint:
 
 
 def _check_plain(payload: Mapping[Any, Any]) -> None:
-    """Refuse values that are not plain, nested too deep or, repeated ones counted, too many."""
+    """Reject values that are not plain, nested too deeply or too many, repetitions included."""
     counts: dict[int, int] = {}
     for name, value in payload.items():
         try:
@@ -196,7 +198,7 @@ def _check_plain(payload: Mapping[Any, Any]) -> None:
 
 
 def _count(value: object, depth: int, counts: dict[int, int]) -> int:
-    """Return the number of plain values in a value; ``counts`` has those of containers by id."""
+    """Return the number of plain values in a value; ``counts`` caches containers by id."""
     if type(value) not in (dict, list, tuple):
         if isinstance(value, int) and value.bit_length() > _MAX_BITS:
             raise ValueError(f"an integer of {value.bit_length()} bits")
@@ -219,24 +221,24 @@ def _count(value: object, depth: int, counts: dict[int, int]) -> int:
 
 
 def _check_weights(checkpoint: Checkpoint, size: int) -> None:
-    """Compare the weights with the network of the spec, built without memory on ``meta``."""
+    """Compare the weights with the network of the spec, built on ``meta``."""
     with torch.device("meta"):
         network = build_network(checkpoint.spec)
-    got = f"stride {checkpoint.stride} and {len(checkpoint.parts)} parts"
+    described = f"stride {checkpoint.stride} and {len(checkpoint.parts)} parts"
     needed = f"stride {network.stride} and {network.num_objects} parts"
-    if got != needed:
-        raise UserError(got, f"{needed}, as the spec has it", _FIX)
+    if described != needed:
+        raise UserError(described, f"{needed}, as the spec has it", _FIX)
     expected, weights = network.state_dict(), checkpoint.state_dict
     odd = sorted(expected.keys() ^ weights.keys()) or [
         name for name, value in expected.items() if not _same_kind(weights[name], value)
     ]
-    # A tensor may be a view that repeats a few stored numbers to any size: the file must hold all.
+    # A tensor may be a view that repeats few stored numbers; the file must hold all of them.
     stored = 0 if odd else sum(value.numel() * value.element_size() for value in weights.values())
     if odd or stored > size:
         first = odd[0] if odd else "their size"
-        got = f"weights that do not fit the spec's network, first {first}"
+        problem = f"weights that do not fit the spec's network, first {first}"
         fix = f"{_FIX}, or use the spec it was trained with"
-        raise UserError(got, f"the {len(expected)} tensors of that network", fix)
+        raise UserError(problem, f"the {len(expected)} tensors of that network", fix)
 
 
 def _same_kind(value: object, expected: Tensor) -> bool:
@@ -264,7 +266,11 @@ def released_paths() -> dict[str, Path]:
 
 
 def find(path: Path) -> Path:
-    """Return the file of a path; a :class:`UserError` for an unknown ``pretrained/NAME``."""
+    """Return the file of a path or of ``pretrained/NAME``.
+
+    Raises:
+        UserError: No released checkpoint has this name.
+    """
     if path.parent != Path(FOLDER) or path.exists():
         return path
     released = released_paths()
@@ -275,11 +281,11 @@ def find(path: Path) -> Path:
 
 
 def _read_released(path: Path) -> tuple[dict[str, Any], int]:
-    """Read a released file; return its content, weights in single precision, and their bytes."""
+    """Return the content of a released file, with float32 weights, and the weights' size, bytes."""
     tensors, metadata = read_safetensors(path)
     if KEY not in metadata:
-        got, allowed = f"{path} without a description under {KEY!r}", "a file of `dopepp release`"
-        raise UserError(got, f"{allowed} or `dopepp export`", "get the file again")
+        allowed = "a file of `dopepp release` or `dopepp export`"
+        raise UserError(f"{path} without a description under {KEY!r}", allowed, "get it again")
     payload = parse_json(metadata[KEY], f"{path}, description under {KEY!r}")
     for name, value in tensors.items():
         tensors[name] = value.float() if value.is_floating_point() else value
@@ -288,7 +294,12 @@ def _read_released(path: Path) -> tuple[dict[str, Any], int]:
 
 
 def write_content(content: Mapping[str, Any], path: Path, half: bool = True) -> None:
-    """Write a safetensors file of :meth:`Checkpoint.to_file`; it names no local path.
+    """Write a safetensors file without local paths.
+
+    Args:
+        content: Result of :meth:`Checkpoint.to_file`.
+        path: File to write.
+        half: Whether to write float16 weights.
 
     Raises:
         UserError: A weight does not fit into half precision.
@@ -309,14 +320,14 @@ def _half(name: str, value: Tensor) -> Tensor:
         return value
     half = value.to(torch.float16)
     if not half.isfinite().all():
-        got = f"{name} with values up to {float(value.abs().max()):g}"
+        problem = f"{name} with values up to {float(value.abs().max()):g}"
         allowed = f"finite weights of at most {torch.finfo(torch.float16).max:g}"
-        raise UserError(got, allowed, "train again: such weights come from a run that diverged")
+        raise UserError(problem, allowed, "train again: such weights come from a run that diverged")
     return half
 
 
 def _portable(value: Any, key: str = "") -> Any:
-    """Return a payload in which folders of this machine are null and files have only a name."""
+    """Return a payload with null in place of local folders and with names of files only."""
     if isinstance(value, Mapping):
         return {name: _portable(item, name) for name, item in value.items()}
     if isinstance(value, list):

