@@ -1,10 +1,8 @@
-"""Guards of a training: steps that are not finite, and belief maps that stay empty.
+"""Guards against optimiser steps that are not finite and against empty belief maps.
 
-Whether a step is taken must be known before it is taken, so :class:`FiniteSteps` waits for the
-device once per optimiser step: three numbers, as often as torch's own gradient scaler does.
-A network whose maps are empty gives no pose, and every pose metric is zero whatever the reason;
-:class:`EmptyMaps` names the likely reasons. To add a reason, write a method like
-:meth:`EmptyMaps._rate` and a line in :meth:`EmptyMaps._warn`.
+:class:`FiniteSteps` synchronises with the device once per optimiser step, as often as torch's own
+gradient scaler. :class:`EmptyMaps` lists likely causes when a network detects nothing. To add a
+cause, write a method like :meth:`EmptyMaps._rate` and a line in :meth:`EmptyMaps._warn`.
 """
 
 from __future__ import annotations
@@ -36,22 +34,19 @@ from dopepp.training.system import PoseSystem, ValidationOutput, all_finite
 
 _log = logging.getLogger(__name__)
 
-FOLDER: Final = "nonfinite"  # Folder of the run that keeps the batch that ended it
+FOLDER: Final = "nonfinite"  # Folder of the run with the batch that ended the run
 
 _COUNTS: Final = Range(1, 10**6)
 _MAX_TILES: Final = 64
-_CHECKED: Final = ("loss", "gradient", "batch norm's statistics")
-"""After every backward pass, in this order."""
-
-_MIN_INSIDE: Final = 0.5
-"""With fewer keypoints inside the images, poses or camera are probably wrong."""
-_MIN_CELLS: Final = 3.0  # Objects narrower than this on the maps have all keypoints in one place
-_FALL: Final = 0.95  # A validation loss above this share of its first value has not fallen
+_CHECKED: Final = ("loss", "gradient", "batch norm's statistics")  # After every backward pass
+_MIN_INSIDE: Final = 0.5  # Share of keypoints inside images below which labels are probably wrong
+_MIN_CELLS: Final = 3.0  # Narrower objects have all keypoints in one peak of the maps
+_FALL: Final = 0.95  # A validation loss above this share of its first value has not decreased
 
 
 @dataclass
 class _Pass:
-    """One forward and backward pass; ``bad`` marks what of it is not finite (as ``_CHECKED``)."""
+    """A forward and backward pass; ``bad`` marks the values of ``_CHECKED`` that are not finite."""
 
     batch: Batch
     loss: Tensor
@@ -59,13 +54,13 @@ class _Pass:
 
 
 class FiniteSteps(Callback):
-    """Leaves out every optimiser step whose loss or gradient is not finite on any process.
+    """Skips optimiser steps whose loss or gradient is not finite on any process.
 
-    Weights, the optimiser's state and batch norm's statistics then stay as they were; the step
-    counts as one, so the schedule goes on as planned. With accumulation the whole step is left out.
-    Gradients that only overflow because mixed precision scales them are not counted.
-    ``train/skipped_steps`` counts over the whole run. After ``max_in_a_row`` such steps the run
-    ends, and leaves the last of their batches in the run folder's ``nonfinite/``.
+    A skipped step changes neither weights nor optimiser states nor batch norm's statistics, but
+    counts for the schedule. With gradient accumulation, the whole step is skipped. Overflows due to
+    the scaling of mixed precision do not count. ``train/skipped_steps`` counts over the whole run.
+    After ``max_in_a_row`` skipped steps in a row, the run ends with the last batch in the folder
+    ``nonfinite/`` of the run.
     """
 
     def __init__(self, max_in_a_row: int = 10) -> None:
@@ -76,7 +71,7 @@ class FiniteSteps(Callback):
         self._kept: list[Tensor] = []
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the count of the whole run."""
+        """Return the number of skipped steps."""
         return {"skipped": self.skipped}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -84,7 +79,7 @@ class FiniteSteps(Callback):
         self.skipped = int(state_dict["skipped"])
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Find what a forward pass changes: batch norm's statistics."""
+        """Collect the buffers that a forward pass changes: batch norm's statistics."""
         self._passes = []
         self._buffers = list(pl_module.buffers())
         self._kept = [buffer.clone() for buffer in self._buffers]
@@ -92,7 +87,7 @@ class FiniteSteps(Callback):
     def on_train_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, batch: Batch, batch_idx: int
     ) -> None:
-        """Keep the statistics as they are before a step's first pass."""
+        """Save the statistics before the first pass of a step."""
         self._batch = batch
         if not self._passes and self._buffers:
             torch._foreach_copy_(self._kept, self._buffers)
@@ -100,11 +95,11 @@ class FiniteSteps(Callback):
     def on_before_backward(
         self, trainer: Trainer, pl_module: LightningModule, loss: Tensor
     ) -> None:
-        """Remember the loss, which is multiplied by the scaler's factor where there is one."""
+        """Store the loss, which a gradient scaler may have scaled."""
         self._loss = loss.detach()
 
     def on_after_backward(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Check the pass without waiting for the device."""
+        """Check the pass without synchronising with the device."""
         gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
         statistics = [buffer for buffer in self._buffers if buffer.is_floating_point()]
         norms = [
@@ -117,13 +112,13 @@ class FiniteSteps(Callback):
     def on_before_optimizer_step(
         self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
     ) -> None:
-        """Leave the step out if any process had a pass that was not finite.
+        """Skip the step if a pass on any process was not finite.
 
         Raises:
-            RunError: It is one too many, or the weights are not finite.
+            RunError: Too many steps in a row were skipped, or the weights are not finite.
         """
         passes, self._passes = self._passes, []
-        bad = torch.stack([one_pass.bad for one_pass in passes]).sum(dim=0)
+        bad = torch.stack([item.bad for item in passes]).sum(dim=0)
         if trainer.world_size > 1:
             torch.distributed.all_reduce(bad)
         names = [name for name, count in zip(_CHECKED, bad.tolist(), strict=True) if count > 0]
@@ -135,7 +130,7 @@ class FiniteSteps(Callback):
             return
         if self._buffers:
             torch._foreach_copy_(self._buffers, self._kept)
-        # A scaler has already seen what is wrong with the gradient, and leaves the step out itself.
+        # A scaler skips steps with non-finite gradients itself.
         if scaler is None or "gradient" not in names:
             optimizer.zero_grad(set_to_none=True)
         self.skipped += 1
@@ -151,28 +146,28 @@ class FiniteSteps(Callback):
             _log.warning("%s: the step is left out (%s)", message, counts)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Log the count."""
+        """Log the number of skipped steps."""
         pl_module.log("train/skipped_steps", float(self.skipped), rank_zero_only=False)
 
     def _dump(self, trainer: Trainer, passes: list[_Pass], names: list[str]) -> Path:
-        """Write the first pass that was not finite, on every process that had one.
+        """Write the batch of the first pass that was not finite, on every process with such a pass.
 
-        Gradients are summed over the processes, so where they alone are wrong, all have one.
+        Gradients are summed over processes, so all processes have the same non-finite gradients.
         """
         folder = Path(trainer.default_root_dir) / FOLDER
-        for one_pass in passes:
-            if one_pass.bad[0] if "loss" in names else one_pass.bad.any():
+        for item in passes:
+            if item.bad[0] if "loss" in names else item.bad.any():
                 step, epoch = trainer.global_step, trainer.current_epoch
                 facts = {"step": step, "epoch": epoch, "not_finite": names}
-                facts["loss"] = float(one_pass.loss)
+                facts["loss"] = float(item.loss)
                 path = folder / f"step_{step}_rank_{trainer.global_rank}"
-                _dump_batch(path, one_pass.batch, facts)
+                _dump_batch(path, item.batch, facts)
                 break
         return folder
 
 
 def _dump_batch(path: Path, batch: Batch, facts: Mapping[str, Any]) -> None:
-    """Write ``path.pt``, for ``torch.load``, and ``path.png``; a full disk is only reported."""
+    """Write ``path.pt`` (for ``torch.load``) and ``path.png``, or warn."""
     shown = batch.rows(torch.arange(min(len(batch), _MAX_TILES))).to("cpu")
     images, truths = shown.images.permute(0, 2, 3, 1).numpy(), shown.keypoints.numpy()
     tiles = [
@@ -187,11 +182,11 @@ def _dump_batch(path: Path, batch: Batch, facts: Mapping[str, Any]) -> None:
 
 
 class EmptyMaps(Callback):
-    """Warns once, with the likely reasons, when no belief is high enough for any detection.
+    """Warns once, with likely causes, if all beliefs are too low for detections.
 
-    Maps are empty if no centroid's, or no corner's, belief reaches the threshold of the recovery on
-    any validation image. The warning comes after ``patience`` such validations in a row (a network
-    of few steps is rightly silent), or at the end of a shorter training.
+    Maps are empty if no belief of a centroid, or none of a corner, reaches the threshold of the
+    recovery on any validation image. The warning follows ``patience`` such validations in a row, or
+    the end of a shorter training.
     """
 
     def __init__(self, patience: int = 3) -> None:
@@ -203,7 +198,7 @@ class EmptyMaps(Callback):
         self._sizes: list[Tensor] = []
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what has been seen, for a run that goes on."""
+        """Return the counts, for a resumed run."""
         return {"empty": self._num_empty, "warned": self._warned, "first_loss": self._first_loss}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -212,14 +207,14 @@ class EmptyMaps(Callback):
         self._first_loss = float(state_dict["first_loss"])
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Forget the validation before."""
+        """Reset the statistics."""
         self._highest = torch.zeros(2, device=pl_module.device)
         self._inside, self._sizes = [], []
 
     def on_validation_batch_end(  # type: ignore[override]
         self, trainer: Trainer, system: PoseSystem, outputs: ValidationOutput, batch: Batch, *_: Any
     ) -> None:
-        """Keep the highest beliefs, and where the labels are."""
+        """Update the highest beliefs and the statistics of labels."""
         belief = outputs.belief.reshape(len(batch), -1, NUM_KEYPOINTS, *outputs.belief.shape[-2:])
         highest = torch.stack([belief[:, :, :CENTROID].max(), belief[:, :, CENTROID].max()])
         self._highest = torch.fmax(self._highest, highest)
@@ -232,7 +227,7 @@ class EmptyMaps(Callback):
         self._sizes.append(extent.amax(dim=-1) / system.geometry.stride)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Count, and warn when there have been enough."""
+        """Count empty validations and warn after enough of them."""
         assert isinstance(pl_module, PoseSystem)
         if trainer.world_size > 1:
             torch.distributed.all_reduce(self._highest, torch.distributed.ReduceOp.MAX)
@@ -247,7 +242,7 @@ class EmptyMaps(Callback):
             self._warn(trainer, pl_module)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Warn of a training with fewer validations."""
+        """Warn at the end of a training with few validations."""
         assert isinstance(pl_module, PoseSystem)
         if self._num_empty:
             self._warn(trainer, pl_module)
@@ -277,7 +272,7 @@ class EmptyMaps(Callback):
         _log.warning("\n".join(lines))
 
     def _early(self, trainer: Trainer, system: PoseSystem) -> str:
-        """Say how far the training is, and which loss learns sooner."""
+        """Describe the progress of the training and recommend a faster loss."""
         text = f"step {trainer.global_step:,} of {trainer.estimated_stepping_batches:,}; wait, or "
         text += "train longer (trainer.max_epochs)"
         if isinstance(system.loss, MapMSE):
@@ -289,7 +284,7 @@ class EmptyMaps(Callback):
         return text
 
     def _rate(self, trainer: Trainer) -> tuple[bool, str]:
-        """Judge the learning rate by the validation loss."""
+        """Return whether the learning rate is a likely cause, judged by the loss, and the advice."""
         first, last = self._first_loss, self._loss
         flat = self._num_empty > 1 and not last < _FALL * first
         rates = [
@@ -298,13 +293,13 @@ class EmptyMaps(Callback):
         present = f"{max(rates):.2g}" if rates else "unknown"
         return flat, (
             f"the validation loss went from {first:.4g} to {last:.4g}, the rate is {present} now; "
-            "job=lr_finder looks for one, optimizer.lr=… sets it"
+            "find a rate with job=lr_finder, set it with optimizer.lr=…"
         )
 
     def _labels(self) -> tuple[bool, str]:
-        """Judge the labels by where they are in the images."""
+        """Return whether labels are a likely cause, judged by their positions, and the advice."""
         inside, sizes = torch.cat(self._inside), torch.cat(self._sizes)
-        look = "look at val_overlay.png, whose truth is green, and run dopepp check on the data"
+        look = "check the green labels in val_overlay.png, and run dopepp check on the data"
         if not len(inside):
             return True, f"no object in the validation images is visible enough to count; {look}"
         share, cells = float(inside.mean()), float(sizes.nanmedian())

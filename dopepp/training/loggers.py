@@ -1,6 +1,6 @@
-"""Loggers that cannot end a run: a CSV table that is always on, and a guard around the others.
+"""Loggers whose failures do not end a run: a CSV table and a guard around other loggers.
 
-To add a logger: a line in ``dopepp/experiment/assembly/registries.py`` and a file in
+To add a logger, add a line to ``dopepp/experiment/assembly/registries.py`` and a file to
 ``conf/logger``.
 """
 
@@ -25,11 +25,10 @@ T = TypeVar("T")
 
 
 class MetricsTable(Logger):
-    """Writes all logged figures into one CSV: a row per step, a column per metric.
+    """Writes logged values to a CSV file with a row per step and a column per metric.
 
-    Lightning's ``CSVLogger`` appends rows and cannot continue a file. Here the file is rewritten
-    whole, so it is never cut in the middle, and an existing file is continued. Only the first of
-    several processes writes. While the file cannot be written, its rows are kept.
+    Unlike Lightning's ``CSVLogger``, this logger continues an existing file and replaces it
+    atomically. Rows stay in memory while the file cannot be written. Only rank 0 writes.
     """
 
     def __init__(self, path: Path) -> None:
@@ -45,26 +44,26 @@ class MetricsTable(Logger):
 
     @property
     def name(self) -> str:
-        """Nothing, so that Lightning puts checkpoints into the run folder itself."""
+        """Empty, so that Lightning puts checkpoints directly into the run folder."""
         return ""
 
     version = name
 
     def forget_after(self, step: int) -> None:
-        """Drop the rows of steps that a resumed run will take again."""
+        """Drop the rows of steps that a resumed run repeats."""
         self._rows = {key: row for key, row in self._rows.items() if key <= step}
 
     def log_hyperparams(self, params: dict[str, Any] | Namespace, *_: Any, **__: Any) -> None:
-        """Do nothing: the run's config is a file of its own."""
+        """Do nothing; the config has a file of its own."""
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Add figures to a step's row."""
+        """Add values to the row of a step."""
         self._rows.setdefault(step or 0, {}).update(metrics)
 
     @rank_zero_only
     def save(self) -> None:
-        """Write the file, or say that it could not be written."""
+        """Write the file, or warn once that it cannot be written."""
         try:
             self.write()
         except OSError as error:
@@ -77,7 +76,11 @@ class MetricsTable(Logger):
 
     @rank_zero_only
     def write(self) -> None:
-        """Write the file; an ``OSError`` if it cannot be written."""
+        """Write the file.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
         if not self._rows:
             return
         columns = sorted({name for row in self._rows.values() for name in row})
@@ -85,12 +88,12 @@ class MetricsTable(Logger):
         write_csv(self.path, rows, ["step", *columns])
 
     def finalize(self, status: str) -> None:
-        """Write what is left."""
+        """Write the remaining rows."""
         self.save()
 
 
 class GuardedLogger(Logger):
-    """Builds a logger and forwards to it; switches it off at its first failure, with a warning."""
+    """Forwards to a logger and, with a warning, disables it at its first failure."""
 
     def __init__(self, make: Callable[[], Logger]) -> None:
         super().__init__()
@@ -99,12 +102,12 @@ class GuardedLogger(Logger):
         self.inner = self.guard(make)
 
     def guard(self, call: Callable[[], T]) -> T | None:
-        """Run a call of the logger; None where it fails or has failed before."""
+        """Call the logger; return None if the call fails or the logger is disabled."""
         if self._failed:
             return None
         try:
             return call()
-        except Exception as error:  # whatever a network, a disk or a service may raise
+        except Exception as error:  # networks, disks and services raise any exception
             self._failed = True
             _log.warning("a logger failed and is off for the rest of the run: %r", error)
             return None
@@ -140,7 +143,7 @@ class GuardedLogger(Logger):
         self._forward(lambda inner: inner.finalize(status))
 
     def log_picture(self, name: str, image: Picture, step: int | None = None) -> None:
-        """Log an RGB picture to TensorBoard or Weights & Biases."""
+        """Log an RGB image to TensorBoard or Weights & Biases."""
         inner = self.inner
         if isinstance(inner, TensorBoardLogger):
             self.guard(lambda: inner.experiment.add_image(name, image, step, dataformats="HWC"))
@@ -148,7 +151,7 @@ class GuardedLogger(Logger):
             self.guard(lambda: inner.log_image(name, [image], step=step))
 
     def log_table(self, name: str, rows: Sequence[Mapping[str, str]], text: str) -> None:
-        """Log rows, the first with all headings, to W&B and their Markdown text to TensorBoard."""
+        """Log rows to W&B or Markdown to TensorBoard; the first row has all columns."""
         inner = self.inner
         if isinstance(inner, TensorBoardLogger):
             self.guard(lambda: inner.experiment.add_text(name, text))
@@ -158,7 +161,7 @@ class GuardedLogger(Logger):
             self.guard(lambda: inner.log_table(name, columns, cells))
 
     def log_summary(self, figures: Mapping[str, float]) -> None:
-        """Log the final figures, in Weights & Biases as the run's summary."""
+        """Log the final values, in Weights & Biases as the run's summary."""
         inner = self.inner
         if isinstance(inner, WandbLogger):
             self.guard(lambda: inner.experiment.summary.update(dict(figures)))
@@ -166,17 +169,17 @@ class GuardedLogger(Logger):
             self.log_metrics(dict(figures))
 
     def close(self, failed: bool) -> None:
-        """End the logger's run: what is logged afterwards would belong to another one."""
+        """End the logger's run; later values belong to another run."""
         if isinstance(self.inner, WandbLogger):
-            self._failed = False  # a run that failed midway has to end as well
+            self._failed = False  # a run whose logging failed must end, too
             self.guard(lambda: _finish_wandb(failed))
         else:
             self.finalize("failed" if failed else "success")
 
 
 def _finish_wandb(failed: bool) -> None:
-    """End the open run of Weights & Biases; a dead service is replaced by the next run."""
-    import wandb  # takes a second, and few runs need it
+    """End the open run of Weights & Biases; the next run replaces a dead service."""
+    import wandb  # slow to import
 
     try:
         wandb.finish(exit_code=int(failed))

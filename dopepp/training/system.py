@@ -1,8 +1,8 @@
 """PoseSystem: a network, a loss and an optimiser as a LightningModule.
 
-The network knows nothing of training and this module knows nothing of backbones or files: what can
-be swapped is handed in, built. To add a callback, one class in :mod:`dopepp.training`, a
-line in ``dopepp/experiment/assembly/registries.py`` and an entry in ``conf/callbacks``.
+All exchangeable components are passed as objects. To add a callback, write a class in
+:mod:`dopepp.training`, and add a line to ``dopepp/experiment/assembly/registries.py`` and an entry
+to ``conf/callbacks``.
 """
 
 from __future__ import annotations
@@ -43,15 +43,12 @@ OptimizerFactory = Callable[[Iterable[nn.Parameter]], Optimizer]
 SchedulerFactory = Callable[[Optimizer, int], LRScheduler]
 
 _SCHEDULE_PROGRESS: Final = ("last_epoch", "_step_count", "_last_lr")
-"""The rest of a state is the schedule."""
+"""Progress in a schedule's state; the other entries describe the schedule."""
 
 
 @dataclass
 class ValidationOutput:
-    """One validation batch's loss, and the last stage's maps, which callbacks read poses from.
-
-    Beliefs are after the activation.
-    """
+    """Loss of a validation batch with the last stage's belief maps (activated) and field."""
 
     loss: Float[Tensor, ""]
     belief: Beliefs
@@ -65,13 +62,13 @@ class PoseSystem(LightningModule):
         network: The network to train.
         loss: Its loss.
         parts: The objects, in the order of the network's channels.
-        geometry: Of the target maps.
-        recovery: Thresholds of the way from maps to poses.
+        geometry: Geometry of the target maps.
+        recovery: Options of the recovery from maps to poses.
         make_optimizer: Builds the optimiser.
-        make_scheduler: Builds a schedule, stepped once a batch, from optimiser and number of steps.
-        payload: The self-description stored in every checkpoint under ``dopepp``.
-        compile_network: Whether to run the network through ``torch.compile``.
-        symmetry: How symmetric parts are learnt.
+        make_scheduler: Builds a schedule, stepped every batch, from optimiser and number of steps.
+        payload: Description stored in every checkpoint under ``dopepp``.
+        compile_network: Whether to compile the network with ``torch.compile``.
+        symmetry: Options for symmetric parts.
     """
 
     def __init__(
@@ -88,7 +85,7 @@ class PoseSystem(LightningModule):
         symmetry: SymmetryOptions | None = None,
     ) -> None:
         super().__init__()
-        # Convolutions on channels-last memory are faster on CPUs and tensor cores alike.
+        # Convolutions are faster in channels-last memory, on CPUs and tensor cores alike.
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.loss = loss
         self.parts = tuple(parts)
@@ -98,7 +95,7 @@ class PoseSystem(LightningModule):
         self.make_optimizer, self.make_scheduler = make_optimizer, make_scheduler
         self.payload = dict(payload or {})
         self._resumed_schedules: list[dict[str, Any]] | None = None
-        # In place, so that parameter names stay those of the plain network.
+        # In place, so that parameters keep their names.
         if compile_network:
             self.network.compile()
 
@@ -110,11 +107,14 @@ class PoseSystem(LightningModule):
         return stages
 
     def targets(self, batch: Batch, stages: Sequence[Stage] | None = None) -> Targets:
-        """Return the maps that the network should give, drawn on the batch's device.
+        """Return the target maps of a batch, on its device.
 
-        Instances too little visible for a metric are left out. Of the poses of a symmetric part
-        that look alike, the network's answer to the images (``stages``) may decide
-        (:mod:`~dopepp.training.targets`).
+        Instances whose visibility is too low for metrics are omitted.
+
+        Args:
+            batch: Images with labels.
+            stages: The network's output, which may choose among the equivalent poses of a
+                symmetric part (:mod:`~dopepp.training.targets`).
         """
         keypoints = batch.keypoints
         if self.symmetry.active:
@@ -122,7 +122,7 @@ class PoseSystem(LightningModule):
         return draw_maps(batch, keypoints, len(self.parts), self.geometry)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Return the loss and log it with its terms."""
+        """Return the loss; log the loss and its terms."""
         stages = self(batch.images)
         loss, terms = self.loss(stages, *self.targets(batch, stages))
         size = len(batch)
@@ -131,7 +131,7 @@ class PoseSystem(LightningModule):
         return loss  # type: ignore[no-any-return]
 
     def validation_step(self, batch: Batch, batch_idx: int) -> ValidationOutput:  # type: ignore[override]
-        """Log the loss and hand the maps to the callbacks."""
+        """Log the loss and return the maps for the callbacks."""
         stages = self(batch.images)
         loss, _ = self.loss(stages, *self.targets(batch, stages))
         self.log("val/loss", loss, prog_bar=True, batch_size=len(batch), sync_dist=True)
@@ -145,19 +145,19 @@ class PoseSystem(LightningModule):
         return recover_batch(*maps, names, **vars(self.recovery))
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
-        """Build the optimiser, and its schedule over all steps of the run."""
+        """Build the optimiser and its schedule over all steps of the run."""
         optimizer = self.make_optimizer(self.network.parameters())
         configured: OptimizerLRScheduler = optimizer
         if self.make_scheduler is not None:
             scheduler = self.make_scheduler(optimizer, int(self.trainer.estimated_stepping_batches))
             schedule: Any = {"scheduler": scheduler, "interval": "step"}
             configured = {"optimizer": optimizer, "lr_scheduler": schedule}
-        # Only now: a schedule adds settings of its own.
+        # After the schedule, which adds settings of its own.
         self._settings = [dict(group) for group in optimizer.param_groups]
         return configured
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep only how far the schedule was: a run resumed for longer has a longer schedule."""
+        """Keep only the progress of schedules: a run resumed for longer has a longer schedule."""
         go_on_with_trained(checkpoint)
         states = checkpoint["lr_schedulers"]
         self._resumed_schedules = [_without_progress(state) for state in states]
@@ -167,7 +167,7 @@ class PoseSystem(LightningModule):
         ]
 
     def on_train_start(self) -> None:
-        """Go to the resumed step's place in the table and on the schedule."""
+        """Continue the table and the schedule at the resumed step."""
         for logger in self.loggers:
             if isinstance(logger, MetricsTable):
                 logger.forget_after(self.global_step - 1)
@@ -175,9 +175,9 @@ class PoseSystem(LightningModule):
         configs = self.trainer.lr_scheduler_configs
         present = [_without_progress(config.scheduler.state_dict()) for config in configs]
         if present == self._resumed_schedules:
-            return  # the optimiser's rates are this schedule's, to the last bit
+            return  # the optimiser's rates already equal those of this schedule
         for config in configs:
-            # Schedules that multiply the last rate would stay at zero where a shorter one ended.
+            # A schedule that multiplies the last rate would stay at 0 if a shorter one ended there.
             closed_form = getattr(config.scheduler, "_get_closed_form_lr", None)
             if closed_form is not None:
                 groups = config.scheduler.optimizer.param_groups
@@ -185,9 +185,9 @@ class PoseSystem(LightningModule):
                     group["lr"] = rate
 
     def _apply_settings(self) -> None:
-        """Use the present config's rate, decay and so on: a checkpoint brings its own ones back.
+        """Replace the optimiser settings of the checkpoint by those of the current config.
 
-        What a schedule sets in every step is left to it.
+        Settings that a schedule sets in every step are kept.
         """
         scheduled = {"lr"} if self.trainer.lr_scheduler_configs else set()
         for optimizer in self.trainer.optimizers:
@@ -197,10 +197,10 @@ class PoseSystem(LightningModule):
                 group.update({k: v for k, v in settings.items() if k not in kept})
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Make the file self-describing: anybody can load it without this module or a config.
+        """Add the description, so that the file can be loaded without this module or a config.
 
         Raises:
-            RunError: Weights or optimiser state are not finite.
+            RunError: Weights or optimiser states are not finite.
         """
         check_state(checkpoint)
         checkpoint["dopepp"] = self.payload
@@ -212,13 +212,17 @@ def _without_progress(state: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def all_finite(tensors: Iterable[Tensor]) -> bool:
-    """Return whether every number is finite; waits for the device once."""
+    """Return whether all values are finite; synchronises with the device once."""
     flags = [tensor.isfinite().all() for tensor in tensors if tensor.is_floating_point()]
     return not flags or bool(torch.stack(flags).all())
 
 
 def check_state(checkpoint: Mapping[str, Any]) -> None:
-    """Refuse, with a :class:`RunError`, to save weights or optimiser states that are not finite."""
+    """Check that weights and optimiser states are finite.
+
+    Raises:
+        RunError: A value is not finite.
+    """
     for name, text in (("state_dict", "weights"), ("optimizer_states", "optimiser's state")):
         if not all_finite(_tensors(checkpoint.get(name))):
             when = f"after step {checkpoint.get('global_step')}"

@@ -1,7 +1,7 @@
-"""Where a training's time goes: its speed, the time that is left, and Lightning's profilers.
+"""Throughput, remaining time and profiles of a training.
 
-To add a profiler, a subclass of Lightning's and a line in :func:`make_profiler` and in
-:func:`profile_rows`.
+To add a profiler, write a subclass of Lightning's ``Profiler`` and add a line to
+:func:`make_profiler` and to :func:`profile_rows`.
 """
 
 from __future__ import annotations
@@ -24,18 +24,17 @@ _log = logging.getLogger(__name__)
 
 FOLDER: Final = "profile"  # Folder of the run with the report and traces
 
-_STARVED: Final = 0.2  # A larger share of waiting is worth a hint
+_STARVED: Final = 0.2  # Share of waiting above which a hint is logged
 _FILE: Final = "report"
 
 Total = tuple[str, int, float]
-"""A hook or operator, its number of calls, and the seconds of all calls."""
+"""Name of a hook or operator, number of calls, and total seconds."""
 
 
 class Throughput(Callback):
-    """Logs images per second and the share of an epoch spent waiting for the loader.
+    """Logs images per second of training time and the share of it spent waiting for the loader.
 
-    ``throughput/images_per_s`` counts training time only; ``throughput/loader_wait`` is the share
-    of it between the end of one step and the arrival of the next batch.
+    The values are ``throughput/images_per_s`` and ``throughput/loader_wait``.
     """
 
     def __init__(self) -> None:
@@ -43,39 +42,38 @@ class Throughput(Callback):
         self._started = self._step_ended = 0.0
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Start the clocks."""
+        """Reset the counters."""
         self._images, self._waited = 0, 0.0
         self._started = self._step_ended = time.perf_counter()
 
     on_train_start = on_train_epoch_start  # a resumed epoch is measured from there on
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Count the time since the last step ended as waiting."""
+        """Add the time since the end of the last step to the waiting time."""
         self._waited += time.perf_counter() - self._step_ended
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Batch, *_: Any
     ) -> None:
-        """Count the batch's images, over all processes."""
+        """Count the images of all processes."""
         self._images += len(batch) * trainer.world_size
         self._step_ended = time.perf_counter()
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Log the epoch's figures."""
+        """Log the values of the epoch."""
         elapsed = max(self._step_ended - self._started, 1e-9)
         speed, waiting = self._images / elapsed, self._waited / elapsed
         pl_module.log("throughput/images_per_s", speed, rank_zero_only=False)
         pl_module.log("throughput/loader_wait", waiting, rank_zero_only=False)
         if trainer.is_global_zero:
-            _log.info(
-                "epoch %d: %.0f images/s, %.0f %% of the time waiting for the loader%s",
-                trainer.current_epoch, speed, 100 * waiting,
-                "; data.cache=memory or disk renders each image once" if waiting > _STARVED else "",
-            )  # fmt: skip
+            hint = "; data.cache=memory or disk renders each image once"
+            text = "epoch %d: %.0f images/s, %.0f %% of the time waiting for the loader%s"
+            values = (trainer.current_epoch, speed, 100 * waiting)
+            _log.info(text, *values, hint if waiting > _STARVED else "")
 
 
 class RunProgress(TQDMProgressBar):
-    """Adds ``left``, the time until the run's last step, extrapolated from all steps so far."""
+    """Adds ``left``, the estimated time until the last step of the run."""
 
     def __init__(self) -> None:
         super().__init__(refresh_rate=5)  # drawing it costs more than a small network's step
@@ -89,7 +87,7 @@ class RunProgress(TQDMProgressBar):
     def get_metrics(
         self, trainer: Trainer, pl_module: LightningModule
     ) -> dict[str, int | str | float | dict[str, float]]:
-        """Return what stands behind the bar."""
+        """Return the values shown next to the bar."""
         metrics = super().get_metrics(trainer, pl_module)
         done = trainer.global_step - self._first_step
         if done <= 0:
@@ -100,7 +98,7 @@ class RunProgress(TQDMProgressBar):
 
 
 class Operators(PyTorchProfiler):
-    """Profiles torch operators in all recorded steps; Lightning reports the last recording only."""
+    """Profiles torch operators of all recorded steps, unlike Lightning, which reports the last."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(dirpath=folder, filename=_FILE, on_trace_ready=self._collect)
@@ -117,12 +115,12 @@ class Operators(PyTorchProfiler):
             if operator.is_user_annotation or operator.key.startswith("[pl]"):
                 continue  # Lightning's hooks
             calls, seconds = self._totals.get(operator.key, (0, 0.0))
-            # Of a GPU's operator, launching and running.
+            # For GPU operators, the time of launch and execution.
             seconds += 1e-6 * (operator.self_cpu_time_total + operator.self_device_time_total)
             self._totals[operator.key] = (calls + operator.count, seconds)
 
     def totals(self) -> list[Total]:
-        """Return every operator, the slowest first."""
+        """Return all operators, slowest first."""
         return _slowest_first((name, *total) for name, total in self._totals.items())
 
     def summary(self) -> str:
@@ -135,18 +133,18 @@ class Operators(PyTorchProfiler):
 
 
 def make_profiler(kind: Literal["simple", "pytorch"] | None, run_dir: Path) -> Profiler | None:
-    """Build the profiler of ``trainer.profiler``: of the loop's hooks, or of torch's operators."""
+    """Build the profiler of ``trainer.profiler``, for the loop's hooks or for torch operators."""
     if kind == "simple":
         return SimpleProfiler(dirpath=run_dir / FOLDER, filename=_FILE)
     return None if kind is None else Operators(run_dir / FOLDER)
 
 
 def profile_rows(profiler: object, limit: int = 12) -> list[dict[str, str]]:
-    """Return what took longest, a row of texts each; empty where nothing was recorded."""
+    """Return the slowest hooks or operators as rows of text."""
     totals: list[Total] = []
     if isinstance(profiler, Operators):
         totals = profiler.totals()
-    elif isinstance(profiler, SimpleProfiler):  # a hook that calls another one contains its time
+    elif isinstance(profiler, SimpleProfiler):  # includes the time of nested hooks
         recorded = profiler.recorded_durations.items()
         totals = _slowest_first((name, len(seconds), sum(seconds)) for name, seconds in recorded)
     return [

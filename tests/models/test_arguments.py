@@ -11,7 +11,7 @@ from dopepp.models.layers import find_activation
 from dopepp.models.losses import SpatialCrossEntropy
 
 WITH_WEIGHTS = {"weights_path": "vgg19.pth"}
-FULL_WIDTH = "only with width=1 and batch_norm=false"
+FULL_WIDTH = "with width=1 and batch_norm=false"
 
 
 @pytest.mark.parametrize(
