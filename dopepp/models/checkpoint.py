@@ -1,9 +1,9 @@
 """Self-describing checkpoints, read under ``weights_only=True``.
 
-A ``.ckpt`` is a Lightning checkpoint, or has just two of its keys: ``state_dict`` holds the weights,
-prefixed ``network.``, and ``dopepp`` the description that turns them into a pose estimator. A
-released ``.safetensors`` holds the weights in half precision and the description as JSON in its
-metadata; ``pretrained/NAME`` names a file in the folder ``dopepp/pretrained``.
+A ``.ckpt`` is a Lightning checkpoint, or has only two of its keys: ``state_dict`` holds the
+weights, prefixed ``network.``, and ``dopepp`` the description of the pose estimator. A released
+``.safetensors`` holds the weights in half precision and the description as JSON in its metadata.
+``pretrained/NAME`` names a file in the folder ``dopepp/pretrained``.
 """
 
 from __future__ import annotations

@@ -45,8 +45,8 @@ class EfficientNetLite(Backbone):
     """EfficientNet-Lite0 down to stride 32, summed top-down into stride 8.
 
     The encoder has inverted residual blocks (Tan & Le 2019, Table 1) with ReLU6 and without
-    squeeze-and-excitation. From stride 32 to stride 8, a 1×1 convolution adapts the features of each
-    stride, which are upsampled and summed (Lin et al. 2017) and pass residual blocks.
+    squeeze-and-excitation. From stride 32 to stride 8, a 1×1 convolution adapts the features of
+    each stride, which are upsampled and summed (Lin et al. 2017) and pass residual blocks.
 
     Args:
         channels: Channels of the sums, 8–1024.

@@ -54,9 +54,9 @@ _NAMES: Final = {
     "torch._utils _rebuild_tensor",
     "torch._utils _rebuild_tensor_v2",
 }
-"""Names that a pickle may use; each creates an object no larger than its arguments. torch's own list
-also has ``bytearray`` and tensor classes, which allocate any size, and ``_rebuild_from_type_v2``,
-which sets any attribute."""
+"""Names that a pickle may use; each creates an object no larger than its arguments. torch's own
+list also has ``bytearray`` and tensor classes, which allocate any size, and
+``_rebuild_from_type_v2``, which sets any attribute."""
 
 MAX_SAFETENSORS_BYTES: Final = 2**30  # Five times the full DOPE in float32
 

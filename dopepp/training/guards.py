@@ -284,7 +284,7 @@ class EmptyMaps(Callback):
         return text
 
     def _rate(self, trainer: Trainer) -> tuple[bool, str]:
-        """Return whether the learning rate is a likely cause, judged by the loss, and the advice."""
+        """Return whether the learning rate is a likely cause, judged by the loss, with advice."""
         first, last = self._first_loss, self._loss
         flat = self._num_empty > 1 and not last < _FALL * first
         rates = [

@@ -1,4 +1,4 @@
-"""What moves the weights: optimisers that torch does not have, and the weights' moving average."""
+"""Muon, an optimiser for convolutions, and the moving average of weights."""
 
 from __future__ import annotations
 
@@ -15,33 +15,27 @@ from torch.optim.swa_utils import AveragedModel
 
 from dopepp.core.validation import Range, check
 
-TRAINED: Final = "trained_state"
-"""Entry of the weights that training goes on with; ``state_dict`` is the average."""
-
-_AVERAGED: Final = "averaged_state"  # Entry of a loaded checkpoint's averaged weights
+TRAINED: Final = "trained_state"  # Key of the weights to train further; state_dict has the average
+_AVERAGED: Final = "averaged_state"  # Key of the average in a loaded checkpoint
 
 _RAMP: Final = 10
-"""The average spans the last ``n / _RAMP`` of n steps until the decay is reached: the untrained
-weights of the beginning would otherwise count for a thousand steps and more."""
+"""The average spans the last ``n / _RAMP`` of n steps until the decay is reached. Untrained weights
+would otherwise contribute for a thousand steps."""
 
 _QUINTIC: Final = (3.4445, -4.7750, 2.0315)
-"""Of s, s³ and s⁵: five rounds bring every singular value of 0.002–1 to 0.7–1.2 (Jordan 2024)."""
-
+"""Coefficients of s, s³ and s⁵; five rounds map singular values of 0.002–1 to 0.7–1.2 (Jordan
+2024)."""
 _ROUNDS: Final = 5
-
-_RMS: Final = 0.2
-"""Root mean square of AdamW's updates, in learning rates (Liu et al. 2025, Muon is scalable)."""
+_RMS: Final = 0.2  # RMS of AdamW's updates, in learning rates (Liu et al. 2025, Muon is scalable)
 
 
 class Muon(AdamW):
-    """Momentum made orthogonal for the weights of convolutions, AdamW for all else.
+    """Orthogonalised momentum for weights of convolutions, AdamW for biases and norms.
 
-    A convolution's weight is a matrix, output channels by all the rest. Its step is Nesterov's
-    momentum with all singular values brought near 1 (Jordan et al. 2024), so that directions of
-    small gradients are learned as fast as those of large ones; it is as large as AdamW's, so
-    learning rates and decays serve both. Biases and norms take AdamW's step. torch's own Muon needs
-    torch 2.9 and takes matrices only. The arguments are those of AdamW; the first of ``betas`` is
-    also the momentum's.
+    The weight of a convolution is treated as a matrix, output channels by the rest. Its step is
+    Nesterov's momentum with all singular values near 1 (Jordan et al. 2024), scaled to the size of
+    AdamW's steps, so that learning rates and decays suit both. torch's own Muon needs torch 2.9 and
+    accepts matrices only. The arguments are those of AdamW; ``betas[0]`` is also the momentum.
     """
 
     def __init__(
@@ -65,14 +59,14 @@ class Muon(AdamW):
             for weight in group["params"]:
                 if weight.ndim > 1 and weight.grad is not None:
                     self._step_matrix(weight, weight.grad, group)
-                    weight.grad = None  # so that AdamW leaves it alone
+                    weight.grad = None  # so that AdamW skips it
         super().step()
         return loss
 
     def _step_matrix(self, weight: nn.Parameter, gradient: Tensor, group: dict[str, Any]) -> None:
-        """Take the step of one matrix."""
+        """Take the step of a matrix."""
         state = self.state[weight]
-        if not state:  # under AdamW's names, which it looks for when a run is resumed
+        if not state:  # AdamW's names, which it requires in a resumed run
             state |= {"step": torch.zeros(()), "exp_avg": torch.zeros_like(weight)}
         state["step"] += 1
         beta = group["betas"][0]
@@ -84,10 +78,10 @@ class Muon(AdamW):
 
 
 def orthogonalised(matrix: Float[Tensor, "m n"]) -> Float[Tensor, "m n"]:
-    """Return U·Vᵀ of a matrix U·S·Vᵀ, nearly: the singular values are 0.7–1.2.
+    """Return approximately U·Vᵀ of a matrix U·S·Vᵀ, with singular values of 0.7–1.2.
 
-    All rounds are polynomials of the small Gram matrix, so only the first and the last product are
-    with the matrix itself.
+    All rounds are polynomials of the small Gram matrix; only the first and the last product use the
+    matrix itself.
     """
     if matrix.shape[0] > matrix.shape[1]:
         return orthogonalised(matrix.T).T
@@ -102,22 +96,22 @@ def orthogonalised(matrix: Float[Tensor, "m n"]) -> Float[Tensor, "m n"]:
 
 
 def _polynomial(gram: Float[Tensor, "m m"]) -> Float[Tensor, "m m"]:
-    """Return what a round multiplies a matrix of this Gram matrix by."""
+    """Return the factor of one round for a matrix with this Gram matrix."""
     a, b, c = _QUINTIC
-    one = torch.eye(len(gram), dtype=gram.dtype, device=gram.device)
-    return a * one + b * gram + c * (gram @ gram)
+    identity = torch.eye(len(gram), dtype=gram.dtype, device=gram.device)
+    return a * identity + b * gram + c * (gram @ gram)
 
 
 class AveragedWeights(WeightAveraging):
     """Exponential moving average of weights and batch norm statistics, used for validation.
 
     After step n, ``average += (1 − d)·(weights − average)`` with ``d = min(decay, n / (n + 9))``.
-    The ``state_dict`` of every checkpoint is the average; training goes on with the weights under
+    The ``state_dict`` of a checkpoint is the average; training continues with the weights under
     :data:`TRAINED`.
 
-    Lightning's ``EMAWeightAveraging`` does not suffice: its checkpoints of a validation have both
-    sets of weights the wrong way round, its training ends with the average, so that it cannot be
-    resumed exactly, it averages 16-bit weights in 16 bits, and its decay has no ramp.
+    Lightning's ``EMAWeightAveraging`` is not sufficient. Its checkpoints of a validation swap both
+    sets of weights, its training ends with the average and cannot be resumed exactly, it averages
+    16-bit weights in 16 bits, and its decay has no ramp.
     """
 
     def __init__(self, decay: float) -> None:
@@ -131,37 +125,37 @@ class AveragedWeights(WeightAveraging):
         return self._average_model
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Begin with the present weights, on the device where training will be."""
+        """Initialise the average with the weights, on the device of the training."""
         self._device = trainer.strategy.root_device
         super().setup(trainer, pl_module, stage)
         if self._average_model is not None:
-            # The weights before the first step count as one; on the CPU, where reading it waits
-            # for no device.
+            # The initial weights count as one update. The counter is on the CPU, so that reading
+            # it does not synchronise with a device.
             self._average_model.n_averaged = torch.tensor(1)
 
     def _move(self, averages: list[Tensor], weights: list[Tensor], _: object) -> None:
-        """Move averages, all of one type, towards the weights."""
+        """Move averages of one dtype towards the weights."""
         if averages[0].is_floating_point():
             n = int(self._averaged.n_averaged)
             decay = min(self.decay, n / (n + _RAMP - 1))
-            # In 32 bits whatever the weights have: in 16 a thousandth of a difference is lost.
+            # In 32 bits, because 16 bits lose a thousandth of a difference.
             torch._foreach_lerp_(averages, [weight.float() for weight in weights], 1 - decay)
             return
         for average, weight in zip(averages, weights, strict=True):  # batch norm's counters
             average.copy_(weight)
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Put the average into the network."""
+        """Copy the average to the network."""
         self._set_aside = {name: value.clone() for name, value in pl_module.state_dict().items()}
         self._copy_average_to_current(pl_module)
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Put the trained weights back."""
+        """Restore the trained weights."""
         pl_module.load_state_dict(self._set_aside)
         self._set_aside = {}
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Keep the trained weights: a run may be resumed for longer."""
+        """Keep the trained weights, because a run may be resumed for longer."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return the average's number of updates and the step of the last one."""
@@ -169,14 +163,14 @@ class AveragedWeights(WeightAveraging):
         return {"num_updates": num_updates, "step": self._latest_update_step}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from there."""
+        """Restore the number of updates and the step."""
         self._averaged.n_averaged.fill_(int(state_dict["num_updates"]) + 1)
         self._latest_update_step = int(state_dict["step"])
 
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Save both, in the middle of a validation as well."""
+        """Save average and trained weights, also during a validation."""
         trained = self._set_aside or checkpoint["state_dict"]
         averaged = self._averaged.module.state_dict()
         checkpoint[TRAINED] = trained
@@ -187,12 +181,12 @@ class AveragedWeights(WeightAveraging):
     def on_load_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Take the average of a run that had one; that of another run begins with its weights."""
+        """Load the average, or start it from the weights of a run without an average."""
         self._averaged.module.load_state_dict(checkpoint.get(_AVERAGED, checkpoint["state_dict"]))
 
 
 def go_on_with_trained(checkpoint: dict[str, Any]) -> None:
-    """Make the trained weights of a loaded checkpoint those that training goes on with."""
+    """Make the trained weights of a loaded checkpoint its ``state_dict``, to train further."""
     if TRAINED in checkpoint:
         checkpoint[_AVERAGED] = checkpoint["state_dict"]
         checkpoint["state_dict"] = checkpoint.pop(TRAINED)

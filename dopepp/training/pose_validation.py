@@ -1,6 +1,6 @@
-"""Validation in poses: metrics, early stopping, and pictures in the run folder and the loggers.
+"""Pose metrics, early stopping and contact sheets of validations.
 
-Poses are recovered from the maps and go into the accumulator that every evaluation uses. To log
+Poses are recovered from the maps and compared by the same accumulator as in evaluations. To log
 another metric, add a field of :class:`~dopepp.metrics.row.PoseRow` and its name in :data:`LOGGED`.
 To draw another sheet of the first validation images, add a subclass of :class:`ValidationSheet`
 with a ``name`` and :meth:`~ValidationSheet.tiles`, a line in
@@ -40,33 +40,32 @@ LOGGED: Final = (
     "add_01d", "add_s_01d", "pass_5cm", "pass_10cm", "auc_10cm", "auc_s_10cm", "ar_mssd",
     "ar_mspd", "median_rotation_deg", "median_rotation_s_deg", "miss_rate",
 )  # fmt: skip
-_OF_MATCHES: Final = ("median_rotation_deg", "median_rotation_s_deg")
-"""Do not exist without a match."""
+_OF_MATCHES: Final = ("median_rotation_deg", "median_rotation_s_deg")  # Undefined without matches
 
 
 class PoseMetricsCallback(Callback):
     """Logs the pose metrics of every validation as ``val/<metric>``, averaged over objects.
 
     ``val/selection``, which chooses the best checkpoint, is the mean over objects of the exact AUC
-    up to 0.1 m, of ADD, or of ADD-S for an object with symmetries ("ADD(-S)"). The metrics stay
-    readable on :attr:`metrics` for callbacks further down the list.
+    of ADD up to 0.1 m, or of ADD-S for symmetric objects ("ADD(-S)"). Later callbacks in the list
+    can read :attr:`metrics`.
     """
 
     metrics: PoseMetrics
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Prepare an accumulator for the system's parts."""
+        """Create an accumulator for the system's parts."""
         assert isinstance(pl_module, PoseSystem)
         self.metrics = PoseMetrics(pl_module.parts)
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Start counting anew, on the device that gathers across processes."""
+        """Reset the accumulator, on the device that gathers across processes."""
         self.metrics.to(pl_module.device).reset()
 
     def on_validation_batch_end(  # type: ignore[override]
         self, trainer: Trainer, system: PoseSystem, outputs: ValidationOutput, batch: Batch, *_: Any
     ) -> None:
-        """Recover the batch's poses and compare them with its instances."""
+        """Recover the poses of the batch and compare them with its instances."""
         detections, truths = system.recover(outputs, batch), batch_instances(batch, system.parts)
         width = batch.images.shape[-1]
         cameras = batch.K.double().cpu().numpy()
@@ -74,7 +73,7 @@ class PoseMetricsCallback(Callback):
             self.metrics.update(*image, width)
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Log the mean over objects; what does not exist (nothing matched) is left out."""
+        """Log the means over objects, without metrics that are undefined."""
         rows = self.metrics.compute()
         values = {name: getattr(rows[MEAN], name) for name in LOGGED}
         objects = [row for name, row in rows.items() if name != MEAN]
@@ -82,7 +81,7 @@ class PoseMetricsCallback(Callback):
         counted = [area for area in areas if area is not None]
         values["selection"] = sum(counted) / len(counted) if counted else None
         for name, value in values.items():
-            # A selection needs a number even where no object was in the validation images.
+            # ModelCheckpoint needs a value even if the validation images have no objects.
             if value is None and name not in _OF_MATCHES:
                 value = math.nan
             if value is not None:
@@ -91,7 +90,7 @@ class PoseMetricsCallback(Callback):
 
 
 def batch_instances(batch: Batch, parts: tuple[Part, ...]) -> Iterator[list[Instance]]:
-    """Yield each image's ground truth in the form that samples have."""
+    """Yield the labelled instances of each image."""
     index = batch.object_index.cpu().numpy()
     poses, keypoints = batch.T_cam_obj.double().cpu().numpy(), batch.keypoints.cpu().numpy()
     visible = batch.visible_fraction.cpu().numpy()
@@ -104,32 +103,32 @@ def batch_instances(batch: Batch, parts: tuple[Part, ...]) -> Iterator[list[Inst
 
 
 class EarlyStop(EarlyStopping):
-    """Lightning's callback, for runs that are resumed.
+    """Lightning's early stopping for resumed runs.
 
-    The patience is that of the present config; and a run that has stopped does not train further,
-    unless it now has more patience.
+    The patience is that of the current config. A run that has stopped trains further only with a
+    larger patience.
     """
 
     @property
     def impatient(self) -> bool:
-        """Whether there were as many validations without an improvement as there may be."""
+        """Whether the number of validations without improvement has reached the patience."""
         return bool(self.wait_count >= self.patience)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on counting."""
+        """Restore the state, but not the patience."""
         super().load_state_dict({**state_dict, "patience": self.patience})
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """End at once what has ended before."""
+        """Stop a run again that has stopped before."""
         if self.impatient:
             trainer.should_stop = True
 
 
 class AUCCurves(Callback):
-    """Writes and logs ``val_auc`` after validations; must follow :class:`PoseMetricsCallback`."""
+    """Draws accuracy curves, ``val_auc``; must follow :class:`PoseMetricsCallback`."""
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw one curve per object; every process takes part in gathering the errors."""
+        """Draw one curve per object; all processes gather the errors."""
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         (metrics,) = (item.metrics for item in callbacks if isinstance(item, PoseMetricsCallback))
         curves = {name: metrics.errors(name) for name in metrics.parts}
@@ -154,16 +153,16 @@ class ValidationSheet(Callback):
 
     @abstractmethod
     def tiles(self, system: PoseSystem, outputs: ValidationOutput, batch: Batch) -> Sequence[Tile]:
-        """Return the pictures of all images of a batch, in order."""
+        """Return the tiles of all images of a batch, in order."""
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Start a new sheet."""
+        """Clear the sheet."""
         self._tiles, self._num_drawn = [], 0
 
     def on_validation_batch_end(  # type: ignore[override]
         self, trainer: Trainer, system: PoseSystem, outputs: ValidationOutput, batch: Batch, *_: Any
     ) -> None:
-        """Draw the batch's first images until the sheet is full."""
+        """Draw the first images of the batch until the sheet is full."""
         num = min(self.num_images - self._num_drawn, len(batch))
         if num <= 0 or not trainer.is_global_zero or trainer.sanity_checking:
             return
@@ -183,7 +182,7 @@ class ValidationSheet(Callback):
 
 
 class Overlays(ValidationSheet):
-    """Wireframes, the predicted ones yellow and the true ones green: ``val_overlay.png``."""
+    """Images with predicted (yellow) and true (green) wireframes: ``val_overlay.png``."""
 
     name: ClassVar[str] = "overlay"
 
@@ -194,13 +193,13 @@ class Overlays(ValidationSheet):
         tiles = []
         for row, detections in enumerate(system.recover(outputs, batch)):
             wireframes = [Wireframe(points, GREEN, "true") for points in truths[row]]
-            wireframes += [Wireframe(pose.keypoints, YELLOW, "predicted") for pose in detections]
+            wireframes += [Wireframe(item.keypoints, YELLOW, "predicted") for item in detections]
             tiles.append(Tile(overlay(images[row], wireframes), batch.keys[row]))
         return tiles
 
 
 class BeliefMaps(ValidationSheet):
-    """The images under the network's belief maps, corners' and centroid's: ``val_belief.png``."""
+    """Images under the belief maps of corners and centroid: ``val_belief.png``."""
 
     name: ClassVar[str] = "belief"
 
@@ -208,7 +207,7 @@ class BeliefMaps(ValidationSheet):
         super().__init__(num_images)
 
     def tiles(self, system: PoseSystem, outputs: ValidationOutput, batch: Batch) -> Sequence[Tile]:
-        """Return each image twice, under its corners' and under its centroid's beliefs."""
+        """Return each image twice: under the beliefs of corners and of the centroid."""
         images = batch.images.permute(0, 2, 3, 1).cpu().numpy()
         shape = (len(images), -1, NUM_KEYPOINTS, *outputs.belief.shape[-2:])
         beliefs = outputs.belief.reshape(shape).amax(dim=1).cpu().numpy()
@@ -226,7 +225,11 @@ def _log_picture(trainer: Trainer, name: str, image: Picture) -> None:
 
 @contextmanager
 def best_effort(what: str) -> Iterator[None]:
-    """Report a file that cannot be written in one line, and go on."""
+    """Log a warning instead of an ``OSError``.
+
+    Args:
+        what: Name of the file for the warning.
+    """
     try:
         yield
     except OSError as error:

@@ -1,8 +1,8 @@
-"""Several processes on one machine that do not outlive one another.
+"""Distributed training whose processes end when one of them dies.
 
-A process that waits in a collective for a dead one would wait for the process group's timeout, half
-an hour; and Lightning kills the first process without a message when another one ends. Here every
-process watches: the first one its children, the children their parent.
+A process in a collective would wait for a dead process until the timeout of half an hour, and
+Lightning kills rank 0 without a message when another process ends. Here, rank 0 watches its
+children and the children watch their parent.
 """
 
 from __future__ import annotations
@@ -23,19 +23,18 @@ from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 
 from dopepp.core.errors import RunError
 
-_STARTED_BY: Final = "DOPEPP_STARTED_BY"
-"""Environment variable with the id of the process that started this one."""
+_STARTED_BY: Final = "DOPEPP_STARTED_BY"  # Environment variable with the parent's process id
 _POLL_S: Final = 1.0
-_NOTICE_S: Final = 5.0  # Time that a death may take to show after the connection that it broke
-_GRACE_S: Final = 20.0  # Time after a death in which a process may end by itself
+_NOTICE_S: Final = 5.0  # Time from a broken connection until the death of a process is noticed
+_GRACE_S: Final = 20.0  # Time after a death in which other processes may end by themselves
 
 
 class ProcessDiedError(RunError):
-    """Another process of the run has ended before it should."""
+    """Another process of the run has ended unexpectedly."""
 
 
 class Watch(threading.Thread):
-    """Watches this process's children, rank 1 first, and its parent if that belongs to the run."""
+    """Watches the children of this process, rank 1 first, and its parent if part of the run."""
 
     def __init__(self, children: Sequence[subprocess.Popen[Any]], parent: int | None) -> None:
         super().__init__(daemon=True, name="process-watch")
@@ -43,21 +42,21 @@ class Watch(threading.Thread):
         self._stopped = threading.Event()
 
     def run(self) -> None:
-        """End this process some time after another has died, should it still be there."""
+        """End this process if it still runs some time after the death of another."""
         while not self._stopped.wait(_POLL_S):
             death = self.death()
             if death is not None:
                 time.sleep(_GRACE_S)
                 sys.stderr.write(f"{death}: the run ends\n")
                 sys.stderr.flush()
-                os._exit(1)  # the main thread hangs in a collective, where no exception reaches it
+                os._exit(1)  # exceptions do not reach the main thread in a collective
 
     def stop(self) -> None:
-        """Stop looking: from now on a process may end."""
+        """Stop watching; processes may end from now on."""
         self._stopped.set()
 
     def death(self, wait_s: float = 0.0) -> str | None:
-        """Say which process has died, after waiting for a death to show; None if none has."""
+        """Return which process has died within ``wait_s`` seconds; None if none has."""
         deadline = time.monotonic() + wait_s
         while True:
             for rank, child in enumerate(self._children, start=1):
@@ -73,7 +72,7 @@ class Watch(threading.Thread):
 
 
 class WatchedLauncher(_SubprocessScriptLauncher):
-    """Starts the other processes as Lightning does, and has each watch the others."""
+    """Starts the other processes like Lightning and watches them."""
 
     def launch(
         self, function: Callable[..., Any], *args: Any, trainer: Trainer | None = None, **kw: Any
@@ -103,14 +102,14 @@ class WatchedLauncher(_SubprocessScriptLauncher):
                 raise
             raise ProcessDiedError(f"{death}: the run ends") from error
         finally:
-            if death is None:  # else the watch goes on: what follows may hang, too
+            if death is None:  # otherwise keep watching, because cleaning up may hang
                 watch.stop()
 
 
 class WatchedDDP(DDPStrategy):
-    """Distributed data parallel whose processes notice each other's death.
+    """Distributed data parallel with :class:`WatchedLauncher`.
 
-    The death of a process on another machine shows after ``timeout_s`` seconds in a collective.
+    The death of a process on another machine is noticed after ``timeout_s`` in a collective.
     """
 
     def __init__(self, timeout_s: float) -> None:

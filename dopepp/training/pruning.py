@@ -1,7 +1,7 @@
-"""A training as one trial of a study: what it reports after each validation, and when it stops.
+"""Reports of a training to a hyperparameter study, and pruning of poor trials.
 
-The study is a database that all its trials write to, in this process or on another machine; its
-objective is the value that the best checkpoint is chosen by.
+The study is a database to which all trials write, also from other machines. Its objective is the
+value that chooses the best checkpoint.
 """
 
 from __future__ import annotations
@@ -19,21 +19,31 @@ if TYPE_CHECKING:
     from optuna import Study
     from optuna.storages import BaseStorage
 
-_WAIT_S: Final = 60  # How long a trial waits for others to finish writing to an SQLite file
-MOST: Final = 10**6  # Above any number of trials or epochs that means something
+_WAIT_S: Final = 60  # Timeout of locks on an SQLite file
+MOST: Final = 10**6  # Maximum number of trials or epochs
 
 
 class PrunedError(Exception):
-    """A trial was stopped because it was worse than the others; no failure."""
+    """A trial was stopped because other trials are better; not a failure."""
 
 
 class TrialReport(Callback):
-    """Reports the objective after each validation and stops a trial that is not worth finishing.
+    """Reports the objective after each validation and stops poor trials.
 
-    Optuna's median rule: a trial is stopped when its best value so far is worse than the median of
-    the other trials' values at the same epoch, once ``after_trials`` are finished, and not in its
-    first ``after_epochs``. The storage is an SQLite file or a database URL, ``monitor`` the logged
-    value that is the objective. ``pruned`` is why training was stopped, empty where it was not.
+    Optuna's median rule stops a trial whose best value is worse than the median of the other
+    trials' values at the same epoch.
+
+    Args:
+        storage: SQLite file or database URL.
+        study: Name of the study.
+        number: Number of the trial.
+        monitor: Logged value that is the objective.
+        prune: Whether poor trials are stopped.
+        after_trials: Number of finished trials before any trial is stopped.
+        after_epochs: Number of epochs before a trial is stopped.
+
+    Attributes:
+        pruned: Why training was stopped; empty otherwise.
     """
 
     _study: Study
@@ -49,24 +59,24 @@ class TrialReport(Callback):
         after_epochs: int,
     ) -> None:
         self.monitor, self.number, self.prune, self.pruned = monitor, number, prune, ""
-        self._place, self._name = storage, study
+        self._location, self._name = storage, study
         self._after_trials = check("search.prune_after_trials", after_trials, int, Range(1, MOST))
         self._after_epochs = check("search.prune_after_epochs", after_epochs, int, Range(0, MOST))
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Find the trial in its study."""
+        """Load the study and the id of the trial."""
         import optuna
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         pruner = optuna.pruners.MedianPruner(self._after_trials, self._after_epochs)
-        self._storage = open_storage(self._place)
+        self._storage = open_storage(self._location)
         self._study = optuna.load_study(study_name=self._name, storage=self._storage, pruner=pruner)
         study_id = self._storage.get_study_id_from_name(self._name)
-        find = self._storage.get_trial_id_from_study_id_trial_number
-        self._trial_id = find(study_id, self.number)
+        trial_id = self._storage.get_trial_id_from_study_id_trial_number(study_id, self.number)
+        self._trial_id = trial_id
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Report this epoch's value; one that goes on after an interruption repeats itself."""
+        """Report the value of the epoch; a resumed trial repeats reports."""
         value = trainer.callback_metrics.get(self.monitor)
         if value is None or not math.isfinite(value):
             return
@@ -83,27 +93,38 @@ class TrialReport(Callback):
 
 
 def raise_if_pruned(trainer: Trainer) -> None:
-    """Raise :class:`PrunedError`, which says why, if training was stopped early."""
+    """Check whether training was stopped early.
+
+    Raises:
+        PrunedError: The trial was pruned.
+    """
     for callback in trainer.callbacks:  # type: ignore[attr-defined]
         if isinstance(callback, TrialReport) and callback.pruned:
             raise PrunedError(callback.pruned)
 
 
-def open_storage(place: str) -> BaseStorage:
-    """Open or create the database of a study; a :class:`UserError` where that fails."""
+def open_storage(location: str) -> BaseStorage:
+    """Open or create the database of a study.
+
+    Args:
+        location: SQLite file or database URL.
+
+    Raises:
+        UserError: The database cannot be opened.
+    """
     from optuna.exceptions import StorageInternalError
     from optuna.storages import RDBStorage
     from sqlalchemy.exc import SQLAlchemyError
 
     try:
-        if "://" in place:
-            return RDBStorage(place)
-        path = Path(place)
+        if "://" in location:
+            return RDBStorage(location)
+        path = Path(location)
         path.parent.mkdir(parents=True, exist_ok=True)
-        # Absolute, because a job may run in another folder.
+        # Absolute, because jobs may run in other folders.
         url = f"sqlite:///{path.absolute()}"
         return RDBStorage(url, engine_kwargs={"connect_args": {"timeout": _WAIT_S}})
     except (OSError, ImportError, RuntimeError, SQLAlchemyError, StorageInternalError) as error:
-        got = f"search.storage={place}, which cannot be opened: {error}"
-        allowed = "a file of an Optuna study or a place for one, or a database URL"
-        raise UserError(got, allowed, "choose another search.storage") from error
+        problem = f"search.storage={location}, which cannot be opened: {error}"
+        allowed = "an existing or new file of an Optuna study, or a database URL"
+        raise UserError(problem, allowed, "choose another search.storage") from error
