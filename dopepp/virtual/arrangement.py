@@ -1,7 +1,7 @@
-"""A scene in the making: what is in it so far, and whether one more object fits.
+"""Composition of a scene: add objects one by one while every target stays visible.
 
-Whether every target stays visible is told by a small depth image of the objects so far. Each object
-is drawn once, alone; trying another costs that one object, not the whole scene.
+A small depth image of the accepted objects measures visibility. Each object is drawn once, alone,
+so testing a candidate costs one object, not the whole scene.
 """
 
 from __future__ import annotations
@@ -35,15 +35,11 @@ from dopepp.virtual.renderers.raster.visibility import (
 from dopepp.virtual.scene import NEAR, Material, SceneObject
 
 _REDRAWS: Final = 25
-"""Poses to try before all of a pose is drawn anew, so that a place without any depth for the part
-ends nothing; in 20,000 scenes of the preset ``paper`` with the paper's parts none was given up."""
+"""Redraws of a position before the whole pose is drawn anew: some positions fit no depth."""
 
 
 class Composition:
-    """Objects that a preset accepts beside each other.
-
-    A distractor may be one of ``negatives`` instead of a primitive.
-    """
+    """Objects that a preset accepts together; ``negatives`` may serve as distractors."""
 
     def __init__(self, preset: Preset, rng: Generator, negatives: Sequence[Body]) -> None:
         self.preset, self.rng, self.negatives = preset, rng, negatives
@@ -58,7 +54,7 @@ class Composition:
         self._preview = Preview(self.K, self.size, self.preset.min_visible_fraction)
 
     def draw_material(self, body: Body) -> Material:
-        """Draw what a body is made of; a part's instances may all be made of the same."""
+        """Draw a body's material; all instances of a part may share it."""
         if body.part is None or not self._alike:
             return self.preset.materials.draw(self.rng, body.surface)
         name = body.part.name
@@ -72,7 +68,7 @@ class Composition:
         return self.preset.distractors.draw(self.rng, width_at_depth, self.negatives)
 
     def add(self, body: Body, T_cam_obj: Transform, material: Material) -> bool:
-        """Add a body where it stands before the camera and no target is hidden too much."""
+        """Add a body if it is in front of the camera and hides no target too much."""
         extremes = transform(T_cam_obj, body.surface.hull)
         if extremes[:, 2].min() <= NEAR:
             return False
@@ -83,7 +79,7 @@ class Composition:
         return True
 
     def _is_well_placed(self, item: SceneObject, extremes: Float[np.ndarray, "hull 3"]) -> bool:
-        """Tell whether a target is not tiny, its centre in the frame and at a wanted depth."""
+        """Return whether a target is large enough, inside the frame and at a wanted depth."""
         if item.part is None:
             return True
         middle = transform(item.T_cam_obj, item.part.cuboid[CENTROID])
@@ -94,12 +90,12 @@ class Composition:
             centre = project(middle, self.K)
             if not ((centre >= -0.5) & (centre < np.array(self.size) - 0.5)).all():
                 return False
-        # No camera shows a target whose image is smaller both ways.
+        # A target below two pixels is not recognisable.
         return bool(np.ptp(project(extremes, self.K), axis=0).max() >= 2.0)
 
 
 class Preview:
-    """The objects accepted so far, drawn coarsely."""
+    """A coarse depth image of the accepted objects."""
 
     def __init__(self, K: CameraMatrix, size: Size, min_visible: float) -> None:
         scale = min(160 / size[0], 1.0)  # smaller images keep their size
@@ -136,13 +132,13 @@ class Preview:
         hidden = self._owners[frame][in_front]
         losses = np.bincount(hidden[hidden >= 0], minlength=len(self._visible))
         left_px = [have - int(loss) for have, loss in zip(self._visible, losses, strict=True)]
-        own = int(np.count_nonzero(in_front))
+        drawn_px = int(np.count_nonzero(in_front))
         needed = self._least * whole if item.is_target else 0.0
-        if (np.array([*left_px, own]) < [*self._needed, needed]).any():
+        if (np.array([*left_px, drawn_px]) < [*self._needed, needed]).any():
             return False
         nearest[in_front] = drawn[in_front]
         self._owners[frame][in_front] = len(left_px)
-        self._visible = [*left_px, own]
+        self._visible = [*left_px, drawn_px]
         self._needed.append(needed)
         return True
 
@@ -174,24 +170,24 @@ def _draw_pose(composition: Composition, body: Body) -> Transform:
     preset, rng = composition.preset, composition.rng
     rotation = preset.turning.draw(rng)
     turned = body.surface.hull @ rotation.T
-    place = preset.placement.draw(rng, composition.K, composition.size, turned)
-    return make_transform(rotation, place)
+    position = preset.placement.draw(rng, composition.K, composition.size, turned)
+    return make_transform(rotation, position)
 
 
 def _poses(composition: Composition, body: Body) -> Iterator[Transform]:
-    """Yield poses to try, each drawn when it is asked for; what the placement keeps comes again."""
+    """Yield candidate poses; redraws keep the orientation and whatever the placement keeps."""
     while True:
         pose = _draw_pose(composition, body)
         for _ in range(_REDRAWS):
             yield pose
-            place = composition.preset.placement.redraw(composition.rng, pose[:3, 3])
-            if place is None:
+            position = composition.preset.placement.redraw(composition.rng, pose[:3, 3])
+            if position is None:
                 break
-            pose = make_transform(pose[:3, :3], place)
+            pose = make_transform(pose[:3, :3], position)
 
 
 def _place_distractor(composition: Composition, reference: float) -> None:
-    """Draw a distractor up to eight times, until it pierces no target and hides none too much."""
+    """Draw a distractor until it neither pierces nor hides a target, at most eight times."""
     rng, ranges = composition.rng, composition.preset.distractors
     for _ in range(8):
         depth = reference * rng.uniform(*ranges.depth)
@@ -207,8 +203,8 @@ def _place_distractor(composition: Composition, reference: float) -> None:
 
 
 def _is_clear(composition: Composition, body: Body, T_cam_obj: Transform) -> bool:
-    """Tell whether no target reaches into the core of a new object."""
-    # Of the bounding sphere's radius, so much is taken as solid.
+    """Return whether no target reaches into the core of a new object."""
+    # 60 % of the bounding sphere's radius counts as solid.
     centre, core = T_cam_obj[:3, 3], 0.6 * body.surface.radius
     for target in composition.objects:
         away = float(np.linalg.norm(target.T_cam_obj[:3, 3] - centre))

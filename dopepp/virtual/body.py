@@ -1,7 +1,7 @@
-"""Bodies: what can be put into a scene, on which faces it can lie, and what stands around targets.
+"""Bodies: surfaces that a scene can contain, their convex hulls and stable faces, and distractors.
 
-To add a shape that distracts, yield it from ``_solids`` or ``_profiles``; to add a part that must
-not be mistaken for a target, give it to the factory as a negative.
+To add a distractor shape, yield it from ``_solids`` or ``_profiles``. To add a part that must not
+be mistaken for a target, give it to the factory as a negative.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Body:
     """A surface that can be posed.
 
     Attributes:
-        part: None for what no network is to find.
-        source: The body it was stretched from, by ``stretch`` along x, y and z.
+        part: The part, if the network must detect it.
+        source: The body that was stretched by ``stretch`` along x, y and z to make this one.
     """
 
     surface: Surface
@@ -42,19 +42,23 @@ class Body:
 
     @cached_property
     def hull(self) -> Hull:
-        """Its convex hull; that of a stretched body is stretched, not computed again."""
+        """Convex hull; for a stretched body, the stretched hull of its source."""
         if self.source is not None:
             return self.source.hull.scaled(np.array(self.stretch))
         return make_hull(self.surface)
 
     def stretched(self, scale: Vector) -> Body:
-        """Return a body of no part, stretched along its axes by positive factors."""
+        """Return a distractor stretched along the axes by positive factors."""
         stretch = triple(scale)
         return Body(self.surface.scaled(np.array(stretch)), source=self, stretch=stretch)
 
 
 def make_body(part: Part, *, is_target: bool) -> Body:
-    """Prepare a part's mesh; a part without a mesh is a UserError."""
+    """Prepare a part's mesh for scenes.
+
+    Raises:
+        UserError: The part has no mesh.
+    """
     if part.mesh is None:
         allowed = "parts that were read from a mesh file or built in"
         fix = "give the part's mesh file; a checkpoint's objects table holds no mesh"
@@ -68,8 +72,8 @@ class Hull:
 
     Attributes:
         vertices: Object frame, metres; the lowest point of the body is always one of them.
-        facets: Number of the flat face that each triangle belongs to.
-        centre: Centre of mass of a solid body, object frame, metres.
+        facets: Number of each triangle's flat face.
+        centre: Centre of mass of the solid body, object frame, metres.
     """
 
     vertices: Vertices
@@ -84,11 +88,11 @@ class Hull:
 
     @cached_property
     def rests(self) -> tuple[Float[np.ndarray, "rests 3"], Float[np.ndarray, "rests"]]:
-        """Outward normals of the faces on which the body rests, and how often it does.
+        """Outward normals of the stable faces, and the frequency with which the body rests on each.
 
-        A face is stable if the centre of mass stands above it. Its frequency is taken as the
-        solid angle under which the centre sees it: the share of directions in which a body that
-        falls without bouncing lands on it.
+        A face is stable if the centre of mass is above it. Its frequency is its solid angle from
+        the
+        centre: the share of directions in which a body falling without bouncing lands on it.
         """
         corners = self.vertices[self.triangles] - self.centre
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -165,7 +169,7 @@ def _centre_of_mass(corners: Float[np.ndarray, "faces 3 3"]) -> Vector:
 def _foot_inside(
     corners: Float[np.ndarray, "triangles 3 3"], normals: Float[np.ndarray, "triangles 3"]
 ) -> Bool[np.ndarray, "triangles"]:
-    """Tell whether the origin's foot on each triangle's plane lies in the triangle."""
+    """Return whether the origin's foot on each triangle's plane lies in the triangle."""
     foot = np.einsum("ij,ij->i", corners[:, 0], normals)[:, None, None] * normals[:, None]
     along = np.roll(corners, -1, axis=1) - corners
     side = np.einsum("ijk,ijk->ij", np.cross(along, foot - corners), normals[:, None])
@@ -189,12 +193,11 @@ class Distractors(Checked):
     """Random objects around the targets.
 
     Attributes:
-        number: Per image; an object that would hide a target too much or finds no place is left
-            out.
+        number: Count per image; objects that would hide a target too much are left out.
         image_share: Diameter of a primitive's image.
-        depth: Of no use on a plane, which gives the depth.
-        lookalike_share: Chance that a distractor is a negative, where there is one: another weakly
-            textured part.
+        depth: Depth of floating distractors; unused on a table.
+        lookalike_share: Chance that a distractor is a negative (another weakly textured part), if
+            there are negatives.
         lookalike_scale: Size of a negative over its real size.
     """
 
@@ -205,25 +208,25 @@ class Distractors(Checked):
     lookalike_scale: Annotated[Pair, Span(0.01, 100.0, "factor")] = (0.7, 1.3)
 
     def draw(self, rng: Generator, width_at_depth: float, negatives: Sequence[Body]) -> Body:
-        """Draw a distractor for a depth at which the image's width shows so many metres."""
+        """Draw a distractor for a depth at which the image spans ``width_at_depth`` metres."""
         if rng.random() < self.lookalike_share and negatives:
             negative = negatives[int(rng.integers(len(negatives)))]
             return negative.stretched(np.full(3, rng.uniform(*self.lookalike_scale)))
         shapes = distractor_shapes()
         radius = 0.5 * rng.uniform(*self.image_share) * width_at_depth
         shape = shapes[int(rng.integers(len(shapes)))]
-        # Stretched by another factor along each axis, none looks like another.
+        # Different factors along the axes make every distractor look different.
         return shape.stretched(radius * rng.uniform(0.5, 1.0, 3))
 
 
 @cache
 def distractor_shapes() -> tuple[Body, ...]:
-    """Return the library of shapes; each is centred and has a bounding sphere of radius 1."""
+    """Return the distractor shapes, each centred, with a bounding sphere of radius 1."""
     return tuple(Body(_unit_surface(solid)) for solid in _solids())
 
 
 def _solids() -> Iterator[Manifold]:
-    """Yield solids of any size and place."""
+    """Yield solids of any size and position."""
     yield Manifold.cube((1.0, 0.7, 0.5))
     yield Manifold.cube((1.0, 0.9, 0.15))
     yield Manifold.cylinder(1.0, 0.35, circular_segments=48)
@@ -235,7 +238,7 @@ def _solids() -> Iterator[Manifold]:
 
 
 def _profiles() -> Iterator[tuple[CrossSection, float]]:
-    """Yield plates with holes and extruded profiles: what lies about in a workshop."""
+    """Yield profiles and thicknesses of plates with holes and other workshop parts."""
 
     def box(width: float, height: float, x: float = 0.0, y: float = 0.0) -> CrossSection:
         return CrossSection.square((width, height), center=True).translate((x, y))

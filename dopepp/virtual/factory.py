@@ -1,10 +1,8 @@
-"""The factory: image ``(epoch, index)`` of an endless, reproducible supply.
+"""The factory: renders image ``(epoch, index)`` of an endless, reproducible supply.
 
-A scale shows the same scene from nearer or farther: the camera moves, the world stays (paper Fig.
-11). The camera goes along the ray to the middle of the targets and keeps its orientation and its
-lens, so a single part stays at its place in the image and grows about as a picture of it would.
-Objects, lamps and the plane keep their places in the world; light from everywhere, and the picture
-behind objects in mid-air, are infinitely far away and do not change.
+A scale renders the same scene from nearer or farther (paper Fig. 11). The camera moves along the
+ray to the middle of the targets and keeps its orientation and lens. Objects, lamps and the plane
+stay in the world; ambient light and the background of floating objects are infinitely far away.
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ from dopepp.parts.part import Part
 from dopepp.virtual.arrangement import Composition, arrange_floating
 from dopepp.virtual.backgrounds import Backgrounds, ProceduralBackgrounds
 from dopepp.virtual.backgrounds.procedural import ClutteredBackgrounds
-from dopepp.virtual.body import Body, make_body
+from dopepp.virtual.body import make_body
 from dopepp.virtual.presets import Preset
 from dopepp.virtual.presets.table import plane_of
 from dopepp.virtual.renderers import find_renderer
@@ -36,7 +34,7 @@ from dopepp.virtual.sensor import capture
 from dopepp.virtual.tabletop import arrange_on_table
 
 _PACKAGE: Final = Path(__file__).parents[1]
-_FOLDERS: Final = ("virtual", "parts", "geometry")  # which decide a render's pixels and labels
+_FOLDERS: Final = ("virtual", "parts", "geometry")  # the code that decides pixels and labels
 
 
 class Factory:
@@ -46,13 +44,13 @@ class Factory:
     bytes for the same (seed, epoch, index), in any order.
 
     Args:
-        parts: Targets, each with a name of its own.
+        parts: Targets, each with its own name.
         preset: Distribution of the scenes.
         seed: At least 0.
         backgrounds: Procedural by default.
         renderer: Name of a renderer.
-        negatives: Parts that are shown among the distractors, so that a network learns not to find
-            them; the built-in parts that are no targets are always among them.
+        negatives: Parts to show among the distractors, so that a network learns to reject them;
+            built-in parts that are not targets are always added.
 
     Raises:
         UserError: There is no part, a part has no mesh, two share a name, a negative is a target
@@ -70,7 +68,7 @@ class Factory:
     ) -> None:
         names = [part.name for part in parts]
         if not parts or len(set(names)) != len(names):
-            allowed = "at least one part, each with a name of its own"
+            allowed = "at least one part, each with its own name"
             raise UserError(f"parts {names} to render", allowed, "name the parts differently")
         if seed < 0:
             raise UserError(f"seed {seed}", "an integer >= 0", "choose another seed")
@@ -82,12 +80,16 @@ class Factory:
         self._others = [make_body(part, is_target=False) for part in self.negatives]
 
     def render(self, epoch: int, index: int, scale: float = 1.0) -> Rendered:
-        """Render an image with its ground truth, as the scene's sensor takes it.
+        """Render an image with its ground truth, including the sensor's effects.
 
-        ``scale`` is how many times as large the targets appear as the preset has it.
+        Args:
+            epoch: Epoch of the image.
+            index: Index of the image within the epoch.
+            scale: Magnification of the targets, relative to the preset.
 
         Raises:
-            UserError: The preset cannot show the part, or the camera cannot stand there.
+            UserError: The preset cannot show the part, or the scale puts the camera below the
+                table.
         """
         rendered = self._render(self.scene(epoch, index, scale))
         return replace(rendered, image=capture(rendered.image, rendered.scene.sensor))
@@ -119,19 +121,26 @@ class Factory:
             T_cam_table = _moved(T_cam_table, shift)
             plane = plane_of(T_cam_table)
             if plane.offset >= 0:
-                got = f"scale {scale:g} of a scene whose parts reach higher than the camera"
+                problem = f"scale {scale:g} of a scene whose parts reach higher than the camera"
                 allowed = "a scale at which the camera is above the table"
-                raise UserError(got, allowed, "choose a larger scale")
+                raise UserError(problem, allowed, "choose a larger scale")
             background = picture.seen(K, size, T_cam_table)
         if targets and not any(item.is_target for item in composition.objects):
-            raise _unplaced(targets[0], preset)
+            part = targets[0].part
+            assert part is not None
+            raise UserError(
+                f"part {part.name} of diameter {part.diameter:.3g} m, which found no place in any "
+                f"draw of preset {preset.name}",
+                "a part that the preset's distances and field of view can show",
+                "check the mesh's unit, or replace the preset's distances or field of view",
+            )
         objects = [
             replace(item, T_cam_obj=_moved(item.T_cam_obj, shift)) for item in composition.objects
         ]
         # The camera may have reached or passed some of them.
         hulls = (transform(item.T_cam_obj, item.surface.hull) for item in objects)
         seen = [item for item, hull in zip(objects, hulls, strict=True) if hull[:, 2].min() > NEAR]
-        # How strongly a lamp lights the scene stays the same.
+        # ``reach`` stays, so the lamps light the scene as before.
         lights = tuple(
             replace(light, position=triple(np.array(light.position) + shift)) for light in lights
         )
@@ -139,27 +148,14 @@ class Factory:
         return Scene(K, background, tuple(seen), lights, ambient, plane, sensor)
 
 
-def _unplaced(body: Body, preset: Preset) -> UserError:
-    assert body.part is not None
-    return UserError(
-        f"part {body.part.name} of diameter {body.part.diameter:.3g} m, which found no place in "
-        f"any draw of preset {preset.name}",
-        "a part that the preset's distances and field of view can show",
-        "check the mesh's unit, or replace the preset's distances or field of view",
-    )
-
-
 def approach(objects: Sequence[SceneObject], scale: float) -> Vector:
-    """Return by how much the world moves in the camera frame, metres.
+    """Return the shift of the world in the camera frame, metres, for a magnification > 0.
 
-    The distance from the camera to the mean of the targets' cuboids' centres is divided by the
-    positive ``scale``: as many times as large they appear. Without a target the camera stays.
+    The distance from the camera to the mean of the targets' centres is divided by ``scale``;
+    without a target the camera stays.
     """
-    centres = [
-        transform(item.T_cam_obj, item.part.cuboid[CENTROID])
-        for item in objects
-        if item.part is not None
-    ]
+    pairs = [(item.T_cam_obj, item.part) for item in objects if item.part is not None]
+    centres = [transform(T_cam_obj, part.cuboid[CENTROID]) for T_cam_obj, part in pairs]
     if not centres or scale == 1:
         return np.zeros(3)
     return np.asarray((1 / scale - 1) * np.mean(centres, axis=0))
@@ -171,10 +167,7 @@ def _moved(T_cam: Transform, shift: Vector) -> Transform:
 
 @cache
 def code_hash() -> str:
-    """Return a SHA-256 of the rendering code: kept renders of other code are not reused.
-
-    Two versions of it may draw the same scene differently.
-    """
+    """Return a SHA-256 of the rendering code; cached renders of other code are not reused."""
     digest = hashlib.sha256()
     for folder in _FOLDERS:
         for path in sorted((_PACKAGE / folder).rglob("*.py")):
@@ -189,8 +182,8 @@ def _all_negatives(parts: Sequence[Part], given: Sequence[Part]) -> tuple[Part, 
         if part.name in names or part.mesh_hash in hashes:
             raise UserError(
                 f"negative {part.name}, which is one of the targets {', '.join(sorted(names))}",
-                "parts of other names and other meshes than the targets'",
-                "take it out of the negatives",
+                "parts whose names and meshes differ from those of the targets",
+                "remove it from the negatives",
             )
     names |= {part.name for part in given}
     hashes |= {part.mesh_hash for part in given}

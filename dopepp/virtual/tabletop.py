@@ -1,9 +1,8 @@
-"""Objects on a table: each on the plane beside the others, or dropped onto a heap.
+"""Objects on a table: side by side on the plane, or dropped onto a heap.
 
-They are set down from above, and a height map knows what lies where. The table's frame has its
-origin on the plane and z upwards. Heights are kept on a square grid of cells; an object is let down
-until, in some cell, its underside meets what is already there. That is no physics: an object stays
-as it was turned. Objects never overlap but by what changes within a cell.
+The table frame has its origin on the plane and z upwards. A height map on a square grid holds the
+objects so far. A new object is lowered until its underside meets the map in some cell. It keeps its
+orientation (this is no physics), and objects overlap by at most the height change within a cell.
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ Cell = tuple[int, int]  # x and y
 
 
 def arrange_on_table(composition: Composition, table: Table, targets: Sequence[Body]) -> Transform:
-    """Choose a view, add targets and distractors, and return T_cam_table (plane z = 0, z up)."""
+    """Choose a view, add targets and distractors; return T_cam_table (plane z = 0, z up)."""
     rng = composition.rng
-    # Another view is drawn where no target finds room in the image.
+    # Draw another view if no target fits into the image.
     for _ in range(8):
         composition.clear()
         setting = _Setting(composition, table, targets)
@@ -50,17 +49,17 @@ def arrange_on_table(composition: Composition, table: Table, targets: Sequence[B
 
 @dataclass(frozen=True, eq=False)
 class _Lying:
-    """One way to lie, with the heights of lowest point and centre of mass above the plane."""
+    """A resting pose, with the heights of lowest point and centre of mass above the plane."""
 
     T_table_obj: Transform
     footprint: Footprint
-    place: Cell
+    cell: Cell
     height: float
     centre: float
 
 
 class _Setting:
-    """One view of the table and what lies on it."""
+    """A view of the table and the objects on it."""
 
     def __init__(self, composition: Composition, table: Table, targets: Sequence[Body]) -> None:
         self.composition, self.table, self.rng = composition, table, composition.rng
@@ -77,46 +76,46 @@ class _Setting:
         self._inverse_depth = inverse_depth_row(plane_of(self.T_cam_table), composition.K)
 
     def place(self, body: Body) -> bool:
-        """Lay a body down; tell whether it found a place."""
+        """Lay a body down; return whether it fits."""
         material = self.composition.draw_material(body)
         for _ in range(6):  # turned anew, until it fits
             for lying in self._candidates(body):
                 T_cam_obj = self.T_cam_table @ lying.T_table_obj
                 if self.composition.add(body, T_cam_obj, material):
-                    self._map.put(lying.footprint, lying.place, lying.height)
+                    self._map.put(lying.footprint, lying.cell, lying.height)
                     return True
         return False
 
     def _candidates(self, body: Body) -> Iterable[_Lying]:
-        """Draw ways in which a body could lie; on a heap, the lowest first."""
+        """Draw resting poses of a body; on a heap, the lowest first."""
         if not self.table.heaped:
             return self._turned(body)
-        # Things slide down: the lowest of two turnings' places.
+        # Objects slide down: prefer the lowest pose of two orientations.
         several = [lying for _ in range(2) for lying in self._turned(body)]
         return sorted(several, key=lambda lying: lying.centre)
 
     def _turned(self, body: Body) -> Iterator[_Lying]:
-        """Turn a body at random and yield places for it."""
+        """Turn a body at random and yield resting poses."""
         rotation, lowest = self.table.draw_turning(self.rng, body.hull)
         footprint = self._map.footprint(body.surface, rotation, lowest)
         if footprint is None:
             return
-        cell, (rows, columns) = self._map.cell, footprint.top.shape
+        side, (rows, columns) = self._map.cell, footprint.top.shape
         for _ in range(6):
-            drawn = self._draw_place()
-            if drawn is None:
+            point = self._draw_point()
+            if point is None:
                 continue
-            x, y = (round(value / cell) for value in drawn)
-            place = x - footprint.corner[0] - columns // 2, y - footprint.corner[1] - rows // 2
-            height = self._map.height(footprint, place)
-            if height is None or not (self.table.heaped or self._map.is_free(footprint, place)):
+            x, y = (round(value / side) for value in point)
+            cell = x - footprint.corner[0] - columns // 2, y - footprint.corner[1] - rows // 2
+            height = self._map.height(footprint, cell)
+            if height is None or not (self.table.heaped or self._map.is_free(footprint, cell)):
                 continue
-            origin = np.array([place[0] * cell, place[1] * cell, height - lowest])
+            origin = np.array([cell[0] * side, cell[1] * side, height - lowest])
             centre = origin[2] + float(rotation[2] @ body.hull.centre)
-            yield _Lying(make_transform(rotation, origin), footprint, place, height, centre)
+            yield _Lying(make_transform(rotation, origin), footprint, cell, height, centre)
 
-    def _draw_place(self) -> tuple[float, float] | None:
-        """Draw a point of the table, metres: in the heap's circle, or seen by a random pixel."""
+    def _draw_point(self) -> tuple[float, float] | None:
+        """Draw a point of the table, metres: in the heap's circle, or under a random pixel."""
         rng = self.rng
         if self.table.heaped:
             # The root makes the points uniform over the circle's area.
@@ -133,7 +132,7 @@ class _Setting:
 
 
 def _in_the_middle(T_cam_table: Transform, composition: Composition) -> Transform:
-    """Turn the camera so that the middle of a window, not of the picture, looks at the table."""
+    """Turn the camera so that the middle of the window, not of the picture, shows the origin."""
     middle = np.array([*(np.array(composition.size) / 2 - 0.5), 1.0])
     ray = np.linalg.solve(composition.K, middle)
     aside = np.array([-ray[1], ray[0], 0.0])  # z × ray: about it, by the angle between them
@@ -145,12 +144,12 @@ def _in_the_middle(T_cam_table: Transform, composition: Composition) -> Transfor
 
 @dataclass(frozen=True, eq=False)
 class Footprint:
-    """A turned object as seen from below and above, with a border of one cell around it.
+    """Height maps of a turned object from below and above, with a border of one cell.
 
     Attributes:
-        bottom: Height of its underside above its lowest point, metres, the least of a cell and
-            its eight neighbours, for what happens between cells' centres; infinite beside it.
-        top: Height of its upper side above its lowest point, metres; −infinite beside it.
+        bottom: Height of the underside above the lowest point, metres; the minimum of a cell and
+            its eight neighbours, to cover the space between centres; infinite beside the object.
+        top: Height of the upper side above the lowest point, metres; −infinite beside the object.
         corner: x and y of the first cell's centre relative to the object's origin, in cells.
     """
 
@@ -160,10 +159,7 @@ class Footprint:
 
 
 class HeightMap:
-    """What lies on the table.
-
-    It covers x and y from −``reach`` to ``reach``, metres; beyond it nothing can lie.
-    """
+    """Heights of the objects on the table, for x and y from −``reach`` to ``reach``, metres."""
 
     def __init__(self, cell: float, reach: float) -> None:
         self.cell = cell
@@ -174,7 +170,7 @@ class HeightMap:
     def footprint(
         self, surface: Surface, rotation: RotationMatrix, lowest: float
     ) -> Footprint | None:
-        """See a turned object from below and above; None where it covers too many cells.
+        """Return the footprint of a turned object, or None if it covers too many cells.
 
         ``lowest`` is the height of its lowest point relative to its origin, metres.
         """
@@ -188,11 +184,11 @@ class HeightMap:
         heights = z - lowest / self.cell
         span = max(float(heights.max()), 1.0)
         below = _greatest(x, y, 1 - heights / span, surface, surface.faces, (x0, y0), shape)
-        # Seen from above without turning the map over, what is in front winds the other way.
+        # Seen from above on the same map, front faces wind the other way.
         mirrored = np.ascontiguousarray(surface.faces[:, ::-1])
         above = _greatest(x, y, heights / span, surface, mirrored, (x0, y0), shape)
         if not above.any():
-            # Thinner than a cell: it takes the one in the middle, from its foot to its head.
+            # An object thinner than a cell occupies the middle cell over its full height.
             above[shape[0] // 2, shape[1] // 2] = below[shape[0] // 2, shape[1] // 2] = 2
         inside, unit = above > 0, np.float32(span * self.cell)
         bottom = np.where(inside, unit * (2 - below), np.float32(np.inf))
@@ -202,39 +198,39 @@ class HeightMap:
             corner=(x0, y0),
         )
 
-    def height(self, footprint: Footprint, place: Cell) -> float | None:
-        """Return how high an object's lowest point would come to lie, metres; None beyond the map.
+    def height(self, footprint: Footprint, cell: Cell) -> float | None:
+        """Return the height of the lowest point at rest, metres; None beyond the map.
 
-        ``place`` is x and y of its origin, in cells.
+        ``cell`` is the x and y of the object's origin.
         """
-        rows, columns = window = self._window(footprint, place)
+        rows, columns = window = self._window(footprint, cell)
         if min(rows.start, columns.start) < 0 or max(rows.stop, columns.stop) > len(self._heights):
             return None
         return max(float((self._heights[window] - footprint.bottom).max()), 0.0)
 
-    def put(self, footprint: Footprint, place: Cell, height: float) -> None:
-        """Set an object down where :meth:`height` said."""
-        window = self._window(footprint, place)
+    def put(self, footprint: Footprint, cell: Cell, height: float) -> None:
+        """Set an object down at the height from :meth:`height`."""
+        window = self._window(footprint, cell)
         np.maximum(self._heights[window], footprint.top + height, out=self._heights[window])
 
-    def is_free(self, footprint: Footprint, place: Cell) -> bool:
-        """Tell whether nothing lies where the object would, neither under nor over it."""
-        window = self._window(footprint, place)
+    def is_free(self, footprint: Footprint, cell: Cell) -> bool:
+        """Return whether no object lies under or over the footprint."""
+        window = self._window(footprint, cell)
         return not bool((self._heights[window][np.isfinite(footprint.bottom)] > 0).any())
 
-    def _window(self, footprint: Footprint, place: Cell) -> tuple[slice, slice]:
+    def _window(self, footprint: Footprint, cell: Cell) -> tuple[slice, slice]:
         rows, columns = footprint.top.shape
-        left = place[0] + footprint.corner[0] + self._half
-        top = place[1] + footprint.corner[1] + self._half
+        left = cell[0] + footprint.corner[0] + self._half
+        top = cell[1] + footprint.corner[1] + self._half
         return slice(top, top + rows), slice(left, left + columns)
 
 
 def _greatest(
     x: Column, y: Column, values: Column, surface: Surface, faces: Faces, corner: Cell, shape: Shape
 ) -> Float32[np.ndarray, "rows columns"]:
-    """Return 1 + the greatest value over every cell's centre, 0 beside the object."""
-    # The rasteriser keeps the greatest 1/z and interpolates it linearly over the image, so a vertex
-    # at column x and row y with z = 1/(1 + value) makes it a map of any linear value in [0, 1].
+    """Return 1 + the greatest value at every cell's centre, 0 beside the object."""
+    # The rasteriser keeps the greatest 1/z and interpolates it linearly over the image. A vertex at
+    # column x and row y with z = 1/(1 + value) therefore maps any linear value in [0, 1].
     z = 1.0 / (1.0 + values)
     hom = np.stack([x * z, y * z, z], axis=1)
     greatest, ids = np.zeros((*shape, 1), np.float32), np.empty((*shape, 1), np.int32)

@@ -1,8 +1,8 @@
-"""Named, typed descriptions of random scenes; every range has its unit in its name or docstring.
+"""Presets: named, typed distributions of random scenes.
 
-A preset is a YAML file of ``conf/virtual/preset``, or of the user's own. :func:`preset_of` changes
-fields of one by plain values, as a config gives them; in code, use :func:`dataclasses.replace`
-(:meth:`Preset.resized` and :meth:`Preset.reframed` for the size). To add one, add a file.
+A preset is a YAML file in ``conf/virtual/preset`` or of the user. :func:`preset_of` changes fields
+by plain values, as a config gives them; in code, use :func:`dataclasses.replace`, or
+:meth:`Preset.resized` and :meth:`Preset.reframed` for the size. To add a preset, add a file.
 """
 
 from __future__ import annotations
@@ -46,20 +46,19 @@ class Preset(Checked):
     """A distribution of scenes.
 
     Attributes:
-        horizontal_fov_deg: Horizontal field of view of a camera with square pixels that looks
-            through the image's middle; ignored where ``intrinsics_px`` is given.
+        horizontal_fov_deg: Horizontal field of view of a camera with square pixels and a centred
+            principal point; ignored if ``intrinsics_px`` is given.
         intrinsics_px: fx, fy, cx, cy of an explicit camera, pixels of this image size.
         turning: Distribution of the targets' orientation; like the placement, unused on a table.
-        table: The plane that everything lies on; None for objects in mid-air.
-        targets_per_image: Number of targets, each a random part; a further target that finds no
-            place is left out. Images without any are for learning and testing silence.
-        min_visible_fraction: Smallest visible fraction of every target; scenes are drawn again,
-            a bounded number of times, to keep it.
-        centroid_inside: Whether every target's cuboid centre must be seen inside the frame.
-        window: (width, height) of the part of the picture that is rendered, around a random point
-            of it; None renders all of it.
-        depths: Smallest and largest depth of the targets' cuboids' centres; None for any.
-        clutter: Number of flat pieces of other pictures that the background is littered with.
+        table: The supporting plane; None for floating objects.
+        targets_per_image: Number of targets, each a random part; further targets that do not fit
+            are left out. Images without targets teach and test silence.
+        min_visible_fraction: Smallest visible fraction of every target.
+        centroid_inside: Whether the image must contain every target's cuboid centre.
+        window: (width, height) of the rendered part of the picture, around a random point; None
+            renders the whole picture.
+        depths: Smallest and largest depth of the targets' cuboid centres; None for any.
+        clutter: Number of flat pieces of other pictures on the background.
         background_contrast: Factor on the background's contrast.
     """
 
@@ -97,10 +96,10 @@ class Preset(Checked):
         return camera_matrix(focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)
 
     def draw_camera(self, rng: Generator) -> tuple[CameraMatrix, Size]:
-        """Return K and (width, height) of what is rendered: all of the picture, or a window of it.
+        """Return K and (width, height) of the rendered picture or window.
 
-        A window lies around a point that is uniform over the picture, moved into it; one larger
-        than the picture has it in its middle.
+        A window is centred on a uniformly drawn point, then shifted into the picture. A window
+        larger than the picture is centred on the picture.
         """
         K, size = self.K, (self.width, self.height)
         if self.window is None:
@@ -113,31 +112,34 @@ class Preset(Checked):
     def resized(self, width: int, height: int) -> Preset:
         """Return the same scenes in another size; another aspect ratio stretches the image."""
         K = resize_camera(self.K, width / self.width, height / self.height)
-        return self._seen_by(K, width, height, width / self.width)
+        return self._with_camera(K, width, height, width / self.width)
 
     def reframed(self, width: int, height: int) -> Preset:
-        """Return the same scenes in a picture of another size and shape, with pixels as square.
+        """Return the same scenes in another size and shape, with the pixels' aspect ratio kept.
 
-        The field of view along the shorter side stays; along the longer one the picture is cut or
-        shows more, alike at both ends.
+        The field of view along the shorter side stays. Along the longer side the picture is cropped
+        or extended equally at both ends.
         """
         side, new_side = min(self.width, self.height), min(width, height)
         scale = new_side / side
         K = resize_camera(self.K, scale, scale)
         K[0, 2] += (width * side - new_side * self.width) / (2 * side)
         K[1, 2] += (height * side - new_side * self.height) / (2 * side)
-        return self._seen_by(K, width, height, scale)
+        return self._with_camera(K, width, height, scale)
 
-    def _seen_by(self, K: CameraMatrix, width: int, height: int, scale: float) -> Preset:
+    def _with_camera(self, K: CameraMatrix, width: int, height: int, scale: float) -> Preset:
         """Return the same scenes in another camera, with pixels ``scale`` times as fine."""
-        return replace(
-            self, width=width, height=height, sensors=self.sensors.resized(scale),
-            intrinsics_px=(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])),
-        )  # fmt: skip
+        sensors, intrinsics = self.sensors.resized(scale), intrinsics_of(K)
+        return replace(self, width=width, height=height, sensors=sensors, intrinsics_px=intrinsics)
+
+
+def intrinsics_of(K: CameraMatrix) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx and cy of a camera matrix."""
+    return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
 
 
 class _Presets(Mapping[str, Preset]):
-    """The shipped presets, each read when it is asked for."""
+    """The shipped presets, read on access."""
 
     def __getitem__(self, name: str) -> Preset:
         return preset_of(name)
@@ -153,34 +155,34 @@ class _Presets(Mapping[str, Preset]):
 
 
 PRESETS: Final[Mapping[str, Preset]] = _Presets()
-"""The scenes to choose from, by name."""
+"""Shipped presets by name."""
 
 
 def preset_of(name: str, changes: object = None, where: str = "") -> Preset:
     """Return a preset with some fields changed.
 
     Args:
-        name: Name of a shipped preset, or a YAML file of the user's own, which names the preset
-            that it changes as ``base``.
-        changes: Values by field. A group of fields is a mapping, of which the other fields stay as
-            they are, e.g. ``{"horizontal_fov_deg": 70, "materials": {"metal_share": 0.2}}``. A
-            group that the preset lacks (``table`` of ``paper``) starts from its defaults, as does
-            one of another ``kind``; None takes a group away.
+        name: Name of a shipped preset, or a YAML file of the user whose ``base`` names the preset
+            to change.
+        changes: Values by field. A mapping changes some fields of a group, e.g.
+            ``{"horizontal_fov_deg": 70, "materials": {"metal_share": 0.2}}``. A group that the
+            preset lacks (``table`` of ``paper``) or a group of another ``kind`` starts from its
+            defaults; None removes a group.
         where: Option that holds the changes, for messages.
 
     Raises:
-        UserError: The preset or a field is unknown, or a value is of the wrong type or outside of
-            the field's range.
+        UserError: The preset or a field is unknown, or a value has the wrong type or is out of
+            range.
     """
     base, changes = written_out(name, changes)
     return parse(Preset, _merged({"name": base, **_shipped(base)}, changes), where)
 
 
 def written_out(name: str, changes: object = None) -> tuple[str, object]:
-    """Return a shipped preset's name, and the changes to it of a file and of the caller.
+    """Return the shipped base preset of ``name``, and the file's and caller's changes to it.
 
     Raises:
-        UserError: There is no such preset, or the file is no mapping with a ``base``.
+        UserError: The preset does not exist, or the file is no mapping with a ``base``.
     """
     path = Path(name)
     if path.suffix != ".yaml":
@@ -191,20 +193,22 @@ def written_out(name: str, changes: object = None) -> tuple[str, object]:
     fields: Any = read_yaml(path)
     base = fields.pop("base", None) if isinstance(fields, dict) else None
     if base not in _NAMES:
-        got = f"{path} with base={shown(base)}"
-        raise UserError(got, ", ".join(_NAMES), "name the preset that the file changes as base")
+        problem, allowed = f"{path} with base={shown(base)}", ", ".join(_NAMES)
+        raise UserError(
+            problem, allowed, "set base to the name of the preset that the file changes"
+        )
     return base, _merged({"name": path.stem, **fields}, changes or {})
 
 
 def _shipped(name: str) -> Any:
-    """Return the fields of a shipped preset's file, over those of its base."""
+    """Return the fields of a shipped preset, including those of its base."""
     fields: Any = read_yaml(_FOLDER / f"{name}.yaml")
     base = fields.pop("base", None)
     return fields if base is None else _merged(_shipped(base), fields)
 
 
 def _merged(values: Any, changes: Any) -> Any:
-    """Change fields of nested mappings; a group of another kind replaces the former."""
+    """Change fields of nested mappings; a group of another kind replaces the old one."""
     if not isinstance(values, dict) or not isinstance(changes, dict):
         return changes
     if changes.get("kind", values.get("kind")) != values.get("kind"):

@@ -1,7 +1,7 @@
-"""How targets are turned and where they stand: the typed choices a preset makes.
+"""Distributions of the targets' orientations (turnings) and positions (placements).
 
-To add a choice, write a frozen dataclass with a ``draw`` method and a ``kind``, and name it in
-:data:`Turning` or :data:`Placement`; a preset's file chooses it by its ``kind``.
+To add a distribution, write a frozen dataclass with a ``draw`` method and a ``kind``, and name it
+in :data:`Turning` or :data:`Placement`; a preset's file selects it by its ``kind``.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ class FreeTurning(Checked):
 
 @dataclass(frozen=True)
 class FacingTurning(Checked):
-    """The part's +z face looks at the camera, tilted a little, then turned in the image plane.
+    """The part's +z face points at the camera, slightly tilted and turned in the image plane.
 
-    ``R = R_z(in-plane) · R_(axis in the image plane)(tilt) · diag(1, −1, −1)``; the tilted axis is
-    uniform over the spherical cap, the in-plane angle uniform over its range to either side.
+    ``R = R_z(in-plane) · R_(axis in the image plane)(tilt) · diag(1, −1, −1)``. The tilted axis is
+    uniform over the spherical cap, the in-plane angle over its range.
 
     Attributes:
         in_plane_deg: Largest rotation about the optical axis to either side.
@@ -73,14 +73,14 @@ class FacingTurning(Checked):
 
 @dataclass(frozen=True)
 class UprightTurning(Checked):
-    """The part stands, turned any way about the vertical, and a camera looks down at it.
+    """The part stands upright at any azimuth, and the camera looks down at it.
 
     ``R = R_z(roll) · R_(camera above the plane) · R_z(azimuth) · R_(up to z)``; elevation, roll and
     azimuth are uniform.
 
     Attributes:
-        up: The axis of the part's file that points upwards.
-        elevation_deg: Angle of the line of sight with the horizontal.
+        up: Axis of the part that points upwards.
+        elevation_deg: Angle between the line of sight and the horizontal.
         roll_deg: Largest rotation of the camera about its line of sight to either side.
     """
 
@@ -97,7 +97,7 @@ class UprightTurning(Checked):
         rolled, turned = (
             rotation_vector_to_matrix(np.array([0.0, 0.0, angle])) for angle in (roll, azimuth)
         )
-        # Axes in a circle: a rotation that brings the axis which points upwards to z.
+        # A cyclic permutation of the axes turns the up axis into z.
         standing = np.roll(np.eye(3), 2 - "xyz".index(self.up), axis=0)
         return np.asarray(rolled @ looking_down(elevation) @ turned @ standing)
 
@@ -107,7 +107,7 @@ Turning = Annotated[FreeTurning | FacingTurning | UprightTurning, Discriminator(
 
 
 def looking_down(elevation: float) -> RotationMatrix:
-    """Return the rotation from a frame whose z is up to a level camera that looks along its +y.
+    """Return the rotation from a z-up frame to a level camera that looks along its +y.
 
     The elevation is the angle of the line of sight below the horizontal, radians.
     """
@@ -118,7 +118,7 @@ def looking_down(elevation: float) -> RotationMatrix:
 class _Placement(Checked):
     """Base of the placements."""
 
-    _ends: ClassVar[tuple[str, str] | None] = None  # two fields, the first at most the second
+    _ends: ClassVar[tuple[str, str] | None] = None  # names of the smallest and largest value
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -127,14 +127,14 @@ class _Placement(Checked):
         low, high = (getattr(self, end) for end in self._ends)
         if low > high:
             first, last = self._ends
-            got = f"{first}={low} and {last}={high} of {type(self).__name__}"
-            raise UserError(got, f"{first} <= {last}", "change the placement's range")
+            problem = f"{first}={low} and {last}={high} of {type(self).__name__}"
+            raise UserError(problem, f"{first} <= {last}", "change the placement's range")
 
-    def redraw(self, rng: Generator, place: Vector) -> Vector | None:
-        """Return another place to try where the object is not well in the frame, or None.
+    def redraw(self, rng: Generator, position: Vector) -> Vector | None:
+        """Return another position for an object that the frame does not show well, or None.
 
-        What a placement keeps of the former place has the distribution it was drawn from, however
-        often the camera does not see the object there. None draws the orientation anew, too.
+        Coordinates that a placement keeps retain their distribution, however many positions are
+        rejected. None also draws the orientation anew.
         """
         return None
 
@@ -143,8 +143,8 @@ class _Placement(Checked):
 class OffsetPlacement(_Placement):
     """A box of positions around a point on the optical axis (the paper's scene, section 2.1).
 
-    Where the camera does not see all of the box, a place is moved along the optical axis until it
-    does: offsets across the axis and orientations keep their uniform distributions.
+    A position that the camera does not see is moved along the optical axis. Lateral offsets and
+    orientations therefore keep their uniform distributions.
 
     Attributes:
         distance: Depth of the box's middle.
@@ -163,7 +163,7 @@ class OffsetPlacement(_Placement):
             raise UserError(
                 f"distance={self.distance} and axial={self.axial} of OffsetPlacement",
                 "axial < distance, in metres",
-                "move the box of positions before the camera",
+                "move the box of positions in front of the camera",
             )
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
@@ -171,9 +171,9 @@ class OffsetPlacement(_Placement):
         x, y = rng.uniform(-self.lateral, self.lateral, 2)
         return np.array([x, y, self._draw_depth(rng)])
 
-    def redraw(self, rng: Generator, place: Vector) -> Vector:
-        """Return the same offsets across the optical axis at another depth, metres."""
-        return np.array([place[0], place[1], self._draw_depth(rng)])
+    def redraw(self, rng: Generator, position: Vector) -> Vector:
+        """Return the same lateral offsets at another depth, metres."""
+        return np.array([position[0], position[1], self._draw_depth(rng)])
 
     def _draw_depth(self, rng: Generator) -> float:
         return self.distance + rng.uniform(-self.axial, self.axial)
@@ -220,13 +220,13 @@ class FillPlacement(_Placement):
         offset = rng.uniform(-0.5, 0.5, 2)
         centre = (rotated_hull.min(axis=0) + rotated_hull.max(axis=0)) / 2
         pixel, hull = np.array(size) / 2 - 0.5, rotated_hull - centre
-        # Perspective moves a tilted part's box off its centre's image; a few steps bring it back.
+        # Perspective moves a tilted part's box away from its centre's image: iterate.
         for _ in range(10):
             ray = np.linalg.solve(K, [*pixel, 1.0])
             depth = _depth_that_fills(share, ray, K, size, hull)
             image = project(hull + depth * ray, K)
             lower, upper = image.min(axis=0), image.max(axis=0)
-            # The bounding box moves as far as it has room; one that fills the image cannot move.
+            # The bounding box stays inside the image; a box that fills the image cannot move.
             wanted = np.array(size) / 2 - 0.5 + offset * (size - (upper - lower))
             missing = wanted - (lower + upper) / 2
             if np.abs(missing).max() < 0.05:
@@ -237,10 +237,10 @@ class FillPlacement(_Placement):
 
 @dataclass(frozen=True)
 class WorkingPlacement(_Placement):
-    """Uniform in the depth of the part's middle and, across, wherever the part fits in the picture.
+    """Uniform in the depth of the part's middle and laterally wherever the picture shows all of it.
 
-    The middle is that of the turned part's extent along each axis, wherever its file has the
-    origin. A part that is larger than the picture is in its middle.
+    The middle is the centre of the turned part's bounding box. A part larger than the picture is
+    centred.
     """
 
     _ends = ("nearest", "farthest")
@@ -251,15 +251,15 @@ class WorkingPlacement(_Placement):
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
         """Return the object's origin in the camera frame, metres."""
-        depth, place = rng.uniform(self.nearest, self.farthest), rng.uniform(-0.5, 0.5, 2)
+        depth, offset = rng.uniform(self.nearest, self.farthest), rng.uniform(-0.5, 0.5, 2)
         lower, upper = rotated_hull.min(axis=0), rotated_hull.max(axis=0)
-        # What is nearer than the middle is as much larger.
+        # The front of the part appears larger than its middle.
         front = depth - (upper[2] - lower[2]) / 2
         extent = (upper - lower)[:2] * K[[0, 1], [0, 1]] / max(front, 1e-6)
         room = np.maximum(size - extent, 0.0)
-        pixel = np.array(size) / 2 - 0.5 + place * room
+        pixel = np.array(size) / 2 - 0.5 + offset * room
         hull = rotated_hull - (lower + upper) / 2
-        # Perspective moves what is nearer outwards; a few steps bring it back into the picture.
+        # Perspective moves near points outwards: shift the part back into the picture.
         for _ in range(10):
             middle = depth * np.linalg.solve(K, [*pixel, 1.0])
             image = project(hull + middle, K)
@@ -281,7 +281,7 @@ Placement = Annotated[
 def _depth_that_fills(
     share: float, ray: Vector, K: CameraMatrix, size: Size, centred_hull: Points
 ) -> float:
-    """Find the depth on a ray at which the hull's bounding box fills a share of the image."""
+    """Return the depth on a ray at which the hull's bounding box fills a share of the image."""
     closest = float(-centred_hull[:, 2].min()) * (1 + 1e-6)
     rays, rows, columns = centred_hull @ K[:2].T, ray @ K[:2].T, np.array(size, np.float64)
     low, high = closest, np.inf
@@ -292,8 +292,8 @@ def _depth_that_fills(
         if abs(filled / share - 1) < 1e-4:  # far below a pixel
             break
         low, high = (depth, high) if filled > share else (low, depth)
-        # The share falls nearly as 1/depth. That guess alternates with bisection, because close
-        # to the camera it closes in from one side only.
+        # The share falls nearly as 1/depth. That guess alternates with bisection, because it
+        # converges from one side only near the camera.
         depth *= filled / share
         if step % 2 or not low < depth < high:
             depth = (low + high) / 2 if np.isfinite(high) else 2 * low

@@ -1,4 +1,4 @@
-"""The table: from where a camera sees a supporting plane, and how parts lie on it."""
+"""The table: views of a supporting plane, resting orientations of parts, the plane's picture."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from dopepp.virtual.scene import Plane, triple
 
 @dataclass(frozen=True)
 class Table(Checked):
-    """A supporting plane before a robot's camera.
+    """A supporting plane in front of a robot's camera.
 
     Attributes:
-        distance: Of the camera from the point of the plane that it looks at.
+        distance: Distance from the camera to the plane along the line of sight.
         elevation_deg: Angle between the plane and the line of sight; 90 looks straight down.
         roll_deg: Largest rotation of the camera about its line of sight to either side.
         tilted_share: Share of objects that lean by ``tilt_deg`` instead of resting on a face.
-        heaped: Whether objects are dropped onto a heap; otherwise each lies beside the others.
+        heaped: Whether objects are dropped onto a heap instead of lying side by side.
         heap_radius: Radius within which a heap's objects are dropped.
         picture_width: Width of the plane that the background's picture covers; beyond it the
             picture is mirrored.
@@ -54,7 +54,7 @@ class Table(Checked):
         return make_transform(rotation, np.array([0.0, 0.0, distance]))
 
     def draw_turning(self, rng: Generator, hull: Hull) -> tuple[Float[np.ndarray, "3 3"], float]:
-        """Draw how an object lies: on one of its stable faces, any way round, or leaning.
+        """Draw an object's orientation: resting on a stable face, or leaning.
 
         Returns:
             Rotation from the object to the table frame, and the height of the object's lowest point
@@ -80,11 +80,11 @@ class Table(Checked):
         size: Size,
         T_cam_table: Transform,
     ) -> TablePicture:
-        """Draw a picture that lies on the plane and, if its end is in view, one for beyond it."""
+        """Draw the plane's picture and, if the plane's end is in view, the surroundings."""
         width, height = size
         picture = backgrounds.draw(rng, width, height)
         metres = rng.uniform(*self.picture_width) * T_cam_table[2, 3]
-        middle = rng.uniform(0.35, 0.65, 2) * size  # to which the camera looks
+        middle = rng.uniform(0.35, 0.65, 2) * size  # pixel at the table's origin
         angle, scale = rng.uniform(0, 2 * np.pi), width / metres
         cosine, sine = scale * np.cos(angle), scale * np.sin(angle)
         picture_table = np.array([[cosine, -sine, middle[0]], [sine, cosine, middle[1]], [0, 0, 1]])
@@ -96,12 +96,12 @@ class Table(Checked):
 
 @dataclass(frozen=True, eq=False)
 class TablePicture:
-    """The picture that lies on the plane, and one for beyond the plane's end.
+    """The picture of the plane, and the surroundings beyond the plane's end.
 
     Attributes:
-        picture_table: Homography from a point (x, y) of the table's frame, metres, to its pixels.
-        end: Depth from which on there is no plane, metres.
-        surroundings: Image of the camera beyond the end; None where that is out of view.
+        picture_table: Homography from (x, y) in the table frame, metres, to the picture's pixels.
+        end: Depth at which the plane ends, metres.
+        surroundings: Camera image beyond the end; None if the end is out of view.
     """
 
     picture: Picture
@@ -110,13 +110,13 @@ class TablePicture:
     surroundings: Picture | None
 
     def seen(self, K: CameraMatrix, size: Size, T_cam_table: Transform) -> Picture:
-        """Return what a camera sees where nothing lies on the plane."""
-        # A point (x, y, 0) of the plane is seen at K [r1 r2 t] (x, y, 1).
-        image_table = K @ T_cam_table[:3, [0, 1, 3]]
+        """Return the camera image of the empty plane."""
+        # A point (x, y, 0) of the plane projects to K [r1 r2 t] (x, y, 1).
+        picture_image = self.picture_table @ np.linalg.inv(K @ T_cam_table[:3, [0, 1, 3]])
+        flags, border = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, cv2.BORDER_REFLECT_101
         image = cv2.warpPerspective(
-            self.picture, self.picture_table @ np.linalg.inv(image_table), size,
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REFLECT_101,
-        )  # fmt: skip
+            self.picture, picture_image, size, flags=flags, borderMode=border
+        )
         beyond = _beyond(self.end, K, size, T_cam_table)
         if beyond is None or self.surroundings is None:
             return np.asarray(image)
@@ -129,7 +129,7 @@ def plane_of(T_cam_table: Transform) -> Plane:
 
 
 def inverse_depth_row(plane: Plane, K: CameraMatrix) -> Vector:
-    """Return what a homogeneous pixel is multiplied with to give the plane's 1/depth, 1/m.
+    """Return the row vector whose product with a homogeneous pixel is the plane's 1/depth, 1/m.
 
     A ray r (with z = 1) meets the plane at depth offset/(normal · r).
     """
@@ -137,7 +137,7 @@ def inverse_depth_row(plane: Plane, K: CameraMatrix) -> Vector:
 
 
 def _beyond(end: float, K: CameraMatrix, size: Size, T_cam_table: Transform) -> Mask | None:
-    """Tell where the plane is farther away than its end, or is not; None if that is nowhere."""
+    """Return the mask of pixels beyond the plane's end, or None without any."""
     width, height = size
     slope = inverse_depth_row(plane_of(T_cam_table), K)
     across, down = slope[0] * np.arange(width), slope[1] * np.arange(height) + slope[2]

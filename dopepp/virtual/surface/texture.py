@@ -23,6 +23,8 @@ from dopepp.parts.mesh import Faces
 from dopepp.virtual.sensor import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
 from dopepp.virtual.triangles import CENTRE_SAMPLE, edge_functions, rasterise
 
+Lookup = tuple[Array, Array, Array]
+
 _MOST_PROBES: Final = 16  # along a footprint's longer axis; beyond this stretch a texture blurs
 _SHARPNESS: Final = 0.75  # a probe's width over the footprint's; interpolation widens it again
 
@@ -142,15 +144,16 @@ def _bilinear(
 
 @compiled(fastmath=True)
 def sample_texture(
-    face: Array, share: Array, x: Array, y: Array, hom: Array, faces: Array, uv: Array,
-    texels: Array, levels: Array, decode: Array, out: Array,
-) -> None:  # fmt: skip
+    points: tuple[Array, ...], hom: Array, faces: Array, uv: Array, texture: Lookup, out: Array
+) -> None:
     """Look up the texture at an object's fragments, filtered over a pixel.
 
-    ``face``, ``share``, ``x`` and ``y`` are the fragments'; ``hom`` are the vertices' homogeneous
-    pixels; ``texels`` and ``levels`` belong to a :class:`Texture`; ``decode`` is the linear light
+    ``points`` are the fragments' ``face``, ``share``, ``x`` and ``y``; ``hom`` the vertices'
+    homogeneous pixels; ``texture`` the texels and levels of a :class:`Texture` and the linear light
     of every code. ``out`` is linear RGB, shape (3, n).
     """
+    face, share, x, y = points
+    texels, levels, decode = texture
     last = levels.shape[0] - 1
     rows, columns = float(levels[0, 1]), float(levels[0, 2])
     for p in range(face.shape[0]):

@@ -18,6 +18,7 @@ from dopepp.virtual.renderers.raster.shading import shade_object
 from dopepp.virtual.renderers.raster.visibility import (
     Box,
     Projected,
+    Samples,
     backdrop,
     box_around,
     centres_within,
@@ -53,15 +54,13 @@ def render(scene: Scene) -> Rendered:
     firsts = first_ids(scene)
     for item, seen, first in zip(scene.objects, projected, firsts, strict=True):
         shade_object(item, seen, scene, lights, samples, int(first), colour)
-    _composite(
-        samples.origin, samples.ids, samples.inverse_depth, colour, firsts, image, depth, instances
-    )
+    _composite(samples, colour, firsts, image, depth, instances)
     return Rendered(image, depth, instances, _fractions(scene, projected, instances), scene)
 
 
 @dataclass(frozen=True, eq=False)
 class Silhouette:
-    """What an object would cover if nothing stood before it.
+    """The pixels of an unoccluded object.
 
     Attributes:
         mask: Its pixels within the image.
@@ -104,7 +103,7 @@ def _fractions(
     for index in np.flatnonzero(visible).tolist():
         item, seen = scene.objects[index], projected[index]
         if seen.inside(scene.size):
-            # Only where something else may be before it can a pixel of it be missing.
+            # Its pixels can be hidden only where another object may be in front of it.
             left, top, right, bottom = _rivals(scene, projected, index) or (0, 0, 0, 0)
             covered = draw_alone(item, seen.hom, (left, top, right, bottom))[0] > 0
             hidden = int((covered & (instances[top:bottom, left:right] != index)).sum())
@@ -116,29 +115,29 @@ def _fractions(
 
 
 def _rivals(scene: Scene, projected: Sequence[Projected], index: int) -> Box | None:
-    """Return the part of an object's box in which other objects or the plane may hide it."""
-    item, own = scene.objects[index], projected[index].box(scene.size)
-    if own is None:
+    """Return the box in which other objects or the plane may hide an object, or None."""
+    item, whole = scene.objects[index], projected[index].box(scene.size)
+    if whole is None:
         return None
     if scene.plane is not None:
         normal = np.array(scene.plane.normal) @ item.T_cam_obj[:3, :3]
         offset = scene.plane.offset - float(np.dot(scene.plane.normal, item.T_cam_obj[:3, 3]))
         if (item.surface.hull @ normal).min() < offset:  # some of it lies below the plane
-            return own
-    # Nothing that begins behind its end can hide it.
+            return whole
+    # An object that begins behind the end of this one cannot hide it.
     depths = [_depths(other) for other in scene.objects]
     boxes = []
     for number, seen in enumerate(projected):
         box = seen.box(scene.size) if depths[number][0] < depths[index][1] else None
         if number != index and box is not None:
-            left, top = max(own[0], box[0]), max(own[1], box[1])
-            right, bottom = min(own[2], box[2]), min(own[3], box[3])
+            left, top = max(whole[0], box[0]), max(whole[1], box[1])
+            right, bottom = min(whole[2], box[2]), min(whole[3], box[3])
             boxes.append((left, top, right, bottom) if left < right and top < bottom else None)
     return box_around(boxes)
 
 
 def _depths(item: SceneObject) -> tuple[float, float]:
-    """Return about the smallest and largest depth of an object, metres; the first too small."""
+    """Return conservative bounds of an object's depth, metres."""
     depth = item.surface.hull @ item.T_cam_obj[2, :3] + item.T_cam_obj[2, 3]
     least, most = float(depth.min()), float(depth.max())
     # The hull's extreme points miss a little of a round object.
@@ -150,8 +149,7 @@ def _whole_px(item: SceneObject, seen: Projected, K: Array) -> float:
     """Count the pixel centres an object covers alone on a canvas as large as it needs."""
     left, top, right, bottom = seen.extent
     if not math.isfinite(left):
-        # It surrounds the camera: the whole silhouette is a hemisphere, of no finite size.
-        return math.inf
+        return math.inf  # it surrounds the camera
     hom, scale, extent = seen.hom, 1.0, seen.extent
     if (right - left + 2) * (bottom - top + 2) > _MOST_PX:
         scale = math.sqrt(_MOST_PX / ((right - left + 2) * (bottom - top + 2)))
@@ -162,14 +160,14 @@ def _whole_px(item: SceneObject, seen: Projected, K: Array) -> float:
 
 @compiled()
 def _composite(
-    origin: tuple[int, int], ids: Array, inverse_depth: Array, colour: Array, first_ids: Array,
-    image: Array, depth: Array, instances: Array,
-) -> None:  # fmt: skip
-    """Put a window of samples over the background and read its centre samples as labels.
+    samples: Samples, colour: Array, first_ids: Array, image: Array, depth: Array, instances: Array
+) -> None:
+    """Lay a window of samples over the background and read the centre samples as labels.
 
-    ``colour`` sums the covered samples' sRGB values; ``first_ids`` ascend by object. Updated in
-    place: ``image``, the background on entry, and, at pixel centres, ``depth`` and ``instances``.
+    ``colour`` sums the covered samples' sRGB values; ``first_ids`` ascend by object. ``image``,
+    ``depth`` and ``instances`` are updated in place.
     """
+    origin, inverse_depth, ids = samples
     height, width, num_samples = ids.shape
     centre = num_samples - 1
     for j in range(height):

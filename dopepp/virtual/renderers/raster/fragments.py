@@ -1,41 +1,44 @@
-"""Fragments: what a pixel sees of one smooth patch of an object, the unit of shading.
+"""Fragments: the part of a smooth patch that a pixel shows, the unit of shading.
 
-A pixel's samples on the same patch are shaded once, at their mean (centroid sampling), so the
-cost follows pixels, neither samples nor triangles: a finely meshed part costs little more than a
-coarse one.
+A pixel's samples on the same patch are shaded once, at their mean (centroid sampling). The cost
+therefore follows the number of pixels, not of samples or triangles.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Final
+from itertools import repeat
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.virtual.renderers.raster.visibility import Projected, Samples
+from dopepp.virtual.renderers.raster.visibility import Box, Projected, Samples
 from dopepp.virtual.scene import Scene, SceneObject
 from dopepp.virtual.triangles import NUM_COLOUR_SAMPLES, PIXEL_SAMPLES, edge_functions, scratch
 
-_DEPTH_GAP: Final = 0.01  # samples of a patch that differ by a larger share hide one another
+_DEPTH_GAP: Final = 0.01  # samples of a patch whose depths differ by more hide one another
+Mesh = tuple[Array, Array, Array]
+
 _ALL_BUT_FIRST: Final = 0b1110  # bits of the samples to skip when all of a pixel are alike
 
 
-@dataclass(frozen=True, eq=False)
-class Fragments:
-    """An object's visible fragments.
+class Fragments(NamedTuple):
+    """An object's n visible fragments: arrays that the shading passes read and update.
 
     Attributes:
         pixel: Index of the pixel in the window, row by row, shape (n,).
         weight: Number of the pixel's samples that it covers, shape (n,).
         face: Index of its triangle; its bitwise complement for a back face, shape (n,).
         x: Column of its mean in the image, shape (n,); ``y`` is the row.
+        inverse: Inverse depth of its sample, 1/m, shape (n,).
         share: Weights of the triangle's corners, shape (3, n).
         position: Camera frame, metres, shape (3, n).
         normal: Unit normal towards the camera, camera frame, shape (3, n).
-        bulge: Metres by which the smooth surface that the normals pretend stands out before the
-            flat triangle, shape (n,).
+        albedo: Linear RGB, shape (3, n).
+        bulge: Height of the smooth surface (as its normals bend) over the flat triangle, metres,
+            shape (n,).
+        alpha: Width of the GGX lobe, shape (n,).
     """
 
     pixel: Array
@@ -43,60 +46,65 @@ class Fragments:
     face: Array
     x: Array
     y: Array
+    inverse: Array
     share: Array
     position: Array
     normal: Array
+    albedo: Array
     bulge: Array
+    alpha: Array
+
+
+class _Groups(NamedTuple):
+    """Samples grouped by pixel and patch: the first fields of :class:`Fragments`."""
+
+    pixel: Array
+    weight: Array
+    face: Array
+    x: Array
+    y: Array
+    inverse: Array
 
 
 def gather_fragments(
-    item: SceneObject, seen: Projected, scene: Scene, samples: Samples, first_id: int
+    item: SceneObject, projected: Projected, scene: Scene, samples: Samples, first_id: int
 ) -> Fragments | None:
-    """Collect an object's fragments, valid until the next object's are collected; None without any.
+    """Collect an object's fragments, or None without any; the arrays are reused for the next.
 
-    ``first_id`` is the number of the object's first triangle.
+    ``first_id`` is the number of the object's first triangle; the albedo and alpha are not set.
     """
-    box = seen.box(scene.size)
+    box = projected.box(scene.size)
     if box is None:
         return None
-    origin, surface = samples.origin, item.surface
-    window = (box[0] - origin[0], box[1] - origin[1], box[2] - origin[0], box[3] - origin[1])
-    # The most there can be; memory that is never touched costs nothing.
-    most = NUM_COLOUR_SAMPLES * (box[2] - box[0]) * (box[3] - box[1])
-    pixel, face = (scratch(name, (most,), np.int32) for name in ("pixel", "face"))
-    weight, x, y, inverse = (
-        scratch(name, (most,), np.float32) for name in ("weight", "x", "y", "inverse")
-    )
-    count = _group(
-        window, origin, samples.ids, samples.inverse_depth, first_id, surface.patches,
-        PIXEL_SAMPLES, pixel, weight, face, x, y, inverse,
-    )  # fmt: skip
+    (x, y), surface = samples.origin, item.surface
+    window = (box[0] - x, box[1] - y, box[2] - x, box[3] - y)
+    # An upper bound; memory that is never touched costs nothing.
+    bound = NUM_COLOUR_SAMPLES * (box[2] - box[0]) * (box[3] - box[1])
+    types = (np.int32, np.float32, np.int32, np.float32, np.float32, np.float32)
+    arrays = (scratch(*field) for field in zip(_Groups._fields, repeat((bound,)), types))
+    groups = _Groups(*arrays)
+    count = _group(window, samples, first_id, surface.patches, PIXEL_SAMPLES, groups)
     if count == 0:
         return None
-    pixel, weight, face, x, y, inverse = (
-        array[:count] for array in (pixel, weight, face, x, y, inverse)
+    fragments = Fragments(
+        *(array[:count] for array in groups),
+        *(scratch(name, (3, count), np.float32) for name in Fragments._fields[6:10]),
+        *(scratch(name, (count,), np.float32) for name in Fragments._fields[10:]),
     )
-    share, position, normal = (
-        scratch(name, (3, count), np.float32) for name in ("share", "position", "normal")
-    )
-    bulge = scratch("bulge", (count,), np.float32)
     rotation = np.ascontiguousarray(item.T_cam_obj[:3, :3], np.float64)
-    _interpolate(
-        x, y, inverse, seen.hom, surface.vertices, surface.faces, surface.normals, rotation,
-        np.linalg.inv(scene.K), face, share, position, normal, bulge,
-    )  # fmt: skip
-    return Fragments(pixel, weight, face, x, y, share, position, normal, bulge)
+    mesh = (surface.vertices, surface.faces, surface.normals)
+    _interpolate(fragments, projected.hom, mesh, rotation, np.linalg.inv(scene.K))
+    return fragments
 
 
 @compiled()
 def _group(
-    window: tuple[int, int, int, int], origin: tuple[int, int], ids: Array, inverse_depth: Array,
-    first_id: int, patches: Array, samples: Array, pixel: Array, weight: Array, triangle: Array,
-    x: Array, y: Array, depth: Array,
-) -> int:  # fmt: skip
-    """Group the samples of every pixel by patch; write pixel, weight, triangle, mean and 1/m."""
+    window: Box, samples: Samples, first_id: int, patches: Array, offsets: Array, groups: _Groups
+) -> int:
+    """Group the samples of every pixel by patch and return the number of groups."""
+    ids, inverse_depth, origin = samples.ids, samples.inverse_depth, samples.origin
     num_faces = patches.shape[0]
-    centre = samples.shape[0] - 1
+    centre = offsets.shape[0] - 1
     number = 0
     for j in range(window[1], window[3]):
         for i in range(window[0], window[2]):
@@ -110,7 +118,7 @@ def _group(
                     continue
                 inverse = inverse_depth[j, i, s]
                 gap = _DEPTH_GAP * inverse
-                count, dx, dy = 1, samples[s, 0], samples[s, 1]
+                count, dx, dy = 1, offsets[s, 0], offsets[s, 1]
                 if alike:
                     count, dx, dy = NUM_COLOUR_SAMPLES, 0.0, 0.0
                 for q in range(s + 1, NUM_COLOUR_SAMPLES):
@@ -124,30 +132,34 @@ def _group(
                     ):
                         done |= 1 << q
                         count += 1
-                        dx += samples[q, 0]
-                        dy += samples[q, 1]
+                        dx += offsets[q, 0]
+                        dy += offsets[q, 1]
                 if count == NUM_COLOUR_SAMPLES:
                     # Their mean is the pixel's centre, which has its own triangle.
                     other = ids[j, i, centre] - first_id
                     if 0 <= other < num_faces and patches[other] == patches[face]:
                         face, inverse = other, inverse_depth[j, i, centre]
-                x[number] = origin[0] + i + dx / count
-                y[number] = origin[1] + j + dy / count
-                pixel[number] = j * ids.shape[1] + i
-                weight[number] = count
-                triangle[number] = face
-                depth[number] = inverse
+                groups.x[number] = origin[0] + i + dx / count
+                groups.y[number] = origin[1] + j + dy / count
+                groups.pixel[number] = j * ids.shape[1] + i
+                groups.weight[number] = count
+                groups.face[number] = face
+                groups.inverse[number] = inverse
                 number += 1
     return number
 
 
 @compiled()
 def _interpolate(
-    columns: Array, rows: Array, depth: Array, hom: Array, vertices: Array, faces: Array,
-    normals: Array, rotation: Array, inverse_K: Array, triangle: Array, share: Array,
-    position: Array, normal: Array, bulge: Array,
-) -> None:  # fmt: skip
-    """Write corner weights, positions, normals and bulges; complement back faces."""
+    fragments: Fragments, hom: Array, mesh: Mesh, rotation: Array, inverse_K: Array
+) -> None:
+    """Write corner weights, positions, normals and bulges; complement back faces.
+
+    ``mesh`` holds vertices, faces and corner normals.
+    """
+    vertices, faces, normals = mesh
+    triangle, share = fragments.face, fragments.share
+    position, normal, bulge = fragments.position, fragments.normal, fragments.bulge
     last, scale = -1, 0.0
     a, b, c, e = 0, 0, 0, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     heights = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -160,13 +172,13 @@ def _interpolate(
             e = edge_functions(hom, a, b, c)
             scale = 1.0 / (hom[a, 0] * e[0] + hom[a, 1] * e[1] + hom[a, 2] * e[2])
             heights = _corner_heights(vertices, a, b, c, normals[face])
-        x, y = float(columns[p]), float(rows[p])
+        x, y = float(fragments.x[p]), float(fragments.y[p])
         k0 = scale * (e[0] * x + e[1] * y + e[2])
         k1 = scale * (e[3] * x + e[4] * y + e[5])
         k2 = scale * (e[6] * x + e[7] * y + e[8])
         # The mean may lie outside this triangle: its plane is right there as long as the depth
         # stays near the sample's, its corners' values must not be overshot.
-        total, inverse = k0 + k1 + k2, float(depth[p])
+        total, inverse = k0 + k1 + k2, float(fragments.inverse[p])
         z = 1.0 / (total if abs(total - inverse) <= _DEPTH_GAP * inverse else inverse)
         k0, k1, k2 = max(k0, 0.0), max(k1, 0.0), max(k2, 0.0)
         total = 1.0 / max(k0 + k1 + k2, 1e-30)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -40,6 +40,24 @@ _VISIBLE: Final = np.float32(0.005)  # share of hidden light that changes a pict
 _SKY_DIRECTIONS: Final = 32  # in which the sky is sampled, one bit each
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
+
+
+class _LitPlane(NamedTuple):
+    """A plane and its lights for compiled code, float32.
+
+    Attributes:
+        to_point: Map from a pixel to its point and 1/z, shape (4, 3).
+        normal: Unit normal.
+        sky: Linear RGB of the ambient light.
+        lights: ``light`` of every shadow map.
+        P: ``P`` of every shadow map.
+    """
+
+    to_point: Array
+    normal: Array
+    sky: Array
+    lights: Array
+    P: Array
 
 
 def darken_plane(
@@ -73,13 +91,14 @@ def darken_plane(
         _warp(cast, to_map @ to_point, box, shade)
     ambient = ambient_row(scene.ambient)
     above = 0.5 + 0.5 * float(np.dot(plane.normal, ambient[:3]))
-    _darken(
-        box[:2], to_point.astype(np.float32), NEAR, np.array(plane.normal, np.float32), shades,
+    lit = _LitPlane(
+        to_point.astype(np.float32),
+        np.array(plane.normal, np.float32),
         np.asarray(above * ambient[3:6] + (1 - above) * ambient[6:], np.float32),
         np.array([shadow.light for shadow in lights], np.float32).reshape(-1, 6),
         np.array([shadow.P for shadow in lights], np.float32).reshape(-1, 3, 4),
-        SRGB_TO_LINEAR, LINEAR_TO_SRGB, CODE_STEPS, samples.origin, samples.ids, image,
-    )  # fmt: skip
+    )
+    _darken(box[:2], lit, shades, SRGB_TO_LINEAR, LINEAR_TO_SRGB, samples, image)
 
 
 def _cast(plane: Plane, shadow: ShadowMap) -> tuple[Float32[np.ndarray, "rows columns"], int]:
@@ -165,11 +184,11 @@ def hidden_sky(
     ``frame`` maps camera-frame points to (x, y) on the plane and the height above it, metres. First
     come (x, y) of the grid's first cell and a cell's side, metres.
     """
-    places = []
+    heights = []
     for item in objects:
         points = transform(item.T_cam_obj, item.surface.points) @ frame[:, :3].T + frame[:, 3]
-        places.append(points[points[:, 2] > 0])
-    everything = np.concatenate(places) if places else np.zeros((0, 3))
+        heights.append(points[points[:, 2] > 0])
+    everything = np.concatenate(heights) if heights else np.zeros((0, 3))
     if len(everything) == 0:
         return None
     # Farther away than twice the objects' height, little sky is hidden.
@@ -177,21 +196,21 @@ def hidden_sky(
     low, high = everything[:, :2].min(axis=0) - margin, everything[:, :2].max(axis=0) + margin
     cell = float((high - low).max()) / 80
     columns, rows = (math.ceil(side) + 1 for side in (high - low) / cell)
-    bits, own = np.zeros((rows, columns), np.uint32), np.empty((rows, columns), np.uint32)
+    bits, splats = np.zeros((rows, columns), np.uint32), np.empty((rows, columns), np.uint32)
     grid = np.array([low[0], low[1], cell])
     # Directions into the sky as (x, y)/z, spread with the cosine (Malley's method).
     k = np.arange(_SKY_DIRECTIONS) + 0.5
     radius, angle = np.sqrt(k / _SKY_DIRECTIONS), k * np.pi * (1 + np.sqrt(5))
     slopes = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
     slopes = slopes / np.sqrt(1 - radius**2)[:, None]
-    for item, points in zip(objects, places, strict=True):
-        own[:] = 0
+    for item, points in zip(objects, heights, strict=True):
+        splats[:] = 0
         # Half a spot's side, so wide that spots leave no gaps.
         reach = max(0.8 * item.surface.spacing / cell, 0.5)
-        _splat(points, reach, slopes, grid, own)
+        _splat(points, reach, slopes, grid, splats)
         # Taken from every direction's spot is what its splats stick out.
         cells = round(reach - 0.5)
-        padded = np.pad(own, cells, constant_values=np.iinfo(np.uint32).max)
+        padded = np.pad(splats, cells, constant_values=np.iinfo(np.uint32).max)
         windows = sliding_window_view(padded, (2 * cells + 1, 2 * cells + 1))
         bits |= np.bitwise_and.reduce(windows, axis=(2, 3))
     counts = np.unpackbits(bits.view(np.uint8), axis=1).reshape(rows, columns, -1).sum(axis=-1)
@@ -225,32 +244,35 @@ def _splat(points: Array, reach: float, slopes: Array, grid: Array, bits: Array)
 
 @compiled(fastmath=True)
 def _darken(
-    corner: tuple[int, int], to_point: Array, near: float, normal: Array, shades: Array, sky: Array,
-    lights: Array, P: Array, decode: Array, encode: Array, steps: int, origin: tuple[int, int],
-    ids: Array, image: Array,
-) -> None:  # fmt: skip
+    corner: tuple[int, int],
+    lit: _LitPlane,
+    shades: Array,
+    decode: Array,
+    encode: Array,
+    samples: Samples,
+    image: Array,
+) -> None:
     """Multiply the picture by the share of the plane's light that is left.
 
-    ``shades``, of shape (1 + lights, h, w), are the shares that are hidden of the sky and of every
-    light; their first pixel is ``corner``, that of ``ids`` ``origin``. ``to_point`` maps a pixel to
-    its point and 1/z, shape (4, 3); ``lights`` and ``P`` are those of the shadow maps. ``decode``
-    turns codes into linear light, ``encode``, in ``steps`` per unit, back.
+    ``shades``, of shape (1 + lights, h, w), are the hidden shares of the sky and of every light;
+    ``corner`` is their first pixel. ``decode`` and ``encode`` convert codes and linear light.
     """
-    width = shades.shape[2]
+    origin, _, ids = samples
+    to_point, width = lit.to_point, shades.shape[2]
     total, lost = np.empty((3, width), np.float32), np.empty((3, width), np.float32)
     for j in range(shades.shape[1]):
         if shades[:, j].max() > _VISIBLE:
             v = corner[1] + j
-            _light_row(corner, j, to_point, normal, shades, sky, lights, P, total, lost)
+            _light_row(corner, j, lit, shades, total, lost)
             for i in range(width):
                 u = corner[0] + i
                 inverse = to_point[3, 0] * u + to_point[3, 1] * v + to_point[3, 2]
-                if not 0.0 < inverse * near <= 1.0 or _is_full(ids, v - origin[1], u - origin[0]):
+                if not 0.0 < inverse * NEAR <= 1.0 or _is_full(ids, v - origin[1], u - origin[0]):
                     continue
                 for c in range(3):
                     if lost[c, i] > _VISIBLE * total[c, i]:
                         kept = max(_ONE - lost[c, i] / total[c, i], _ZERO)
-                        step = int(decode[image[v, u, c]] * kept * steps + 0.5)
+                        step = int(decode[image[v, u, c]] * kept * CODE_STEPS + 0.5)
                         image[v, u, c] = np.uint8(encode[step] + 0.5)
 
 
@@ -267,15 +289,14 @@ def _is_full(ids: Array, j: int, i: int) -> bool:
 
 @compiled(fastmath=True)
 def _light_row(
-    corner: tuple[int, int], j: int, to_point: Array, normal: Array, shades: Array, sky: Array,
-    lights: Array, P: Array, total: Array, lost: Array,
-) -> None:  # fmt: skip
-    """Sum up all light on a row of the plane's pixels, and what is hidden of it."""
+    corner: tuple[int, int], j: int, lit: _LitPlane, shades: Array, total: Array, lost: Array
+) -> None:
+    """Sum all light on a row of the plane's pixels, and the hidden part of it."""
+    to_point, normal, sky, lights, P = lit
     fv = np.float32(corner[1] + j)
     px, py = to_point[0, 1] * fv + to_point[0, 2], to_point[1, 1] * fv + to_point[1, 2]
-    pw, mx, my, mw = (
-        to_point[3, 1] * fv + to_point[3, 2], to_point[0, 0], to_point[1, 0], to_point[3, 0]
-    )  # fmt: skip
+    pw, mx = to_point[3, 1] * fv + to_point[3, 2], to_point[0, 0]
+    my, mw = to_point[1, 0], to_point[3, 0]
     nx, ny, nz = normal[0], normal[1], normal[2]
     for c in range(3):
         for i in range(total.shape[1]):

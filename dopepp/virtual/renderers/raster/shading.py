@@ -1,19 +1,15 @@
 """Shading: the light that an object's visible fragments send to the camera.
 
-The steps follow one another over all fragments of an object: what they are (``fragments``), their
-colour (``surface.texture``, noise), their normals (grooves), the sky above them
-(``surface.occlusion``), and each light (``shadow``). Every step writes arrays over all fragments.
-A fragment has a position, camera frame, metres, a unit normal towards the camera and an albedo,
-linear RGB, each of shape (3, n), and alpha, the width of GGX, of shape (n,); all are float32. π is
-left out of every term: a white diffuse surface under intensity 1 has radiance 1.
+Each pass works on all fragments of an object: colour (``surface.texture``, noise), normals
+(grooves), the open sky (``surface.occlusion``), and each light with its shadow map. Arrays are
+float32. π is left out of every term: a white diffuse surface under intensity 1 has radiance 1.
 
-Grooves are the layer lines of a print and the streaks of brushed metal: their profile is a sine of
-the distance along an axis, mixed with noise for irregular ones. Averaged over a pixel, a sine keeps
-sinc(w) of its amplitude, w being the grooves per pixel; the slope variance that the average takes
-away goes into the roughness (as in Olano and Baker, "LEAN mapping", 2010), so grooves never alias
-and a distant print still has a broad highlight.
+Grooves are the layer lines of a print or the marks of brushed metal: a sine of the distance
+along an axis, mixed with noise for irregular grooves. Averaged over a pixel of w grooves, a sine
+keeps sinc(w) of its amplitude. The lost slope variance is added to the roughness (as in Olano and
+Baker, "LEAN mapping", 2010), so grooves never alias and a distant print keeps its broad highlight.
 
-To add a material effect, write one more such pass and call it in :func:`shade_object`.
+To add a material effect, write a pass and call it in :func:`shade_object`.
 """
 
 from __future__ import annotations
@@ -51,7 +47,7 @@ _NOISE: Final = np.random.default_rng(0).integers(-127, 128, (_SIDE, _SIDE, _SID
 
 def shade_object(
     item: SceneObject,
-    seen: Projected,
+    projected: Projected,
     scene: Scene,
     lights: Sequence[ShadowMap],
     samples: Samples,
@@ -62,60 +58,48 @@ def shade_object(
 
     ``colour`` is the sum of sRGB values per pixel, float32 (height, width, 3), updated in place.
     """
-    fragments = gather_fragments(item, seen, scene, samples, first_id)
+    fragments = gather_fragments(item, projected, scene, samples, first_id)
     if fragments is None:
         return
-    material, sky = item.material, item.surface.sky
-    position, normal, count = fragments.position, fragments.normal, len(fragments.pixel)
-    albedo = _albedo(item, seen, scene, fragments)
-    alpha = scratch("alpha", (count,), np.float32)
+    material, sky, count = item.material, item.surface.sky, len(fragments.pixel)
+    _set_albedo(item, projected, scene, fragments)
     # A highlight under a point light may be narrower than any pixel.
-    alpha.fill(max(material.roughness**2, 0.002))
+    fragments.alpha.fill(max(material.roughness**2, 0.002))
     if (grooves := material.grooves) is not None:
         axis = item.T_cam_obj[:3, :3] @ np.array(grooves.axis, np.float64)
-        _tilt_normals(
-            _NOISE, position, axis, float(axis @ item.T_cam_obj[:3, 3]), scene.K.diagonal()[:2],
-            grooves.pitch, grooves.slope, grooves.irregularity, normal, alpha,
-        )  # fmt: skip
+        origin, focal = float(axis @ item.T_cam_obj[:3, 3]), scene.K.diagonal()[:2]
+        profile = np.array([grooves.pitch, grooves.slope, grooves.irregularity], np.float64)
+        _tilt_normals(_NOISE, fragments, axis, origin, focal, profile)
     opened = scratch("sky", (count,), np.float32)
     radiance = scratch("radiance", (3, count), np.float32)
     look_up_sky(fragments.face, fragments.share, sky.steps, sky.firsts, sky.values, opened)
-    reflect_ambient(
-        position, normal, albedo, alpha, opened, ambient_row(scene.ambient), material.metallic,
-        radiance,
-    )  # fmt: skip
+    ambient = ambient_row(scene.ambient)
+    reflect_ambient(fragments, opened, ambient, material.metallic, radiance)
     for shadow in lights:
-        lit = shadow.lit_shares(position, normal, fragments.bulge)
-        reflect_light(
-            position, normal, albedo, alpha, lit, shadow.light, material.specular,
-            material.metallic, radiance,
-        )  # fmt: skip
-    _add_colour(
-        fragments.pixel, fragments.weight, radiance, TONE_CURVE, TONE_LIMIT, CODE_STEPS,
-        colour.reshape(-1, 3),
-    )  # fmt: skip
+        lit = shadow.lit_shares(fragments.position, fragments.normal, fragments.bulge)
+        specular, metallic = material.specular, material.metallic
+        reflect_light(fragments, lit, shadow.light, specular, metallic, radiance)
+    _add_colour(fragments.pixel, fragments.weight, radiance, TONE_CURVE, colour.reshape(-1, 3))
 
 
-def _albedo(item: SceneObject, seen: Projected, scene: Scene, fragments: Fragments) -> Array:
-    """Return the fragments' albedo: the surface's times the material's colour, and its noise."""
-    surface, material = item.surface, item.material
-    albedo = scratch("albedo", (3, len(fragments.pixel)), np.float32)
+def _set_albedo(
+    item: SceneObject, projected: Projected, scene: Scene, fragments: Fragments
+) -> None:
+    """Set the albedo to the surface's colour times the material's, with its noise."""
+    surface, material, albedo = item.surface, item.material, fragments.albedo
+    face, share = fragments.face, fragments.share
     if surface.texture is not None:
-        sample_texture(
-            fragments.face, fragments.share, fragments.x, fragments.y, seen.hom, surface.faces,
-            surface.uv, surface.texture.texels, surface.texture.levels, SRGB_TO_LINEAR, albedo,
-        )  # fmt: skip
+        texture = (surface.texture.texels, surface.texture.levels, SRGB_TO_LINEAR)
+        points = (face, share, fragments.x, fragments.y)
+        sample_texture(points, projected.hom, surface.faces, surface.uv, texture, albedo)
     elif len(surface.colours):
-        _blend_colours(fragments.face, fragments.share, surface.faces, surface.colours, albedo)
+        _blend_colours(face, share, surface.faces, surface.colours, albedo)
     else:
         albedo.fill(1.0)
     albedo *= np.array(material.colour, np.float32)[:, None]
     if material.noise > 0.0:
-        _tint_albedo(
-            _NOISE, fragments.position, item.T_cam_obj, float(scene.K[0, 0]), material.noise,
-            material.noise_pitch, albedo, *NOISE_LIMITS,
-        )  # fmt: skip
-    return albedo
+        amplitude, pitch, focal = material.noise, material.noise_pitch, float(scene.K[0, 0])
+        _tint_albedo(_NOISE, fragments, item.T_cam_obj, focal, amplitude, pitch)
 
 
 @compiled(fastmath=True)
@@ -134,13 +118,16 @@ def _blend_colours(face: Array, share: Array, faces: Array, colours: Array, albe
 
 @compiled(fastmath=True)
 def _tint_albedo(
-    noise: Array, position: Array, T_cam_obj: Array, focal: float, amplitude: float, pitch: float,
-    albedo: Array, least: float, greatest: float,
-) -> None:  # fmt: skip
-    """Vary the albedo, in place, over an object's surface; variation finer than a pixel fades.
-
-    ``pitch`` is the lattice's, metres; the factors lie between ``least`` and ``greatest``.
-    """
+    noise: Array,
+    fragments: Fragments,
+    T_cam_obj: Array,
+    focal: float,
+    amplitude: float,
+    pitch: float,
+) -> None:
+    """Vary the albedo over the surface; ``pitch`` is the step of the noise lattice, metres."""
+    position, albedo = fragments.position, fragments.albedo
+    least, greatest = NOISE_LIMITS
     for p in range(position.shape[1]):
         # Two lattice steps are the shortest wave; it needs two pixels.
         fade = 2.0 - position[2, p] / (focal * pitch)
@@ -162,15 +149,16 @@ def _tint_albedo(
 
 @compiled(fastmath=True)
 def _tilt_normals(
-    noise: Array, position: Array, axis: Array, phase_origin: float, focal: Array, pitch: float,
-    slope: float, irregularity: float, normal: Array, alpha: Array,
-) -> None:  # fmt: skip
-    """Tilt the normals of grooved points, or widen their alpha where grooves are fine, in place.
+    noise: Array, fragments: Fragments, axis: Array, origin: float, focal: Array, profile: Array
+) -> None:
+    """Tilt the normals of grooved points, or widen their alpha where grooves are fine.
 
-    ``axis`` is a unit vector across the grooves, camera frame; ``phase_origin`` is ``axis ·
-    origin`` of the object's frame, metres; ``focal`` is (fx, fy), pixels.
+    ``axis`` is a unit vector across the grooves, camera frame; ``origin`` the object's origin along
+    it, metres; ``focal`` (fx, fy), pixels; ``profile`` the grooves' pitch, slope and irregularity.
     """
+    position, normal, alpha = fragments.position, fragments.normal, fragments.alpha
     ax, ay, az = axis
+    pitch, slope, irregularity = profile[0], profile[1], profile[2]
     for p in range(position.shape[1]):
         nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
         px, py, pz = position[0, p], position[1, p], position[2, p]
@@ -184,7 +172,7 @@ def _tilt_normals(
         down = pz / focal[1] * (ay - shift * ny)
         kept = _kept_share(math.sqrt(right * right + down * down) / pitch)
         if kept > 0.0:
-            phase = (ax * px + ay * py + az * pz - phase_origin) / pitch
+            phase = (ax * px + ay * py + az * pz - origin) / pitch
             wave = (1.0 - irregularity) * math.sin(2.0 * math.pi * phase)
             if irregularity > 0.0:
                 wave += irregularity * _streak_noise(noise, 2.0 * phase)
@@ -234,16 +222,17 @@ def _streak_noise(noise: Array, x: Scalar) -> Scalar:
 
 @compiled(fastmath=True)
 def reflect_ambient(
-    position: Array, normal: Array, albedo: Array, alpha: Array, opened: Array, ambient: Array,
-    metallic: float, radiance: Array,
-) -> None:  # fmt: skip
+    fragments: Fragments, opened: Array, ambient: Array, metallic: float, radiance: Array
+) -> None:
     """Set the radiance to the reflected ambient light.
 
-    A dielectric scatters the hemisphere around its normal; the little gloss on top is left out. A
-    metal mirrors the hemisphere's colour in the reflected direction, the sharper the smoother it
-    is, and tints it with its albedo. ``opened`` is the share of the ambient light that reaches each
+    A dielectric scatters the hemisphere around its normal; its weak gloss is left out. A metal
+    mirrors the hemisphere's colour in the reflected direction, tinted with its albedo; a smoother
+    metal mirrors more sharply. ``opened`` is the share of the ambient light that reaches each
     point, ``ambient`` comes from :func:`ambient_row`, ``metallic`` is 1 for metals.
     """
+    position, normal = fragments.position, fragments.normal
+    albedo, alpha = fragments.albedo, fragments.alpha
     ux, uy, uz = ambient[0], ambient[1], ambient[2]
     for p in range(position.shape[1]):
         nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
@@ -267,15 +256,21 @@ def reflect_ambient(
 
 @compiled(fastmath=True)
 def reflect_light(
-    position: Array, normal: Array, albedo: Array, alpha: Array, lit: Array, light: Array,
-    specular: float, metallic: float, radiance: Array,
-) -> None:  # fmt: skip
-    """Add one point light: Lambert, and GGX with Smith's visibility and Schlick's Fresnel factor.
+    fragments: Fragments,
+    lit: Array,
+    light: Array,
+    specular: float,
+    metallic: float,
+    radiance: Array,
+) -> None:
+    """Add a point light: Lambert, and GGX with Smith's visibility and Schlick's Fresnel factor.
 
     ``lit`` is the share of the light that reaches each point, ``light`` a :class:`ShadowMap`'s,
     ``specular`` the reflectance of the dielectric part at normal incidence, ``metallic`` 1 for a
-    metal, whose reflectance is its albedo. ``radiance`` is updated in place.
+    metal, whose reflectance is its albedo.
     """
+    position, normal = fragments.position, fragments.normal
+    albedo, alpha = fragments.albedo, fragments.alpha
     base, metal = np.float32(specular), np.float32(metallic)
     matt = _ONE - metal
     for p in range(position.shape[1]):
@@ -309,16 +304,12 @@ def reflect_light(
 
 
 @compiled(fastmath=True)
-def _add_colour(
-    pixel: Array, weight: Array, radiance: Array, curve: Array, limit: float, steps: int,
-    colour: Array,
-) -> None:  # fmt: skip
-    """Add fragments to the sums of their pixels' sRGB values.
+def _add_colour(pixel: Array, weight: Array, radiance: Array, curve: Array, colour: Array) -> None:
+    """Add fragments to the sums of their pixels' sRGB values; ``curve`` is the tone curve.
 
-    Light is encoded before samples are averaged, so a highlight's edge stays smooth. ``curve``
-    gives sRGB in ``steps`` per unit of radiance up to ``limit``.
+    Light is encoded before samples are averaged, so a highlight's edge stays smooth.
     """
     for p in range(pixel.shape[0]):
         for c in range(3):
-            step = int(min(max(radiance[c, p], 0.0), limit) * steps + 0.5)
+            step = int(min(max(radiance[c, p], 0.0), TONE_LIMIT) * CODE_STEPS + 0.5)
             colour[pixel[p], c] += weight[p] * curve[step]

@@ -1,6 +1,6 @@
-"""Visibility: what every sample of the image sees, of a scene or of one object alone; shadow maps.
+"""Visibility: the nearest triangle of every sample, for a scene or one object, and shadow maps.
 
-A shadow map is the scene's depth as a light sees it.
+A shadow map is the scene's depth from a light.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Int16
@@ -41,13 +41,13 @@ _ZERO, _ONE = np.float32(0), np.float32(1)  # literals would turn the arithmetic
 
 @dataclass(frozen=True, eq=False)
 class Projected:
-    """An object's vertices as the camera sees them.
+    """An object's projected vertices.
 
     Attributes:
         cam: Camera frame, metres, shape (V, 3).
         hom: Homogeneous pixels ``K x_cam``, shape (V, 3).
-        extent: Of its image; infinite if it crosses the camera plane, left > right if it lies
-            behind.
+        extent: Bounds of its image; infinite if it crosses the camera plane, left > right if it
+            lies behind.
     """
 
     cam: Array
@@ -55,7 +55,7 @@ class Projected:
     extent: Extent
 
     def box(self, size: Size) -> Box | None:
-        """Return the pixels of an image of a size that it may touch; None if there are none."""
+        """Return the pixels it may touch in an image of (width, height), or None."""
         left, top, right, bottom = self.extent
         if left > right:
             return None
@@ -65,7 +65,7 @@ class Projected:
         return box if box[0] < box[2] and box[1] < box[3] else None
 
     def inside(self, size: Size) -> bool:
-        """Tell whether its whole image lies within the pixel centres of an image of a size."""
+        """Return whether it lies within the pixel centres of an image of (width, height)."""
         left, top, right, bottom = self.extent
         return 0 <= left <= right <= size[0] - 1 and 0 <= top <= bottom <= size[1] - 1
 
@@ -84,21 +84,20 @@ def centres_within(extent: Extent) -> Box:
 
 
 def box_around(boxes: Iterable[Box | None]) -> Box | None:
-    """Return the box around several; None if there is none."""
-    known = [box for box in boxes if box is not None]
-    if not known:
+    """Return the box around several boxes, or None without any."""
+    drawn = [box for box in boxes if box is not None]
+    if not drawn:
         return None
-    left, top, right, bottom = zip(*known, strict=True)
+    left, top, right, bottom = zip(*drawn, strict=True)
     return min(left), min(top), max(right), max(bottom)
 
 
-@dataclass(frozen=True, eq=False)
-class Samples:
-    """What the samples of a window of the image see.
+class Samples(NamedTuple):
+    """The sample buffers of a window of the image.
 
     Attributes:
         origin: Image pixel (x, y) of the window's first pixel.
-        inverse_depth: 1/m per sample, 0 where nothing is, float32, shape (height, width, S).
+        inverse_depth: 1/m per sample, 0 for empty ones, float32, shape (height, width, S).
         ids: Triangle per sample, numbered through all objects, −1 for none, int32, same shape.
     """
 
@@ -110,9 +109,9 @@ class Samples:
 def draw_samples(
     scene: Scene, projected: Sequence[Projected], window: Box, offsets: Array
 ) -> Samples:
-    """Draw a scene's plane and objects into the samples of a window, valid until the next scene's.
+    """Draw a scene's plane and objects; the buffers are reused for the next scene.
 
-    ``offsets`` are those of a pixel's samples from its centre, shape (S, 2).
+    ``offsets`` are the samples' offsets from the pixel's centre, shape (S, 2).
     """
     left, top, right, bottom = window
     shape = (bottom - top, right - left, len(offsets))
@@ -124,12 +123,11 @@ def draw_samples(
     else:
         inverse = inverse_depth_of(scene.plane, scene.K)
         _clear_to_plane(inverse, (left, top), offsets, NEAR, inverse_depth)
+    samples = Samples((left, top), inverse_depth, ids)
     for item, seen, first in zip(scene.objects, projected, first_ids(scene), strict=True):
-        rasterise(
-            seen.hom, item.surface.faces, item.surface.closed, NEAR, (left, top), offsets,
-            inverse_depth, ids, first,
-        )  # fmt: skip
-    return Samples((left, top), inverse_depth, ids)
+        faces, closed = item.surface.faces, item.surface.closed
+        rasterise(seen.hom, faces, closed, NEAR, (left, top), offsets, inverse_depth, ids, first)
+    return samples
 
 
 def first_ids(scene: Scene) -> Array:
@@ -141,9 +139,10 @@ def first_ids(scene: Scene) -> Array:
 def draw_alone(
     item: SceneObject, hom: Array, box: Box
 ) -> tuple[Float32[np.ndarray, "height width"], Array]:
-    """Draw 1/m and triangles of an object alone at a box's pixel centres, also beyond the image.
+    """Draw an object alone at a box's pixel centres, also beyond the image.
 
-    Beside the object there is 0, and any triangle.
+    Returns:
+        Inverse depth (1/m, 0 beside the object) and triangles (undefined beside the object).
     """
     left, top, right, bottom = box
     canvas = np.zeros((max(bottom - top, 0), max(right - left, 0), 1), np.float32)
@@ -170,13 +169,13 @@ def inverse_depth_of(plane: Plane, K: Array) -> Vector:
 
 @dataclass(frozen=True, eq=False)
 class ShadowMap:
-    """What one light sees.
+    """A scene's depth from one light.
 
     Attributes:
         light: Position and linear RGB at one metre, for compiled code.
-        inverse_depth: 1/m, 0 where nothing is, shape (height, width, 1).
-        P: Camera frame to homogeneous pixels of the map, of which the third is the depth from the
-            light, shape (3, 4), float32.
+        inverse_depth: 1/m, 0 for empty texels, shape (height, width, 1).
+        P: Projection from the camera frame to homogeneous pixels of the map, the third of which is
+            the depth from the light, shape (3, 4), float32.
         texel: Metres that a texel spans per metre of depth.
     """
 
@@ -188,16 +187,15 @@ class ShadowMap:
     def lit_shares(self, position: Array, normal: Array, bulge: Array) -> Array:
         """Return the share of the light that reaches each point; 0 where it faces away.
 
-        Before a point is looked up it is lifted along its normal: by 1.5 texels (from √2 on, the
-        four texels around it lie behind it on its own plane, whatever the slope), and by its
-        ``bulge``, metres: a smooth ball of few flat triangles would shadow itself where its normals
-        still face the light.
+        Points are first lifted along their normals, by 1.5 texels and by their ``bulge``, metres.
+        Beyond √2 texels, a plane cannot shadow itself at any slope; the bulge keeps a smooth ball
+        of few flat triangles from shadowing itself where its normals still face the light.
         """
-        u, v, inverse = scratch("places", position.shape, np.float32)
-        lit = scratch("lit", u.shape, np.float32)
+        projected = scratch("projected", position.shape, np.float32)
+        lit = scratch("lit", projected.shape[1:], np.float32)
         lift = np.float32(1.5 * self.texel)
-        _place(position, normal, bulge, self.light, self.P, lift, u, v, inverse)
-        _compare(u, v, inverse, self.inverse_depth, lit)
+        _project_points(position, normal, bulge, self.light, self.P, lift, projected)
+        _compare(projected, self.inverse_depth, lit)
         return lit
 
 
@@ -215,16 +213,12 @@ def shadow_maps(scene: Scene, projected: Sequence[Projected]) -> list[ShadowMap]
 def shadow_map(
     light: Light, objects: Sequence[SceneObject], projected: Sequence[Projected], texels: float
 ) -> ShadowMap:
-    """Rasterise objects from a light; outside the map nothing casts a shadow.
-
-    ``projected`` are their vertices in the camera frame; the map's longer side has about
-    ``texels``.
-    """
+    """Rasterise objects from a light; the map's longer side has about ``texels``."""
     points = np.concatenate([transform(item.T_cam_obj, item.surface.hull) for item in objects])
     position = np.array(light.position, np.float64)
     forward = (points.min(axis=0) + points.max(axis=0)) / 2 - position
     distance = float(np.linalg.norm(forward))
-    # From their middle itself, the light looks anywhere.
+    # A light in the middle of the objects may face any direction.
     rotation = rotation_to_z(forward / distance if distance > 0 else np.array([0.0, 0.0, 1.0]))
     T_light_cam = make_transform(rotation, -rotation @ position)
     points = transform(T_light_cam, points)
@@ -258,11 +252,10 @@ def ambient_row(ambient: Ambient) -> Array:
 
 
 @compiled(fastmath=True)
-def _place(
-    position: Array, normal: Array, bulge: Array, light: Array, P: Array, lift: Scalar, u: Array,
-    v: Array, inverse: Array,
-) -> None:  # fmt: skip
-    """Project lifted points into the map: (u, v) and 1/depth, negative where they face away."""
+def _project_points(
+    position: Array, normal: Array, bulge: Array, light: Array, P: Array, lift: Scalar, out: Array
+) -> None:
+    """Project lifted points to u, v and 1/depth in the map; 1/depth is −1 where they face away."""
     x0, y0, z0 = light[0], light[1], light[2]
     a, b, c, d = P[0, 0], P[0, 1], P[0, 2], P[0, 3]
     e, f, g, h = P[1, 0], P[1, 1], P[1, 2], P[1, 3]
@@ -274,16 +267,17 @@ def _place(
         up = bulge[p] + lift * (i * x + j * y + k * z + m)
         x, y, z = x + up * nx, y + up * ny, z + up * nz
         scale = _ONE / (i * x + j * y + k * z + m)
-        u[p] = (a * x + b * y + c * z + d) * scale
-        v[p] = (e * x + f * y + g * z + h) * scale
-        inverse[p] = scale if facing > _ZERO else -_ONE
+        out[0, p] = (a * x + b * y + c * z + d) * scale
+        out[1, p] = (e * x + f * y + g * z + h) * scale
+        out[2, p] = scale if facing > _ZERO else -_ONE
 
 
 @compiled(fastmath=True)
-def _compare(u: Array, v: Array, inverse: Array, inverse_depth: Array, lit: Array) -> None:
+def _compare(projected: Array, inverse_depth: Array, lit: Array) -> None:
     """Compare projected points with the map."""
     for p in range(lit.shape[0]):
-        lit[p] = open_share(u[p], v[p], inverse[p], inverse_depth) if inverse[p] > _ZERO else _ZERO
+        u, v, inverse = projected[0, p], projected[1, p], projected[2, p]
+        lit[p] = open_share(u, v, inverse, inverse_depth) if inverse > _ZERO else _ZERO
 
 
 @compiled()
