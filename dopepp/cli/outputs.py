@@ -19,7 +19,7 @@ from dopepp.core.files import PICTURES, check_target, partial_path
 
 if TYPE_CHECKING:
     from dopepp.data.formats.bop.bop_results import BopResult
-    from dopepp.drawing.video import VideoFile
+    from dopepp.drawing.pictures import VideoFile
     from dopepp.inference.frames import FrameSource
     from dopepp.inference.pose_result import PoseResult
 
@@ -94,7 +94,7 @@ class Overlays:
             result.save(self._free(path.stem, suffix, path))
             return
         if self._video is None:
-            from dopepp.drawing.video import VideoFile
+            from dopepp.drawing.pictures import VideoFile
 
             own = Path(self._source.name)
             rate = (self._source.rate or 1.0) / self._stride

@@ -1,7 +1,7 @@
-"""Curves: the share of poses below a threshold, and rates over what makes a task harder.
+"""Curves: accuracy over thresholds, rates over conditions, and values over training.
 
-Figures are objects (:class:`matplotlib.figure.Figure`), never pyplot's global state, so threads
-and tests cannot see each other's. :func:`figure_image` turns one into pixels.
+Figures are :class:`matplotlib.figure.Figure` objects without pyplot's global state.
+:func:`figure_image` renders a figure to pixels.
 """
 
 from __future__ import annotations
@@ -21,14 +21,13 @@ from dopepp.core.files import write_csv, write_png
 from dopepp.drawing.pictures import Picture
 
 MAX_THRESHOLD: Final = 0.1
-"""Where accuracy-threshold curves end, metres (paper Fig. 4)."""
+"""Largest threshold of accuracy-threshold curves, metres (paper Fig. 4)."""
 
 _NUM_STEPS: Final = 200
 """Steps of a curve: 0.5 mm each up to 0.1 m."""
 
 _SMOOTHING: Final = 50
-"""A line of more points than this is drawn as a moving average over 1/50 of them, above its own
-pale self."""
+"""Lines of more points are drawn pale, below their moving average over 1/50 of the points."""
 
 
 def accuracy_curve(
@@ -51,10 +50,13 @@ def accuracy_figure(
     title: str = "",
     colours: Mapping[str, str] | None = None,
 ) -> Figure:
-    """Draw accuracy-threshold curves of several methods, their exact AUC in the legend.
+    """Draw accuracy-threshold curves of several methods, with their exact AUC in the legend.
 
-    ``curves`` are errors in metres by name, a miss is infinite; they end at ``max_threshold``
-    metres. ``colours`` are Matplotlib's names by method; its own order by default.
+    Args:
+        curves: Errors in metres by method; infinite for a miss.
+        max_threshold: Largest threshold, metres.
+        title: Title of the figure.
+        colours: Matplotlib colours by method; the default cycle if None.
     """
     figure, axes = figure_with_axes("error threshold (m)", "share of instances below (%)", title)
     for name, errors in curves.items():
@@ -76,7 +78,7 @@ def save_accuracy_curves(
 ) -> Figure:
     """Write the curves as ``<path>.png`` and ``<path>.csv`` and return the figure.
 
-    The CSV has a column ``threshold_m`` and one per method with the share below, in [0, 1].
+    The CSV has a column ``threshold_m`` and a column per method, the share below in [0, 1].
     """
     path = Path(path)
     columns = {"threshold_m": np.linspace(0.0, max_threshold, _NUM_STEPS + 1)}
@@ -109,19 +111,16 @@ def figure_image(figure: Figure) -> Picture:
 
 
 def _area(errors: Float[np.ndarray, "n"], max_threshold: float) -> float:
-    """Exact area under the curve; metrics stand above drawing, which may not import ``auc``."""
+    """Return the exact area under the curve (``metrics.auc`` is in a higher layer)."""
     if len(errors) == 0:
         return 0.0
-    # fmin passes NaN over, which makes it the miss it is.
+    # fmin ignores NaN, which counts NaN as a miss.
     return float(np.mean(1 - np.fmin(errors, max_threshold) / max_threshold))
 
 
 @dataclass(frozen=True)
 class RateCurve:
-    """One line: rates in [0, 1] at ascending values of a quantity.
-
-    ``low`` and ``high`` are the ends of its confidence interval.
-    """
+    """Rates in [0, 1] at ascending values of a quantity, with confidence limits."""
 
     x: Float[np.ndarray, "points"]
     rate: Float[np.ndarray, "points"]
@@ -137,11 +136,15 @@ def rates_figure(
     *,
     ratio: bool = False,
 ) -> Figure:
-    """Draw panels row by row, each with a line and a band of confidence for every method.
+    """Draw panels row by row, with a line and a confidence band for every method.
 
-    ``panels`` are by title, then by method; ``columns`` are in a row. ``x_label`` is the quantity
-    with its unit; of a ratio the axis is logarithmic, marked where it was measured. ``edges`` are
-    where bins end, marked on the axis.
+    Args:
+        panels: Curves by title and method.
+        x_label: Quantity with its unit.
+        columns: Panels per row.
+        edges: Limits of bins, to mark on the axis.
+        ratio: Whether the quantity is a ratio, drawn on a logarithmic axis with ticks at the
+            measured values.
     """
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(columns * 5.2, rows * 4.0), dpi=120, layout="constrained")
@@ -151,7 +154,7 @@ def rates_figure(
             rate, low, high = 100 * curve.rate, 100 * curve.low, 100 * curve.high
             (line,) = axes.plot(curve.x, rate, marker="o", markersize=4, label=name)
             axes.fill_between(curve.x, low, high, color=line.get_color(), alpha=0.15, lw=0)
-            # A band needs two points, and a bar says which points are measured.
+            # Bars mark the measured points; a band needs at least two.
             axes.vlines(curve.x, low, high, line.get_color(), alpha=0.5, lw=1)
         for edge in () if edges is None else edges:
             axes.axvline(float(edge), color="0.8", linewidth=0.8, zorder=0)
@@ -172,7 +175,7 @@ def rates_figure(
 
 @dataclass(frozen=True)
 class PlotLine:
-    """One method's values over training, by run; NaN where there is none."""
+    """A method's values over training, by run; NaN for missing values."""
 
     name: str
     x: Float[np.ndarray, "points"]
@@ -184,9 +187,9 @@ class PlotLine:
 def lines_figure(
     lines: Sequence[PlotLine], x_label: str, y_label: str, log_y: bool = False
 ) -> Figure:
-    """Draw lines; of several runs their mean, in a band from the lowest to the highest.
+    """Draw lines; several runs as their mean within a band from the lowest to the highest.
 
-    ``y_label`` has its unit; ``log_y`` makes values logarithmic, where all are positive.
+    ``log_y`` selects a logarithmic axis, if all values are positive.
     """
     figure, axes = figure_with_axes(x_label, y_label)
     for line in lines:
@@ -197,8 +200,8 @@ def lines_figure(
         marker = "o" if len(mean) <= _SMOOTHING else ""
         if len(mean) > _SMOOTHING and len(line.values) == 1:
             axes.plot(line.x, mean, color=line.colour, alpha=0.2)
-        axes.plot(line.x, smoothed(mean), "--" if line.dashed else "-", color=line.colour,
-                  label=line.name, marker=marker, markersize=3)  # fmt: skip
+        style = ("--" if line.dashed else "-") + marker
+        axes.plot(line.x, smoothed(mean), style, color=line.colour, label=line.name, markersize=3)
     positive = [(line.values[np.isfinite(line.values)] > 0).all() for line in lines]
     if log_y and lines and all(positive):
         axes.set_yscale("log")
@@ -208,7 +211,7 @@ def lines_figure(
 
 
 def smoothed(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Return the moving average of a long line, of what there is near its ends."""
+    """Return the moving average of a long line; windows are cut off at the ends."""
     width = max(1, len(values) // _SMOOTHING)
     if width == 1:
         return values

@@ -1,8 +1,8 @@
-"""Wireframes of objects' cuboids, lines and text on an image, so that a person can judge a pose.
+"""Wireframes of cuboids, lines and text on an image, for people to judge poses.
 
-A cuboid's +z face is drawn bright and thick with an arrow head on it that points to +y; so, unless
-that face is seen edge-on, every orientation looks different, even of a cube. Text is in any script
-that matplotlib's own font has, where cv2's fonts know ASCII only.
+A cuboid's +z face is bright and thick, with an arrow head that points to +y. Every orientation of a
+cube therefore looks different, unless that face is seen edge-on. Text uses matplotlib's font,
+because cv2's fonts are limited to ASCII.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Colour = tuple[int, int, int]
 """RGB, 0..255."""
 
 YELLOW: Final[Colour] = (255, 221, 0)
-"""Predicted; DOPE++ where two networks are compared (paper Fig. 14)."""
+"""Prediction; DOPE++ in a comparison of two networks (paper Fig. 14)."""
 
 GREEN: Final[Colour] = (40, 220, 60)
 """Ground truth."""
@@ -33,10 +33,10 @@ BLUE: Final[Colour] = (70, 165, 255)
 """The DOPE baseline (paper Fig. 14)."""
 
 MIN_WIDTH_PX: Final = 640
-"""Narrower images are enlarged before drawing: lines and legend need that many pixels."""
+"""Narrower images are enlarged before drawing, for readable lines and legends."""
 
 _FRACTION_BITS: Final = 4
-"""cv2 takes sub-pixel coordinates as integers, here in 1/16 pixel."""
+"""cv2's sub-pixel coordinates are integers, here in 1/16 pixel."""
 
 _FRONT: Final = frozenset(np.flatnonzero(CORNER_SIGNS[:, 2] > 0).tolist())
 _FRONT_BOTTOM: Final = tuple(np.flatnonzero((CORNER_SIGNS[:, 1:] == [-1, 1]).all(axis=1)).tolist())
@@ -48,7 +48,7 @@ class Wireframe:
     """A cuboid to draw.
 
     Attributes:
-        keypoints: Its eight corners and centroid, pixels; NaN where there is none.
+        keypoints: Eight corners and centroid, pixels; NaN for missing keypoints.
     """
 
     keypoints: Float[np.ndarray, "9 2"]
@@ -80,12 +80,14 @@ def overlay(
 def draw_wireframe(
     image: Picture, keypoints: Float[np.ndarray, "9 2"], colour: Colour = YELLOW, thickness: int = 1
 ) -> Picture:
-    """Draw one cuboid, anti-aliased, on a copy of the image.
+    """Draw a cuboid, anti-aliased, on a copy of the image.
 
-    Edges with a keypoint that is not finite are left out; those that leave the image are cut.
-
-    ``keypoints`` are eight corners in NDDS order and the centroid, pixels. ``thickness`` is that of
-    the back edges, pixels; those of the +z face get one more.
+    Args:
+        image: Image to copy.
+        keypoints: Eight corners in NDDS order and the centroid, pixels; edges with a keypoint that
+            is not finite are left out.
+        colour: Colour of the +z face; other edges are darker.
+        thickness: Width of the back edges, pixels; edges of the +z face are one pixel wider.
     """
     canvas = np.ascontiguousarray(image).copy()
     points = np.asarray(keypoints, np.float64)
@@ -104,7 +106,7 @@ def draw_wireframe(
 
 
 def enlarge(image: Picture, factor: int) -> UInt8[np.ndarray, "out_height out_width 3"]:
-    """Enlarge a copy of the image by a whole factor; ``resize_points`` moves keypoints along."""
+    """Enlarge a copy of the image by an integer factor (``resize_points`` scales keypoints)."""
     if factor == 1:
         return np.ascontiguousarray(image).copy()
     resized = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
@@ -118,10 +120,7 @@ def draw_line(
     colour: tuple[int, ...],
     thickness: int,
 ) -> None:
-    """Draw a segment IN PLACE, anti-aliased, between positions in pixels.
-
-    Equal ends make a dot, ends that are not finite nothing.
-    """
+    """Draw an anti-aliased segment IN PLACE; equal ends make a dot, ends not finite nothing."""
     clipped = _clip(start, end, canvas.shape[1], canvas.shape[0], margin=2 * thickness)
     if clipped is None:
         return
@@ -133,7 +132,7 @@ def draw_line(
 def _clip(
     start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"], width: int, height: int, margin: int
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]] | None:
-    """Cut a segment to the image and a margin (Liang–Barsky): cv2 overflows far outside."""
+    """Clip a segment to the image and a margin (Liang–Barsky); cv2 overflows far outside."""
     if not (np.isfinite(start).all() and np.isfinite(end).all()):
         return None
     direction = end - start
@@ -156,24 +155,24 @@ def _clip(
 def draw_text(
     image: Picture, text: str, position: tuple[int, int], size_px: int, colour: tuple[int, int, int]
 ) -> None:
-    """Write one line IN PLACE on a darkened box; what leaves the image is cut off.
+    """Write a line IN PLACE on a darkened box, cut off at the border.
 
-    ``position`` is (column, row) of its top left corner, pixels, not negative; ``size_px`` its
+    ``position`` is (column, row) of the top left corner, pixels, not negative; ``size_px`` the
     height.
     """
     column, row = position
-    place = image[row : row + size_px, column:]
-    coverage = text_coverage(text, size_px)[: place.shape[0], : place.shape[1], None]
-    place = place[:, : coverage.shape[1]]
-    # Half-dark ground keeps any colour readable on any picture.
-    place[:] = np.rint(0.5 * place * (1 - coverage) + np.array(colour) * coverage)
+    box = image[row : row + size_px, column:]
+    coverage = text_coverage(text, size_px)[: box.shape[0], : box.shape[1], None]
+    box = box[:, : coverage.shape[1]]
+    # Darkening keeps any colour readable on any picture.
+    box[:] = np.rint(0.5 * box * (1 - coverage) + np.array(colour) * coverage)
 
 
 def draw_tags(image: Picture, tags: Sequence[tuple[str, tuple[float, float], Colour]]) -> None:
-    """Write a line above each of several places IN PLACE, none over another.
+    """Write a line of text IN PLACE above each of several points, without overlap.
 
-    A tag is its text, the (column, row) of what it names, pixels, and its colour; where that lies
-    outside the image, the text stands at the border.
+    A tag is a text, a point (column, row) in pixels and a colour; texts of points outside the image
+    are written at the border.
     """
     size = max(12, round(max(image.shape[:2]) / 50))
     taken: list[tuple[int, int, int]] = []
@@ -192,17 +191,17 @@ def draw_tags(image: Picture, tags: Sequence[tuple[str, tuple[float, float], Col
 
 @lru_cache(maxsize=256)
 def text_coverage(text: str, size_px: int) -> Float[np.ndarray, "size_px width"]:
-    """Rasterise one line: how much of each pixel the glyphs cover, in [0, 1]; do not change it."""
-    # Imported where text is drawn: a command that prints poses alone starts without it.
+    """Return each pixel's coverage by a line of text, in [0, 1]; a shared, read-only array."""
+    # Imported on demand, so that a command that only prints poses starts faster.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    # Wide enough for any glyph (an em each), cut to the measured width afterwards.
+    # An em per glyph is wide enough; the result is cut to the measured width.
     width = size_px * (len(text) + 1)
     figure = Figure(figsize=(width / 100, size_px / 100), dpi=100)
     canvas = FigureCanvasAgg(figure)
-    # 0.72 of the line is the em, so that ascenders and descenders stay inside, and at 100 dots per
-    # inch a pixel is 0.72 typographic points.
+    # The em is 0.72 of the line, which leaves room for ascenders and descenders; at 100 dots per
+    # inch a pixel is 0.72 points.
     points = 0.72 * size_px * 0.72
     label = figure.text(
         size_px / 4 / width, 0.28, text, fontsize=points, va="baseline", parse_math=False

@@ -1,26 +1,33 @@
-"""Pictures from anybody's files: decoded whole or not at all, and never larger than expected.
+"""Picture and video files: strict decoding of pictures, and crash-safe writing of videos.
 
-Every reader of photos, textures, frames, depth images and masks decodes here. Pillow refuses a file
-that is cut short, where OpenCV returns the part it has, and it tells a picture's size before it
-decodes it; a PNG's checksums and a JPEG's end, which it does not look at, are held to as well.
-
-To take a further format, name it in :data:`FORMATS`, if it is nothing but pixels.
+All photos, textures, frames, depth images and masks are decoded here, completely or not at all.
+Pillow, unlike OpenCV, rejects truncated files and reports the size before decoding; the checksums
+of a PNG and the end of a JPEG are checked here. To accept a further format of plain pixels, name it
+in :data:`FORMATS`.
 """
 
 from __future__ import annotations
 
 import io
+import os
+import shutil
 import warnings
 import zlib
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Final
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
-from dopepp.core.errors import UserError
+from dopepp.core.errors import RunError, UserError
+from dopepp.core.files import partial_path
+
+# OpenCV reads this once, before its first video: FFmpeg must not write to the terminal.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 Picture = UInt8[np.ndarray, "height width 3"]
 """RGB, first row on top."""
@@ -34,25 +41,34 @@ Shape = tuple[int, int]
 Mask = Bool[np.ndarray, "height width"]
 
 DepthMap = Float[np.ndarray, "height width"]
-"""Metres along z, 0 where unknown."""
+"""Metres along z; 0 for unknown."""
 
 FORMATS: Final = ("BMP", "JPEG", "PNG", "TGA", "TIFF", "WEBP")
-"""Formats that are nothing but pixels: PIL would hand EPS to another program."""
+"""Formats of plain pixels; PIL would pass EPS to another program."""
 
 FRAME_FORMATS: Final = ("PNG", "JPEG")
 """Formats of the frames of YCB-Video, NDDS and FAT."""
 
 MAX_SIDE: Final = 8192
-"""Pixels; such a picture takes 0.2 GB, and a small file can claim any size."""
+"""Longest side, pixels: 0.2 GB in memory. A small file can declare any size."""
 
 MAX_PIXELS: Final = 64_000_000
-"""Of a data set's image: twice the largest industrial cameras."""
+"""Largest image of a data set: twice the largest industrial cameras."""
 
 MAX_BYTES: Final = 256_000_000
-"""Of a picture's file: as many pixels as :data:`MAX_SIDE` allows, without compression."""
+"""Largest file: the pixels that :data:`MAX_SIDE` allows, without compression."""
 
 DARKEST: Final = 16
 """Brightest value, of 255, of 16-bit pixels that hold no more than 12 bits."""
+
+LEAST_FREE: Final = 16_000_000
+"""Free bytes on the disk below which writing stops, so that the file can still be completed."""
+
+USUAL_RATE: Final = 25.0
+"""Frames per second if a file or a camera does not state the rate."""
+
+LONGEST_GAP_S: Final = 2.0
+"""Longest time for which a picture is repeated if the next is late, seconds."""
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _JPEG: Final = b"\xff\xd8"
@@ -60,11 +76,15 @@ _JPEG_END: Final = b"\xff\xd9"
 
 
 def read_picture(path: Path, longest_px: int | None = None) -> Picture:
-    """Return a picture in one of :data:`FORMATS`, whatever its suffix, as RGB.
+    """Return a picture in one of :data:`FORMATS` as RGB.
 
-    One whose longer side is longer than ``longest_px`` is reduced; a JPEG file is then decoded at a
-    fraction of its size, which takes a fraction of the time. A ValueError: it is missing, no
-    picture, damaged, or over 8,192 pixels wide or high.
+    Args:
+        path: File, with any suffix.
+        longest_px: Longest side; larger pictures are reduced (a JPEG is then decoded at a fraction
+            of its size and time).
+
+    Raises:
+        ValueError: The file is missing, damaged, no picture, or a side exceeds :data:`MAX_SIDE`.
     """
     try:
         with _opened(_content(path), FORMATS) as image:
@@ -81,9 +101,10 @@ def read_picture(path: Path, longest_px: int | None = None) -> Picture:
 
 
 def whole_picture(content: bytes, formats: tuple[str, ...] = FORMATS) -> Image.Image:
-    """Decode a file that is in memory, with its own depth and channels.
+    """Decode a file's content with its original depth and channels.
 
-    A ValueError: it is none of the formats, damaged, or larger than :data:`MAX_PIXELS`.
+    Raises:
+        ValueError: The content is none of the formats, damaged, or over :data:`MAX_PIXELS`.
     """
     try:
         image = _opened(content, formats)
@@ -96,7 +117,11 @@ def whole_picture(content: bytes, formats: tuple[str, ...] = FORMATS) -> Image.I
 
 
 def read_content(path: Path) -> bytes:
-    """Return an image file's bytes; a UserError where it is missing or too large."""
+    """Return an image file's bytes.
+
+    Raises:
+        UserError: The file is missing or too large.
+    """
     try:
         return _content(path)
     except (OSError, ValueError) as error:
@@ -107,10 +132,11 @@ def read_content(path: Path) -> bytes:
 
 
 def read_image(path: Path) -> NDArray[Any]:
-    """Read a frame with its own depth and channels, colours as R, G, B(, A).
+    """Read a PNG or JPEG frame with its original depth and channels, colours as R, G, B(, A).
 
-    A UserError: the file is missing, is neither PNG nor JPEG, is incomplete or damaged, or has
-    colours of 16 bits.
+    Raises:
+        UserError: The file is missing, incomplete, damaged, of another format, or has 16-bit
+            colours.
     """
     content = read_content(path)
     try:
@@ -122,21 +148,22 @@ def read_image(path: Path) -> NDArray[Any]:
             "copy or download the file again",
         ) from error
     if _is_deep_colour(content):
-        # Pillow would drop their lower half without a word.
+        # Pillow would silently drop the lower half of the bits.
         raise UserError(f"image {path} of 16-bit colours", "8 bits a channel", "convert it")
     if image.mode.startswith("I"):
         return np.asarray(image, np.uint16)
     if image.mode not in ("L", "RGB", "RGBA"):
-        # Palettes, greys with alpha, one bit a pixel, print colours.
+        # Palettes, greys with alpha, one bit per pixel, print colours.
         plain = "L" if image.mode == "1" else "RGBA" if image.has_transparency_data else "RGB"
         image = image.convert(plain)
     return np.asarray(image)
 
 
 def read_rgb(path: Path) -> Picture:
-    """Read an 8-bit frame as RGB; an alpha channel is dropped, grey becomes three channels.
+    """Read an 8-bit frame as RGB; alpha is dropped, grey becomes three channels.
 
-    A UserError, as from :func:`read_image`, also where the image does not have 8 bits.
+    Raises:
+        UserError: As :func:`read_image`, or the image does not have 8 bits.
     """
     image = read_image(path)
     if image.dtype != np.uint8:
@@ -147,13 +174,14 @@ def read_rgb(path: Path) -> Picture:
 
 
 def read_photo(path: Path) -> Picture:
-    """Read what a camera or a person has saved as RGB, upright: as OpenCV reads it, and no less.
+    """Read a picture in one of :data:`FORMATS` as upright 8-bit RGB, as OpenCV reads it.
 
-    The format is one of :data:`FORMATS`. An EXIF orientation is applied, an alpha channel dropped;
-    grey becomes three channels. Of 16 bits the upper eight are taken.
+    The EXIF orientation is applied, alpha dropped, grey repeated. Of 16 bits, the upper eight are
+    used.
 
-    A UserError: the file is missing, damaged or too large, none of the formats or one of several
-    pages, its values are not 8 or 16 bits, or its 16 bits hold so little that nothing is left.
+    Raises:
+        UserError: The file is missing, damaged, too large, of another format or multi-page, its
+            values do not have 8 or 16 bits, or its 16-bit values are too dark.
     """
     allowed = "a picture (PNG, JPEG, TIFF, BMP, WEBP) of 8 or 16 bits a channel"
     save = f"save it as PNG, e.g. with ImageMagick: magick {path.name} picture.png"
@@ -169,7 +197,7 @@ def read_photo(path: Path) -> Picture:
         raise UserError(f"image {path}: {_reason(error)}", allowed, save) from error
     if is_grey16:
         picture = np.repeat((np.asarray(image, np.uint16) >> 8)[..., None], 3, 2).astype(np.uint8)
-    else:  # of 16-bit colours, Pillow has taken the upper eight itself
+    else:  # Pillow keeps the upper eight of 16 bits in colours
         picture = np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
     if is_deep and picture[..., :3].max() < DARKEST:
         raise UserError(
@@ -189,27 +217,27 @@ def _content(path: Path) -> bytes:
 
 
 def _opened(content: bytes, formats: tuple[str, ...]) -> Image.Image:
-    """Open a picture and hold it to its format, without decoding it."""
+    """Open a picture and check its container, without decoding."""
     damage = "" if content else "an empty file"
     if content.startswith(_PNG):
         damage = _png_damage(content)
     elif content.startswith(_JPEG) and _JPEG_END not in content:
-        damage = "no end marker"  # behind which cameras append anything
+        damage = "no end marker"  # cameras may append data after the marker
     if damage:
         raise ValueError(f"truncated or damaged, {damage}")
     with warnings.catch_warnings():
-        # Of a picture above its limit PIL warns, in a line of its own; ours are lower.
+        # Our limits are lower than the limit of this warning.
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         try:
             return Image.open(io.BytesIO(content), formats=formats)
         except UnidentifiedImageError:
-            # PIL's own text shows an address in memory.
+            # PIL's message contains a memory address.
             listed = ", ".join(formats)
             raise ValueError(f"cannot identify the format, none of {listed}") from None
 
 
 def _png_damage(content: bytes) -> str:
-    """Walk the chunks (length, type, data, checksum) up to IEND; say what is wrong, if anything."""
+    """Check the chunks (length, type, data, checksum) up to IEND; return the damage, or ''."""
     start = len(_PNG)
     while start + 12 <= len(content):
         length = int.from_bytes(content[start : start + 4], "big")
@@ -226,15 +254,89 @@ def _png_damage(content: bytes) -> str:
 
 
 def _is_deep_colour(content: bytes) -> bool:
-    """Tell whether a PNG's header (behind signature, length, type and size) says 16-bit colour."""
+    """Return whether a PNG's header (after signature, length, type and size) has 16-bit colour."""
     return content.startswith(_PNG) and content[24] == 16 and content[25] != 0
 
 
 def _is_deep(image: Image.Image, content: bytes) -> bool:
-    """Tell whether a picture has 16 bits a channel, by a PNG's header or a TIFF's entry."""
+    """Return whether a PNG's header or a TIFF's tag declares 16 bits per channel."""
     bits = getattr(image, "tag_v2", {}).get(ExifTags.Base.BitsPerSample, (8,))
     return max(bits) == 16 or (content.startswith(_PNG) and content[24] == 16)
 
 
 def _reason(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
+
+
+class VideoFile(AbstractContextManager["VideoFile"]):
+    """An MP4 file (MPEG-4 part 2), written to a partial file that is renamed on close.
+
+    Pictures are repeated or dropped to match their times, and resized to the first picture's size.
+    Odd sides are padded by one pixel, as the format requires even sides.
+
+    Args:
+        path: Path of the video, with the suffix ``.mp4``.
+        rate: Frames per second.
+    """
+
+    def __init__(self, path: Path, rate: float) -> None:
+        self.path, self._rate = path, rate
+        partial = partial_path(path)
+        self._partial = partial.with_name(partial.name + path.suffix)
+        self._writer: cv2.VideoWriter | None = None
+        self._size = (0, 0)
+        self._start = 0.0
+        self._written = 0
+
+    def write(self, picture: Picture, time: float) -> None:
+        """Add a picture taken at a time in seconds.
+
+        Raises:
+            RunError: The disk is full, or this OpenCV cannot write MP4.
+        """
+        height, width = picture.shape[:2]
+        even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), "edge")
+        if self._writer is None:
+            self._size, self._start = (even.shape[1], even.shape[0]), time
+            code = cv2.VideoWriter.fourcc(*"mp4v")
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._writer = cv2.VideoWriter(
+                str(self._partial), cv2.CAP_FFMPEG, code, self._rate, self._size
+            )
+            if not self._writer.isOpened():
+                raise RunError(f"{self.path}: this OpenCV cannot write MP4 videos")
+        if (even.shape[1], even.shape[0]) != self._size:
+            even = np.asarray(cv2.resize(even, self._size, interpolation=cv2.INTER_AREA))
+        until = round((time - self._start) * self._rate) + 1
+        until = min(until, self._written + max(1, round(LONGEST_GAP_S * self._rate)))
+        if self._written < until and shutil.disk_usage(self.path.parent).free < LEAST_FREE:
+            raise RunError(f"no space left for {self.path}: free some")
+        frame = cv2.cvtColor(even, cv2.COLOR_RGB2BGR)
+        while self._written < until:
+            self._writer.write(frame)
+            self._written += 1
+
+    def close(self) -> None:
+        """Complete the file.
+
+        Raises:
+            RunError: Frames are missing from the file.
+        """
+        if self._writer is None:
+            return
+        self._writer.release()
+        self._writer = None
+        num_saved = 0
+        if self._written:
+            reader = cv2.VideoCapture(str(self._partial), cv2.CAP_FFMPEG)
+            num_saved = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
+            reader.release()
+        if num_saved:
+            self._partial.replace(self.path)
+        self._partial.unlink(missing_ok=True)
+        if num_saved < self._written:
+            frames = f"{num_saved} of {self._written} frames"
+            raise RunError(f"{self.path}: only {frames} were saved: is the disk full?")
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,4 +1,4 @@
-"""Contact sheets of captioned pictures, and panels for them: masks, depth, axes, a message."""
+"""Contact sheets of captioned pictures, and their panels: masks, depth, axes and messages."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from dopepp.geometry.cuboid import CENTROID
 
 _CAPTION_PX: Final = 18
 _MIN_CAPTION_PX: Final = 9
-"""Smallest readable line; what is still too long at this size is cut."""
+"""Smallest readable line; longer text is cut."""
 
 COLOURS: Final[tuple[Colour, ...]] = (
     (230, 25, 75), (60, 180, 75), (255, 225, 25), (0, 130, 200), (245, 130, 48),
     (145, 30, 180), (70, 240, 240), (240, 50, 230), (210, 245, 60), (250, 190, 212),
 )  # fmt: skip
-"""Of the first, second, … instance; easy to tell apart, also with most colour blindness."""
+"""Colours of instances, distinguishable with most kinds of colour blindness."""
 
 AXIS_COLOURS: Final[tuple[Colour, ...]] = ((255, 60, 60), (60, 255, 60), (90, 140, 255))
 """x red, y green, z blue, as everywhere."""
@@ -34,19 +34,17 @@ _COVER: Final = 0.65
 
 @dataclass(frozen=True)
 class Tile:
-    """One picture of a contact sheet.
-
-    ``caption`` is one line below it; empty for none.
-    """
+    """A picture of a contact sheet with a line of text below it, or ``""``."""
 
     image: Picture
     caption: str = ""
 
 
 def contact_sheet(tiles: Sequence[Tile], columns: int = 4, tile_width: int = 320) -> Picture:
-    """Lay tiles out row by row on white, each scaled to one width with its shape kept.
+    """Lay tiles out row by row on white, each scaled to ``tile_width`` pixels.
 
-    A row has ``columns`` tiles at most; ``tile_width`` is in pixels. A ValueError without tiles.
+    Raises:
+        ValueError: There are no tiles.
     """
     gap = 6
     drawn = [
@@ -57,7 +55,7 @@ def contact_sheet(tiles: Sequence[Tile], columns: int = 4, tile_width: int = 320
 
 
 def _draw_tile(tile: Tile, width: int) -> Picture:
-    """Scale the picture and put its caption, shrunk to fit, below it."""
+    """Scale the picture and add its caption, shrunk to fit."""
     scale = width / tile.image.shape[1]
     height = max(1, round(tile.image.shape[0] * scale))
     # Averaging is right for shrinking, cubic for enlarging.
@@ -67,8 +65,8 @@ def _draw_tile(tile: Tile, width: int) -> Picture:
 
 
 def text_line(text: str, width: int) -> Picture:
-    """Return one line of black text on a white strip of a width in pixels, shrunk to fit."""
-    # Glyphs are hinted, so their width does not follow the size exactly: try, largest first.
+    """Return a line of black text on a white strip of ``width`` pixels, shrunk to fit."""
+    # Hinted glyphs do not scale exactly with the size: try sizes, the largest first.
     lines = (text_coverage(text, px) for px in range(_CAPTION_PX, _MIN_CAPTION_PX, -1))
     smallest = text_coverage(text, _MIN_CAPTION_PX)
     coverage = next((line for line in lines if line.shape[1] <= width), smallest)[:, :width, None]
@@ -78,27 +76,31 @@ def text_line(text: str, width: int) -> Picture:
 
 
 def grid(pictures: Sequence[Picture], columns: int) -> Picture:
-    """Put pictures side by side, row by row, on white; a ValueError, if there is none to put."""
+    """Arrange pictures row by row on white.
+
+    Raises:
+        ValueError: There are no pictures or no columns.
+    """
     if not pictures or columns < 1:
         raise ValueError(f"a grid needs pictures and columns, got {len(pictures)} and {columns}")
     rows = [pictures[i : i + columns] for i in range(0, len(pictures), columns)]
-    width = max(sum(one.shape[1] for one in row) for row in rows)
+    width = max(sum(picture.shape[1] for picture in row) for row in rows)
     bands = []
     for row in rows:
-        band = np.full((max(one.shape[0] for one in row), width, 3), 255, np.uint8)
+        band = np.full((max(picture.shape[0] for picture in row), width, 3), 255, np.uint8)
         left = 0
-        for one in row:
-            band[: one.shape[0], left : left + one.shape[1]] = one
-            left += one.shape[1]
+        for picture in row:
+            band[: picture.shape[0], left : left + picture.shape[1]] = picture
+            left += picture.shape[1]
         bands.append(band)
     return np.concatenate(bands)
 
 
 def message_picture(width: int, height: int, text: str) -> Picture:
-    """Return an empty picture that says why it is empty; lines beyond its height are cut."""
+    """Return a grey picture with a message; lines beyond its height are cut."""
     picture = np.full((height, width, 3), 225, np.uint8)
     size = max(10, int(0.05 * width))
-    # A character is half as wide as the line is high, in the mean.
+    # On average, a character is half as wide as the line is high.
     per_line = max(10, int((width - 2 * size) / (0.52 * size)))
     for number, line in enumerate(textwrap.wrap(text, per_line)):
         top = size + number * (size + size // 4)
@@ -111,37 +113,36 @@ def message_picture(width: int, height: int, text: str) -> Picture:
 def belief_tiles(
     image: Picture, beliefs: Float[np.ndarray, "9 map_height map_width"], stride: int, name: str
 ) -> list[Tile]:
-    """Show an image twice with the maxima: under its corners' and under its centroid's beliefs.
+    """Return tiles of the corners' and the centroid's beliefs over an image, with their maxima.
 
     See :func:`heat_picture`; the captions begin with ``name``.
     """
     maps = {"corners": beliefs[:CENTROID].max(axis=0), "centroid": beliefs[CENTROID]}
     return [
-        Tile(heat_picture(image, one, stride), f"{name} {which}, max {one.max():.2f}")
-        for which, one in maps.items()
+        Tile(heat_picture(image, belief, stride), f"{name} {title}, max {belief.max():.2f}")
+        for title, belief in maps.items()
     ]
 
 
 def heat_picture(
     image: Picture, channel: Float[np.ndarray, "map_height map_width"], stride: int = 8
 ) -> Picture:
-    """Blend one map into the dimmed image, the more opaque the stronger the belief.
+    """Blend a belief map into the dimmed image, with the belief (clipped to [0, 1]) as opacity.
 
-    The image is at the scale of the network's input, ``stride`` pixels per cell of the map that
-    covers it, whose values are clipped to [0, 1].
+    The image has the scale of the network's input, ``stride`` pixels per cell of the map.
     """
     # cv2's resize keeps pixel centres: cell i lands on pixel stride·i + (stride − 1)/2.
     large = cv2.resize(channel, None, fx=stride, fy=stride, interpolation=cv2.INTER_LINEAR)
     share = np.clip(large[: image.shape[0], : image.shape[1]], 0.0, 1.0)
     heat = cv2.applyColorMap(np.rint(255 * share).astype(np.uint8), cv2.COLORMAP_JET)
     weight = (0.8 * share)[..., None]
-    # The picture is dimmed, so that a faint belief is not lost in a bright background.
+    # Dim the picture, so that a faint belief is visible on a bright background.
     blended = (1 - weight) * 0.6 * image + weight * heat[..., ::-1]
     return np.asarray(np.rint(blended), np.uint8)
 
 
 def mask_panel(image: Picture, masks: Sequence[Mask | None]) -> Picture:
-    """Paint each instance's visible pixels in its colour on the darkened, grey image."""
+    """Paint each instance's visible pixels on the darkened grey image."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[..., None].repeat(3, axis=2)
     panel = 0.35 * grey.astype(np.float64)
     for number, mask in enumerate(masks):
@@ -152,33 +153,31 @@ def mask_panel(image: Picture, masks: Sequence[Mask | None]) -> Picture:
 
 
 def depth_panel(depth: DepthMap, shown: Mask) -> tuple[Picture, str]:
-    """Colour depth from near (red) to far (blue), unknown black; return the ends in words, too.
+    """Colour depth from near (red) to far (blue), unknown depth black, and describe the scale.
 
-    The scale is for the ``shown`` pixels, the objects': a plane that reaches far behind them would
-    leave them one colour.
+    The scale spans the ``shown`` pixels (the objects), because a plane may reach far behind them.
     """
-    known = depth > 0
-    scale = depth[known & shown] if (known & shown).any() else depth[known]
+    measured = depth > 0
+    scale = depth[measured & shown] if (measured & shown).any() else depth[measured]
     if not scale.size:
         return np.zeros((*depth.shape, 3), np.uint8), "no depth"
     near, far = float(scale.min()), float(scale.max())
-    # A tenth of the objects' range at both ends, or a millimetre: also of a flat depth.
+    # Extend both ends by a tenth of the range, at least a millimetre for a flat depth.
     margin = max(0.1 * (far - near), 1e-3)
     near, far = max(near - margin, 0.0), far + margin
     share = np.clip((far - depth) / (far - near), 0, 1)
     coloured = cv2.applyColorMap(np.rint(255 * share).astype(np.uint8), cv2.COLORMAP_TURBO)
     panel = cv2.cvtColor(coloured, cv2.COLOR_BGR2RGB)
-    panel[~known] = 0
+    panel[~measured] = 0
     return np.asarray(panel, np.uint8), f"depth: red {near:.3f} m to blue {far:.3f} m"
 
 
 def draw_axes(image: Picture, ends: Float[np.ndarray, "4 2"], thickness: int = 2) -> None:
-    """Draw the object frame's axes IN PLACE.
+    """Draw the object frame's axes IN PLACE, except for ends that are not finite or far outside.
 
-    ``ends`` is where the origin and the tips of x, y and z are seen, pixels; a line whose end is
-    not finite or far outside is left out.
+    ``ends`` are the projections of the origin and of the tips of x, y and z, pixels.
     """
-    # A tip that far outside of the image belongs to an object beside the camera.
+    # A tip this far outside belongs to an object beside the camera.
     bound = 10 * max(image.shape)
     for tip, colour in zip(ends[1:], AXIS_COLOURS, strict=True):
         if (np.abs([ends[0], tip]) < bound).all():

@@ -1,10 +1,9 @@
-"""How well an image agrees with a part drawn at a pose: a check for people without labels.
+"""Agreement of an image with a part drawn at a pose: a check that needs no labels.
 
-The part's outline and creases are drawn at the pose. Across each of their pixels, the image's
-gradient along the contour's normal is read from well inside to well outside: where the pose is
-right, the strongest edge lies at the contour, and everywhere else it may lie anywhere. Reading the
-same profile at the contour and beside it is the comparison with the contour shifted, and dividing
-each profile by its own sum makes strong and weak contrasts count alike.
+The part's outline and creases are drawn at the pose. Across each contour pixel, the image gradient
+along the contour's normal is sampled from inside to outside. At a correct pose the strongest edge
+lies at the contour; otherwise it may lie anywhere. Each profile is compared with its own maximum,
+so strong and weak contrasts count equally.
 """
 
 from __future__ import annotations
@@ -22,27 +21,25 @@ from dopepp.virtual.scene import NEAR, SceneObject
 from dopepp.virtual.surface import Surface
 
 MOST_POINTS: Final = 1500  # contour pixels that are read
-FLOOR: Final = 2.0  # gradient of noise, grey levels a pixel: a profile of noise agrees with nothing
+FLOOR: Final = 2.0  # gradient of noise, grey levels per pixel
 
 
 def agreement(image: Picture, K: CameraMatrix, T_cam_obj: Transform, surface: Surface) -> float:
-    """Compare outline and creases of a part at a pose with an image.
+    """Return the agreement of a part's outline and creases with an image, in [0, 1].
 
-    0 says that edges lie anywhere, 1 that all lie on the contour. It is 0, too, where the part is
-    not before the camera or has no contour within the image.
+    1 means that all edges lie on the contour. A part that is not in front of the camera, or has no
+    contour within the image, has agreement 0.
     """
     if transform(T_cam_obj, surface.hull)[:, 2].min() <= NEAR:
         return 0.0
     contour, extent = _contour(SceneObject(surface, T_cam_obj), K, image.shape[1::-1])
     if not len(contour):
         return 0.0
-    # Pixels that are read to each side of the contour.
-    reach = max(6, round(0.2 * extent))
+    reach = max(6, round(0.2 * extent))  # pixels to each side of the contour
     profiles = _profiles(image, contour, reach)
     offsets = np.arange(-reach, reach + 1)
     total = 0.0
-    # "At the contour" is so wide, of the reach: the sharp width tells good poses apart, the broad
-    # one bad ones.
+    # Tolerances relative to the reach: the narrow one ranks good poses, the wide one bad poses.
     for width in (0.12, 0.4):
         kernel = np.exp(-0.5 * (offsets / (width * reach)) ** 2)
         shifted = cv2.filter2D(profiles, -1, kernel[None], borderType=cv2.BORDER_CONSTANT)
@@ -74,16 +71,16 @@ def _contour(
 
 
 def _edges(item: SceneObject, ids: Int[np.ndarray, "height width"]) -> Mask:
-    """Tell the pixels right before an outline, a step in depth or a crease."""
+    """Return the mask of pixels next to an outline, a step in depth or a crease."""
     a, b, c = transform(item.T_cam_obj, item.surface.vertices)[item.surface.faces].swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
     drawn = normals[ids]
     drawn[ids < 0] = 0.0
     edges = np.zeros(ids.shape, bool)
-    # Every pixel with the one below it, then with the one to the right.
+    # Compare every pixel with its lower, then its right neighbour.
     for first, second in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
-        # Of a crease, the normals differ by over 26°.
+        # Normals differ by over 26° at a crease.
         crease = (drawn[first] * drawn[second]).sum(axis=-1) < 0.9
         edges[first] |= crease & ((ids[first] >= 0) | (ids[second] >= 0))
     return edges

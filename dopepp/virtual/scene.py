@@ -1,4 +1,4 @@
-"""A scene: what stands before the camera, of what, under which light, on which background."""
+"""A scene: objects, materials, lights, background and sensor of one image, and its render."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from dopepp.virtual.surface import Surface
 
 NEAR: Final = 0.01  # metres; nothing closer to the camera is drawn
 
-Triple = tuple[float, float, float]  # a vector or a colour that can be compared and shown
+Triple = tuple[float, float, float]  # a hashable vector or colour
 
 
 def triple(values: Iterable[float]) -> Triple:
-    """Return three numbers as scenes hold them."""
+    """Convert three numbers to a tuple of floats."""
     first, second, third = (float(value) for value in values)
     return first, second, third
 
@@ -32,8 +32,8 @@ class Grooves:
     """Fine parallel grooves that tilt a surface's normal: layer lines of a print, brushed metal.
 
     Attributes:
-        axis: Unit vector, object frame, along which groove follows groove.
-        pitch: Metres from one groove to the next; finer than a pixel, they widen the highlight.
+        axis: Unit vector across the grooves, object frame.
+        pitch: Distance between grooves, metres; grooves finer than a pixel widen the highlight.
         slope: Largest slope of a groove's flanks, the tangent of the normal's tilt.
         irregularity: 0 for even grooves (layer lines), 1 for random depths and widths (brushing).
     """
@@ -44,20 +44,20 @@ class Grooves:
     irregularity: float = 0.0
 
 
-NOISE_LIMITS: Final = (0.05, 2.0)  # factors of a material's noise on its albedo
+NOISE_LIMITS: Final = (0.05, 2.0)  # of the factor of a material's noise on its albedo
 
 
 @dataclass(frozen=True)
 class Material:
-    """How a surface reflects light (Lambert plus GGX, metallic workflow).
+    """Reflectance of a surface (Lambert plus GGX, metallic workflow).
 
     Attributes:
-        colour: Linear albedo in [0, 1] per channel; a factor on colours of the surface's own.
+        colour: Linear albedo in [0, 1] per channel; a factor on the colours of coloured surfaces.
         roughness: GGX roughness in (0, 1]; 1 is chalk.
         specular: Reflectance at normal incidence of the dielectric part, 0.04 for plastics.
-        metallic: 1 for a metal: no diffuse light, and the colour is its reflectance.
-        noise: Relative amplitude of the albedo's variation, kept within :data:`NOISE_LIMITS`.
-        noise_pitch: Size of that variation, metres.
+        metallic: 1 for a metal, which has no diffuse light and reflects its colour.
+        noise: Relative amplitude of the albedo's noise, clipped to :data:`NOISE_LIMITS`.
+        noise_pitch: Size of the noise, metres.
     """
 
     colour: Triple = (0.6, 0.6, 0.6)
@@ -97,13 +97,13 @@ class Ambient:
 
 @dataclass(frozen=True)
 class Plane:
-    """An unbounded supporting plane: the table that objects lie on.
+    """An unbounded supporting plane, the table.
 
-    Its look is the scene's background, which is a picture of it already; a renderer only darkens
-    the plane where objects keep light from it. It belongs to the depth, not to the instances.
+    The scene's background is its picture; renderers only add shadows. The plane has depth but no
+    instance.
 
     Attributes:
-        normal: Unit vector away from the plane, on the camera's side, camera frame.
+        normal: Unit normal on the camera's side, camera frame.
         offset: ``normal · x`` of the plane's points, metres; negative, as the camera is above.
     """
 
@@ -116,7 +116,7 @@ class SceneObject:
     """One posed object.
 
     Attributes:
-        part: The part it is an instance of; None for a distractor.
+        part: None for a distractor.
     """
 
     surface: Surface
@@ -126,18 +126,18 @@ class SceneObject:
 
     @property
     def is_target(self) -> bool:
-        """Whether the network is to find it."""
+        """Whether the network must detect the object."""
         return self.part is not None
 
     @property
     def label(self) -> str:
-        """The part's name; ``distractor`` for everything else."""
+        """The part's name, or ``distractor``."""
         return "distractor" if self.part is None else self.part.name
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Everything one image shows."""
+    """The content of one image."""
 
     K: CameraMatrix
     background: Picture
@@ -154,11 +154,15 @@ class Scene:
 
     @property
     def targets(self) -> tuple[int, ...]:
-        """Indices of the objects that the network is to find."""
+        """Indices of the objects that the network must detect."""
         return tuple(i for i, item in enumerate(self.objects) if item.is_target)
 
     def keypoints(self, index: int) -> Float[np.ndarray, "9 2"]:
-        """Return a target's projected corners and centroid, pixels; ValueError for no target."""
+        """Return a target's projected corners and centroid, pixels.
+
+        Raises:
+            ValueError: The object is a distractor.
+        """
         item = self.objects[index]
         if item.part is None:
             raise ValueError(f"object {index} is a distractor and has no {NUM_KEYPOINTS} keypoints")
@@ -167,13 +171,13 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """An image and its ground truth, whichever renderer made it.
+    """An image and its ground truth.
 
     Attributes:
         depth: Metres along z at pixel centres, float32; 0 on the background.
         instances: Index into ``scene.objects`` at pixel centres, −1 on plane and background.
-        visible_fractions: Per object, its visible pixels over those of its whole silhouette,
-            alone and without the image's border: occlusion and truncation both count.
+        visible_fractions: Visible pixels of every object over the pixels of its unoccluded,
+            untruncated silhouette.
     """
 
     image: Picture

@@ -1,8 +1,8 @@
-"""The sensor: what lens, chip and file make of an ideal picture, and how often they do.
+"""The sensor: exposure, lens blur, noise and compression of an ideal picture; sRGB and tone curve.
 
-To add a step, write a function like those below, give :class:`Sensor` its parameter,
-:class:`Sensors` its probability and range, and call it in :func:`capture`, in a camera's order:
-exposure, lens, chip, file. The end of the module holds sRGB and the camera's tone curve.
+To add an effect, write a function, add its parameter to :class:`Sensor` and its probability and
+range to :class:`Sensors`, and call it in :func:`capture` in a camera's order: exposure, lens, chip,
+file.
 """
 
 from __future__ import annotations
@@ -26,18 +26,19 @@ from dopepp.drawing.pictures import Picture
 Probability = Annotated[float, Range(0.0, 1.0, "probability")]
 
 _NOISE_VALUES: Final = 65536  # length of the table of normal values; a power of two
-_NOISE_RUN: Final = 1024  # values read in a row; then the hash chooses another place and a sign
+_NOISE_RUN: Final = 1024  # values read in a row; then the hash chooses another start and sign
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """What the camera does to the light, applied to the whole picture after rendering.
+    """A camera's effects, applied to the whole picture after rendering.
 
     Attributes:
-        exposure_ev: Stops by which the picture is brighter; 1 doubles the light.
+        exposure_ev: Exposure in stops; 1 doubles the light.
         motion_px: Displacement (x, y) of the image during the exposure, pixels.
-        read_noise: Standard deviation of the signal-independent noise, grey levels of 255.
-        shot_noise: That of the signal-dependent noise at white; it falls with the signal's root.
+        read_noise: Standard deviation of signal-independent noise, grey levels of 255.
+        shot_noise: Standard deviation of signal-dependent noise at white; proportional to the
+            square root of the signal.
     """
 
     exposure_ev: float = 0.0
@@ -53,7 +54,7 @@ class Sensor:
 class Sensors(Checked):
     """Probabilities and ranges of a :class:`Sensor`; ``motion_px`` is the displacement's length.
 
-    Blur and motion belong to the preset's image size and follow it when it is resized.
+    Blur and motion scale with the preset's image size.
     """
 
     exposure_probability: Probability = 0.5
@@ -69,7 +70,7 @@ class Sensors(Checked):
     jpeg_quality: Annotated[tuple[int, int], Span(1, 100, "JPEG quality")] = (70, 95)
 
     def resized(self, scale: float) -> Sensors:
-        """Return the same camera for a picture that is ``scale`` times as large."""
+        """Return the same camera for pictures scaled by a factor."""
         blur, motion = ((scale * low, scale * high) for low, high in (self.blur_px, self.motion_px))
         return replace(self, blur_px=blur, motion_px=motion)
 
@@ -79,7 +80,7 @@ class Sensors(Checked):
         on = rng.random(5) < [getattr(self, f"{step}_probability") for step in steps]
         direction, length = rng.uniform(0, 2 * np.pi), rng.uniform(*self.motion_px)
         motion = (float(length * np.cos(direction)), float(length * np.sin(direction)))
-        # Every number is drawn whether it is used or not, so a probability changes nothing else.
+        # Draw every number, used or not, so that a probability changes no other effect.
         exposure, blur = rng.uniform(*self.exposure_ev), rng.uniform(*self.blur_px)
         read, shot = rng.uniform(*self.read_noise), rng.uniform(*self.shot_noise)
         quality = int(rng.integers(self.jpeg_quality[0], self.jpeg_quality[1] + 1))
@@ -95,14 +96,13 @@ class Sensors(Checked):
 
 
 def capture(image: Picture, sensor: Sensor) -> Picture:
-    """Return what a sensor makes of an ideal picture; the default sensor returns it unchanged.
+    """Apply a sensor's effects to an ideal picture; the default sensor has none.
 
-    Exposure works on linear light. Both blurs work on the sRGB picture, which spreads highlights
-    a little less than light would.
+    Exposure works on linear light; both blurs work on sRGB and spread highlights slightly less.
     """
     if sensor.exposure_ev:
         image = np.asarray(cv2.LUT(image, _exposure_curve(sensor.exposure_ev)))
-    if sensor.blur_px >= 0.1:  # a narrower one leaves every 8-bit picture as it is
+    if sensor.blur_px >= 0.1:  # narrower blur does not change 8-bit pictures
         image = defocus(image, sensor.blur_px)
     if any(sensor.motion_px):
         image = motion_blur(image, sensor.motion_px)
@@ -119,10 +119,9 @@ def defocus(image: Picture, sigma_px: float) -> Picture:
 
 
 def motion_blur(image: Picture, motion_px: tuple[float, float]) -> Picture:
-    """Average the picture along a displacement (x, y) in pixels, centred, so that it stays put."""
-    return np.asarray(
-        cv2.filter2D(image, -1, _line_kernel(*motion_px), borderType=cv2.BORDER_REFLECT_101)
-    )
+    """Average the picture along a displacement (x, y) in pixels, centred on each pixel."""
+    kernel = _line_kernel(*motion_px)
+    return np.asarray(cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REFLECT_101))
 
 
 def add_noise(image: Picture, read: float, shot: float, seed: int) -> Picture:
@@ -140,14 +139,14 @@ def add_noise(image: Picture, read: float, shot: float, seed: int) -> Picture:
 
 def compress(image: Picture, quality: int) -> Picture:
     """Compress to JPEG (quality 1 to 100) and back."""
-    # The codec takes the channels as B, G, R; a swapped order would weigh red and blue wrongly.
+    # The codec expects B, G, R.
     bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     _, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return np.asarray(cv2.cvtColor(cv2.imdecode(encoded, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB))
 
 
 def _exposure_curve(exposure_ev: float) -> UInt8[np.ndarray, "256"]:
-    """Return the sRGB codes after the light was multiplied by 2^EV; what is over white clips."""
+    """Return the sRGB codes after multiplying the light by 2^EV, clipped at white."""
     light = np.clip(decode_srgb(np.arange(256) / 255) * 2.0**exposure_ev, 0.0, 1.0)
     return np.asarray(np.rint(255 * encode_srgb(light)), np.uint8)
 
@@ -156,7 +155,7 @@ def _line_kernel(x: float, y: float) -> Float32[np.ndarray, "side side"]:
     """Return the kernel of a line through the middle, its points spread over the four nearest."""
     half = math.ceil(max(abs(x), abs(y)) / 2)
     kernel = np.zeros((2 * half + 2, 2 * half + 2))
-    # Four points a pixel make it even; one lies in the middle, so a short line is nearly a point.
+    # Four points per pixel make the line even; an odd number keeps a point in the middle.
     steps = 2 * math.ceil(2 * math.hypot(x, y)) + 1
     points = half + ((np.arange(steps) + 0.5) / steps - 0.5)[:, None] * (x, y)
     corner = points.astype(np.int64)
@@ -164,14 +163,14 @@ def _line_kernel(x: float, y: float) -> Float32[np.ndarray, "side side"]:
     for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
         share = np.abs(1 - right - near[:, 0]) * np.abs(1 - down - near[:, 1])
         np.add.at(kernel, (corner[:, 1] + down, corner[:, 0] + right), share)
-    # No point reaches the last row and column; without them the middle is in the middle.
+    # Drop the empty last row and column to centre the kernel.
     return np.asarray(kernel[:-1, :-1] / kernel.sum(), np.float32)
 
 
 @cache
 def _normal_values() -> Float32[np.ndarray, "values"]:
-    """Return the table of noise: quantiles of a normal distribution, shuffled, deviation 1."""
-    # Its beginning is repeated at its end, so that a run may start anywhere.
+    """Return shuffled quantiles of the standard normal distribution."""
+    # The start is repeated at the end, so that a run may start anywhere.
     normal = NormalDist()
     quantiles = [normal.inv_cdf((k + 0.5) / _NOISE_VALUES) for k in range(_NOISE_VALUES)]
     values = np.array(quantiles, np.float32)
@@ -181,7 +180,7 @@ def _normal_values() -> Float32[np.ndarray, "values"]:
 
 @compiled()
 def _shuffle(values: Array) -> None:
-    """Shuffle in place (Fisher and Yates), by the hash, so that every platform has one order."""
+    """Shuffle in place (Fisher and Yates) by the hash, in the same order on every platform."""
     for i in range(values.shape[0] - 1, 0, -1):
         k = _mixed(np.uint32(i)) % np.uint32(i + 1)
         values[i], values[k] = values[k], values[i]
@@ -212,7 +211,7 @@ def _add_noise(
 
 @compiled(inline="always")
 def _mixed(h: np.uint32) -> np.uint32:
-    """Mix 32 bits: xor-shifts and odd multipliers, a bijection in which every bit moves all."""
+    """Mix 32 bits by xor-shifts and odd multipliers (a bijection)."""
     h = np.uint32(h ^ (h >> np.uint32(16)))
     h = np.uint32(h * np.uint32(0x7FEB352D))
     h = np.uint32(h ^ (h >> np.uint32(15)))
@@ -243,8 +242,8 @@ LINEAR_TO_SRGB: Final[NDArray[np.float32]] = (
 TONE_LIMIT: Final = 4.0  # radiance at which the tone curve ends, white to 1/1000
 _SHOULDER: Final = 0.5
 _radiance = np.arange(int(TONE_LIMIT) * CODE_STEPS + 1) / CODE_STEPS
-# Linear up to the shoulder; above, it bends smoothly towards 1, as a camera's curve does, so that
-# bright white parts keep their shading.
+# Linear up to the shoulder, then smoothly towards 1 like a camera's curve, so that bright white
+# parts keep their shading.
 _shown = np.where(
     _radiance <= _SHOULDER,
     _radiance,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import RunError
-from dopepp.drawing.video import VideoFile
+from dopepp.drawing.pictures import VideoFile
 
 
 def frames(path) -> list[np.ndarray]:

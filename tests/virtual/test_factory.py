@@ -144,7 +144,7 @@ THING = replace(BOX, name="thing", mesh=None, mesh_hash="")
     ("parts", "seed", "negatives", "message"),
     [
         ([], 0, [], "at least one part"),
-        ([BOX, BOX], 0, [], "each with a name of its own"),
+        ([BOX, BOX], 0, [], "each with its own name"),
         ([THING], 0, [], "part thing without a mesh"),
         ([BOX], -1, [], "seed -1"),
         ([pivconnector()], 0, [pivconnector()], "negative pivconnector, which is one of the tar"),

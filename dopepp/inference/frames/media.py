@@ -23,8 +23,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from dopepp.core.errors import RunError, UserError
-from dopepp.drawing.pictures import MAX_PIXELS, Picture, read_photo
-from dopepp.drawing.video import USUAL_RATE
+from dopepp.drawing.pictures import MAX_PIXELS, USUAL_RATE, Picture, read_photo
 from dopepp.inference.frames.ros import BAGS, is_bag_folder
 from dopepp.inference.frames.source import CameraFrame, FrameSource
 

@@ -13,9 +13,8 @@ import numpy as np
 from dopepp.core.errors import require
 from dopepp.core.files import draft, write_picture
 from dopepp.drawing.overlay import Wireframe, overlay
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import Picture, VideoFile
 from dopepp.drawing.sheet import Tile, contact_sheet
-from dopepp.drawing.video import VideoFile
 from dopepp.geometry.camera import invert_transform, project_keypoints
 from dopepp.robot.grasping.cell import TRAY, Cell
 from dopepp.robot.grasping.execution import FRAME_S

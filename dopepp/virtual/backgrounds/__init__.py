@@ -1,4 +1,4 @@
-"""What lies behind the scene: photos of a folder, scikit-image's photos, or procedural textures.
+"""Backgrounds: photos of a folder, photos of scikit-image, or procedural textures.
 
 To add a kind, write a class with the methods of :class:`Backgrounds` and name it in
 :func:`find_backgrounds`.
@@ -36,12 +36,12 @@ BUNDLED: Final = (
 """Photos in scikit-image's wheel; its other pictures are drawings, scans and microscopy."""
 
 _LONGEST_PHOTO_PX: Final = 1000
-"""Photos are kept reduced to this side: a 640×480 crop of them is still sharp. JPEG decodes at a
-half, a quarter or an eighth, so that a camera's 4000 pixels take 20 ms less than with 1024 here."""
+"""Longest side of cached photos: enough for a sharp 640×480 crop. JPEG decodes at 1/2, 1/4 or 1/8,
+so 1000 lets a photo of 4000 pixels decode at a quarter."""
 
 _LEAST_REDUCTION: Final = 2.0
-"""A crop is cut out of the smallest halving of a photo that it still reduces so many times, as a
-small piece of a large photo would cost as much as all of that photo."""
+"""A crop comes from the smallest halving of a photo that it still reduces by this factor, which is
+cheaper than reducing the whole photo."""
 
 _SMALLEST_PX: Final = 30  # shorter side of the smallest halving, at least
 _KEPT_BYTES: Final = 200_000_000  # decoded photos a process keeps: about 260 of VOC2007
@@ -51,21 +51,21 @@ class Backgrounds(Protocol):
     """Draws background images."""
 
     def draw(self, rng: Generator, width: int, height: int) -> Picture:
-        """Return an RGB image of the asked size, a pure function of the generator's state."""
+        """Return an RGB image, a pure function of the generator's state."""
 
     def identity(self) -> list[str]:
-        """Return the kind and a fingerprint of its files, for the record of what was rendered."""
+        """Return the kind and a fingerprint of its files, for the record of the render."""
 
 
 def find_backgrounds(choice: str | Path | None) -> Backgrounds:
-    """Return the backgrounds that a user names.
+    """Return the backgrounds that a user selects.
 
     Args:
         choice: None or ``procedural``, the same on every machine; ``skimage`` for the photos in an
             installed scikit-image; or a folder of photos (``./skimage`` for one of that name).
 
     Raises:
-        UserError: The folder is missing or holds no photo, or scikit-image is not installed.
+        UserError: The folder is missing or contains no photo, or scikit-image is not installed.
     """
     if choice is None or choice == "procedural":
         return ProceduralBackgrounds()
@@ -77,13 +77,17 @@ def find_backgrounds(choice: str | Path | None) -> Backgrounds:
 class PhotoBackgrounds:
     """Random crops of photos, mirrored and dimmed at random.
 
-    A damaged photo is replaced by the next one that the generator draws, so that an image stays a
-    pure function of the generator and the files. It is named in the log; more than 10 of them, or
-    more than 1 % of all photos, are a UserError, as is a folder without any.
+    A damaged photo is logged and replaced by the next draw, so an image stays a pure function of
+    the generator and the files.
 
-    The folder is searched recursively for :data:`PHOTO_SUFFIXES`, but for hidden files and folders
-    and links to folders; or ``names`` are its files. The photos' order is that of their relative
-    paths; none is opened.
+    Args:
+        folder: Folder to search recursively for :data:`PHOTO_SUFFIXES`, without hidden files and
+            links to folders. Photos are sorted by relative path.
+        names: Relative paths of the photos, instead of a search.
+
+    Raises:
+        UserError: The folder contains no photo; or, while drawing, more than 10 photos or more than
+            1 % of all photos are damaged.
     """
 
     def __init__(self, folder: Path, names: Sequence[str] | None = None) -> None:
@@ -99,7 +103,7 @@ class PhotoBackgrounds:
         self._kept_bytes = 0
 
     def __getstate__(self) -> dict[str, Any]:
-        """Send another process the paths, not hundreds of megabytes of decoded photos."""
+        """Pickle without the decoded photos."""
         return self.__dict__ | {"_photos": OrderedDict(), "_kept_bytes": 0}
 
     def identity(self) -> list[str]:
@@ -132,10 +136,7 @@ class PhotoBackgrounds:
         return np.asarray(cv2.convertScaleAbs(image, alpha=float(rng.uniform(0.5, 1.1))), np.uint8)
 
     def _photo(self, path: Path) -> list[Picture] | None:
-        """Return a photo, reduced, and its halvings; the most recent ones are kept.
-
-        None for a damaged one.
-        """
+        """Return a reduced photo and its halvings from the cache or file; None if damaged."""
         if path in self._photos:
             self._photos.move_to_end(path)
             return self._photos[path]
@@ -155,7 +156,7 @@ class PhotoBackgrounds:
         return sizes
 
     def _quarantine(self, path: Path, damage: str) -> None:
-        """Remember a damaged photo, and refuse too many of them."""
+        """Record a damaged photo; raise a UserError if there are too many."""
         self.bad[path] = damage
         most = min(10, int(0.01 * len(self.paths)))
         if len(self.bad) > most:
@@ -165,27 +166,28 @@ class PhotoBackgrounds:
                 f"whole photos of at most {MAX_SIDE} pixels a side; {most} damaged ones of these",
                 "remove or replace them",
             )
-        logger.warning(
-            "background photo %s left out: %s (%d damaged of at most %d)",
-            path, damage, len(self.bad), most,
-        )  # fmt: skip
+        text = "background photo %s left out: %s (%d damaged of at most %d)"
+        logger.warning(text, path, damage, len(self.bad), most)
 
 
 def bundled_photos() -> PhotoBackgrounds:
-    """Return the photos in scikit-image's package, a UserError without; nothing is downloaded."""
-    # Looked up, not imported: the package's folder is all that is needed.
+    """Return the photos in scikit-image's package; nothing is downloaded or imported.
+
+    Raises:
+        UserError: scikit-image or its photos are not installed.
+    """
     package = importlib.util.find_spec("skimage")
     folder = Path(package.origin).parent / "data" if package and package.origin else None
     names = [name for name in BUNDLED if folder and (folder / name).is_file()]
     if folder is None or not names:
-        got = "backgrounds=skimage without scikit-image and its photos"
+        problem = "backgrounds=skimage without scikit-image and its photos"
         fix = "pip install scikit-image, or give a folder of photos"
-        raise UserError(got, "an installed scikit-image", fix)
+        raise UserError(problem, "an installed scikit-image", fix)
     return PhotoBackgrounds(folder, names)
 
 
 def _halvings(photo: Picture) -> list[Picture]:
-    """Return a photo and its halves, halves of these and so on."""
+    """Return a photo and its successive halvings."""
     sizes = [photo]
     while min(sizes[-1].shape[:2]) >= 2 * _SMALLEST_PX:
         half = cv2.resize(sizes[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
@@ -202,7 +204,7 @@ def _photo_names(folder: Path) -> Iterator[str]:
         prefix = pending.pop()
         with os.scandir(folder / prefix) as entries:
             for entry in entries:
-                if entry.name.startswith("."):  # such as a Mac's ._photo.jpg, which is no photo
+                if entry.name.startswith("."):  # such as a Mac's ._photo.jpg
                     continue
                 if entry.is_dir(follow_symlinks=False):
                     pending.append(f"{prefix}{entry.name}/")

@@ -1,16 +1,14 @@
-"""Drawn backgrounds: procedural textures with shapes on them, and clutter.
+"""Drawn backgrounds: procedural textures with shapes, and clutter.
 
-Photos of landscapes and people have few sharp outlines of the size of a part. A network that has
-seen its part before such photos alone takes much of a real desk for the part; so clutter lays
-pieces of other pictures on backgrounds.
-
-To add a pattern, write a function like ``_checker`` and name it in ``_PATTERNS``.
+Photos of landscapes and people have few sharp outlines of the size of a part. A network trained on
+such photos alone mistakes much of a real desk for the part; clutter therefore adds pieces of other
+pictures. To add a pattern, write a function like ``_checker`` and name it in ``_PATTERNS``.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final
 
 import cv2
@@ -51,10 +49,9 @@ class ProceduralBackgrounds:
 def _texture(rng: Generator, width: int, height: int) -> Picture:
     """Return a random pattern in a random palette of two to five colours."""
     pattern = _PATTERNS[int(rng.integers(len(_PATTERNS)))]
-    # A background is out of focus, more or less: large ones are drawn coarser and enlarged.
-    scale = (
-        1.0 if width <= _SHARP_WIDTH_PX else max(rng.uniform(0.35, 0.75), _SHARP_WIDTH_PX / width)
-    )
+    scale = 1.0
+    if width > _SHARP_WIDTH_PX:  # backgrounds are out of focus: draw large ones coarser and enlarge
+        scale = max(rng.uniform(0.35, 0.75), _SHARP_WIDTH_PX / width)
     columns, rows = round(width * scale), max(round(height * scale), 1)
     field = pattern(rng, columns, rows)
     grain = np.float32(rng.uniform(0.0, 0.25))
@@ -74,10 +71,10 @@ def _palette(rng: Generator) -> UInt8[np.ndarray, "256 1 3"]:
     # Rooms and workshops are greyer than random colours: pull most palettes towards grey.
     grey = colours.mean(axis=1, keepdims=True)
     colours = grey + (colours - grey) * rng.uniform(0.0, 1.0)
-    # From the first colour at code 0 to the last one at 255, straight between two of them.
-    place = np.arange(256) * ((count - 1) / 255)
-    before = np.minimum(place.astype(np.int64), count - 2)
-    share = (place - before)[:, None]
+    # Interpolate linearly from the first colour at code 0 to the last at 255.
+    position = np.arange(256) * ((count - 1) / 255)
+    before = np.minimum(position.astype(np.int64), count - 2)
+    share = (position - before)[:, None]
     colours = (1 - share) * colours[before] + share * colours[before + 1]
     return np.asarray(np.clip(colours, 0, 255), np.uint8)[:, None]
 
@@ -87,7 +84,7 @@ def _noise(rng: Generator, width: int, height: int, cells: int) -> Field:
     rows = max(round(cells * height / width), 1)
     grid = rng.random((rows + 1, cells + 1), np.float32)
     if cells * 32 <= width:
-        # Such large cells lose nothing by being enlarged from a quarter of their size.
+        # Cells this large lose nothing when enlarged from a quarter of their size.
         quarter = (width // 4, max(height // 4, 1))
         grid = np.asarray(cv2.resize(grid, quarter, interpolation=cv2.INTER_CUBIC))
         return np.asarray(cv2.resize(grid, (width, height), interpolation=cv2.INTER_LINEAR))
@@ -105,7 +102,7 @@ def _clouds(rng: Generator, width: int, height: int) -> Field:
             break
         cv2.scaleAdd(_noise(rng, width, height, cells * 2**octave), gain**octave, field, field)
         total += gain**octave
-    # A sum of noises bunches around its middle: spread it over the palette.
+    # A sum of noises concentrates around its middle: spread it over the palette.
     return np.asarray((field / total - 0.5) * 1.8 + 0.5)
 
 
@@ -136,12 +133,12 @@ def _checker(rng: Generator, width: int, height: int) -> Field:
 
 
 def _whole(values: Field) -> Int32[np.ndarray, "height width"]:
-    """Return the next integers below, on which remainders take a fraction of the time."""
+    """Return the integers below, as int32, whose remainders are fast to compute."""
     return np.asarray(np.floor(values), np.int32)
 
 
 def _bricks(rng: Generator, width: int, height: int) -> Field:
-    """Return a running bond with mortar joints and a shade of its own for every brick."""
+    """Return a running bond with mortar joints and a different shade for every brick."""
     along, across = _coordinates(rng, width, height)
     across = across * np.float32(rng.uniform(4, 14))
     row = _whole(across)
@@ -171,15 +168,14 @@ def _speckle(rng: Generator, width: int, height: int) -> Field:
     return share * _noise(rng, width, height, cells) + (1 - share) * _clouds(rng, width, height)
 
 
-_PATTERNS: Final[tuple[Callable[[Generator, int, int], Field], ...]] = (
-    _clouds, _gradient, _checker, _bricks, _wood, _speckle,
-)  # fmt: skip
+_Pattern = Callable[[Generator, int, int], Field]
+_PATTERNS: Final[Sequence[_Pattern]] = (_clouds, _gradient, _checker, _bricks, _wood, _speckle)
 
 
 def _scatter(rng: Generator, image: Picture, count: int) -> None:
     """Draw random ellipses, polygons, lines and circles over an image in place."""
     height, width = image.shape[:2]
-    # All of a shape's numbers in one draw: one by one they would take longer than the drawing.
+    # Draw all numbers at once; single draws would take longer than the shapes.
     for red, green, blue, x, y, size, kind, turn, more in rng.random((count, 9)).tolist():
         colour = (256 * red, 256 * green, 256 * blue)
         centre = (int(x * width), int(y * height))
@@ -199,20 +195,17 @@ def _scatter(rng: Generator, image: Picture, count: int) -> None:
             cv2.circle(image, centre, radius, colour, thickness, cv2.LINE_AA)
 
 
-# Shares of the pieces: of one colour, lighter towards one side, as weakly textured things; printed
-# with cells of a dark and a light colour, as markers and keyboards. The others are cut out of
-# backgrounds.
-_PLAIN_SHARE: Final = 0.4
-_PRINTED_SHARE: Final = 0.2
-_WIDTHS: Final = (0.04, 0.4)  # over the picture's; logarithmically uniform: most things are small
+_PLAIN_SHARE: Final = 0.4  # of pieces of one colour, lighter towards one side
+_PRINTED_SHARE: Final = 0.2  # of pieces of dark and light cells, like markers and keyboards
+_WIDTHS: Final = (0.04, 0.4)  # over the picture's, logarithmically uniform: most things are small
 _FINE_BITS: Final = 4  # outlines are drawn in sixteenths of a pixel
 
 
 class ClutteredBackgrounds:
-    """Backgrounds with pieces of others on them: polygons, turned boxes, ellipses and rings.
+    """Backgrounds with pieces of other pictures: polygons, turned boxes, ellipses and rings.
 
     Args:
-        behind: What lies behind, and what some of the pieces are cut out of.
+        behind: Backgrounds, from which some of the pieces are cut as well.
         number: Smallest and largest number of pieces.
         contrast: Smallest and largest factor on the whole picture's contrast, about its mean.
     """
@@ -226,7 +219,7 @@ class ClutteredBackgrounds:
         self.behind, self.number, self.contrast = behind, number, contrast
 
     def identity(self) -> list[str]:
-        """Return what lies behind, the number of pieces and the contrast."""
+        """Return the identity of the backgrounds, the number of pieces and the contrast."""
         return [*self.behind.identity(), "cluttered", *map(str, (*self.number, *self.contrast))]
 
     def draw(self, rng: Generator, width: int, height: int) -> Picture:
@@ -241,11 +234,11 @@ class ClutteredBackgrounds:
         return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
 
     def _add_piece(self, rng: Generator, image: Picture) -> None:
-        """Lay a piece on a picture; what of it is beyond the border is cut off."""
+        """Lay a piece on a picture, cut off at the border."""
         rows, columns = image.shape[:2]
         size = columns * math.exp(rng.uniform(*np.log(_WIDTHS)))
         outline = _outline(rng) * size / 2
-        # What does not lie on the picture need not be drawn.
+        # Draw only the part within the picture.
         corner = np.floor(rng.uniform(0, 1, 2) * (columns, rows) - size / 2).astype(int)
         first, last = np.maximum(corner, 0), np.minimum(corner + math.ceil(size), (columns, rows))
         if (last - first < 2).any():
@@ -258,13 +251,13 @@ class ClutteredBackgrounds:
         others = _printed if kind < _PLAIN_SHARE + _PRINTED_SHARE else self.behind.draw
         draw = _plain if kind < _PLAIN_SHARE else others
         piece = draw(rng, wide, high).astype(np.float32)
-        there = image[first[1] : last[1], first[0] : last[0]]
+        region = image[first[1] : last[1], first[0] : last[0]]
         opacity = np.repeat(mask[..., None], 3, axis=2).astype(np.float32) / 255
-        there[:] = np.rint(there + opacity * (piece - there))
+        region[:] = np.rint(region + opacity * (piece - region))
 
 
 def _outline(rng: Generator) -> Float[np.ndarray, "loops points 2"]:
-    """Return one closed line or two, one inside the other, within the unit circle."""
+    """Return a closed line, or two nested ones, within the unit circle."""
     kind = int(rng.integers(4))
     corners = (int(rng.integers(3, 9)), 4, 32, 32)[kind]
     angles = np.arange(corners) / corners * 2 * np.pi

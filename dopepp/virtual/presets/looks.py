@@ -1,7 +1,7 @@
-"""How a scene looks: plastics, 3D prints, plain and brushed metals, and the lamps that light them.
+"""Distributions of materials (plastics, 3D prints, plain and brushed metals) and of lights.
 
-To add a kind of material or light, give :class:`Materials` or :class:`Lighting` its share and its
-ranges, and draw it in ``draw``.
+To add a kind of material or light, add its share and ranges to :class:`Materials` or
+:class:`Lighting`, and draw it in ``draw``.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ _GREY_CAST: Final = 0.05  # largest relative deviation of a channel: real greys 
 
 @dataclass(frozen=True)
 class Materials(Checked):
-    """Ranges of what surfaces are made of; a textured or coloured one keeps its colours.
+    """Ranges of materials; textured and coloured surfaces keep their colours.
 
     Attributes:
         albedo: Linear albedo of the brightest channel, the same range for greys and colours.
         coloured_share: Share of untextured surfaces that have a colour; the others are grey.
         roughness: Of dielectrics.
         specular: Their reflectance at normal incidence.
-        texture_gain: Factor on the colours of surfaces that have some.
-        texture_tint: Largest relative deviation of one colour channel from that factor: a scan's
-            colours are another camera's.
-        texture_noise: Relative amplitude of the variation of these colours over the surface: a
-            thing has shades, stains and openings that its model lacks.
-        noise: Relative amplitude of the albedo's variation over an untextured surface.
-        noise_pitch: Size of either variation over the object's radius.
+        texture_gain: Factor on the colours of coloured surfaces.
+        texture_tint: Largest relative deviation of a channel from that factor, because scans are
+            taken with another camera.
+        texture_noise: Relative amplitude of noise on these colours, for the stains and openings
+            that a model lacks.
+        noise: Relative amplitude of noise on the albedo of an untextured surface.
+        noise_pitch: Size of the noise over the object's radius.
         metal_albedo: Reflectance of metals at normal incidence.
         brush_pitch: Mean distance of the marks on brushed metals.
         brush_slope: Largest slope of their flanks, the tangent of the normal's tilt.
         print_share: Share of untextured dielectrics that are 3D prints with layer lines.
         layer_pitch: Height of a print's layers.
         layer_slope: Largest slope of the layers' flanks, as ``brush_slope``.
-        alike_share: Chance that all instances of a part in an image are made of the same.
+        alike_share: Chance that all instances of a part in an image share a material.
     """
 
     albedo: Shares = (0.02, 0.9)
@@ -74,14 +74,14 @@ class Materials(Checked):
     alike_share: Share = 0.5
 
     def draw(self, rng: Generator, surface: Surface) -> Material:
-        """Draw what a surface is made of."""
+        """Draw a surface's material."""
         pitch = surface.radius * rng.uniform(*self.noise_pitch)
         if surface.is_coloured:
             gain = np.full(3, rng.uniform(*self.texture_gain))
             if self.texture_tint:
                 gain *= 1 + rng.uniform(-self.texture_tint, self.texture_tint, 3)
             roughness, specular = rng.uniform(*self.roughness), rng.uniform(*self.specular)
-            # Without it nothing is drawn, so that other presets' images stay as they are.
+            # Draw only if needed, so that the images of other presets do not change.
             noise = rng.uniform(*self.texture_noise) if self.texture_noise[1] else 0.0
             return Material(triple(gain), roughness, specular, noise=noise, noise_pitch=pitch)
         noise = rng.uniform(*self.noise)
@@ -90,7 +90,7 @@ class Materials(Checked):
         return self._dielectric(rng, surface, noise, pitch)
 
     def _metal(self, rng: Generator, noise: float, pitch: float) -> Material:
-        """Draw a bare metal: grey but for a cast, brushed along one of the object's axes or not."""
+        """Draw a bare metal: nearly grey, possibly brushed along one of the object's axes."""
         colour = _grey(rng, rng.uniform(*self.metal_albedo))
         grooves = None
         if rng.random() < self.brushed_share:
@@ -106,10 +106,9 @@ class Materials(Checked):
         )
 
     def _dielectric(self, rng: Generator, surface: Surface, noise: float, pitch: float) -> Material:
-        """Draw a plastic; a printed one has layers along the axis it was built up."""
+        """Draw a plastic; a 3D print has layers along its build axis."""
         brightness = rng.uniform(*self.albedo)
-        coloured = rng.random() < self.coloured_share
-        if coloured:
+        if rng.random() < self.coloured_share:
             srgb = colorsys.hsv_to_rgb(rng.random(), rng.uniform(*self.saturation), 1.0)
             # The usual power for sRGB, exact enough for a random colour.
             colour = triple(brightness * channel**2.2 for channel in srgb)
@@ -117,7 +116,7 @@ class Materials(Checked):
             colour = _grey(rng, brightness)
         grooves = None
         if rng.random() < self.print_share:
-            # Two times of three, the axis it was built up along is the thinnest, as slicers lay.
+            # Slicers lay parts flat: in two of three cases the thinnest axis is the build axis.
             thinnest = rng.random() < 2 / 3
             extents: Vector = np.ptp(surface.hull, axis=0)
             number = int(extents.argmin()) if thinnest else int(rng.integers(3))
@@ -157,9 +156,9 @@ class Lighting(Checked):
 
     Attributes:
         num_lights: Number of point lights; the first, the key light, casts the sharpest shadows.
-        max_angle_deg: Largest angle between a light's direction and the camera's (over a plane:
-            the plane's normal), as seen from the scene; 0 is a flash light on the camera.
-        distance: Of a light from the scene.
+        max_angle_deg: Largest angle at the scene between a light and the camera (or, over a plane,
+            the plane's normal); 0 is a flash light on the camera.
+        distance: Distance of a light from the scene.
         temperature_k: Colour temperature as a camera balanced for 6500 K sees it; low is warm.
         tint: Largest relative deviation of a colour channel from that colour.
         ground_share: Light from below over the light from above.
@@ -201,7 +200,7 @@ class Lighting(Checked):
 
     def _colour(self, rng: Generator) -> Vector:
         """Draw the linear RGB of a lamp of luminance about 1."""
-        # Equal steps of 1/T look equally different (mired), so it is what is uniform.
+        # Uniform in 1/T, because equal steps of it look equally different (mired).
         warm, cold = self.temperature_k
         colour = black_body_rgb(1.0 / rng.uniform(1.0 / cold, 1.0 / warm))
         return np.asarray(colour * (1 + rng.uniform(-self.tint, self.tint, 3)))

@@ -1,4 +1,4 @@
-"""The renderers to choose from, by name; each is imported when it is asked for.
+"""The renderers by name, imported on demand.
 
 To add one, write a module with ``render(scene) -> Rendered`` and one line in :data:`RENDERERS`, or
 an entry point ``dopepp.renderers`` in a package of your own (:mod:`dopepp.core.extensions`).
@@ -15,7 +15,7 @@ from dopepp.core.errors import UserError
 from dopepp.virtual.scene import Rendered, Scene
 
 Renderer = Callable[[Scene], Rendered]
-"""Draws a scene as an ideal camera sees it; the factory applies the scene's sensor."""
+"""Renders a scene for an ideal camera; the factory applies the scene's sensor."""
 
 RENDERERS: Final = {
     "raster": "dopepp.virtual.renderers.raster",
@@ -25,10 +25,14 @@ RENDERERS: Final = {
 
 
 def find_renderer(name: str) -> Renderer:
-    """Return a renderer by name; a UserError where it is unknown or its extra not installed."""
-    known = RENDERERS if name in RENDERERS else {**extensions.found("renderers"), **RENDERERS}
-    if name not in known:
-        advice = extensions.advice("renderers", name)
-        raise UserError(f"renderer {name!r}", ", ".join(known), f"choose one of them, or {advice}")
-    render: Renderer = import_module(known[name]).render
+    """Return a renderer by name.
+
+    Raises:
+        UserError: The renderer is unknown, or its extra is not installed.
+    """
+    modules = RENDERERS if name in RENDERERS else {**extensions.found("renderers"), **RENDERERS}
+    if name not in modules:
+        fix = f"choose one of them, or {extensions.advice('renderers', name)}"
+        raise UserError(f"renderer {name!r}", ", ".join(modules), fix)
+    render: Renderer = import_module(modules[name]).render
     return render

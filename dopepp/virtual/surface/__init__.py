@@ -1,4 +1,4 @@
-"""A mesh made ready for rendering: smooth normals with sharp creases, texture, open sky, hull."""
+"""Surfaces: meshes prepared for rendering, with normals and creases, texture, open sky and hull."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ PerFace = Float[np.ndarray, "faces"]
 _CREASE_ANGLE_DEG: Final = 35.0
 """Faces that meet at a larger angle keep a sharp edge; a CAD cylinder has facets of 5° to 30°."""
 
-_HULL_DIRECTIONS: Final = 400  # whose extreme points stand for a mesh when its image is measured
-_NUM_POINTS: Final = 400  # that stand for a mesh where a plane is darkened beside it
-_MOST_CORNERS: Final = 1024  # of a vertex; averaging more normals takes the square of the number
+_HULL_DIRECTIONS: Final = 400  # whose extreme points approximate the hull of a large mesh
+_NUM_POINTS: Final = 400  # that represent a mesh for the shadows on a plane
+_MOST_CORNERS: Final = 1024  # of a vertex whose normals are averaged, in quadratic time
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles as the rasteriser takes them; positions in the object frame, metres.
+    """Triangles for the renderers; positions in the object frame, metres.
 
     Attributes:
         vertices: float64; ``faces`` are their indices, int32.
@@ -61,7 +61,7 @@ class Surface:
 
     @property
     def is_coloured(self) -> bool:
-        """Whether it has colours of its own, from a texture or of its vertices."""
+        """Whether it has a texture or vertex colours."""
         return self.texture is not None or len(self.colours) > 0
 
     @property
@@ -72,8 +72,7 @@ class Surface:
     def scaled(self, scale: Vector) -> Surface:
         """Return the surface stretched along its axes by positive factors.
 
-        The open sky stays that of the unstretched surface, which is near enough for stretches up
-        to two.
+        The open sky is not recomputed, which is accurate enough for factors up to two.
         """
         normals = self.normals / np.asarray(scale, np.float32)
         normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-20)
@@ -91,18 +90,18 @@ def make_surface(mesh: Mesh) -> Surface:
     """Prepare a mesh for rendering (a quarter of a second; do it once per part).
 
     Raises:
-        UserError: The mesh has no faces, a value that is not finite, or a face with a vertex that
-            does not exist.
+        UserError: The mesh has no faces, a value that is not finite, or a face with an index out of
+            range.
     """
     vertices = np.ascontiguousarray(mesh.vertices, np.float64)
     faces = np.ascontiguousarray(mesh.faces, np.int32)
     fix = "repair the mesh or export it again"
     if len(faces) == 0 or not np.isfinite(vertices).all():
-        got = f"a mesh of {len(vertices)} vertices and {len(faces)} faces to render"
-        raise UserError(got, "at least one face and finite vertices", fix)
+        problem = f"a mesh of {len(vertices)} vertices and {len(faces)} faces to render"
+        raise UserError(problem, "at least one face and finite vertices", fix)
     if faces.min() < 0 or faces.max() >= len(vertices):  # compiled code does not check indices
-        got = f"a mesh with a face of vertices {faces.min()} to {faces.max()}"
-        raise UserError(got, f"vertices 0 to {len(vertices) - 1}", fix)
+        problem = f"a mesh with a face of vertices {faces.min()} to {faces.max()}"
+        raise UserError(problem, f"vertices 0 to {len(vertices) - 1}", fix)
     merged = _merge_vertices(vertices)[faces]
     edges = vertices[faces[:, [1, 2, 0]]] - vertices[faces]
     doubled = np.cross(edges[:, 0], edges[:, 1])
@@ -116,8 +115,8 @@ def make_surface(mesh: Mesh) -> Surface:
     if mesh.uv is not None and mesh.texture is not None:
         uv = np.ascontiguousarray(mesh.uv, np.float32)
         if len(uv) != len(vertices) or not np.isfinite(uv).all():
-            got = f"{len(uv)} texture coordinates of a mesh of {len(vertices)} vertices"
-            raise UserError(got, "one finite texture coordinate per vertex", fix)
+            problem = f"{len(uv)} texture coordinates of a mesh of {len(vertices)} vertices"
+            raise UserError(problem, "one finite texture coordinate per vertex", fix)
         texture = make_texture(mesh.texture, uv, faces)
     elif mesh.colours is not None:
         colours = SRGB_TO_LINEAR[mesh.colours]
@@ -126,7 +125,7 @@ def make_surface(mesh: Mesh) -> Surface:
     sky = bake_open_sky(vertices, faces, normals, closed)
     hull = vertices[np.unique(faces)]
     if len(hull) > _HULL_DIRECTIONS:
-        # One direction after the other: all at once would take gigabytes for a large mesh.
+        # One direction at a time: all at once would take gigabytes for a large mesh.
         extreme = [int((hull @ along).argmax()) for along in spread_directions(_HULL_DIRECTIONS)]
         hull = hull[np.unique(extreme)]
     spacing = float(np.sqrt(length.sum() / 2 / _NUM_POINTS))
@@ -137,11 +136,11 @@ def make_surface(mesh: Mesh) -> Surface:
 
 
 def _spread_points(corners: Corners, weights: PerFace) -> Points:
-    """Return points evenly spread over triangles, by area; the corners of a mesh without any."""
+    """Return points spread evenly over triangles by area; the corners of a mesh without area."""
     if weights.sum() <= 0.0:
         return corners.reshape(-1, 3)[:_NUM_POINTS]
-    places = (np.arange(_NUM_POINTS) + 0.5) / _NUM_POINTS * weights.sum()
-    chosen = np.minimum(np.searchsorted(np.cumsum(weights), places), len(weights) - 1)
+    levels = (np.arange(_NUM_POINTS) + 0.5) / _NUM_POINTS * weights.sum()
+    chosen = np.minimum(np.searchsorted(np.cumsum(weights), levels), len(weights) - 1)
     # A low-discrepancy sequence within the triangles (Roberts' R2), folded into each.
     share = (np.arange(1, _NUM_POINTS + 1)[:, None] * (0.7548776662466927, 0.5698402909980532)) % 1
     share = np.where(share.sum(axis=1, keepdims=True) > 1, 1 - share, share)
@@ -151,8 +150,8 @@ def _spread_points(corners: Corners, weights: PerFace) -> Points:
 
 def _merge_vertices(vertices: Vertices) -> Int[np.ndarray, "vertices"]:
     """Number vertices so that equal positions share a number."""
-    # STL and UV seams split vertices. Those of one cell of a grid this fine are one, and three such
-    # coordinates fit into one integer of 64 bits.
+    # STL and UV seams split vertices: merge those in the same cell of a fine grid. Three
+    # coordinates of 21 bits fit into an integer of 64 bits.
     step = max(float(np.ptp(vertices, axis=0).max()), 1e-12) / (2**21 - 1)
     cells = np.round((vertices - vertices.min(axis=0)) / step).astype(np.int64)
     keys = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
@@ -160,7 +159,7 @@ def _merge_vertices(vertices: Vertices) -> Int[np.ndarray, "vertices"]:
 
 
 def _is_closed(merged: Faces, triangles: Corners) -> bool:
-    """Tell whether every directed edge has exactly one opposite and the volume is positive."""
+    """Return whether every directed edge has exactly one opposite and the volume is positive."""
     collapsed = (merged == merged[:, [1, 2, 0]]).any(axis=1)
     start, end = merged[~collapsed], merged[~collapsed][:, [1, 2, 0]]
     count = int(merged.max()) + 1
@@ -197,12 +196,12 @@ def _corner_normals(
 def _take_given(
     normals: Corners, given: Corners, doubled: Float[np.ndarray, "faces 3"], length: PerFace
 ) -> None:
-    """Put a file's normals at the corners where they can be the smooth surface's.
+    """Replace computed normals by the file's where these are close to the face's normal.
 
-    Files average them over sharp edges, too. There each of two faces that meet at more than the
-    crease angle is more than half of it away, and what was computed stays.
+    Files also average normals over sharp edges; such normals are over half the crease angle away
+    from the face's normal.
     """
-    with np.errstate(all="ignore"):  # of what is zero, or not finite
+    with np.errstate(all="ignore"):  # normals may be zero or not finite
         unit = given / np.linalg.norm(given, axis=2, keepdims=True)
         facing = np.einsum("fki,fi->fk", unit, doubled / np.maximum(length, 1e-300)[:, None])
         near = facing >= math.cos(math.radians(_CREASE_ANGLE_DEG / 2))
@@ -224,7 +223,7 @@ def _average_normals(
             face, k = corners[p] // 3, corners[p] % 3
             nx, ny, nz = face_normals[face, 0], face_normals[face, 1], face_normals[face, 2]
             sx, sy, sz = 0.0, 0.0, 0.0
-            # Every pair of a vertex's faces is compared; a hub of a million faces is left flat.
+            # All pairs of a vertex's faces are compared; a hub of a million faces stays flat.
             first, last = offsets[vertex], offsets[vertex + 1]
             if last - first > _MOST_CORNERS:
                 first, last = p, p + 1

@@ -1,9 +1,9 @@
-"""Baked ambient occlusion: how much of the sky above every point of a surface is open.
+"""Baked ambient occlusion: the open share of the sky above every point of a surface.
 
-The mesh is drawn as depth maps from directions all around it, and points spread over its
-triangles are looked up in each (as in Landis, "Production-ready global illumination", 2002). The
-result lies on a grid of every triangle's own, because a CAD plate is two huge triangles, and its
-corners know nothing of a rib in its middle; small triangles keep their three corners.
+The mesh is drawn as depth maps from directions all around it, and points on its triangles are
+looked up in each map (as in Landis, "Production-ready global illumination", 2002). Every triangle
+has a grid of points, because a CAD plate is two huge triangles whose corners do not reflect a rib
+in the middle; small triangles have only their corners.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -20,12 +20,22 @@ from dopepp.core.compiled import Array, compiled
 from dopepp.parts.mesh import Faces, Vertices
 from dopepp.virtual.triangles import CENTRE_SAMPLE, lit_share, project_vertices, rasterise
 
-_FINEST: Final = 1 / 96  # spacing of the points over the mesh's size; 96 steps an edge at most
+_FINEST: Final = 1 / 96  # spacing of the points over the mesh's size; at most 96 steps per edge
+_MAP_SIDE: Final = 192  # texels across a depth map
+
+
+class _Points(NamedTuple):
+    """Points on the triangles: positions, unit normals, faces, and the normals of all faces."""
+
+    points: Array
+    upright: Array
+    ground: Array
+    flat: Array
 
 
 @dataclass(frozen=True, eq=False)
 class OpenSky:
-    """The share of a point's hemisphere, weighted by the cosine, that its own mesh leaves open.
+    """Cosine-weighted share of each point's hemisphere that its own mesh leaves open.
 
     Attributes:
         steps: Steps along the edges of every triangle's grid, shape (F,).
@@ -39,16 +49,16 @@ class OpenSky:
 
 
 _BAKED: Final[dict[bytes, OpenSky]] = {}
-"""What this process has baked, by a hash of the mesh."""
+"""Results of this process, by a hash of the mesh."""
 
 
 def bake_open_sky(
     vertices: Vertices, faces: Faces, normals: Float[np.ndarray, "faces 3 3"], closed: bool
 ) -> OpenSky:
-    """Measure the open sky over a mesh; the time grows with the number of triangles.
+    """Return the open sky of a mesh; the time grows with the number of triangles.
 
-    The last skies are kept, because a run prepares its parts anew for every set of its data.
-    ``normals`` are of every corner; of a ``closed`` mesh, nobody sees the back sides.
+    Results are cached, because a run prepares its parts again for every data set. ``normals``
+    belong to the corners; back sides of a ``closed`` mesh are skipped.
     """
     digest = hashlib.sha256(str((vertices.shape, closed)).encode())
     for array in (vertices, faces, normals):
@@ -56,18 +66,18 @@ def bake_open_sky(
     key = digest.digest()
     baked = _BAKED.get(key)
     if baked is None:
-        if len(_BAKED) >= 32:  # more than the parts of a run
+        if len(_BAKED) >= 32:  # more than a run's parts
             _BAKED.pop(next(iter(_BAKED)), None)
         baked = _BAKED[key] = _bake_mesh(vertices, faces, normals, closed)
     return baked
 
 
 def _bake_mesh(vertices: Array, faces: Array, normals: Array, closed: bool) -> OpenSky:
-    """Draw a mesh from all around and look its points up in the depth maps."""
+    """Draw a mesh from all directions and look its points up in the depth maps."""
     corners = vertices[faces]
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
-    # Comparing all with all pays for so many; a convex mesh cannot hide its own sky.
+    # A convex mesh cannot hide its own sky; the test is quadratic.
     if len(faces) <= 1000 and _is_convex(corners, flat, closed):
         steps, firsts = np.ones(len(faces), np.int32), np.zeros(len(faces), np.int64)
         return OpenSky(steps, firsts, np.ones((2, 3), np.float32))
@@ -75,23 +85,20 @@ def _bake_mesh(vertices: Array, faces: Array, normals: Array, closed: bool) -> O
     centre = (used.min(axis=0) + used.max(axis=0)) / 2
     radius = math.sqrt(float(((used - centre) ** 2).sum(axis=1).max()))
     steps, firsts, count = _grids(corners, 2 * radius)
-    points, upright = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
-    ground = np.empty(count, np.int32)
-    _spread(corners, normals, steps, firsts, points, upright, ground)
+    points, upright = np.empty((2, count, 3), np.float32)
+    grid = _Points(points, upright, np.empty(count, np.int32), flat)
+    _spread(corners, normals, steps, firsts, grid)
     sums = np.zeros((4, count), np.float32)
     # A huge mesh is drawn from fewer directions.
     directions = spread_directions(int(np.clip(6_000_000 // len(faces), 24, 256)))
-    _bake(
-        vertices, faces, closed, centre, radius, directions, 192, CENTRE_SAMPLE, points,
-        upright, flat, ground, sums,
-    )  # fmt: skip
-    # A point that no direction sees from outside (a face without area) counts as open.
+    _bake(vertices, faces, closed, centre, radius, directions, CENTRE_SAMPLE, grid, sums)
+    # A point on a face without area counts as open.
     values = np.where(sums[1::2] > 0, sums[::2] / np.maximum(sums[1::2], 1e-9), 1.0)
     return OpenSky(steps, firsts, values.astype(np.float32))
 
 
 def _is_convex(corners: Array, flat: Array, closed: bool) -> bool:
-    """Tell whether all corners lie behind every face's plane, or on it for an open mesh."""
+    """Return whether all corners lie behind every face's plane, or on it for an open mesh."""
     points = corners.reshape(-1, 3)
     slack = 1e-4 * float(np.ptp(points, axis=0).max())
     heights = points @ flat.T - (corners[:, 0] * flat).sum(axis=1)
@@ -121,11 +128,9 @@ def spread_directions(count: int) -> Float[np.ndarray, "directions 3"]:
 
 
 @compiled()
-def _spread(
-    corners: Array, normals: Array, steps: Array, firsts: Array, points: Array, upright: Array,
-    ground: Array,
-) -> None:  # fmt: skip
+def _spread(corners: Array, normals: Array, steps: Array, firsts: Array, grid: _Points) -> None:
     """Write every triangle's grid of points, their normals and their triangle."""
+    points, upright = grid.points, grid.upright
     for f in range(corners.shape[0]):
         n = steps[f]
         # A little inside the triangle, or a point in a corner of the mesh would lie on both walls.
@@ -143,24 +148,30 @@ def _spread(
                     upright[p, r] = (
                         k0 * normals[f, 0, r] + k1 * normals[f, 1, r] + k2 * normals[f, 2, r]
                     )
-                ground[p] = f
+                grid.ground[p] = f
                 p += 1
 
 
 @compiled()
 def _bake(
-    vertices: Array, faces: Array, closed: bool, centre: Array, radius: float, directions: Array,
-    side: int, samples: Array, points: Array, upright: Array, flat: Array, ground: Array,
+    vertices: Array,
+    faces: Array,
+    closed: bool,
+    centre: Array,
+    radius: float,
+    directions: Array,
+    samples: Array,
+    grid: _Points,
     sums: Array,
-) -> None:  # fmt: skip
-    """Sum the open and all of the cosine over directions, for front and back sides.
+) -> None:
+    """Sum the cosine over all directions: open front, all front, open back and all back.
 
-    The mesh lies within ``radius`` around ``centre``. Depth maps along ``directions`` have ``side``
-    texels across, sampled at their centres. ``points`` with normals ``upright`` lie on the faces
-    ``ground``; ``flat`` are the faces' normals. ``sums`` are open front, all front, open back and
-    all back.
+    The mesh lies within ``radius`` around ``centre``; depth maps along ``directions`` are sampled
+    at the texels' centres.
     """
-    distance = 20.0 * radius  # as good as parallel
+    points, upright, ground, flat = grid
+    side = _MAP_SIDE
+    distance = 20.0 * radius  # almost parallel rays
     focal = 0.5 * (side - 4) * distance / radius
     K = np.array([[focal, 0.0, 0.5 * side], [0.0, focal, 0.5 * side], [0.0, 0.0, 1.0]])
     # As for shadows: a point lifted by more than √2 texels is not hidden by its own plane.
@@ -171,7 +182,7 @@ def _bake(
     T, P = np.zeros((4, 4)), np.empty((3, 4), np.float32)
     for k in range(directions.shape[0]):
         dx, dy, dz = directions[k]
-        # Any two axes across the direction do.
+        # Any two perpendicular axes serve.
         if abs(dz) < 0.9:
             norm = 1.0 / math.sqrt(dx * dx + dy * dy)
             rx, ry, rz = -dy * norm, dx * norm, 0.0
@@ -205,12 +216,10 @@ def _bake(
             if facing < 1e-3 or cosine <= 0.0:
                 continue
             sums[back + 1, p] += cosine
-            sums[back, p] += cosine * lit_share(
-                np.float32(points[p, 0] + up * flat[f, 0]),
-                np.float32(points[p, 1] + up * flat[f, 1]),
-                np.float32(points[p, 2] + up * flat[f, 2]),
-                depth, P,
-            )  # fmt: skip
+            x = np.float32(points[p, 0] + up * flat[f, 0])
+            y = np.float32(points[p, 1] + up * flat[f, 1])
+            z = np.float32(points[p, 2] + up * flat[f, 2])
+            sums[back, p] += cosine * lit_share(x, y, z, depth, P)
 
 
 @compiled(fastmath=True)

@@ -1,10 +1,9 @@
-"""Textures: a pyramid of halvings, looked up so that no pixel sees finer detail than it can show.
+"""Textures: a pyramid of halvings with anisotropic filtering over each pixel's footprint.
 
-A pixel's footprint on the texture is a parallelogram. Its longer axis is covered by several
-probes side by side, each as wide as the shorter axis and each interpolated between the two
-nearest levels, so a grazing surface neither shimmers nor blurs away (McCormack et al., "Feline",
-1999). Light is averaged, not codes; texels that no triangle uses take the colour of their
-neighbours, so an atlas shows no seams from afar.
+A pixel's footprint on the texture is a parallelogram. Several probes cover its longer axis, each as
+wide as the shorter axis and interpolated between the two nearest levels, so a grazing surface
+neither shimmers nor blurs (McCormack et al., "Feline", 1999). Averages are of linear light. Unused
+texels take the colour of their neighbours, so an atlas shows no seams from afar.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from dopepp.virtual.triangles import CENTRE_SAMPLE, edge_functions, rasterise
 
 Lookup = tuple[Array, Array, Array]
 
-_MOST_PROBES: Final = 16  # along a footprint's longer axis; beyond this stretch a texture blurs
+_MOST_PROBES: Final = 16  # along a footprint's longer axis; more stretched textures blur
 _SHARPNESS: Final = 0.75  # a probe's width over the footprint's; interpolation widens it again
 
 
@@ -61,16 +60,14 @@ def make_texture(image: Picture, uv: Float[np.ndarray, "vertices 2"], faces: Fac
     shares = [_used_texels(uv, faces, shapes[0])]
     for level in range(1, len(shapes)):
         shares.append(np.empty(shapes[level], np.float32))
-        _halve(
-            texture.image(level - 1), shares[-2], SRGB_TO_LINEAR, LINEAR_TO_SRGB,
-            texture.image(level), shares[-1],
-        )  # fmt: skip
-    # Texels that nothing uses take the colour of the next coarser level.
+        finer, coarser = texture.image(level - 1), texture.image(level)
+        _halve(finer, shares[-2], SRGB_TO_LINEAR, LINEAR_TO_SRGB, coarser, shares[-1])
+    # Unused texels take the colour of the next coarser level.
     for level in range(len(shapes) - 2, -1, -1):
         (rows, columns), coarser = shapes[level], texture.image(level + 1)
         j, i = np.nonzero(shares[level] == 0)
-        finer = coarser[j * coarser.shape[0] // rows, i * coarser.shape[1] // columns]
-        texture.image(level)[j, i] = finer
+        colours = coarser[j * coarser.shape[0] // rows, i * coarser.shape[1] // columns]
+        texture.image(level)[j, i] = colours
     return texture
 
 
@@ -81,7 +78,7 @@ def _used_texels(
     rows, columns = shape
     used = uv[faces]
     if used.min() < 0.0 or used.max() > 1.0:
-        return np.ones(shape, np.float32)  # it repeats, so a gap may be another copy's texels
+        return np.ones(shape, np.float32)  # the texture repeats: other copies may use a gap
     flat = np.ones((len(uv), 3))
     flat[:, 0], flat[:, 1] = uv[:, 0] * columns - 0.5, (1.0 - uv[:, 1]) * rows - 0.5
     touched, ids = np.zeros((rows, columns, 1), np.float32), np.empty((rows, columns, 1), np.int32)

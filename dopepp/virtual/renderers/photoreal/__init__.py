@@ -1,15 +1,15 @@
-"""Mitsuba, imported once a process in the fastest variant that runs on this machine.
+"""Mitsuba, imported once per process in the fastest variant that runs on this machine.
 
 ``llvm_ad_rgb`` compiles its kernels with the system's libLLVM and is several times faster than
-``scalar_rgb``, which needs nothing. A libLLVM that Mitsuba cannot work with (15 and older, as in
-Debian 12) ends the whole process, so each is first tried in a process of its own, and the outcome
-is kept in the user's cache folder for as long as library and Mitsuba stay the same.
+``scalar_rgb``, which needs no library. An incompatible libLLVM (15 and older, as in Debian 12) ends
+the whole process. Each library is therefore first tried in a separate process; the outcome is
+cached in the user's cache folder until the library or Mitsuba changes.
 
 Environment variables:
     ``DOPEPP_MITSUBA_VARIANT``: ``llvm_ad_rgb`` or ``scalar_rgb`` instead of the automatic choice.
-    ``DRJIT_LIBLLVM_PATH``: Mitsuba's own; the only library that is tried where it is set.
-    ``DOPEPP_RENDER_THREADS``: Threads to render with; by default one for each core that this
-    process may run on, and a single one in a worker that another Python process started.
+    ``DRJIT_LIBLLVM_PATH``: Path of the only library to try.
+    ``DOPEPP_RENDER_THREADS``: Number of render threads; by default one per available core, and a
+    single one in a worker process.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ VARIANT_SETTING: Final = "DOPEPP_MITSUBA_VARIANT"
 LIBRARY_SETTING: Final = "DRJIT_LIBLLVM_PATH"
 THREADS_SETTING: Final = "DOPEPP_RENDER_THREADS"
 
-PLACES: Final = (
+LIBRARY_PATTERNS: Final = (
     "/usr/lib/*-linux-gnu/libLLVM*.so.*",
     "/usr/lib64/libLLVM*.so.*",
     "/usr/lib/libLLVM*.so.*",
     "/opt/homebrew/opt/llvm/lib/libLLVM.dylib",
 )
-"""Where Debian, Fedora, Arch and Homebrew put libLLVM; the environment names one elsewhere."""
+"""Paths of libLLVM on Debian, Fedora, Arch and Homebrew."""
 
 _TRIAL: Final = """
 import mitsuba as mi
@@ -54,15 +54,15 @@ scene = mi.cornell_box()
 scene["small-box"]["bsdf"] = {"type": "principled", "roughness": 0.3, "metallic": 0.5}
 print("mean", float(mi.TensorXf(mi.render(mi.load_dict(scene), spp=1)).array[0]))
 """
-"""A small scene with most of what compiles in a real one."""
+"""A small scene with most features of a real one."""
 
 
 def mitsuba() -> Any:
     """Return the ``mitsuba`` module with its variant and threads set.
 
     Raises:
-        UserError: It is not installed, a setting is wrong, or this process was forked from one that
-            has rendered, whose threads it lacks.
+        UserError: Mitsuba is not installed, a setting is wrong, or this process was forked after
+            rendering and lacks the render threads.
     """
     require("mitsuba", "renderer 'photoreal'", "photoreal")
     pid = _start()
@@ -76,7 +76,11 @@ def mitsuba() -> Any:
 
 
 def num_threads() -> int:
-    """Return the threads to render with; a UserError, if the environment states no such number."""
+    """Return the number of render threads.
+
+    Raises:
+        UserError: The environment variable is not a positive integer.
+    """
     setting = os.environ.get(THREADS_SETTING)
     if setting is not None:
         if not setting.isdecimal() or int(setting) < 1:
@@ -87,7 +91,7 @@ def num_threads() -> int:
 
 @cache
 def _start() -> int:
-    """Import Mitsuba in the chosen variant; return the process that did."""
+    """Import Mitsuba in the chosen variant and return this process's id."""
     library = _chosen_library()
     if library is not None and os.environ.get(LIBRARY_SETTING) != str(library):
         if "drjit" in sys.modules:
@@ -104,16 +108,16 @@ def _start() -> int:
 
 def _chosen_library() -> Path | None:
     """Return the libLLVM to use; None for the scalar variant."""
-    wish = os.environ.get(VARIANT_SETTING)
-    if wish not in (None, *VARIANTS):
-        raise UserError(f"{VARIANT_SETTING}={wish!r}", ", ".join(VARIANTS), "change or unset it")
-    if wish == "scalar_rgb":
+    variant = os.environ.get(VARIANT_SETTING)
+    if variant not in (None, *VARIANTS):
+        raise UserError(f"{VARIANT_SETTING}={variant!r}", ", ".join(VARIANTS), "change or unset it")
+    if variant == "scalar_rgb":
         return None
     libraries = candidates()
     library = next((path for path in libraries if is_usable(path)), None)
-    if library is None and wish == "llvm_ad_rgb":
+    if library is None and variant == "llvm_ad_rgb":
         raise UserError(
-            f"{VARIANT_SETTING}={wish} with {', '.join(map(str, libraries)) or 'no libLLVM'}",
+            f"{VARIANT_SETTING}={variant} with {', '.join(map(str, libraries)) or 'no libLLVM'}",
             "a libLLVM that Mitsuba can work with",
             f"install a newer LLVM, set {LIBRARY_SETTING}, or unset {VARIANT_SETTING}",
         )
@@ -125,38 +129,42 @@ def candidates() -> list[Path]:
     setting = os.environ.get(LIBRARY_SETTING)
     if setting:
         return [Path(setting)]
-    libraries = {path.resolve() for place in PLACES for path in Path("/").glob(place[1:])}
-    # Their names give the version: libLLVM-17.so.1, libLLVM.so.19.1.
-    numbers = {
-        path: [int(digits) for digits in re.findall(r"\d+", path.name)] for path in libraries
-    }
-    return sorted(libraries, key=lambda path: (numbers[path], path), reverse=True)
+    root = Path("/")
+    libraries = {path.resolve() for pattern in LIBRARY_PATTERNS for path in root.glob(pattern[1:])}
+
+    def version_of(path: Path) -> tuple[list[int], Path]:
+        # The name contains the version: libLLVM-17.so.1, libLLVM.so.19.1.
+        return [int(digits) for digits in re.findall(r"\d+", path.name)], path
+
+    return sorted(libraries, key=version_of, reverse=True)
 
 
 def is_usable(library: Path) -> bool:
-    """Tell whether Mitsuba renders with a libLLVM, from memory on disk or by trying it."""
+    """Return whether Mitsuba renders with a libLLVM, from the cache or by trying."""
     try:
         stat = library.stat()
     except OSError:
         return False
     key = f"{library} {stat.st_mtime_ns} {stat.st_size} {version('mitsuba')} {version('drjit')}"
-    memory = cache_folder() / f"libllvm_{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+    cached = cache_folder() / f"libllvm_{hashlib.sha256(key.encode()).hexdigest()[:16]}"
     with suppress(OSError, ValueError, KeyError):  # not tried yet, or the file is damaged
-        return {"works": True, "fails": False}[memory.read_text("utf-8")]
-    environment = {**os.environ, LIBRARY_SETTING: str(library)}
+        return {"works": True, "fails": False}[cached.read_text("utf-8")]
+    command, environment = (
+        [sys.executable, "-c", _TRIAL],
+        {**os.environ, LIBRARY_SETTING: str(library)},
+    )
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", _TRIAL], env=environment, capture_output=True, text=True,
-            timeout=60.0, check=False,
-        )  # fmt: skip
+        trial = subprocess.run(
+            command, env=environment, capture_output=True, text=True, timeout=60.0
+        )
     except (OSError, subprocess.TimeoutExpired) as error:
         _log.warning("%s could not be tried: %s", library, error)
         return False
-    usable = done.returncode == 0 and "mean" in done.stdout
+    usable = trial.returncode == 0 and "mean" in trial.stdout
     _log.info("%s %s with Mitsuba", library, "works" if usable else "does not work")
     try:
-        memory.parent.mkdir(parents=True, exist_ok=True)
-        memory.write_text("works" if usable else "fails", "utf-8")
+        cached.parent.mkdir(parents=True, exist_ok=True)
+        cached.write_text("works" if usable else "fails", "utf-8")
     except OSError as error:
-        _log.warning("%s cannot be written, libLLVM will be tried again: %s", memory, error)
+        _log.warning("%s cannot be written, libLLVM will be tried again: %s", cached, error)
     return usable

@@ -1,20 +1,17 @@
 """The photoreal renderer: path tracing by Mitsuba 3, denoised by Intel's Open Image Denoise.
 
-Objects stand in the light that the rasteriser gives them, but lamps have a size, light goes from
-object to object, and surfaces mirror their surroundings. The picture is laid over the background
-in linear light.
+Lights match the rasteriser's, but lamps have a size, objects light each other, and surfaces mirror
+their surroundings. The traced picture is composited over the background in linear light.
 
-A matt disc stands for a supporting plane, whose picture is the background. Where the path tracer
-sees the disc, its light over its light without objects is the factor for the background: shadows,
-and light that objects throw on it.
+A matt disc represents the supporting plane, whose picture is the background. The disc's radiance,
+divided by its radiance without objects, is the factor on the background: shadows and reflected
+light.
 
-The same scene gives the same bytes on the same machine, whatever the number of threads. Workers
-must be spawned, or forked before the first image. The package lists the environment variables that
-choose Mitsuba's variant and the number of threads.
+A scene renders to the same bytes on the same machine for any number of threads. Workers must be
+spawned, or forked before the first image. The package lists the environment variables.
 
-Importing this module needs the extra ``photoreal``. pyoidn's C interface is called directly: the
-package itself imports torch wherever that is installed, which takes seconds and memory that
-rendering does without.
+This module needs the extra ``photoreal``. It calls pyoidn's C interface directly, because the
+pyoidn package imports torch if installed, which costs seconds and memory.
 """
 
 from __future__ import annotations
@@ -35,7 +32,7 @@ from dopepp.core.errors import require
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.rotation import Vector
 from dopepp.virtual.renderers.photoreal import mitsuba, num_threads
-from dopepp.virtual.renderers.photoreal.scene import (
+from dopepp.virtual.renderers.photoreal.mitsuba_scene import (
     Film,
     bounding_sphere,
     cast,
@@ -60,21 +57,21 @@ Depth = Float32[np.ndarray, "height width"]
 SAMPLES_PER_PIXEL: Final = 16
 
 _PATHS: Final = {"type": "path", "max_depth": 6, "hide_emitters": True}
-"""Light that bounces off at most five surfaces; lamps are seen in reflections only."""
+"""At most five bounces; lamps are visible in reflections only."""
 
 _GUIDES: Final = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}
-"""What the denoiser learns of the surfaces; in one pass with the light it takes far longer."""
+"""Surface features for the denoiser; a separate pass is far faster than one with the light."""
 
-_MARGIN_PX: Final = 1  # around the objects: what covers a pixel's rim, and what the denoiser sees
+_MARGIN_PX: Final = 1  # around the objects, for partly covered pixels and the denoiser
 
 _RADIANCE_OF_CODE: Final = np.interp(
     np.arange(256), TONE_CURVE, np.arange(len(TONE_CURVE)) / CODE_STEPS
 ).astype(np.float32)
-"""The radiance that the tone curve shows as a code of 0–255."""
+"""Radiance of every code 0–255 under the tone curve."""
 
 _ALBEDO: Final = (0.05, 0.8)  # bounds of the disc's albedo, estimated from its picture and light
-_LEAST_LIGHT: Final = 1e-3  # radiance of a white table below which no shadow is cast
-_SPREAD_PX: Final = 2.0  # width over which a shadow is carried on under an object's rim
+_LEAST_LIGHT: Final = 1e-3  # radiance of a white table below which shadows are not estimated
+_SPREAD_PX: Final = 2.0  # width over which a shadow is extrapolated under an object's rim
 _FLOAT3: Final = 3  # OIDN_FORMAT_FLOAT3
 
 
@@ -105,19 +102,17 @@ def render(scene: Scene) -> Rendered:
 
 
 def _objects_window(scene: Scene) -> Box | None:
-    """Return the part of the image that objects may touch; None if they touch none."""
+    """Return the part of the image that objects may touch, or None."""
     box = box_around(project_object(item, scene.K).box(scene.size) for item in scene.objects)
     if box is None:
         return None
-    left, top, right, bottom = box
-    return (
-        max(left - _MARGIN_PX, 0), max(top - _MARGIN_PX, 0),
-        min(right + _MARGIN_PX, scene.size[0]), min(bottom + _MARGIN_PX, scene.size[1]),
-    )  # fmt: skip
+    left, top = (max(start - _MARGIN_PX, 0) for start in box[:2])
+    right, bottom = (min(*ends) for ends in zip((box[2] + 1, box[3] + 1), scene.size, strict=True))
+    return left, top, right, bottom
 
 
 class Tracer:
-    """Mitsuba's view of a scene with objects.
+    """Path tracing of a scene with objects by Mitsuba.
 
     Attributes:
         world: Mitsuba's description of the objects.
@@ -128,23 +123,23 @@ class Tracer:
         self._shapes = make_shapes(self._mi, scene)
         objects = {f"object{number}": shape for number, shape in enumerate(self._shapes)}
         self.world: dict[str, Any] = {"type": "scene"} | objects
-        # A seed that is the scene's own, so that no two images share their noise.
+        # A seed from the scene, so that no two images share their noise.
         poses = b"".join(np.asarray(item.T_cam_obj, np.float64).tobytes() for item in scene.objects)
         noise_seed = scene.sensor.noise_seed.to_bytes(16, "little", signed=True)
         self._seed = zlib.crc32(poses + noise_seed)
 
     def cast(self, window: Box) -> tuple[Depth, np.ndarray]:
-        """Return the depth and the object that a window's pixel centres see."""
+        """Return depth and object index at a window's pixel centres."""
         world = self._mi.load_dict(self.world, parallel=False)
         return cast(self._mi, world, self._shapes, pixel_rays(self._scene.K, window))
 
     def trace(
         self, world: dict[str, Any], film: Film
     ) -> Float32[np.ndarray, "film_height film_width 4"]:
-        """Return the light that reaches a film's pixels, denoised, and their coverage."""
+        """Return the denoised radiance and the coverage of a film's pixels."""
         lit = {**world, **make_surroundings(self._mi, self._scene)}
         traced = self._measure(lit, film, _PATHS, SAMPLES_PER_PIXEL)
-        # Four samples a pixel, as it is far less noisy than light.
+        # Four samples per pixel suffice: surface features are far less noisy than light.
         guides = self._measure(world, film, _GUIDES, 4)
         traced[..., :3] = denoise(traced[..., :3], guides[..., :3], guides[..., 3:6])
         return traced
@@ -157,8 +152,8 @@ class Tracer:
             return
         area, film = _slices(window), make_film(self._scene.K, window)
         traced = self.trace({**self.world, "table": table.shape(self._mi)}, film)
-        # Whether light comes from an object or from the table is a second, cheap picture: the
-        # fourth channel of any integrator is the share of rays that hit something.
+        # A second, cheap pass without the table measures the objects' coverage: the fourth channel
+        # of any integrator is the share of rays that hit something.
         hit = self._measure(self.world, film, {"type": "depth"}, SAMPLES_PER_PIXEL)
         traced[..., 3] = hit[..., 3]
         traced = film.resampled(traced)
@@ -170,15 +165,15 @@ class Tracer:
     def _measure(
         self, world: dict[str, Any], film: Film, integrator: dict[str, Any], samples: int
     ) -> Float32[np.ndarray, "film_height film_width channels"]:
-        """Return what an integrator measures in every pixel of a film."""
+        """Return an integrator's output for every pixel of a film."""
         whole = {**world, "sensor": film.sensor(self._mi, samples), "integrator": integrator}
-        # Loaded in parallel, objects come in random order, and every order is compiled anew.
+        # Parallel loading would order objects randomly and recompile for every order.
         loaded = self._mi.load_dict(whole, parallel=False)
         return np.array(self._mi.render(loaded, seed=self._seed), np.float32)
 
 
 def _over(light: Colours, alpha: Depth, behind: Picture) -> Picture:
-    """Lay light that covers a share of each pixel over a picture, in linear light."""
+    """Composite light over a picture in linear light; ``alpha`` is the coverage."""
     alpha = np.clip(alpha, 0.0, 1.0)[..., None]
     total = light + (1 - alpha) * _RADIANCE_OF_CODE[behind]
     steps = np.minimum(total * CODE_STEPS + 0.5, len(TONE_CURVE) - 1).astype(np.int32)
@@ -191,9 +186,9 @@ def _slices(window: Box) -> Area:
 
 
 class TableTop:
-    """The disc that stands for a scene's plane.
+    """The disc that represents a scene's plane.
 
-    ``depth`` is the plane's at pixel centres, metres; 0 where it is not seen.
+    ``depth`` is the plane's depth at pixel centres, metres; 0 where it is not visible.
     """
 
     def __init__(self, scene: Scene, depth: Depth) -> None:
@@ -209,7 +204,7 @@ class TableTop:
         self.albedo = self._estimated_albedo()
 
     def window(self, objects: Box | None) -> Box | None:
-        """Return the part of the image with the disc and the objects; None if neither is seen."""
+        """Return the part of the image with the disc and the objects, or None."""
         seen = self._away < 1
         if objects is not None:
             seen[_slices(objects)] = True
@@ -221,20 +216,19 @@ class TableTop:
     def shape(self, mi: Any) -> dict[str, Any]:
         """Return the disc for Mitsuba."""
         up = np.eye(3)[np.abs(self._normal).argmin()]
-        place = mi.ScalarTransform4f().look_at(
-            list(self.centre), list(self.centre + self._normal), list(up)
-        )
+        target = list(self.centre + self._normal)
+        to_world = mi.ScalarTransform4f().look_at(list(self.centre), target, list(up))
         bsdf = {"type": "diffuse", "reflectance": rgb(self.albedo)}
-        return {"type": "disk", "to_world": place.scale(self.radius), "bsdf": bsdf}
+        return {"type": "disk", "to_world": to_world.scale(self.radius), "bsdf": bsdf}
 
     def unshadowed(self, area: Area) -> Colours:
         """Return the disc's radiance without objects; 0 beside it."""
         return np.asarray(self.albedo * self._light[area])
 
     def faded(self, kept: Colours, area: Area) -> Colours:
-        """Return the shares of light with no step at the disc's rim, and 1 beside it."""
+        """Return the shares of light, faded to 1 towards the disc's rim."""
         share = np.clip((1 - self._away[area]) / (1 - 0.6), 0.0, 1.0)[..., None]
-        # Smoothstep: no visible line where the fading begins and ends.
+        # Smoothstep: no visible line at either end of the fading.
         return 1 + (kept - 1) * share * share * (3 - 2 * share)
 
     def _full_light(self) -> Colours:
@@ -252,7 +246,7 @@ class TableTop:
         return light
 
     def _estimated_albedo(self) -> Vector:
-        """Return the albedo with which the disc is as bright as its picture, within reason."""
+        """Return the albedo at which the disc is as bright as its picture, within limits."""
         seen = self._away < 1
         if not seen.any():
             return np.full(3, np.mean(_ALBEDO))
@@ -262,32 +256,37 @@ class TableTop:
 
 
 def split_light(light: Colours, alpha: Depth, unshadowed: Colours) -> tuple[Colours, Colours]:
-    """Return the objects' share of each pixel's radiance, and the share of light left on the disc.
+    """Split radiance into the objects' and the disc's.
 
-    ``light`` is the radiance of objects and disc together, ``alpha`` the share of each pixel that
-    objects cover, ``unshadowed`` the disc's radiance without objects, 0 beside it.
+    Args:
+        light: Radiance of objects and disc together.
+        alpha: Coverage of each pixel by objects.
+        unshadowed: Radiance of the disc without objects, 0 beside it.
+
+    Returns:
+        Radiance of the objects, and the share of the light that remains on the disc.
     """
-    known = (alpha <= 0) & (unshadowed.min(axis=-1) > _LEAST_LIGHT)
-    kept = np.where(known[..., None], light / np.maximum(unshadowed, _LEAST_LIGHT), 1.0)
+    is_disc = (alpha <= 0) & (unshadowed.min(axis=-1) > _LEAST_LIGHT)
+    kept = np.where(is_disc[..., None], light / np.maximum(unshadowed, _LEAST_LIGHT), 1.0)
     kept = np.clip(kept, 0.0, 4.0)  # over 1: light thrown on a table in deep shade
-    # At an object's rim both are mixed; the shadow beside it goes on there.
-    weight = cv2.GaussianBlur(known.astype(np.float64), (0, 0), _SPREAD_PX)[..., None]
-    spread = cv2.GaussianBlur(np.where(known[..., None], kept, 0.0), (0, 0), _SPREAD_PX)
+    # An object's rim mixes both: extrapolate the shadow beside it.
+    weight = cv2.GaussianBlur(is_disc.astype(np.float64), (0, 0), _SPREAD_PX)[..., None]
+    spread = cv2.GaussianBlur(np.where(is_disc[..., None], kept, 0.0), (0, 0), _SPREAD_PX)
     carried = np.where(weight > 1e-3, spread / np.maximum(weight, 1e-3), 1.0)
-    kept = np.where(known[..., None], kept, carried)
-    own = light - (1 - alpha[..., None]) * unshadowed * kept
-    return np.where(alpha[..., None] > 0, np.maximum(own, 0), 0).astype(np.float32), kept
+    kept = np.where(is_disc[..., None], kept, carried)
+    objects = light - (1 - alpha[..., None]) * unshadowed * kept
+    return np.where(alpha[..., None] > 0, np.maximum(objects, 0), 0).astype(np.float32), kept
 
 
 def shadowed(picture: Picture, kept: Colours) -> Picture:
-    """Return a picture of which shares of the light are left."""
+    """Multiply a picture's linear light by the remaining shares."""
     steps = np.minimum(SRGB_TO_LINEAR[picture] * kept * CODE_STEPS + 0.5, CODE_STEPS)
     changed = (LINEAR_TO_SRGB[steps.astype(np.int32)] + 0.5).astype(np.uint8)
     return np.where(kept == 1.0, picture, changed)
 
 
 def denoise(colour: Colours, albedo: Colours, normal: Colours) -> Colours:
-    """Return a picture in linear light without its noise.
+    """Denoise a picture in linear light.
 
     Args:
         colour: The picture, float32 like the guides.
@@ -319,7 +318,7 @@ def denoise(colour: Colours, albedo: Colours, normal: Colours) -> Colours:
 
 @cache
 def _device() -> tuple[Any, Any]:
-    """Return pyoidn's C interface and a device, made once a process."""
+    """Return pyoidn's C interface and a device, created once per process."""
     origin = getattr(find_spec("pyoidn"), "origin", "")
     interface = SimpleNamespace(**run_path(str(Path(origin).with_name("capi.py"))))
     library = interface.oidn_Capi

@@ -1,13 +1,12 @@
-"""The shadows that objects cast on the picture of a supporting plane.
+"""Shadows of objects on the picture of a supporting plane.
 
-The background shows the plane in full light. Where objects keep light from it, the background is
-multiplied by the share of light that is left, of the sky and of every lamp. A plane's points map
-to a shadow map, and to the grid of its sky, by homographies; so both are warped into the image.
+The background shows the plane in full light and is multiplied by the share of light (sky and lamps)
+that objects leave. Homographies map the plane to each shadow map and to the grid of its sky, so
+both are warped into the image.
 
-For the sky, points spread over the objects stand for them: in each of 32 directions, spread with
-the cosine, every point hides the sky from one spot of the plane. One bit per direction and cell
-says so; the share of bits is the share of the sky. That is the soft darkening around an object that
-touches a table.
+For the sky, points on the objects' surfaces hide it in 32 cosine-distributed directions: each point
+sets one bit per direction in a cell of the plane, and the share of bits is the hidden share of the
+sky. This gives the soft contact shadow of an object.
 """
 
 from __future__ import annotations
@@ -63,12 +62,8 @@ class _LitPlane(NamedTuple):
 def darken_plane(
     scene: Scene, plane: Plane, lights: Sequence[ShadowMap], samples: Samples, image: Array
 ) -> None:
-    """Darken the plane's picture where objects keep light from it.
-
-    ``samples`` are what the pixels with objects see, those full of objects left out; ``image`` is
-    the uint8 background, updated in place.
-    """
-    # To (x, y) on the plane and the height above it, metres.
+    """Darken the plane's picture in place, except for pixels that objects fill."""
+    # Camera frame to (x, y) on the plane and the height above it, metres.
     rotation = rotation_to_z(np.array(plane.normal, np.float64))
     frame = np.column_stack([rotation, [0.0, 0.0, -plane.offset]])
     sky = hidden_sky(frame, scene.objects)
@@ -102,10 +97,7 @@ def darken_plane(
 
 
 def _cast(plane: Plane, shadow: ShadowMap) -> tuple[Float32[np.ndarray, "rows columns"], int]:
-    """Return the share of every texel that hides the plane from the light, penumbra included.
-
-    The map has a margin around it for the penumbra, whose width, texels, comes second.
-    """
+    """Return the shadow of every texel with its penumbra, and the margin added for it, texels."""
     P = shadow.P.astype(np.float64)
     # In the map, too, the plane's 1/depth is linear: n · x = offset with x = M⁻¹ (depth (u, v, 1)
     # − p), P = [M | p].
@@ -134,7 +126,7 @@ def _cast(plane: Plane, shadow: ShadowMap) -> tuple[Float32[np.ndarray, "rows co
 
 
 def _warp(source: Array, to_source: Array, box: Box, out: Array) -> None:
-    """Write, at the pixels of a box, what a homography finds in an image; 0 beside it."""
+    """Warp an image by a homography into the pixels of a box; 0 beside the image."""
     shift = np.array([[1.0, 0.0, box[0]], [0.0, 1.0, box[1]], [0.0, 0.0, 1.0]])
     size = (box[2] - box[0], box[3] - box[1])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -148,7 +140,7 @@ def _shadowed_box(
     cells: tuple[int, ...],
     lights: Sequence[ShadowMap],
 ) -> Box | None:
-    """Bound the pixels of the plane that may be darker; None if there are none."""
+    """Return the box of the plane's pixels that may be darker, or None."""
     size = scene.size
     right, bottom = grid[0] + cells[1] * grid[2], grid[1] + cells[0] * grid[2]
     corners = np.array([(x, y, 0.0) for x in (grid[0], right) for y in (grid[1], bottom)])
@@ -179,10 +171,14 @@ def _shadowed_box(
 def hidden_sky(
     frame: Float[np.ndarray, "3 4"], objects: Sequence[SceneObject]
 ) -> tuple[Vector, Float[np.ndarray, "rows columns"]] | None:
-    """Return the share of a plane's sky that objects hide; None if they are all below it.
+    """Return the share of a plane's sky that objects hide; None if all are below the plane.
 
-    ``frame`` maps camera-frame points to (x, y) on the plane and the height above it, metres. First
-    come (x, y) of the grid's first cell and a cell's side, metres.
+    Args:
+        frame: Map from the camera frame to (x, y) on the plane and the height above it, metres.
+        objects: Objects that hide the sky.
+
+    Returns:
+        Position (x, y) of the grid's first cell and a cell's side, metres; hidden share per cell.
     """
     heights = []
     for item in objects:
@@ -191,7 +187,7 @@ def hidden_sky(
     everything = np.concatenate(heights) if heights else np.zeros((0, 3))
     if len(everything) == 0:
         return None
-    # Farther away than twice the objects' height, little sky is hidden.
+    # Beyond twice the objects' height, little sky is hidden.
     margin = 2 * float(everything[:, 2].max())
     low, high = everything[:, :2].min(axis=0) - margin, everything[:, :2].max(axis=0) + margin
     cell = float((high - low).max()) / 80
@@ -205,17 +201,17 @@ def hidden_sky(
     slopes = slopes / np.sqrt(1 - radius**2)[:, None]
     for item, points in zip(objects, heights, strict=True):
         splats[:] = 0
-        # Half a spot's side, so wide that spots leave no gaps.
+        # Half the side of a splat, so wide that splats leave no gaps.
         reach = max(0.8 * item.surface.spacing / cell, 0.5)
         _splat(points, reach, slopes, grid, splats)
-        # Taken from every direction's spot is what its splats stick out.
+        # Erode by the splats' overhang.
         cells = round(reach - 0.5)
         padded = np.pad(splats, cells, constant_values=np.iinfo(np.uint32).max)
         windows = sliding_window_view(padded, (2 * cells + 1, 2 * cells + 1))
         bits |= np.bitwise_and.reduce(windows, axis=(2, 3))
     counts = np.unpackbits(bits.view(np.uint8), axis=1).reshape(rows, columns, -1).sum(axis=-1)
     hidden = cv2.blur(counts.astype(np.float32) / _SKY_DIRECTIONS, (3, 3))
-    # A little is left at the grid's border; it is faded out over half of the margin.
+    # Fade out over half of the margin, so that the grid's border does not show.
     edges = (
         np.minimum(np.arange(side), np.arange(side)[::-1]) / (0.5 * margin / cell)
         for side in (rows, columns)
@@ -226,7 +222,7 @@ def hidden_sky(
 
 @compiled()
 def _splat(points: Array, reach: float, slopes: Array, grid: Array, bits: Array) -> None:
-    """Set a direction's bit in the cells, up to a reach, from which a point hides it."""
+    """Set the direction's bit in all cells within ``reach`` from which a point hides it."""
     rows, columns = bits.shape
     for p in range(points.shape[0]):
         for k in range(slopes.shape[0]):
@@ -278,7 +274,7 @@ def _darken(
 
 @compiled()
 def _is_full(ids: Array, j: int, i: int) -> bool:
-    """Tell whether objects cover all samples of a pixel."""
+    """Return whether objects cover all samples of a pixel."""
     if not (0 <= j < ids.shape[0] and 0 <= i < ids.shape[1]):
         return False
     full = True
@@ -314,7 +310,7 @@ def _light_row(
             facing = max(nx * lx + ny * ly + nz * lz, _ZERO)
             square = lx * lx + ly * ly + lz * lz
             strength = facing / (square * math.sqrt(square))
-            # A homography also maps what lies behind the light into its map.
+            # The homography also maps points behind the light into its map.
             shade = strength * shades[1 + k, j, i] if a * x + b * y + c * z + d > _ZERO else _ZERO
             total[0, i] += strength * red
             total[1, i] += strength * green

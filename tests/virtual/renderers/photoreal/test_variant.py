@@ -103,7 +103,7 @@ def test_a_wrong_number_of_threads(monkeypatch, number):
 def test_the_newest_library_comes_first(library, monkeypatch, tmp_path):
     assert variant.candidates() == [library]
     monkeypatch.delenv(variant.LIBRARY_SETTING)
-    monkeypatch.setattr(variant, "PLACES", (f"{tmp_path}/libLLVM*.so.*",))
+    monkeypatch.setattr(variant, "LIBRARY_PATTERNS", (f"{tmp_path}/libLLVM*.so.*",))
     (tmp_path / "libLLVM.so.19.1").touch()
     (tmp_path / "libLLVM-9.so.1").touch()
     (tmp_path / "libLLVM-15.0.7.so.1").symlink_to(library)

@@ -1,11 +1,8 @@
-"""A scene as Mitsuba takes it: meshes, reflectance, lamps and the sky, and the film that sees them.
+"""Conversion of a scene for Mitsuba: meshes, reflectance, lamps, sky and film, in the camera frame.
 
-Everything stands in the camera frame. Light is matched to ``raster.shading``: a lamp is a sphere
-that gives a surface what the point light gives it, and the sky is two hemispheres. Path tracing
-adds soft shadows, light from object to object, and reflections of lamps and surroundings.
-
-Grooves finer than a pixel only widen the highlight, and that is how all of them are drawn here: by
-roughness. The albedo's variation is drawn on untextured surfaces.
+Light matches ``raster.shading``: a lamp is a sphere with the illuminance of the point light, and
+the sky is two hemispheres. All grooves are rendered as roughness, as if finer than a pixel. Noise
+on the albedo is rendered on untextured surfaces only.
 """
 
 from __future__ import annotations
@@ -29,8 +26,8 @@ from dopepp.virtual.surface import Surface
 
 Sphere = tuple[Vector, float]  # centre and radius, camera frame, metres
 
-LAMP_SHARE: Final = 0.06  # a lamp's radius over its distance: a bulb 6 cm across at half a metre
-_MAX_ALBEDO: Final = 0.95  # nothing reflects all light; more would keep paths alive without end
+LAMP_SHARE: Final = 0.06  # a lamp's radius over its distance: a bulb of 6 cm at half a metre
+_MAX_ALBEDO: Final = 0.95  # a higher albedo would be unphysical and prolong paths
 _VERTEX_COLOUR: Final = "vertex_colour"
 _SKY_ROWS: Final = 64
 _NOISE_CELLS: Final = 64  # side of the repeating lattice of random albedos
@@ -69,7 +66,7 @@ def bounding_sphere(scene: Scene) -> Sphere:
 
 
 def lamp_radius(light: Light, scene: Scene, bounds: Sphere) -> float:
-    """Return the radius of the sphere that stands for a point light, metres."""
+    """Return the radius of the sphere that represents a point light, metres."""
     position = np.array(light.position)
     distance = float(np.linalg.norm(position - bounds[0]))
     room = [float(np.linalg.norm(position))]
@@ -78,12 +75,12 @@ def lamp_radius(light: Light, scene: Scene, bounds: Sphere) -> float:
         room.append(float(np.linalg.norm(away, axis=1).min()))
     if scene.plane is not None:
         room.append(float(np.array(scene.plane.normal) @ position) - scene.plane.offset)
-    # It reaches at most half of the way to an object, the camera or the table.
+    # The sphere extends at most half of the way to an object, the camera or the table.
     return max(min(LAMP_SHARE * distance, 0.5 * min(room)), 1e-3)
 
 
 def rgb(values: Vector) -> dict[str, Any]:
-    """Return a colour as Mitsuba takes it."""
+    """Return a colour for Mitsuba."""
     return {"type": "rgb", "value": [float(value) for value in values]}
 
 
@@ -93,10 +90,9 @@ def _mesh(mi: Any, item: SceneObject, reflectance: Any) -> Any:
     corners = transform(item.T_cam_obj, surface.vertices)[surface.faces].reshape(-1, 3)
     properties = mi.Properties()
     properties["bsdf"] = reflectance
-    mesh = mi.Mesh(
-        item.label, len(corners), len(surface.faces), props=properties,
-        has_vertex_normals=True, has_vertex_texcoords=True,
-    )  # fmt: skip
+    counts = (len(corners), len(surface.faces))
+    channels = {"has_vertex_normals": True, "has_vertex_texcoords": True}
+    mesh = mi.Mesh(item.label, *counts, props=properties, **channels)
     parameters = mi.traverse(mesh)
     normals = surface.normals.reshape(-1, 3) @ rotation.T
     parameters["vertex_positions"] = np.ravel(corners).astype(np.float32)
@@ -125,9 +121,8 @@ def _corner_uv(surface: Surface) -> Float[np.ndarray, "corners 2"]:
 def _reflectance(mi: Any, item: SceneObject, K: CameraMatrix) -> dict[str, Any]:
     """Return the material: Lambert and GGX with a metallic workflow, on both sides."""
     material = item.material
-    # GGX roughness, whose square is α, widened by the grooves. A sine of largest slope s has the
-    # slope variance s²/2 across the grooves and none along them: s²/4 on average. GGX's α² stands
-    # for twice the variance.
+    # Grooves widen the GGX roughness, whose square is α. A sine of largest slope s has the slope
+    # variance s²/2 across the grooves, so s²/4 on average; α² is twice the variance.
     variance = material.roughness**4
     if material.grooves is not None:
         variance += material.grooves.slope**2 / 2
@@ -154,7 +149,7 @@ def _colour(mi: Any, item: SceneObject, K: CameraMatrix) -> dict[str, Any]:
         return {"type": "mesh_attribute", "name": _VERTEX_COLOUR}
     if material.noise == 0.0:
         return rgb(np.clip(colour, 0.0, _MAX_ALBEDO))
-    # Random from cell to cell, always the same: only the look of a rough surface.
+    # The same random lattice for every object.
     cells = np.random.default_rng(0).uniform(-1, 1, (_NOISE_CELLS, _NOISE_CELLS, 1))
     scale = 1.0 / (_NOISE_CELLS * material.noise_pitch)
     tint = np.clip(1 + material.noise * cells, *NOISE_LIMITS)
@@ -170,7 +165,7 @@ def _bitmap(
 
 
 def _texture_level(item: SceneObject, K: CameraMatrix) -> int:
-    """Return the texture level whose texels are about half as large as the object's pixels."""
+    """Return the texture level with texels about half as large as the object's pixels."""
     surface, depth = item.surface, float(item.T_cam_obj[2, 3])
     assert surface.texture is not None
     levels = surface.texture.levels
@@ -191,17 +186,17 @@ def _sky(mi: Any, ambient: Ambient) -> dict[str, Any]:
     pixels[: _SKY_ROWS // 2], pixels[_SKY_ROWS // 2 :] = ambient.above, ambient.below
     up = np.array(ambient.up) / np.linalg.norm(ambient.up)
     right, across, up = rotation_to_z(up)
-    place = np.eye(4)
-    place[:3, :3] = np.stack([right, up, -across], axis=1)  # Mitsuba's zenith is +y
-    return {"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": mi.ScalarTransform4f(place)}
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, up, -across], axis=1)  # Mitsuba's zenith is +y
+    return {"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": mi.ScalarTransform4f(pose)}
 
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """A film with square pixels, which Mitsuba demands, over a window of the image.
+    """A film with square pixels, as Mitsuba requires, over a window of the image.
 
-    Its pixels are at least as fine as the image's. Where the camera's pixels are not square, the
-    picture is resampled.
+    Its pixels are at least as fine as the image's. The picture of a camera with other pixels is
+    resampled.
 
     Attributes:
         size: (width, height) of the film, pixels.
@@ -236,7 +231,7 @@ class Film:
                 "height": height,
                 "pixel_format": "rgba",
                 "component_format": "float32",
-                # Pixels that share no samples, so that the denoiser sees independent noise.
+                # Pixels share no samples, so the denoiser gets independent noise.
                 "rfilter": {"type": "box"},
             },
         }
@@ -248,10 +243,9 @@ class Film:
         left, top, right, bottom = self.window
         if np.array_equal(self.film_from_window, np.eye(2, 3)):
             return picture
-        resampled = cv2.warpAffine(
-            picture, self.film_from_window, (right - left, bottom - top),
-            flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
-        )  # fmt: skip
+        size, flags = (right - left, bottom - top), cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+        options = {"flags": flags, "borderMode": cv2.BORDER_REPLICATE}
+        resampled = cv2.warpAffine(picture, self.film_from_window, size, **options)
         return np.asarray(np.maximum(resampled, np.float32(0)))
 
 
@@ -274,7 +268,7 @@ def make_film(K: CameraMatrix, window: Box) -> Film:
 
 
 def pixel_rays(K: CameraMatrix, window: Box) -> Float[np.ndarray, "height width 3"]:
-    """Return the points at depth 1 m that the window's pixel centres see."""
+    """Return the points at depth 1 m on the rays of the window's pixel centres."""
     left, top, right, bottom = window
     y, x = np.mgrid[top:bottom, left:right]
     return np.asarray(np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(K).T)
@@ -283,10 +277,10 @@ def pixel_rays(K: CameraMatrix, window: Box) -> Float[np.ndarray, "height width 
 def cast(
     mi: Any, world: Any, shapes: list[Any], rays: Float[np.ndarray, "height width 3"]
 ) -> tuple[Float32[np.ndarray, "height width"], Int16[np.ndarray, "height width"]]:
-    """Return depth (0 where nothing is hit) and the number of the shape that each ray hits.
+    """Return depth (0 without a hit) and the index of the shape that each ray hits (−1 without).
 
-    ``rays`` are points at depth 1 m; shapes nearer than :data:`~dopepp.virtual.scene.NEAR` are
-    transparent.
+    ``rays`` are points at depth 1 m; points nearer than :data:`~dopepp.virtual.scene.NEAR` are
+    ignored.
     """
     flat = rays.reshape(-1, 3).astype(np.float32)
     if mi.variant().startswith("scalar"):
