@@ -13,12 +13,7 @@ from dopepp.virtual.presets.placement import (
     OffsetPlacement,
 )
 from dopepp.virtual.presets.table import Table
-from dopepp.virtual.renderers.raster import (
-    Silhouette,
-    render,
-    silhouette,
-    visible_fractions,
-)
+from dopepp.virtual.renderers.raster import Silhouette, render, silhouette, visible_fractions
 from dopepp.virtual.scene import (
     Ambient,
     Grooves,

@@ -27,11 +27,7 @@ from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import random_rotation
 from dopepp.virtual.body import Body
 from dopepp.virtual.presets import Preset
-from dopepp.virtual.renderers.raster.visibility import (
-    centres_within,
-    draw_alone,
-    project_object,
-)
+from dopepp.virtual.renderers.raster.visibility import centres_within, draw_alone, project_object
 from dopepp.virtual.scene import NEAR, Material, SceneObject
 
 _REDRAWS: Final = 25

@@ -94,12 +94,8 @@ class Materials(Checked):
         colour = _grey(rng, rng.uniform(*self.metal_albedo))
         grooves = None
         if rng.random() < self.brushed_share:
-            grooves = Grooves(
-                axis=_unit_axis(int(rng.integers(3))),
-                pitch=rng.uniform(*self.brush_pitch),
-                slope=rng.uniform(*self.brush_slope),
-                irregularity=1.0,
-            )
+            axis = int(rng.integers(3))
+            grooves = _grooves(rng, axis, self.brush_pitch, self.brush_slope, irregularity=1.0)
         roughness = rng.uniform(*self.metal_roughness)
         return Material(
             colour, roughness, metallic=1.0, noise=noise, noise_pitch=pitch, grooves=grooves
@@ -119,12 +115,8 @@ class Materials(Checked):
             # Slicers lay parts flat: in two of three cases the thinnest axis is the build axis.
             thinnest = rng.random() < 2 / 3
             extents: Vector = np.ptp(surface.hull, axis=0)
-            number = int(extents.argmin()) if thinnest else int(rng.integers(3))
-            grooves = Grooves(
-                axis=_unit_axis(number),
-                pitch=rng.uniform(*self.layer_pitch),
-                slope=rng.uniform(*self.layer_slope),
-            )
+            axis = int(extents.argmin()) if thinnest else int(rng.integers(3))
+            grooves = _grooves(rng, axis, self.layer_pitch, self.layer_slope)
         roughness, specular = rng.uniform(*self.roughness), rng.uniform(*self.specular)
         return Material(
             colour, roughness, specular, noise=noise, noise_pitch=pitch, grooves=grooves
@@ -135,8 +127,11 @@ def _grey(rng: Generator, brightness: float) -> Triple:
     return triple(np.clip(brightness * (1 + rng.uniform(-_GREY_CAST, _GREY_CAST, 3)), 0.0, 1.0))
 
 
-def _unit_axis(number: int) -> Triple:
-    return triple(number == axis for axis in range(3))
+def _grooves(
+    rng: Generator, axis: int, pitch: Pair, slope: Pair, irregularity: float = 0.0
+) -> Grooves:
+    direction = triple(np.eye(3)[axis])
+    return Grooves(direction, rng.uniform(*pitch), rng.uniform(*slope), irregularity)
 
 
 _LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB (BT.709)

@@ -85,9 +85,7 @@ def _bake_mesh(vertices: Array, faces: Array, normals: Array, closed: bool) -> O
     centre = (used.min(axis=0) + used.max(axis=0)) / 2
     radius = math.sqrt(float(((used - centre) ** 2).sum(axis=1).max()))
     steps, firsts, count = _grids(corners, 2 * radius)
-    points, upright = np.empty((2, count, 3), np.float32)
-    grid = _Points(points, upright, np.empty(count, np.int32), flat)
-    _spread(corners, normals, steps, firsts, grid)
+    grid = _Points(*_spread(corners, normals, steps, firsts, count), flat)
     sums = np.zeros((4, count), np.float32)
     # A huge mesh is drawn from fewer directions.
     directions = spread_directions(int(np.clip(6_000_000 // len(faces), 24, 256)))
@@ -127,29 +125,25 @@ def spread_directions(count: int) -> Float[np.ndarray, "directions 3"]:
     return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
 
 
-@compiled()
-def _spread(corners: Array, normals: Array, steps: Array, firsts: Array, grid: _Points) -> None:
-    """Write every triangle's grid of points, their normals and their triangle."""
-    points, upright = grid.points, grid.upright
-    for f in range(corners.shape[0]):
-        n = steps[f]
-        # A little inside the triangle, or a point in a corner of the mesh would lie on both walls.
+def _spread(
+    corners: Array, normals: Array, steps: Array, firsts: Array, count: int
+) -> tuple[Array, Array, Array]:
+    """Return the points of every triangle's grid, their normals and their triangle."""
+    points, upright = np.empty((2, count, 3), np.float32)
+    ground = np.empty(count, np.int32)
+    for n in np.unique(steps).tolist():
+        j, i = np.nonzero(np.add.outer(np.arange(n + 1), np.arange(n + 1)) <= n)
+        # A little inside the triangle: a point in a corner of the mesh would lie on both walls.
         inset = 0.1 / n
-        p = firsts[f]
-        for j in range(n + 1):
-            for i in range(n + 1 - j):
-                k1 = inset / 3 + (1 - inset) * i / n
-                k2 = inset / 3 + (1 - inset) * j / n
-                k0 = 1.0 - k1 - k2
-                for r in range(3):
-                    points[p, r] = (
-                        k0 * corners[f, 0, r] + k1 * corners[f, 1, r] + k2 * corners[f, 2, r]
-                    )
-                    upright[p, r] = (
-                        k0 * normals[f, 0, r] + k1 * normals[f, 1, r] + k2 * normals[f, 2, r]
-                    )
-                grid.ground[p] = f
-                p += 1
+        k1, k2 = (inset / 3 + (1 - inset) * step[:, None] / n for step in (i, j))
+        k0 = 1.0 - k1 - k2
+        faces = np.flatnonzero(steps == n)
+        index = firsts[faces, None] + np.arange(len(i))
+        ground[index] = faces[:, None]
+        for source, out in ((corners, points), (normals, upright)):
+            a, b, c = source[faces].transpose(1, 0, 2)[:, :, None]
+            out[index] = k0 * a + k1 * b + k2 * c
+    return points, upright, ground
 
 
 @compiled()

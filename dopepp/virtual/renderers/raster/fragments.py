@@ -7,7 +7,6 @@ therefore follows the number of pixels, not of samples or triangles.
 from __future__ import annotations
 
 import math
-from itertools import repeat
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -55,15 +54,15 @@ class Fragments(NamedTuple):
     alpha: Array
 
 
-class _Groups(NamedTuple):
-    """Samples grouped by pixel and patch: the first fields of :class:`Fragments`."""
-
-    pixel: Array
-    weight: Array
-    face: Array
-    x: Array
-    y: Array
-    inverse: Array
+_GROUP_TYPES: Final = {
+    "pixel": np.int32,
+    "weight": np.float32,
+    "face": np.int32,
+    "x": np.float32,
+    "y": np.float32,
+    "inverse": np.float32,
+}
+"""The first fields of :class:`Fragments`, which grouping writes."""
 
 
 def gather_fragments(
@@ -80,9 +79,7 @@ def gather_fragments(
     window = (box[0] - x, box[1] - y, box[2] - x, box[3] - y)
     # An upper bound; memory that is never touched costs nothing.
     bound = NUM_COLOUR_SAMPLES * (box[2] - box[0]) * (box[3] - box[1])
-    types = (np.int32, np.float32, np.int32, np.float32, np.float32, np.float32)
-    arrays = (scratch(*field) for field in zip(_Groups._fields, repeat((bound,)), types))
-    groups = _Groups(*arrays)
+    groups = tuple(scratch(name, (bound,), dtype) for name, dtype in _GROUP_TYPES.items())
     count = _group(window, samples, first_id, surface.patches, PIXEL_SAMPLES, groups)
     if count == 0:
         return None
@@ -99,10 +96,16 @@ def gather_fragments(
 
 @compiled()
 def _group(
-    window: Box, samples: Samples, first_id: int, patches: Array, offsets: Array, groups: _Groups
+    window: Box,
+    samples: Samples,
+    first_id: int,
+    patches: Array,
+    offsets: Array,
+    groups: tuple[Array, ...],
 ) -> int:
     """Group the samples of every pixel by patch and return the number of groups."""
-    ids, inverse_depth, origin = samples.ids, samples.inverse_depth, samples.origin
+    origin, inverse_depth, ids = samples
+    pixel, weight, triangle, x, y, depth = groups
     num_faces = patches.shape[0]
     centre = offsets.shape[0] - 1
     number = 0
@@ -139,12 +142,12 @@ def _group(
                     other = ids[j, i, centre] - first_id
                     if 0 <= other < num_faces and patches[other] == patches[face]:
                         face, inverse = other, inverse_depth[j, i, centre]
-                groups.x[number] = origin[0] + i + dx / count
-                groups.y[number] = origin[1] + j + dy / count
-                groups.pixel[number] = j * ids.shape[1] + i
-                groups.weight[number] = count
-                groups.face[number] = face
-                groups.inverse[number] = inverse
+                x[number] = origin[0] + i + dx / count
+                y[number] = origin[1] + j + dy / count
+                pixel[number] = j * ids.shape[1] + i
+                weight[number] = count
+                triangle[number] = face
+                depth[number] = inverse
                 number += 1
     return number
 

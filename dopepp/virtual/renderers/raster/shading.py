@@ -22,12 +22,7 @@ import numpy as np
 
 from dopepp.core.compiled import Array, Scalar, compiled
 from dopepp.virtual.renderers.raster.fragments import Fragments, gather_fragments
-from dopepp.virtual.renderers.raster.visibility import (
-    Projected,
-    Samples,
-    ShadowMap,
-    ambient_row,
-)
+from dopepp.virtual.renderers.raster.visibility import Projected, Samples, ShadowMap, ambient_row
 from dopepp.virtual.scene import NOISE_LIMITS, Scene, SceneObject
 from dopepp.virtual.sensor import CODE_STEPS, SRGB_TO_LINEAR, TONE_CURVE, TONE_LIMIT
 from dopepp.virtual.surface.occlusion import look_up_sky
