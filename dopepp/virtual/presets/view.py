@@ -187,7 +187,7 @@ def read_lens(path: str | Path) -> tuple[Size, CameraMatrix]:
             "add them, e.g. image_width and image_height as ROS writes them",
         )
     if camera.distortion:
-        _log.info("%s: distortion is not rendered; undistort for prediction", camera.source)
+        _log.info("%s: its distortion is not rendered; undistort for prediction", camera.source)
     return camera.size, camera.K
 
 
