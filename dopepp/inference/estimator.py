@@ -186,8 +186,7 @@ class PoseEstimator:
         """
         image, K, depth = prepare_image(image, K, distortion, depth, cropped)
         with self._timed("pre"):
-            multiple = self.network.size_multiple
-            views = network_views(self.checkpoint, multiple, image, K, distances, roi)
+            views = self.views(image, K, distances, roi)
         scales: list[list[Detection]] = []
         for view in views:
             with self._timed("network"):
