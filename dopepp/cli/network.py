@@ -135,7 +135,7 @@ def doctor(
         K = None if intrinsics is None else camera_matrix(*intrinsics)
         lens = Lens(choose_camera(K, camera, Images([image])), K_size, crop)
         picture = read_photo(image)
-        from dopepp.inference.diagnosis import Case, Finding, diagnose
+        from dopepp.inference.diagnosis import Case, Diagnosis, diagnose
         from dopepp.inference.estimator import PoseEstimator
         from dopepp.parts.catalogue import with_meshes
 
@@ -146,7 +146,7 @@ def doctor(
             case = Case(estimator, *lens.undistort(picture), known, distance, crop is not None)
         except UserError as error:
             got = f"{error.got}; allowed: {error.allowed}"
-            findings = [Finding("camera", got, error.fix)]
+            findings = [Diagnosis("camera", got, error.fix)]
         else:
             findings = diagnose(case)
     wrong = [one for one in findings if one.fix]

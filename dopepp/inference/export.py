@@ -1,7 +1,7 @@
-"""Exporting a network: normalisation, network and activation as one graph in a file.
+"""Export of a network: normalisation, network and activation as one graph in a file.
 
-Pixels (batch, 3, height, width), uint8 RGB, go in; belief maps and the vector field come out.
-Batch, height and width are free, the sides multiples of the network's. To add a format, write an
+The graph maps pixels (batch, 3, height, width), uint8 RGB, to belief maps and vector field. Batch,
+height and width are free; the network's size multiple divides the sides. To add a format, write an
 :data:`Exporter` and a line in :data:`EXPORTERS`.
 """
 
@@ -31,13 +31,13 @@ from dopepp.models.network import PoseNetwork
 PRECISIONS: Final = ("fp32", "fp16", "int8")
 
 Save = Callable[[Path, Checkpoint, Export], None]
-"""Writes a graph with its description into a file, or a folder, that is not there yet."""
+"""Writes a graph with its description to a new file or folder."""
 
 Exporter = Callable[[PoseNetwork, str, Sequence[Pixels]], Save]
-"""Makes a graph of a network in a precision; int8 is measured on images of the network's input.
+"""Converts a network to a graph of a precision; int8 is calibrated on inputs of the network.
 
-A UserError: the network has what the format or the precision has not. What is missing here,
-:func:`check_possible` tells before."""
+Raises a UserError if the format or precision does not support the network. :func:`check_possible`
+detects missing packages beforehand."""
 
 _PACKAGES: Final = {
     "onnx": ("onnx", "onnxscript", "onnxruntime"),
@@ -46,16 +46,16 @@ _PACKAGES: Final = {
 }
 
 _CHATTY: Final = ("torch.onnx", "onnxscript", "onnx_ir")
-"""Loggers that tell every step of a translation."""
+"""Loggers of every step of a conversion."""
 
 _SMALL: Final = 1024
-"""Numbers of a constant that half precision does not make worthwhile; shapes have fewer."""
+"""Elements up to which a constant stays in full precision; shapes have fewer."""
 
 _FLOAT16_MAX: Final = 65504.0
 
 
 class _Maps(nn.Module):
-    """What is exported of a network: from pixels to maps in float32."""
+    """The exported part of a network: from pixels to maps in float32."""
 
     def __init__(self, network: PoseNetwork) -> None:
         super().__init__()
@@ -67,7 +67,11 @@ class _Maps(nn.Module):
 
 
 def check_possible(layout: str, precision: str) -> None:
-    """Check that a format has a precision and that their extras are there; a UserError if not."""
+    """Check that a format supports a precision and that the required extras are installed.
+
+    Raises:
+        UserError: It does not, or an extra is missing.
+    """
     if layout == "safetensors" and precision == "int8":
         allowed, fix = "fp32 or fp16", "choose --format onnx or openvino for int8"
         raise UserError("--format safetensors --precision int8", allowed, fix)
@@ -78,19 +82,19 @@ def check_possible(layout: str, precision: str) -> None:
 
 
 def to_onnx(network: PoseNetwork, precision: str, images: Sequence[Pixels]) -> Save:
-    """Make an ONNX model; see :data:`Exporter`."""
+    """Convert to an ONNX model; see :data:`Exporter`."""
     program = _traced(network)
     with _translating(network, "ONNX"):
-        made: Any = torch.onnx.export(
-            program, input_names=[INPUT], output_names=list(OUTPUTS), dynamo=True,
-            external_data=False, verbose=False,
-        )  # fmt: skip
-        model = made.model_proto
+        names: dict[str, Any] = {"input_names": [INPUT], "output_names": list(OUTPUTS)}
+        exported: Any = torch.onnx.export(
+            program, **names, dynamo=True, external_data=False, verbose=False
+        )
+        model = exported.model_proto
     _strip(model.graph)
     if precision == "fp16":
         _halve(model.graph)
     if precision == "int8":
-        batches = [{INPUT: one} for one in images]
+        batches = [{INPUT: image} for image in images]
         model = _quantised(model, batches, _last_convolutions(model.graph))
 
     def save(path: Path, checkpoint: Checkpoint, export: Export) -> None:
@@ -102,7 +106,7 @@ def to_onnx(network: PoseNetwork, precision: str, images: Sequence[Pixels]) -> S
 
 
 def to_openvino(network: PoseNetwork, precision: str, images: Sequence[Pixels]) -> Save:
-    """Make an OpenVINO model; see :data:`Exporter`."""
+    """Convert to an OpenVINO model; see :data:`Exporter`."""
     openvino = load_openvino("--format openvino")
     program = _traced(network)
     with _translating(network, "OpenVINO"):
@@ -119,14 +123,14 @@ def to_openvino(network: PoseNetwork, precision: str, images: Sequence[Pixels]) 
         folder.mkdir(exist_ok=True)
         try:
             openvino.save_model(model, folder / NAME, compress_to_fp16=precision == "fp16")
-        except RuntimeError as error:  # does not say what the system has refused
+        except RuntimeError as error:  # without the operating system's reason
             raise OSError(errno.EIO, "OpenVINO could not write it, is the disk full?") from error
 
     return save
 
 
 def to_safetensors(network: PoseNetwork, precision: str, images: Sequence[Pixels]) -> Save:
-    """Keep the weights as they are, or in half precision, for PyTorch; see :data:`Exporter`."""
+    """Keep the weights, in full or half precision, for PyTorch; see :data:`Exporter`."""
     weights = network.state_dict()
 
     def save(path: Path, checkpoint: Checkpoint, export: Export) -> None:
@@ -141,11 +145,11 @@ EXPORTERS: Final[dict[str, tuple[Exporter, str]]] = {
     "openvino": (to_openvino, "_openvino"),
     "safetensors": (to_safetensors, SUFFIX),
 }
-"""Of every format what makes it, and how a file's or folder's name ends."""
+"""Exporter of each format, and suffix of its file or folder."""
 
 
 def _traced(network: PoseNetwork) -> ExportedProgram:
-    """Return the operations of a network for any batch, height and width."""
+    """Trace a network for any batch, height and width."""
     multiple = network.size_multiple
     example = torch.zeros(2, 3, 3 * multiple, 4 * multiple, dtype=torch.uint8)
     free = {0: Dim("batch"), 2: multiple * Dim("rows"), 3: multiple * Dim("columns")}
@@ -156,57 +160,57 @@ def _traced(network: PoseNetwork) -> ExportedProgram:
 
 @contextmanager
 def _translating(network: PoseNetwork, language: str) -> Iterator[None]:
-    """Tell an operator that a language does not have in one line, and nothing else."""
-    loggers = {one: one.level for one in map(logging.getLogger, _CHATTY)}
-    for one in loggers:
-        one.setLevel(logging.ERROR)
+    """Silence a conversion, and report an unsupported operator in one line."""
+    levels = {logger: logger.level for logger in map(logging.getLogger, _CHATTY)}
+    for logger in levels:
+        logger.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
     except UserError:
         raise
-    except Exception as error:  # each library's own, whatever the network leads to
+    except Exception as error:  # the libraries' own
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-        parts = ", ".join(type(one).__name__ for one in network.children())
+        parts = ", ".join(type(child).__name__ for child in network.children())
         raise UserError(
             f"a network of {parts}, which {language} has no words for "
             f"({lines[0] if lines else type(error).__name__:.300})",
-            f"operators that {language} knows, for images of any size",
+            f"operators that {language} supports, for images of any size",
             "use another operator in your module, or export it as safetensors",
         ) from error
     finally:
-        for one, level in loggers.items():
-            one.setLevel(level)
+        for logger, level in levels.items():
+            logger.setLevel(level)
 
 
 def _strip(graph: Any) -> None:
-    """Leave out where in our sources a node comes from, and give the free sides names."""
-    for one in (*graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
-        del one.metadata_props[:]
-        one.doc_string = ""
+    """Remove references to source code, and name the free dimensions."""
+    for item in (*graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
+        del item.metadata_props[:]
+        item.doc_string = ""
     del graph.value_info[:]
     names = ("batch", None, "height", "width"), *2 * (("batch", None, "rows", "columns"),)
-    for one, sides in zip((*graph.input, *graph.output), names, strict=True):
-        for side, name in zip(one.type.tensor_type.shape.dim, sides, strict=True):
+    for value, sides in zip((*graph.input, *graph.output), names, strict=True):
+        for side, name in zip(value.type.tensor_type.shape.dim, sides, strict=True):
             if name is not None:
                 side.dim_param = name
 
 
 def _halve(graph: Any) -> None:
-    """Keep weights in half precision, each behind a conversion that a runtime does once."""
+    """Store weights in half precision, followed by a cast that a runtime evaluates once."""
     from onnx import TensorProto, helper, numpy_helper
 
     conversions = []
-    for one in graph.initializer:
-        values = numpy_helper.to_array(one)
+    for tensor in graph.initializer:
+        values = numpy_helper.to_array(tensor)
         if values.dtype != np.float32 or values.size <= _SMALL:
             continue
         if not np.abs(values).max() <= _FLOAT16_MAX:
             allowed = f"weights of at most {_FLOAT16_MAX:g}"
-            raise UserError(f"--precision fp16 of {one.name}", allowed, "choose fp32")
-        name, half = one.name, f"{one.name}.half"
-        one.CopyFrom(numpy_helper.from_array(values.astype(np.float16), half))
+            raise UserError(f"--precision fp16 of {tensor.name}", allowed, "choose fp32")
+        name, half = tensor.name, f"{tensor.name}.half"
+        tensor.CopyFrom(numpy_helper.from_array(values.astype(np.float16), half))
         conversions.append(helper.make_node("Cast", [half], [name], name, to=TensorProto.FLOAT))
     nodes = [*conversions, *graph.node]
     del graph.node[:]
@@ -214,34 +218,33 @@ def _halve(graph: Any) -> None:
 
 
 def _last_convolutions(graph: Any) -> list[str]:
-    """Return the names of the convolutions that answer an ONNX graph's maps."""
-    made_by = {name: node for node in graph.node for name in node.output}
+    """Return the names of the convolutions that compute an ONNX graph's maps."""
+    producers = {name: node for node in graph.node for name in node.output}
     ends = []
     for output in graph.output:
-        node = made_by.get(output.name)
+        node = producers.get(output.name)
         while node is not None and node.op_type != "Conv":
-            node = next((made_by[one] for one in node.input if one in made_by), None)
+            node = next((producers[name] for name in node.input if name in producers), None)
         ends += [] if node is None else [node.name]
     return ends
 
 
 def _last_openvino_convolutions(model: Any) -> list[str]:
-    """Return the names of the convolutions that answer an OpenVINO graph's maps."""
+    """Return the names of the convolutions that compute an OpenVINO graph's maps."""
     ends = []
     for output in model.outputs:
         node = output.get_node()
         while node is not None and node.get_type_name() != "Convolution":
-            inputs = (one.get_node() for one in node.input_values())
-            node = next((one for one in inputs if one.get_type_name() != "Constant"), None)
+            inputs = (value.get_node() for value in node.input_values())
+            node = next((n for n in inputs if n.get_type_name() != "Constant"), None)
         ends += [] if node is None else [node.get_friendly_name()]
     return ends
 
 
 def _quantised(model: Any, images: Sequence[Any], ends: Sequence[str]) -> Any:
-    """Return a graph that computes in 8 bits, but for what answers the maps.
+    """Return a graph that computes in 8 bits, except the last convolutions.
 
-    Weights take 7 bits of them: where the processor has no VNNI, sums of two products of 8 bits
-    overflow.
+    Weights use 7 bits: without VNNI, sums of two 8-bit products overflow.
     """
     load_openvino("--precision int8")
     logging.getLogger("nncf").setLevel(logging.ERROR)

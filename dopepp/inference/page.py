@@ -1,8 +1,8 @@
-"""The page of ``dopepp serve``: a picture and its camera in; poses drawn, listed and as a file.
+"""The page of ``dopepp serve``: image and camera in; poses drawn, listed and as a file.
 
-The server answers this machine alone, and the page loads nothing from anywhere else. What is wrong
-with a file or a number stands on the page in one line, as the command line says it. Pictures that
-were uploaded are gone when the server ends.
+The server responds to this machine only, and the page loads nothing from other hosts. Errors about
+files and numbers appear on the page as one line, as on the command line. Uploaded images are
+deleted when the server stops.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ from dopepp.inference.pose_result import PoseResult, make_shape
 from dopepp.parts.size import part_in_words
 from dopepp.recovery.recover import explained
 
-HOST: Final = "127.0.0.1"  # nobody but this machine reaches it
-MAX_UPLOAD: Final = "64mb"  # of a file: a picture of 20 million pixels without compression
-SHOWN_PX: Final = 1600  # longer side of the drawn picture: a browser shows no more
+HOST: Final = "127.0.0.1"  # reachable from this machine only
+MAX_UPLOAD: Final = "64mb"  # of a file: an uncompressed image of 20 megapixels
+SHOWN_PX: Final = 1600  # longer side of the drawn image: a browser shows no more
 
 VIEW, NUMBERS, FILE = "field of view", "K", "camera file"
-"""How the page can be told what took the picture."""
+"""Ways to specify the camera."""
 
-COLUMNS: Final = ("part", "score", "x mm", "y mm", "z mm", "qw", "qx", "qy", "qz", "error px")
-"""Of the table: the part's place and turn in the camera's frame, and the reprojection error."""
+COLUMNS: Final = ["part", "score", "x mm", "y mm", "z mm", "qw", "qx", "qy", "qz", "error px"]
+"""Table: position and quaternion in the camera frame, and the reprojection error."""
 
 FRAME: Final = "Poses in the camera's frame: x right, y down, z forward"
 
@@ -57,31 +57,45 @@ STYLE: Final = """
 footer { display: none !important; }
 """
 
-Shown = tuple[Picture | None, str, list[list[object]], Any, Picture | None]
-"""What a look at a picture puts on the page: poses, message, table, the file's button, maps."""
+DISABLED: Final = ("share", "run_history", "ssr_mode", "pwa", "mcp_server", "enable_monitoring")
+
+LAUNCH: Final[dict[str, Any]] = {
+    "server_name": HOST,
+    "prevent_thread_lock": True,
+    "max_file_size": MAX_UPLOAD,
+    "css": STYLE,
+    "theme": gr.themes.Soft(font=["system-ui", "sans-serif"], font_mono=["monospace"]),
+    "footer_links": [],
+    "quiet": True,
+    # Requests under another host name that resolves to this machine are rejected.
+    "app_kwargs": {"middleware": [Middleware(TrustedHostMiddleware, [HOST])]},
+    **dict.fromkeys(DISABLED, False),
+}
+"""Settings of Gradio's server."""
+
+Outputs = tuple[Picture | None, str, list[list[object]], Any, Picture | None]
+"""Outputs of the page: drawn poses, message, table, download button, belief maps."""
 
 
 @contextmanager
 def served(estimator: PoseEstimator, port: int | None = None) -> Iterator[str]:
-    """Serve the page beside this thread while the block runs; yield its address.
+    """Serve the page in another thread while the block runs; yield its address.
 
-    Without a port it takes the first free one from 7860. A :class:`UserError`: the port is taken.
+    Args:
+        estimator: Estimates the poses.
+        port: Port (default: the first free port from 7860 on).
+
+    Raises:
+        UserError: The port is taken.
     """
     with TemporaryDirectory(prefix="dopepp-") as folder:
         os.environ["GRADIO_TEMP_DIR"] = folder
         page = make_page(estimator, Path(folder))
         try:
-            _, address, _ = page.launch(
-                server_name=HOST, server_port=port, share=False, prevent_thread_lock=True,
-                max_file_size=MAX_UPLOAD, footer_links=[], run_history=False, ssr_mode=False,
-                pwa=False, mcp_server=False, enable_monitoring=False, quiet=True, css=STYLE,
-                theme=gr.themes.Soft(font=["system-ui", "sans-serif"], font_mono=["monospace"]),
-                # Another site's name that leads to this machine gets no answer.
-                app_kwargs={"middleware": [Middleware(TrustedHostMiddleware, [HOST])]},
-            )  # fmt: skip
+            _, address, _ = page.launch(server_port=port, **LAUNCH)
         except OSError as error:
-            got = "every port from 7860 on" if port is None else f"--port {port}"
-            raise UserError(f"{got}, which is taken", "a free port", "choose another") from error
+            taken = "every port from 7860 on" if port is None else f"--port {port}"
+            raise UserError(f"{taken}, which is taken", "a free port", "choose another") from error
         try:
             yield address
         finally:
@@ -89,48 +103,49 @@ def served(estimator: PoseEstimator, port: int | None = None) -> Iterator[str]:
 
 
 def make_page(estimator: PoseEstimator, folder: Path) -> gr.Blocks:
-    """Lay the page out; what it hands out is written to a folder."""
+    """Build the page; downloads are written to a folder."""
 
-    def look(path: str | None, kind: str, *camera: Any) -> Shown:
+    def find_poses(path: str | None, kind: str, *camera: Any) -> Outputs:
         try:
-            return _looked(estimator, path, kind, camera, folder)
+            if path is None:
+                raise UserError("no picture", "a picture's file", "drop one")
+            return _outputs(estimator, Path(path), kind, camera, folder)
         except UserError as error:
-            said = str(error)
-            for one in filter(None, (path, camera[-1])):
-                said = said.replace(one, Path(one).name)
-            return None, _said(said, wrong=True), [], _button(None), None
+            message = str(error)
+            for upload in filter(None, (path, camera[-1])):
+                message = message.replace(upload, Path(upload).name)
+            return None, _message(message, is_error=True), [], _button(None), None
 
     page = gr.Blocks(title="DOPE++", analytics_enabled=False)
     with page:
-        gr.Markdown(f"# DOPE++\nlooks for {_in_words(estimator)}")
+        parts = "; ".join(part_in_words(part) for part in estimator.parts)
+        gr.Markdown(f"# DOPE++\nlooks for {parts}")
         with gr.Row():
             with gr.Column(scale=1, min_width=320):
-                kinds = "PNG, JPEG, TIFF, BMP or WEBP"
-                picture = gr.File(label=f"Picture: {kinds}", height=160, elem_id="picture")
+                formats = "Picture: PNG, JPEG, TIFF, BMP or WEBP"
+                picture = gr.File(label=formats, height=160, elem_id="picture")
                 camera = _camera_inputs()
                 button = gr.Button("Find poses", variant="primary")
-                maps = _picture("Belief maps", "maps")
+                maps = _image("Belief maps", "maps")
             with gr.Column(scale=2, min_width=480):
-                greeting = _said("Drop a picture, say what took it, and find the poses.")
+                greeting = _message("Drop a picture, say what took it, and find the poses.")
                 message = gr.HTML(greeting, padding=False)
-                drawn = _picture("Poses", "poses")
-                table = gr.Dataframe(headers=list(COLUMNS), label=FRAME, interactive=False)
+                drawn = _image("Poses", "poses")
+                table = gr.Dataframe(headers=COLUMNS, label=FRAME, interactive=False)
                 file = gr.DownloadButton("Download JSON", interactive=False)
         outputs = [drawn, message, table, file, maps]
-        button.click(look, [picture, *camera], outputs, api_visibility="private")
+        button.click(find_poses, [picture, *camera], outputs, api_visibility="private")
     return page
 
 
-def _picture(label: str, name: str) -> gr.Image:
-    """Lay out a place for a picture; of Gradio's buttons, the one that publishes it is left out."""
-    return gr.Image(
-        label=label, elem_id=name, interactive=False, format="png",
-        buttons=["download", "fullscreen"],
-    )  # fmt: skip
+def _image(label: str, name: str) -> gr.Image:
+    """Return an image output without Gradio's button that publishes the image."""
+    buttons: Any = ["download", "fullscreen"]
+    return gr.Image(label=label, elem_id=name, interactive=False, format="png", buttons=buttons)
 
 
 def _camera_inputs() -> list[Any]:
-    """Lay out the ways to tell the camera, of which one is shown."""
+    """Return the inputs of all ways to specify the camera; only those of the chosen are shown."""
     kind = gr.Radio([VIEW, NUMBERS, FILE], value=VIEW, label="Camera")
     view = gr.Number(label="Degrees across the picture's width", placeholder="60")
     with gr.Row(visible=False) as row:
@@ -141,42 +156,52 @@ def _camera_inputs() -> list[Any]:
     formats = "ROS, OpenCV, BOP, COLMAP, or 3×3 numbers"
     file = gr.File(label=formats, height=140, visible=False, elem_id="camera")
 
-    def chosen(one: str) -> list[Any]:
-        return [gr.update(visible=one == this) for this in (VIEW, NUMBERS, FILE)]
+    def show(chosen: str) -> list[Any]:
+        return [gr.update(visible=kind == chosen) for kind in (VIEW, NUMBERS, FILE)]
 
-    kind.change(chosen, kind, [view, row, file], api_visibility="private", show_progress="hidden")
+    kind.change(show, kind, [view, row, file], api_visibility="private", show_progress="hidden")
     return [kind, view, *numbers, file]
 
 
-def _looked(
-    estimator: PoseEstimator, path: str | None, kind: str, given: Sequence[Any], folder: Path
-) -> Shown:
-    """Return what is on a picture; see :func:`look` of the page for the arguments."""
-    if path is None:
-        raise UserError("no picture", "a picture's file", "drop one")
-    picture = read_photo(Path(path))
+def _outputs(
+    estimator: PoseEstimator, path: Path, kind: str, inputs: Sequence[Any], folder: Path
+) -> Outputs:
+    """Estimate the poses on an uploaded image."""
+    picture = read_photo(path)
     size = (picture.shape[1], picture.shape[0])
-    camera = _camera(kind, given, size[0], size[1]).for_picture(size)
+    camera = _camera(kind, inputs, *size).for_picture(size)
     image, K = camera.undistorted(picture), camera.K
-    found, said = estimator.predict(image, K), ""
-    if not found:
-        found = estimator.predict(image, K, distances="any")
-        said = ", not where training had the parts, but at another distance"
-    if not found:
-        said = f": {explained(estimator.explain(image, K))}"
+    detections, remark = estimator.predict(image, K), ""
+    if not detections:
+        detections = estimator.predict(image, K, distances="any")
+        remark = ", not where training had the parts, but at another distance"
+    count = len(detections)
+    message = f"{count} pose{'s' * (count > 1)} found{remark}"
+    if not detections:
+        message = f"Nothing found: {explained(estimator.explain(image, K))}"
     shapes = {part.name: make_shape(part) for part in estimator.parts}
-    result = PoseResult(image, K, found, {}, Path(path).name, shapes=shapes)
-    count = f"{len(found)} pose{'s' * (len(found) > 1)} found" if found else "Nothing found"
-    file = Path(mkdtemp(dir=folder), f"{Path(path).stem}.json")
+    result = PoseResult(image, K, detections, {}, path.name, shapes=shapes)
+    file = Path(mkdtemp(dir=folder), f"{path.stem}.json")
     write_whole(file, json.dumps(result.records(), ensure_ascii=False, indent=1).encode())
-    rows = _rows(result)
-    maps = belief_sheet(estimator, image, K)
-    return _shrunk(result.plot()), _said(count + said, wrong=not found), rows, _button(file), maps
+    rows: list[list[object]] = []
+    for detection in detections:
+        position = [f"{mm:.1f}" for mm in 1000 * detection.T_cam_obj[:3, 3]]
+        rotation = [f"{q:.3f}" for q in matrix_to_quaternion(detection.T_cam_obj[:3, :3])]
+        error = f"{detection.reprojection_error_px:.1f}"
+        rows.append([detection.object, f"{detection.score:.2f}", *position, *rotation, error])
+    drawn = result.plot()
+    scale = SHOWN_PX / max(drawn.shape)
+    if scale < 1:
+        drawn = np.asarray(
+            cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        )
+    said = _message(message, is_error=not detections)
+    return drawn, said, rows, _button(file), belief_sheet(estimator, image, K)
 
 
-def _camera(kind: str, given: Sequence[Any], width: int, height: int) -> Camera:
-    """Return the camera of a picture, as the page tells it."""
-    view, fx, fy, cx, cy, file = given
+def _camera(kind: str, inputs: Sequence[Any], width: int, height: int) -> Camera:
+    """Return the camera that the page's inputs specify."""
+    view, fx, fy, cx, cy, file = inputs
     if kind == VIEW:
         check("field of view", view, float, Range(LEAST_VIEW_DEG, MOST_VIEW_DEG, "degrees"))
         focal = width / 2 / math.tan(math.radians(view) / 2)
@@ -186,51 +211,28 @@ def _camera(kind: str, given: Sequence[Any], width: int, height: int) -> Camera:
         if file is None:
             raise UserError("no camera file", "the calibration's file", "drop it")
         return read_camera(file)
-    numbers = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
-    missing = [name for name, number in numbers.items() if number is None]
-    if missing:
-        raise UserError(f"K without {missing[0]}", "fx, fy, cx and cy, pixels", "fill it in")
+    for name, number in {"fx": fx, "fy": fy, "cx": cx, "cy": cy}.items():
+        if number is None:
+            raise UserError(f"K without {name}", "fx, fy, cx and cy, pixels", "fill it in")
     return Camera(None, camera_matrix(fx, fy, cx, cy), (), "K")
 
 
 def belief_sheet(estimator: PoseEstimator, image: Picture, K: CameraMatrix) -> Picture:
-    """Draw the belief maps on a picture in every size in which the network looks at it."""
+    """Draw the belief maps over the image, in every size that the network is run on."""
     tiles = []
     for view in estimator.views(image, K):
-        box = view.box
         belief = estimator.maps(view.pixels)[0].cpu().numpy()
         strongest = belief.reshape(-1, NUM_KEYPOINTS, *belief.shape[1:]).max(axis=0)
-        shown = view.pixels[: box.height, : box.width]  # without its padding
-        size = f"{box.width}×{box.height}"
-        tiles += belief_tiles(shown, strongest, estimator.network.stride, size)
+        width, height = view.box.width, view.box.height
+        unpadded = view.pixels[:height, :width]
+        tiles += belief_tiles(unpadded, strongest, estimator.network.stride, f"{width}×{height}")
     return contact_sheet(tiles, columns=2)
 
 
-def _rows(result: PoseResult) -> list[list[object]]:
-    rows: list[list[object]] = []
-    for one in result.detections:
-        place = [f"{number:.1f}" for number in 1000 * one.T_cam_obj[:3, 3]]
-        turn = [f"{number:.3f}" for number in matrix_to_quaternion(one.T_cam_obj[:3, :3])]
-        error = f"{one.reprojection_error_px:.1f}"
-        rows.append([one.object, f"{one.score:.2f}", *place, *turn, error])
-    return rows
-
-
-def _shrunk(picture: Picture) -> Picture:
-    scale = SHOWN_PX / max(picture.shape)
-    if scale >= 1:
-        return picture
-    return np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
-
-
-def _in_words(estimator: PoseEstimator) -> str:
-    return "; ".join(part_in_words(part) for part in estimator.parts)
-
-
-def _said(text: str, wrong: bool = False) -> str:
-    return f'<p class="said{" wrong" * wrong}">{escape(text)}</p>'
+def _message(text: str, is_error: bool = False) -> str:
+    return f'<p class="said{" wrong" * is_error}">{escape(text)}</p>'
 
 
 def _button(file: Path | None) -> Any:
-    """Return the button with its file, or one that cannot be pressed."""
+    """Return the download button, disabled without a file."""
     return gr.update(value=None if file is None else str(file), interactive=file is not None)

@@ -1,14 +1,14 @@
-"""PoseTracker: parts followed from frame to frame; the network runs only where it must.
+"""PoseTracker: tracks parts from frame to frame and runs the network only where necessary.
 
-A part that was seen in the last frame is looked for where its motion takes it, by refinement alone
-(:mod:`dopepp.inference.refinement.region`): first near there, then as far as a hand may have moved
-it. Where neither is believed, the network looks; where it finds nothing either, the part is lost,
-and the network looks in every frame until it is there again, under the same identity.
+A part of the last frame is searched where its motion predicts it, by refinement alone
+(:mod:`dopepp.inference.refinement.region`): first close to the prediction, then as far as a hand
+may have moved it. If neither pose is accepted, the network is run on the surroundings. If it does
+not detect the part either, the part is lost, and the network is run on every frame until the part
+reappears, under the same identity.
 
-A part's motion is a Kalman filter over its pose and its velocity. Each frame's pose comes with a
-covariance in which the filter's own forecast is contained already (it was the refinement's prior),
-so the velocity follows from what the pose has been corrected by: a pose that is still being
-corrected is not taken for one that moves.
+A part's motion is a Kalman filter over pose and velocity. The covariance of each frame's pose
+already contains the filter's prediction (it was the refinement's prior), so the velocity follows
+from the correction of the pose: a pose that is still converging is not mistaken for motion.
 """
 
 from __future__ import annotations
@@ -41,69 +41,67 @@ if TYPE_CHECKING:
     from dopepp.inference.estimator import PoseEstimator
 
 AROUND: Final = 0.5
-"""Of a part's extent on the picture, beyond it: where the network looks for one in doubt."""
+"""Margin of the region in which the network searches a doubtful part, share of its extent."""
 
 NEAR: Final = 0.5
-"""Diameters between the centres of a track and a detection that may be the same part."""
+"""Largest distance between the centres of a track and a detection of the same part, diameters."""
 
 ELSEWHERE: Final = 0.1
-"""Diameters, of mean distance between keypoints: farther apart, track and detection disagree."""
+"""Mean distance between keypoints above which track and detection disagree, diameters."""
 
-OUTVOTED: Final = 2  # detections in a row that disagree with a track before it is moved to them
+OUTVOTED: Final = 2  # disagreeing detections in a row after which a track is moved to them
 
 DOUBTFUL: Final = 0.8
-"""Share of its usual agreement below which a track may have been drawn away by what hides it: on
-rendered sequences, right poses kept 0.97 of it and wrong ones half."""
+"""Share of its usual agreement below which a track is doubtful: on rendered sequences, right poses
+kept 0.97 of it and poses that an occluder had drawn away half."""
 
 TRUSTED: Final = 0.6
-"""Agreement below which no pose is taken over, except the first: half of a wrong one's outline may
-lie on edges of something else."""
+"""Agreement below which a pose is rejected, except the first: half of a wrong pose's outline may
+coincide with other edges."""
 
-SURE: Final = 0.85
-OFTEN: Final = 5  # agreement below which the network looks at every so manieth frame
+SURE: Final = 0.85  # agreement below which the network is run every OFTEN frames
+OFTEN: Final = 5
 USUAL: Final = 0.1  # weight of a frame in the usual agreement
 
 PATIENCE: Final = 6
-"""Doubtful frames in a row, in which a part goes on as it was going, before it is lost."""
+"""Doubtful frames in a row in which a part continues its motion, before it is lost."""
 
-FORGOTTEN: Final = 300  # frames after which a lost part is no longer looked for
-
+FORGOTTEN: Final = 300  # frames after which a lost part is no longer searched
 
 STILL: Final = (math.radians(0.05), 2e-4)
-"""Standard deviations of how much the velocity of a part at rest may change in a frame: radians
-along each axis, and metres per metre of its distance. The smaller, the less it trembles."""
+"""Standard deviations of the change in velocity of a part at rest, per frame: radians about each
+axis, and metres per metre of distance. Smaller values reduce jitter."""
 
 SUDDEN: Final = (math.radians(4.0), 0.025)
-"""The same of a part that a hand takes up or turns round: half of 8° and of 5 % a frame."""
+"""Like :data:`STILL`, for a part that a hand picks up or turns: half of 8° and of 5 % per frame."""
 
 SWERVE: Final = 0.6
-"""Share of its speed, and of what the last frame has corrected, that may come on top of it."""
+"""Share of the speed, and of the last correction, by which the velocity may change in addition."""
 
-PERSISTENCE: Final = 0.95  # share of the velocity that is left after a frame
+PERSISTENCE: Final = 0.95  # share of the velocity that remains after a frame
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A part's pose and velocity."""
+    """State of the Kalman filter: pose and velocity of a part."""
 
-    T_cam_obj: Transform  # the pose
-    # A frame's turn (rotation vector, radians) about the object's origin, and its shift
-    # (metres), both in camera axes
+    T_cam_obj: Transform
+    # Rotation per frame (rotation vector about the object's origin, radians) and shift (metres),
+    # both in camera axes
     velocity: Step
-    covariance: Float[np.ndarray, "12 12"]  # of pose and velocity, in the same six numbers each
-    correction: Step  # by which the last frame has moved the forecast
+    covariance: Float[np.ndarray, "12 12"]  # of pose and velocity, six numbers each
+    correction: Step  # by the last frame, from the predicted pose
 
     @property
     def pose_covariance(self) -> Float[np.ndarray, "6 6"]:
         """Covariance of the pose alone."""
         return self.covariance[:6, :6]
 
-    def ahead(self, sudden: bool = False) -> Motion:
-        """Return the next frame's forecast; ``sudden``: something may have happened."""
-        change = self._change(sudden) ** 2
+    def predict(self, sudden: bool = False) -> Motion:
+        """Predict the next frame, after a ``sudden`` change in velocity or without one."""
         step = np.eye(12)
         step[:6, 6:] = step[6:, 6:] = PERSISTENCE * np.eye(6)
-        added = np.kron([[1.0, 1.0], [1.0, 1.0]], np.diag(change))
+        added = np.kron([[1.0, 1.0], [1.0, 1.0]], np.diag(self._velocity_change(sudden) ** 2))
         return Motion(
             moved(self.T_cam_obj, PERSISTENCE * self.velocity),
             PERSISTENCE * self.velocity,
@@ -111,80 +109,77 @@ class Motion:
             self.correction,
         )
 
-    def seen(self, T_cam_obj: Transform, covariance: Float[np.ndarray, "6 6"]) -> Motion:
-        """Return this forecast with a frame's pose, and its covariance, which contains it."""
+    def update(self, T_cam_obj: Transform, covariance: Float[np.ndarray, "6 6"]) -> Motion:
+        """Update a prediction by a pose whose covariance already contains the prediction."""
         correction = step_between(self.T_cam_obj, T_cam_obj)
-        pose = self.pose_covariance
-        gain = self.covariance[:, :6] @ np.linalg.inv(pose)
+        predicted = self.pose_covariance
+        gain = self.covariance[:, :6] @ np.linalg.inv(predicted)
         velocity = self.velocity + gain[6:] @ correction
-        whole = self.covariance - gain @ (pose - covariance) @ gain.T
-        return Motion(T_cam_obj, velocity, whole, correction)
+        updated = self.covariance - gain @ (predicted - covariance) @ gain.T
+        return Motion(T_cam_obj, velocity, updated, correction)
 
-    def _change(self, sudden: bool) -> Step:
-        """Return the deviations of the velocity's change."""
+    def _velocity_change(self, sudden: bool) -> Step:
+        """Return the standard deviations of the change in velocity."""
         least = SUDDEN if sudden else STILL
         deviations = []
         for number, unit in enumerate((1.0, float(self.T_cam_obj[2, 3]))):
-            own = slice(3 * number, 3 * number + 3)
-            speeds = np.linalg.norm(self.velocity[own]), np.linalg.norm(self.correction[own])
+            axes = slice(3 * number, 3 * number + 3)
+            speeds = np.linalg.norm(self.velocity[axes]), np.linalg.norm(self.correction[axes])
             deviations.append(max(least[number] * unit, SWERVE / math.sqrt(3) * float(sum(speeds))))
         return np.repeat(deviations, 3)
 
 
 def at_rest(T_cam_obj: Transform, covariance: Float[np.ndarray, "6 6"]) -> Motion:
-    """Return the motion of a part that was seen once: whether it moves is not known."""
-    whole = np.zeros((12, 12))
-    whole[:6, :6] = covariance
-    turn, shift = SUDDEN
-    whole[6:, 6:] = np.diag(np.repeat([turn, shift * float(T_cam_obj[2, 3])], 3) ** 2)
-    return Motion(T_cam_obj, np.zeros(6), whole, np.zeros(6))
+    """Return the motion of a part after its first frame: at rest, with an uncertain velocity."""
+    both = np.zeros((12, 12))
+    both[:6, :6] = covariance
+    rotation, shift = SUDDEN
+    both[6:, 6:] = np.diag(np.repeat([rotation, shift * float(T_cam_obj[2, 3])], 3) ** 2)
+    return Motion(T_cam_obj, np.zeros(6), both, np.zeros(6))
 
 
 @dataclass(frozen=True)
 class Track:
-    """A part that was found on a frame."""
+    """A part on a frame."""
 
-    # Of this instance, the same as long as it is followed, and when it is found again
-    identity: int
-    # Its pose, keypoints and covariance on this frame; score and peaks are those of the
-    # network's last look
-    detection: Detection
-    # Its motion a frame, camera axes: a turn (rotation vector, radians) about the object's
-    # origin, and a shift (metres)
+    identity: int  # of the instance; it is kept while the part is tracked or lost
+    detection: Detection  # with this frame's pose; score and peaks are of the network's last run
+    # Motion per frame in camera axes: rotation vector about the object's origin (radians), and
+    # shift (metres)
     velocity: Step
     detected: bool  # whether this frame's pose came from the network's detection
 
 
 @dataclass
 class _State:
-    """What is known of a part between two frames.
-
-    ``usual`` is its agreement with the picture on late frames. ``unseen`` counts the frames since
-    it was last seen, ``doubts`` those in which it agreed less than usual, and ``disagreements`` the
-    network's answers in a row that were elsewhere.
-    """
+    """State of a tracked part between two frames."""
 
     track: Track
     motion: Motion
-    usual: float
-    unseen: int = 0
-    doubts: int = 0
-    disagreements: int = 0
+    usual: float  # mean agreement with the image on the last frames
+    unseen: int = 0  # frames since the part was lost
+    doubts: int = 0  # frames in a row with less than the usual agreement
+    disagreements: int = 0  # detections in a row that were elsewhere
 
-    def move_to(self, one: Detection) -> None:
-        """Go on from where the network has found the part."""
-        self.track = Track(self.track.identity, one, np.zeros(6), detected=True)
-        self.motion = at_rest(one.T_cam_obj, one.covariance)
+    def move_to(self, detection: Detection) -> None:
+        """Continue from a detection of the network."""
+        self.track = Track(self.track.identity, detection, np.zeros(6), detected=True)
+        self.motion = at_rest(detection.T_cam_obj, detection.covariance)
         self.unseen = self.doubts = self.disagreements = 0
+
+    def follow(self, motion: Motion, detection: Detection) -> None:
+        """Continue with a pose that was refined or predicted."""
+        identity, self.motion = self.track.identity, motion
+        self.track = Track(identity, detection, motion.velocity, detected=False)
 
 
 class PoseTracker:
-    """Follows the parts of an estimator through the frames of one camera.
+    """Tracks the parts of an estimator through the frames of one camera.
 
     Args:
-        estimator: One that refines poses on the picture (``refine="region"``).
-        detect_every: The network looks at every so manieth frame even where all parts are followed,
-            for parts that have come into view.
+        estimator: Estimator that refines poses on the image (``refine="region"``).
+        detect_every: The network is run on every n-th frame even if all parts are tracked, to
+            detect parts that have come into view.
 
     Raises:
         UserError: The estimator does not refine, or ``detect_every`` is below 1.
@@ -192,10 +187,9 @@ class PoseTracker:
 
     def __init__(self, estimator: PoseEstimator, detect_every: int = 30) -> None:
         if estimator.refiner is None:
-            raise UserError(
-                "a tracker of an estimator that does not refine", "refine='region'",
-                "load it with PoseEstimator.load(path, refine='region')",
-            )  # fmt: skip
+            problem = "a tracker of an estimator that does not refine"
+            fix = "load it with PoseEstimator.load(path, refine='region')"
+            raise UserError(problem, "refine='region'", fix)
         self.detect_every = check("detect_every", detect_every, int, Range(1, 1_000_000))
         self._estimator = estimator
         self._cuboid_of = {part.name: part.cuboid for part in estimator.parts}
@@ -205,139 +199,136 @@ class PoseTracker:
         self._identities = 0
 
     def track(self, image: Picture, K: CameraMatrix, cropped: bool = False) -> list[Track]:
-        """Find the parts on the next frame.
+        """Track and detect the parts on the next frame.
 
         Args:
             image: RGB, uint8, without lens distortion.
             K: Camera matrix, pixels.
-            cropped: As :meth:`PoseEstimator.predict` takes it.
+            cropped: As in :meth:`PoseEstimator.predict`.
 
         Returns:
-            The parts that were found, in the order of their identities.
+            Visible parts, sorted by identity.
 
         Raises:
-            UserError: The image is no RGB picture, or K cannot belong to it.
+            UserError: The image is no RGB image, or K does not belong to it.
         """
         image, K, _ = prepare_image(image, K, cropped=cropped)
         for state in self._states:
             self._follow(state, image, K)
-        due = self._frame % self.detect_every == 0
-        asked = [one for one in self._states if self._is_asked(one)]
-        if due or not self._states or any(one.unseen for one in asked):
-            self._look(image, K)
-        elif asked:
-            self._look(image, K, _around([one.track.detection for one in asked], image))
+        doubtful = [state for state in self._states if self._is_doubtful(state)]
+        is_due = self._frame % self.detect_every == 0
+        if is_due or not self._states or any(state.unseen for state in doubtful):
+            self._detect(image, K)
+        elif doubtful:
+            self._detect(image, K, _region_around([s.track.detection for s in doubtful], image))
         self._frame += 1
-        self._states = [one for one in self._states if one.unseen <= FORGOTTEN]
-        return [one.track for one in self._states if not one.unseen]
+        self._states = [state for state in self._states if state.unseen <= FORGOTTEN]
+        return [state.track for state in self._states if not state.unseen]
 
-    def _is_asked(self, state: _State) -> bool:
-        """Tell whether the network is to look for a part on this frame."""
+    def _is_doubtful(self, state: _State) -> bool:
+        """Return whether the network has to search a part on this frame."""
         unsure = _agreement(state.track.detection) < SURE and self._frame % OFTEN == 0
         return bool(unsure or state.unseen or state.doubts or state.disagreements)
 
     def _follow(self, state: _State, image: Picture, K: CameraMatrix) -> None:
-        """Look for a part where its motion takes it."""
-        old = state.track.detection
-        forecast = state.motion.ahead()
-        doubtful = None
+        """Refine a part's predicted pose; continue its motion if no pose is accepted."""
+        previous, forecast = state.track.detection, state.motion.predict()
+        rejected = None
         if not state.unseen and forecast.T_cam_obj[2, 3] > 0:
-            for expected in (forecast, state.motion.ahead(sudden=True)):
-                given = replace(
-                    old, T_cam_obj=expected.T_cam_obj, covariance=expected.pose_covariance
-                )
-                found = self._estimator.refined([given], image, K)[0]
-                if found.kept:
+            for motion in (forecast, state.motion.predict(sudden=True)):
+                covariance = motion.pose_covariance
+                start = replace(previous, T_cam_obj=motion.T_cam_obj, covariance=covariance)
+                refined = self._estimator.refined([start], image, K)[0]
+                if refined.kept:
                     continue
-                agreement = _agreement(found)
+                agreement = _agreement(refined)
                 if agreement >= max(DOUBTFUL * state.usual, min(TRUSTED, state.usual)):
-                    state.motion = expected.seen(found.T_cam_obj, found.covariance)
-                    state.track = replace(
-                        state.track, detection=found, velocity=state.motion.velocity, detected=False
-                    )
+                    state.follow(motion.update(refined.T_cam_obj, refined.covariance), refined)
                     state.usual += USUAL * (agreement - state.usual)
                     state.doubts = 0
                     return
-                doubtful = doubtful or replace(given, agreement=agreement)
-        if doubtful is None or state.doubts == PATIENCE:
+                rejected = rejected or replace(start, agreement=agreement)
+        if rejected is None or state.doubts == PATIENCE:
             state.unseen += 1
             return
-        keypoints = project_keypoints(self._cuboid_of[old.object], forecast.T_cam_obj, K)
-        doubtful = replace(doubtful, keypoints=keypoints)
-        state.motion = forecast
-        state.track = replace(
-            state.track, detection=doubtful, velocity=forecast.velocity, detected=False
-        )
+        keypoints = project_keypoints(self._cuboid_of[previous.object], forecast.T_cam_obj, K)
+        state.follow(forecast, replace(rejected, keypoints=keypoints))
         state.doubts += 1
 
-    def _look(self, image: Picture, K: CameraMatrix, roi: Region | None = None) -> None:
-        """Let the network look, and tell known parts from new ones."""
-        found = self._estimator.predict(image, K, roi=roi, cropped=True)  # checked before
-        found = [one for one in found if not one.kept]
-        for state, one in self._matched(found):
+    def _detect(self, image: Picture, K: CameraMatrix, roi: Region | None = None) -> None:
+        """Run the network, and assign its detections to tracked, lost and new parts."""
+        detections = self._estimator.predict(image, K, roi=roi, cropped=True)  # checked before
+        refined = [detection for detection in detections if not detection.kept]
+        for state, detection in self._assigned(refined):
+            agreement = _agreement(detection)
             if state is None:
-                track = Track(self._identities, one, np.zeros(6), detected=True)
-                motion = at_rest(one.T_cam_obj, one.covariance)
-                self._states.append(_State(track, motion, _agreement(one)))
+                track = Track(self._identities, detection, np.zeros(6), detected=True)
+                motion = at_rest(detection.T_cam_obj, detection.covariance)
+                self._states.append(_State(track, motion, agreement))
                 self._identities += 1
-            elif _agreement(one) < min(TRUSTED, state.usual):
                 continue
-            elif state.unseen or (
-                state.doubts and _agreement(one) > _agreement(state.track.detection)
-            ):
-                state.move_to(one)
-            elif self._apart(state.track.detection, one) <= ELSEWHERE:
+            tracked = state.track.detection
+            if agreement < min(TRUSTED, state.usual):
+                continue
+            if state.unseen or (state.doubts and agreement > _agreement(tracked)):
+                state.move_to(detection)
+            elif self._keypoint_distance(tracked, detection) <= ELSEWHERE:
                 state.disagreements = 0
-            elif _agreement(one) >= _agreement(state.track.detection):
+            elif agreement >= _agreement(tracked):
                 state.disagreements += 1
                 if state.disagreements == OUTVOTED:
-                    state.move_to(one)
+                    state.move_to(detection)
 
-    def _matched(self, found: Sequence[Detection]) -> list[tuple[_State | None, Detection]]:
-        """Pair detections with the parts they show: first those followed, then lost or in doubt."""
+    def _assigned(self, detections: Sequence[Detection]) -> list[tuple[_State | None, Detection]]:
+        """Assign detections to parts of the same name: tracked ones first, then lost or doubtful.
+
+        None: a new part.
+        """
         pairs: list[tuple[_State | None, Detection]] = []
         for name in self._cuboid_of:
-            left = [one for one in found if one.object == name]
-            own = [one for one in self._states if one.track.detection.object == name]
-            for astray, limit in ((False, NEAR * self._diameters[name]), (True, math.inf)):
-                states = [one for one in own if bool(one.unseen or one.doubts) == astray]
-                distances = np.array(
-                    [[_distance(one.track.detection, other) for other in left] for one in states]
-                ).reshape(len(states), len(left))
-                taken = set()
+            left = [detection for detection in detections if detection.object == name]
+            states = [state for state in self._states if state.track.detection.object == name]
+            for is_astray, limit in ((False, NEAR * self._diameters[name]), (True, math.inf)):
+                chosen = [s for s in states if bool(s.unseen or s.doubts) == is_astray]
+                tracked = np.reshape([_centre(s.track.detection) for s in chosen], (-1, 1, 3))
+                detected = np.reshape([_centre(detection) for detection in left], (1, -1, 3))
+                distances = np.linalg.norm(tracked - detected, axis=2)
                 assigned = scipy.optimize.linear_sum_assignment(distances)
-                for row, column in zip(*assigned, strict=True):
-                    if distances[row, column] <= limit:
-                        pairs.append((states[row], left[column]))
-                        taken.add(column)
-                left = [one for number, one in enumerate(left) if number not in taken]
-            pairs += [(None, one) for one in left]
+                near = [
+                    (row, column)
+                    for row, column in zip(*assigned, strict=True)
+                    if distances[row, column] <= limit
+                ]
+                pairs += [(chosen[row], left[column]) for row, column in near]
+                used = {column for _, column in near}
+                left = [detection for number, detection in enumerate(left) if number not in used]
+            pairs += [(None, detection) for detection in left]
         return pairs
 
-    def _apart(self, one: Detection, other: Detection) -> float:
-        """Return the mean distance between the cuboids' corners, diameters."""
-        cuboid = self._cuboid_of[one.object]
-        first, second = (transform(pose.T_cam_obj, cuboid) for pose in (one, other))
-        apart = np.linalg.norm(first - second, axis=1).mean()
-        return float(apart / self._diameters[one.object])
+    def _keypoint_distance(self, tracked: Detection, detection: Detection) -> float:
+        """Return the mean distance between the keypoints at two poses, diameters."""
+        cuboid = self._cuboid_of[tracked.object]
+        first, second = (transform(pose.T_cam_obj, cuboid) for pose in (tracked, detection))
+        distance = np.linalg.norm(first - second, axis=1).mean()
+        return float(distance / self._diameters[tracked.object])
 
 
-def _around(found: Sequence[Detection], image: Picture) -> Region | None:
-    """Return the region in which parts may be that were there; None is the whole image."""
-    points = np.concatenate([one.keypoints for one in found])
-    reach = AROUND * max(np.ptp(one.keypoints, axis=0).max() for one in found)
+def _region_around(detections: Sequence[Detection], image: Picture) -> Region | None:
+    """Return a region around detections; None for the whole image."""
+    points = np.concatenate([detection.keypoints for detection in detections])
+    margin = AROUND * max(np.ptp(detection.keypoints, axis=0).max() for detection in detections)
     limits = np.array(image.shape[1::-1])
-    start = np.clip(np.floor(points.min(axis=0) - reach), 0, limits)
-    end = np.clip(np.ceil(points.max(axis=0) + reach), 0, limits)
-    if (end - start).min() < reach:  # hardly in view
+    start = np.clip(np.floor(points.min(axis=0) - margin), 0, limits)
+    end = np.clip(np.ceil(points.max(axis=0) + margin), 0, limits)
+    if (end - start).min() < margin:  # hardly in view
         return None
     (x, y), (width, height) = start.astype(int), (end - start).astype(int)
     return x, y, width, height
 
 
-def _agreement(one: Detection) -> float:
-    return 0.0 if one.agreement is None else one.agreement
+def _agreement(detection: Detection) -> float:
+    return 0.0 if detection.agreement is None else detection.agreement
 
 
-def _distance(one: Detection, other: Detection) -> float:
-    return float(np.linalg.norm(one.T_cam_obj[:3, 3] - other.T_cam_obj[:3, 3]))
+def _centre(detection: Detection) -> Float[np.ndarray, "3"]:
+    return detection.T_cam_obj[:3, 3]

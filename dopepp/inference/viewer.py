@@ -1,7 +1,7 @@
-"""Viewer: results in Rerun (extra ``rerun``), in a window or a file: what is seen, and where it is.
+"""Viewer: results in Rerun (extra ``rerun``), in a window or a file.
 
-Shown are the picture with cuboids and silhouettes, the parts' meshes, cuboids and axes in space
-with the ellipsoid of their place's uncertainty, and the network's belief maps, on a timeline.
+It shows the image with cuboids and silhouettes, the parts' meshes, cuboids and axes in space with
+the ellipsoid of their position's uncertainty, and the network's belief maps, on a timeline.
 """
 
 from __future__ import annotations
@@ -28,40 +28,33 @@ from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.frames import FrameSource
 from dopepp.inference.pose_result import AXIS, COLOURS, PoseResult, silhouette_contours
-from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 
 if TYPE_CHECKING:
     import rerun as rr
 
-MEMORY: Final = "2GB"  # of the viewer's window, which then drops what is oldest
-
+MEMORY: Final = "2GB"  # limit of the viewer's window, which then drops the oldest data
 GROUPS: Final = ("parts", "meshes", "uncertainty")
-
 CENTRE: Final = 0.5  # of the top-left pixel, in Rerun's pixels
-
 LOCALHOST: Final = "127.0.0.1"
-
-START_S: Final = 20.0  # seconds that a window may take to open
+START_S: Final = 20.0  # timeout for opening a window, seconds
 
 ELLIPSOID: Final = 2.8
 """Half axes of the ellipsoid, standard deviations: 95 % of a normal distribution in space."""
 
 JPEG_QUALITY: Final = 90
-
-SINCE_1970: Final = 1e8  # seconds above which a time is a date, not a place in a video
+SINCE_1970: Final = 1e8  # seconds above which a time is a date, not a position in a video
 
 
 class Viewer:
     """A Rerun recording, shown in a window or written to a file.
 
     Args:
-        estimator: Whose results these are; it draws the belief maps.
-        path: The ``.rrd`` file; None opens a window.
+        estimator: Estimator of the results; it computes the belief maps.
+        path: ``.rrd`` file; None opens a window.
 
     Raises:
-        UserError: The extra is missing, the file cannot be written, or there is no display to open
-            a window on.
+        UserError: The extra is missing, the file cannot be written, or there is no display.
     """
 
     def __init__(self, estimator: PoseEstimator, path: Path | None = None) -> None:
@@ -80,33 +73,35 @@ class Viewer:
             raise UserError("--show without a display", "a desktop session", fix)
 
     def begin(self, source: FrameSource) -> None:
-        """Go on with another source on the same timeline."""
+        """Continue with another source on the same timeline."""
 
     def take(self, result: PoseResult) -> None:
-        """Add one result."""
+        """Add a result."""
         import rerun as rr
 
-        log = self._recording.log
+        log, distance = self._recording.log, self._distance(result)
         if not self._is_open:
-            self._open(result)
+            self._open(distance)
         self._recording.set_time("frame", sequence=result.number)
         if result.time is not None:
-            since = "timestamp" if result.time > SINCE_1970 else "duration"
-            self._recording.set_time("time", **{since: result.time})
-        size = result.image.shape[1::-1]
+            kind = "timestamp" if result.time > SINCE_1970 else "duration"
+            self._recording.set_time("time", **{kind: result.time})
         pinhole = rr.Pinhole(
-            image_from_camera=crop_camera(result.K, -CENTRE, -CENTRE), resolution=size,
+            image_from_camera=crop_camera(result.K, -CENTRE, -CENTRE),
+            resolution=result.image.shape[1::-1],
             camera_xyz=rr.ViewCoordinates.RDF,
-            image_plane_distance=1.5 * _distance(result, self._parts),
-        )  # fmt: skip
+            image_plane_distance=1.5 * distance,
+        )
         log("world/camera", pinhole)
         log("world/camera/picture", rr.Image(result.image).compress(JPEG_QUALITY))
         log("world/camera/outlines", _outlines(result))
         for name, belief in belief_pictures(self._estimator, result).items():
             log(f"beliefs/{name}", rr.Image(belief))
-        names = _names(result)
-        for number, (name, one) in enumerate(zip(names, result.detections, strict=True)):
-            self._log_part(name, one, COLOURS[number % len(COLOURS)])
+        # With a tracker, a detection has the same name on every frame.
+        numbers = result.identities or range(len(result.detections))
+        names = [f"{it.object}_{k}" for it, k in zip(result.detections, numbers, strict=True)]
+        for number, (name, detection) in enumerate(zip(names, result.detections, strict=True)):
+            self._log_part(name, detection, COLOURS[number % len(COLOURS)])
         for name in self._shown - set(names):
             for group in GROUPS:
                 log(f"world/{group}/{name}", rr.Clear(recursive=True))
@@ -129,22 +124,29 @@ class Viewer:
     ) -> None:
         self.close()
 
-    def _open(self, result: PoseResult) -> None:
-        """Open file or window with a view past the camera at what was found first."""
+    def _distance(self, result: PoseResult) -> float:
+        """Return the distance of the farthest part, or of a part that fills the image, metres."""
+        if result.detections:
+            return max(float(detection.T_cam_obj[2, 3]) for detection in result.detections)
+        largest = max(part.diameter for part in self._parts.values())
+        return float(largest * result.K[0, 0] / min(result.image.shape[:2]))
+
+    def _open(self, distance: float) -> None:
+        """Open the file or window, with a view over the camera's shoulder."""
         import rerun as rr
 
-        blueprint = _blueprint(_distance(result, self._parts))
+        blueprint = _blueprint(distance)
         if self._path is not None:
             self._recording.save(partial_path(self._path), default_blueprint=blueprint)
         else:
-            self._show(blueprint)
+            self._open_window(blueprint)
         self._is_open = True
         self._recording.log("world", rr.ViewCoordinates.RDF, static=True)
 
-    def _show(self, blueprint: Any) -> None:
-        """Open a window that nobody but this machine can send anything to, or look into."""
+    def _open_window(self, blueprint: Any) -> None:
+        """Open a window that other machines can neither see nor send data to."""
         viewer = [sys.executable, "-m", "rerun_cli"]
-        # It would report its use; whoever wants that says `rerun analytics enable`.
+        # It would report its use; `rerun analytics enable` allows that again.
         subprocess.run([*viewer, "analytics", "disable"], capture_output=True, check=False)
         with socket.socket() as free:
             free.bind((LOCALHOST, 0))
@@ -152,63 +154,64 @@ class Viewer:
         viewer += ["--bind", LOCALHOST, "--port", str(port), "--memory-limit", MEMORY]
         silent = subprocess.DEVNULL
         subprocess.Popen(viewer, stdout=silent, stderr=silent, start_new_session=True)
-        until = time.monotonic() + START_S
-        while not _listens(port):
-            if time.monotonic() > until:
+        deadline = time.monotonic() + START_S
+        while not _is_listening(port):
+            if time.monotonic() > deadline:
                 raise RunError("the viewer did not start; --rerun FILE.rrd writes a file")
             time.sleep(0.1)
         address = f"rerun+http://{LOCALHOST}:{port}/proxy"
         self._recording.connect_grpc(address, default_blueprint=blueprint)
 
-    def _log_part(self, name: str, one: Detection, colour: tuple[int, int, int]) -> None:
-        """Show a part at its pose, and where it may be instead."""
+    def _log_part(self, name: str, detection: Detection, colour: tuple[int, int, int]) -> None:
+        """Log a part at its pose, and the uncertainty of its position."""
         import rerun as rr
 
-        log, part = self._recording.log, self._parts[one.object]
-        R, t = one.T_cam_obj[:3, :3], one.T_cam_obj[:3, 3]
+        log, part = self._recording.log, self._parts[detection.object]
+        R, t = detection.T_cam_obj[:3, :3], detection.T_cam_obj[:3, 3]
         for group in ("parts", "meshes"):
             log(f"world/{group}/{name}", rr.Transform3D(translation=t, mat3x3=R))
         if name not in self._shown:
             log(f"world/parts/{name}", rr.TransformAxes3D(AXIS * part.diameter))
-            half = np.ptp(part.cuboid[:CENTROID], axis=0) / 2
             box = rr.Boxes3D(
-                centers=[part.cuboid[CENTROID]], half_sizes=[half], colors=[colour],
+                centers=[part.cuboid[CENTROID]],
+                half_sizes=[np.ptp(part.cuboid[:CENTROID], axis=0) / 2],
+                colors=[colour],
                 fill_mode=rr.components.FillMode.MajorWireframe,
-            )  # fmt: skip
+            )
             log(f"world/parts/{name}/cuboid", box)
             if part.mesh is not None:
                 log(f"world/meshes/{name}", _mesh(part.mesh.vertices, part.mesh.faces, colour))
-        spread, axes = np.linalg.eigh(one.covariance[3:, 3:])
+        variances, axes = np.linalg.eigh(detection.covariance[3:, 3:])
         axes[:, 2] *= np.sign(np.linalg.det(axes))
         ellipsoid = rr.Ellipsoids3D(
-            centers=[t], half_sizes=[ELLIPSOID * np.sqrt(spread.clip(0))], colors=[colour],
-            quaternions=[np.roll(matrix_to_quaternion(axes), -1)], labels=[f"{one.score:.2f}"],
-        )  # fmt: skip
+            centers=[t],
+            half_sizes=[ELLIPSOID * np.sqrt(variances.clip(0))],
+            colors=[colour],
+            quaternions=[np.roll(matrix_to_quaternion(axes), -1)],
+            labels=[f"{detection.score:.2f}"],
+        )
         log(f"world/uncertainty/{name}", ellipsoid)
 
 
 def belief_pictures(estimator: PoseEstimator, result: PoseResult) -> Mapping[str, Picture]:
-    """Return, for every part, the network's strongest belief of its keypoints as colours.
+    """Return the strongest belief of each part's keypoints as colours.
 
-    The network looks again, at the last of the sizes in which it has looked at the picture.
+    The network is run again, on the largest of its image sizes.
     """
     view = estimator.views(result.image, result.K)[-1]
-    beliefs, _ = estimator.maps(view.pixels)
-    strongest = (
-        beliefs.cpu().numpy().reshape(len(estimator.parts), CENTROID + 1, *beliefs.shape[1:])
-    )
-    levels = np.rint(255 * strongest.max(axis=1).clip(0, 1)).astype(np.uint8)
+    beliefs = estimator.maps(view.pixels)[0].cpu().numpy()
+    by_part = beliefs.reshape(len(estimator.parts), CENTROID + 1, *beliefs.shape[1:])
+    levels = np.rint(255 * by_part.max(axis=1).clip(0, 1)).astype(np.uint8)
     stride = estimator.network.stride
     rows, columns = -(-view.box.height // stride), -(-view.box.width // stride)
-    return {
-        part.name: np.asarray(
-            cv2.applyColorMap(level[:rows, :columns], cv2.COLORMAP_INFERNO)[..., ::-1]
-        )
-        for part, level in zip(estimator.parts, levels, strict=True)
-    }
+    pictures = {}
+    for part, level in zip(estimator.parts, levels, strict=True):
+        colours = cv2.applyColorMap(level[:rows, :columns], cv2.COLORMAP_INFERNO)
+        pictures[part.name] = np.asarray(colours[..., ::-1])
+    return pictures
 
 
-def _listens(port: int) -> bool:
+def _is_listening(port: int) -> bool:
     try:
         socket.create_connection((LOCALHOST, port), 0.5).close()
     except OSError:
@@ -217,7 +220,7 @@ def _listens(port: int) -> bool:
 
 
 def _blueprint(distance: float) -> Any:
-    """Arrange space at the left, picture and beliefs at the right."""
+    """Arrange space on the left, image and beliefs on the right."""
     import rerun.blueprint as rrb
 
     eye = rrb.EyeControls3D(
@@ -230,52 +233,38 @@ def _blueprint(distance: float) -> Any:
     beliefs = rrb.Spatial2DView(origin="beliefs", name="belief maps")
     return rrb.Blueprint(
         rrb.Horizontal(space, rrb.Vertical(picture, beliefs, row_shares=[2, 1])),
-        rrb.SelectionPanel(state="hidden"), rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline="frame"),
-    )  # fmt: skip
+    )
 
 
 def _outlines(result: PoseResult) -> rr.LineStrips2D:
-    """Return every part's cuboid and silhouette on the picture."""
+    """Return every part's cuboid and silhouette on the image."""
     import rerun as rr
 
     strips, colours = [], []
-    for number, one in enumerate(result.detections):
-        edges = [one.keypoints[[a, b]] for a, b in EDGES]
-        own = [edge + CENTRE for edge in edges if np.isfinite(edge).all()]
-        if (shape := result.shapes.get(one.object)) is not None:
-            contours = silhouette_contours(shape, one.T_cam_obj, result.K, result.image)
-            own += [np.vstack([line, line[:1]])[:, 0] + CENTRE for line in contours]
-        strips += own
-        colours += [COLOURS[number % len(COLOURS)]] * len(own)
+    for number, detection in enumerate(result.detections):
+        edges = [detection.keypoints[[a, b]] for a, b in EDGES]
+        lines = [edge + CENTRE for edge in edges if np.isfinite(edge).all()]
+        if (shape := result.shapes.get(detection.object)) is not None:
+            contours = silhouette_contours(shape, detection.T_cam_obj, result.K, result.image)
+            lines += [np.vstack([line, line[:1]])[:, 0] + CENTRE for line in contours]
+        strips += lines
+        colours += [COLOURS[number % len(COLOURS)]] * len(lines)
     return rr.LineStrips2D(strips, colors=colours)
 
 
 def _mesh(vertices: Any, faces: Any, colour: tuple[int, int, int]) -> rr.Mesh3D:
-    """Return a mesh with a flat normal on each triangle, by whose shade its shape is seen."""
+    """Return a mesh with one normal per triangle: flat shading shows its shape."""
     import rerun as rr
 
     corners = np.asarray(vertices)[np.asarray(faces)]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-30)
     return rr.Mesh3D(
-        vertex_positions=corners.reshape(-1, 3), vertex_normals=normals.repeat(3, axis=0),
-        triangle_indices=np.arange(3 * len(corners)).reshape(-1, 3), albedo_factor=colour,
-    )  # fmt: skip
-
-
-def _names(result: PoseResult) -> list[str]:
-    """Name each detection, the same in every picture where a tracker follows it."""
-    if result.identities is not None:
-        named = zip(result.detections, result.identities, strict=True)
-        return [f"{one.object}_{identity}" for one, identity in named]
-    return [f"{one.object}_{number}" for number, one in enumerate(result.detections)]
-
-
-def _distance(result: PoseResult, parts: Mapping[str, Part]) -> float:
-    """Return how far the farthest part is, metres; without any, where one fills the picture."""
-    found = [float(one.T_cam_obj[2, 3]) for one in result.detections]
-    if found:
-        return max(found)
-    largest = max(part.diameter for part in parts.values())
-    return float(largest * result.K[0, 0] / min(result.image.shape[:2]))
+        vertex_positions=corners.reshape(-1, 3),
+        vertex_normals=normals.repeat(3, axis=0),
+        triangle_indices=np.arange(3 * len(corners)).reshape(-1, 3),
+        albedo_factor=colour,
+    )

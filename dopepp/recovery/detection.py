@@ -199,14 +199,15 @@ def calibrated(
     if options.distance_factor != 1.0:
         T = detection.T_cam_obj.copy()
         T[:3, 3] *= options.distance_factor
-        keypoints = project_keypoints(cuboid, T, K)
-        detection = replace(detection, T_cam_obj=T, keypoints=keypoints)
-    probability = detection.belief
+        detection = replace(detection, T_cam_obj=T)
+    probability, keypoints = detection.belief, detection.keypoints
     if options.score_weights != _MEAN_BELIEF:
         features = detection_features(detection, cuboid, K)
         probability = float(score(features, np.array(options.score_weights)))
+    if options.distance_factor != 1.0:
+        keypoints = project_keypoints(cuboid, detection.T_cam_obj, K)
     covariance = options.covariance_factor * detection.covariance
-    return replace(detection, score=probability, covariance=covariance)
+    return replace(detection, keypoints=keypoints, score=probability, covariance=covariance)
 
 
 def rescored(refined: Sequence[Detection], options: RecoveryOptions) -> list[Detection]:

@@ -250,7 +250,7 @@ def filtered(motion: Motion, T: np.ndarray) -> Motion:
     prior, own = np.linalg.inv(motion.pose_covariance), np.diag(1 / NOISE**2)
     covariance = np.linalg.inv(prior + own)
     step = covariance @ own @ step_between(motion.T_cam_obj, T)
-    return motion.seen(moved(motion.T_cam_obj, step), covariance)
+    return motion.update(moved(motion.T_cam_obj, step), covariance)
 
 
 def test_what_a_frame_says_is_kalmans_update() -> None:
@@ -273,8 +273,8 @@ def test_a_filter_foresees_a_steady_motion() -> None:
     motion, T = at_rest(START, np.diag(NOISE**2)), START
     for _ in range(15):
         T = moved(T, step)
-        motion = filtered(motion.ahead(), T)
-    miss = step_between(motion.ahead().T_cam_obj, moved(T, step))
+        motion = filtered(motion.predict(), T)
+    miss = step_between(motion.predict().T_cam_obj, moved(T, step))
     assert np.abs(miss[:3]).max() < math.radians(0.5)
     assert np.abs(miss[3:]).max() < 0.001
 
@@ -283,7 +283,7 @@ def test_a_part_at_rest_trembles_less_than_what_is_seen_of_it() -> None:
     rng = np.random.default_rng(1)
     motion, steps = at_rest(START, np.diag(NOISE**2)), []
     for _ in range(80):
-        after = filtered(motion.ahead(), moved(START, rng.normal(size=6) * NOISE))
+        after = filtered(motion.predict(), moved(START, rng.normal(size=6) * NOISE))
         steps.append(step_between(motion.T_cam_obj, after.T_cam_obj))
         motion = after
     trembling = np.sqrt(np.mean(np.square(steps[20:]), axis=0) / 2)
@@ -295,7 +295,7 @@ def test_a_part_at_rest_trembles_less_than_what_is_seen_of_it() -> None:
 def test_unseen_it_becomes_less_certain_and_slower(sudden: bool) -> None:
     motion = at_rest(START, np.diag(NOISE**2))
     motion = Motion(START, np.array([0, 0, 0.02, 0.003, 0, 0]), motion.covariance, np.zeros(6))
-    later = motion.ahead(sudden)
+    later = motion.predict(sudden)
     assert_allclose(later.velocity, PERSISTENCE * motion.velocity)
     assert (np.diag(later.pose_covariance) > np.diag(motion.pose_covariance)).all()
     if sudden:

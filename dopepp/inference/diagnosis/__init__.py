@@ -1,38 +1,245 @@
-"""What is wrong where poses are missing or bad: a sentence and a fix for each thing looked at.
+"""Diagnosis of missing or bad poses: one sentence and one fix per check.
 
-A picture is looked at as :meth:`PoseEstimator.predict` does, then in further sizes, and what is
-found is held against its outline. Findings stand in the order of causes: a wrong mesh or a blurred
-picture spoils all that follows, and maps tell least about why they are empty.
+The image is processed as :meth:`PoseEstimator.predict` does and in further sizes, and detections
+are compared with their outline. Checks are in the order of causes: a wrong mesh or a blurred image
+affects all checks after it. Thresholds were measured on rendered images with known faults
+(``benchmarks/doctor.py``).
 
-To add a check, write a function from a :class:`Case` to a :class:`Finding` in ``checks.py`` and
-name it in :data:`CHECKS`, before those whose findings it explains.
+To add a check, write a function from a :class:`Case` to a :class:`Diagnosis` and insert it into
+:data:`CHECKS` before the checks whose failures it explains.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Final
 
-from dopepp.inference.diagnosis.case import Case
-from dopepp.inference.diagnosis.checks import (
-    Finding,
-    camera,
-    exposure,
-    part_size,
-    pose,
-    sharpness,
-    size,
-    visibility,
+import numpy as np
+
+from dopepp.geometry.camera import Letterbox, focal_length
+from dopepp.geometry.cuboid import CENTROID
+from dopepp.geometry.focal import focal_factor
+from dopepp.inference.diagnosis.case import Case, clipped, edge_width, highlights, num_keypoints
+from dopepp.inference.picture import MARGIN
+from dopepp.parts.part import UNITS
+from dopepp.parts.size import is_plausible, size_in_words
+
+__all__ = ["CHECKS", "Case", "Diagnosis", "diagnose"]
+
+SAME: Final = 1.05  # factor on a part's size that simplification of the mesh may cause
+
+DARK: Final = 70.0
+"""Highlights, of 255: 106 and more in good renders, 35 to 60 with a 16th of the light."""
+
+CLIPPED, CLIPPED_PART = 0.25, 0.15
+"""Shares of white in an image and around the part: up to 0.1 in good renders, 0.2 to 0.8 with eight
+times the light."""
+
+BLURRED: Final = 2.5
+"""Width of edges, pixels of the network's input: a blur of two pixels measures 1.1 to 2 and is
+harmless, a blur of five measures 3.2 to 4.7 and costs a quarter of the parts."""
+
+# K is doubted if another focal length (by this factor) fits the keypoints so many times better, and
+# its logarithm is determined to this standard deviation. With the right K the gain is 0.9 to 2.3,
+# with twice or half of it 3 to 20 on a third of the images.
+FOCAL, GAIN, CERTAIN = 1.35, 3.0, 0.2
+
+PARTLY: Final = 0.3
+"""Belief of a centre: 0.4 to 0.8 of half covered parts, mostly below 0.2 on images without it."""
+
+LEAST_SCORE: Final = 0.03
+"""Score of a detected part: false positives of a network that is not tuned have less."""
+
+OFF: Final = 0.08
+"""Reprojection error, share of the part's length on the image: up to 0.06 for good poses."""
+
+AGREEING: Final = 0.6  # share of the outline that agrees: 0.68 to 1 in good renders
+
+ABSENT: Final = (
+    "check that it is on the picture, uncovered, with a side that training showed; else its "
+    "appearance differs from training: train with such materials, light and backgrounds"
 )
 
-__all__ = ["CHECKS", "Case", "Finding", "diagnose"]
 
-CHECKS: Final[tuple[Callable[[Case], Finding], ...]] = (
-    part_size, exposure, sharpness, camera, size, visibility, pose,
-)  # fmt: skip
-"""In the order of causes."""
+@dataclass(frozen=True)
+class Diagnosis:
+    """Result of a check."""
+
+    subject: str  # part, exposure, sharpness, camera, size, visibility or pose
+    sentence: str  # observation
+    fix: str = ""  # remedy; empty if all is well
+
+    def __str__(self) -> str:
+        return f"{self.subject}: {self.sentence}" + (f"; fix: {self.fix}" if self.fix else "")
 
 
-def diagnose(case: Case) -> list[Finding]:
-    """Return a finding of every check, in the order of causes."""
+def part_size(case: Case) -> Diagnosis:
+    """Check whether the parts have a plausible size, and the mesh the size of training."""
+    sizes = []
+    for part, given in zip(case.estimator.parts, case.parts, strict=True):
+        learned = np.ptp(part.cuboid, axis=0)
+        sizes.append(f"{part.name} measures {size_in_words(learned)}")
+        if given.mesh is not None:
+            extents = np.ptp(given.mesh.vertices, axis=0)
+            ratio = float(np.linalg.norm(extents) / np.linalg.norm(learned))
+            if not _near(ratio, SAME):
+                mesh = f"its mesh {size_in_words(extents)}, {ratio:.3g} times that"
+                return Diagnosis("part", f"{sizes[-1]}, and {mesh}", _unit_fix(ratio))
+        if not is_plausible(part):
+            fix = "train again with the unit of the mesh's file: data.unit=mm, cm, m or inch"
+            return Diagnosis("part", f"{sizes[-1]}, which is unlikely", fix)
+    return Diagnosis("part", "; ".join(sizes))
+
+
+def exposure(case: Case) -> Diagnosis:
+    """Check whether the image is dark, or white at the part."""
+    brightest, white, near = highlights(case.image), clipped(case.image), 0.0
+    sentence = f"highlights of {brightest:.0f} of 255, {white:.0%} white without detail"
+    if case.found is not None:
+        near = clipped(case.around())
+        sentence += f", {near:.0%} around the part"
+    if brightest < DARK:
+        return Diagnosis("exposure", f"too dark: {sentence}", "expose longer, or add light")
+    if white > CLIPPED or near > CLIPPED_PART:
+        return Diagnosis("exposure", f"too bright: {sentence}", "expose less, or reduce the light")
+    return Diagnosis("exposure", sentence)
+
+
+def sharpness(case: Case) -> Diagnosis:
+    """Check whether edges are sharp in the size that the network is run on."""
+    width = edge_width(case.around())
+    if width is None:
+        return Diagnosis("sharpness", "too few edges to tell")
+    size = f"{case.box.width}×{case.box.height}"
+    width_image = width / case.box.scale_x
+    sentence = f"edges {width_image:.1f} pixels wide, {width:.1f} in the network's {size}"
+    if width <= BLURRED:
+        return Diagnosis("sharpness", sentence)
+    fix = "focus on the part; if it or the camera moves, use a shorter exposure"
+    return Diagnosis("sharpness", f"blurred: {sentence}", fix)
+
+
+def camera(case: Case) -> Diagnosis:
+    """Check whether K fits the part's perspective and distance."""
+    half = np.array([case.image.shape[1], case.image.shape[0]]) / 2
+    across, down = np.degrees(2 * np.arctan(half / case.K.diagonal()[:2]))
+    sentence = f"K sees {across:.0f}° × {down:.0f}°"
+    if case.found is None:
+        return Diagnosis("camera", sentence)
+    fix = "check K: its size (--K-size), what was cut out (--crop), its calibration"
+    detection, name = case.found, case.part.name
+    lens = focal_factor(case.part.cuboid, detection.peaks, detection.T_cam_obj, case.K)
+    if lens and lens.gain > GAIN and lens.deviation < CERTAIN and not _near(lens.factor, FOCAL):
+        other = f"{name} is seen in the perspective of a focal length {lens.factor:.2g} times K's"
+        return Diagnosis("camera", f"{sentence}, but {other}", fix)
+    ratio = _lens_ratio(case)
+    if ratio is not None:
+        other = f"{name} looks as large as in training, and is {ratio:.2g} times as far away by K"
+        fix = f"right if the lens is {ratio:.2g} times as long as training's; else {fix}"
+        return Diagnosis("camera", f"{sentence}, and {other}", fix)
+    return Diagnosis("camera", sentence)
+
+
+def size(case: Case) -> Diagnosis:
+    """Check whether the part has a distance and a size of training."""
+    name, seen = case.part.name, case.seen
+    if seen is None:
+        return Diagnosis("size", f"the checkpoint does not know in which sizes {name} was trained")
+    near, far = case.distances or seen[2:]
+    usual = f"{near:.2g} – {far:.2g} m"
+    if case.found is None:
+        return Diagnosis("size", f"{name} is looked for at {usual}, and nearer and farther")
+    z = float(case.found.T_cam_obj[2, 3])
+    sentence = f"{name} is {case.length_px:.0f} pixels long at {z:.3g} m"
+    if case.elsewhere is None:
+        return Diagnosis("size", f"{sentence}; it is looked for at {usual}")
+    fix = f"bring it to {usual}, or look there: --distance {0.9 * z:.2g} {1.1 * z:.2g}"
+    if not _near(z / math.sqrt(near * far), 5):
+        fix += "; such a factor may also be the unit of the part's mesh or of a distance"
+    return Diagnosis("size", f"{sentence}, and nothing is found at {usual}", fix)
+
+
+def visibility(case: Case) -> Diagnosis:
+    """Check how much of the part the network sees, and what its maps lack."""
+    name = case.part.name
+    if case.found is not None:
+        count, score = num_keypoints(case.found), case.found.score
+        sentence = f"{count} of 9 keypoints of {name}, score {score:.2g}"
+        if score >= LEAST_SCORE:
+            return Diagnosis("visibility", sentence)
+        problem = f"what looks most like {name} hardly does: {sentence}"
+        return Diagnosis("visibility", problem, ABSENT)
+    beliefs = case.strongest_beliefs()
+    centre, count = float(beliefs[CENTROID]), int((beliefs > PARTLY).sum())
+    if centre < PARTLY:
+        belief = f"the belief of its centre is {centre:.2g} at most"
+        return Diagnosis("visibility", f"nothing like {name} is seen, {belief}", ABSENT)
+    return Diagnosis(
+        "visibility",
+        f"{name} is seen in part: its centre with a belief of {centre:.2g} and {count} of 9 "
+        "keypoints, which make no pose that can be trusted",
+        "uncover it, and keep all of it within the picture, not nearer than in training",
+    )
+
+
+def pose(case: Case) -> Diagnosis:
+    """Check whether keypoints and outline agree with the pose."""
+    if case.found is None:
+        return Diagnosis("pose", "none to look at")
+    detection, refined, name = case.found, case.refined, case.part.name
+    share = detection.reprojection_error_px / case.length_px
+    sentence = f"{name}'s keypoints are {detection.reprojection_error_px:.1f} pixels off it"
+    if share > OFF:
+        fix = "check K and the mesh; if both are right, train longer or with more such pictures"
+        return Diagnosis("pose", f"{sentence}, {share:.0%} of its length", fix)
+    if refined is None:
+        return Diagnosis("pose", f"{sentence}; without a mesh its outline is not looked at")
+    if refined.agreement is None:
+        fix = "another background or light; check that the mesh is this part's (--part)"
+        sentence += f", its outline tells nothing: {refined.kept}"
+        return Diagnosis("pose", sentence, fix if case.estimator.refiner is not None else "")
+    sentence += f", {refined.agreement:.0%} of its outline agrees"
+    fix = "uncover the part; check that the mesh is this part's (--part)"
+    return Diagnosis("pose", sentence, "" if refined.agreement >= AGREEING else fix)
+
+
+Check = Callable[[Case], Diagnosis]
+
+CHECKS: Final[Sequence[Check]] = (part_size, exposure, sharpness, camera, size, visibility, pose)
+"""Checks, in the order of causes."""
+
+
+def diagnose(case: Case) -> list[Diagnosis]:
+    """Return the result of every check, in the order of causes."""
     return [check(case) for check in CHECKS]
+
+
+def _lens_ratio(case: Case) -> float | None:
+    """Return the ratio of K's focal length to that of training.
+
+    None unless that places a part of usual size on the image outside the distances of training.
+    """
+    if case.seen is None or case.distances is not None or case.found is None:
+        return None
+    learned = Letterbox.fit(case.image.shape[1::-1], case.estimator.checkpoint.input_size)
+    length, z = case.length_px * learned.scale_x, float(case.found.T_cam_obj[2, 3])
+    smallest, largest, near, far = case.seen
+    if near / MARGIN < z < far * MARGIN or not smallest / MARGIN < length < largest * MARGIN:
+        return None
+    ratio = focal_length(case.K) * learned.scale_x * case.part.diameter / (smallest * far)
+    return None if _near(ratio, FOCAL) else ratio
+
+
+def _near(ratio: float, factor: float) -> bool:
+    return 1 / factor < ratio < factor
+
+
+def _unit_fix(ratio: float) -> str:
+    """Return which unit explains a mesh that is too large by a ratio."""
+    for read, metres in UNITS.items():
+        for actual, actual_metres in UNITS.items():
+            if read != actual and _near(ratio * actual_metres / metres, SAME):
+                return f"it was read in {read} and is in {actual}: --unit {actual}"
+    return "pass the mesh of the part that the network learned: --part"

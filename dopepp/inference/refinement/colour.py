@@ -1,9 +1,9 @@
-"""Colours inside a part's outline against those around it: how much each pixel looks like the part.
+"""Colours of the part and its surroundings: the log odds that a pixel shows the part.
 
-Both are histograms of 16 steps a channel, blurred a little, and the answer is the logarithm of
-their ratio at a pixel's colour. A colour that neither has seen says nothing. A part may be of
-several colours and lie before several: each tile of its box counts its own and its neighbours'
-pixels most, and the others a little (local histograms, Lankton and Tannenbaum 2008; RBOT).
+Colours inside and around the outline are counted in histograms with 16 bins per channel, blurred a
+little. The log odds are the logarithm of their ratio at a pixel's colour, 0 for a colour in neither
+of them. Part and background may have several colours: each tile of the part's box has histograms
+of its own, with a small weight of the other tiles (Lankton and Tannenbaum 2008; RBOT).
 """
 
 from __future__ import annotations
@@ -18,32 +18,34 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
 from dopepp.core.compiled import Array, Scalar, compiled
+from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix, crop_camera, resize_camera
+from dopepp.inference.refinement.solver import UndecidedError
 
-SMALLEST_PX: Final = 12  # A part that is shorter on the picture shows no outline
-MARGIN: Final = 0.35  # of the part's extent, looked at around it
-EDGE_PX: Final = 6.0  # looked at around it besides: an outline is looked for no nearer
-STEPS: Final = 16  # of a channel
-UNSEEN: Final = 0.3  # pixels of each colour that both histograms have from the start
+SMALLEST_PX: Final = 12  # length below which a part shows no outline
+MARGIN: Final = 0.35  # margin of a crop, share of the part's extent
+EDGE_PX: Final = 6.0  # additional margin: the least search distance of an outline
+STEPS: Final = 16  # bins per channel
+UNSEEN: Final = 0.3  # initial count of each colour in both histograms
 
 KNOWN: Final = 100.0
-"""Pixels that the whole part's colours, and those all around, count for in each tile."""
+"""Pixels by which the colours of all tiles count in each tile."""
 
 MOST: Final = 3.0
-"""Bound of the logarithm: no colour proves more than 20 to 1, because colours come in patches."""
+"""Bound of the log odds, 20 to 1: pixels of a patch are not independent."""
 
-LONGEST_PX: Final = 250  # of larger pictures, not every pixel is counted
-FEWEST: Final = 60  # pixels that a histogram needs
+LONGEST_PX: Final = 250  # pixels of larger crops are subsampled
+FEWEST: Final = 60  # pixels of a histogram, at least
 
 
 @dataclass(frozen=True, eq=False)
 class Crop:
-    """A piece of a picture."""
+    """A part and its surroundings, cut from an image and shrunk."""
 
-    colours: UInt8[np.ndarray, "height width 3"]  # RGB
-    K: CameraMatrix  # its camera matrix, pixels
-    extent: float  # longer side of the part on it, pixels
-    scale: float  # its pixels per pixel of the picture: 1 over a whole number
+    colours: Picture  # RGB
+    K: CameraMatrix  # camera matrix of the crop, pixels
+    extent: float  # longer side of the part, pixels of the crop
+    scale: float  # pixels of the crop per pixel of the image: 1 over an integer
 
     @property
     def size(self) -> tuple[int, int]:
@@ -52,52 +54,53 @@ class Crop:
 
     @cached_property
     def bins(self) -> Int[np.ndarray, "height width"]:
-        """The colours as one number a pixel; of rounds that are left out, nobody asks for it."""
+        """Colour bins, computed on first use: rounds may be left out."""
         return colour_bins(self.colours)
 
 
 def crop_around(
-    image: UInt8[np.ndarray, "height width 3"],
+    image: Picture,
     K: CameraMatrix,
     corners: Float[np.ndarray, "2 2"],
     longest_px: int,
-) -> Crop | str:
-    """Cut out a posed part and what is around it; where there is too little, say so.
+) -> Crop:
+    """Cut out a posed part and its surroundings.
 
     Args:
         image: RGB.
-        K: Its camera matrix, pixels.
-        corners: The upper left and the lower right one of the part's box on it.
-        longest_px: About so long is the part on the crop at most.
+        K: Camera matrix, pixels.
+        corners: Upper left and lower right corner of the part's box, pixels.
+        longest_px: Approximate upper limit of the part's length on the crop.
+
+    Raises:
+        UndecidedError: The part is too small or outside the image.
     """
     lower, upper = corners
     extent = float((upper - lower).max())
     if extent < SMALLEST_PX:
-        return f"the part is only {extent:.0f} pixels long"
+        raise UndecidedError(f"the part is only {extent:.0f} pixels long")
     edge = MARGIN * extent + EDGE_PX
     limit = np.array(image.shape[1::-1])
     left, top = np.clip(np.floor(lower - edge), 0, limit).astype(int)
     right, bottom = np.clip(np.ceil(upper + edge) + 1, 0, limit).astype(int)
     if min(right - left, bottom - top) < SMALLEST_PX:
-        return "the part lies outside the picture"
-    # Whole numbers of pixels become one: that is exact, and many times faster than any other share.
+        raise UndecidedError("the part lies outside the picture")
+    # Shrinking by an integer is exact, and much faster than by other factors.
     most = min(right - left, bottom - top) // SMALLEST_PX
-    few = min(max(1, round(extent / longest_px)), most)
-    width, height = (right - left) // few, (bottom - top) // few
-    colours = image[top : top + few * height, left : left + few * width]
-    own = crop_camera(K, left, top)
-    if few == 1:
-        colours = colours.copy()  # one kind of array, whose inner loops are compiled once
+    factor = min(max(1, round(extent / longest_px)), most)
+    width, height = (right - left) // factor, (bottom - top) // factor
+    colours = image[top : top + factor * height, left : left + factor * width]
+    K = crop_camera(K, left, top)
+    if factor == 1:
+        colours = colours.copy()  # contiguous like a resized crop: kernels are compiled once
     else:
-        own = resize_camera(own, 1 / few, 1 / few)
+        K = resize_camera(K, 1 / factor, 1 / factor)
         colours = cv2.resize(colours, (width, height), interpolation=cv2.INTER_AREA)
-    return Crop(colours, own, extent / few, 1 / few)
+    return Crop(colours, K, extent / factor, 1 / factor)
 
 
-def colour_bins(
-    image: UInt8[np.ndarray, "height width 3"],
-) -> Int[np.ndarray, "height width"]:
-    """Return each pixel's colour as one number below 4096."""
+def colour_bins(image: Picture) -> Int[np.ndarray, "height width"]:
+    """Return each pixel's colour bin, below 4096."""
     bins = np.empty(image.shape[:2], np.int16)
     _bins(image, bins)
     return bins
@@ -110,17 +113,17 @@ def log_odds(
     ring: float,
     tiles: int,
 ) -> Float32[np.ndarray, "height width"] | None:
-    """Return the logarithm of part against surroundings for every pixel.
+    """Return the log odds of part against surroundings for every pixel.
 
     Args:
-        bins: The colours.
-        mask: 1 where the part is taken to be.
-        unsure: Pixels on both sides of the outline that count for neither.
+        bins: Colour bins.
+        mask: 1 at the assumed pose of the part.
+        unsure: Width on both sides of the outline that counts for neither, pixels.
         ring: Width of the surroundings, pixels.
-        tiles: Along each side of the part's box; each has colours of its own.
+        tiles: Tiles along each side of the part's box.
 
     Returns:
-        None where one of them has too few pixels on the picture.
+        None if part or surroundings have too few pixels on the image.
     """
     thinned = math.ceil(max(mask.shape) / LONGEST_PX)
     few, unsure, ring = mask[::thinned, ::thinned], unsure / thinned, ring / thinned
@@ -132,11 +135,9 @@ def log_odds(
     columns = _tile_of(bins.shape[1], left * thinned, width * thinned, tiles)
     rows = _tile_of(bins.shape[0], top * thinned, height * thinned, tiles)
     counts = np.zeros((2, tiles, tiles, STEPS**3), np.float32)
-    counted = _count(
-        bins[::thinned, ::thinned], within, beyond, unsure_within, unsure, unsure + ring,
-        rows[::thinned], columns[::thinned], counts,
-    )  # fmt: skip
-    if counted < FEWEST:
+    sparse = bins[::thinned, ::thinned], rows[::thinned], columns[::thinned]
+    limits = unsure_within, unsure, unsure + ring
+    if _count(*sparse, within, beyond, *limits, counts) < FEWEST:
         return None
     tables = np.empty((tiles, tiles, STEPS**3), np.float32)
     _tables(counts, tables)
@@ -146,7 +147,7 @@ def log_odds(
 
 
 def _tile_of(length: int, start: int, extent: int, tiles: int) -> Int[np.ndarray, "length"]:
-    """Return the tile of each place along a side; those before and beyond the box are its ends'."""
+    """Return the tile of each pixel along a side; pixels outside the box belong to its ends."""
     return np.clip((np.arange(length) - start) * tiles // max(extent, 1), 0, tiles - 1)
 
 
@@ -161,16 +162,16 @@ def _bins(image: Array, bins: Array) -> None:
 @compiled()
 def _count(
     bins: Array,
+    rows: Array,
+    columns: Array,
     within: Array,
     beyond: Array,
     nearest_within: float,
     nearest: float,
     farthest: float,
-    rows: Array,
-    columns: Array,
     counts: Array,
 ) -> int:
-    """Count the colours of the part and around it in every tile; return how many the fewer are."""
+    """Count the colours of part and surroundings per tile; return the smaller number of pixels."""
     inside = outside = 0
     for v in range(bins.shape[0]):
         for u in range(bins.shape[1]):
@@ -185,25 +186,25 @@ def _count(
 
 @compiled()
 def _tables(counts: Array, tables: Array) -> None:
-    """Write the logarithm of the ratio for every tile and colour; ``counts`` are blurred."""
+    """Write the log odds of every tile and colour; ``counts`` are blurred in place."""
     tiles = counts.shape[1]
-    known, near = np.empty((2, STEPS**3), np.float32), np.empty((2, STEPS**3), np.float32)
+    total, near = np.empty((2, STEPS**3), np.float32), np.empty((2, STEPS**3), np.float32)
     for side in range(2):
         for k in range(STEPS**3):
-            known[side, k] = UNSEEN
+            total[side, k] = UNSEEN
         for i in range(tiles):
             for j in range(tiles):
                 _blur(counts[side, i, j])
                 for k in range(STEPS**3):
-                    known[side, k] += counts[side, i, j, k]
-        factor = KNOWN / _sum(known[side])
+                    total[side, k] += counts[side, i, j, k]
+        factor = KNOWN / _sum(total[side])
         for k in range(STEPS**3):
-            known[side, k] *= factor
+            total[side, k] *= factor
     for i in range(tiles):
         for j in range(tiles):
             for side in range(2):
                 for k in range(STEPS**3):
-                    near[side, k] = known[side, k]
+                    near[side, k] = total[side, k]
                 for a in range(max(0, i - 1), min(tiles, i + 2)):
                     for b in range(max(0, j - 1), min(tiles, j + 2)):
                         share = np.float32(0.5 ** (abs(a - i) + abs(b - j)))
@@ -247,7 +248,7 @@ def _blur(counts: Array) -> None:
 def _blur_row(counts: Array, first: int, stride: int) -> None:
     before = counts[first]
     for i in range(STEPS):
-        own = counts[first + i * stride]
+        count = counts[first + i * stride]
         after = counts[first + min(i + 1, STEPS - 1) * stride]
-        counts[first + i * stride] = 0.25 * before + 0.5 * own + 0.25 * after
-        before = own
+        counts[first + i * stride] = 0.25 * before + 0.5 * count + 0.25 * after
+        before = count

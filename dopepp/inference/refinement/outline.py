@@ -1,12 +1,12 @@
 """The outline of a mesh at a pose: its silhouette, and points on the silhouette's border.
 
-The triangles of a closed mesh that face the camera cover all that the mesh covers, and each covers
-a pixel once. So does their common border wind around it as often as they cover it, and few edges
-are on that border: they are crossed row by row. Of an open mesh every triangle is filled.
+The mask of a closed mesh is that of its triangles that face the camera. Their common border winds
+around a pixel as often as they cover it, so only the few edges on this border are filled, row by
+row. In an open mesh, every triangle is filled.
 
-An edge may belong to the outline where one of its triangles faces the camera and the other does
-not, or where it has one triangle only. Which of these edges really do is read off the filled mask:
-the part ends there. Edges behind or before other surface of the part have the part on both sides.
+An edge can belong to the outline if exactly one of its triangles faces the camera, or if it has one
+triangle only. The filled mask shows which of these edges do: the part ends there. Other edges have
+the part on both sides.
 """
 
 from __future__ import annotations
@@ -24,38 +24,38 @@ from dopepp.parts.mesh import Faces, Vertices, face_areas, weld
 from dopepp.parts.mesh.decimate import decimate
 from dopepp.parts.part import MAX_LIGHT_FACES
 
-NEAR: Final = 1e-3  # metres before the camera that every vertex must keep
+NEAR: Final = 1e-3  # least depth of every vertex, metres
 
 WINDOW_PX: Final = 3.0
-"""Radius of the disc of the mask in which a point's outward direction is read."""
+"""Radius of the disc of the mask that determines a point's outward direction."""
 
 BESIDE_PX: Final = 1.25
-"""Distance from the outline at which there is part on one side and none on the other."""
+"""Distance from the outline at which the mask must differ on both sides."""
 
 LONG_PX: Final = 4.0
-"""Edges of at least this length have their own normal; shorter ones zigzag about the outline."""
+"""Least length of an edge that determines the normal; shorter edges zigzag."""
 
 
 @dataclass(frozen=True, eq=False)
 class OutlineMesh:
-    """Triangles with what their outlines need."""
+    """A mesh, prepared for silhouettes and outlines."""
 
     vertices: Vertices  # positions, metres
     faces: Faces  # corners of each triangle
-    # Normal of each triangle (of any length) and its product with a corner
+    # Normal of each triangle (of any length) and its dot product with a corner
     planes: Float[np.ndarray, "faces 4"]
     edges: Int[np.ndarray, "edges 2"]  # the two vertices of each edge
-    # The two triangles at it; the second is −1 where there is one only
+    # Two triangles of each edge; the second is −1 if there is one only
     sides: Int[np.ndarray, "edges 2"]
-    # 1 where these two run along it in the same direction, else 0
+    # 1 if both triangles run along the edge in the same direction, else 0
     opposed: UInt8[np.ndarray, "edges"]
-    is_closed: bool  # whether the triangles that face the camera hide all others
+    is_closed: bool  # whether triangles that face the camera hide all others
 
 
 def make_outline_mesh(
     vertices: Vertices, faces: Faces, max_faces: int = MAX_LIGHT_FACES
 ) -> OutlineMesh:
-    """Prepare triangles; more than ``max_faces`` of them are replaced by fewer.
+    """Prepare a mesh; it is simplified to at most ``max_faces`` triangles.
 
     Raises:
         ValueError: The triangles have no area.
@@ -75,40 +75,37 @@ def make_outline_mesh(
     order = np.argsort(keys, kind="stable")
     first = np.flatnonzero(np.diff(keys[order], prepend=-1))
     uses = np.diff(first, append=len(keys))
-    one, other = order[first], order[np.where(uses > 1, first + 1, first)]
-    opposed = (start[one] == start[other]) & (uses > 1)
-    return OutlineMesh(
-        vertices, faces, planes,
-        edges=np.stack([start[one], end[one]], axis=1),
-        sides=np.stack([one // 3, np.where(uses > 1, other // 3, -1)], axis=1),
-        opposed=opposed.astype(np.uint8),
-        is_closed=bool((uses == 2).all() and not opposed.any()),
-    )  # fmt: skip
+    left, right = order[first], order[np.where(uses > 1, first + 1, first)]
+    opposed = (start[left] == start[right]) & (uses > 1)
+    edges = np.stack([start[left], end[left]], axis=1)
+    sides = np.stack([left // 3, np.where(uses > 1, right // 3, -1)], axis=1)
+    is_closed = bool((uses == 2).all() and not opposed.any())
+    return OutlineMesh(vertices, faces, planes, edges, sides, opposed.astype(np.uint8), is_closed)
 
 
 @dataclass(frozen=True, eq=False)
-class Posed:
+class PosedMesh:
     """A mesh at a pose."""
 
-    T_cam_obj: Transform  # the pose
+    T_cam_obj: Transform
     arms: Float[np.ndarray, "vertices 3"]  # vertices from the object's origin, camera axes, metres
-    pixels: Float[np.ndarray, "vertices 2"]  # where they are on the picture
-    front: Bool[np.ndarray, "faces"]  # which triangles face the camera
+    pixels: Float[np.ndarray, "vertices 2"]  # projected vertices
+    front: Bool[np.ndarray, "faces"]  # whether each triangle faces the camera
 
 
-def posed(mesh: OutlineMesh, T_cam_obj: Transform, K: CameraMatrix) -> Posed | None:
-    """Put a mesh at a pose; None where some of it is not before the camera."""
+def posed(mesh: OutlineMesh, T_cam_obj: Transform, K: CameraMatrix) -> PosedMesh | None:
+    """Project a mesh; None if some of it is not in front of the camera."""
     arms, pixels = np.empty_like(mesh.vertices), np.empty((len(mesh.vertices), 2))
     front = np.empty(len(mesh.faces), np.bool_)
     if not _pose(mesh.vertices, mesh.planes, T_cam_obj, K, arms, pixels, front):
         return None
-    return Posed(T_cam_obj, arms, pixels, front)
+    return PosedMesh(T_cam_obj, arms, pixels, front)
 
 
 def filled_mask(
-    mesh: OutlineMesh, at: Posed, size: tuple[int, int]
+    mesh: OutlineMesh, at: PosedMesh, size: tuple[int, int]
 ) -> UInt8[np.ndarray, "height width"]:
-    """Return 1 at the pixels of (width, height) whose centres a posed mesh covers, else 0."""
+    """Return a mask of (width, height): 1 if the mesh covers the pixel's centre, else 0."""
     width, height = size
     mask = np.zeros((height, width), np.uint8)
     if mesh.is_closed:
@@ -124,36 +121,33 @@ class Contour:
     """Points on the outline of a posed part."""
 
     arms: Float[np.ndarray, "points 3"]  # from the object's origin to each, camera axes, metres
-    pixels: Float[np.ndarray, "points 2"]  # where they are on the picture
-    # Unit vectors on the picture that point away from the part
-    normals: Float[np.ndarray, "points 2"]
+    pixels: Float[np.ndarray, "points 2"]
+    normals: Float[np.ndarray, "points 2"]  # unit vectors on the image, pointing outwards
 
     def __len__(self) -> int:
         return len(self.pixels)
 
 
 def find_contour(
-    mesh: OutlineMesh, at: Posed, mask: UInt8[np.ndarray, "height width"], spacing: float
+    mesh: OutlineMesh, at: PosedMesh, mask: UInt8[np.ndarray, "height width"], spacing: float
 ) -> Contour:
-    """Find the points of an outline, about ``spacing`` pixels apart, that are on the picture.
+    """Return the points of an outline that are on the image.
 
     Args:
-        mesh: The mesh.
-        at: It at the pose.
-        mask: It filled.
-        spacing: Pixels.
+        mesh: Mesh.
+        at: Mesh at its pose.
+        mask: Filled mask of the posed mesh.
+        spacing: Approximate distance between points, pixels.
     """
-    rows = _walk(
-        mesh.edges, mesh.sides, mesh.opposed, at.front, at.arms, at.pixels,
-        float(at.T_cam_obj[2, 3]), mask, spacing,
-    )  # fmt: skip
+    edges, distance = (mesh.edges, mesh.sides, mesh.opposed), float(at.T_cam_obj[2, 3])
+    rows = _walk(*edges, at.front, at.arms, at.pixels, distance, mask, spacing)
     return Contour(rows[:, :3], rows[:, 3:5], rows[:, 5:])
 
 
 def outline_rows(
     contour: Contour, T_cam_obj: Transform, K: CameraMatrix
 ) -> Float[np.ndarray, "points 6"]:
-    """Return how each point moves along its normal, pixels, with (turn, shift) of the pose."""
+    """Return the derivative of each point's motion along its normal, pixels, by the pose."""
     rows = np.empty((len(contour), 6))
     _rows(contour.arms, contour.normals, T_cam_obj, K, rows)
     return rows
@@ -163,7 +157,7 @@ def outline_rows(
 def _pose(
     vertices: Array, planes: Array, T: Array, K: Array, arms: Array, pixels: Array, front: Array
 ) -> bool:
-    """Write arms, pixels and facing; False where a vertex is not before the camera."""
+    """Write arms, pixels and facing; return False if a vertex is not in front of the camera."""
     for i in range(len(vertices)):
         for r in range(3):
             arms[i, r] = (
@@ -174,7 +168,7 @@ def _pose(
             return False
         pixels[i, 0] = K[0, 0] * (arms[i, 0] + T[0, 3]) / z + K[0, 2]
         pixels[i, 1] = K[1, 1] * (arms[i, 1] + T[1, 3]) / z + K[1, 2]
-    # The camera's place in the object's frame.
+    # Camera centre in the object frame.
     x = -(T[0, 0] * T[0, 3] + T[1, 0] * T[1, 3] + T[2, 0] * T[2, 3])
     y = -(T[0, 1] * T[0, 3] + T[1, 1] * T[1, 3] + T[2, 1] * T[2, 3])
     z = -(T[0, 2] * T[0, 3] + T[1, 2] * T[1, 3] + T[2, 2] * T[2, 3])
@@ -207,7 +201,7 @@ def _fill(pixels: Array, faces: Array, mask: Array) -> None:
                 x = pixels[i, 0] + slope * (v - y)
                 left[v], right[v] = min(left[v], x), max(right[v], x)
         for v in range(first, last + 1):
-            # Rounding must not open a gap between two triangles.
+            # Rounding must not open gaps between triangles.
             start, end = max(0.0, math.ceil(left[v] - 1e-9)), min(width - 1.0, right[v] + 1e-9)
             if end >= start:
                 mask[v, int(start) : int(end) + 1] = 1
@@ -217,17 +211,17 @@ def _fill(pixels: Array, faces: Array, mask: Array) -> None:
 def _wind(
     pixels: Array, edges: Array, sides: Array, front: Array, turns: Array, mask: Array
 ) -> None:
-    """Set the pixels whose centres the border of the triangles that face the camera winds around.
+    """Set the pixels that the border of the triangles facing the camera winds around.
 
-    ``turns`` is as high as the mask and wider by one, and zero: it counts crossings.
+    ``turns`` counts crossings; it is one pixel wider than the mask, and initially zero.
     """
     height, width = mask.shape
     for e in range(len(edges)):
-        one, other = front[sides[e, 0]], front[sides[e, 1]]
-        if one == other:
+        is_front = front[sides[e, 0]]
+        if is_front == front[sides[e, 1]]:
             continue
-        # An edge runs as its first triangle does, and against its second one.
-        i, j = (edges[e, 0], edges[e, 1]) if one else (edges[e, 1], edges[e, 0])
+        # An edge has the direction of its first triangle, and opposes its second one.
+        i, j = (edges[e, 0], edges[e, 1]) if is_front else (edges[e, 1], edges[e, 0])
         way = 1
         if pixels[i, 1] > pixels[j, 1]:
             i, j, way = j, i, -1
@@ -255,12 +249,12 @@ def _walk(
     mask: Array,
     spacing: float,
 ) -> Array:
-    """Return arm, pixel and normal of a point every ``spacing`` pixels along all edges in turn."""
+    """Return arm, pixel and normal of points every ``spacing`` pixels along all edges."""
     rows, count, left = np.empty((256, 7)), 0, 0.5 * spacing
     normal = np.empty(2)
     for e in range(len(edges)):
-        one, other = sides[e, 0], sides[e, 1]
-        if other >= 0 and (front[one] != front[other]) == (opposed[e] == 1):
+        first, second = sides[e, 0], sides[e, 1]
+        if second >= 0 and (front[first] != front[second]) == (opposed[e] == 1):
             continue
         i, j = edges[e, 0], edges[e, 1]
         x, y = pixels[i, 0], pixels[i, 1]
@@ -278,7 +272,7 @@ def _walk(
                     for c in range(7):
                         longer[k, c] = rows[k, c]
                 rows = longer
-            # Halfway on the picture is not halfway in space.
+            # Perspective: halfway on the image is not halfway in space.
             zi, zj = arms[i, 2] + distance, arms[j, 2] + distance
             share = share * zi / (share * zi + (1.0 - share) * zj)
             for c in range(3):
@@ -294,11 +288,11 @@ def _walk(
 def _outward(
     mask: Array, u: float, v: float, dx: float, dy: float, length: float, normal: Array
 ) -> bool:
-    """Write the direction away from the mask; tell whether the mask ends at this point."""
+    """Write the outward direction at a point; return whether the mask ends there."""
     height, width = mask.shape
     if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
         return False
-    # The filled pixels around lie, on average, on the inside.
+    # Filled pixels in the disc lie, on average, on the inside.
     x = y = 0.0
     for row in range(math.ceil(v - WINDOW_PX), math.floor(v + WINDOW_PX) + 1):
         for column in range(math.ceil(u - WINDOW_PX), math.floor(u + WINDOW_PX) + 1):

@@ -1,9 +1,10 @@
-"""Poses made precise: one solver, and the evidence that ``refine=`` names as its terms.
+"""Refinement of poses: one solver, and the evidence that ``refine=`` names as its terms.
 
-``region`` is the outline on the picture, ``depth`` a depth image. Where both are asked for, the
-picture alone leads to a start, or depth where the picture does not decide or leads too far from the
-measured surface; from there both pull at once. What does not decide is left out: without depth the
-picture refines alone, and depth alone where part and background are of one colour.
+``region`` is the outline on the image, ``depth`` a depth image. With both, the image alone is
+refined first. If it does not determine the pose, or ends too far from the measured surface, depth
+alone provides the start. From there both terms are used. Evidence that does not determine the pose
+is left out: without depth the image refines alone, and depth alone if part and background have the
+same colour.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from dopepp.geometry.pnp import solve_pnp
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.picture import Depth
 from dopepp.inference.refinement.depth import DepthEvidence
+from dopepp.inference.refinement.part_surface import FEWEST_POINTS, Points, surface_points
 from dopepp.inference.refinement.region import RegionRefiner, Starts, refinement
 from dopepp.inference.refinement.solver import (
     PoseMatrix,
@@ -43,7 +45,6 @@ from dopepp.inference.refinement.solver import (
     UndecidedError,
     make_prior,
 )
-from dopepp.inference.refinement.surface import FEWEST_POINTS, Points, surface_points
 from dopepp.parts.part import Part
 
 if TYPE_CHECKING:
@@ -52,24 +53,31 @@ if TYPE_CHECKING:
 TERMS: Final = ("region", "depth")
 
 LOOSER: Final = 3.0
-"""Factor on the deviations of a network's pose: its covariance was learned on pictures like those
-of its training, and it is farther off on others."""
+"""Factor on the deviations of a network's pose: its covariance was fitted to images like those of
+training, and errors are larger on others."""
 
-FEW: Final = 4  # keypoints that fix a pose
+FEW: Final = 4  # keypoints that determine a pose
 NUM_QUADRUPLES: Final = 40  # of the 126 of nine keypoints
 
-Refine = str | Sequence[str]  # what `refine=` takes: one of TERMS, or several
+Refine = str | Sequence[str]  # one or several of TERMS
 
 
 class Refiner:
-    """Refines the detections of some parts by one or several of :data:`TERMS`.
+    """Refines the detections of several parts.
+
+    Args:
+        refine: One or several of :data:`TERMS`.
+        parts: Parts, with meshes for the term ``region``.
 
     Raises:
-        UserError: There is no such term, or a part has no mesh whose outline it could use.
+        UserError: There is no such term, or a part has no mesh.
     """
 
     def __init__(self, refine: Refine, parts: Sequence[Part]) -> None:
-        terms = checked_terms(refine)
+        terms = (refine,) if isinstance(refine, str) else tuple(refine)
+        if not terms or not set(terms) <= set(TERMS):
+            allowed = f"{', '.join(TERMS)}, several of them, or none"
+            raise UserError(f"refine={refine!r}", allowed, "choose among them")
         self._refiners = {part.name: PartRefiner(part, terms) for part in parts}
         self._cuboids = {part.name: part.cuboid for part in parts}
 
@@ -99,31 +107,31 @@ class Refiner:
         )
 
 
-def checked_terms(refine: Refine) -> tuple[str, ...]:
-    """Return the names of the terms; a :class:`UserError` for what is none of them."""
-    terms = (refine,) if isinstance(refine, str) else tuple(refine)
-    if not terms or not set(terms) <= set(TERMS):
-        allowed = f"{', '.join(TERMS)}, several of them, or none"
-        raise UserError(f"refine={refine!r}", allowed, "choose among them")
-    return terms
-
-
 class PartRefiner:
     """Refines the poses of one part.
 
     Args:
-        part: The part.
-        terms: The evidence, some of :data:`TERMS`.
+        part: Part.
+        terms: Evidence, some of :data:`TERMS`.
 
     Raises:
-        UserError: The picture's outline is asked for, and the part has no mesh.
+        UserError: The term ``region`` requires a mesh, and the part has none.
     """
 
     def __init__(self, part: Part, terms: Sequence[str]) -> None:
-        self._region = _region(part) if "region" in terms else None
-        self._by_depth, self._diameter = "depth" in terms, part.diameter
-        large = self._by_depth and len(part.points) >= FEWEST_POINTS
-        self._surface = surface_points(part.points) if large else None
+        self._region: RegionRefiner | None = None
+        if "region" in terms:
+            if part.mesh is None:
+                raise UserError(
+                    f"refine=region and no mesh of {part.name} in the checkpoint",
+                    "a mesh of every part of the checkpoint",
+                    f"add --part {part.name}=FILE and its --unit (parts=… in Python), "
+                    "or train again",
+                )
+            self._region = RegionRefiner(part.mesh.vertices, part.mesh.faces)
+        self._uses_depth, self._diameter = "depth" in terms, part.diameter
+        has_surface = self._uses_depth and len(part.points) >= FEWEST_POINTS
+        self._surface = surface_points(part.points) if has_surface else None
 
     def refine(
         self,
@@ -139,75 +147,101 @@ class PartRefiner:
 
         Args:
             image: RGB.
-            K: Its camera matrix, pixels.
-            T_cam_obj: The pose to start from, metres.
-            covariance: Of the given pose: rotation vector about the object's origin and shift, both
-                in camera axes, radians and metres. Without it, a broad one is taken.
+            K: Camera matrix, pixels.
+            T_cam_obj: Start pose, metres.
+            covariance: Covariance of the start pose (default: broad): rotation vector about the
+                object's origin and shift, both in camera axes, radians and metres.
             depth: Metres along z, aligned to the image, 0 where unknown.
-            followed: Whether the pose follows from one that was refined on the frame before.
-            starts: As :meth:`RegionRefiner.refine` takes it.
+            followed: Whether the part was refined on the previous frame.
+            starts: Further start poses; see :meth:`RegionRefiner.refine`.
 
         Returns:
-            The refined pose with its covariance, or the given one with the reason why it was kept.
+            The refined pose and its covariance, or the given pose and the reason why it was kept.
         """
         given = np.asarray(T_cam_obj, np.float64)
-        if not np.isfinite(given).all():
-            return Refinement(given, reason="the pose is not finite")
-        alone = None
+        by_image = None
         if self._region is not None:
-            alone = self._region.refine(image, K, given, covariance, followed, starts)
-        if alone is not None and (depth is None or not self._by_depth):
-            return alone
+            by_image = self._region.refine(image, K, given, covariance, followed, starts)
+            if depth is None or not self._uses_depth:
+                return by_image
         try:
-            measured = self._measured(K, given, covariance, depth)
-            if self._region is None or alone is None:
-                return _by_depth(measured, measured.descend())
-            return _by_both(self._region, image, K, alone, measured)
+            if depth is None:
+                raise UndecidedError("no depth image was given")
+            if self._surface is None:
+                raise UndecidedError("the part has too few surface points")
+            prior = make_prior(given, self._diameter, covariance)
+            evidence = DepthEvidence(self._surface, self._diameter, depth, K, prior)
+            if self._region is None or by_image is None:
+                return _checked(evidence, evidence.descend())
+            return _refine_with_both(self._region, image, K, by_image, evidence)
         except UndecidedError as undecided:
-            return alone or Refinement(given, reason=str(undecided))
+            return by_image or Refinement(given, reason=str(undecided))
 
-    def _measured(
-        self,
-        K: CameraMatrix,
-        given: Transform,
-        covariance: PoseMatrix | None,
-        depth: Depth | None,
-    ) -> DepthEvidence:
-        """Return what depth says; an :class:`UndecidedError` where that is nothing."""
-        if depth is None:
-            raise UndecidedError("no depth image was given")
-        if self._surface is None:
-            raise UndecidedError("the part has too few surface points")
-        prior = make_prior(given, self._diameter, covariance)
-        return DepthEvidence(self._surface, self._diameter, depth, K, prior)
+
+def _checked(evidence: DepthEvidence, end: Solution) -> Refinement:
+    """Return the end of a descent by depth alone, if depth confirms it."""
+    evidence.check(end.T_cam_obj)
+    return Refinement(end.T_cam_obj, np.linalg.inv(end.information))
+
+
+def _refine_with_both(
+    region: RegionRefiner,
+    image: Picture,
+    K: CameraMatrix,
+    by_image: Refinement,
+    evidence: DepthEvidence,
+) -> Refinement:
+    """Refine on image and depth, from the end of the image alone or else of depth alone.
+
+    If the image does not determine the pose, the end of depth alone is returned.
+
+    Raises:
+        UndecidedError: Depth does not determine the pose, or contradicts the image.
+    """
+
+    def refine_from(start: Solution) -> Refinement:
+        end, agreement = region.refine_with(image, K, evidence, start)
+        evidence.check(end.T_cam_obj)
+        return refinement(end, agreement)
+
+    if by_image.covariance is not None:
+        with contextlib.suppress(UndecidedError):  # too far from the measured surface
+            return refine_from(Solution(by_image.T_cam_obj, np.linalg.inv(by_image.covariance)))
+    start = evidence.descend()
+    try:
+        return refine_from(start)
+    except UndecidedError:
+        if by_image.covariance is not None:
+            raise
+        return _checked(evidence, start)
 
 
 def poses_of_four(
     cuboid: Cuboid, peaks: Float[np.ndarray, "9 2"], K: CameraMatrix
 ) -> list[Transform]:
-    """Return the poses of several quadruples of measured keypoints, always the same ones.
+    """Return the poses of several quadruples of measured keypoints, equal in every call.
 
-    What hides a part, or looks like it, puts several keypoints wrong together, which no keypoint's
-    own covariance tells; the others are right.
+    An occluder or a similar object displaces several keypoints together, which their covariances do
+    not show; the other keypoints are right.
 
     Args:
-        cuboid: The part's keypoints, metres.
-        peaks: Those measured on the picture, pixels; NaN where there is none.
+        cuboid: Keypoints of the part, metres.
+        peaks: Measured keypoints, pixels; NaN if missing.
         K: Camera matrix.
     """
     quadruples = list(combinations(np.flatnonzero(np.isfinite(peaks).all(axis=1)), FEW))
     order = np.random.default_rng(0).permutation(len(quadruples))[:NUM_QUADRUPLES]
     poses = []
     for number in order:
-        few = list(quadruples[number])
+        four = list(quadruples[number])
         try:
-            found, turn, place = cv2.solvePnP(
-                cuboid[few], peaks[few], K, None, flags=cv2.SOLVEPNP_SQPNP
+            solved, rotation, shift = cv2.solvePnP(
+                cuboid[four], peaks[four], K, None, flags=cv2.SOLVEPNP_SQPNP
             )
-        except cv2.error:  # all four in one place
+        except cv2.error:  # all four at the same pixel
             continue
-        if found and np.isfinite(turn).all() and place[2, 0] > 0:
-            poses.append(make_transform(rotation_vector_to_matrix(turn[:, 0]), place[:, 0]))
+        if solved and np.isfinite(rotation).all() and shift[2, 0] > 0:
+            poses.append(make_transform(rotation_vector_to_matrix(rotation[:, 0]), shift[:, 0]))
     return poses
 
 
@@ -222,7 +256,7 @@ def rehearse_pose() -> None:
 
 
 def rehearse_refinement() -> None:
-    """Refine the pose of a drawn box, as :func:`rehearse_pose` does."""
+    """Refine the pose of a drawn box, for the same purpose."""
     corners, K, T, pixels = _box()
     image = np.full((128, 128, 3), 40, np.uint8)
     cv2.fillConvexPoly(image, cv2.convexHull(np.rint(pixels).astype(np.int32)), (200, 160, 90))
@@ -236,54 +270,6 @@ def rehearse_refinement() -> None:
 def _box() -> tuple[Points, CameraMatrix, Transform, Float[np.ndarray, "8 2"]]:
     """Return the corners of a box, a camera, the box's pose and the corners' pixels."""
     corners = 0.06 * (np.array(list(np.ndindex(2, 2, 2))) - 0.5)
-    turn = rotation_vector_to_matrix(np.array([0.5, 0.4, 0.3]))
-    K, T = camera_matrix(120, 120, 63.5, 63.5), make_transform(turn, np.array([0.0, 0.0, 0.2]))
+    rotation = rotation_vector_to_matrix(np.array([0.5, 0.4, 0.3]))
+    K, T = camera_matrix(120, 120, 63.5, 63.5), make_transform(rotation, np.array([0.0, 0.0, 0.2]))
     return corners, K, T, project(transform(T, corners), K)
-
-
-def _by_depth(measured: DepthEvidence, end: Solution) -> Refinement:
-    """Return depth's own end; an :class:`UndecidedError` where depth does not decide for it."""
-    measured.check(end.T_cam_obj)
-    return Refinement(end.T_cam_obj, np.linalg.inv(end.information))
-
-
-def _by_both(
-    region: RegionRefiner,
-    image: Picture,
-    K: CameraMatrix,
-    alone: Refinement,
-    measured: DepthEvidence,
-) -> Refinement:
-    """Refine on picture and depth, from where the picture alone has led, or else from depth's end.
-
-    Where the picture does not decide, depth's own end is what remains.
-
-    Raises:
-        UndecidedError: Depth does not decide, or contradicts what the picture has decided.
-    """
-
-    def together(start: Solution) -> Refinement:
-        end, agreement = region.refine_with(image, K, measured, start)
-        measured.check(end.T_cam_obj)
-        return refinement(end, agreement)
-
-    if alone.covariance is not None:
-        with contextlib.suppress(UndecidedError):  # too far from the surface that depth shows
-            return together(Solution(alone.T_cam_obj, np.linalg.inv(alone.covariance)))
-    start = measured.descend()
-    try:
-        return together(start)
-    except UndecidedError:
-        if alone.covariance is not None:
-            raise
-        return _by_depth(measured, start)
-
-
-def _region(part: Part) -> RegionRefiner:
-    if part.mesh is None:
-        raise UserError(
-            f"refine=region and no mesh of {part.name} in the checkpoint",
-            "a mesh of every part of the checkpoint",
-            f"add --part {part.name}=FILE and its --unit (parts=… in Python), or train again",
-        )
-    return RegionRefiner(part.mesh.vertices, part.mesh.faces)

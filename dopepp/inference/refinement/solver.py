@@ -1,4 +1,4 @@
-"""The one solver of a pose: Gauss–Newton steps on what was known before and on several terms.
+"""Solver of a pose: Gauss–Newton steps on a prior and several terms of evidence.
 
 To add a kind of evidence, write a :class:`Term`.
 """
@@ -17,68 +17,59 @@ from dopepp.geometry.camera import Transform, moved, step_between
 from dopepp.geometry.refine import solve_damped
 
 PoseMatrix = Float[np.ndarray, "6 6"]
-"""Covariance or information of a turn (radians) about the object's origin and a shift (metres)."""
+"""Covariance or information of a rotation vector about the object's origin and a shift."""
 
 NormalEquations = tuple[PoseMatrix, Float[np.ndarray, "6"]]
-"""H and g of H ξ = g, whose ξ is a turn and a shift, both in camera axes."""
+"""H and g of H ξ = g, where ξ is rotation vector (radians) and shift (metres), in camera axes."""
 
-DAMPING: Final = 1e-6  # share of each unknown's own information: the prior leaves none of them open
+DAMPING: Final = 1e-6  # share of each unknown's information: the prior determines all of them
 ARRIVED: Final = 0.1  # standard deviations; a shorter step ends the descent
 
+# Standard deviations of a pose without covariance: radians, and diameters across and along the
+# viewing ray. An image says little about the distance.
 UNKNOWN_TURN: Final = math.radians(8.0)
 UNKNOWN_ACROSS: Final = 0.07
 UNKNOWN_ALONG: Final = 0.30
-"""Standard deviations of a pose without covariance: radians, and diameters across and along the
-viewing ray. An image says little about the distance."""
 
+# Lower bounds, in the same units: calibration and CAD have errors that no image shows, and an error
+# of the focal length is an error of the distance.
 LEAST_TURN: Final = math.radians(2.0)
 LEAST_ACROSS: Final = 0.03
 LEAST_ALONG: Final = 0.15
-"""Never less, in radians and diameters: calibration and CAD have errors that no image shows, and an
-error of the focal length is one of the distance."""
 
 
 class UndecidedError(Exception):
-    """Why the evidence does not decide about a pose."""
+    """Reason why the evidence does not determine a pose."""
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """What the evidence has made of a pose."""
+    """Result of refining a pose."""
 
-    T_cam_obj: Transform  # the refined pose
-    # Of the refined pose, as PnPResult defines it; None where the given pose was kept
-    covariance: PoseMatrix | None = None
-    reason: str = ""  # why the given pose was kept; empty where it was refined
-    # Share of what the picture tells about the refined outline that agrees with it; None
-    # without it
-    agreement: float | None = None
-    # Share of the refined outline that the picture tells about and that agrees; None without
-    # it
-    support: float | None = None
+    T_cam_obj: Transform
+    covariance: PoseMatrix | None = None  # as in PnPResult; None if the given pose was kept
+    reason: str = ""  # why the given pose was kept; empty if it was refined
+    agreement: float | None = None  # share of the image's evidence that agrees with the outline
+    support: float | None = None  # share of the outline with agreeing evidence
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Where a descent ended: the pose, and the information behind it with the prior's."""
+    """End of a descent."""
 
     T_cam_obj: Transform
-    information: PoseMatrix
+    information: PoseMatrix  # with that of the prior
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known of a pose (metres) beforehand: a normal distribution around it.
+    """Normal distribution of a pose."""
 
-    ``information`` is the inverse of its covariance, of (turn about the object's origin, shift) in
-    camera axes, radians and metres.
-    """
-
-    T_cam_obj: Transform
-    information: PoseMatrix
+    T_cam_obj: Transform  # mean
+    information: PoseMatrix  # inverse of the covariance
 
     def offset(self, T_cam_obj: Transform) -> Float[np.ndarray, "6"]:
-        """Return the turn and the shift from a pose to the prior's."""
+        """Return the step from a pose to the mean."""
         return step_between(T_cam_obj, self.T_cam_obj)
 
     def squared_distance(self, T_cam_obj: Transform) -> float:
@@ -87,7 +78,7 @@ class Prior:
         return max(0.0, float(offset @ self.information @ offset))
 
     def draws(self, spread: float, count: int) -> list[Transform]:
-        """Draw poses with ``spread`` times the prior's deviations, the same ones every time."""
+        """Draw poses with ``spread`` times the standard deviations, equal in every call."""
         deviations = spread * np.linalg.cholesky(np.linalg.inv(self.information))
         draws = np.random.default_rng(0).normal(size=(count, 6))
         return [moved(self.T_cam_obj, deviations @ draw) for draw in draws]
@@ -96,10 +87,18 @@ class Prior:
 def make_prior(
     T_cam_obj: Transform, diameter: float, covariance: PoseMatrix | None = None
 ) -> Prior:
-    """Return the prior of a pose, with a broad covariance where none, or no finite one, is given.
+    """Return the prior of a pose.
 
-    The diameter is of the part, metres; the covariance of (turn, shift).
+    Args:
+        T_cam_obj: Mean.
+        diameter: Diameter of the part, metres.
+        covariance: Covariance; a broad one is assumed without a finite one.
+
+    Raises:
+        UndecidedError: The pose is not finite.
     """
+    if not np.isfinite(T_cam_obj).all():
+        raise UndecidedError("the pose is not finite")
     ray = T_cam_obj[:3, 3] / np.linalg.norm(T_cam_obj[:3, 3])
     along = np.outer(ray, ray)
     floor = LEAST_TURN**2 * np.eye(6)
@@ -116,31 +115,29 @@ def make_prior(
 class Term(Protocol):
     """Evidence about a pose."""
 
-    def __call__(self, pose: Transform, known: NormalEquations) -> NormalEquations | None:
-        """Return the evidence at a pose, linearised; None where there is nothing to read it from.
-
-        ``known`` is what is known of the step besides.
-        """
+    def __call__(self, pose: Transform, prior: NormalEquations, /) -> NormalEquations | None:
+        """Linearise the evidence at a pose, given the prior of the step; None without evidence."""
 
 
 def descend(
     T_cam_obj: Transform, prior: Prior, terms: Sequence[Term], steps: int
 ) -> Solution | None:
-    """Take at most so many Gauss–Newton steps on the terms and the prior, which may be elsewhere.
+    """Take Gauss–Newton steps on the prior and the terms from a start pose.
 
-    None where a term has nothing to read.
+    Returns:
+        The end after at most ``steps`` steps; None if a term has no evidence.
     """
     pose, information = T_cam_obj, prior.information
     step = np.empty(6)
     for _ in range(steps):
-        known = prior.information, prior.information @ prior.offset(pose)
-        information, pull = known
+        before = prior.information, prior.information @ prior.offset(pose)
+        information, gradient = before
         for term in terms:
-            equations = term(pose, known)
+            equations = term(pose, before)
             if equations is None:
                 return None
-            information, pull = information + equations[0], pull + equations[1]
-        solve_damped(information, -pull, DAMPING, step)
+            information, gradient = information + equations[0], gradient + equations[1]
+        solve_damped(information, -gradient, DAMPING, step)
         pose = moved(pose, step)
         if step @ information @ step < ARRIVED**2:
             break

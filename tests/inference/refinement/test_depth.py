@@ -12,9 +12,14 @@ from dopepp.geometry.camera import camera_matrix, make_transform, transform
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
 from dopepp.inference.refinement.depth import DepthEvidence
 from dopepp.inference.refinement.depth.terms import outline_terms, plane_terms
+from dopepp.inference.refinement.part_surface import (
+    lay_over,
+    surface_points,
+    view_around,
+    visible,
+)
 from dopepp.inference.refinement.refiner import PartRefiner
 from dopepp.inference.refinement.solver import make_prior
-from dopepp.inference.refinement.surface import lay_over, surface_points, view_around, visible
 from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.part import Mesh, Part, make_part
 from dopepp.virtual.body import make_body
@@ -171,7 +176,7 @@ def test_a_descent_depends_on_nothing_asked_before(box):
     surface = surface_points(box.points)
     fresh, asked = (DepthEvidence(surface, box.diameter, depth, K, prior) for _ in range(2))
     turned = TRUE @ make_transform(np.diag([1.0, -1.0, -1.0]), np.zeros(3))  # its other sides
-    asked.information(turned, asked.seen(turned))
+    asked.information(turned, asked.visible(turned))
     assert_allclose(asked.descend().T_cam_obj, fresh.descend().T_cam_obj, rtol=0, atol=0)
 
 

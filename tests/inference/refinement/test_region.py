@@ -237,7 +237,6 @@ def test_crop_keeps_places(extent: float) -> None:
     middle = np.array([600.0, 480.0])
     box = middle + extent / 2 * np.array([[-1, -1], [1, 1]])
     crop = crop_around(image, K, box, 120)
-    assert not isinstance(crop, str)
     assert crop.extent <= 1.5 * 120
     assert crop.extent == pytest.approx(extent * crop.scale)
     # A pixel of the crop shows what the picture shows at the place that has the same ray.

@@ -1,14 +1,11 @@
-"""The terms of a depth image: planes of the part's points, and the part's outline in the depth.
+"""Terms of a depth image: planes of the part's points, and the part's outline in the depth.
 
-Point-to-plane terms: measured depth pulls the planes of a part's points onto itself.
+Point-to-plane terms: a pixel's residual is its distance from the plane of the visible point that it
+shows. Weights decrease to 0 at a limit, so occluders, background and outliers have no effect.
 
-A pixel's residual is its distance from the plane of the visible point that it falls on. What
-differs by more than a reach pulls nothing, and less the nearer it comes to that: an occluder, a
-background and a wild pixel say nothing of the part, and neither does a pixel without depth.
-
-The outline pulls where a part's point looks past the measured surface, or a pixel beside the part
-continues its surface: each such place pulls across the viewing ray. Where the two outlines agree,
-nothing pulls, so a surface's inside does not hold the pose back.
+Outline terms: a point with depth behind it, or a pixel beside the part that continues its surface,
+moves the part across the viewing ray. Where both outlines agree there is no term, so the inside of
+a surface does not hold the pose.
 """
 
 from __future__ import annotations
@@ -16,45 +13,48 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import Transform
 from dopepp.geometry.rotation import Vector
-from dopepp.inference.refinement.solver import NormalEquations, PoseMatrix
-from dopepp.inference.refinement.surface import (
+from dopepp.inference.refinement.part_surface import (
     COVERED,
     GATE,
     DepthView,
-    Overlay,
-    Region,
-    Seen,
+    Mask,
+    SurfaceOverlay,
     SurfacePoints,
+    Visible,
     lay_over,
+    nearest_zero,
 )
+from dopepp.inference.refinement.solver import NormalEquations
 
 INDEPENDENT: Final = 100.0
-"""So many independent measurements stand behind any number of neighbouring pixels."""
+"""Number of independent measurements of a surface, however many pixels show it."""
 
-ROUGH: Final = 0.25  # of the part's spacing: standard deviation of a point's plane
+ROUGH: Final = 0.25  # standard deviation of a point's plane, spacings
+
+Pulls = tuple[Float[np.ndarray, "points 3"], Float[np.ndarray, "points 2"]]
+"""Points of the part, camera frame, and their desired motion on the image, pixels."""
 
 
 @dataclass(frozen=True, eq=False)
 class DepthTerm:
-    """The pull of depth on the points of a part that are seen."""
+    """Term of the depth at the visible points of a part."""
 
-    view: DepthView  # the depth
-    surface: SurfacePoints  # the part's points
-    seen: Seen  # which of them the camera sees
-    reach: float  # largest distance from a plane that pulls, metres
-    outline: float  # largest difference of outlines that pulls, metres; 0 leaves the outline out
+    view: DepthView
+    surface: SurfacePoints
+    is_visible: Visible
+    reach: float  # largest distance from a plane that has a weight, metres
+    outline: float  # largest difference of outlines that has a weight, metres; 0 for no outline
 
-    def __call__(self, pose: Transform, known: NormalEquations) -> NormalEquations | None:
-        """Return the pull at a pose; None where no point is within the view."""
+    def __call__(self, pose: Transform, prior: NormalEquations, /) -> NormalEquations | None:
+        """Linearise the term at a pose; None if no point is within the view."""
         view, origin, spacing = self.view, pose[:3, 3], self.surface.spacing
-        overlay = lay_over(view, self.surface, self.seen, pose)
+        overlay = lay_over(view, self.surface, self.is_visible, pose)
         if overlay is None:
             return None
         H, g = plane_terms(view, overlay, origin, spacing, self.reach)
@@ -65,95 +65,78 @@ class DepthTerm:
 
 
 def plane_terms(
-    view: DepthView, overlay: Overlay, origin: Vector, spacing: float, reach: float
+    view: DepthView, overlay: SurfaceOverlay, origin: Vector, spacing: float, reach: float
 ) -> NormalEquations:
-    """Return the pull of the depth on a posed part's surface.
+    """Return the point-to-plane terms of a posed part; all lengths are metres.
 
-    The object's origin is in the camera frame; ``spacing`` is that of the part's points; ``reach``
-    is the largest difference that pulls. All are metres.
+    Args:
+        view: Depth.
+        overlay: Posed part on the depth.
+        origin: Object's origin, camera frame.
+        spacing: Spacing of the part's points.
+        reach: Largest distance that has a weight.
     """
     H, g = np.zeros((6, 6)), np.zeros(6)
-    count = _add_planes(
-        view.depth, view.rays, overlay.distance, overlay.nearest, overlay.points, overlay.normals,
-        np.ascontiguousarray(origin), reach, view.noise, ROUGH * spacing, H, g,
-    )  # fmt: skip
+    planes = overlay.distance, overlay.nearest, overlay.points, overlay.normals
+    limits = np.ascontiguousarray(origin), reach, view.noise, ROUGH * spacing
+    count = _add_planes(view.depth, view.rays, *planes, *limits, H, g)
     share = min(1.0, INDEPENDENT / max(1.0, count))
     return share * H, share * g
 
 
 def outline_terms(
-    view: DepthView, overlay: Overlay, origin: Vector, spacing: float, reach: float
+    view: DepthView, overlay: SurfaceOverlay, origin: Vector, spacing: float, reach: float
 ) -> NormalEquations:
-    """Return the pull of the outline.
+    """Return the terms of the outline; see :func:`plane_terms` for the arguments.
 
-    The object's origin is in the camera frame; ``spacing`` is that of the part's points and also
-    the standard deviation of a place; ``reach`` is the largest difference between the outlines that
-    pulls. All are metres.
+    ``spacing`` is also the standard deviation of a point, and ``reach`` the largest difference
+    between the outlines that has a weight.
     """
     gate = GATE * view.noise
     offset = overlay.at_points
     past = np.flatnonzero((offset > gate) | np.isnan(offset))
     supported = overlay.covered & (np.abs(overlay.offset) <= gate)
     beside = overlay.continues(view.noise, reach / spacing)
-    pairs = [_to_surface(overlay, past, supported), _to_pixels(overlay, beside)]
-    depth = float(overlay.points[:, 2].mean())
-    scale = depth / view.K[0, 0]
-    # A point stands for spacing² of surface, a pixel for scale².
-    weights = (1.0, min(1.0, (scale / spacing) ** 2))
+    scale = float(overlay.points[:, 2].mean()) / view.K[0, 0]
+    # A point represents spacing² of surface, a pixel scale².
+    pixel_weight = min(1.0, (scale / spacing) ** 2)
     H, g = np.zeros((6, 6)), np.zeros(6)
-    for (points, pulls_px), weight in zip(pairs, weights, strict=True):
+    for (points, pulls_px), weight in (
+        (_to_surface(overlay, past, supported), 1.0),
+        (_to_pixels(overlay, beside), pixel_weight),
+    ):
         pulls = scale * pulls_px
         near = np.linalg.norm(pulls, axis=1) <= reach
-        _add(H, g, points[near] - origin, pulls[near], weight / spacing**2)
+        # A rotation ω moves a point at ``arm`` from the origin by ω × arm.
+        x, y, z = (points[near] - origin).T
+        zero, unit = np.zeros(len(x)), np.ones(len(x))
+        along_x = np.stack([zero, z, -y, unit, zero, zero], 1)
+        along_y = np.stack([-z, zero, x, zero, unit, zero], 1)
+        for row, pull in zip((along_x, along_y), pulls[near].T, strict=True):
+            H += weight / spacing**2 * row.T @ row
+            g += weight / spacing**2 * row.T @ pull
     return H, g
 
 
-Pulls = tuple[Float[np.ndarray, "places 3"], Float[np.ndarray, "places 2"]]
-"""Places on the part, camera frame, and where they should go from there, pixels."""
-
-
-def _to_surface(overlay: Overlay, past: Int[np.ndarray, "past"], supported: Region) -> Pulls:
-    """Pull points that look past the surface to the nearest pixel of it."""
+def _to_surface(overlay: SurfaceOverlay, past: Int[np.ndarray, "past"], supported: Mask) -> Pulls:
+    """Pull points with depth behind them to the nearest pixel of the surface."""
     if not len(past) or not supported.any():
         return np.empty((0, 3)), np.empty((0, 2))
-    _, labels = cv2.distanceTransformWithLabels(
-        (~supported).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
+    _, labels = nearest_zero((~supported).astype(np.uint8))
     rows, columns = np.nonzero(supported)
-    place = np.zeros((int(labels.max()) + 1, 2))
-    place[labels[rows, columns]] = np.stack([columns, rows], axis=1)
-    own = overlay.pixels[past]
-    return overlay.points[past], place[labels[own[:, 1], own[:, 0]]] - own
+    target = np.zeros((int(labels.max()) + 1, 2))
+    target[labels[rows, columns]] = np.stack([columns, rows], axis=1)
+    pixels = overlay.pixels[past]
+    return overlay.points[past], target[labels[pixels[:, 1], pixels[:, 0]]] - pixels
 
 
-def _to_pixels(overlay: Overlay, beside: Region) -> Pulls:
-    """Pull the points nearest to uncovered surface until they cover it."""
+def _to_pixels(overlay: SurfaceOverlay, beside: Mask) -> Pulls:
+    """Pull the nearest points to uncovered surface until they cover it."""
     rows, columns = np.nonzero(beside)
     nearest = overlay.nearest[rows, columns]
     pulls = np.stack([columns, rows], axis=1) - overlay.pixels[nearest]
     short = 1.0 - COVERED / overlay.distance[rows, columns]
     return overlay.points[nearest], pulls * short[:, None]
-
-
-def _add(
-    H: PoseMatrix,
-    g: Float[np.ndarray, "6"],
-    arms: Float[np.ndarray, "places 3"],
-    pulls: Float[np.ndarray, "places 2"],
-    weight: float,
-) -> None:
-    """Add the terms of places that should move by ``pulls`` along x and y.
-
-    A turn ω moves a place at ``arm`` from the origin by ω × arm.
-    """
-    zero, one = np.zeros(len(arms)), np.ones(len(arms))
-    x, y, z = arms.T
-    for row, pull in (
-        (np.stack([zero, z, -y, one, zero, zero], 1), pulls[:, 0]),
-        (np.stack([-z, zero, x, zero, one, zero], 1), pulls[:, 1]),
-    ):
-        H += weight * row.T @ row
-        g += weight * row.T @ pull
 
 
 @compiled()
@@ -171,9 +154,9 @@ def _add_planes(
     H: Array,
     g: Array,
 ) -> float:
-    """Add the terms of all pixels that the part covers; return how many count, by their weights.
+    """Add the terms of all pixels that the part covers; return the sum of their weights.
 
-    A turn ω and a shift τ of the part move a place at ``arm`` from its origin by ω × arm + τ.
+    A rotation ω and a shift τ of the part move a point at ``arm`` from its origin by ω × arm + τ.
     """
     row = np.empty(6)
     total = 0.0
@@ -191,7 +174,7 @@ def _add_planes(
                 continue
             weight = (1.0 - (residual / reach) ** 2) ** 2
             total += weight
-            # The depth's error is one along the ray.
+            # The error of the depth is along the ray.
             weight /= rough * rough + (noise * slope) ** 2
             x = z * ray[0] - residual * normal[0] - origin[0]
             y = z * ray[1] - residual * normal[1] - origin[1]

@@ -1,12 +1,12 @@
-"""Where the part ends along each normal of its outline, and what that says about the pose.
+"""Shifts of the outline along its normals, and the terms of the pose that follow from them.
 
-Along a normal, pixels look like the part up to some place and like its surroundings beyond. If it
-ends at a shift d, the pixels' log odds before d speak for it, and the sum of them is, up to a
-constant, the logarithm of d's likelihood. It also ends where the picture changes more than it does
-on average, whatever the colours: that is what tells a part from surroundings of its own colour, and
-an edge to better than a pixel. Mean and variance of the shift follow. A normal along which all
-shifts are alike has the variance of none known, and its information, which is taken from the
-inverse of its variance, is zero.
+Along a normal, pixels have the part's colours up to the shift d at which the part ends, and those
+of its surroundings beyond. The sum of the pixels' log odds up to d is therefore the logarithm of
+the likelihood of d, up to a constant. The likelihood is also higher where the image changes more
+than on average: edges separate a part from surroundings of its own colour, and locate its end to
+better than a pixel. The result is mean and variance of the shift. A normal whose shifts are all
+equally likely has no information: the inverse of its variance minus that of a uniform distribution
+is zero.
 """
 
 from __future__ import annotations
@@ -23,53 +23,48 @@ from dopepp.geometry.refine import solve_damped
 from dopepp.inference.refinement.outline import Contour
 from dopepp.inference.refinement.solver import DAMPING, NormalEquations
 
-LEAST_CHANGE: Final = 3.0  # grey levels that are noise: a picture that changes less has no edges
+LEAST_CHANGE: Final = 3.0  # grey levels of noise: smaller changes are no edges
 
 CHANCE: Final = 1.2
-"""Variance of no knowledge over one that is read from nothing but noise, at most."""
+"""Largest ratio of the variance of a uniform distribution to that measured on pure noise."""
 
-LEAST_DEVIATION: Final = 0.3
-"""Pixels: no place of an edge is better known than to this, of one point."""
+LEAST_DEVIATION: Final = 0.3  # pixels; lower bound for the position of an edge at one point
 
-INDEPENDENT_PX: Final = 4.0  # length of the outline along which its errors are one error
-LEAST_INFORMATION: Final = 1e-3  # pixels⁻²; less is none
+INDEPENDENT_PX: Final = 4.0  # length of the outline within which errors are equal
+LEAST_INFORMATION: Final = 1e-3  # pixels⁻²; less counts as none
 
 REWEIGHTINGS: Final = 2
 
-GATE: Final = 2.0  # standard deviations that a point may differ by and still count for a quarter
+GATE: Final = 2.0  # standard deviations at which a point has a quarter of its weight
 
 ALIKE: Final = 0.5
-"""Of the part's extent: so far along the outline, errors beyond a pixel are one error."""
+"""Length of the outline within which errors above a pixel are equal, share of the extent."""
 
 OFFSET_PX: Final = 1.5
-"""Standard deviation of an offset that all points have in common: blur, a halo, a CAD's error."""
+"""Standard deviation of the offset that all points share: blur, a halo, an error of the mesh."""
 
 
 class Weights(NamedTuple):
-    """How much colours and edges tell."""
+    """Weights of colours and edges."""
 
-    # Exponent of the likelihood of neighbouring pixels, whose colours are not independent
-    colour: float
-    # Exponent of a place's likelihood of an edge: one, plus the square of its change over the
-    # mean
-    edge: float
+    colour: float  # exponent of a pixel's likelihood: neighbouring pixels are not independent
+    edge: float  # exponent of an edge's likelihood: 1 + (change / mean change)²
 
 
 FOUND: Final = Weights(colour=0.5, edge=1.0)
-"""For a start that may be far off: many edges are near, and colours tell which is the part's."""
+"""For a start that may be far off: colours decide which of many edges is the part's."""
 
 FOLLOWED: Final = Weights(colour=0.12, edge=4.0)
-"""For one that is near: the nearest edge is the part's, and blur leaves its middle where it was,
-whatever the colours. From far starts on real pictures 9 % of poses get worse by it, not 7 %."""
+"""For a tracked part: the nearest edge is the part's, and its centre is robust to blur. From far
+starts on real images, 9 % of poses get worse with these weights, instead of 7 %."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shifts:
-    """How far the picture's outline is from a pose's, along each normal."""
+    """Shift of the image's outline from a pose's, along each normal."""
 
     mean: Float[np.ndarray, "points"]  # pixels, outward
-    # Inverse of the variance beyond what not knowing has, pixels⁻²
-    information: Float[np.ndarray, "points"]
+    information: Float[np.ndarray, "points"]  # pixels⁻²; 0 where all shifts are equally likely
 
 
 def find_shifts(
@@ -80,22 +75,22 @@ def find_shifts(
     step: float,
     weights: Weights,
 ) -> Shifts:
-    """Read the picture along the normals.
+    """Measure the shifts of an outline.
 
     Args:
-        odds: The pixels' log odds, 0 where unknown.
-        colours: The pixels.
-        contour: The outline.
-        reach: Pixels to each side.
-        step: Pixels between what is read.
-        weights: Of what is read.
+        odds: Log odds of the pixels, 0 where unknown.
+        colours: RGB.
+        contour: Outline.
+        reach: Search distance to each side, pixels.
+        step: Distance between samples, pixels.
+        weights: Weights of colours and edges.
     """
     count = max(2, round(reach / step))
     changes = np.empty((len(contour), 2 * count + 2))
     strength = _changes(colours, contour.pixels, contour.normals, step, count, changes)
-    found = np.empty((len(contour), 2))
-    _shifts(odds, contour.pixels, contour.normals, changes, strength, step, count, *weights, found)
-    return Shifts(found[:, 0], found[:, 1])
+    shifts = np.empty((len(contour), 2))
+    _shifts(odds, contour.pixels, contour.normals, changes, strength, step, count, *weights, shifts)
+    return Shifts(shifts[:, 0], shifts[:, 1])
 
 
 def region_terms(
@@ -105,25 +100,23 @@ def region_terms(
     spacing: float,
     extent: float,
 ) -> NormalEquations:
-    """Return the pull of an outline whose points have one unknown offset in common.
+    """Return the terms of an outline whose points share an unknown offset.
 
-    The offset is a seventh unknown with a prior. Points are weighted by what remains of their
-    shifts after the step that all of them ask for: its spread is the variance of each, besides its
-    own, and what is far from the others counts little (Geman–McClure).
+    The offset is a seventh unknown with a prior. Points are reweighted by their residuals after a
+    common step: the spread of the residuals is added to each point's variance, and outliers get a
+    small weight (Geman–McClure).
 
     Args:
-        rows: How the points move.
-        shifts: Where they should go.
-        prior: Of the step, so that there always is one.
-        spacing: Between the points, pixels.
-        extent: Of the part, pixels.
+        rows: Derivatives of the points' motion.
+        shifts: Shifts of the points.
+        prior: Prior of the step.
+        spacing: Distance between points, pixels.
+        extent: Extent of the part, pixels.
     """
     H, g = np.zeros((7, 7)), np.zeros(7)
-    _terms(
-        rows, shifts.mean, shifts.information, *prior,
-        min(1.0, spacing / INDEPENDENT_PX), ALIKE * extent / spacing, H, g,
-    )  # fmt: skip
-    # Without the seventh unknown: its Schur complement.
+    independent, alike = min(1.0, spacing / INDEPENDENT_PX), ALIKE * extent / spacing
+    _terms(rows, shifts.mean, shifts.information, *prior, independent, alike, H, g)
+    # The Schur complement eliminates the offset.
     last = H[:6, 6] / (H[6, 6] + 1.0 / OFFSET_PX**2)
     return H[:6, :6] - np.outer(last, H[:6, 6]), g[:6] - last * g[6]
 
@@ -140,56 +133,56 @@ def _terms(
     H: Array,
     g: Array,
 ) -> None:
-    """Add the reweighted terms of (turn, shift, offset).
+    """Write the reweighted terms of (rotation, shift, offset).
 
-    ``independent`` is how many measurements a point stands for where errors are small, ``alike``
-    how many points have one error where they are not.
+    ``independent`` is the number of measurements that a point represents if errors are small,
+    ``alike`` the number of points that share an error otherwise.
     """
-    left, known, weights = np.empty(len(rows)), np.empty(len(rows)), np.empty(len(rows))
-    num_known = 0
+    squares, valid, weights = np.empty(len(rows)), np.empty(len(rows)), np.empty(len(rows))
+    num_valid = 0
     for i in range(len(rows)):
         weights[i] = 0.0
         if information[i] > LEAST_INFORMATION:
             weights[i] = information[i] * independent
-            num_known += 1
-    if not num_known:
+            num_valid += 1
+    if not num_valid:
         return
     matrix, gradient, step = np.empty((6, 6)), np.empty(6), np.empty(6)
     for _ in range(REWEIGHTINGS):
         _add(rows, means, weights, H, g)
-        own = H[6, 6] + 1.0 / OFFSET_PX**2
+        pivot = H[6, 6] + 1.0 / OFFSET_PX**2
         for c in range(6):
-            last = H[6, c] / own
+            last = H[6, c] / pivot
             gradient[c] = last * g[6] - g[c] - prior_g[c]
             for d in range(6):
                 matrix[c, d] = H[c, d] + prior_H[c, d] - last * H[6, d]
         solve_damped(matrix, gradient, DAMPING, step)
         drawn = 0.0
         for c in range(6):
-            drawn += H[6, c] / own * step[c]
-        offset, place = g[6] / own - drawn, 0
+            drawn += H[6, c] / pivot * step[c]
+        offset, k = g[6] / pivot - drawn, 0
         for i in range(len(rows)):
-            rest = means[i] - offset
+            residual = means[i] - offset
             for c in range(6):
-                rest -= rows[i, c] * step[c]
-            left[i] = rest * rest
+                residual -= rows[i, c] * step[c]
+            squares[i] = residual * residual
             if information[i] > LEAST_INFORMATION:
-                known[place] = left[i]
-                place += 1
+                valid[k] = squares[i]
+                k += 1
         # The median of a squared normal variable is 0.455 of its variance.
-        spread = _median(known[:num_known]) / 0.455
-        # Less than a pixel is noise; more is a shadow, a highlight, an error of the mesh.
+        spread = _median(valid[:num_valid]) / 0.455
+        # Below a pixel it is noise; above it is a shadow, a highlight or an error of the mesh.
         share = min(independent, 1.0 / max(alike * min(1.0, spread), 1.0))
         for i in range(len(rows)):
             if information[i] > LEAST_INFORMATION:
                 variance = 1.0 / information[i] + spread
-                weights[i] = share / variance / (1.0 + left[i] / (GATE**2 * variance)) ** 2
+                weights[i] = share / variance / (1.0 + squares[i] / (GATE**2 * variance)) ** 2
     _add(rows, means, weights, H, g)
 
 
 @compiled()
 def _median(values: Array) -> float:
-    """Return the median by Hoare's selection, which reorders the values."""
+    """Return the median by quickselect, which reorders the values."""
     half = len(values) // 2
     low, high = 0, len(values) - 1
     while low < high:
@@ -217,8 +210,8 @@ def _median(values: Array) -> float:
 
 @compiled()
 def _add(rows: Array, means: Array, weights: Array, H: Array, g: Array) -> None:
-    """Write the normal equations of points that move by their row and by one in the offset."""
-    own = np.ones(7)
+    """Write the normal equations; the derivative by the offset is 1."""
+    row = np.ones(7)
     for c in range(7):
         g[c] = 0.0
         for d in range(7):
@@ -227,11 +220,11 @@ def _add(rows: Array, means: Array, weights: Array, H: Array, g: Array) -> None:
         if weights[i] == 0.0:
             continue
         for c in range(6):
-            own[c] = rows[i, c]
+            row[c] = rows[i, c]
         for c in range(7):
-            g[c] += weights[i] * own[c] * means[i]
+            g[c] += weights[i] * row[c] * means[i]
             for d in range(c + 1):
-                H[c, d] += weights[i] * own[c] * own[d]
+                H[c, d] += weights[i] * row[c] * row[d]
     for c in range(7):
         for d in range(c):
             H[d, c] = H[c, d]
@@ -241,9 +234,9 @@ def _add(rows: Array, means: Array, weights: Array, H: Array, g: Array) -> None:
 def _changes(
     colours: Array, pixels: Array, normals: Array, step: float, count: int, changes: Array
 ) -> float:
-    """Write how much the picture changes between any two samples; return the mean change.
+    """Write the change of the image between neighbouring samples; return the mean change.
 
-    It is that of the two samples before against the two after, in the colour where it is largest.
+    It is the difference between two samples before and two after, in the channel with the largest.
     """
     height, width = colours.shape[:2]
     samples = np.empty((2 * count + 5, 3))
@@ -282,11 +275,11 @@ def _shifts(
     count: int,
     colour: float,
     edge: float,
-    found: Array,
+    shifts: Array,
 ) -> None:
-    """Write mean and information of every normal's shift."""
+    """Write mean and information of each normal's shift."""
     sums = np.empty(2 * count + 2)
-    # The part may end between any two samples, before the first one and after the last one.
+    # The part may end between any two samples, before the first or after the last.
     unknown = step * step * (len(sums) ** 2 - 1) / 12.0
     floor = LEAST_DEVIATION**2 + step * step / 12.0
     for i in range(len(pixels)):
@@ -307,16 +300,16 @@ def _shifts(
             second += sums[k] * shift * shift
         mean = first / total
         variance = second / total - mean * mean
-        # That it ends beyond the reach is no measurement of where.
+        # An end beyond the search distance is no measurement.
         inner = 1.0 - (sums[0] + sums[len(sums) - 1]) / total
         information = 1.0 / (variance + floor) - CHANCE / (unknown + floor)
-        found[i, 0] = mean
-        found[i, 1] = max(0.0, information) * inner * inner
+        shifts[i, 0] = mean
+        shifts[i, 1] = max(0.0, information) * inner * inner
 
 
 @compiled()
 def _sampled(values: Array, u: float, v: float) -> float:
-    """Return a value between four pixels; 0 beyond the picture."""
+    """Interpolate between four pixels; 0 outside the image."""
     height, width = values.shape
     if not (0.0 <= u < width - 1.0 and 0.0 <= v < height - 1.0):
         return 0.0

@@ -1,0 +1,286 @@
+"""A part's surface as points, and its comparison with a region of a depth image.
+
+Checkpoints of parts without a mesh have surface points only. Every point represents a disc of the
+surface around it. A point is hidden if the discs of other points lie in front of it on its ray.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Final
+
+import cv2
+import numpy as np
+import scipy  # its submodules load on first use
+from jaxtyping import Bool, Float, Int
+
+from dopepp.core.compiled import Array, compiled
+from dopepp.geometry.camera import CameraMatrix, Transform, crop_camera
+from dopepp.inference.picture import Depth
+
+Mask = Bool[np.ndarray, "height width"]  # some of the pixels
+Points = Float[np.ndarray, "points 3"]
+Visible = Bool[np.ndarray, "points"]
+
+# Lengths are in spacings of the surface points unless stated otherwise.
+MOST_POINTS: Final = 3000  # more make a refinement slower, but not better
+FEWEST_POINTS: Final = 100  # fewer do not describe a surface
+NEIGHBOURS: Final = 12  # points that a normal is estimated from
+FLAT: Final = 0.3  # neighbours farther from a plane belong to another face
+SLIVER: Final = 0.3  # twice the area (squared spacings) of a triangle that determines a plane
+DISC: Final = 1.5  # radius of a disc: of random points, fewer than 1 in 1,000 discs is empty
+CLEARANCE: Final = 0.4  # distance in front of a point that hides it: the error of a disc's plane
+STEEPEST: Final = 0.2  # cosine between ray and normal below which a disc counts as a point
+LONGEST_PX: Final = 112  # longer crops are subsampled: 10,000 pixels determine six numbers
+MARGIN: Final = 0.3  # margin of a crop, share of the part's extent
+
+NOISE: Final = 2e-3
+"""Standard deviation of a depth camera at 1 m, metres; it grows with the square of the depth."""
+
+LEAST_NOISE: Final = 1e-3  # metres: quantisation and distortion
+GATE: Final = 3.0  # standard deviations within which depth agrees with the part
+BESIDE: Final = 6.0  # width around the part that is compared with its surface
+EXTENDED: Final = 4.0  # largest depth difference between a point and its extended plane
+COVERED: Final = 1.0  # distance of a pixel from the nearest point that counts as covered
+
+STEP: Final = 2.0
+"""Standard deviations of the depth by which a continued surface may differ from the part."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """Points on a part's surface, object frame, metres."""
+
+    points: Points
+    normals: Points  # unit normals of either sign
+    spacing: float  # side of the square of surface that a point represents, metres
+
+
+def surface_points(points: Points) -> SurfacePoints:
+    """Estimate normals and spacing of surface points (object frame, metres).
+
+    Raises:
+        ValueError: There are fewer than :data:`FEWEST_POINTS`.
+    """
+    if len(points) < FEWEST_POINTS:
+        raise ValueError(f"{len(points)} points are no surface, {FEWEST_POINTS} are needed")
+    points = np.asarray(points, np.float64)
+    if len(points) > MOST_POINTS:
+        points = points[np.linspace(0, len(points) - 1, MOST_POINTS).astype(int)]
+    count = min(NEIGHBOURS + 1, len(points))
+    distances, neighbours = map(np.asarray, scipy.spatial.KDTree(points).query(points, count))
+    # With ρ points per unit of area, πρr² of them lie within r, one of which is the point itself.
+    spacing = float(np.median(distances[:, -1])) * math.sqrt(math.pi / (count - 0.5))
+    offsets = (points[neighbours[:, 1:]] - points[:, None]) / spacing
+    # The normal is that of the plane through a point and two neighbours that fits most neighbours:
+    # a least-squares plane would mix the two faces of a thin plate.
+    best, normals = np.full(len(offsets), np.inf), np.zeros((len(offsets), 3))
+    for first, second in combinations(range(offsets.shape[1]), 2):
+        normal = np.cross(offsets[:, first], offsets[:, second])
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        normal = normal / np.maximum(length, 1e-12)
+        cost = np.minimum((offsets @ normal[..., None])[..., 0] ** 2, FLAT**2).sum(axis=1)
+        better = (cost < best) & (length[:, 0] > SLIVER)
+        best[better], normals[better] = cost[better], normal[better]
+    return SurfacePoints(points, normals, spacing)
+
+
+def visible(surface: SurfacePoints, T_cam_obj: Transform) -> Visible:
+    """Return which points are not hidden by the part itself; all are in front of the camera."""
+    points = surface.points @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
+    normals = surface.normals @ T_cam_obj[:3, :3].T
+    rays = points / points[:, 2:]
+    # All cells have the size of a disc at the nearest point.
+    cell = DISC * surface.spacing / points[:, 2].min()
+    keys = np.floor((rays[:, :2] - rays[:, :2].min(axis=0)) / cell).astype(np.int64)
+    columns, rows = (keys.max(axis=0) + 1).tolist()
+    flat = keys[:, 1] * columns + keys[:, 0]
+    order = np.argsort(flat, kind="stable")
+    starts = np.searchsorted(flat[order], np.arange(columns * rows + 1))
+    is_visible = np.empty(len(points), np.bool_)
+    grid = keys, order, starts, columns, rows
+    _hide(points, normals, rays, *grid, surface.spacing, is_visible)
+    return is_visible
+
+
+@dataclass(frozen=True, eq=False)
+class DepthView:
+    """A subsampled crop of a depth image."""
+
+    depth: Depth  # metres along z, float32, 0 where unknown
+    K: CameraMatrix  # camera matrix of the crop
+    rays: Float[np.ndarray, "height width 3"]  # camera-frame points of the pixels at z = 1
+    noise: float  # standard deviation of the depth at the part, metres
+
+
+def view_around(depth: Depth, K: CameraMatrix, points_cam: Points) -> DepthView | None:
+    """Crop a depth image around a part; None if the part is outside the image."""
+    u, v = (points_cam[:, :2] / points_cam[:, 2:] * K.diagonal()[:2] + K[:2, 2]).T
+    margin = MARGIN * max(np.ptp(u), np.ptp(v))
+    left, right = max(0, math.floor(u.min() - margin)), math.ceil(u.max() + margin) + 1
+    top, bottom = max(0, math.floor(v.min() - margin)), math.ceil(v.max() + margin) + 1
+    crop = np.ascontiguousarray(depth[top:bottom, left:right], np.float32)
+    if crop.size == 0:
+        return None
+    step = math.ceil(max(crop.shape) / LONGEST_PX)
+    # A median keeps edges, removes single outliers and halves the noise.
+    crop = np.ascontiguousarray(cv2.medianBlur(crop, 3)[::step, ::step])
+    K = crop_camera(K, left, top)
+    K[:2] /= step
+    columns, rows = np.meshgrid(np.arange(crop.shape[1]), np.arange(crop.shape[0]))
+    x, y = (columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1]
+    noise = max(LEAST_NOISE, NOISE * float(points_cam[:, 2].mean()) ** 2)
+    return DepthView(crop, K, np.stack([x, y, np.ones(crop.shape)], -1), noise)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceOverlay:
+    """A posed part's visible points, compared with a depth view."""
+
+    points: Points  # points within the view, camera frame, metres
+    normals: Points  # unit normals of either sign
+    pixels: Int[np.ndarray, "points 2"]  # column and row of each point
+    distance: Depth  # of every pixel of the view to the nearest point, spacings
+    nearest: Int[np.ndarray, "height width"]  # index of that point
+    # Measured depth minus the depth of the nearest point's plane, metres; NaN where unknown
+    offset: Depth
+
+    @property
+    def covered(self) -> Mask:
+        """Pixels of the part with a measured depth."""
+        return np.asarray((self.distance <= COVERED) & np.isfinite(self.offset))
+
+    @property
+    def at_points(self) -> Float[np.ndarray, "points"]:
+        """Offset at the points' pixels, metres; NaN where unknown."""
+        return np.asarray(self.offset[self.pixels[:, 1], self.pixels[:, 0]])
+
+    def continues(self, noise: float, reach: float) -> Mask:
+        """Return the pixels beside the part whose depth continues the part's surface.
+
+        Pixels are compared with the offset of the adjacent surface, so that the table is not taken
+        for the part while the pose is still tilted.
+
+        Args:
+            noise: Standard deviation of the depth, metres.
+            reach: Width around the part, spacings.
+        """
+        beside = (self.distance > COVERED) & (self.distance <= COVERED + reach)
+        at_points = self.at_points
+        adjacent = np.where(np.abs(at_points) <= GATE * noise, at_points, np.nan)[self.nearest]
+        return np.asarray(beside & (np.abs(self.offset - adjacent) <= STEP * noise))
+
+
+def lay_over(
+    view: DepthView, surface: SurfacePoints, is_visible: Visible, T_cam_obj: Transform
+) -> SurfaceOverlay | None:
+    """Compare every pixel with a posed part's nearest visible point; None if none is in view."""
+    points = surface.points[is_visible] @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
+    normals = surface.normals[is_visible] @ T_cam_obj[:3, :3].T
+    exact = points[:, :2] / points[:, 2:] * view.K.diagonal()[:2] + view.K[:2, 2]
+    pixels = np.rint(exact).astype(np.int64)
+    inside = ((pixels >= 0) & (pixels < view.depth.shape[::-1])).all(axis=1)
+    if not inside.any():
+        return None
+    points, normals, pixels = points[inside], normals[inside], pixels[inside]
+    order = np.argsort(-points[:, 2])  # of two points at a pixel, the nearer one is written last
+    free = np.ones(view.depth.shape, np.uint8)
+    free[pixels[:, 1], pixels[:, 0]] = 0
+    distance, labels = nearest_zero(free)
+    owner = np.zeros(int(labels.max()) + 1, np.int64)
+    owner[labels[pixels[order, 1], pixels[order, 0]]] = order
+    nearest = owner[labels]
+    # If the spacing is below a pixel, the nearest pixel counts as covered.
+    distance /= max(surface.spacing * view.K[0, 0] / points[:, 2].mean(), 1.0)
+    offset = np.empty(view.depth.shape)
+    limit = EXTENDED * surface.spacing
+    _offsets(view.depth, view.rays, distance, nearest, points, normals, BESIDE, limit, offset)
+    return SurfaceOverlay(points, normals, pixels, distance, nearest, offset)
+
+
+def nearest_zero(mask: Array) -> tuple[Array, Array]:
+    """Return the distance of every pixel to the nearest zero of a mask, and that zero's label."""
+    distance, labels = cv2.distanceTransformWithLabels(
+        mask, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    return distance, labels
+
+
+@compiled()
+def _hide(
+    points: Array,
+    normals: Array,
+    rays: Array,
+    keys: Array,
+    order: Array,
+    starts: Array,
+    columns: int,
+    rows: int,
+    spacing: float,
+    is_visible: Array,
+) -> None:
+    """Write which points are visible; two discs that hide a point have to agree.
+
+    Points are sorted into a grid over the image: ``keys`` are the column and row of each point's
+    cell, ``order`` the points by cell, and ``starts`` the index of each cell's first point.
+    """
+    clearance, reach = CLEARANCE * spacing, DISC * spacing
+    for i in range(points.shape[0]):
+        z, votes = points[i, 2], 0
+        for row in range(max(keys[i, 1] - 1, 0), min(keys[i, 1] + 2, rows)):
+            first = starts[row * columns + max(keys[i, 0] - 1, 0)]
+            end = starts[row * columns + min(keys[i, 0] + 2, columns)]
+            for k in range(first, end):
+                j = order[k]
+                zj = points[j, 2]
+                dx, dy = rays[j, 0] - rays[i, 0], rays[j, 1] - rays[i, 1]
+                if zj >= z or (dx * dx + dy * dy) * zj * zj > reach * reach:
+                    continue
+                # At a convex edge, each extended plane is in front of the other: none is hidden.
+                if plane_depth(points[j], normals[j], rays[i]) >= z - clearance:
+                    continue
+                if plane_depth(points[i], normals[i], rays[j]) > zj + clearance:
+                    votes += 1
+                    if votes == 2:
+                        break
+            if votes == 2:
+                break
+        is_visible[i] = votes < 2
+
+
+@compiled()
+def _offsets(
+    depth: Array,
+    rays: Array,
+    distance: Array,
+    nearest: Array,
+    points: Array,
+    normals: Array,
+    farthest: float,
+    limit: float,
+    offset: Array,
+) -> None:
+    """Write each pixel's depth minus that of its nearest point's plane, metres.
+
+    The offset is NaN if the nearest point is beyond ``farthest``. ``limit`` bounds the difference
+    between the depths of plane and point.
+    """
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            offset[v, u] = np.nan
+            if depth[v, u] > 0.0 and distance[v, u] <= farthest:
+                j = nearest[v, u]
+                z = points[j, 2]
+                plane = plane_depth(points[j], normals[j], rays[v, u])
+                offset[v, u] = depth[v, u] - min(max(plane, z - limit), z + limit)
+
+
+@compiled(inline="always")
+def plane_depth(point: Array, normal: Array, ray: Array) -> float:
+    """Return the depth where a ray meets a disc's plane; the point's depth at a grazing angle."""
+    toward = normal[0] * ray[0] + normal[1] * ray[1] + normal[2]
+    if abs(toward) < STEEPEST * math.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + 1.0):
+        return float(point[2])
+    return float((normal[0] * point[0] + normal[1] * point[1] + normal[2] * point[2]) / toward)
