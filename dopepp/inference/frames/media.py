@@ -15,7 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 from urllib.parse import urlsplit
 
 import cv2
@@ -162,24 +162,13 @@ def _unreadable(path: Path, reason: str) -> UserError:
     return UserError(f"video {path}: {reason}", allowed, fix)
 
 
-class Capture(Protocol):
-    """The methods of ``cv2.VideoCapture`` that :class:`Live` uses."""
-
-    def isOpened(self) -> bool: ...  # noqa: N802, D102
-
-    def read(self) -> tuple[bool, Any]: ...  # noqa: D102
-
-    def get(self, what: int) -> float: ...  # noqa: D102
-
-    def release(self) -> None: ...  # noqa: D102
-
-
 class Live(FrameSource):
     """A camera or a network stream.
 
     Args:
         address: Camera number, device path, or URL of a stream.
-        opened: Opens the address.
+        opened: Opens the address; the result has ``isOpened``, ``read``, ``get`` and ``release`` of
+            ``cv2.VideoCapture``.
         clock: Returns seconds since 1970.
         first_s: Timeout of the first frame, seconds.
         stalled_s: Timeout of each further frame, seconds.
@@ -188,7 +177,7 @@ class Live(FrameSource):
     def __init__(
         self,
         address: int | str,
-        opened: Callable[[int | str], Capture] | None = None,
+        opened: Callable[[int | str], Any] | None = None,
         clock: Callable[[], float] = time.time,
         first_s: float = FIRST_S,
         stalled_s: float = STALLED_S,
@@ -233,7 +222,7 @@ class Live(FrameSource):
 class _NewestFrame:
     """Reads a capture in a thread and keeps the newest frame."""
 
-    def __init__(self, capture: Capture, name: str, clock: Callable[[], float]) -> None:
+    def __init__(self, capture: Any, name: str, clock: Callable[[], float]) -> None:
         self._capture, self._name, self._clock = capture, name, clock
         self._newest: tuple[Any, int, float] | None = None
         self._fresh, self._stopped = threading.Condition(), threading.Event()
@@ -285,7 +274,7 @@ def is_url(text: str) -> bool:
     return True
 
 
-def _open_live(address: int | str) -> Capture:
+def _open_live(address: int | str) -> cv2.VideoCapture:
     if isinstance(address, int) or not is_url(address):
         return _open_capture(address)
     timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, int(1000 * FIRST_S)]

@@ -178,7 +178,11 @@ def _search(rounds: Sequence[Round], prior: Prior, loose: Prior, starts: Starts 
     """
     near, doubt = None, None
     try:
-        near = _search_near(rounds, prior)
+        reach = _search_distance(rounds[0], prior)
+        needed, start = _necessary(rounds, reach), prior.T_cam_obj
+        if needed[0] is not needed[-1]:  # else the last round only, once or twice
+            start, needed = _coarse_end(needed[0], start, prior, reach), needed[1:]
+        near = _refine(needed, start, prior, reach)
     except UndecidedError as undecided:
         doubt = undecided
     if starts is not None and (near is None or near[1].share < SURE):
@@ -187,16 +191,6 @@ def _search(rounds: Sequence[Round], prior: Prior, loose: Prior, starts: Starts 
         assert doubt is not None
         raise doubt
     return near
-
-
-def _search_near(rounds: Sequence[Round], prior: Prior) -> Outcome:
-    """Descend from the given pose."""
-    reach = _search_distance(rounds[0], prior)
-    rounds = _necessary(rounds, reach)
-    if rounds[0] is rounds[-1]:  # only the last round, once or twice
-        return _refine(rounds, prior.T_cam_obj, prior, reach)
-    start = _coarse_end(rounds[0], prior.T_cam_obj, prior, reach)
-    return _refine(rounds[1:], start, prior, reach)
 
 
 def _search_far(
