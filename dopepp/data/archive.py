@@ -1,10 +1,10 @@
-"""Unpack a tar file from anywhere into a folder that is there completely or not at all.
+"""Unpack an untrusted tar file into a folder that exists completely or not at all.
 
-All members' names, kinds and sizes are checked before the first byte is written, and the folder
-gets its name in the end. Only plain files and folders are unpacked, with permissions of their own.
-``tarfile``'s ``filter="data"`` is no guard for this: it accepts links within the folder, makes
-absolute paths relative, and knows no backslash or drive, no name twice, no file below a file and no
-size (``tests/security/test_hostile_files.py`` has a case for each).
+All names, kinds and sizes of members are checked before the first byte is written, and the folder
+gets its name last. Only plain files and folders are unpacked, with default permissions.
+``tarfile``'s ``filter="data"`` is not enough: it accepts links within the folder, makes absolute
+paths relative, and ignores backslashes, drives, repeated names, files below files and sizes
+(``tests/security/test_hostile_files.py`` has a case for each).
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from dopepp.core.errors import UserError
 from dopepp.core.files import partial_path
 
 CHUNK_BYTES: Final = 1 << 20
-"""Largest piece that is read at once."""
+"""Largest number of bytes to read at once."""
 
 MOST_MEMBERS: Final = 200_000
 
 _MAX_NAME: Final = 1000
 _MAX_PART: Final = 200
-"""Characters of a member's path and of each of its parts; file systems end at 255 bytes."""
+"""Characters of a member's path and of each part; file systems allow 255 bytes."""
 
 _RESERVED: Final = frozenset('<>:"|?*\\')
-"""Characters that mean something else, or nothing, in a path of another system."""
+"""Characters that are special or forbidden in paths of some systems."""
 
 
 class Bounded(io.RawIOBase):
-    """A seekable stream that refuses to be read in one huge piece.
+    """A seekable stream that rejects a huge read.
 
     The tar format lets a header claim a name of any length, which :mod:`tarfile` reads at once.
     """
@@ -54,20 +54,19 @@ class Bounded(io.RawIOBase):
         return self._stream.seek(offset, whence)
 
     def read(self, size: int = -1) -> bytes:
-        """Return the next ``size`` bytes, a megabyte at most."""
+        """Return the next ``size`` bytes, at most a megabyte."""
         if not 0 <= size <= CHUNK_BYTES:
             raise ValueError(f"a header of {size} bytes")
         return self._stream.read(size)
 
 
 def safe_extract(archive: Path | str, folder: Path | str, most_members: int = MOST_MEMBERS) -> Path:
-    """Unpack a tar file into ``folder``, which must not exist, or be empty.
+    """Unpack a tar file into ``folder``, which must be new or empty.
 
     Raises:
         UserError: The archive is missing, damaged, or of another format; a member's path leads out
-            of the folder, or is the same as another's; a member is no plain file or folder; there
-            are too many members; or the folder is in use or cannot be written. Nothing is left of
-            the folder then.
+            of the folder or repeats another path; a member is no plain file or folder; there are
+            too many members; or the folder is in use or not writable. The folder is then removed.
     """
     archive, folder = Path(archive), Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -99,7 +98,7 @@ def safe_extract(archive: Path | str, folder: Path | str, most_members: int = MO
             "an archive to read and a folder with room to write",
             "check both, and the space on the disk",
         ) from error
-    except Exception as error:  # tarfile lets through whatever a damaged header causes
+    except Exception as error:  # a damaged header makes tarfile raise any type
         raise _refused(archive, f"damaged: {error or type(error).__name__}") from error
     finally:
         shutil.rmtree(draft, ignore_errors=True)
@@ -109,7 +108,7 @@ def safe_extract(archive: Path | str, folder: Path | str, most_members: int = MO
 def _checked(
     archive: Path, tar: tarfile.TarFile, most_members: int
 ) -> dict[PurePosixPath, tarfile.TarInfo]:
-    """Return the members by their paths inside of the folder, or refuse the archive."""
+    """Return the members by their paths in the folder, or reject the archive."""
     members: dict[PurePosixPath, tarfile.TarInfo] = {}
     is_folder: dict[str, bool] = {}
     for number, member in enumerate(tar):
@@ -118,8 +117,8 @@ def _checked(
             raise _refused(archive, f"more than {most_members} members")
         if problem := _problem(member, path):
             raise _refused(archive, f"{shown}{problem}")
-        # Folders may come twice; a file may not, nor have another one inside. Compared without
-        # case, as some file systems do.
+        # Folders may be repeated; a file may not, nor contain another. Case is ignored, as some
+        # file systems do.
         for parent in (*path.parents, path) if member.isdir() else path.parents:
             if is_folder.setdefault(str(parent).casefold(), True) is False:
                 raise _refused(archive, f"{shown} below or instead of a file")
@@ -132,7 +131,7 @@ def _checked(
 
 
 def _problem(member: tarfile.TarInfo, path: PurePosixPath) -> str:
-    """Return why a member is refused, or an empty string."""
+    """Return why a member is rejected, or an empty string."""
     if member.issym() or member.islnk():
         return f", a link to {member.linkname[:100]!r}"
     if not (member.isreg() or member.isdir()) or member.issparse():
@@ -153,7 +152,7 @@ def _unpack(tar: tarfile.TarFile, member: tarfile.TarInfo, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     source = tar.extractfile(member)
     assert source is not None  # only plain files are left
-    # "x": a name that passes the checks twice after all overwrites nothing.
+    # Mode "x" overwrites nothing, even if a repeated name passes the checks.
     with source, path.open("xb") as target:
         shutil.copyfileobj(source, target, CHUNK_BYTES)
     if path.stat().st_size != member.size:

@@ -1,6 +1,6 @@
-"""A batch: pixels and poses as tensors, padded to the largest number of instances in it.
+"""Collate samples into a batch of tensors, padded to the largest number of instances.
 
-Belief targets are not here: they are made on the training device from the keypoints.
+Belief targets are computed from the keypoints on the training device.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class Batch:
     Attributes:
         T_cam_obj: Rigid transforms, metres; the identity in padding.
         keypoints: Projected cuboids in pixels; NaN behind the camera and in padding.
-        object_index: Position of the instance's object in the list of objects, −1 in padding.
-        visible_fraction: 0 in padding, as is ``masked_fraction``; see ``Instance``.
+        object_index: Index of the instance's object in the list of objects, −1 in padding.
+        visible_fraction: See ``Instance``; 0 in padding, like ``masked_fraction``.
     """
 
     images: UInt8[Tensor, "batch 3 height width"]
@@ -67,8 +67,8 @@ class Batch:
 
 
 def collate(samples: Sequence[Sample], object_index: Mapping[str, int]) -> Batch:
-    """Stack samples of one size; ``object_index`` has the position of every object, by name."""
-    # One slot even when nothing is visible anywhere: an empty axis is a special case for everybody.
+    """Stack samples of one size; ``object_index`` gives the index of each object by name."""
+    # At least one slot, because an empty axis would be a special case everywhere.
     shape = (len(samples), max(1, *(len(sample.instances) for sample in samples)))
     stated = {
         "T_cam_obj": np.tile(np.eye(4, dtype=np.float32), (*shape, 1, 1)),

@@ -1,6 +1,6 @@
-"""Find a folder's layout and check it: its reader collects problems, then come its invariants.
+"""Recognise a folder's layout and check it with its reader and its invariants.
 
-To add a layout, write ``check_NAME(report)`` in ``invariants.py`` of its folder in
+To add a layout, write ``check_NAME(report)`` in the module of its invariants in
 :mod:`dopepp.data.formats`, and a line in ``LAYOUTS``.
 """
 
@@ -20,7 +20,7 @@ from dopepp.data.formats.webdataset.webdataset_invariants import check_webdatase
 from dopepp.data.formats.ycb_video.ycb_invariants import check_ycb
 
 _LISTED: Final = 8
-"""Data sets of a parent folder, at most."""
+"""Limit of listed data sets in a parent folder."""
 
 LAYOUTS: Final[dict[str, tuple[Callable[[Path], bool], Callable[[CheckReport], None]]]] = {
     "YCB-Video": (lambda root: all((root / n).is_dir() for n in ("image_sets", "data")), check_ycb),
@@ -31,7 +31,7 @@ LAYOUTS: Final[dict[str, tuple[Callable[[Path], bool], Callable[[CheckReport], N
         check_ndds,
     ),
 }
-"""How each layout is recognised, in this order, and checked."""
+"""Functions that recognise and check each layout, in order of recognition."""
 
 
 def check_dataset(root: Path) -> CheckReport:
@@ -48,7 +48,7 @@ def check_dataset(root: Path) -> CheckReport:
     if not root.is_dir():
         raise UserError(f"{root}, which is no folder", allowed, "give the data set's folder")
     layout = _layout_of(root)
-    if layout in (None, "NDDS"):  # which takes annotations anywhere below
+    if layout in (None, "NDDS"):  # NDDS includes annotations of all subfolders
         _refuse_parent(root, layout)
     if layout is None:
         raise UserError(
@@ -64,9 +64,9 @@ def _layout_of(root: Path) -> str | None:
 
 
 def _refuse_parent(root: Path, layout: str | None) -> None:
-    """Refuse a folder that holds data sets and is none itself.
+    """Reject a folder that holds data sets and is no data set itself.
 
-    FAT's folders of scenes are one data set; those of render jobs are one each.
+    FAT's scene folders form one data set; folders of render jobs are data sets each.
     """
     if (root / RECORD_FILE).is_file() or any(root.glob("*.json")):
         return

@@ -1,7 +1,7 @@
-"""The DataModule: sources in, batches for training and validation out, one seed for everything.
+"""Turn sources into batches for training and validation, with one seed for everything.
 
-Its loader says which item of which epoch comes next, and raises a worker's mistake. The sampler
-hands out (epoch, index) pairs, so persistent workers cannot go stale.
+The sampler yields (epoch, index) pairs, so persistent workers never use an old epoch. The loader
+resumes inside an epoch and raises the user errors of workers.
 """
 
 from __future__ import annotations
@@ -44,15 +44,15 @@ from dopepp.parts.part import Part
 from dopepp.parts.size import Seen, widest
 from dopepp.virtual.backgrounds import Backgrounds
 
-_SEEN_ITEMS: Final = 200  # Images on which the range of sizes is measured
+_SEEN_ITEMS: Final = 200  # Number of images for measuring the range of sizes
 
 
 class PoseDataModule(LightningDataModule):
     """Training, validation and test data for pose estimation.
 
-    Training items are resized, jittered, masked, augmented and padded; validation items only
-    letterboxed; test items come at their native resolution. Only training items have epochs.
-    ``masking`` requires ``backgrounds``, other pictures that it may need.
+    Training items are resized, jittered, masked, augmented and padded; validation items are only
+    letterboxed; test items keep their resolution. Only training items depend on the epoch.
+    ``masking`` requires ``backgrounds`` for objects that fill their picture.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class PoseDataModule(LightningDataModule):
 
     def train_item(self, epoch: int, index: int) -> Sample:
         """Return a training item, a pure function of (seed, epoch, index)."""
-        # Padding comes last: as at prediction, it is neither background nor does it get noise.
+        # Padding comes last, so that it has no noise and is no background, as in prediction.
         sample = resize_sample(self.train_source.sample(index, epoch), self.input_size)
         rng = item_rng(self.seed, Purpose.AUGMENT, epoch, index)
         if self._jitter is not None:
@@ -105,7 +105,7 @@ class PoseDataModule(LightningDataModule):
         return self._loader(SampleDataset(self.train_item, len(self.train_source)), shuffle=True)
 
     def val_dataloader(self) -> PoseLoader:
-        """Return the loader in order; over all ranks every item comes exactly once."""
+        """Return the loader in order; all ranks together yield each item exactly once."""
         return self._loader(SampleDataset(self.val_item, len(self.val_source)), shuffle=False)
 
     def _loader(self, dataset: SampleDataset, shuffle: bool) -> PoseLoader:
@@ -122,7 +122,11 @@ class PoseDataModule(LightningDataModule):
         )
 
     def check_objects(self) -> None:
-        """Raise a UserError that names the objects to learn that are in no training source."""
+        """Check that each object to learn is in a training source.
+
+        Raises:
+            UserError: Objects are in no training source.
+        """
         missing = [name for name in self.object_names if not self.train_source.contains(name)]
         if missing:
             sources = ", ".join(info.name for info in self.train_source.describe())
@@ -131,7 +135,7 @@ class PoseDataModule(LightningDataModule):
             raise UserError(problem, "objects with at least one instance in a training source", fix)
 
     def seen(self, parts: Sequence[Part]) -> dict[str, Seen]:
-        """Measure how large and how far away the parts are on validation, else training images."""
+        """Measure size and distance of the parts on validation images, else training images."""
         views: dict[str, list[Seen]] = {part.name: [] for part in parts}
         for source in (self.val_source, self.train_source):
             missing = [part for part in parts if not views[part.name]]
@@ -152,7 +156,7 @@ class PoseDataModule(LightningDataModule):
         return [(split, info) for split, source in splits for info in source.describe()]
 
     def fingerprint(self) -> str:
-        """Return a SHA-256 over everything that decides the images, without the images."""
+        """Return a SHA-256 over everything that determines the images."""
         record = {
             split: [[info.name, info.num_images, dict(info.identity)] for info in source.describe()]
             for split, source in self._splits().items()
@@ -169,7 +173,7 @@ Item = Callable[[int, int], Sample]
 
 
 class SampleDataset(Dataset[Sample | UserError]):
-    """Items by (epoch, index); a user's mistake is an item too, see :class:`PoseLoader`."""
+    """Items by (epoch, index); a UserError is an item too, see :class:`PoseLoader`."""
 
     def __init__(self, item: Item, num_items: int) -> None:
         self._item, self._num_items = item, num_items
@@ -186,14 +190,14 @@ class SampleDataset(Dataset[Sample | UserError]):
 
 
 class EpochSampler(DistributedSampler[tuple[int, int]]):
-    """Hands out (epoch, index) in an order that depends on (seed, epoch) only.
+    """Yields (epoch, index) in an order that depends on (seed, epoch) only.
 
-    A ``DistributedSampler``, so that Lightning keeps it and calls ``set_epoch``. The next pass
-    leaves out this rank's first ``skip`` items, to resume inside an epoch.
+    Lightning keeps a ``DistributedSampler`` and calls its ``set_epoch``. To resume inside an epoch,
+    the next pass skips this rank's first ``skip`` items.
 
     Args:
-        shuffle: Use a new order every epoch, with equally many items for every rank. Otherwise the
-            items come in order, of epoch 0, every item exactly once over all ranks.
+        shuffle: Whether each epoch has a new order, with equally many items per rank. Otherwise the
+            items of epoch 0 come in order, each exactly once over all ranks.
     """
 
     def __init__(
@@ -209,7 +213,7 @@ class EpochSampler(DistributedSampler[tuple[int, int]]):
         return len(range(self._rank, self._num_items, self._world_size))
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
-        """Go through this rank's items of the epoch that was set."""
+        """Iterate over this rank's items of the current epoch."""
         epoch = self.epoch if self.shuffle else 0
         order = np.arange(self._num_items)
         if self.shuffle:
@@ -222,7 +226,7 @@ class EpochSampler(DistributedSampler[tuple[int, int]]):
 class PoseLoader(DataLoader[Any]):
     """A ``DataLoader`` that resumes inside an epoch and raises a worker's ``UserError``.
 
-    A worker's exception would arrive with its stack as text; so the error travels as a value.
+    A worker's exception would arrive with its stack as text, so the error travels as a value.
     ``object_names`` are in the network's order.
     """
 
@@ -242,8 +246,8 @@ class PoseLoader(DataLoader[Any]):
             # Forked workers inherit the render cache's shared memory and the compiled kernels.
             multiprocessing_context="fork" if options.get("num_workers") else None,
             persistent_workers=bool(options.get("num_workers")),
-            # Starting a pass draws a seed for the workers, which none uses: not from the generator
-            # that training draws from, or a pass that is resumed would leave it elsewhere.
+            # A pass draws an unused seed for the workers. A separate generator keeps this draw out of
+            # the training's generator, which must be the same after resuming.
             generator=torch.Generator(),
             **options,
         )
@@ -252,7 +256,7 @@ class PoseLoader(DataLoader[Any]):
         self._resume_at = 0
 
     def __iter__(self) -> Iterator[Batch]:  # type: ignore[override]  # torch names its own class
-        """Yield batches, from the batch where a loaded state says the pass was cut off."""
+        """Yield batches, starting after the batches of a loaded state."""
         self._num_batches, self._resume_at = self._resume_at, 0
         assert self.batch_size is not None
         self._epoch_sampler.skip = self._num_batches * self.batch_size
@@ -263,17 +267,17 @@ class PoseLoader(DataLoader[Any]):
             yield batch
         else:
             return
-        # The workers end here, in order. Left to the exception's traceback, which holds them in a
-        # reference cycle, the collector would close their queues first and then wait for them.
+        # This ends the workers in order. Otherwise the exception's traceback keeps them in a
+        # reference cycle, and the collector closes their queues before waiting for them.
         self._iterator = None
         raise batch
 
     def state_dict(self) -> dict[str, int]:
-        """Return how many batches of this pass were handed out; Lightning stores it."""
+        """Return the number of yielded batches of this pass, which Lightning stores."""
         return {"num_batches": self._num_batches}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Start the next pass after the batches that were handed out before."""
+        """Start the next pass after the batches that were yielded before."""
         self._resume_at = state["num_batches"] % max(1, len(self))
 
 
@@ -285,9 +289,9 @@ def _collate(items: list[Sample | UserError], object_index: dict[str, int]) -> B
 
 
 def _start_worker(worker: int) -> None:
-    # One process per core is the parallelism; OpenCV's own pool would compete and dislikes forks.
+    # The workers use all cores; OpenCV's threads would compete and do not survive forks.
     cv2.setNumThreads(0)
-    # Both may be sent to the whole group. The main process decides when to stop, and a worker whose
-    # main process has gone ends by itself.
+    # Signals may reach the whole process group. The main process decides when to stop, and workers
+    # end when it has ended.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)

@@ -1,10 +1,10 @@
-"""Data sets from the network, by an explicit command only.
+"""Download data sets on an explicit command.
 
-Each is one archive of a known size and checksum, whose download goes on where it was cut off, and
-which is there whole or not at all.
+A data set is an archive of known size and checksum. An interrupted download resumes, and the
+unpacked folder exists completely or not at all.
 
-To add a data set, add a :class:`DownloadSource` to :data:`SOURCES`, its checksum from a second
-place than the file's own server.
+To add a data set, add a :class:`DownloadSource` to :data:`SOURCES`, with a checksum from another
+server than the file.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from dopepp.data.archive import safe_extract
 logger = logging.getLogger(__name__)
 
 TIMEOUT_S: Final = 30.0
-"""Seconds without a byte after which a connection counts as broken."""
+"""A connection is broken after this many seconds without a byte."""
 
 _CHUNK_BYTES: Final = 1 << 20
 
 Progress = Callable[[int, int], None]
-"""Receives the number of bytes so far, and of the whole file."""
+"""Receives the number of downloaded bytes and the size of the file."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class DownloadSource:
     """An archive on the network.
 
     Attributes:
-        photos: The folder in it that serves as ``virtual.backgrounds``.
-        licence: What its user must know before using it.
+        photos: Folder of the archive for ``virtual.backgrounds``.
+        licence: Terms that the user must know.
     """
 
     url: str
@@ -54,22 +54,22 @@ SOURCES: Final = {
     "voc2007": DownloadSource(
         url="http://host.robots.ox.ac.uk/pascal/VOC/voc2007/VOCtrainval_06-Nov-2007.tar",
         num_bytes=460_032_000,
-        # As TensorFlow Datasets and torchvision's data set prototypes give it.
+        # From TensorFlow Datasets and torchvision's data set prototypes.
         sha256="7d8cd951101b0957ddfd7a530bdc8a94f06121cfc1e511bb5937e973020c7508",
         photos=PurePosixPath("VOCdevkit/VOC2007/JPEGImages"),
         licence="photos from Flickr: use them within Flickr's terms of use and their authors' "
         "licences (http://host.robots.ox.ac.uk/pascal/VOC/voc2007/)",
     )
 }
-"""What can be downloaded, by name."""
+"""Available data sets by name."""
 
 
 def download(name: str, folder: Path | str, progress: Progress | None = None) -> Path:
-    """Download and unpack a data set into ``folder/NAME``, unless present; return its photos.
+    """Download and unpack a data set into ``folder/NAME`` unless present; return its photos.
 
     Raises:
-        UserError: The name is unknown, the network or the disk fails, or the file is another one
-            than expected. What was received before a failure stays, and the next call continues.
+        UserError: The name is unknown, the network or the disk fails, or the file differs from the
+            expected file. The next call resumes a failed download.
     """
     source = SOURCES.get(name)
     if source is None:
@@ -90,14 +90,17 @@ def download(name: str, folder: Path | str, progress: Progress | None = None) ->
 def fetch(
     url: str, path: Path, num_bytes: int, sha256: str, progress: Progress | None = None
 ) -> None:
-    """Download one file; an unfinished one stays beside its place as ``NAME.partial``.
+    """Download a file; an unfinished download stays as ``NAME.partial`` in its folder.
 
     Args:
-        url: An http or https address; redirections to others are refused, and from https to http.
-        path: Target; a complete file there is kept.
-        num_bytes: The file's exact size; not a byte more is received.
-        sha256: Its checksum, hex.
-        progress: Called after every piece.
+        url: An http or https address; redirections to other schemes or from https to http fail.
+        path: Target; a complete file is kept.
+        num_bytes: Exact size of the file, which limits the download.
+        sha256: Checksum in hex.
+        progress: Called after each piece.
+
+    Raises:
+        UserError: The network or the disk fails, or size or checksum differ.
     """
     partial = path.with_name(f"{path.name}.partial")
     try:
@@ -164,7 +167,7 @@ def _receive(url: str, partial: Path, num_bytes: int, progress: Progress | None)
 
 
 class _Redirects(urllib.request.HTTPRedirectHandler):
-    """Follow redirections to the web only, and from https to nothing that others can change."""
+    """Follow redirections to http and https only, and never from https to http."""
 
     def redirect_request(
         self, req: urllib.request.Request, fp: Any, code: int, msg: str, headers: Any, newurl: str
@@ -178,7 +181,7 @@ class _Redirects(urllib.request.HTTPRedirectHandler):
 
 
 def _verify(path: Path, url: str, sha256: str) -> None:
-    """Compare a file's checksum; delete another file, so that it is neither resumed nor kept."""
+    """Compare a file's checksum, and delete a wrong file so that no download resumes it."""
     with path.open("rb") as file:
         actual = hashlib.file_digest(file, "sha256").hexdigest()
     if actual != sha256:

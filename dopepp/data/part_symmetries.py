@@ -1,7 +1,7 @@
-"""The symmetries of the objects to learn: found, read from a file, or left out.
+"""Choose the symmetries of the objects to learn: from the mesh, a file, a config, or none.
 
-A file is BOP's ``models_info.json``, or one entry of it, as ``dopepp symmetries`` prints; a config
-may have such entries by name.
+A file is BOP's ``models_info.json``, or a single entry as printed by ``dopepp symmetries``; a
+config has such entries by name.
 """
 
 from __future__ import annotations
@@ -37,11 +37,16 @@ NONE: Final = "none"
 def choose_symmetries(
     parts: Sequence[Part], choice: str | Mapping[str, object] | None
 ) -> list[Part]:
-    """Give parts the symmetries that a user has chosen.
+    """Return the parts with the chosen symmetries.
 
-    The choice None leaves them as they are; ``none`` takes their symmetries away; ``auto`` finds
-    them on the mesh; another text is a file that has them for every part, by name. A mapping has
-    entries like that file's for some parts, by name; the others are left as they are.
+    Args:
+        parts: Objects to learn.
+        choice: None keeps the symmetries; ``none`` removes them; ``auto`` finds them on the mesh.
+            Another text is a file with an entry for each part, by name. A mapping has entries by
+            name for some parts, and keeps the symmetries of the others.
+
+    Raises:
+        UserError: A file or an entry is missing or wrong, or a part has no mesh for ``auto``.
     """
     if choice is None:
         return list(parts)
@@ -71,7 +76,11 @@ def _with(part: Part, discrete: Discrete | None, continuous: Continuous) -> Part
 
 
 def with_found_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
-    """Return a part with the symmetries of its mesh, which the log states."""
+    """Return a part with the symmetries of its mesh, and log them.
+
+    Raises:
+        UserError: The part has no mesh.
+    """
     if part.mesh is None:
         problem = f"part {part.name} without a mesh to find symmetries on"
         fix = "state its symmetries in a file, or leave them out"
@@ -90,7 +99,7 @@ def with_found_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
 
 
 def describe_symmetries(path: Path | str, unit: str | None, tolerance: float) -> str:
-    """Return the ``models_info.json`` entry of a mesh file or built-in part, as JSON."""
+    """Return the ``models_info.json`` entry of a mesh file or built-in part as JSON."""
     entry = model_info(with_found_symmetries(load_part(path, unit), tolerance))
     entry |= {field: entry.get(field, []) for field in SYMMETRY_FIELDS}
     return json.dumps(entry, indent=2, ensure_ascii=False)

@@ -1,7 +1,7 @@
-"""What every reader returns: one image with its camera and the posed objects on it.
+"""Define the sample that every source returns: an image, its camera and its posed objects.
 
 To add a source, write a class with the :class:`DescribedSource` methods and one YAML file in
-``conf/data``. What it draws at random it draws from :func:`item_rng`.
+``conf/data``. Its random draws come from :func:`item_rng`.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ class Instance:
         keypoints: Projected cuboid corners and centroid, pixels, NaN behind the camera.
         visible_fraction: Visible share of the object's full silhouette, occlusion and truncation
             both counted, in [0, 1].
-        mask: Visible pixels, or None where the source has none.
-        wanted: Whether the test set's list of targets names it; None where there is no list.
-        masked_fraction: Share of the visible pixels that random mask local processing has covered;
+        mask: Visible pixels, or None if the source has no mask.
+        wanted: Whether the test set's list of targets contains the object; None without a list.
+        masked_fraction: Share of the visible pixels that masking has covered;
             ``visible_fraction`` and ``mask`` are already reduced by it.
     """
 
@@ -51,7 +51,7 @@ class Sample:
 
     Attributes:
         K: Camera matrix in pixels of this image, float64.
-        depth: Metres along z, float32, 0 where unknown; None where the source has none.
+        depth: Metres along z, float32, 0 if unknown; None if the source has no depth.
         source: Name of the source, e.g. ``ycb_video/data``.
         key: The item within its source, e.g. ``0050/000003``.
     """
@@ -83,12 +83,12 @@ class SampleSource(Protocol):
 
 @dataclass(frozen=True)
 class SourceInfo:
-    """What a source holds, for the start-up print and the data fingerprint.
+    """Content of a source, for the start-up print and the data fingerprint.
 
     Attributes:
-        identity: Everything that decides the items, as plain values that JSON can write.
-        num_instances: Instances of each object, empty where counting them is not cheap.
-        num_per_epoch: Images it gives to an epoch (default: all).
+        identity: Everything that determines the items, as values that JSON can encode.
+        num_instances: Instances of each object; empty if counting is expensive.
+        num_per_epoch: Number of its images in an epoch (default: all).
     """
 
     name: str
@@ -99,19 +99,19 @@ class SourceInfo:
 
 
 class DescribedSource(SampleSource, Protocol):
-    """A source that the DataModule can train on: it also says what it holds."""
+    """A source for the DataModule, which also describes its content."""
 
     def describe(self) -> list[SourceInfo]:
-        """Return one entry per elementary source in it."""
+        """Return an entry for each elementary source."""
 
     def contains(self, label: str) -> bool:
         """Tell whether any item of any epoch can hold an instance of this object."""
 
 
 def silhouette(instance: Instance, shape: Shape) -> Mask:
-    """Return the instance's mask or, without one, the hull of its cuboid (empty behind the camera).
+    """Return the instance's mask, or else the hull of its cuboid (empty behind the camera).
 
-    The hull contains the true outline: a crop that avoids it is free of the object.
+    The hull contains the object's outline, so a crop that avoids the hull does not show the object.
     """
     if instance.mask is not None:
         return instance.mask
@@ -126,9 +126,9 @@ def silhouette(instance: Instance, shape: Shape) -> Mask:
 def hull_areas(
     points_px: Float[np.ndarray, "points 2"], shape: tuple[int, ...]
 ) -> tuple[float, float]:
-    """Return the area (px²) of the points' hull inside an image (height, width), and all of it.
+    """Return the area (px²) of the points' hull inside an image (height, width), and in total.
 
-    Points behind the camera (NaN) do not count.
+    Points behind the camera (NaN) are ignored.
     """
     points = points_px[np.isfinite(points_px).all(axis=1)].astype(np.float32)
     if len(points) < 3:
@@ -144,15 +144,15 @@ def hull_areas(
 def less_visible(
     before: Instance, after: Instance, shapes: tuple[Shape, Shape], scale: float = 1.0
 ) -> Instance:
-    """Return an object in another view of its image, its visible fraction reduced by what is lost.
+    """Reduce the visible fraction of an object by its loss in another view of the image.
 
     The loss is a share of the mask's pixels or, without a mask, of the cuboid's outline.
 
     Args:
         before: The object on the image.
-        after: The same with keypoints and mask of the view.
+        after: The object with keypoints and mask of the view.
         shapes: (height, width) of the image and of the view.
-        scale: Pixels of the view for one of the image.
+        scale: Pixels of the view per pixel of the image.
     """
     whole, left = (
         hull_areas(view.keypoints, shape)[0] if view.mask is None else float(view.mask.sum())
@@ -163,7 +163,7 @@ def less_visible(
 
 
 class Purpose(IntEnum):
-    """What a generator is for; the numbers are part of the data and must not change."""
+    """Purpose of a random generator; the numbers determine the data and must not change."""
 
     SHUFFLE = 101
     MIX = 102
@@ -175,14 +175,14 @@ class Purpose(IntEnum):
 
 
 def item_rng(seed: int, purpose: Purpose, epoch: int, index: int = 0) -> Generator:
-    """Return the generator of one item: workers, ranks and a resumed run never change it."""
-    # Last, because a generator ignores trailing zeros: [seed, epoch, index], from which the
-    # factory draws its scenes, is [seed, epoch, index, 0].
+    """Return an item's random generator, independent of workers, ranks and resuming."""
+    # The purpose comes last, because a generator ignores trailing zeros: the factory draws its
+    # scenes from [seed, epoch, index], which equals [seed, epoch, index, 0].
     return np.random.default_rng([seed, epoch, index, int(purpose)])
 
 
 def nearest(image: NDArray[Any], width: int, height: int) -> NDArray[Any]:
-    """Resize by exact nearest: target pixel j takes source pixel ⌊(j + ½) / s⌋, which holds it.
+    """Resize by nearest neighbour: target pixel j takes source pixel ⌊(j + ½) / s⌋.
 
     Integer arithmetic is exact; ``cv2.INTER_NEAREST`` takes ⌊j / s⌋, half a pixel off.
     """
@@ -192,7 +192,7 @@ def nearest(image: NDArray[Any], width: int, height: int) -> NDArray[Any]:
 
 
 def resize_sample(sample: Sample, input_size: Size) -> Sample:
-    """Scale a sample to just fit into ``input_size``, without padding, by ``Letterbox``'s rule."""
+    """Scale a sample to fit into ``input_size`` like ``Letterbox``, without padding."""
     box = Letterbox.fit(sample.size, input_size)
     if (box.width, box.height) == sample.size:
         return sample
@@ -231,7 +231,7 @@ def pad_sample(sample: Sample, input_size: Size) -> Sample:
 
 
 def crop_sample(sample: Sample, left: int, top: int, size: Size) -> Sample:
-    """Cut (width, height) pixels out of an image; visible fractions shrink (`less_visible`)."""
+    """Crop (width, height) pixels; visible fractions shrink as in :func:`less_visible`."""
     width, height = size
 
     def cut(pixels: NDArray[Any]) -> NDArray[Any]:

@@ -1,8 +1,8 @@
-"""Poses to maps, and maps to peaks: the two directions of the DOPE representation.
+"""Encode poses as maps, and find peaks in maps: the DOPE representation.
 
-Maps are drawn batched, on the device of the keypoints. Peaks, local maxima with sub-cell positions,
-covariances and vectors, are found and fitted on the host, compiled: an image's maps are a few
-hundred kilobytes, and copying them takes less than many small operations on a device.
+Maps are drawn in batches on the device of the keypoints. Peaks are local maxima with sub-cell
+positions, covariances and vectors. Compiled code finds and fits peaks on the host: copying an
+image's maps, a few hundred kilobytes, is faster than many small operations on a device.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ Beliefs = Float[Tensor, "batch beliefs height width"]
 Fields = Float[Tensor, "batch fields height width"]
 
 REACH: Final = 2.5
-"""Half-width of the neighbourhood a peak is fitted to, in standard deviations of a perfect peak:
-it shows the flanks of a clamped top; what lies beyond adds more noise than knowledge."""
+"""Half-width of the fitted neighbourhood in standard deviations of a perfect peak: it contains the
+flanks of a clamped top, and cells beyond add more noise than information."""
 
 HALF_WIDTHS: Final = (2, 4)
-"""Least and greatest half-width, cells: a fit needs 5×5, and 9×9 determine any."""
+"""Smallest and largest half-width, cells: a fit needs 5×5 cells, and 9×9 always suffice."""
 
 TIE_BREAK: Final = 1e-11
-"""Weight of the neighbourhood's sum among equal cells: sums that differ by no more than the
-rounding of 25 beliefs leave float64's last digit, and the cells, equal."""
+"""Weight of the neighbourhood's sum in the rank of equal cells, so small that sums which differ by
+the rounding of 25 beliefs give the same float64."""
 
 
 @dataclass(frozen=True)
 class MapGeometry:
-    """How maps relate to the network's input.
+    """Geometry of maps relative to the network's input.
 
     Attributes:
         stride: Input pixels per cell. Cell i covers pixels ``stride·i … stride·i + stride − 1``,
@@ -51,7 +51,7 @@ class MapGeometry:
     field_radius: float = 2.0
 
     def to_cells(self, pixels: Tensor) -> Tensor:
-        """Turn input pixels into cell coordinates (cell centres are whole numbers)."""
+        """Convert input pixels to cell coordinates, in which cell centres are whole numbers."""
         return (pixels - (self.stride - 1) / 2) / self.stride
 
 
@@ -64,16 +64,16 @@ def encode(
 ) -> tuple[Beliefs, Fields]:
     """Draw the target maps of a batch: 9·C belief and 16·C field channels.
 
-    Beliefs are Gaussians of peak 1, their maximum taken over instances. A keypoint off the map or
-    not finite is absent. Fields are unit vectors from a corner to its instance's centroid; where
-    discs overlap, the nearest corner's vector stands.
+    Beliefs are Gaussians of peak 1, combined over instances by their maximum. Keypoints off the map
+    and keypoints that are not finite are left out. Fields are unit vectors from a corner to its
+    instance's centroid; where discs overlap, the nearest corner's vector counts.
 
     Args:
         keypoints: Input pixels.
-        object_index: Objects of the instances; −1 marks padding.
+        object_index: Object of each instance; −1 marks padding.
         num_objects: Number of objects C.
         map_size: (height, width) of the maps, cells.
-        geometry: Relation of the maps to the input.
+        geometry: Geometry of the maps.
     """
     height, width = map_size
     batch, instances = object_index.shape
@@ -113,14 +113,14 @@ class Peaks:
     """The strongest local maxima of every channel, strongest first, on the host.
 
     Attributes:
-        position: (x, y) in input pixels; NaN where there is none.
-        score: Belief at the peak's cell; 0 where there is none.
-        covariance_px: Of the position, pixels²: the variance by which the peak is wider than a
-            perfect one, and that of the fit. A network trained with a proper loss returns the
-            target Gaussian blurred by its own uncertainty, so variances subtract.
-        toward: Mean of the field's vectors around a corner's peak; the more they spread, the
-            shorter it is. Zeros for a centroid.
-        found: False where a channel has fewer peaks than slots.
+        position: (x, y) in input pixels; NaN in an empty slot.
+        score: Belief at the peak's cell; 0 in an empty slot.
+        covariance_px: Covariance of the position, pixels²: the variance by which the peak is wider
+            than a perfect peak, plus that of the fit. A network trained with a proper loss returns
+            the target Gaussian blurred by its own uncertainty, so variances subtract.
+        toward: Mean of the field's vectors around a corner's peak, which is shorter the more they
+            differ; zero for a centroid.
+        found: Whether the slot holds a peak.
     """
 
     position: Float[np.ndarray, "batch channels peaks 2"]
@@ -140,9 +140,15 @@ def find_peaks(
     """Find up to ``max_peaks`` local maxima above ``threshold`` in each channel.
 
     A peak is a cell not below its eight neighbours. Of equal cells, as on the flat top of a clamped
-    belief, it is the one with the highest neighbourhood, which is the middle one; if these are
-    equal too, the first in raster order. Its position is that of a Gaussian fitted around it.
-    Without a ``field``, which has 16 channels to nine of the belief, peaks have no vectors.
+    belief, the cell with the highest neighbourhood counts, which is the middle one, or else the
+    first in raster order. A Gaussian fitted to the neighbourhood gives the position.
+
+    Args:
+        belief: Maps of nine channels per object.
+        geometry: Geometry of the maps.
+        threshold: Smallest belief of a peak.
+        max_peaks: Number of slots per channel.
+        field: Vectors of 16 channels per object; without it, ``toward`` is zero.
     """
     maps = _on_host(belief)
     height, width = maps.shape[2:]
@@ -153,7 +159,7 @@ def find_peaks(
     if field is not None:
         vectors = _on_host(field).reshape(-1, height, width)
     half = min(max(math.ceil(REACH * geometry.sigma), HALF_WIDTHS[0]), HALF_WIDTHS[1])
-    least = float(np.float32(threshold))  # as exact as beliefs are
+    least = float(np.float32(threshold))  # rounded like the beliefs
     inputs = maps.reshape(-1, height, width), vectors, least, half, geometry.sigma
     # The views by channel share the memory of the arrays, which are filled.
     outputs = (
@@ -165,7 +171,7 @@ def find_peaks(
 
 
 def _on_host(maps: Tensor) -> Float[np.ndarray, "batch channels height width"]:
-    """Return maps as float32 that lies row by row."""
+    """Return maps as a contiguous float32 array."""
     return np.ascontiguousarray(maps.detach().float().cpu().numpy())
 
 
@@ -182,7 +188,7 @@ def _find(
     covariance: Array,
     toward: Array,
 ) -> None:
-    """Fill the peaks of every channel, cells; there may be no field at all."""
+    """Fill the peaks of all channels, in cells; the field may be empty."""
     cells = np.empty((score.shape[1], 2), np.int64)
     for channel in range(len(belief)):
         count = _strongest(belief[channel], threshold, score[channel], cells)
@@ -198,7 +204,7 @@ def _find(
 
 @compiled()
 def _strongest(belief: Array, threshold: float, score: Array, cells: Array) -> int:
-    """Write belief and (column, row) of the strongest maxima, strongest first; say how many."""
+    """Write belief and (column, row) of the strongest maxima in order; return their number."""
     count = 0
     for y in range(belief.shape[0]):
         for x in range(belief.shape[1]):
@@ -220,14 +226,14 @@ def _strongest(belief: Array, threshold: float, score: Array, cells: Array) -> i
 
 @compiled()
 def _is_highest(belief: Array, y: int, x: int) -> bool:
-    """Tell whether a cell is the highest of its 3×3 neighbourhood, one of every set of equals."""
+    """Tell whether a cell is the highest of its 3×3 neighbourhood; one of equal cells is."""
     value = belief[y, x]
     for v in range(max(y - 1, 0), min(y + 2, belief.shape[0])):
         for u in range(max(x - 1, 0), min(x + 2, belief.shape[1])):
             other = belief[v, u]
             if value > other or (v == y and u == x):
                 continue
-            if value != other:  # higher, or no number
+            if value != other:  # higher, or NaN
                 return False
             rank, other_rank = _tie_break(belief, y, x), _tie_break(belief, v, u)
             if not (rank > other_rank or (rank == other_rank and (v > y or (v == y and u > x)))):
@@ -237,7 +243,7 @@ def _is_highest(belief: Array, y: int, x: int) -> bool:
 
 @compiled()
 def _tie_break(belief: Array, y: int, x: int) -> float:
-    """Return what orders cells of one belief: it and, in its last digits, the 5×5 cells' sum."""
+    """Return the rank among equal cells: the belief plus a tiny share of the 5×5 cells' sum."""
     total = np.float32(0.0)
     for u in range(max(x - 2, 0), min(x + 3, belief.shape[1])):
         column = np.float32(0.0)

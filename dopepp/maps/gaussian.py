@@ -1,8 +1,8 @@
-"""Gaussians fitted to the neighbourhoods of peaks, compiled.
+"""Fit Gaussians to the neighbourhoods of peaks, in compiled code.
 
 A belief map is the maximum over instances of b = exp(c + p·x + q·y − r·x² − t·xy − s·y²), with x
-and y counted from the peak's cell. All peaks of a channel are fitted together: each to the cells
-that no other of them reaches, which are told anew once positions are known.
+and y relative to the peak's cell. All peaks of a channel are fitted together, each to the cells
+that no other peak dominates. The cells are assigned again once positions are known.
 """
 
 from __future__ import annotations
@@ -16,53 +16,53 @@ from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.refine import solve_inside
 
 FLOOR: Final = 1e-6
-"""Belief over its peak below which a cell's logarithm says nothing; a peak of σ = 0.5 on the border
-needs its third column, which is as low as e⁻¹²·⁵ = 4e-6."""
+"""Smallest belief, relative to its peak, whose logarithm is used; a peak of σ = 0.5 on the border
+needs its third column, which falls to e⁻¹²·⁵ = 4e-6."""
 
 FIRST_MARGIN: Final = 3.0
-"""Squared cells by which a cell must be nearer to its peak than to another, whose positions within
-their own cells are unknown."""
+"""Squared cells by which a cell must be nearer to its peak than to another peak, while positions
+within cells are unknown."""
 
-MARGIN: Final = 1.0  # The same once both positions are fitted
-SURELY: Final = 1e-6  # Squared cells beyond which a comparison of distances is none of rounding
+MARGIN: Final = 1.0  # As above once both positions are fitted.
+SURELY: Final = 1e-6  # Squared cells that exceed the rounding of distances.
 
-PLATEAU: Final = 3  # Cells as high as the peak's from which on its top is cut off
+PLATEAU: Final = 3  # Number of cells as high as the peak that means a clamped top.
 
-STEPS: Final = 3  # Gauss–Newton steps; the start is the exact answer where there is no noise
+STEPS: Final = 3  # Gauss–Newton steps; without noise, the start is exact.
 
 STEEPEST: Final = 10.0
-"""Logarithm of the highest top under which a clamped belief's flanks are believed."""
+"""Largest logarithm of a fitted top, relative to the peak's belief."""
 
-ARRIVED: Final = 1e-4  # Change of the parameters below which a fit has arrived: 1e-3 px of stride 8
+ARRIVED: Final = 1e-4  # Change of the parameters of a converged fit: 1e-3 px at stride 8.
 
 SHAPE_PRIOR: Final = 0.5
-"""Deviation of a peak's curvature from the target's, relative to it, a priori."""
+"""Prior standard deviation of a peak's curvature, relative to the target's."""
 
-RIDGE: Final = 1e-14  # Decides directions in which no cell is above the floor
+RIDGE: Final = 1e-14  # Determines directions in which no cell exceeds the floor.
 FLATTEST: Final = 1e-3  # Smallest curvature of a peak, 1/cells²: a standard deviation of 22 cells
 
 UNCERTAIN: Final = 4.0
-"""Variance of a position that is only the middle of its highest cells, cells²."""
+"""Variance of a position that is only the centre of its highest cells, cells²."""
 
 
 @compiled()
 def fit_peaks(
     belief: Array, cells: Array, half: int, sigma: float, position: Array, covariance: Array
 ) -> None:
-    """Fit all peaks of one channel, first their logarithms, then the beliefs themselves.
+    """Fit all peaks of a channel, first to logarithms, then to the beliefs.
 
-    The logarithm makes the first fit linear and exact for a clean Gaussian, at the border too,
-    where the neighbourhood is cut; weights b² undo the logarithm's amplification of noise (Guo,
-    IEEE SPM 2011). Gauss–Newton on b itself then removes the bias that noise leaves in logarithms.
+    Logarithms make the first fit linear and exact for a clean Gaussian, even at the border; weights
+    b² compensate for their amplification of noise (Guo, IEEE SPM 2011). Gauss–Newton on b then
+    removes the bias that noise causes in logarithms.
 
     Args:
         belief: The channel's map.
         cells: (column, row) of each peak.
-        half: Half-width of the window around a peak that it is fitted to, cells.
+        half: Half-width of the fitted window, cells.
         sigma: Standard deviation of a perfect peak, cells.
         position: Filled with (x, y) of each peak, cells.
-        covariance: Filled with the covariance of each position, cells²: the fitted Gaussian's less
-            the target's, as far as the map's noise does not explain it, and that of the fit.
+        covariance: Filled with the covariance of each position, cells²: that of the fit, plus the
+            fitted Gaussian's minus the target's if the map's noise does not explain it.
     """
     count, side = len(cells), 2 * half + 1
     theta, hessian = np.zeros((count, 6)), np.zeros((count, 6, 6))
@@ -109,7 +109,7 @@ def fit_peaks(
 
 @compiled()
 def _read_window(belief: Array, left: int, top: int, score: float, window: Array) -> None:
-    """Write the cells around a peak over its belief, NaN outside of the map."""
+    """Write the cells around a peak relative to its belief; NaN outside of the map."""
     height, width = belief.shape
     for y in range(len(window)):
         for x in range(len(window)):
@@ -122,10 +122,10 @@ def _read_window(belief: Array, left: int, top: int, score: float, window: Array
 def mean_vectors(
     vectors: Array, cells: Array, position: Array, radius: float, toward: Array
 ) -> None:
-    """Write the mean of the vectors in each corner's disc, nearer ones weighted more.
+    """Write the weighted mean of the vectors in each corner's disc.
 
-    Where discs overlap, cells carry the vector of the nearest corner. The weights 1 − (d/radius)²
-    fall to 0 at the edges of discs, which no position is exact enough to tell.
+    Where discs overlap, cells hold the vector of the nearest corner. The weights 1 − (d/radius)²
+    fall to 0 at the edges of discs, which inexact positions blur.
     """
     height, width = vectors.shape[1:]
     half = math.ceil(radius)
@@ -170,9 +170,9 @@ def _own_cells(
     margin: float,
     usable: Array,
 ) -> None:
-    """Mark the finite cells of a window that no other peak reaches and no plateau has cut off.
+    """Mark the finite cells of a window that no other peak dominates and no plateau clamps.
 
-    Of Gaussians s·exp(−d²/2σ²) the highest in a cell is that with the smallest d² − 2σ² log s.
+    Of Gaussians s·exp(−d²/2σ²), the highest in a cell has the smallest d² − 2σ² log s.
     """
     side, highest = windows.shape[1], 0
     half = side // 2
@@ -185,7 +185,7 @@ def _own_cells(
         if j == i or far > 4 * half + 2:
             continue
         handicap = 2 * sigma**2 * math.log(scores[i] / scores[j]) - margin
-        # The difference of the squared distances is linear, so a corner has the least of it.
+        # The difference of the squared distances is linear, so its minimum is at a corner.
         column = cells[i, 0] + (half if position[j, 0] > position[i, 0] else -half)
         row = cells[i, 1] + (half if position[j, 1] > position[i, 1] else -half)
         mine = (column - position[i, 0]) ** 2 + (row - position[i, 1]) ** 2
@@ -216,7 +216,7 @@ def _fit_logarithm(
     room: Array,
     theta: Array,
 ) -> None:
-    """Write the weighted linear least-squares fit of log b over its peak, with the prior's pull."""
+    """Write the weighted linear least-squares fit of log b with the prior on the shape."""
     side, half, curvature = len(window), len(window) // 2, 0.5 / sigma**2
     theta[:] = 0.0
     theta[3] = theta[5] = curvature
@@ -233,7 +233,7 @@ def _fit_logarithm(
     _system(work, theta, noise, sigma, hessian, room[0])
     solve_inside(hessian, room[0], 0.0, room[1], room[4:])
     theta += room[1]
-    if work[0, 0] == 0.0:  # nothing but a cut-off top: no slope, no peak
+    if work[0, 0] == 0.0:  # only a clamped top: no slope, no peak
         theta[:] = 0.0
 
 
@@ -248,10 +248,7 @@ def _linearised(
     gradient: Array,
     hessian: Array,
 ) -> tuple[float, float]:
-    """Write the normal equations of b with a prior on the shape.
-
-    Returned are Σ residual² and the number of cells.
-    """
+    """Write the normal equations of b with the prior; return Σ residual² and the cell count."""
     side, half = len(window), len(window) // 2
     squared, used = 0.0, 0.0
     work[:] = 0.0
@@ -262,7 +259,7 @@ def _linearised(
         for x in range(side):
             if usable[y, x]:
                 u = float(x - half)
-                # Beyond it the fit is far off already, and its square must stay a number.
+                # A steeper fit is wrong anyway, and its square must stay finite.
                 model = math.exp(min(level + u * (slope - theta[3] * u), STEEPEST))
                 residual = model - window[y, x]
                 squared += residual * residual
@@ -275,10 +272,7 @@ def _linearised(
 
 @compiled()
 def _step(theta: Array, hessian: Array, room: Array) -> float:
-    """Take the Gauss–Newton step whose gradient is the room's first row; return its length.
-
-    That is the largest move of a parameter.
-    """
+    """Take a Gauss–Newton step with the gradient in ``room[0]``; return its largest component."""
     solve_inside(hessian, room[0], 0.0, room[1], room[4:])
     farthest = 0.0
     for k in range(6):
@@ -333,7 +327,7 @@ def _system(
 
 @compiled()
 def _mode(window: Array, theta: Array) -> tuple[float, float, bool]:
-    """Return a fit's top, or the middle of the highest cells, and whether it is a peak."""
+    """Return a fit's maximum, or else the centre of the highest cells, and whether it is sound."""
     half = len(window) // 2
     across, down, count = 0.0, 0.0, 0
     for v in range(-2, 3):
@@ -348,7 +342,7 @@ def _mode(window: Array, theta: Array) -> tuple[float, float, bool]:
     x = (c * theta[1] - b * theta[2]) / determinant
     y = (a * theta[2] - b * theta[1]) / determinant
     smallest = 0.5 * (a + c - math.sqrt((a - c) ** 2 + 4 * b * b))
-    # A cut-off top's cell may be any of it.
+    # The cell of a clamped top may be any of its cells.
     reach = 1.0 if count < PLATEAU else 2.0
     if smallest > FLATTEST and abs(x - across) <= reach and abs(y - down) <= reach:
         return x, y, True
@@ -376,7 +370,7 @@ def _covariance(
     xx, xy, yy = c / determinant, -b / determinant, a / determinant
     slopes, moved, mean = room[:2], room[2], room[3]
     for k in range(2):
-        # Down to the minus sign, as the equations are solved for the negative.
+        # With a minus sign, as the equations are solved for the negative.
         across, down = (-xx, -xy) if k == 0 else (-xy, -yy)
         slopes[k, 0], slopes[k, 1], slopes[k, 2] = 0.0, across, down
         slopes[k, 3] = -2 * x * across
@@ -387,7 +381,7 @@ def _covariance(
         for m in range(2):
             out[k, m] = -noise * _product(slopes[m], moved)
     out[0, 1] = out[1, 0]
-    # How uncertain the variance is: that of (r + s)/2 relative to it.
+    # Relative uncertainty of the variance: that of (r + s)/2.
     mean[:] = 0.0
     mean[3] = mean[5] = -0.5
     solve_inside(hessian, mean, 0.0, moved, room[4:])

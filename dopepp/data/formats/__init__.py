@@ -1,8 +1,8 @@
-"""Parts that the layouts share: instances, shares of a data set, writers that survive a kill.
+"""Share code between layouts: instances, shares of a data set, writers that survive a kill.
 
-Items are written one by one and finalized chunk by chunk. An item's last file marks the item as
-complete. Files that a chunk's items share (``scene_gt.json``, a tar shard) are assembled from
-items that are staged in a hidden folder.
+Writers write items one by one and finalize them chunk by chunk. An item's last file marks the item
+as complete. Files that a chunk's items share (``scene_gt.json``, a tar shard) are assembled from
+items staged in a hidden folder.
 
 To add a format, see ``docs/how-to/adding-a-data-format.md``.
 """
@@ -39,16 +39,16 @@ RECORD_FILE: Final = "_dopepp_render.json"
 ESTIMATED: Final = (
     "estimated: mask pixels, or without a mask those inside the image, over the hull of the points"
 )
-"""How :func:`make_instance` gets a visible fraction that the annotation does not state."""
+"""How :func:`make_instance` determines a visible fraction that is not annotated."""
 
 _LOCK: Final = "lock"
 _ATTEMPTS: Final = 100
 
 
 class Writer(Protocol):
-    """Writes samples into a folder; every process makes one from (folder, parts).
+    """Writes samples into a folder; each process makes a writer from (folder, parts).
 
-    A file is there completely or not at all. The bytes of an item depend on (index, sample) only.
+    A file exists completely or not at all. The bytes of an item depend on (index, sample) only.
     """
 
     name: str
@@ -58,25 +58,25 @@ class Writer(Protocol):
     """Items ``chunk·chunk_size … (chunk + 1)·chunk_size − 1`` are finalized together."""
 
     def prepare(self) -> None:
-        """Write what all items share, idempotently; a UserError in a folder of other data."""
+        """Write the files that all items share, idempotently; reject a folder of other data."""
 
     def write(self, index: int, sample: Sample) -> None:
-        """Write one item completely; on return it survives a crash."""
+        """Write an item completely; after the call it survives a crash."""
 
     def written(self, chunk: int) -> set[int]:
         """Return the indices of the chunk's complete items, finalized or not."""
 
     def finalize(self, chunk: int, indices: Sequence[int]) -> None:
-        """Assemble what the chunk's items share: idempotent, atomic, and safe in two processes.
+        """Assemble the files that the chunk's items share: idempotent, atomic, process-safe.
 
         A finalized chunk may be finalized again after later items have been added to it.
         """
 
 
 def share(num_items: int, part_of: tuple[float, float], name: str) -> slice:
-    """Return the slice of a share (first, last), given in fractions, of ``num_items`` items.
+    """Return the slice of ``num_items`` items for a share (first, last) in fractions.
 
-    Both bounds are rounded alike, so adjacent shares neither overlap nor leave an item out.
+    Equal bounds are rounded equally, so adjacent shares neither overlap nor leave a gap.
 
     Raises:
         UserError: The share has no item.
@@ -103,9 +103,9 @@ def make_instance(
 ) -> Instance:
     """Return an annotated object as an instance.
 
-    A fraction that is not stated (NaN) is estimated: mask pixels or, without a mask, the hull's
-    area inside the image, over the area of the convex hull of the projected ADD points. The
-    estimate is too small for a concave object.
+    If the visible fraction is NaN, it is estimated: mask pixels or, without a mask, the hull's area
+    inside the image, over the area of the convex hull of the projected ADD points. The estimate is
+    too small for a concave object.
     """
     if math.isnan(visible_fraction):
         inside, whole = hull_areas(project(transform(T_cam_obj, part.points), K), shape)
@@ -116,7 +116,7 @@ def make_instance(
 
 
 def read_object(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
-    """Read a JSON object that a writer extends; empty where there is no file yet."""
+    """Read a JSON object that a writer extends; empty without a file."""
     content = read_json(path, max_bytes) if path.exists() else {}
     if not isinstance(content, dict):
         raise UserError(f"{path}, no JSON object", "what this writer wrote", "restore or remove it")
@@ -124,18 +124,18 @@ def read_object(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
 
 
 def by_line(content: Mapping[str, object]) -> bytes:
-    """Return a JSON object with a line for each key."""
+    """Encode a JSON object with a line for each key."""
     lines = [f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in content.items()]
     return ("{\n" + ",\n".join(lines) + "\n}\n").encode()
 
 
 def stage(path: Path, content: bytes) -> None:
-    """Write a staged item, also if a finalizer removes the empty folder at that moment."""
+    """Write a staged item, even if a finalizer removes the empty folder meanwhile."""
     _retry(lambda: write_whole(path, content))
 
 
 def staged_items(staging: Path, suffix: str) -> list[Path]:
-    """Return the staged items in order; none if a finalizer removes the folder meanwhile."""
+    """Return the staged items in order; none if a finalizer removes the folder."""
     try:
         return sorted(staging.glob(f"[0-9]*{suffix}"))
     except FileNotFoundError:
@@ -144,9 +144,10 @@ def staged_items(staging: Path, suffix: str) -> list[Path]:
 
 @contextmanager
 def finalizing(staging: Path) -> Iterator[None]:
-    """Lock a folder of staged items, and remove the folder in the end if it is empty.
+    """Lock a folder of staged items, and finally remove the folder if it is empty.
 
-    So no process removes items that it has not merged. The system releases a killed process's lock.
+    The lock keeps a process from removing items that it has not merged. The system releases the
+    lock of a killed process.
     """
     path = staging / _LOCK
     while True:
@@ -172,8 +173,8 @@ def _open(path: Path) -> int:
 
 
 def _retry(act: Callable[[], T]) -> T:
-    """Return the result of ``act``, which makes a folder that a finalizer may remove any moment."""
-    # Removed before its use, the folder is not found; removed within ``mkdir``, it "exists".
+    """Repeat ``act``, which needs a folder that a finalizer may remove at any moment."""
+    # A folder removed before its use is not found; a folder removed within ``mkdir`` "exists".
     for _ in range(_ATTEMPTS - 1):
         with suppress(FileNotFoundError, FileExistsError):
             return act()

@@ -1,8 +1,8 @@
-"""Images of all layouts: decoded whole or reported, and encoded.
+"""Decode and encode the images of all layouts.
 
-BOP's images are PNG, JPEG or TIFF, in a file or in a member of a tar file; the frames and maps of
-YCB-Video, NDDS and FAT are PNG or JPEG files. Masks in BOP-WebDataset are run lengths down the
-columns, as COCO's uncompressed RLE: ``{"size": [height, width], "counts": [zeros, ones, …]}``.
+BOP's images are PNG, JPEG or TIFF files or tar members; the frames and maps of YCB-Video, NDDS and
+FAT are PNG or JPEG files. Masks in BOP-WebDataset are run lengths down the columns, like COCO's
+uncompressed RLE: ``{"size": [height, width], "counts": [zeros, ones, …]}``.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ DEPTH_MODES: Final = ("I;16", "I;16B", "I", "L")
 """Pillow's pixel types of BOP's depth images: whole numbers."""
 
 DEPTH_SCALES_MM: Final = (0.1, 1.0)
-"""Millimetres a unit of the depth images that are written: up to 6.5 m, and up to 65 m."""
+"""Millimetres a unit of written depth images, which then reach 6.5 m or 65 m."""
 
 _MAX_UNITS: Final = 65_535
 
@@ -47,10 +47,12 @@ _MAX_UNITS: Final = 65_535
 def picture(
     node: Node, content: bytes | None = None, modes: Sequence[str] = ()
 ) -> Image.Image | None:
-    """Decode a BOP image; return None where it is missing, damaged, too large or of another kind.
+    """Decode a BOP image; report a missing, damaged or too large image and return None.
 
-    ``content`` are the bytes of an image in a tar file; ``modes`` are the allowed pixel types by
-    Pillow's names, none for any.
+    Args:
+        node: The file or tar member.
+        content: Bytes of an image in a tar file.
+        modes: Pillow's names of the allowed pixel types; none allows any.
     """
     if content is None:
         content = node["image"].attempt(lambda: read_content(Path(node.path)))
@@ -80,11 +82,11 @@ def picture_shape(
 
 
 def stated_shape(file: Path | io.BytesIO) -> Shape | None:
-    """Return the (height, width) that a truncated image still states, or None."""
+    """Return the (height, width) in the header of a truncated image, or None."""
     try:
         with Image.open(file, formats=FORMATS) as image:
             width, height = image.size
-    except Exception:  # Pillow raises another type for every way to be damaged
+    except Exception:  # damage makes Pillow raise any type
         return None
     return (height, width) if 0 < width * height <= MAX_PIXELS else None
 
@@ -93,7 +95,7 @@ def decode_rgb(content: bytes, where: str) -> Picture:
     """Decode a colour or grey image as RGB, without an alpha channel.
 
     Raises:
-        UserError: The image is no PNG, JPEG or TIFF, damaged, too large, or not of 8 bits.
+        UserError: The image is no PNG, JPEG or TIFF, is damaged or too large, or has not 8 bits.
     """
     image = picture(Node(STRICT, where), content, COLOUR_MODES)
     assert image is not None
@@ -101,13 +103,16 @@ def decode_rgb(content: bytes, where: str) -> Picture:
 
 
 def decode_depth(content: bytes, where: str, depth_scale: float, shape: Shape) -> DepthMap:
-    """Decode a depth image as metres, float32, 0 where unknown.
+    """Decode a depth image as metres, float32; 0 is unknown.
 
-    ``depth_scale`` is in millimetres a unit, NaN where it is not stated; ``shape`` is the colour
-    image's (height, width).
+    Args:
+        content: The image file.
+        where: Name of the image in messages.
+        depth_scale: Millimetres a unit; NaN if not stated.
+        shape: (height, width) of the colour image.
 
     Raises:
-        UserError: As for :func:`decode_rgb`, or another size, no whole numbers, or no scale.
+        UserError: The image is damaged, too large, of another size or type, or has no scale.
     """
     node = Node(STRICT, where)
     units = one_channel_of(node, shape, content, DEPTH_MODES)
@@ -121,7 +126,7 @@ def decode_mask(content: bytes, where: str, shape: Shape) -> Mask:
     """Decode a mask of an image of ``shape`` (height, width); the object's pixels are not 0.
 
     Raises:
-        UserError: As for :func:`decode_rgb`, or another size, or several channels.
+        UserError: The mask is damaged, too large, of another size, or has several channels.
     """
     mask = one_channel_of(Node(STRICT, where), shape, content)
     assert mask is not None
@@ -131,7 +136,7 @@ def decode_mask(content: bytes, where: str, shape: Shape) -> Mask:
 def one_channel_of(
     node: Node, shape: Shape | None, content: bytes | None = None, modes: tuple[str, ...] = ()
 ) -> NDArray[Any] | None:
-    """Decode a BOP depth image or mask like :func:`picture`; return None where it is reported."""
+    """Decode a BOP depth image or mask; report a wrong image and return None."""
     image = picture(node, content)
     if image is None:
         return None
@@ -143,10 +148,12 @@ def one_channel_of(
 
 
 def read_map(node: Node, shape: Shape | None, colour: bool = False) -> NDArray[Any] | None:
-    """Read a map (depth, labels) of YCB-Video, NDDS or FAT; return None where it is reported.
+    """Read a map (depth, labels) of YCB-Video, NDDS or FAT; report a wrong map and return None.
 
-    ``shape`` is the colour image's (height, width), None for any. Where ``colour`` is allowed, a
-    map of several channels, whose meaning no file states, returns None without a report.
+    Args:
+        node: The file.
+        shape: (height, width) of the colour image; None allows any.
+        colour: Whether several channels, whose meaning no file states, are None without a report.
     """
     image = node["image"].attempt(lambda: read_image(Path(node.path)))
     if image is not None and image.ndim > 2 and colour:
@@ -158,7 +165,7 @@ def read_map(node: Node, shape: Shape | None, colour: bool = False) -> NDArray[A
 def one_channel(
     node: Node, image: NDArray[Any] | None, shape: tuple[int, ...] | None
 ) -> NDArray[Any] | None:
-    """Return a map, or None where it has several channels or another size than the image."""
+    """Return a map; report several channels or another size than ``shape`` and return None."""
     if image is None:
         return None
     if image.ndim != 2:
@@ -181,8 +188,8 @@ def encode_png(pixels: NDArray[Any]) -> bytes:
 def depth_units(depth: DepthMap, covered: Mask) -> tuple[NDArray[np.uint16], float]:
     """Convert metres into units of a 16-bit image; return the units and BOP's ``depth_scale``.
 
-    The scale is the finest one that reaches the farthest object: 0.1 mm within 6.5 m. Background
-    beyond the scale's range becomes 0, unknown. ``covered`` are the pixels of the objects.
+    The scale is the finest scale that reaches all objects, the pixels of ``covered``: 0.1 mm within
+    6.5 m. Background beyond its range becomes 0, unknown.
     """
     farthest = 1000 * float(depth[covered].max(initial=0.0))
     fine, coarse = DEPTH_SCALES_MM
@@ -192,7 +199,7 @@ def depth_units(depth: DepthMap, covered: Mask) -> tuple[NDArray[np.uint16], flo
 
 
 def encode_runs(mask: Mask) -> dict[str, list[int]]:
-    """Return a mask as run lengths, the first of which counts zeros."""
+    """Encode a mask as run lengths; the first run counts zeros."""
     pixels = mask.ravel(order="F")
     borders = np.flatnonzero(np.diff(pixels)) + 1
     runs = np.diff(np.concatenate([[0], borders, [pixels.size]])).tolist()
@@ -200,10 +207,10 @@ def encode_runs(mask: Mask) -> dict[str, list[int]]:
 
 
 def decode_runs(record: object, shape: Shape, node: Node) -> Mask | None:
-    """Decode the run lengths of a mask; return None where they are reported.
+    """Decode the run lengths of a mask; report wrong runs and return None.
 
-    ``record`` must have the image's ``shape`` (height, width) as its size, so a file cannot ask for
-    more memory, and its runs must fill it.
+    The record's size must be the image's ``shape`` (height, width), which bounds memory, and the
+    runs must fill it.
     """
     fields = mapping(record)
     counts, size = fields.get("counts"), fields.get("size")

@@ -1,4 +1,4 @@
-"""Invariants of poses, cameras and boxes that hold in every layout.
+"""Check poses, cameras and boxes of any layout.
 
 Tolerances: a rotation is orthogonal to 1e-3, BOP's to 1e-2; the visible pixels of an object lie in
 the reprojected box within 8 px (released poses of YCB-Video are up to 6 px off) or 5 % of the box's
@@ -39,7 +39,7 @@ class Box(NamedTuple):
 
     @classmethod
     def of_points(cls, points_px: Float[np.ndarray, "points 2"]) -> Box | None:
-        """Return the box of points, or None where one of them is not finite."""
+        """Return the box of points, or None if a coordinate is not finite."""
         if not len(points_px) or not np.isfinite(points_px).all():
             return None
         (left, top), (right, bottom) = points_px.min(axis=0), points_px.max(axis=0)
@@ -47,19 +47,19 @@ class Box(NamedTuple):
 
     @classmethod
     def of_mask(cls, mask: NDArray[Any]) -> Box | None:
-        """Return the box of a mask's pixels, or None where it has none."""
+        """Return the box of a mask's pixels, or None for an empty mask."""
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         if not len(rows):
             return None
         return cls(float(columns[0]), float(rows[0]), float(columns[-1]), float(rows[-1]))
 
     def beyond(self, other: Box) -> float:
-        """Return how far another box reaches out of this one, pixels; negative inside of it."""
+        """Return by how many pixels another box exceeds this box; negative inside."""
         left, top = self.left - other.left, self.top - other.top
         return max(left, top, other.right - self.right, other.bottom - self.bottom)
 
     def is_inside(self, shape: Shape) -> bool:
-        """Tell whether the whole box is in an image of (height, width)."""
+        """Tell whether an image of (height, width) contains the box."""
         height, width = shape
         return min(self.left, self.top) >= 0 and self.right < width and self.bottom < height
 
@@ -68,7 +68,7 @@ class Box(NamedTuple):
 
 
 def rotation_problem(rotation: RotationMatrix, tolerance: float = 1e-3) -> str | None:
-    """Return why a matrix is no rotation, or None where it is one or has NaN."""
+    """Return why a matrix is no rotation; None for a rotation, and for NaN."""
     if is_rotation(rotation, tolerance) or not np.isfinite(rotation).all():
         return None
     deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()

@@ -1,9 +1,9 @@
-"""Problems of a data set's files: raised one by one, or collected by a check.
+"""Report problems of a data set's files: raise the first problem, or collect all problems.
 
-A reader reports what is wrong at a :class:`Node` and goes on with a neutral value (NaN, None, an
-empty list). :class:`Problems` raises the first problem: a data source reads like this.
-:class:`CheckReport` keeps all problems: ``dopepp check`` runs the same reader with it, so a data
-set that passes a check can be read.
+A reader reports a problem at a :class:`Node` and continues with a neutral value (NaN, None, an
+empty list). In a data source, :class:`Problems` raises the first problem. ``dopepp check`` runs the
+same reader with a :class:`CheckReport`, which collects all problems, so a data set that passes a
+check is readable.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from dopepp.core.json import MAX_BYTES, parse_json, read_json
 _log = logging.getLogger(__name__)
 
 MAX_KEPT: Final = 10_000
-"""Defects kept in full; the rest is only counted, so that memory stays bounded."""
+"""Limit of stored defects, which bounds memory; further defects are only counted."""
 
 FARTHEST: Final = 1e9
-"""Largest number of a label in any unit; squares of such numbers stay exact enough."""
+"""Largest number in a label, in any unit; its square is exact enough."""
 
 _IMAGES_A_LINE: Final = 1000  # of the log
 
@@ -39,14 +39,13 @@ class Problems:
     """Raises the first problem."""
 
     def report(self, path: Path | str, where: str, message: str, allowed: str = "") -> None:
-        """Take a problem at a :class:`Node`; ``allowed`` is empty where ``message`` implies it."""
+        """Raise a problem; ``allowed`` is empty if ``message`` implies it."""
         fix = "correct the file or get it again; `dopepp check` lists all problems of a data set"
-        raise UserError(
-            ": ".join(filter(None, (str(path), where.lstrip("."), message))), allowed, fix
-        )
+        parts = str(path), where.lstrip("."), message
+        raise UserError(": ".join(filter(None, parts)), allowed, fix)
 
     def take(self, path: Path | str, where: str, error: UserError) -> None:
-        """Take a problem that a function of another package has raised."""
+        """Raise an error of another package's function."""
         raise error
 
 
@@ -93,18 +92,18 @@ class CheckReport(Problems):
         self.report(path, where, "missing" if where == "file" else message, error.allowed)
 
     def note(self, text: str) -> None:
-        """Add, once, something that is worth knowing and no defect."""
+        """Add a remark that is no defect, unless it has been added already."""
         if text not in self.notes:
             self.notes.append(text)
 
     def count_image(self) -> None:
-        """Count an image, and log the progress now and then."""
+        """Count an image, and log the progress once in a while."""
         self.num_images += 1
         if self.num_images % _IMAGES_A_LINE == 0:
             _log.info("%s images checked, %s defects", self.num_images, self.num_defects)
 
     def lines(self, most: int = 100) -> list[str]:
-        """Return the notes, at most ``most`` defects, and a summary, a line each."""
+        """Return lines of the notes, of at most ``most`` defects, and of a summary."""
         shown = self.defects[:most]
         if self.num_defects > len(shown):
             shown.append(f"… and {self.num_defects - len(shown):,} more")
@@ -118,7 +117,7 @@ class CheckReport(Problems):
 
 @dataclass(frozen=True)
 class Node:
-    """A file or a field of it, with the receiver of its problems.
+    """A file or a field of a file, with the receiver of its problems.
 
     Attributes:
         path: The file; a member of a tar file as ``TAR/MEMBER``.
@@ -139,7 +138,7 @@ class Node:
         self.problems.report(self.path, self.where, message, allowed)
 
     def attempt(self, read: Callable[[], T]) -> T | None:
-        """Return the result of ``read``, or None where it raises, which is reported."""
+        """Return the result of ``read``, or report its error and return None."""
         is_missing = isinstance(self.path, Path) and not self.path.is_file()
         try:
             return read()
@@ -150,9 +149,9 @@ class Node:
     def load(
         self, allowed: str = "a JSON object { }", max_bytes: int = MAX_BYTES
     ) -> dict[str, Any] | None:
-        """Read a JSON file whose top level is an object; return None where that is impossible.
+        """Read a JSON file whose top level is an object; return None if that is impossible.
 
-        A number that is not finite, or a key twice, is reported, and the rest is read still.
+        Numbers that are not finite and repeated keys are reported, and the rest is read.
         """
         path = Path(self.path)
         strict = self["JSON"].attempt(lambda: [read_json(path, max_bytes)])
@@ -174,11 +173,11 @@ class Node:
         return _leniently(content) if strict is None else strict[0]
 
     def numbers(self, value: object, *shape: int) -> Float[np.ndarray, "..."]:
-        """Return a field's numbers as an array; NaN where they are reported.
+        """Return a field's numbers as an array; report other values and return NaN.
 
         Args:
-            value: A number or (nested) lists of numbers; None where the field is missing.
-            shape: Shape of the array. Lists of another shape with as many numbers are accepted.
+            value: A number or (nested) lists of numbers; None for a missing field.
+            *shape: Shape of the array. Lists of another shape with as many numbers are accepted.
         """
         try:
             array = np.array(value)
@@ -195,11 +194,11 @@ class Node:
         return np.full(shape, np.nan)
 
     def scalar(self, value: object) -> float:
-        """Return a field's number; NaN where it is reported."""
+        """Return a field's number; report another value and return NaN."""
         return float(self.numbers(value, 1)[0])
 
     def entries(self, value: object) -> list[Any]:
-        """Return a list's JSON objects; an empty one in place of an entry that is reported."""
+        """Return a list's JSON objects; report other entries and make them empty."""
         if not isinstance(value, list):
             self.report("missing" if value is None else f"{value!r:.60}", "a list")
             return []

@@ -1,1 +1,1 @@
-"""Where samples come from besides files: renders, kept renders, and mixtures."""
+"""Sources of samples other than files: renders, cached renders, and mixtures."""

@@ -1,6 +1,6 @@
-"""Sources made of others: a mix of real, rendered and synthetic frames, and windows of frames.
+"""Combine sources: mix real, rendered and synthetic frames, and crop windows of frames.
 
-``real_fraction`` counts real camera frames only (paper Table 1: real against hybrid); synthetic
+``real_fraction`` counts real camera frames only (paper Table 1: real versus hybrid). Synthetic
 frames of a data set, e.g. YCB-Video's ``data_syn``, count as virtual.
 """
 
@@ -41,7 +41,7 @@ Order = Int[np.ndarray, " items"]
 def _shares(
     present: tuple[bool, ...], real_fraction: float, synthetic_fraction: float
 ) -> list[float]:
-    """Return the shares of (real, virtual, synthetic); the others take an absent one's."""
+    """Return the shares of (real, virtual, synthetic), without those of absent sources."""
     real, virtual, synthetic = present
     real_share = (real_fraction if virtual or synthetic else 1.0) if real else 0.0
     synthetic_part = (synthetic_fraction if virtual else 1.0) if synthetic else 0.0
@@ -51,14 +51,14 @@ def _shares(
 class HybridSource:
     """A mix with exact shares, a pure function of (seed, epoch, index).
 
-    Every epoch holds round(share × samples_per_epoch) items of each source in an order drawn per
-    epoch. A source is gone through in its own shuffled order from one epoch into the next, so that
-    its items are used equally often; the number of the round is the epoch that it is asked for.
+    An epoch holds round(share × samples_per_epoch) items of each source in an order drawn per
+    epoch. Each source is traversed in its own shuffled order across epochs, so that its items are
+    used equally often; the number of the traversal is the epoch of the source.
 
     Args:
-        real: Real camera frames; without them the real share is 0.
+        real: Real camera frames; the real share is 0 without them.
         real_fraction: Share of ``real``, in [0, 1].
-        synthetic_fraction: Share of ``synthetic`` in what is not real, in [0, 1].
+        synthetic_fraction: Share of ``synthetic`` in the remaining items, in [0, 1].
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class HybridSource:
         self.counts = (num_real, samples_per_epoch - num_real - num_synthetic, num_synthetic)
         self.name, self._seed, self._length = name, seed, samples_per_epoch
         self._plan = lru_cache(1)(self._make_plan)
-        # An epoch may straddle two cycles of a source; older ones are not needed again.
+        # An epoch may straddle two cycles of a source; older cycles are not needed again.
         self._order = lru_cache(2 * len(_ROLES))(
             lambda role, cycle, length: item_rng(seed, Purpose.CYCLE, cycle, role).permutation(
                 length
@@ -97,7 +97,7 @@ class HybridSource:
         return self._length
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Return item ``index`` of ``epoch`` from whichever source the mix has drawn for it."""
+        """Return item ``index`` of ``epoch`` from the source that the mix has drawn."""
         role, cycle, item = self.locate(index, epoch)
         source = self._sources[role]
         assert source is not None  # an absent source has no items in the plan
@@ -123,14 +123,14 @@ class HybridSource:
         return roles, ranks
 
     def contains(self, label: str) -> bool:
-        """Tell whether any source that has a share holds this object."""
+        """Tell whether any source with a share holds this object."""
         return any(
             count > 0 and source is not None and source.contains(label)
             for source, count in zip(self._sources, self.counts, strict=True)
         )
 
     def describe(self) -> list[SourceInfo]:
-        """Return the entries of all sources that have a share."""
+        """Return the entries of all sources with a share."""
         mix = {"seed": self._seed, "samples_per_epoch": self._length}
         entries = []
         for role, source, count in zip(_ROLES, self._sources, self.counts, strict=True):
@@ -143,11 +143,11 @@ class HybridSource:
 
 
 class WindowedSource:
-    """Another source's images, scaled, and of each a window with the centre of an object in it.
+    """Windows of another source's scaled images that contain the centre of an object.
 
-    A network that learns on windows of renders sees the same of photographs. Object and window are
-    drawn anew every epoch, the window among all in the picture that hold the object's centre, or
-    anywhere without an object. Pictures smaller than the window are padded, as for prediction.
+    A network that trains on windows of renders thus gets windows of photographs. Each epoch draws
+    object and window anew, uniformly among the windows that contain the object's centre, or among
+    all windows without an object. Smaller pictures are padded, as for prediction.
 
     Args:
         picture: (width, height) that the source's images are resized to fit, pixels.
@@ -180,11 +180,11 @@ class WindowedSource:
         return pad_sample(window, self._window)
 
     def contains(self, label: str) -> bool:
-        """Tell what the whole images tell."""
+        """Tell whether the whole images hold this object."""
         return self._source.contains(label)
 
     def describe(self) -> list[SourceInfo]:
-        """Return what the images are, and the sizes."""
+        """Describe the source with the sizes."""
         sizes = {"picture": list(self._picture), "window": list(self._window)}
         return [
             replace(info, identity={**info.identity, **sizes}) for info in self._source.describe()

@@ -1,8 +1,8 @@
-"""Virtual images as a source: rendered when they are asked for, or once and then kept.
+"""Provide virtual images as a source, rendered on demand or cached.
 
-Training, validation and test are three disjoint index ranges of one factory, so no image is ever in
-two of them. Only training images change with the epoch; those that are kept are of epoch 0, and
-masking and augmentation, which come after, still differ from epoch to epoch.
+Training, validation and test are three disjoint index ranges of a factory, so they share no image.
+Only training images change with the epoch. Cached images are those of epoch 0; masking and
+augmentation come later and still differ between epochs.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class RenderedSource:
 
     Args:
         split: One of the three disjoint index ranges; ``val`` and ``test`` ignore the epoch.
-        scale: Enlargement of the parts: the camera of the same scenes, moved.
+        scale: Enlargement of the parts by a camera that is moved in the same scenes.
     """
 
     def __init__(
@@ -81,14 +81,14 @@ class RenderedSource:
             "parts": {part.name: part.mesh_hash for part in self.factory.parts},
             "negatives": {part.name: part.mesh_hash for part in self.factory.negatives},
         }
-        # What was rendered before there were these keeps its identity.
+        # The default adds no key, so that older renders keep their identity.
         if self.scale != 1:
             identity["scale"] = self.scale
         return [SourceInfo(self.name, self._num_items, identity)]
 
 
 def rendered_sample(rendered: Rendered, source: str, key: str) -> Sample:
-    """Turn a rendered image into a sample of its targets, hidden ones included."""
+    """Turn a rendered image into a sample of all its targets, even hidden targets."""
     scene = rendered.scene
     instances = [
         Instance(
@@ -105,21 +105,20 @@ def rendered_sample(rendered: Rendered, source: str, key: str) -> Sample:
 
 _TEXT_LENGTH: Final = 64
 _MAX_INSTANCES: Final = 16
-"""Masks are kept as one uint8 map: 0 for the background, i + 1 for instance i."""
+"""Masks are stored as a uint8 map: 0 for the background, i + 1 for instance i."""
 
 _FILLED: Final = 1 << 32
-"""Added to a slot's CRC-32, which may be 0, so that only an empty slot has the checksum 0."""
+"""Added to a slot's CRC-32, so that only an empty slot has the checksum 0."""
 
 
 def _in_memory(dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndarray, " items"]:
-    """Return zeros that forked processes share; they take memory only where they are written."""
+    """Return zeros that forked processes share; only written pages take memory."""
     return np.frombuffer(mmap.mmap(-1, dtype.itemsize * num_items), dtype)
 
 
 def _in_file(path: Path, dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndarray, " items"]:
-    """Map a file that is there, or else a new one of zeros, into memory."""
-    # All of its disk space is taken now: a disk that becomes full under a map with holes kills the
-    # process.
+    """Map an existing file, or a new file of zeros, into memory."""
+    # Disk space is allocated now, because a full disk under a map with holes kills the process.
     size = dtype.itemsize * num_items
     try:
         if not path.is_file() or path.stat().st_size != size:
@@ -134,22 +133,21 @@ def _in_file(path: Path, dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndar
 
 
 class CachedSource:
-    """A source that keeps another one's items of epoch 0, resized to the network's input size.
+    """Caches another source's items of epoch 0, resized to the network's input size.
 
-    It is one array with a slot for every item, in memory, which forked workers share, or in a file,
-    which runs share. Whoever asks for an item first fills its slot: the content, then its checksum.
-    A slot with a wrong checksum, left by a kill, is filled again. No lock is needed: processes that
-    fill one slot at once write the same bytes.
+    The cache is an array with a slot for each item, in memory shared by forked workers or in a file
+    shared by runs. The first request for an item fills its slot: the content, then the checksum. A
+    slot with a wrong checksum, left by a killed process, is filled again. No lock is needed, as
+    processes that fill a slot simultaneously write the same bytes.
 
     Args:
-        input_size: (width, height) that the images are shrunk to fit; None keeps size and depth.
-        folder: Folder of the files, each in a subfolder named by a hash of everything that decides
-            its items; None keeps the items in memory.
-        identity: What decides the items beside the source's description, e.g. the code's version.
+        input_size: (width, height) that bounds the resized images; None keeps size and depth.
+        folder: Folder of the files, in subfolders named by a hash of everything that determines the
+            items; None keeps the items in memory.
+        identity: Determines the items besides the source's description, e.g. the code's version.
 
     Raises:
-        UserError: The cache would take more than half of the machine's memory, or there is no room
-            in the folder.
+        UserError: The cache needs more than half of the machine's memory, or the disk is full.
     """
 
     def __init__(
@@ -197,11 +195,11 @@ class CachedSource:
         return self._load(index)
 
     def contains(self, label: str) -> bool:
-        """Tell what the kept source tells."""
+        """Tell whether the cached source holds this object."""
         return self._source.contains(label)
 
     def describe(self) -> list[SourceInfo]:
-        """Return what the kept source describes, marked as cached: its epochs are all the same."""
+        """Describe the source, marked as cached: its epochs are all the same."""
         return [
             replace(info, identity={**info.identity, "cached": True})
             for info in self._source.describe()
@@ -234,7 +232,7 @@ class CachedSource:
         self._checksums[index] = self._checksum(index)
 
     def _check(self, sample: Sample) -> None:
-        """Refuse what a slot would cut off or mix up without a word."""
+        """Reject samples that a slot cannot represent."""
         if len(sample.instances) > _MAX_INSTANCES:
             raise ValueError(f"{len(sample.instances)} instances; at most {_MAX_INSTANCES}")
         kept = (self._shape, self._source_name, self._has_depth)
@@ -268,7 +266,7 @@ class CachedSource:
 
 
 def _slot(shape: Shape, has_depth: bool) -> np.dtype[Any]:
-    """Return the layout of one kept sample."""
+    """Return the layout of a cached sample."""
     instance = np.dtype(
         [
             ("T_cam_obj", "f8", (4, 4)),

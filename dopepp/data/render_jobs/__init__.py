@@ -1,1 +1,1 @@
-"""Render jobs: a data set of any size, by any number of processes, stopped and resumed at will."""
+"""Render data sets of any size with any number of processes; jobs can stop and resume."""

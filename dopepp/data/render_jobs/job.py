@@ -1,7 +1,7 @@
-"""What a render job makes, from what a user writes; its record, and the folder it claims.
+"""Define a render job from user input, record it, and claim its folder.
 
-The record holds, as plain values, everything that decides the job's bytes. It is written into the
-folder first; whoever comes later with another one is refused, by the fields that differ.
+The record holds everything that determines the job's bytes, as plain values. It is written into the
+folder first. A later job with another record is rejected with the fields that differ.
 
 To add a layout, write a :class:`~dopepp.data.formats.Writer` and one line in :data:`WRITERS`.
 """
@@ -44,13 +44,13 @@ WRITERS: Final = {
 """Module and class of each layout's writer."""
 
 RECORD_VERSION: Final = 1  # of the record's layout
-_HASH_DIGITS: Final = 16  # of the hash of the code that renders, enough to tell versions apart
+_HASH_DIGITS: Final = 16  # of the rendering code's hash, enough to distinguish versions
 _NAMED: Final = re.compile(r"([^=/\\]+)=(.+)")  # ``NAME=FILE``; a name is not a path
 
 
 @dataclass(frozen=True)
 class Job:
-    """What is rendered, whoever renders how much of it."""
+    """Images to render, independent of processes and shards."""
 
     factory: Factory  # renders image (0, index)
     layout: str
@@ -76,22 +76,25 @@ def make_job(
     camera: str | Path | None = None,
     working_distance: str | None = None,
 ) -> Job:
-    """Make a job from what a user writes; a UserError tells what of it cannot be used.
+    """Make a job from user input.
 
     Args:
-        parts: Built-in names, mesh files, or ``NAME=FILE`` where the file's name will not do.
-        unit: The mesh files' unit; None for the assumed one.
+        parts: Built-in names, mesh files, or ``NAME=FILE`` to name a file's part.
+        unit: Unit of the mesh files; None for the default.
         preset: Name of a preset.
-        changes: ``field.field=value``, the value as YAML.
-        size: ``WIDTHxHEIGHT`` or ``WIDTH,HEIGHT`` in pixels, as :meth:`Preset.reframed` takes it;
-            None for the preset's own.
-        seed: Of the whole job.
-        backgrounds: As :func:`~dopepp.virtual.backgrounds.find_backgrounds` takes it.
-        negatives: Parts among the distractors, written as ``parts``.
+        changes: ``field.field=value`` with a value in YAML.
+        size: ``WIDTHxHEIGHT`` or ``WIDTH,HEIGHT`` in pixels for :meth:`Preset.reframed`; None
+            for the preset's size.
+        seed: Seed of the whole job.
+        backgrounds: Value for :func:`~dopepp.virtual.backgrounds.find_backgrounds`.
+        negatives: Parts among the distractors, written like ``parts``.
         renderer: Name of a renderer.
         layout: Key of :data:`WRITERS`.
-        camera: File of the camera whose pictures are rendered; None for the preset's own camera.
-        working_distance: ``NEAREST,FARTHEST`` of the parts from this camera, metres.
+        camera: File of the camera to simulate; None for the preset's camera.
+        working_distance: ``NEAREST,FARTHEST`` distance of the parts from this camera, metres.
+
+    Raises:
+        UserError: A value is not usable.
     """
     _find_writer(layout)
     scenes = preset_of(preset, _nested(changes))
@@ -106,7 +109,7 @@ def make_job(
         renderer=renderer,
         negatives=[named_part(text, unit) for text in negatives],
     )
-    # What a user chooses comes first: of several differences, the first are shown.
+    # The user's choices come first, as messages show the first differences.
     record = {
         "record_version": RECORD_VERSION,
         "format": layout,
@@ -123,7 +126,7 @@ def make_job(
 
 
 def _find_writer(layout: str) -> Callable[[Path, Sequence[Part]], Writer]:
-    """Return the class of a layout's writer; its module is imported only now."""
+    """Import and return the class of a layout's writer."""
     if layout not in WRITERS:
         raise UserError(f"format {layout!r}", ", ".join(WRITERS), "choose one of them")
     module, name = WRITERS[layout]
@@ -132,7 +135,7 @@ def _find_writer(layout: str) -> Callable[[Path, Sequence[Part]], Writer]:
 
 
 def named_part(text: str, unit: str | None) -> Part:
-    """Load a part that is written as in :func:`make_job`; a UserError where there is none such."""
+    """Load a part that is written as in :func:`make_job`."""
     match = None if Path(text).exists() else _NAMED.fullmatch(text)
     if match is None:
         return load_part(text, unit)
@@ -142,7 +145,7 @@ def named_part(text: str, unit: str | None) -> Part:
 def _in_camera(
     scenes: Preset, parts: Sequence[Part], path: str | Path | None, distance: str | None
 ) -> Preset:
-    """Return the scenes in a camera's whole pictures, and tell how large the parts are there."""
+    """Return the scenes in a camera's whole pictures, and log the sizes of the parts."""
     if path is None or distance is None:
         missing = "--camera FILE" if path is None else "--working-distance 0.3,0.8"
         given = "--working-distance" if path is None else "--camera"
@@ -168,7 +171,7 @@ def _sides(size: str) -> tuple[int, int]:
 
 
 def _nested(changes: Sequence[str]) -> dict[str, Any]:
-    """Turn ``a.b=1`` into ``{"a": {"b": 1}}``."""
+    """Convert ``a.b=1`` to ``{"a": {"b": 1}}``."""
     tree: dict[str, Any] = {}
     for change in changes:
         path, sign, text = change.partition("=")
@@ -190,7 +193,7 @@ def _nested(changes: Sequence[str]) -> dict[str, Any]:
 
 
 def _part_record(part: Part) -> dict[str, Any]:
-    """Describe a part by its name, its size and hashes of its shape and its looks."""
+    """Describe a part by its name, size and hashes of shape and appearance."""
     mesh = part.mesh
     appearance = hashlib.sha256()
     looks = () if mesh is None else (mesh.uv, mesh.texture, mesh.colours, mesh.normals)
@@ -215,10 +218,11 @@ def is_begun(root: Path) -> bool:
 
 
 def begin(root: Path, record: Mapping[str, Any]) -> None:
-    """Claim a folder for a job, or find that it is this job's already, and clean it.
+    """Claim a folder for a job, unless the job has claimed it already, and clean it.
 
-    A UserError: it cannot be written, or holds another job or something else; a StoppedError: there
-    is no space left.
+    Raises:
+        UserError: The folder is not writable, or holds another job or other files.
+        StoppedError: The disk is full.
     """
     try:
         root.mkdir(parents=True, exist_ok=True)
@@ -234,7 +238,7 @@ def begin(root: Path, record: Mapping[str, Any]) -> None:
 
 def _claim(root: Path, record: Mapping[str, Any]) -> None:
     path = root / RECORD_FILE
-    # Listed before the record is looked for: what another shard has made came after its record.
+    # Listed before the check for a record, because other shards write after their record.
     names = sorted(entry.name for entry in root.iterdir())
     if not path.exists():
         foreign = [name for name in names if not name.endswith(PARTIAL_SUFFIX)]
@@ -245,7 +249,7 @@ def _claim(root: Path, record: Mapping[str, Any]) -> None:
                 "choose another folder",
             )
         write_whole(path, (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())
-    # Also after writing: two jobs may have begun in the same moment.
+    # This also follows writing, as two jobs may begin simultaneously.
     differences = list(_differences(read_json(path, _MAX_RECORD_BYTES), record, ""))
     if differences:
         raise UserError(
@@ -256,7 +260,7 @@ def _claim(root: Path, record: Mapping[str, Any]) -> None:
 
 
 def _differences(there: object, now: object, where: str) -> Iterator[str]:
-    """Yield every field that differs, with both values."""
+    """Yield each different field with both values."""
     if isinstance(there, dict) and isinstance(now, dict):
         for key in now | there:
             field = f"{where}.{key}" if where else str(key)
@@ -271,7 +275,7 @@ def _differences(there: object, now: object, where: str) -> Iterator[str]:
 
 
 def _remove_abandoned(root: Path) -> None:
-    """Remove the partial files that killed processes left, but none of a running shard."""
+    """Remove partial files of killed processes, but no file of a running shard."""
     clock = partial_path(root / "clock")
     clock.touch()
     now = clock.stat().st_mtime

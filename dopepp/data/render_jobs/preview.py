@@ -1,4 +1,4 @@
-"""The first images of a job on one sheet, to look at before rendering thousands."""
+"""Preview the first images of a job on a sheet before rendering thousands."""
 
 from __future__ import annotations
 
@@ -37,10 +37,14 @@ _AXIS_LENGTH: Final = 0.5  # of the part's diameter
 
 
 def write_preview(job: Job, out: Path) -> Path:
-    """Write a contact sheet of the job's first images.
+    """Write a contact sheet of the job's first images, and return its path.
 
-    ``out`` is a PNG file, or the data set's folder: the sheet then lies beside it. Returns its
-    path.
+    Args:
+        job: The job.
+        out: A PNG file, or the data set's folder, to whose name ``.preview.png`` is added.
+
+    Raises:
+        UserError: The sheet cannot be written.
     """
     out = out.resolve()
     path = out if out.suffix.lower() == ".png" else out.parent / f"{out.name}.preview.png"
@@ -55,10 +59,7 @@ def write_preview(job: Job, out: Path) -> Path:
 
 
 def preview_sheet(factory: Factory, num_scenes: int = NUM_SCENES) -> Picture:
-    """Render a job's first images and draw, in a row each, the image and its labels.
-
-    Above them stands what each part is: its size and how many bodies it has.
-    """
+    """Render a job's first images into rows of image and labels, below a line per part."""
     tiles: list[Tile] = []
     for index in range(num_scenes):
         tiles += scene_tiles(factory.render(0, index), f"image {index}")
@@ -91,7 +92,7 @@ def scene_tiles(rendered: Rendered, name: str) -> Iterator[Tile]:
 
 
 def _posed(rendered: Rendered, sample: Sample) -> Picture:
-    """Draw cuboids in the masks' colours, and the object frames' axes."""
+    """Draw cuboids in the masks' colours, and the axes of the object frames."""
     frames = [
         Wireframe(instance.keypoints, COLOURS[number % len(COLOURS)])
         for number, instance in enumerate(sample.instances)

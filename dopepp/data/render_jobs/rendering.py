@@ -1,7 +1,7 @@
-"""Make a data set: render what is missing, finalize what is complete, and show how far it is.
+"""Render a data set: render missing images, finalize complete chunks, and show the progress.
 
-A job's images lie in chunks, which are finalized when they are complete. A shard is a contiguous
-part of the job; it may begin and end within a chunk.
+A job's images form chunks, which are finalized when they are complete. A shard is a contiguous part
+of the job, which may begin and end within a chunk.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ from dopepp.virtual.renderers.photoreal import THREADS_SETTING
 _log = logging.getLogger(__name__)
 
 ENGINES: Final = ("local", "ray")
-MAX_WORKERS: Final = 1024  # more processes than any machine here has cores: a slip of the keyboard
+MAX_WORKERS: Final = 1024  # more than any machine has cores, so a larger number is a typing error
 _LINE_EVERY_S: Final = 30.0
 
 OpenPool = Callable[[bytes], Pool]
-"""From the pickled :class:`RenderTasks` of a job to a pool."""
+"""Opens a pool for the pickled :class:`RenderTasks` of a job."""
 
 OnProgress = Callable[[int, int], None]
-"""Told how many of how many images are there, once at the start and then whenever some came."""
+"""Receives the numbers of finished and of all images, at the start and after each task."""
 
 
 @dataclass
 class RenderReport:
-    """What a run has done."""
+    """Numbers and times of a run."""
 
-    num_images: int  # images of the shard, all there now
-    num_rendered: int = 0  # those that this run made
+    num_images: int  # images of the shard
+    num_rendered: int = 0  # images rendered by this run
     wall_s: float = 0.0
     render_s: float = 0.0  # CPU seconds of rendering
     write_s: float = 0.0  # CPU seconds of encoding and writing
@@ -75,16 +75,20 @@ def run(
     engine: str = "local",
     ray_address: str | None = None,
 ) -> RenderReport:
-    """Render what is missing and show the progress on stderr.
+    """Render missing images and show the progress on stderr.
 
     Args:
-        job: What to render.
+        job: The job.
         out: Folder of the data set.
         num: Number of images of the whole job.
         shard: Part of the job, ``i/n``.
         workers: Number of processes; None for one per core.
-        engine: One of :data:`ENGINES`.
-        ray_address: ``host:port`` of a Ray cluster; None for one on this machine.
+        engine: An entry of :data:`ENGINES`.
+        ray_address: ``host:port`` of a Ray cluster; None starts a cluster on this machine.
+
+    Raises:
+        UserError: A value is not usable.
+        StoppedError: The disk is full, or a worker has died.
     """
     if num is None:
         raise UserError("no -n", "the number of images, or --preview", "add -n 1000")
@@ -94,7 +98,7 @@ def run(
 
 
 def _engine(engine: str, workers: int | None, ray_address: str | None) -> OpenPool:
-    """Return what opens the pool, after checking what can be checked without it."""
+    """Return the function that opens the pool, after checking the options."""
     workers = available_cores() if workers is None else workers
     if not 1 <= workers <= MAX_WORKERS:
         raise UserError(f"--workers {workers}", f"1 to {MAX_WORKERS}", "change --workers")
@@ -110,14 +114,18 @@ def _engine(engine: str, workers: int | None, ray_address: str | None) -> OpenPo
 
 @dataclass(frozen=True)
 class Shard:
-    """One of several equal, contiguous parts of a job."""
+    """One of several equal and contiguous parts of a job."""
 
     number: int = 0
     total: int = 1
 
     @classmethod
     def parse(cls, text: str) -> Shard:
-        """Read ``i/n``, i from 0 to n − 1; anything else is a :class:`UserError`."""
+        """Parse ``i/n`` with i from 0 to n − 1.
+
+        Raises:
+            UserError: The text has another form.
+        """
         match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text)
         if match is None or int(match[1]) >= int(match[2]):
             raise UserError(
@@ -128,7 +136,7 @@ class Shard:
         return cls(int(match[1]), int(match[2]))
 
     def span(self, num_items: int) -> range:
-        """Return the shard's indices of a job of ``num_items`` images."""
+        """Return the shard's indices in a job of ``num_items`` images."""
         return range(
             num_items * self.number // self.total, num_items * (self.number + 1) // self.total
         )
@@ -136,15 +144,15 @@ class Shard:
 
 @dataclass(frozen=True)
 class Chunk:
-    """What a shard has to do with a chunk."""
+    """A shard's share of a chunk."""
 
     number: int
-    required: range  # the job's images in it, also those of other shards, to finalize it with
-    missing: Sequence[int]  # the shard's images in it that are not there yet
+    required: range  # the job's images in the chunk, from all shards, needed to finalize it
+    missing: Sequence[int]  # the shard's images in the chunk that are not rendered
 
 
 def plan(writer: Writer, shard: Shard, num_items: int) -> Iterator[Chunk]:
-    """Yield the chunks that a shard touches, in order, also those that are complete."""
+    """Yield the chunks that a shard overlaps, in order, including complete chunks."""
     span, size = shard.span(num_items), writer.chunk_size
     for number in range(span.start // size, -(-span.stop // size) if span else 0):
         required = range(number * size, min((number + 1) * size, num_items))
@@ -159,12 +167,12 @@ class RenderTask:
     """Images to render and write, or a chunk to finalize."""
 
     chunk: int
-    indices: Sequence[int]  # the images; for finalizing, those without which it must not happen
-    finalizes: bool = False  # whether the chunk is to be finalized
+    indices: Sequence[int]  # images to render, or images required for finalizing
+    finalizes: bool = False
 
 
 class RenderTasks:
-    """A pool's function: performs tasks of a job in one process, on one thread."""
+    """Performs tasks of a job in a process of a pool, on one thread."""
 
     def __init__(self, job: Job, root: Path) -> None:
         self._job, self._root = job, root
@@ -175,7 +183,9 @@ class RenderTasks:
         factory, writer = self._open()
         if task.finalizes:
             written = writer.written(task.chunk)
-            if written.issuperset(task.indices):  # else images of it are still to come
+            if written.issuperset(
+                task.indices
+            ):  # otherwise other shards still render images of the chunk
                 writer.finalize(task.chunk, sorted(written))
             return 0.0, 0.0
         render_s = write_s = 0.0
@@ -210,17 +220,28 @@ def render_dataset(
     shard: Shard | None = None,
     on_progress: OnProgress = lambda done, total: None,
 ) -> RenderReport:
-    """Bring a folder to ``num_items`` images, or to one shard of them.
+    """Render the missing images of a job, or of a shard, into a folder.
 
-    What is there is kept: whatever stopped an earlier run, this one goes on. Several shards may
-    share the folder at the same time; whoever completes a chunk finalizes it. A StoppedError: the
-    disk is full or a worker died.
+    Existing images are kept, so a run resumes after any interruption. Several shards may share the
+    folder simultaneously; the shard that completes a chunk finalizes it.
+
+    Args:
+        job: The job.
+        root: Folder of the data set.
+        num_items: Number of images of the whole job.
+        open_pool: Opens the pool of processes.
+        shard: Part of the job; None for the whole job.
+        on_progress: Receives the progress.
+
+    Raises:
+        UserError: The number or the folder is not usable.
+        StoppedError: The disk is full, or a worker has died.
     """
     if not 1 <= num_items <= MAX_ITEMS:
         raise UserError(f"-n {num_items}", f"1 to {MAX_ITEMS:,} images", "change -n")
     root, shard = root.resolve(), shard or Shard()
     if not is_begun(root):
-        # A preset that cannot show the part is found out before anything is written.
+        # This fails before anything is written if the preset cannot show the part.
         job.factory.scene(0, 0)
     begin(root, job.record)
     start = time.monotonic()
@@ -230,7 +251,7 @@ def render_dataset(
         run = _Run(list(plan(writer, shard, num_items)), RenderReport(len(shard.span(num_items))))
         on_progress(run.num_there, run.report.num_images)
         with open_pool(pickle.dumps(RenderTasks(job, root))) as pool:
-            # Renders and, between them, finalizes; then the finalizes of what was rendered last.
+            # Render tasks with finalizing tasks in between, then the remaining finalizing tasks.
             for tasks in (run.tasks(pool.batch_size), run.finalizes()):
                 for task, future in pool.run(tasks):
                     run.note(task, *future.result())
@@ -244,31 +265,31 @@ def render_dataset(
 
 
 class _Run:
-    """What is left to do, and what has been done."""
+    """Remaining and finished tasks of a run."""
 
     def __init__(self, chunks: list[Chunk], report: RenderReport) -> None:
         self.report = report
         self._chunks = {chunk.number: chunk for chunk in chunks}
         self._left = {chunk.number: len(chunk.missing) for chunk in chunks}
-        # Complete already, but maybe not finalized: finalizing is idempotent.
+        # Complete chunks may lack finalizing, which is idempotent.
         self._complete = deque(number for number, left in self._left.items() if not left)
         self.num_there = report.num_images - sum(self._left.values())
 
     def tasks(self, images_per_task: int) -> Iterator[RenderTask]:
-        """Yield all renders and, between them, the finalizes of chunks that are complete."""
+        """Yield all render tasks and, in between, finalizing tasks of complete chunks."""
         for chunk in self._chunks.values():
             for first in range(0, len(chunk.missing), images_per_task):
                 yield from self.finalizes()
                 yield RenderTask(chunk.number, chunk.missing[first : first + images_per_task])
 
     def finalizes(self) -> Iterator[RenderTask]:
-        """Yield the finalizes of chunks that are complete by now."""
+        """Yield finalizing tasks of the chunks that are complete by now."""
         while self._complete:
             number = self._complete.popleft()
             yield RenderTask(number, self._chunks[number].required, finalizes=True)
 
     def note(self, task: RenderTask, render_s: float, write_s: float) -> None:
-        """Count a task that is done."""
+        """Count a finished task."""
         if task.finalizes:
             return
         self.report.render_s += render_s
@@ -281,7 +302,7 @@ class _Run:
 
 
 class ProgressDisplay:
-    """An :data:`OnProgress`, while it is entered: a bar, or without a terminal lines in the log."""
+    """Context that shows progress as a bar or, without a terminal, as lines in the log."""
 
     def __init__(self, console: Console) -> None:
         self._bar = shown.Progress(
@@ -300,10 +321,10 @@ class ProgressDisplay:
         self._bar.stop()
 
     def __call__(self, done: int, total: int) -> None:
-        """Show that ``done`` of ``total`` images are there."""
+        """Show that ``done`` of ``total`` images exist."""
         now = time.monotonic()
         if self._first is None:
-            # What an earlier run made is no part of this one's rate.
+            # Images of an earlier run do not count in the rate.
             self._first, self._start, self._last = done, now, now
             self._bar.add_task("", completed=done, total=total)
         self._bar.update(self._bar.task_ids[0], completed=done)
@@ -317,7 +338,7 @@ class ProgressDisplay:
 
 
 class _RateColumn(shown.ProgressColumn):
-    """Images per second, of the last half minute; nothing while it is unknown."""
+    """Images per second over the last half minute; empty while unknown."""
 
     def render(self, task: shown.Task) -> Text:
         speed = task.finished_speed or task.speed

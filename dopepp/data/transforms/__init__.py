@@ -1,1 +1,1 @@
-"""What happens to a sample before it is learned from or measured."""
+"""Transforms of samples for training and for shading tests."""

@@ -1,9 +1,8 @@
-"""Photometric augmentation: light, colour, focus, sensor noise and compression vary, poses do not.
+"""Augment light, colour, focus, sensor noise and compression; poses stay.
 
 Lens, sensor and file are those of the virtual camera (:mod:`dopepp.virtual.sensor`). To add a
-change, write a function of an image, give its range a field and call it in
-:meth:`Photometric.__call__`, where the order is the order of a camera: light and colour, lens,
-sensor, file.
+change, write a function of an image, add a field for its range and call it in
+:meth:`Photometric.__call__`, in the order of a camera: light and colour, lens, sensor, file.
 """
 
 from __future__ import annotations
@@ -34,15 +33,15 @@ _Changes = Annotated[Pair, Span(0, math.inf)]
 
 @dataclass(frozen=True)
 class Photometric(Checked):
-    """Random photometric changes, each drawn from the item's own generator.
+    """Random photometric changes, drawn from the item's generator.
 
     Attributes:
         brightness: Largest offset, as a share of 255.
         contrast: Largest relative change of the contrast about mid-grey.
         hue: Largest hue rotation, radians.
         colour_gain: Largest relative change of each colour channel (white balance).
-        blur_sigma: Range of its sigma, pixels.
-        noise_sigma: Range of its standard deviation, grey levels.
+        blur_sigma: Range of the blur's sigma, pixels.
+        noise_sigma: Range of the noise's standard deviation, grey levels.
     """
 
     brightness: _Change = 0.2
@@ -69,7 +68,7 @@ class Photometric(Checked):
         return np.asarray(image)
 
     def _colour_matrix(self, rng: Generator) -> Float[np.ndarray, "3 4"]:
-        """Compose all colour changes into one affine map, so pixels are rounded once."""
+        """Compose all colour changes into one affine map, so that pixels are rounded once."""
         angle = rng.uniform(-self.hue, self.hue)
         chroma = 1 + rng.uniform(-self.saturation, self.saturation)
         turn = np.eye(3)

@@ -1,8 +1,8 @@
-"""Camera jitter: the same scene as a camera sees it that is rolled, zoomed and moved a little.
+"""Jitter the camera: roll, zoom and shift the picture a little.
 
-A render is seen many times in a training; each time a little different, a network learns the part
-from it and not the picture. Image, camera matrix, poses and keypoints all follow exactly: a camera
-that rolls about its optical axis and zooms sees the same rays, at other pixels.
+A training uses each render many times; jitter keeps the network from memorising pictures. Image,
+camera matrix, poses and keypoints follow exactly: a camera that rolls about its optical axis and
+zooms sees the same rays at other pixels.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from dopepp.geometry.rotation import rotation_vector_to_matrix
 
 @dataclass(frozen=True)
 class CameraJitter(Checked):
-    """Roll, zoom and move the camera's picture at random; what comes into view repeats its border.
+    """Roll, zoom and shift the camera's picture at random; new pixels repeat its border.
 
     Attributes:
-        roll_deg: Largest turn of the picture about its middle, to either side.
-        zoom: Range of the factor on the focal length, logarithmically uniform.
-        shift: Largest move in each direction, as a share of the picture's sides.
+        roll_deg: Largest rotation of the picture about its centre, in either direction.
+        zoom: Range of the factor on the focal length, log-uniform.
+        shift: Largest shift in each direction, as a share of the picture's sides.
     """
 
     roll_deg: Annotated[float, Range(0, 180, "degrees")] = 20.0
@@ -36,7 +36,7 @@ class CameraJitter(Checked):
     shift: Annotated[float, Range(0, 0.49, "share")] = 0.1
 
     def __call__(self, sample: Sample, rng: Generator) -> Sample:
-        """Return a copy seen by another camera, visible fractions reduced by what it lost."""
+        """Return a copy seen by the jittered camera, with reduced visible fractions."""
         size = np.array(sample.size)
         middle = (size - 1) / 2
         roll = np.radians(rng.uniform(-self.roll_deg, self.roll_deg))
@@ -44,7 +44,7 @@ class CameraJitter(Checked):
         zoom = float(np.exp(rng.uniform(*np.log(self.zoom))))
         goal = middle + rng.uniform(-self.shift, self.shift, 2) * size
         K = np.diag([zoom, zoom, 1.0]) @ sample.K
-        # A homography, and an affine one, because the camera rolls about its axis.
+        # The homography is affine, because the camera rolls about its axis.
         warp = (K @ turn @ np.linalg.inv(sample.K))[:2]
         offset = goal - warp @ [*middle, 1.0]
         warp[:, 2] += offset

@@ -1,8 +1,8 @@
 """Random mask local processing (paper Eq. 3, 4): cover a part of the object with background.
 
-A patch is a crop of the image's own background, never a solid colour, at most 0.8 of the object's
-box high and wide; it is smaller where the background has no such window. Masks and visible
-fractions lose the covered pixels; keypoints stay, as the network still has to place them.
+A patch is a crop of the image's background, never a solid colour, and at most 0.8 of the object's
+box high and wide; it is smaller if the background has no such window. Masks and visible fractions
+lose the covered pixels; keypoints stay, as the network must still estimate them.
 :class:`BackgroundCrops` also serves :mod:`dopepp.data.transforms.shading_protocol`.
 """
 
@@ -23,20 +23,19 @@ from dopepp.data.sample import Instance, Sample, silhouette
 from dopepp.drawing.pictures import Mask, Picture, Size
 from dopepp.virtual.backgrounds import Backgrounds
 
-MIN_PATCH_PX: Final = 2  # A patch of one pixel is a solid colour, whatever it shows
+MIN_PATCH_PX: Final = 2  # A patch of one pixel is always a solid colour.
 MIN_CONTRAST: Final = 3.0
-"""A crop counts as solid when no colour channel's standard deviation reaches this many grey
-levels."""
+"""A crop is solid if no colour channel's standard deviation reaches this many grey levels."""
 
-MAX_DRAWS: Final = 8  # Crops drawn from a picture until one is not solid
+MAX_DRAWS: Final = 8  # Largest number of crops to draw from a picture.
 
 
 class BackgroundCrops:
     """Draws crops of an image that show no object.
 
     Args:
-        image: RGB, unpadded, so that padding is never taken as background.
-        silhouettes: What each object covers; no crop touches any of it.
+        image: RGB, without padding, which is no background.
+        silhouettes: Pixels of each object, which no crop contains.
     """
 
     def __init__(
@@ -53,7 +52,7 @@ class BackgroundCrops:
         self._integral = cv2.integral(occupied.astype(np.uint8))
 
     def draw(self, size: Size, rng: Generator) -> Picture | None:
-        """Return a crop of (height, width), or None when a few draws gave none with contrast."""
+        """Return a crop of (height, width), or None if no draw has contrast."""
         windows = np.flatnonzero(self._is_free(size).ravel())
         for _ in range(self.max_draws if len(windows) else 0):
             crop = self._crop(int(rng.choice(windows)), size)
@@ -62,13 +61,13 @@ class BackgroundCrops:
         return None
 
     def search(self, size: Size, rng: Generator) -> Picture | None:
-        """Return a crop of (height, width) with contrast, however rare, or else of two colours."""
+        """Return any crop of (height, width) with contrast, else any of two colours, or None."""
         free = self._is_free(size)
         if not free.any():
             return None
         sums, squares = self._moments
         num = size[0] * size[1]
-        # num²·variance: whole numbers below 2⁵³, so that a single colour gives exactly 0.
+        # num²·variance is a whole number below 2⁵³, so a single colour gives exactly 0.
         spread = (num * _windows(squares, size) - _windows(sums, size) ** 2).max(axis=2)
         spread[~free] = 0
         for least in ((num * self.min_contrast) ** 2, 1.0):
@@ -78,7 +77,7 @@ class BackgroundCrops:
         return None
 
     def largest(self, size: Size, rng: Generator) -> Picture | None:
-        """Return a crop of (height, width), or of half that, and so on; None without any."""
+        """Return a crop of (height, width), halved until the background has one, or None."""
         height, width = size
         while True:
             crop = self.draw((height, width), rng)
@@ -89,7 +88,7 @@ class BackgroundCrops:
             height, width = max(MIN_PATCH_PX, height // 2), max(MIN_PATCH_PX, width // 2)
 
     def _is_free(self, size: Size) -> Bool[np.ndarray, "rows columns"]:
-        """Tell of the top left corner of every window whether it is free of objects."""
+        """Tell for each window, by its top left corner, whether it is free of objects."""
         return np.asarray(_windows(self._integral, size) == 0)
 
     @cached_property
@@ -99,13 +98,13 @@ class BackgroundCrops:
         return sums, squares
 
     def _crop(self, window: int, size: Size) -> Picture:
-        """Return the window that is counted row by row."""
+        """Return a window by its number, counted row by row."""
         row, column = divmod(window, self.image.shape[1] - size[1] + 1)
         return self.image[row : row + size[0], column : column + size[1]]
 
 
 def _windows(integral: np.ndarray, size: Size) -> np.ndarray:
-    """Return the sum in every window of (height, width), from an integral image."""
+    """Return the sums in all windows of (height, width) from an integral image."""
     height, width = size
     return np.asarray(
         integral[height:, width:]
@@ -123,7 +122,7 @@ def has_contrast(crop: Picture, min_contrast: float) -> bool:
 def covered_instances(
     instances: Sequence[Instance], silhouettes: Sequence[Mask], covered: Mask
 ) -> list[Instance]:
-    """Return an image's instances without its covered pixels; keypoints and poses stay."""
+    """Remove covered pixels from instances; keypoints and poses stay."""
     changed = []
     for instance, seen in zip(instances, silhouettes, strict=True):
         num_seen = int(np.count_nonzero(seen))
@@ -144,7 +143,7 @@ class RandomMask(Checked):
         max_height: Largest patch height as a share of the object's box height (paper: 0.8).
         max_width: Largest patch width as a share of the object's box width (paper: 0.8).
         min_contrast: Grey levels of standard deviation that a crop needs in a colour channel.
-        max_draws: Crops drawn from each picture; without any, the instance stays uncovered.
+        max_draws: Number of crops to try per picture; the instance stays uncovered if all fail.
     """
 
     probability: Share = 0.5
@@ -174,7 +173,7 @@ class RandomMask(Checked):
         return replace(sample, image=image, instances=instances)
 
     def _patch(self, seen: Mask, rng: Generator) -> tuple[slice, slice] | None:
-        """Draw a patch inside the object's box; None when the box is too small for any."""
+        """Draw a patch inside the object's box; None if the box is too small."""
         slices = []
         for axis, limit in ((1, self.max_height), (0, self.max_width)):
             hit = np.flatnonzero(seen.any(axis=axis))
@@ -190,8 +189,7 @@ class RandomMask(Checked):
     def _crop(
         self, crops: BackgroundCrops, size: Size, rng: Generator, other: Backgrounds
     ) -> Picture | None:
-        """Draw a crop from the image's background, smaller where it must be."""
-        # Only where there is no background, or one of a single colour, another picture gives it.
+        """Draw a crop from the image's background, else from another picture."""
         crop = crops.largest(size, rng)
         if crop is not None:
             return crop

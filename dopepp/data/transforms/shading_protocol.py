@@ -1,13 +1,12 @@
-"""The shading protocol (paper Table 3): cover a stated share of what is visible of each object.
+"""Shade objects (paper Table 3): cover a given share of the visible pixels of each object.
 
-Random crops of the image's own background are laid over an object inside its box, one after the
-other, until all of its visible pixels that are asked for are covered. Every pixel so has a place in
-an order, and a share is the beginning of that order which covers so many visible pixels: it is
-reached to half a pixel, and more shading contains less. The patch that reaches the share is cut off
-there, between two pixels of a row.
+Random crops of the image's background cover an object inside its box, one after another, until the
+requested number of visible pixels is covered. The order in which pixels are covered defines all
+shares: a share is the start of this order with the right number of visible pixels. It is exact to
+half a pixel, and a larger share contains a smaller share. The last patch is cut between two pixels.
 
-A patch passes behind the other objects on the image, so that each is covered by its own patches
-alone. What training does (Eq. 4, one patch) is :mod:`dopepp.data.transforms.masking`.
+A patch passes behind the other objects, so that only its own patches cover an object. Training
+uses :mod:`dopepp.data.transforms.masking` (Eq. 4, one patch) instead.
 """
 
 from __future__ import annotations
@@ -24,12 +23,12 @@ from dopepp.data.sample import Instance, Purpose, Sample, item_rng, silhouette
 from dopepp.data.transforms.masking import MIN_PATCH_PX, BackgroundCrops, covered_instances
 from dopepp.drawing.pictures import Mask, Picture
 
-TOLERANCE: Final = 0.02  # How far the covered share may be from the asked one
+TOLERANCE: Final = 0.02  # Allowed difference of the covered share from the requested share.
 _SIDES: Final = (0.15, 0.5)
-"""A patch's sides as shares of the box's: small enough for several, large enough to hide edges."""
+"""Range of a patch's sides as shares of the box's: several fit, and each hides edges."""
 
 _MAX_PATCHES: Final = 300
-"""With more the patches are confetti, because the background has no room for larger crops."""
+"""More patches would be tiny, as the background has no room for larger crops."""
 
 _NEVER: Final = np.iinfo(np.int32).max
 
@@ -39,9 +38,9 @@ class Shaded:
     """An image with shaded objects.
 
     Attributes:
-        sample: The image; depth is unknown where a patch lies.
-        reached: Covered share of each instance's visible pixels; None without a visible pixel or
-            a mask.
+        sample: The image; depth is unknown under patches.
+        reached: Covered share of each instance's visible pixels; None for an instance
+            without a mask or a visible pixel.
     """
 
     share: float
@@ -52,15 +51,19 @@ class Shaded:
 def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> list[Shaded]:
     """Shade an image's objects, once for each share.
 
-    ``shares`` are of the visible pixels of each instance, each in [0, 1]: an image depends on its
-    own share alone, not on the others asked for. ``index`` is its place in the test set.
+    Args:
+        sample: The image.
+        shares: Shares of each instance's visible pixels, in [0, 1]; they do not influence each
+            other.
+        seed: Seed of the patches.
+        index: Index of the image in the test set.
     """
     if not all(0 <= share <= 1 for share in shares):
         raise ValueError(f"shares must be in [0, 1], problem {list(shares)}")
     shape = sample.image.shape[:2]
     silhouettes = [silhouette(instance, shape) for instance in sample.instances]
     crops = BackgroundCrops(sample.image, silhouettes)
-    # Of its own for every instance: how much of one is covered changes no patch of another.
+    # Each instance has its own generator, so that no instance changes the patches of another.
     rngs = item_rng(seed, Purpose.SHADING, 0, index).spawn(len(silhouettes))
     largest = max(shares, default=0.0)
     covers = []
@@ -98,9 +101,9 @@ def _shaded(
 
 
 class _Cover:
-    """Patches over one instance until ``share`` of its visible pixels is covered.
+    """Patches that cover ``share`` of an instance's visible pixels.
 
-    ``order`` numbers the pixels of its box as they are covered; ``spared`` ones never are.
+    ``order`` numbers the pixels of its box as they are covered; ``spared`` pixels stay.
     """
 
     def __init__(
@@ -121,7 +124,7 @@ class _Cover:
             self._lay(crop, bare[rng.integers(len(bare))], rng)
 
     def laid(self, share: float) -> Bool[np.ndarray, "rows columns"]:
-        """Return the pixels of the box that are covered at a share of the visible pixels."""
+        """Return the covered pixels of the box for a share of the visible pixels."""
         asked = self._num_asked(share)
         if asked == 0:
             return np.zeros(self.order.shape, bool)
@@ -132,7 +135,7 @@ class _Cover:
         return round(share * self._num_seen)
 
     def _draw_crop(self, crops: BackgroundCrops, rng: Generator) -> Picture | None:
-        """Draw a crop of random size, smaller where the background has none, or None."""
+        """Draw a crop of random size, or smaller if the background has none, or None."""
         extent = self._seen.shape
         if min(extent) < MIN_PATCH_PX:
             return None
@@ -142,7 +145,7 @@ class _Cover:
         return crops.largest((height, width), rng)
 
     def _lay(self, crop: Picture, pixel: Int[np.ndarray, "2"], rng: Generator) -> None:
-        """Lay a crop at random, so that it covers a given pixel, below all earlier ones."""
+        """Lay a crop below earlier crops at random, so that it covers a given pixel."""
         slices = []
         for position, length, extent in zip(pixel, crop.shape, self.order.shape, strict=False):
             first, last = max(0, position - length + 1), min(position, extent - length)
