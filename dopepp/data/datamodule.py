@@ -246,8 +246,8 @@ class PoseLoader(DataLoader[Any]):
             # Forked workers inherit the render cache's shared memory and the compiled kernels.
             multiprocessing_context="fork" if options.get("num_workers") else None,
             persistent_workers=bool(options.get("num_workers")),
-            # A pass draws an unused seed for the workers. A separate generator keeps this draw out of
-            # the training's generator, which must be the same after resuming.
+            # A pass draws an unused seed for the workers. A separate generator keeps this draw out
+            # of the training's generator, which must be the same after resuming.
             generator=torch.Generator(),
             **options,
         )

@@ -15,15 +15,7 @@ from typing import Final
 
 from dopepp.core.errors import UserError
 from dopepp.core.json import read_json
-from dopepp.data.formats.bop.bop_models import (
-    SYMMETRY_FIELDS,
-    Continuous,
-    Discrete,
-    ModelInfo,
-    model_info,
-    parse_models,
-    parse_symmetries,
-)
+from dopepp.data.formats.bop import bop_models
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Part
 from dopepp.parts.symmetry_finder import TOLERANCE, find_symmetries
@@ -55,7 +47,7 @@ def choose_symmetries(
     if choice == AUTO:
         return [with_found_symmetries(part) for part in parts]
     if isinstance(choice, Mapping):
-        given = {name: parse_symmetries(name, entry) for name, entry in choice.items()}
+        given = {name: bop_models.parse_symmetries(name, entry) for name, entry in choice.items()}
         return [_with(part, *given[part.name]) if part.name in given else part for part in parts]
     infos = _read_infos(choice)
     for part in parts:
@@ -71,7 +63,9 @@ def choose_symmetries(
     ]
 
 
-def _with(part: Part, discrete: Discrete | None, continuous: Continuous) -> Part:
+def _with(
+    part: Part, discrete: bop_models.Discrete | None, continuous: bop_models.Continuous
+) -> Part:
     return replace(part, symmetries_discrete=discrete, symmetries_continuous=continuous)
 
 
@@ -100,12 +94,12 @@ def with_found_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
 
 def describe_symmetries(path: Path | str, unit: str | None, tolerance: float) -> str:
     """Return the ``models_info.json`` entry of a mesh file or built-in part as JSON."""
-    entry = model_info(with_found_symmetries(load_part(path, unit), tolerance))
-    entry |= {field: entry.get(field, []) for field in SYMMETRY_FIELDS}
+    entry = bop_models.model_info(with_found_symmetries(load_part(path, unit), tolerance))
+    entry |= {field: entry.get(field, []) for field in bop_models.SYMMETRY_FIELDS}
     return json.dumps(entry, indent=2, ensure_ascii=False)
 
 
-def _read_infos(choice: str) -> dict[str, ModelInfo]:
+def _read_infos(choice: str) -> dict[str, bop_models.ModelInfo]:
     """Return a file's entries by the part's name."""
     path = Path(choice)
     if not path.is_file():
@@ -114,4 +108,4 @@ def _read_infos(choice: str) -> dict[str, ModelInfo]:
     records = read_json(path)
     if isinstance(records, dict) and "diameter" in records:
         records = {"1": records}  # one entry alone
-    return {info.name: info for info in parse_models(path, records).values()}
+    return {info.name: info for info in bop_models.parse_models(path, records).values()}

@@ -6,7 +6,7 @@ To add a source, write a class with the :class:`DescribedSource` methods and one
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Any, Protocol
@@ -191,25 +191,27 @@ def nearest(image: NDArray[Any], width: int, height: int) -> NDArray[Any]:
     return np.asarray(image[rows[:, None], columns])
 
 
+def _map_pixels(sample: Sample, function: Callable[[NDArray[Any]], NDArray[Any]]) -> Sample:
+    """Apply a function to the depth image and the masks."""
+
+    def mapped(pixels: NDArray[Any] | None) -> NDArray[Any] | None:
+        return None if pixels is None else function(pixels)
+
+    instances = [replace(instance, mask=mapped(instance.mask)) for instance in sample.instances]
+    return replace(sample, depth=mapped(sample.depth), instances=instances)
+
+
 def resize_sample(sample: Sample, input_size: Size) -> Sample:
     """Scale a sample to fit into ``input_size`` like ``Letterbox``, without padding."""
     box = Letterbox.fit(sample.size, input_size)
     if (box.width, box.height) == sample.size:
         return sample
-
-    def resized(pixels: NDArray[Any] | None) -> NDArray[Any] | None:
-        return None if pixels is None else nearest(pixels, box.width, box.height)
-
-    return replace(
-        sample,
-        image=box.image(sample.image),
-        K=box.camera(sample.K),
-        depth=resized(sample.depth),
-        instances=[
-            replace(instance, keypoints=box.points(instance.keypoints), mask=resized(instance.mask))
-            for instance in sample.instances
-        ],
-    )
+    image, K = box.image(sample.image), box.camera(sample.K)
+    sample = _map_pixels(sample, lambda pixels: nearest(pixels, box.width, box.height))
+    instances = [
+        replace(instance, keypoints=box.points(instance.keypoints)) for instance in sample.instances
+    ]
+    return replace(sample, image=image, K=K, instances=instances)
 
 
 def pad_sample(sample: Sample, input_size: Size) -> Sample:
@@ -222,12 +224,7 @@ def pad_sample(sample: Sample, input_size: Size) -> Sample:
         beyond = [(0, input_size[1] - height), (0, input_size[0] - width)]
         return np.pad(array, beyond + [(0, 0)] * (array.ndim - 2))
 
-    instances = [
-        replace(instance, mask=None if instance.mask is None else pad(instance.mask))
-        for instance in sample.instances
-    ]
-    depth = None if sample.depth is None else pad(sample.depth)
-    return replace(sample, image=pad(sample.image), depth=depth, instances=instances)
+    return replace(_map_pixels(sample, pad), image=pad(sample.image))
 
 
 def crop_sample(sample: Sample, left: int, top: int, size: Size) -> Sample:
@@ -237,18 +234,13 @@ def crop_sample(sample: Sample, left: int, top: int, size: Size) -> Sample:
     def cut(pixels: NDArray[Any]) -> NDArray[Any]:
         return pixels[top : top + height, left : left + width]
 
-    def cropped(instance: Instance) -> Instance:
-        mask = None if instance.mask is None else cut(instance.mask)
-        moved = replace(instance, keypoints=instance.keypoints - (left, top), mask=mask)
-        return less_visible(instance, moved, (sample.image.shape[:2], (height, width)))
-
-    return replace(
-        sample,
-        image=cut(sample.image),
-        K=crop_camera(sample.K, left, top),
-        depth=None if sample.depth is None else cut(sample.depth),
-        instances=[cropped(instance) for instance in sample.instances],
-    )
+    cropped, shapes = _map_pixels(sample, cut), (sample.image.shape[:2], (height, width))
+    instances = [
+        less_visible(before, replace(after, keypoints=before.keypoints - (left, top)), shapes)
+        for before, after in zip(sample.instances, cropped.instances, strict=True)
+    ]
+    K = crop_camera(sample.K, left, top)
+    return replace(cropped, image=cut(sample.image), K=K, instances=instances)
 
 
 def letterbox_sample(sample: Sample, input_size: Size) -> Sample:

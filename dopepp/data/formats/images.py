@@ -18,16 +18,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dopepp.data.formats.problems import STRICT, Node, mapping
-from dopepp.drawing.pictures import (
-    MAX_PIXELS,
-    DepthMap,
-    Mask,
-    Picture,
-    Shape,
-    read_content,
-    read_image,
-    whole_picture,
-)
+from dopepp.drawing import pictures
+from dopepp.drawing.pictures import DepthMap, Mask, Picture, Shape
 
 FORMATS: Final = ("PNG", "JPEG", "TIFF")
 """Formats of BOP's images."""
@@ -55,14 +47,15 @@ def picture(
         modes: Pillow's names of the allowed pixel types; none allows any.
     """
     if content is None:
-        content = node["image"].attempt(lambda: read_content(Path(node.path)))
+        content = node["image"].attempt(lambda: pictures.read_content(Path(node.path)))
     if content is None:
         return None
     try:
-        image = whole_picture(content, FORMATS)
+        image = pictures.whole_picture(content, FORMATS)
     except ValueError as error:
         problem = f"unreadable or truncated, {len(content):,} bytes ({error})"
-        allowed = f"a whole {', '.join(FORMATS)} image of at most {MAX_PIXELS / 1e6:.0f} megapixels"
+        most = f"{pictures.MAX_PIXELS / 1e6:.0f} megapixels"
+        allowed = f"a whole {', '.join(FORMATS)} image of at most {most}"
         node["image"].report(problem, allowed)
         return None
     if modes and image.mode not in modes:
@@ -88,7 +81,7 @@ def stated_shape(file: Path | io.BytesIO) -> Shape | None:
             width, height = image.size
     except Exception:  # damage makes Pillow raise any type
         return None
-    return (height, width) if 0 < width * height <= MAX_PIXELS else None
+    return (height, width) if 0 < width * height <= pictures.MAX_PIXELS else None
 
 
 def decode_rgb(content: bytes, where: str) -> Picture:
@@ -155,7 +148,7 @@ def read_map(node: Node, shape: Shape | None, colour: bool = False) -> NDArray[A
         shape: (height, width) of the colour image; None allows any.
         colour: Whether several channels, whose meaning no file states, are None without a report.
     """
-    image = node["image"].attempt(lambda: read_image(Path(node.path)))
+    image = node["image"].attempt(lambda: pictures.read_image(Path(node.path)))
     if image is not None and image.ndim > 2 and colour:
         one_channel(node, image[..., 0], shape)
         return None

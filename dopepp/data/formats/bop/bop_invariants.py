@@ -19,16 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.data.formats import STAGING, bop, staged_items
-from dopepp.data.formats.bop import (
-    DEPTHS,
-    MM,
-    PICTURES,
-    BopPoses,
-    Nodes,
-    Record,
-    image_files,
-    read_records,
-)
+from dopepp.data.formats.bop import MM, BopPoses, Nodes, Record
 from dopepp.data.formats.bop.bop_models import INFO_FILE, info_path, modelled, parse_models, part_of
 from dopepp.data.formats.images import COLOUR_MODES, DEPTH_MODES, one_channel_of, picture_shape
 from dopepp.data.formats.invariants import Box, check_box, check_translation, plausible_camera
@@ -90,14 +81,14 @@ class _SceneCheck:
 
     def __init__(self, report: CheckReport, folder: Path, models: Models | None) -> None:
         self._report, self._folder, self._models = report, folder, models
-        self._pictures, self._depths = (self._image_files(kind) for kind in (PICTURES, DEPTHS))
+        self._pictures, self._depths = map(self._image_files, (bop.PICTURES, bop.DEPTHS))
         self._masks = {name: _mask_files(folder / name) for name in _MASKS}
-        self._records = read_records(folder, report)
+        self._records = bop.read_records(folder, report)
         self._has_truth = (folder / _TRUTH).is_file()
 
     def _image_files(self, kind: tuple[tuple[str, ...], tuple[str, ...]]) -> dict[int, Path]:
         """Return numbered images; report images of another name beside them."""
-        files = image_files(self._folder, kind, self._report)
+        files = bop.image_files(self._folder, kind, self._report)
         for folder in {path.parent for path in files.values()}:
             for path in sorted(folder.glob("[!.]*")):
                 if path.suffix.lower() in kind[1] and not bop.is_number(path.stem):

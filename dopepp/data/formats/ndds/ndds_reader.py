@@ -17,12 +17,8 @@ from typing import Final
 
 from dopepp.core.errors import UserError
 from dopepp.data.formats import ndds, share
-from dopepp.data.formats.ndds.conventions import (
-    NddsFinding,
-    Observation,
-    check_observation,
-    find_convention,
-)
+from dopepp.data.formats.ndds import conventions
+from dopepp.data.formats.ndds.conventions import NddsFinding, Observation
 from dopepp.data.sample import Instance, Sample, SourceInfo, hull_areas
 from dopepp.drawing.pictures import Shape, read_rgb
 from dopepp.geometry.camera import CameraMatrix, check_camera, project_keypoints
@@ -109,7 +105,7 @@ class NddsReader:
                 "name the parts as the classes, or give classes={class: part}",
             )
         # Hidden objects may be behind the camera, where projections are meaningless.
-        return find_convention(seen or hidden, str(self.folder))
+        return conventions.find_convention(seen or hidden, str(self.folder))
 
     def _part(self, label: str) -> Part | None:
         """Return the part of a class name, after removing FAT's suffix if necessary."""
@@ -172,7 +168,7 @@ class NddsReader:
     def _instance(
         self, observation: Observation, shape: Shape, counts_truncation: bool
     ) -> Instance:
-        T_cam_obj = check_observation(observation, self.finding.convention)
+        T_cam_obj = conventions.check_observation(observation, self.finding.convention)
         part, fraction = observation.part, observation.item.visibility
         keypoints = project_keypoints(part.cuboid, T_cam_obj, observation.K)
         if fraction is None or fraction == -1:

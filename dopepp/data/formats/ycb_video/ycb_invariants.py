@@ -14,16 +14,10 @@ from typing import Final
 import numpy as np
 
 from dopepp.core.errors import UserError
+from dopepp.data.formats import ycb_video
 from dopepp.data.formats.invariants import Box, check_box, check_translation, plausible_camera
 from dopepp.data.formats.problems import CheckReport, Node
-from dopepp.data.formats.ycb_video import (
-    FOLDERS,
-    FrameMeta,
-    Subset,
-    read_classes,
-    read_frame,
-    read_image_set,
-)
+from dopepp.data.formats.ycb_video import FrameMeta, Subset
 from dopepp.drawing.pictures import Shape
 from dopepp.geometry.camera import CameraMatrix, transform
 from dopepp.parts.mesh import Points, largest_distance
@@ -37,13 +31,13 @@ def check_ycb(report: CheckReport) -> None:
     Raises:
         UserError: The folder has no class list.
     """
-    classes = read_classes(report.root)
+    classes = ycb_video.read_classes(report.root)
     if not classes or len(set(classes)) != len(classes):
         path = report.root / "image_sets" / "classes.txt"
         report.report(path, "names", "empty, or one name twice")
     _check_lists(report)
     check = _FrameCheck(report, classes)
-    for subset, folder in FOLDERS.items():
+    for subset, folder in ycb_video.FOLDERS.items():
         for start in _frames(report.root / folder):
             check.check(start, subset)
             report.count_image()
@@ -54,9 +48,9 @@ def _check_lists(report: CheckReport) -> None:
         if path.stem == "classes":
             continue
         absent = 0
-        for subset, folder in FOLDERS.items():
+        for subset, folder in ycb_video.FOLDERS.items():
             try:
-                listed = read_image_set(report.root, path.stem, subset)
+                listed = ycb_video.read_image_set(report.root, path.stem, subset)
             except UserError as error:
                 report.take(path, "line", error)
                 break
@@ -99,7 +93,7 @@ class _FrameCheck:
 
     def check(self, start: str, subset: Subset) -> None:
         """Check the files of the frame whose paths start with ``start``."""
-        frame = read_frame(start, subset, self._report)
+        frame = ycb_video.read_frame(start, subset, self._report)
         meta, label = frame.meta, frame.labels
         node = Node(self._report, Path(f"{start}-meta.mat"))
         K = plausible_camera(node["intrinsic_matrix"], meta.K, frame.shape)

@@ -15,16 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats import make_instance
-from dopepp.data.formats.ycb_video import (
-    FOLDERS,
-    FrameMeta,
-    Subset,
-    read_classes,
-    read_frame,
-    read_image_set,
-    read_meta,
-)
+from dopepp.data.formats import make_instance, ycb_video
+from dopepp.data.formats.ycb_video import FrameMeta, Subset
 from dopepp.data.sample import Purpose, Sample, SourceInfo, item_rng
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import camera_matrix, check_camera
@@ -81,21 +73,21 @@ class YcbVideoReader:
         if subset == "synthetic" and backgrounds is None:
             raise ValueError("synthetic frames are transparent: give backgrounds")
         self.root, self.subset = Path(root), subset
-        self.name = f"ycb_video/{FOLDERS[subset]}"
-        classes = read_classes(self.root)
+        self.name = f"ycb_video/{ycb_video.FOLDERS[subset]}"
+        classes = ycb_video.read_classes(self.root)
         unknown = [part.name for part in parts if part.name not in classes]
         if unknown:
             allowed = f"those of classes.txt: {classes}"
             raise UserError(f"objects {unknown}", allowed, "correct them")
         self._parts = {classes.index(part.name) + 1: part for part in parts}
         if image_set is not None:
-            frames = read_image_set(self.root, image_set, subset)
+            frames = ycb_video.read_image_set(self.root, image_set, subset)
         where = f"{image_set}.txt" if image_set else "frames"
         self.frames = self._present(list(frames or ()), where)
         self._backgrounds, self._seed, self._read_depth = backgrounds, seed, read_depth
 
     def _present(self, listed: list[str], where: str) -> list[str]:
-        folder = self.root / FOLDERS[self.subset]
+        folder = self.root / ycb_video.FOLDERS[self.subset]
         is_there = {frame: Path(f"{self._start(frame)}-color.png").is_file() for frame in listed}
         absent = [frame for frame in listed if not is_there[frame]]
         if len(absent) == len(listed):
@@ -114,7 +106,7 @@ class YcbVideoReader:
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Read a frame; only the background of a synthetic frame depends on the epoch."""
         name, is_real = self.frames[index], self.subset == "real"
-        frame = read_frame(self._start(name), self.subset, read_depth=self._read_depth)
+        frame = ycb_video.read_frame(self._start(name), self.subset, read_depth=self._read_depth)
         assert frame.image is not None
         shape, meta, depth = frame.image.shape[:2], frame.meta, frame.depth
         if depth is not None:
@@ -132,10 +124,10 @@ class YcbVideoReader:
         return Sample(self._rgb(frame.image, name, epoch), K, instances, depth, self.name, name)
 
     def _start(self, frame: str) -> str:
-        return str(self.root / FOLDERS[self.subset] / frame)
+        return str(self.root / ycb_video.FOLDERS[self.subset] / frame)
 
     def _meta(self, frame: str) -> FrameMeta:
-        return read_meta(Path(f"{self._start(frame)}-meta.mat"))
+        return ycb_video.read_meta(Path(f"{self._start(frame)}-meta.mat"))
 
     def _rgb(self, image: NDArray[Any], frame: str, epoch: int) -> Picture:
         """Composite a synthetic frame on a background drawn by (seed, epoch, frame)."""
