@@ -15,7 +15,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from dopepp.data.image_sources.rendered import RenderedSource
+from dopepp.data.rendered import RenderedSource
 from dopepp.experiment.results.cost import likely_maps
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
 from dopepp.geometry.cuboid import cuboid_keypoints

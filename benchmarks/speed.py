@@ -164,7 +164,7 @@ class Side:
 @cache
 def scenes() -> list:
     """Render the scenes that all networks see."""
-    from dopepp.data.image_sources.rendered import RenderedSource
+    from dopepp.data.rendered import RenderedSource
     from dopepp.parts.catalogue import pivconnector
     from dopepp.virtual import PRESETS, Factory
 

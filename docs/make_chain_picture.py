@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from dopepp import PoseEstimator
 from dopepp.core.files import write_picture
-from dopepp.data.image_sources.rendered import RenderedSource
+from dopepp.data.rendered import RenderedSource
 from dopepp.drawing.overlay import Wireframe, overlay
 from dopepp.drawing.pictures import Picture
 from dopepp.drawing.sheet import Tile, contact_sheet, grid, heat_picture

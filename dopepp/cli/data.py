@@ -81,8 +81,8 @@ def render(
     Exit codes: 0 done; 1 stopped (disk full, a worker died); 2 wrong input; 130, 143 interrupted.
     """
     with resumable():
-        from dopepp.data.render_jobs.job import make_job
-        from dopepp.data.render_jobs.rendering import run
+        from dopepp.data.render_job import make_job
+        from dopepp.data.render_run import run
 
         job = make_job(
             parts, unit=unit, preset=preset, changes=changes or (), size=size, seed=seed,
@@ -90,7 +90,7 @@ def render(
             camera=camera, working_distance=working_distance,
         )  # fmt: skip
         if preview:
-            from dopepp.data.render_jobs.preview import (
+            from dopepp.data.render_preview import (
                 write_preview,  # fonts and drawing take a second
             )
 

@@ -264,9 +264,9 @@ def test_neither_render_nor_check_imports_torch(layout, command, tmp_path):
 import sys
 from typer.testing import CliRunner
 from dopepp.cli import app
-from dopepp.data.render_jobs.job import make_job
-from dopepp.data.render_jobs.preview import write_preview
-from dopepp.data.render_jobs.rendering import RenderTasks, RenderTask
+from dopepp.data.render_job import make_job
+from dopepp.data.render_preview import write_preview
+from dopepp.data.render_run import RenderTasks, RenderTask
 from pathlib import Path
 out = {str(tmp_path / "out")!r}
 arguments = ["render", "servoholder", "--preset", "quickstart", "--size", "32x24",

@@ -9,7 +9,7 @@ from torch import Tensor
 from dopepp.core.errors import UserError
 from dopepp.data.batch import PADDING, Batch, collate
 from dopepp.data.datamodule import EpochSampler, PoseDataModule, SampleDataset
-from dopepp.data.image_sources.rendered import CachedSource
+from dopepp.data.rendered import CachedSource
 from dopepp.data.transforms.augment import Photometric
 from dopepp.data.transforms.masking import RandomMask
 from dopepp.parts.part import make_part

@@ -8,7 +8,7 @@ import torch
 import yaml
 
 from dopepp.core.files import read_csv
-from dopepp.data.image_sources.rendered import RenderedSource
+from dopepp.data.rendered import RenderedSource
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.references import REFERENCES
 from dopepp.parts.catalogue import pivconnector

@@ -10,7 +10,7 @@ from lightning.pytorch import Callback, Trainer
 
 from dopepp.data.batch import Batch
 from dopepp.data.datamodule import PoseDataModule
-from dopepp.data.image_sources.rendered import RenderedSource, Split
+from dopepp.data.rendered import RenderedSource, Split
 from dopepp.data.sample import Instance, Sample, SourceInfo
 from dopepp.maps.codec import MapGeometry
 from dopepp.models.checkpoint import Checkpoint

@@ -23,8 +23,8 @@ from dopepp.data.formats.ndds.ndds_reader import NddsReader
 from dopepp.data.formats.webdataset.webdataset_reader import WebdatasetReader
 from dopepp.data.formats.ycb_video import read_image_set
 from dopepp.data.formats.ycb_video.ycb_reader import YcbVideoReader
-from dopepp.data.image_sources.hybrid import HybridSource, WindowedSource
-from dopepp.data.image_sources.rendered import RenderedSource, Split
+from dopepp.data.hybrid import HybridSource, WindowedSource
+from dopepp.data.rendered import RenderedSource, Split
 from dopepp.data.sample import DescribedSource
 from dopepp.data.transforms.augment import Photometric
 from dopepp.data.transforms.jitter import CameraJitter

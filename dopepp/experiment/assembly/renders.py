@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import cache_folder
-from dopepp.data.image_sources.rendered import CachedSource, RenderedSource, Split
+from dopepp.data.rendered import CachedSource, RenderedSource, Split
 from dopepp.data.sample import DescribedSource
 from dopepp.drawing.pictures import Size
 from dopepp.experiment.assembly.build_parts import build_negatives

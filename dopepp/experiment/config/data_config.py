@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final, Literal
 
 from dopepp.core.errors import UserError
 from dopepp.core.validation import STRICT, Range, parse, shown
-from dopepp.data.image_sources.rendered import MAX_ITEMS, Split
+from dopepp.data.rendered import MAX_ITEMS, Split
 from dopepp.geometry.camera import camera_matrix
 from dopepp.virtual.presets import Preset, preset_of, written_out
 from dopepp.virtual.presets.view import View, read_lens

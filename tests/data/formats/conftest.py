@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from dopepp.data.image_sources.rendered import rendered_sample
+from dopepp.data.rendered import rendered_sample
 from dopepp.data.sample import Instance, Sample
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
 from dopepp.geometry.cuboid import cuboid_keypoints

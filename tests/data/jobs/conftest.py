@@ -1,6 +1,6 @@
 import pytest
 
-from dopepp.data.render_jobs.job import make_job
+from dopepp.data.render_job import make_job
 
 
 @pytest.fixture(scope="session")

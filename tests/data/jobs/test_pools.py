@@ -8,8 +8,8 @@ import pytest
 
 from dopepp.core.errors import StoppedError, UserError
 from dopepp.core.pool import ClusterPool, ProcessPool
-from dopepp.data.render_jobs.job import WRITERS, begin
-from dopepp.data.render_jobs.rendering import RenderTask, RenderTasks, Shard, render_dataset
+from dopepp.data.render_job import WRITERS, begin
+from dopepp.data.render_run import RenderTask, RenderTasks, Shard, render_dataset
 
 NUM = 60
 

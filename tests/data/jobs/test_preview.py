@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.data.render_jobs import preview
-from dopepp.data.render_jobs.job import make_job
-from dopepp.data.render_jobs.preview import preview_sheet, scene_tiles, write_preview
+from dopepp.data.render_job import make_job
+from dopepp.data.render_preview import preview_sheet, scene_tiles, write_preview
 
 SMALL = ("width=96", "height=72")
 
@@ -51,7 +50,7 @@ def test_no_target_is_said_so():
 
 def test_the_sheet_lies_beside_the_folder_or_where_it_is_wanted(small_job, tmp_path, monkeypatch):
     sheet = np.zeros((5, 7, 3), np.uint8)
-    monkeypatch.setattr(preview, "preview_sheet", lambda factory: sheet)
+    monkeypatch.setattr(render_preview, "preview_sheet", lambda factory: sheet)
     assert write_preview(small_job(), tmp_path / "data") == tmp_path / "data.preview.png"
     named = write_preview(small_job(), tmp_path / "sheet.png")
     assert {path.name for path in tmp_path.iterdir()} == {"data.preview.png", "sheet.png"}

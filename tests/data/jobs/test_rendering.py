@@ -21,8 +21,8 @@ from dopepp.core.files import partial_path
 from dopepp.core.pool import PickledFunction, Pool, opened
 from dopepp.data.formats import RECORD_FILE
 from dopepp.data.formats.ndds.ndds_writer import NddsWriter
-from dopepp.data.render_jobs.job import WRITERS, make_job, named_part
-from dopepp.data.render_jobs.rendering import (
+from dopepp.data.render_job import WRITERS, make_job, named_part
+from dopepp.data.render_run import (
     ProgressDisplay,
     RenderReport,
     Shard,

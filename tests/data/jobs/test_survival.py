@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from dopepp.data.check import check_dataset
-from dopepp.data.render_jobs.job import WRITERS
+from dopepp.data.render_job import WRITERS
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals are asked of POSIX")
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dopepp.core.errors import UserError
-from dopepp.data.image_sources.hybrid import VIRTUAL, HybridSource
+from dopepp.data.hybrid import VIRTUAL, HybridSource
 from dopepp.data.sample import Sample, SourceInfo
 
 

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dopepp.data.image_sources.rendered import FIRST_INDEX, MAX_ITEMS, RenderedSource
+from dopepp.data.rendered import FIRST_INDEX, MAX_ITEMS, RenderedSource
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import PRESETS, preset_of

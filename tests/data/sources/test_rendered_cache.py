@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.data.image_sources import rendered
-from dopepp.data.image_sources.rendered import CachedSource
+from dopepp.data import rendered
+from dopepp.data.rendered import CachedSource
 from dopepp.data.sample import Sample, resize_sample
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from dopepp.data.image_sources.hybrid import WindowedSource
-from dopepp.data.image_sources.rendered import RenderedSource
+from dopepp.data.hybrid import WindowedSource
+from dopepp.data.rendered import RenderedSource
 from dopepp.data.sample import Sample, crop_sample, letterbox_sample
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID

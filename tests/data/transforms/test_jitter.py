@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopepp.data.image_sources.rendered import RenderedSource
+from dopepp.data.rendered import RenderedSource
 from dopepp.data.sample import Instance, Sample
 from dopepp.data.transforms.jitter import CameraJitter
 from dopepp.geometry.camera import make_transform

@@ -13,7 +13,7 @@ from dopepp.data.formats.bop.bop_models import bop_parts
 from dopepp.data.formats.bop.bop_reader import BopReader
 from dopepp.data.formats.bop.bop_results import BopResult, write_results
 from dopepp.data.formats.bop.bop_writer import BopWriter
-from dopepp.data.image_sources.rendered import RenderedSource
+from dopepp.data.rendered import RenderedSource
 from dopepp.experiment.assembly.build_parts import build_negatives, build_parts
 from dopepp.experiment.assembly.build_sources import (
     build_datamodule,

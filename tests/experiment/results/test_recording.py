@@ -14,7 +14,7 @@ from dopepp.data.formats.bop.bop_models import bop_parts
 from dopepp.data.formats.bop.bop_reader import BopReader
 from dopepp.data.formats.bop.bop_results import BopResult, read_results, write_results
 from dopepp.data.formats.bop.bop_writer import BopWriter
-from dopepp.data.image_sources.rendered import rendered_sample
+from dopepp.data.rendered import rendered_sample
 from dopepp.data.sample import Sample
 from dopepp.experiment.results.measurement import image_id, object_numbers
 from dopepp.experiment.run.evaluate import run_evaluation

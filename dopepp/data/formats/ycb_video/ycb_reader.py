@@ -1,6 +1,6 @@
 """Read YCB-Video: ``data/SSSS/NNNNNN-*`` (real) or ``data_syn/NNNNNN-*`` (synthetic).
 
-A reader reads one of the two subsets; :mod:`dopepp.data.image_sources.hybrid` mixes them.
+A reader reads one of the two subsets; :mod:`dopepp.data.hybrid` mixes them.
 """
 
 from __future__ import annotations

@@ -25,8 +25,8 @@ from rich.text import Text
 from dopepp.core.errors import StoppedError, UserError, stopped
 from dopepp.core.pool import ClusterPool, LostWorkerError, Pool, ProcessPool, available_cores
 from dopepp.data.formats import RECORD_FILE, Writer
-from dopepp.data.image_sources.rendered import MAX_ITEMS, rendered_sample
-from dopepp.data.render_jobs.job import Job, begin, is_begun
+from dopepp.data.render_job import Job, begin, is_begun
+from dopepp.data.rendered import MAX_ITEMS, rendered_sample
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.renderers.photoreal import THREADS_SETTING
 

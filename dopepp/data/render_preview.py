@@ -11,8 +11,8 @@ import numpy as np
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_png
-from dopepp.data.image_sources.rendered import rendered_sample
-from dopepp.data.render_jobs.job import Job
+from dopepp.data.render_job import Job
+from dopepp.data.rendered import rendered_sample
 from dopepp.data.sample import Sample
 from dopepp.drawing.overlay import Wireframe, overlay
 from dopepp.drawing.pictures import Picture

@@ -1,1 +1,0 @@
-"""Sources of samples other than files: renders, cached renders, and mixtures."""
