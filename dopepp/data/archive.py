@@ -75,10 +75,7 @@ def safe_extract(archive: Path | str, folder: Path | str, most_members: int = MO
         raise UserError(f"archive {archive}, no such file", "a tar file", "check the path")
     draft = partial_path(folder.absolute())
     try:
-        with (
-            archive.open("rb") as stream,
-            tarfile.open(fileobj=Bounded(stream), mode="r:") as tar,
-        ):
+        with archive.open("rb") as file, tarfile.open(fileobj=Bounded(file), mode="r:") as tar:
             members = _checked(archive, tar, most_members)
             shutil.rmtree(draft, ignore_errors=True)
             draft.mkdir(parents=True)
@@ -93,11 +90,9 @@ def safe_extract(archive: Path | str, folder: Path | str, most_members: int = MO
     except UserError:
         raise
     except OSError as error:
-        raise UserError(
-            f"{archive}, which cannot be unpacked into {folder}: {error}",
-            "an archive to read and a folder with room to write",
-            "check both, and the space on the disk",
-        ) from error
+        problem = f"{archive}, which cannot be unpacked into {folder}: {error}"
+        allowed = "an archive to read and a folder with room to write"
+        raise UserError(problem, allowed, "check both, and the space on the disk") from error
     except Exception as error:  # a damaged header makes tarfile raise any type
         raise _refused(archive, f"damaged: {error or type(error).__name__}") from error
     finally:
@@ -160,8 +155,6 @@ def _unpack(tar: tarfile.TarFile, member: tarfile.TarInfo, path: Path) -> None:
 
 
 def _refused(archive: Path, reason: str) -> UserError:
-    return UserError(
-        f"archive {archive}: {reason}",
-        "a whole tar file of plain files and folders that stay inside of its own folder",
-        "do not trust it; get it again from its source",
-    )
+    allowed = "a whole tar file of plain files and folders that stay inside of its own folder"
+    fix = "do not trust it; get it again from its source"
+    return UserError(f"archive {archive}: {reason}", allowed, fix)

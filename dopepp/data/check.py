@@ -51,9 +51,8 @@ def check_dataset(root: Path) -> CheckReport:
     if layout in (None, "NDDS"):  # NDDS includes annotations of all subfolders
         _refuse_parent(root, layout)
     if layout is None:
-        raise UserError(
-            f"{root}, a folder of no known layout", allowed, "give the data set's folder"
-        )
+        problem = f"{root}, a folder of no known layout"
+        raise UserError(problem, allowed, "give the data set's folder")
     report = CheckReport(root, layout)
     LAYOUTS[layout][1](report)
     return report

@@ -120,11 +120,9 @@ def fetch(
     except (http.client.HTTPException, TimeoutError, ConnectionError) as error:
         raise _failed(url, f"the connection broke: {error or type(error).__name__}") from error
     except OSError as error:
-        raise UserError(
-            f"{path}, which cannot be written: {error}",
-            f"a folder to write to with {num_bytes} bytes of room",
-            "choose another folder, or make room; what was received stays",
-        ) from error
+        allowed = f"a folder to write to with {num_bytes} bytes of room"
+        fix = "choose another folder, or make room; what was received stays"
+        raise UserError(f"{path}, which cannot be written: {error}", allowed, fix) from error
 
 
 def _receive(url: str, partial: Path, num_bytes: int, progress: Progress | None) -> None:
@@ -190,11 +188,8 @@ def _verify(path: Path, url: str, sha256: str) -> None:
 
 
 def _failed(url: str, reason: str) -> UserError:
-    return UserError(
-        f"{url}: {reason}",
-        "a server that can be reached and has the file",
-        "check the network and run the same command again: it goes on where it stopped",
-    )
+    fix = "check the network and run the same command again: it goes on where it stopped"
+    return UserError(f"{url}: {reason}", "a server that can be reached and has the file", fix)
 
 
 def _other_file(url: str, problem: str, expected: str) -> UserError:

@@ -243,20 +243,16 @@ def _claim(root: Path, record: Mapping[str, Any]) -> None:
     if not path.exists():
         foreign = [name for name in names if not name.endswith(PARTIAL_SUFFIX)]
         if foreign:
-            raise UserError(
-                f"folder {root}, which holds {foreign[0]!r} and no {RECORD_FILE}",
-                "an empty folder, or one that a render job began",
-                "choose another folder",
-            )
+            problem = f"folder {root}, which holds {foreign[0]!r} and no {RECORD_FILE}"
+            allowed = "an empty folder, or one that a render job began"
+            raise UserError(problem, allowed, "choose another folder")
         write_whole(path, (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())
     # This also follows writing, as two jobs may begin simultaneously.
     differences = list(_differences(read_json(path, _MAX_RECORD_BYTES), record, ""))
     if differences:
-        raise UserError(
-            f"{path} of another job: {', '.join(differences[:_MAX_DIFFERENCES])}",
-            "the settings that the folder was begun with",
-            "repeat those settings with that version of dopepp, or choose another folder",
-        )
+        problem = f"{path} of another job: {', '.join(differences[:_MAX_DIFFERENCES])}"
+        fix = "repeat those settings with that version of dopepp, or choose another folder"
+        raise UserError(problem, "the settings that the folder was begun with", fix)
 
 
 def _differences(there: object, now: object, where: str) -> Iterator[str]:

@@ -128,18 +128,16 @@ class Shard:
         """
         match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text)
         if match is None or int(match[1]) >= int(match[2]):
-            raise UserError(
-                f"shard {text!r}",
-                "i/n with 0 <= i < n: 0/2 and 1/2 are the two halves",
-                "count the shards from 0",
-            )
+            allowed = "i/n with 0 <= i < n: 0/2 and 1/2 are the two halves"
+            raise UserError(f"shard {text!r}", allowed, "count the shards from 0")
         return cls(int(match[1]), int(match[2]))
 
     def span(self, num_items: int) -> range:
         """Return the shard's indices in a job of ``num_items`` images."""
-        return range(
-            num_items * self.number // self.total, num_items * (self.number + 1) // self.total
+        first, last = (
+            num_items * number // self.total for number in (self.number, self.number + 1)
         )
+        return range(first, last)
 
 
 @dataclass(frozen=True)
@@ -203,11 +201,9 @@ class RenderTasks:
             cv2.setNumThreads(1)
             os.environ.setdefault(THREADS_SETTING, "1")
             if not is_begun(self._root):
-                raise UserError(
-                    f"{self._root} without {RECORD_FILE}, as one of the workers sees it",
-                    "a folder that every machine of the cluster sees under the same path",
-                    "choose --out on a shared file system",
-                )
+                problem = f"{self._root} without {RECORD_FILE}, as one of the workers sees it"
+                allowed = "a folder that every machine of the cluster sees under the same path"
+                raise UserError(problem, allowed, "choose --out on a shared file system")
             self._opened = self._job.factory, self._job.writer(self._root)
         return self._opened
 
@@ -332,9 +328,7 @@ class ProgressDisplay:
             self._last = now
             rate = (done - self._first) / (now - self._start)
             left = (total - done) / rate / 60
-            _log.info(
-                "%s of %s images, %.1f/s, %.0f min left", f"{done:,}", f"{total:,}", rate, left
-            )
+            _log.info("%s images, %.1f/s, %.0f min left", f"{done:,} of {total:,}", rate, left)
 
 
 class _RateColumn(shown.ProgressColumn):

@@ -87,9 +87,8 @@ def share(num_items: int, part_of: tuple[float, float], name: str) -> slice:
     chosen = slice(round(first * num_items), round(last * num_items))
     if chosen.start == chosen.stop:
         problem = f"{name}: no image in the share {first:.3g} – {last:.3g} of {num_items} images"
-        raise UserError(
-            problem, "a folder with more images", "give every split a folder of its own"
-        )
+        fix = "give every split a folder of its own"
+        raise UserError(problem, "a folder with more images", fix)
     return chosen
 
 

@@ -165,7 +165,8 @@ class RandomMask(Checked):
             patch = self._patch(seen, rng)
             if patch is None:
                 continue
-            crop = self._crop(crops, (_length(patch[0]), _length(patch[1])), rng, other)
+            height, width = (side.stop - side.start for side in patch)
+            crop = self._crop(crops, (height, width), rng, other)
             if crop is not None:
                 rows, columns = map(_middle, patch, crop.shape)
                 image[rows, columns], covered[rows, columns] = crop, True
@@ -204,11 +205,7 @@ class RandomMask(Checked):
         return None
 
 
-def _length(patch: slice) -> int:
-    return int(patch.stop - patch.start)
-
-
 def _middle(patch: slice, length: int) -> slice:
     """Return the middle of a patch's rows or columns."""
-    start = patch.start + (_length(patch) - length) // 2
+    start = patch.start + (patch.stop - patch.start - length) // 2
     return slice(start, start + length)

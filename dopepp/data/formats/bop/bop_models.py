@@ -267,9 +267,8 @@ def write_models(root: Path, parts: Sequence[Part]) -> None:
     for part in parts:
         if part.mesh is None:
             allowed = "parts that were read from a mesh file"
-            raise UserError(
-                f"part {part.name} without a mesh", allowed, "give the part's mesh file"
-            )
+            fix = "give the part's mesh file"
+            raise UserError(f"part {part.name} without a mesh", allowed, fix)
     folder, names = root / MODEL_FOLDERS[0], [part.name for part in parts]
     numbers = model_numbers(names)
     entries = {str(numbers[part.name]): model_info(part) for part in parts}

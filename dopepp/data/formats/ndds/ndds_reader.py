@@ -98,12 +98,10 @@ class NddsReader:
                 break
         if not seen and not hidden:
             listed = ", ".join(f"{name} ({number})" for name, number in others.most_common(8))
-            raise UserError(
-                f"{self.folder}: no instance with projected_cuboid of the parts "
-                f"{', '.join(self._parts)}; other classes: {listed or 'none'}",
-                "at least one, whose class is a part's name",
-                "name the parts as the classes, or give classes={class: part}",
-            )
+            names = f"{', '.join(self._parts)}; other classes: {listed or 'none'}"
+            problem = f"{self.folder}: no instance with projected_cuboid of the parts {names}"
+            fix = "name the parts as the classes, or give classes={class: part}"
+            raise UserError(problem, "at least one, whose class is a part's name", fix)
         # Hidden objects may be behind the camera, where projections are meaningless.
         return conventions.find_convention(seen or hidden, str(self.folder))
 
@@ -213,11 +211,10 @@ class NddsReader:
 def _find(folder: Path) -> list[Path]:
     items, lonely = ndds.find_items(folder) if folder.is_dir() else ([], [])
     if not items:
-        raise UserError(
-            f"{folder} without one annotated image ({len(lonely)} JSON files without an image)",
-            "an NDDS or FAT folder with pairs such as 000000.json and 000000.png or .jpg",
-            "give the folder of the data set",
-        )
+        counts = f"({len(lonely)} JSON files without an image)"
+        allowed = "an NDDS or FAT folder with pairs such as 000000.json and 000000.png or .jpg"
+        problem = f"{folder} without one annotated image {counts}"
+        raise UserError(problem, allowed, "give the folder of the data set")
     if lonely:
         message = "%s: %s annotations have no image and are left out; first: %s"
         _log.warning(message, folder, f"{len(lonely):,}", lonely[0])
