@@ -39,13 +39,9 @@ from dopepp.virtual.surface import Surface, make_surface
 IMAGES_A_SCENE: Final = 1000
 """As in the rendered training sets of BOP."""
 
-SCENE_FILES: Final = {
-    "scene_gt.json": "gt",
-    "scene_gt_info.json": "gt_info",
-    "scene_camera.json": "camera",
-}
-"""Field of a staged item for each file of a scene. The last file lists the finalized images, so it
-is written last."""
+SCENE_FIELDS: Final = ("gt", "gt_info", "camera")
+"""Fields of a staged item, each for a file ``scene_FIELD.json``. The cameras list the finalized
+images, so their file is written last."""
 
 Record = dict[str, Any]
 
@@ -115,13 +111,14 @@ class BopWriter(BopFolder):
         with finalizing(scene / STAGING):
             staged = [path for path in _staged(scene) if int(path.stem) in wanted]
             items: dict[int, Any] = {int(path.stem): read_json(path) for path in staged}
-            for name, field in SCENE_FILES.items():
-                merged = read_object(scene / name, MAX_SCENE_BYTES)
+            for field in SCENE_FIELDS:
+                path = scene / f"scene_{field}.json"
+                merged = read_object(path, MAX_SCENE_BYTES)
                 merged |= {f"{image}": item[field] for image, item in items.items()}
                 # In order: the bytes do not depend on who wrote what first.
                 merged = dict(sorted(merged.items(), key=lambda entry: int(entry[0])))
                 if items:
-                    write_whole(scene / name, by_line(merged))
+                    write_whole(path, by_line(merged))
             if items:
                 image, camera = next(iter(merged.items()))
                 self._write_camera(chunk, int(image), camera)
