@@ -133,11 +133,10 @@ def released(name: str, preset: str, seed: int) -> tuple[float, ...]:
 def decoding(maps: Maps, K: np.ndarray, estimator: PoseEstimator) -> tuple[float, int]:
     """Time recovery from an image's maps, and count their peaks."""
     options, stride = estimator.recovery, estimator.network.stride
-    peaks = find_peaks(
-        maps[0][None], MapGeometry(stride, options.sigma), options.peak_threshold
-    ).found
+    geometry = MapGeometry(stride, options.sigma)
+    peaks = find_peaks(maps[0][None], geometry, options.peak_threshold)
     spent = milliseconds(lambda: recover(*maps, estimator.cuboids, K, stride, **vars(options)))
-    return spent, int(peaks.sum())
+    return spent, int((peaks.score > 0).sum())
 
 
 def row(count: int, belief: torch.Tensor, field: torch.Tensor) -> tuple[str, ...]:

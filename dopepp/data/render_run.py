@@ -301,11 +301,10 @@ class ProgressDisplay:
     """Context that shows progress as a bar or, without a terminal, as lines in the log."""
 
     def __init__(self, console: Console) -> None:
-        self._bar = shown.Progress(
-            "rendering", shown.BarColumn(), shown.MofNCompleteColumn(), _RateColumn(),
-            shown.TimeElapsedColumn(), "left", shown.TimeRemainingColumn(),
-            console=console, disable=not console.is_terminal,
-        )  # fmt: skip
+        counts = "rendering", shown.BarColumn(), shown.MofNCompleteColumn(), _RateColumn()
+        times = shown.TimeElapsedColumn(), "left", shown.TimeRemainingColumn()
+        is_hidden = not console.is_terminal
+        self._bar = shown.Progress(*counts, *times, console=console, disable=is_hidden)
         self._first: int | None = None
         self._start = self._last = 0.0
 

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from dopepp.core.compiled import Array, compiled
@@ -120,14 +120,12 @@ class Peaks:
             the target Gaussian blurred by its own uncertainty, so variances subtract.
         toward: Mean of the field's vectors around a corner's peak, which is shorter the more they
             differ; zero for a centroid.
-        found: Whether the slot holds a peak.
     """
 
     position: Float[np.ndarray, "batch channels peaks 2"]
     score: Float[np.ndarray, "batch channels peaks"]
     covariance_px: Float[np.ndarray, "batch channels peaks 2 2"]
     toward: Float[np.ndarray, "batch channels peaks 2"]
-    found: Bool[np.ndarray, "batch channels peaks"]
 
 
 def find_peaks(
@@ -167,7 +165,7 @@ def find_peaks(
     )
     _find(*inputs, geometry.field_radius, *outputs)
     pixels = position * geometry.stride + (geometry.stride - 1) / 2
-    return Peaks(pixels, score, covariance * geometry.stride**2, toward, score > 0.0)
+    return Peaks(pixels, score, covariance * geometry.stride**2, toward)
 
 
 def _on_host(maps: Tensor) -> Float[np.ndarray, "batch channels height width"]:

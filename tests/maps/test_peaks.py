@@ -28,7 +28,7 @@ def gaussians(
 
 def positions(peaks: Peaks, channel: int = 0) -> np.ndarray:
     """Found peaks of the first image's channel in cells, (n, 2)."""
-    found = peaks.position[0, channel][peaks.found[0, channel]]
+    found = peaks.position[0, channel][peaks.score[0, channel] > 0]
     return np.asarray((found - 3.5) / 8)
 
 
@@ -60,12 +60,12 @@ def test_decoding_an_encoded_pose_finds_its_keypoints(sigma):
     assert on_map.mean() < 0.99  # some are off the map
     border = on_map & ((keypoints < 8) | (keypoints > 247)).any(-1)
     assert border.sum() > 20
-    assert (peaks.found.sum(-1) == on_map).all()
+    assert ((peaks.score > 0).sum(-1) == on_map).all()
     error = peaks.position[:, :, 0][on_map] - keypoints[on_map]
     distance = np.linalg.norm(error, axis=-1)
     assert np.abs(error.mean(0)).max() < 0.1
     assert np.quantile(distance, 0.99) < 0.5
-    assert np.abs(peaks.covariance_px[peaks.found]).max() < 0.01
+    assert np.abs(peaks.covariance_px[peaks.score > 0]).max() < 0.01
 
 
 BORDER = [(0.0, 0.0), (-0.4, 29.3), (29.4, -0.3), (12.0, 29.49)]
@@ -153,7 +153,7 @@ def test_noise_on_a_peak_moves_it_little():
     )
     peaks = find_peaks(belief, GEOMETRY, threshold=0.3, max_peaks=1)
     error = (peaks.position[0, :, 0] - 3.5) / 8 - np.array([14.3, 15.6])
-    assert peaks.found.all()
+    assert (peaks.score > 0).all()
     assert 8 * np.sqrt((error**2).mean()) < 0.15
 
 
@@ -164,7 +164,7 @@ def test_the_strongest_above_the_threshold_fill_the_slots():
     peaks = find_peaks(belief, GEOMETRY, max_peaks=3)
     assert peaks.score[0, 0].tolist() == pytest.approx([0.9, 0.7, 0.5])
     assert positions(peaks)[:, 0] == pytest.approx([11.0, 23.0, 17.0], abs=1e-3)
-    assert peaks.found.tolist() == [[[True] * 3, [True, False, False]]]
+    assert (peaks.score > 0).tolist() == [[[True] * 3, [True, False, False]]]
     assert np.isnan(peaks.position[0, 1, 1:]).all()
     assert peaks.score[0, 1, 1:].tolist() == [0, 0]
     for threshold, count in ((0.2, 4), (0.6, 2), (0.9001, 0)):
@@ -174,7 +174,7 @@ def test_the_strongest_above_the_threshold_fill_the_slots():
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_constant_map_of_nothing_has_no_peak(value):
     peaks = find_peaks(torch.full((2, 9, 8, 8), value), GEOMETRY)
-    assert not peaks.found.any()
+    assert not (peaks.score > 0).any()
 
 
 @pytest.mark.parametrize("size", [(16, 16), (7, 31), (1, 9), (2, 3)])
@@ -196,11 +196,11 @@ def test_random_maps_never_give_a_position_that_is_none():
     belief[2, :, ::5, ::5] = torch.inf
     belief[3] *= 1e-3
     peaks = find_peaks(belief, GEOMETRY, threshold=1e-6)
-    cells = (peaks.position[peaks.found] - 3.5) / 8
-    assert peaks.found.sum() > 100
+    cells = (peaks.position[peaks.score > 0] - 3.5) / 8
+    assert (peaks.score > 0).sum() > 100
     assert (cells > -3).all()
     assert (cells < 23).all()
-    assert np.isfinite(peaks.covariance_px[peaks.found]).all()
+    assert np.isfinite(peaks.covariance_px[peaks.score > 0]).all()
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])

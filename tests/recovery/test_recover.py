@@ -243,7 +243,7 @@ def test_peaks_at_the_border_are_less_certain():
     position[0, 0] = inside + outside
     covariance = np.tile(np.diag([2.0, 3.0]), (1, 9, 6, 1, 1))
     score = np.ones((1, 9, 6))
-    peaks = Peaks(position, score, covariance, np.zeros((1, 9, 6, 2)), np.ones((1, 9, 6), bool))
+    peaks = Peaks(position, score, covariance, np.zeros((1, 9, 6, 2)))
     own = select_peaks(peaks, 0, 0, 0.05, (10, 6), 8.0)
     added = own.covariance_px[0] - covariance[0, 0]
     assert_array_equal(added[:2], 0.0)
