@@ -143,8 +143,7 @@ def rates_figure(
         x_label: Quantity with its unit.
         columns: Panels per row.
         edges: Limits of bins, to mark on the axis.
-        ratio: Whether the quantity is a ratio, drawn on a logarithmic axis with ticks at the
-            measured values.
+        ratio: Whether to use a logarithmic axis with ticks at the measured values.
     """
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(columns * 5.2, rows * 4.0), dpi=120, layout="constrained")

@@ -157,8 +157,7 @@ def draw_text(
 ) -> None:
     """Write a line IN PLACE on a darkened box, cut off at the border.
 
-    ``position`` is (column, row) of the top left corner, pixels, not negative; ``size_px`` the
-    height.
+    ``position`` is (column, row) of the top left corner, pixels, at least 0.
     """
     column, row = position
     box = image[row : row + size_px, column:]

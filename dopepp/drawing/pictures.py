@@ -135,8 +135,7 @@ def read_image(path: Path) -> NDArray[Any]:
     """Read a PNG or JPEG frame with its original depth and channels, colours as R, G, B(, A).
 
     Raises:
-        UserError: The file is missing, incomplete, damaged, of another format, or has 16-bit
-            colours.
+        UserError: The file is missing, damaged, of another format, or has 16-bit colours.
     """
     content = read_content(path)
     try:
@@ -176,8 +175,7 @@ def read_rgb(path: Path) -> Picture:
 def read_photo(path: Path) -> Picture:
     """Read a picture in one of :data:`FORMATS` as upright 8-bit RGB, as OpenCV reads it.
 
-    The EXIF orientation is applied, alpha dropped, grey repeated. Of 16 bits, the upper eight are
-    used.
+    The EXIF orientation is applied, alpha dropped, grey repeated, and 16 bits cut to the upper 8.
 
     Raises:
         UserError: The file is missing, damaged, too large, of another format or multi-page, its

@@ -91,8 +91,7 @@ class Hull:
         """Outward normals of the stable faces, and the frequency with which the body rests on each.
 
         A face is stable if the centre of mass is above it. Its frequency is its solid angle from
-        the
-        centre: the share of directions in which a body falling without bouncing lands on it.
+        the centre: the share of directions in which a body that does not bounce lands on it.
         """
         corners = self.vertices[self.triangles] - self.centre
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -196,8 +195,7 @@ class Distractors(Checked):
         number: Count per image; objects that would hide a target too much are left out.
         image_share: Diameter of a primitive's image.
         depth: Depth of floating distractors; unused on a table.
-        lookalike_share: Chance that a distractor is a negative (another weakly textured part), if
-            there are negatives.
+        lookalike_share: Chance that a distractor is a negative, if there are negatives.
         lookalike_scale: Size of a negative over its real size.
     """
 

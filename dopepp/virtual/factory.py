@@ -88,8 +88,7 @@ class Factory:
             scale: Magnification of the targets, relative to the preset.
 
         Raises:
-            UserError: The preset cannot show the part, or the scale puts the camera below the
-                table.
+            UserError: The preset cannot show the part, or the camera would be below the table.
         """
         rendered = self._render(self.scene(epoch, index, scale))
         return replace(rendered, image=capture(rendered.image, rendered.scene.sensor))

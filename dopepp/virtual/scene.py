@@ -99,8 +99,7 @@ class Ambient:
 class Plane:
     """An unbounded supporting plane, the table.
 
-    The scene's background is its picture; renderers only add shadows. The plane has depth but no
-    instance.
+    The scene's background is its picture; renderers only add shadows. It has no instance.
 
     Attributes:
         normal: Unit normal on the camera's side, camera frame.
@@ -176,8 +175,7 @@ class Rendered:
     Attributes:
         depth: Metres along z at pixel centres, float32; 0 on the background.
         instances: Index into ``scene.objects`` at pixel centres, −1 on plane and background.
-        visible_fractions: Visible pixels of every object over the pixels of its unoccluded,
-            untruncated silhouette.
+        visible_fractions: Visible pixels of every object over those of its whole silhouette.
     """
 
     image: Picture

@@ -1,8 +1,7 @@
 """The sensor: exposure, lens blur, noise and compression of an ideal picture; sRGB and tone curve.
 
 To add an effect, write a function, add its parameter to :class:`Sensor` and its probability and
-range to :class:`Sensors`, and call it in :func:`capture` in a camera's order: exposure, lens, chip,
-file.
+range to :class:`Sensors`, and call it in :func:`capture` (order: exposure, lens, chip, file).
 """
 
 from __future__ import annotations
@@ -127,8 +126,7 @@ def motion_blur(image: Picture, motion_px: tuple[float, float]) -> Picture:
 def add_noise(image: Picture, read: float, shot: float, seed: int) -> Picture:
     """Add Gaussian noise, independent per pixel and channel.
 
-    ``read`` and ``shot`` are as in :class:`Sensor`; the same ``seed`` (0 to 2³² − 1) gives the same
-    noise.
+    ``read`` and ``shot`` are as in :class:`Sensor`; ``seed`` (0 to 2³² − 1) fixes the noise.
     """
     noisy = np.empty(image.shape, np.uint8)
     values = np.ascontiguousarray(image).reshape(-1)

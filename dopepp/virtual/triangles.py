@@ -99,8 +99,7 @@ def rasterise(
     ``hom`` are the vertices' homogeneous pixels, shape (V, 3); ``cull`` drops back faces
     (watertight meshes only). Samples nearer than ``near`` metres are dropped. ``origin`` is the
     pixel (x, y) of the buffer's first element; ``samples`` are a pixel's offsets from its centre,
-    shape (S, 2), up to 1/4. The buffers have the shape (height, width, S); ``ids`` count from
-    ``first_id``.
+    shape (S, 2), up to 1/4. Buffers have the shape (height, width, S); ids start at ``first_id``.
     """
     height, width, num_samples = inverse_depth.shape
     x0, y0 = origin

@@ -162,8 +162,7 @@ def preset_of(name: str, changes: object = None, where: str = "") -> Preset:
     """Return a preset with some fields changed.
 
     Args:
-        name: Name of a shipped preset, or a YAML file of the user whose ``base`` names the preset
-            to change.
+        name: Shipped preset, or a user's YAML file whose ``base`` names the preset to change.
         changes: Values by field. A mapping changes some fields of a group, e.g.
             ``{"horizontal_fov_deg": 70, "materials": {"metal_share": 0.2}}``. A group that the
             preset lacks (``table`` of ``paper``) or a group of another ``kind`` starts from its
@@ -171,8 +170,7 @@ def preset_of(name: str, changes: object = None, where: str = "") -> Preset:
         where: Option that holds the changes, for messages.
 
     Raises:
-        UserError: The preset or a field is unknown, or a value has the wrong type or is out of
-            range.
+        UserError: A preset or field is unknown, or a value has the wrong type or range.
     """
     base, changes = written_out(name, changes)
     return parse(Preset, _merged({"name": base, **_shipped(base)}, changes), where)

@@ -239,7 +239,7 @@ class FillPlacement(_Placement):
 class WorkingPlacement(_Placement):
     """Uniform in the depth of the part's middle and laterally wherever the picture shows all of it.
 
-    The middle is the centre of the turned part's bounding box. A part larger than the picture is
+    The middle is the centre of the turned part's bounding box. Parts larger than the picture are
     centred.
     """
 

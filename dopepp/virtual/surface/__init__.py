@@ -90,8 +90,7 @@ def make_surface(mesh: Mesh) -> Surface:
     """Prepare a mesh for rendering (a quarter of a second; do it once per part).
 
     Raises:
-        UserError: The mesh has no faces, a value that is not finite, or a face with an index out of
-            range.
+        UserError: The mesh has no faces, a value that is not finite, or a wrong vertex index.
     """
     vertices = np.ascontiguousarray(mesh.vertices, np.float64)
     faces = np.ascontiguousarray(mesh.faces, np.int32)

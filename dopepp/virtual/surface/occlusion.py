@@ -222,8 +222,7 @@ def look_up_sky(
 ) -> None:
     """Interpolate the open sky at an object's fragments.
 
-    ``face`` and ``share`` are the fragments'; ``steps``, ``firsts`` and ``values`` those of an
-    :class:`OpenSky`.
+    ``face`` and ``share`` are the fragments'; the other inputs belong to an :class:`OpenSky`.
     """
     for p in range(face.shape[0]):
         f, side = (face[p], 0) if face[p] >= 0 else (~face[p], 1)

@@ -195,8 +195,7 @@ def _sky(mi: Any, ambient: Ambient) -> dict[str, Any]:
 class Film:
     """A film with square pixels, as Mitsuba requires, over a window of the image.
 
-    Its pixels are at least as fine as the image's. The picture of a camera with other pixels is
-    resampled.
+    Its pixels are at least as fine as the image's; other cameras' pictures are resampled.
 
     Attributes:
         size: (width, height) of the film, pixels.
@@ -279,8 +278,7 @@ def cast(
 ) -> tuple[Float32[np.ndarray, "height width"], Int16[np.ndarray, "height width"]]:
     """Return depth (0 without a hit) and the index of the shape that each ray hits (−1 without).
 
-    ``rays`` are points at depth 1 m; points nearer than :data:`~dopepp.virtual.scene.NEAR` are
-    ignored.
+    ``rays`` are points at depth 1 m; hits nearer than ``NEAR`` are ignored.
     """
     flat = rays.reshape(-1, 3).astype(np.float32)
     if mi.variant().startswith("scalar"):

@@ -4,8 +4,7 @@ Lights match the rasteriser's, but lamps have a size, objects light each other, 
 their surroundings. The traced picture is composited over the background in linear light.
 
 A matt disc represents the supporting plane, whose picture is the background. The disc's radiance,
-divided by its radiance without objects, is the factor on the background: shadows and reflected
-light.
+divided by its radiance without objects, multiplies the background (shadows, reflected light).
 
 A scene renders to the same bytes on the same machine for any number of threads. Workers must be
 spawned, or forked before the first image. The package lists the environment variables.

@@ -35,8 +35,7 @@ class Fragments(NamedTuple):
         position: Camera frame, metres, shape (3, n).
         normal: Unit normal towards the camera, camera frame, shape (3, n).
         albedo: Linear RGB, shape (3, n).
-        bulge: Height of the smooth surface (as its normals bend) over the flat triangle, metres,
-            shape (n,).
+        bulge: Height of the smooth surface over the flat triangle, metres, shape (n,).
         alpha: Width of the GGX lobe, shape (n,).
     """
 

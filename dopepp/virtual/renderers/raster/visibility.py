@@ -46,8 +46,7 @@ class Projected:
     Attributes:
         cam: Camera frame, metres, shape (V, 3).
         hom: Homogeneous pixels ``K x_cam``, shape (V, 3).
-        extent: Bounds of its image; infinite if it crosses the camera plane, left > right if it
-            lies behind.
+        extent: Bounds of its image; infinite across the camera plane, left > right behind it.
     """
 
     cam: Array
