@@ -201,11 +201,8 @@ WHOLE: Final = 0.2
 """Largest offset of a whole image's principal point from the centre, as a share of the side. Lenses
 stay within a tenth; the K of half or one and a half times the size is a quarter off."""
 
-INSIDE: Final = 0.5
-"""Largest such offset for an image that may be a crop, as in some data sets."""
-
-ANYWHERE: Final = math.inf
-"""Largest such offset for a crop."""
+INSIDE: Final = 0.5  # Largest such offset for an image that may be a crop, as in some data sets
+ANYWHERE: Final = math.inf  # Largest such offset for a crop
 
 
 def check_camera(

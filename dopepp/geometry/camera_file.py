@@ -40,8 +40,7 @@ Crop = tuple[int, int, int, int]
 MAX_BYTES: Final = 250_000
 """Larger than a calibration with all its points; YAML of this size takes 10 s."""
 
-COEFFICIENTS: Final = (0, 4, 5, 8, 12, 14)
-"""Numbers of coefficients of OpenCV's lens models."""
+COEFFICIENTS: Final = (0, 4, 5, 8, 12, 14)  # Numbers of coefficients of OpenCV's lens models
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,8 +21,7 @@ MIN_POINTS: Final = 8  # With fewer keypoints, an outlier resembles perspective
 MILD: Final = 0.02
 """Error of a keypoint, as a share of the part's extent, above which the loss is not quadratic."""
 
-LENGTHS: Final = (0.5, 1.0, 2.0)
-"""Initial factors; each search covers half to twice the factor."""
+LENGTHS: Final = (0.5, 1.0, 2.0)  # Initial factors; each search covers half to twice the factor
 
 
 class Focal(NamedTuple):

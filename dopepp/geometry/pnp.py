@@ -47,8 +47,7 @@ MAX_TANGENT: Final = 1000.0
 """Largest distance from the principal point in focal lengths: 89.9° off the axis."""
 
 ROTATION_TOLERANCE: Final = 1e-6  # Largest error of a refined rotation matrix's entries
-PLATE: Final = 0.3
-"""Largest thickness over length of a part whose mirrored tilt is refined as well."""
+PLATE: Final = 0.3  # Largest thickness over length of a part whose mirrored tilt is refined as well
 
 
 @dataclass(frozen=True)

@@ -17,14 +17,9 @@ MAX_FINITE: Final = 60
 SAME_TURN: Final = math.radians(10.0)
 """Largest angle between equal rotations: those of a 12-fold axis are 30° apart."""
 
-_AVERAGINGS: Final = 5
-"""Each averaging squares the error: 10° become less than 1e-15."""
-
-BALL_STEP: Final = 0.2
-"""Smallest angle between neighbouring rotations of a ball, radians."""
-
-_PARALLEL: Final = 0.01
-"""Sine of the largest angle between parallel axes."""
+_AVERAGINGS: Final = 5  # Each averaging squares the error: 10° become less than 1e-15
+BALL_STEP: Final = 0.2  # Smallest angle between neighbouring rotations of a ball, radians
+_PARALLEL: Final = 0.01  # Sine of the largest angle between parallel axes
 
 MAX_STEP = 0.01
 """Largest move of a point between two steps of a continuous symmetry, diameters (BOP)."""

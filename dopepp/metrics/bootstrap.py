@@ -31,8 +31,7 @@ Draws = Float[np.ndarray, "resamples seeds"]
 _Statistic = Callable[[Float[np.ndarray, "... n"]], Float[np.ndarray, "..."]]
 StatisticName = Literal["mean", "median"]
 
-_BLOCK: Final = 4_000_000
-"""Numbers resampled at once: 32 MB."""
+_BLOCK: Final = 4_000_000  # Numbers resampled at once: 32 MB
 
 
 @dataclass(frozen=True)

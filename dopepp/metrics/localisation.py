@@ -36,8 +36,7 @@ from dopepp.parts.part import Part
 Draw = Callable[[Part, Transform, CameraMatrix, Size], DepthMap]
 """Renders the depth of a single part, metres, 0 beside the part."""
 
-_STRICT: Final = 0.1
-"""Threshold of ADD(-S), diameters."""
+_STRICT: Final = 0.1  # Threshold of ADD(-S), diameters
 
 Errors = Float[np.ndarray, "estimates targets"]
 

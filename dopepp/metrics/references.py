@@ -31,8 +31,7 @@ CHANCE_RANGE: Final = "chance, test range"
 BEST_CONSTANT: Final = "best constant pose"
 REFERENCES: Final = (CHANCE_ALL, CHANCE_RANGE, BEST_CONSTANT)
 
-_MAX_POSES: Final = 300
-"""Most test poses used; the best constant compares all pairs."""
+_MAX_POSES: Final = 300  # Most test poses used; the best constant compares all pairs
 _NUM_DRAWS: Final = 2000
 """Guesses of a chance row: the standard error of a share near 15 % is 0.8 %."""
 _NUM_POINTS: Final = 500

@@ -42,9 +42,7 @@ SMALLEST_DIAMETER: Final = 0.005
 LARGEST_DIAMETER: Final = 5.0
 """Metres. Other diameters nearly always mean a wrong unit."""
 
-MAX_NAME: Final = 200
-"""Characters; bounds what a hostile file prints."""
-
+MAX_NAME: Final = 200  # Characters; bounds what a hostile file prints
 MAX_POINTS: Final = 100_000
 MAX_SYMMETRIES: Final = 1000
 """Far more than any real part has; bounds on the memory of a hostile file."""
@@ -52,8 +50,7 @@ MAX_SYMMETRIES: Final = 1000
 MAX_LIGHT_FACES: Final = 4000
 """Triangles of a record's mesh: edges of two pixels on a part of 100 pixels."""
 
-_FARTHEST: Final = 1e6
-"""Largest coordinate, metres; its square stays finite."""
+_FARTHEST: Final = 1e6  # Largest coordinate, metres; its square stays finite
 
 
 @dataclass(frozen=True)

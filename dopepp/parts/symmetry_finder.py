@@ -25,9 +25,7 @@ from dopepp.geometry.symmetry import SAME_TURN, ContinuousSymmetry, exact_group,
 from dopepp.parts.mesh import Points, SurfaceTree, half_sphere, largest_distance
 from dopepp.parts.part import Mesh
 
-_ROUGH: Final = 0.06
-"""Mean distance that excludes a symmetry within 2.6° of the axis, diameters."""
-
+_ROUGH: Final = 0.06  # Mean distance that excludes a symmetry within 2.6° of the axis, diameters
 _GIVE: Final = 0.02
 """Distance above which a point pulls with constant force, diameters: its feature may have no
 counterpart."""

@@ -25,14 +25,11 @@ from dopepp.core.compiled import Array, compiled
 Affine = tuple[Float[Tensor, "k 3 3"], Float[Tensor, "k 3"]]
 """Matrices and translations of affine maps."""
 
-_LEAF: Final = 16
-"""Largest number of points in a leaf; the fastest of 4 to 32."""
-
+_LEAF: Final = 16  # Largest number of points in a leaf; the fastest of 4 to 32
 _ROUNDING: Final = 1e-9
 """Share by which a bound is lowered, so that rounding never prunes the nearest point."""
 
-_NUM_PROBES: Final = 8
-"""Number of probes, as many as a box has corners."""
+_NUM_PROBES: Final = 8  # Number of probes, as many as a box has corners
 
 
 def mean_nearest(

@@ -30,9 +30,7 @@ from dopepp.parts.mesh import RawMesh, Vertices, weld
 MAX_UNPACKED_BYTES: Final = 50_000_000
 """Largest text in a 3MF file: trimesh uses 17 times as much memory."""
 
-MAX_PIECES: Final = 1000
-"""Most meshes of a part; bounds time."""
-
+MAX_PIECES: Final = 1000  # Most meshes of a part; bounds time
 MAX_TRIANGLES: Final = 5_000_000  # Of all pieces, counted once per instance
 UNITS_3MF: Final = {"millimeter": "mm", "centimeter": "cm", "meter": "m", "inch": "inch"}
 """Unit by 3MF's name; 3MF also has feet and micrometres."""

@@ -39,8 +39,7 @@ NORMALS: Final = ("nx", "ny", "nz")
 COORDINATES: Final = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 """Names of a vertex's colour, normal and texture coordinates."""
 
-_ROUNDING: Final = 1e-3
-"""Share of the range by which a colour may exceed it, due to rounding."""
+_ROUNDING: Final = 1e-3  # Share of the range by which a colour may exceed it, due to rounding
 
 
 class PlyProperty(NamedTuple):

@@ -28,9 +28,7 @@ from dopepp.parts.part import UNITS, Mesh, Part, make_part
 
 logger = logging.getLogger(__name__)
 ASSUMED_UNIT: Final = "mm"  # Unit of most CAD files that cannot state a unit
-MAX_BYTES: Final = 250_000_000
-"""Largest file, about five million triangles; bounds memory."""
-
+MAX_BYTES: Final = 250_000_000  # Largest file, about five million triangles; bounds memory
 MAX_POINTS_BYTES: Final = 20_000_000  # Largest ``points.xyz``: half a million points
 READERS: Final[dict[str, Callable[[Path], RawMesh]]] = {
     ".stl": read_stl,
