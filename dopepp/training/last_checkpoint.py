@@ -1,14 +1,13 @@
-"""The checkpoint that a run is resumed from: saved by the clock, at moments that leave no trace.
+"""The last checkpoint of a run, from which the run can be resumed exactly.
 
-A run that was cut off anywhere and resumed ends with the weights, the best checkpoint and the
-metrics of one that was not, as far as its arithmetic repeats (on CPUs it does). See
+A run that was interrupted anywhere and resumed ends with the weights, best checkpoint and metrics
+of an uninterrupted run, if its arithmetic is deterministic (as on CPUs). See
 ``docs/explanation/reliability.md``. Ctrl-C and SIGTERM take effect between two steps.
 
-Lightning's ``ModelCheckpoint`` keeps the best checkpoint, and cannot keep this one. It saves inside
-a batch or a validation, or at the end of an epoch, where Lightning's counters (a batch counts as
-begun when it is handed out, an epoch as open until its metrics are logged) lead to replayed or
-skipped batches. The counters of every checkpoint are therefore set to a moment between two batches,
-at the beginning of a validation or between two epochs, and only these are resumed from.
+Lightning's ``ModelCheckpoint`` keeps the best checkpoint, but is not suitable for the last one. It
+saves inside a batch or a validation, or at the end of an epoch, where Lightning's counters cause
+replayed or skipped batches. This module sets the counters of every checkpoint to a moment between
+two batches, before a validation or between two epochs.
 """
 
 from __future__ import annotations
@@ -43,15 +42,15 @@ _ANSWERS: Final = {
 }
 
 Cut = Callable[[dict[str, Any]], None]
-"""Sets a loop state's counters to a moment that can be resumed from."""
+"""Sets the counters of a loop's state to a moment from which a run can be resumed."""
 
 
 class LastCheckpoint(Checkpoint):
-    """Saves ``checkpoints/last.ckpt`` during an epoch, too, and keeps the one before.
+    """Saves ``checkpoints/last.ckpt``, also during an epoch, and keeps the previous one.
 
-    It saves between two batches or before a validation, when ``every_s`` seconds have passed or a
-    new best checkpoint was saved, at the end, and when a signal asks the run to stop. Saving by the
-    clock takes at most ``max_share`` of the time.
+    It saves between two batches or before a validation: after ``every_s`` seconds, after a new best
+    checkpoint, at the end, and when a signal requests a stop. Periodic saving takes at most
+    ``max_share`` of the time.
     """
 
     def __init__(self, every_s: float = 60.0, max_share: float = 0.01) -> None:
@@ -64,34 +63,34 @@ class LastCheckpoint(Checkpoint):
         self._saved: tuple[int, float | None] = (0, None)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the random generators' states; in a validation, those at its beginning."""
+        """Return the states of the random generators, in a validation those at its start."""
         return {"random": self._random or _capture()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Keep the states until training starts."""
+        """Store the states until training starts."""
         self._random = state_dict["random"]
 
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Set the counters of every full checkpoint to a moment that can be resumed from."""
+        """Set the counters of a checkpoint to a moment from which the run can be resumed."""
         fit_loop = checkpoint["loops"]["fit_loop"]
         epochs = fit_loop["epoch_progress"]["total"]
         if self._cut is not None:
             self._cut(fit_loop)
-        elif epochs["processed"] == epochs["ready"]:  # the best one, at the end of an epoch
+        elif epochs["processed"] == epochs["ready"]:  # the best checkpoint, at the end of an epoch
             _between_epochs(fit_loop)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Take up the random states and the signals; tidy up after the run that was cut off."""
+        """Restore random states, catch signals and clean up after an interrupted run."""
         if self._random is not None:
             _restore(self._random)
             self._random = None
-        _find_place(trainer)
+        _restore_position(trainer)
         if trainer.is_global_zero:
             run_dir, resumed = Path(trainer.default_root_dir), trainer.ckpt_path
             files.sweep(run_dir)
-            # A damaged file must not take the place of the whole one that is resumed from.
+            # A damaged file must not replace the complete one that is resumed from.
             last = run_dir / files.FOLDER / files.LAST
             if resumed is not None and Path(resumed).name != files.LAST and last.exists():
                 last.replace(last.with_name(f"{files.LAST}.damaged"))
@@ -103,27 +102,31 @@ class LastCheckpoint(Checkpoint):
     def on_train_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, batch: Batch, batch_idx: int
     ) -> None:
-        """Save the state after the batches before this one, if it is time."""
-        # Gradients that are being accumulated are in no checkpoint.
+        """Save the state before this batch, if due."""
+        # Checkpoints have no accumulated gradients.
         if batch_idx % trainer.accumulate_grad_batches == 0:
             self._save_if_due(trainer, _before_batch)
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Remember the random states that a repeated validation has to begin with."""
+        """Store the random states with which a repeated validation must start."""
         self._random = _capture()
 
     def on_validation_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, *_: Any
     ) -> None:
-        """Save if it is time; a resumed run repeats the validation as a whole."""
+        """Save if due; a resumed run repeats the whole validation."""
         self._save_if_due(trainer, _before_validation)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Go back to the present states."""
+        """Discard the stored random states."""
         self._random = None
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Save the result; a ``SavingFailedError`` if it cannot be written."""
+        """Save the result.
+
+        Raises:
+            SavingFailedError: The checkpoint cannot be written.
+        """
         self._stop.end()
         self._save(trainer, _between_epochs)
         if trainer.is_global_zero:
@@ -132,17 +135,17 @@ class LastCheckpoint(Checkpoint):
             writer.finish()
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Give the signals back."""
+        """Restore the signal handlers."""
         self._stop.end()
 
     def _save_if_due(self, trainer: Trainer, cut: Cut) -> None:
-        """Save by the clock and by request; after a request, end the run."""
+        """Save if due or requested; end the run after a request."""
         stop = self._stop.number
         wait_s = max(self.every_s, self._duration_s / self.max_share)
         progress = _progress(trainer)
         is_late = time.monotonic() - self._saved_at >= wait_s
         due = trainer.is_global_zero and (is_late or progress[1] != self._saved[1])
-        # Of several processes the first one has the clock, but any may be asked to stop.
+        # Rank 0 decides when to save, but any process may receive a signal.
         agree = trainer.strategy.reduce_boolean_decision
         if not agree(due or stop is not None, all=False):
             return
@@ -165,11 +168,13 @@ class LastCheckpoint(Checkpoint):
 
 
 class StopRequest:
-    """Catches the signals that ask a run to stop, so that it can save before it does.
+    """Catches signals that stop a run, so that the run can save first.
 
-    The first Ctrl-C is remembered, the second ends the run at once; schedulers repeat SIGTERM, so
-    it is remembered however often it comes. Under SLURM, SIGUSR1 (``--signal=USR1@90``) asks for
-    the same as SIGTERM. ``number`` is the signal that was caught, SIGTERM for SIGUSR1, or None.
+    A second Ctrl-C ends the run at once. SIGTERM may be repeated, as schedulers do. Under SLURM,
+    SIGUSR1 (``--signal=USR1@90``) acts like SIGTERM.
+
+    Attributes:
+        number: The caught signal, SIGTERM for SIGUSR1; None before any signal.
     """
 
     def __init__(self) -> None:
@@ -178,7 +183,7 @@ class StopRequest:
         self._kept: dict[int, Any] = {}
 
     def listen(self) -> None:
-        """Take the signals over from whoever had them; in the main thread only."""
+        """Install the signal handlers, in the main thread only."""
         if threading.current_thread() is not threading.main_thread():
             return
         requeued = [signal.SIGUSR1] if "SLURM_JOB_ID" in os.environ else []
@@ -186,39 +191,39 @@ class StopRequest:
             self._kept[number] = signal.signal(number, self._remember)
 
     def end(self) -> None:
-        """Give the signals back."""
+        """Restore the signal handlers."""
         for number, handler in self._kept.items():
             signal.signal(number, handler)
         self._kept = {}
 
     def _remember(self, number: int, _: FrameType | None) -> None:
-        if os.getpid() != self._process:  # a forked loader's worker: its parent decides
+        if os.getpid() != self._process:  # a forked worker of the data loader
             return
         if number == signal.SIGINT and self.number is not None:
             raise Interruption(number)
         first = self.number is None
         self.number = signal.SIGINT if number == signal.SIGINT else signal.SIGTERM
         if first:
-            # Not through a stream or a logger: the signal may have come in the middle of its own.
+            # Not through a stream or logger, which the signal may have interrupted.
             os.write(2, _ANSWERS[self.number])
 
 
-def _find_place(trainer: Trainer) -> None:
-    """Set loop and loader to the batch of the epoch at which the loop's counters stand."""
+def _restore_position(trainer: Trainer) -> None:
+    """Set loop and loader to the batch at the loop's counters."""
     epoch_loop, epochs = trainer.fit_loop.epoch_loop, trainer.fit_loop.epoch_progress.total
     batches = epoch_loop.batch_progress
     num_done = 0 if batches.is_last_batch else batches.current.ready
     if epochs.ready == epochs.completed or batches.current.ready == 0:
         epoch_loop.restarting = False  # nothing of this epoch is done yet
         num_done = 0
-    # Lightning itself forgets to, where the schedule has asked for the number of steps.
+    # Lightning does not do this if the schedule has requested the number of steps.
     loader = trainer.train_dataloader
     if isinstance(loader, PoseLoader):
         loader.load_state_dict({"num_batches": num_done})
 
 
 def _progress(trainer: Trainer) -> tuple[int, float | None]:
-    """Return the step and the best score: a checkpoint that differs in neither is not saved."""
+    """Return step and best score; a checkpoint that differs in neither is not saved."""
     score = getattr(_best(trainer), "best_model_score", None)
     return trainer.global_step, None if score is None else float(score)
 
@@ -232,10 +237,10 @@ def _best(trainer: Trainer) -> ModelCheckpoint | None:
 
 
 def _forget_later_best(trainer: Trainer) -> None:
-    """Choose the best checkpoint anew if its file is newer than the step that is resumed from.
+    """Reset the best checkpoint if its file is newer than the resumed step.
 
-    Arithmetic that does not repeat exactly would not find that checkpoint again, and the run would
-    end with a best one that none of its metrics are of.
+    Without deterministic arithmetic, the resumed run would not reproduce this checkpoint, and its
+    metrics would belong to another one.
     """
     best = _best(trainer)
     if best is None or not best.best_model_path:
@@ -251,7 +256,7 @@ def _forget_later_best(trainer: Trainer) -> None:
 
 
 def _before_batch(fit_loop: dict[str, Any]) -> None:
-    """Take back the batch that was handed out and has not been trained on."""
+    """Undo the count of the batch that was loaded but not trained on."""
     batches = fit_loop["epoch_loop.batch_progress"]
     for counter in (batches["total"], batches["current"]):
         counter["ready"] -= 1
@@ -259,22 +264,22 @@ def _before_batch(fit_loop: dict[str, Any]) -> None:
 
 
 def _before_validation(fit_loop: dict[str, Any]) -> None:
-    """Forget what has been validated: all of the epoch's batches are trained on, none is judged."""
+    """Reset the validation: all batches of the epoch are trained on, none is validated."""
     validation = fit_loop["epoch_loop.val_loop.batch_progress"]
-    # One batch begun and none done is how Lightning tells that a validation was cut off.
+    # Lightning recognises an interrupted validation by one started and no processed batch.
     validation["total"].update(ready=1, started=1, processed=0, completed=0)
     validation["current"].update(ready=0, started=0, processed=0, completed=0)
     validation["is_last_batch"] = False
 
 
 def _between_epochs(fit_loop: dict[str, Any]) -> None:
-    """Close the epoch: the next one starts with its first batch."""
+    """Complete the epoch, so that the next one starts with its first batch."""
     for counter in fit_loop["epoch_progress"].values():
         counter["completed"] = counter["processed"]
 
 
 def _capture() -> dict[str, Any]:
-    """Return the states of Python's, NumPy's and torch's generators, as tensors and numbers."""
+    """Return the states of the generators of Python, NumPy and torch as tensors and numbers."""
     version, numbers, gauss = random.getstate()
     _, keys, position, has_gauss, cached = np.random.get_state(legacy=True)  # noqa: NPY002
     return {
@@ -287,7 +292,7 @@ def _capture() -> dict[str, Any]:
 
 
 def _restore(state: dict[str, Any]) -> None:
-    """Set the generators to captured states; those of GPUs only where there are as many."""
+    """Restore captured states, those of GPUs only if their number is the same."""
     version, numbers, gauss = state["python"]
     random.setstate((version, tuple(numbers), gauss))
     keys, position, has_gauss = state["numpy"]

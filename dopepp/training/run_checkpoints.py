@@ -1,7 +1,7 @@
-"""The checkpoints of a run's folder: whole or absent, however a run ends.
+"""Checkpoint files of a run, complete or absent however the run ends.
 
-:class:`AtomicCheckpointIO` writes them, and keeps in memory what cannot be written at once;
-:func:`newest_checkpoint` finds the one to go on from.
+:class:`AtomicCheckpointIO` writes the files and keeps checkpoints in memory that cannot be written;
+:func:`newest_checkpoint` returns the checkpoint to resume from.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ PREVIOUS: Final = "previous.ckpt"
 BEST: Final = "best.ckpt"
 
 _NEEDED: Final = frozenset({"global_step", "loops", "optimizer_states", "callbacks"})
-_NUM_FILES: Final = 4  # last, previous, best, and one that is being written
+_NUM_FILES: Final = 4  # last, previous, best, and a file being written
 _WEIGHTS_PER_FILE: Final = 3  # the weights and an optimiser's two moments
 _ADVICE: Final = {
     errno.ENOSPC: "free some space there",
@@ -49,12 +49,15 @@ class SavingFailedError(RunError):
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Lightning's checkpoint files, saved atomically and loaded without running code.
+    """Saves Lightning's checkpoints atomically and loads them without running code.
 
-    A checkpoint that cannot be written (disk full, server away) is kept in memory and written
-    before the next one, so files on disk never refer to a missing one; a newer version of the same
-    file takes its place. ``prepare`` is called before each writing; if it raises ``OSError``,
-    nothing is written. Outside of the run's ``folder`` nothing is removed.
+    A checkpoint that cannot be written (disk full, server unavailable) is kept in memory and
+    written before the next one, so that no file refers to a missing file. A newer version of the
+    same file replaces it.
+
+    Args:
+        prepare: Called before each writing; if it raises ``OSError``, nothing is written.
+        folder: Folder of the run; no files outside are removed.
     """
 
     def __init__(
@@ -66,15 +69,18 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
     @property
     def waiting(self) -> list[Path]:
-        """The files that could not be written so far, oldest first."""
+        """The files that could not be written yet, oldest first."""
         return list(self._waiting)
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
     ) -> None:
-        """Write the file, or keep it in memory; a crash leaves either the old or the new one.
+        """Write the file atomically, or keep the checkpoint in memory and warn.
 
-        ``storage_options`` are None, or ``{"previous": PATH}`` to keep the old file there.
+        Args:
+            checkpoint: Content of the file.
+            path: File to write.
+            storage_options: ``{"previous": PATH}`` moves the old file to this path.
         """
         target = Path(os.fspath(path))
         self._waiting.pop(target, None)
@@ -84,20 +90,24 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             _log.warning("%s; trying again at the next saving", _failure(self.waiting[0], error))
 
     def finish(self) -> None:
-        """Write what is still waiting, or raise :class:`SavingFailedError`."""
+        """Write the waiting files.
+
+        Raises:
+            SavingFailedError: A file cannot be written.
+        """
         error = self._write_waiting()
         if error is not None:
             raise SavingFailedError(_failure(self.waiting[0], error)) from error
 
     def _write_waiting(self) -> OSError | None:
-        """Write in order; stop at the first file that cannot be written and keep the rest."""
+        """Write the waiting files in order up to the first failure, which is returned."""
         for path, (checkpoint, previous) in list(self._waiting.items()):
             try:
                 if self._prepare is not None:
                     self._prepare()
                 write_atomic(checkpoint, path, previous)
             except OSError as error:
-                # Training goes on to change the tensors that the newest one refers to.
+                # Training will change the tensors of the newest checkpoint.
                 self._waiting = {
                     p: (_copy(content), old) for p, (content, old) in self._waiting.items()
                 }
@@ -106,7 +116,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         return None
 
     def remove_checkpoint(self, path: str | Path) -> None:
-        """Remove a file of the run; a checkpoint names the file, so it may be anybody's."""
+        """Remove a file of the run; the untrusted checkpoint names it, so others are kept."""
         target = Path(os.fspath(path))
         folder = target.parent.resolve()
         if self._folder is not None and not folder.is_relative_to(self._folder.resolve()):
@@ -118,10 +128,9 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def load_checkpoint(
         self, path: Any, map_location: Any = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """Load a file as plain data; a pickled object in it is refused, whoever asks.
+        """Load a file as plain data, without pickled objects.
 
-        A run's folder may have been moved: its callbacks' files are looked for beside the file
-        itself.
+        The run folder may have been moved, so the callbacks' paths are updated.
         """
         loaded: Mapping[str, Any] = super().load_checkpoint(path, map_location, weights_only=True)
         if self._folder is None:
@@ -132,10 +141,12 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
 
 def newest_checkpoint(run_dir: Path) -> tuple[Path, Checkpoint] | None:
-    """Return the newest whole checkpoint of a run; None if it has not saved any yet.
+    """Return the newest complete checkpoint of a run; None if the run has not saved any.
+
+    Damaged files are logged.
 
     Raises:
-        UserError: All are damaged; each damaged file is reported in a line.
+        UserError: All checkpoints are damaged.
     """
     damaged = []
     paths = [run_dir / FOLDER / name for name in (LAST, PREVIOUS, BEST)]
@@ -150,27 +161,31 @@ def newest_checkpoint(run_dir: Path) -> tuple[Path, Checkpoint] | None:
             _log.warning("going on from %s, step %d", path.name, step)
         return path, checkpoint
     if damaged:
-        got = f"{run_dir}, whose checkpoints are all damaged ({', '.join(damaged)})"
+        problem = f"{run_dir}, whose checkpoints are all damaged ({', '.join(damaged)})"
         allowed = f"a run with at least one whole file among {LAST}, {PREVIOUS} and {BEST}"
         fix = "restore one of them from a backup, or start anew without resume"
-        raise UserError(got, allowed, fix)
+        raise UserError(problem, allowed, fix)
     return None
 
 
 def saved_step(path: Path) -> int | None:
-    """Return after how many steps a checkpoint was taken; None if it cannot be told."""
+    """Return the step of a checkpoint file; None if it cannot be read."""
     try:
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
         return int(content["global_step"])
-    except Exception:  # a damaged file raises whatever its bytes lead to
+    except Exception:  # a damaged file may raise any exception
         return None
 
 
 def check_room(run_dir: Path, weight_bytes: int) -> None:
-    """Check, as far as possible in advance, that a run can write its checkpoints.
+    """Check in advance that a run can write its checkpoints.
+
+    Args:
+        run_dir: Folder of the run.
+        weight_bytes: Size of the network's weights.
 
     Raises:
-        UserError: The folder cannot be written, or has no room for weights of so many bytes.
+        UserError: The folder is not writable, or has too little free space.
     """
     folder = run_dir / FOLDER
     probe = folder / ".probe"
@@ -180,9 +195,9 @@ def check_room(run_dir: Path, weight_bytes: int) -> None:
         probe.unlink()
         free = shutil.disk_usage(folder).free
     except OSError as error:
-        got = f"{folder}, which cannot be written: {error.strerror or error}"
+        problem = f"{folder}, which cannot be written: {error.strerror or error}"
         fix = "set output_dir=…, or make it writable"
-        raise UserError(got, "a folder that can be written, for checkpoints", fix) from error
+        raise UserError(problem, "a folder that can be written, for checkpoints", fix) from error
     needed = _NUM_FILES * _WEIGHTS_PER_FILE * weight_bytes
     needed -= sum(path.stat().st_size for path in folder.glob("*.ckpt"))
     if free < needed:
@@ -192,7 +207,7 @@ def check_room(run_dir: Path, weight_bytes: int) -> None:
 
 
 def sweep(run_dir: Path) -> None:
-    """Remove the half-written files of processes that are gone."""
+    """Remove the partial files of processes that no longer run."""
     for folder in (run_dir, run_dir / FOLDER):
         for path in folder.glob(f".*{PARTIAL_SUFFIX}"):
             if is_abandoned(path, time.time()):
@@ -200,7 +215,7 @@ def sweep(run_dir: Path) -> None:
 
 
 def _read_whole(path: Path) -> tuple[Checkpoint, int]:
-    """Read a checkpoint after comparing its checksums, which torch does not do."""
+    """Read a checkpoint and check its checksums, which torch does not."""
     checkpoint = read(path)
     with zipfile.ZipFile(path) as archive:
         try:
@@ -210,13 +225,13 @@ def _read_whole(path: Path) -> tuple[Checkpoint, int]:
     content: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     missing = sorted(_NEEDED - content.keys())
     if bad is not None or missing:
-        got = f"{path}, damaged in {bad}" if bad else f"{path}, without {', '.join(missing)}"
-        raise UserError(got, "a checkpoint as training wrote it", "take another one")
+        problem = f"{path}, damaged in {bad}" if bad else f"{path}, without {', '.join(missing)}"
+        raise UserError(problem, "a checkpoint as training wrote it", "take another one")
     return checkpoint, int(content["global_step"])
 
 
 def _copy(value: Any) -> Any:
-    """Return a checkpoint with copies of its tensors, on the CPU."""
+    """Copy a checkpoint with its tensors to the CPU."""
     if isinstance(value, Tensor):
         return value.detach().to("cpu", copy=True)
     if isinstance(value, Mapping):
@@ -225,15 +240,15 @@ def _copy(value: Any) -> Any:
 
 
 def _moved(state: Any, folder: Path) -> Any:
-    """Return a callback's state, a ``ModelCheckpoint``'s with all of its files in a folder."""
+    """Return a callback's state, with the files of a ``ModelCheckpoint`` moved to a folder."""
     if not isinstance(state, dict) or "dirpath" not in state:
         return state
 
-    def place(path: str) -> str:
+    def move(path: str) -> str:
         return str(folder / Path(path).name) if path else path
 
-    moved = {key: place(state[key]) for key in _PATHS if key in state}
-    best = {place(path): score for path, score in state.get("best_k_models", {}).items()}
+    moved = {key: move(state[key]) for key in _PATHS if key in state}
+    best = {move(path): score for path, score in state.get("best_k_models", {}).items()}
     return {**state, **moved, "dirpath": str(folder), "best_k_models": best}
 
 

@@ -1,9 +1,9 @@
-"""Target maps: what the network is asked to give for a batch, also for symmetric parts.
+"""Target maps of a batch, with a unique choice of pose for symmetric parts.
 
-A pose T and T·S look the same when S maps the part onto itself, so a network that is asked for both
-learns their mean, which is neither. Of all T·S it is asked for one: the nearest to a reference
-orientation, as seen along the line of sight. Where another is nearly as near, at a sector's border,
-it may give either. The poses that metrics compare with are left as they are.
+If a symmetry S maps the part onto itself, the poses T and T·S look alike, and a network trained on
+both learns their mean. Targets therefore use the equivalent pose that is nearest to a reference
+orientation relative to the line of sight. If another pose is almost as near, at the border of a
+sector, the network may choose. Metrics use the labelled poses.
 """
 
 from __future__ import annotations
@@ -29,22 +29,20 @@ from dopepp.models.losses import MapLoss
 from dopepp.parts.part import Part
 
 Keypoints = Float[Tensor, "batch instances 9 2"]
-Targets = tuple[Beliefs, Fields]  # Belief maps and vector fields as the network should give them
+Targets = tuple[Beliefs, Fields]  # Target belief maps and vector fields
 
-FACING: Final = np.diag([1.0, -1.0, -1.0])  # Reference orientation: +z at the camera, +y up
-
-UP: Final = np.array([0.0, -1.0, 0.0])
-"""Direction of a round part's axis in the reference orientation."""
+FACING: Final = np.diag([1.0, -1.0, -1.0])  # Reference orientation: +z to the camera, +y up
+UP: Final = np.array([0.0, -1.0, 0.0])  # Axis of a round part in the reference orientation
 
 
 @dataclass(frozen=True)
 class SymmetryOptions(Checked):
-    """How symmetric parts are learnt.
+    """Options for targets of symmetric parts.
 
     Attributes:
-        canonical: Whether keypoints are those of the equivalent pose nearest the reference.
-        border_deg: Equivalent poses whose angle to the reference exceeds the nearest's by less than
-            this, degrees, are as good: the one with the least loss is learnt. 0: never.
+        canonical: Whether targets use the equivalent pose nearest to the reference.
+        border_deg: Difference of angles to the reference, degrees, within which equivalent poses
+            are alternatives; the one with the lowest loss is used. 0 allows no alternatives.
     """
 
     canonical: bool = True
@@ -53,15 +51,15 @@ class SymmetryOptions(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.border_deg > 0 and not self.canonical:
-            got = f"symmetry.border_deg={self.border_deg} with symmetry.canonical=false"
+            problem = f"symmetry.border_deg={self.border_deg} with symmetry.canonical=false"
             fix = "set symmetry=none, or symmetry.canonical=true"
-            raise UserError(got, "0 where there are no sectors and so no borders", fix)
+            raise UserError(problem, "0 where there are no sectors and so no borders", fix)
 
 
 def draw_maps(
     batch: Batch, keypoints: Keypoints, num_objects: int, geometry: MapGeometry
 ) -> Targets:
-    """Draw the maps of the instances that are visible enough for a metric to count them."""
+    """Draw the target maps of all instances that are visible enough for metrics."""
     height, width = batch.images.shape[-2:]
     map_size = height // geometry.stride, width // geometry.stride
     seen = batch.visible_fraction >= MIN_VISIBLE_FRACTION
@@ -76,18 +74,24 @@ def choose_keypoints(
     loss: MapLoss,
     geometry: MapGeometry,
 ) -> Keypoints:
-    """Return each instance's keypoints in the pose, of those that look alike, to be learnt.
+    """Return the keypoints of each instance in the equivalent pose to train on.
 
-    This is the pose nearest the reference orientation. Where another pose is as good, the one is
-    taken whose maps have the lower loss to the network's answer (``stages``); instances are decided
-    one after the other.
+    The default is the pose nearest to the reference orientation. An allowed alternative is used if
+    its maps have a lower loss; instances are decided in sequence.
+
+    Args:
+        batch: Images with labels.
+        stages: The network's output; None uses the default.
+        symmetry: Equivalent poses of the parts.
+        loss: Loss that compares alternatives.
+        geometry: Geometry of the maps.
     """
     choices, allowed = symmetry.equivalents(batch)
     keypoints = choices[:, :, 0].clone()
     if stages is None:
         return keypoints
     for slot, choice in allowed[:, :, 1:].any(dim=0).nonzero().tolist():
-        # Only the images on which this instance may take this choice are drawn, twice.
+        # Draw maps only for images on which this choice is allowed for the instance.
         rows = allowed[:, slot, 1 + choice].nonzero()[:, 0]
         some = batch.rows(rows)
         answer = [(logits[rows].detach(), field[rows].detach()) for logits, field in stages]
@@ -103,9 +107,9 @@ def choose_keypoints(
 
 
 class Equivalents(NamedTuple):
-    """Poses that look alike, the one to learn first: projected cuboids of each, input pixels.
+    """Keypoints of equivalent poses, input pixels, the nearest to the reference first.
 
-    ``allowed`` marks those that may be learnt; the first always may.
+    ``allowed`` marks poses that may be used as targets; the first is always allowed.
     """
 
     keypoints: Float[Tensor, "batch instances choices 9 2"]
@@ -113,7 +117,7 @@ class Equivalents(NamedTuple):
 
 
 class SymmetryHandling:
-    """Finds the poses that look like a labelled one; parts are in the order of the channels."""
+    """Computes the equivalent poses of labelled ones; parts are in channel order."""
 
     def __init__(self, parts: Sequence[Part], options: SymmetryOptions) -> None:
         self.options, self.num_objects = options, len(parts)
@@ -130,9 +134,9 @@ class SymmetryHandling:
         }
 
     def equivalents(self, batch: Batch) -> Equivalents:
-        """Return the poses of a batch's instances that look alike.
+        """Return the equivalent poses of a batch's instances.
 
-        Instances of parts without symmetries have their own keypoints alone, bit by bit.
+        Instances of parts without symmetries keep exactly their labelled keypoints.
         """
         poses, excess = self._poses(batch)
         order = excess.argsort(dim=-1, stable=True)
@@ -151,10 +155,10 @@ class SymmetryHandling:
         )
 
     def _poses(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Return T·S·C of every discrete S, and the angle of each to the reference.
+        """Return T·S·C for every discrete S, and their angles to the reference.
 
-        C is the best turn about a round part's axis. Poses are (batch, instances, choices, 4, 4),
-        angles (batch, instances, choices), radians, infinite for what pads the table.
+        C is the best rotation about the axis of a round part. Poses have the shape (batch,
+        instances, choices, 4, 4), angles (batch, instances, choices), radians; padding is infinite.
         """
         tables = self._on(batch.T_cam_obj.device)
         index = batch.object_index.clamp(min=0)
@@ -180,16 +184,16 @@ class SymmetryHandling:
 
 
 def _row(part: Part) -> dict[str, np.ndarray]:
-    """Return a part's symmetries with the reference that its poses are compared with."""
+    """Return the symmetries of a part and the reference orientation of its poses."""
     discrete = part.symmetries_discrete
     transforms = np.eye(4)[None]
     if discrete is not None and len(discrete):
         transforms = np.concatenate([transforms, discrete])
     axis, offset, reference = np.zeros(3), np.zeros(3), FACING
     orbit = transforms[:, :3, :3] @ part.cuboid[CENTROID] + transforms[:, :3, 3]
-    fixed = orbit.mean(axis=0)  # every symmetry only reorders the orbit
+    fixed = orbit.mean(axis=0)  # symmetries only permute the orbit
     if part.symmetries_continuous:
-        # A ball has more axes than this one; its maps are round whatever is chosen.
+        # A ball has further axes, but its maps are round for any choice.
         axis, offset = map(np.array, part.symmetries_continuous[0])
         axis = axis / np.linalg.norm(axis)
         reference = _between(FACING @ axis, UP) @ FACING
@@ -209,7 +213,7 @@ def _between(start: np.ndarray, end: np.ndarray) -> Float[np.ndarray, "3 3"]:
     """Return the smallest rotation of one unit vector to another."""
     across = np.cross(start, end)
     sine, cosine = np.linalg.norm(across), start @ end
-    if sine < 1e-9:  # the same, or opposite: then half a turn in the image plane
+    if sine < 1e-9:  # equal, or opposite: then a half turn in the image plane
         return np.eye(3) if cosine > 0 else np.diag([-1.0, -1.0, 1.0])
     return rotation_vector_to_matrix(across / sine * np.arctan2(sine, cosine))
 
@@ -217,13 +221,13 @@ def _between(start: np.ndarray, end: np.ndarray) -> Float[np.ndarray, "3 3"]:
 def _line_of_sight(
     T_cam_obj: Float[Tensor, "batch instances 4 4"], fixed: Float[Tensor, "batch instances 3"]
 ) -> Float[Tensor, "batch instances 3 3"]:
-    """Return the smallest rotation of the optical axis to the direction of a part's centre.
+    """Return the smallest rotation from the optical axis to the direction of a part's centre.
 
-    A part that moves across the image keeps its look when it turns with this.
+    A part that moves across the image and rotates so keeps its appearance.
     """
     centre = (T_cam_obj[..., :3, :3] @ fixed[..., None])[..., 0] + T_cam_obj[..., :3, 3]
     x, y, z = torch.nn.functional.normalize(centre, dim=-1).unbind(-1)
-    # Rodrigues' formula for the axis (−y, x, 0); at z = −1, behind the camera, nothing is drawn.
+    # Rodrigues' formula for the axis (−y, x, 0); parts behind the camera (z = −1) are not drawn.
     c = 1 / (1 + z).clamp(min=1e-6)
     rows = [1 - c * x * x, -c * x * y, x, -c * x * y, 1 - c * y * y, y, -x, -y, z]
     return torch.stack(rows, -1).reshape(*x.shape, 3, 3)
@@ -232,10 +236,10 @@ def _line_of_sight(
 def _best_turn(
     offset: Float[Tensor, "*batch 3 3"], axes: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "*batch 3 3"]:
-    """Return the turn C about an axis that brings offset·C nearest to the identity.
+    """Return the rotation C about an axis for which offset·C is nearest to the identity.
 
     tr(A·C(θ)) = aᵀAa + cos θ·(tr A − aᵀAa) + sin θ·tr(A·[a]×) is largest at the angle of the two
-    factors. An axis of zeros stands for no continuous symmetry: then C is the identity.
+    factors. An axis of zeros means no continuous symmetry; then C is the identity.
     """
     x, y, z = axes.unbind(-1)
     zero = torch.zeros_like(x)
