@@ -18,7 +18,7 @@ from dopepp.geometry.camera_file import Camera
 from dopepp.robot.calibration.board import board_pose, draw_view, parse_board
 from dopepp.robot.calibration.hand_eye import calibrate_hand_eye
 from dopepp.robot.calibration.lens import calibrate_lens
-from dopepp.robot.calibration.quality import explain
+from dopepp.robot.calibration.quality import assess
 from dopepp.robot.calibration.tool import find_tip
 
 BOARD = parse_board("charuco:9x7:25:18")
@@ -72,7 +72,7 @@ def calibrated(seed: int, num: int):
         flanges = [M if mount == "hand" else invert_transform(M) for M in robot]
         said = np.array([noisy(M, rng) for M in flanges])
         estimate = calibrate_hand_eye(said, boards, mount)
-        worth = explain(said, boards, estimate)
+        worth = assess(said, boards, estimate)
         yield [*apart(X, estimate.T_mount_cam), 1000 * worth.shift, off, tip, len(worth.findings)]
 
 

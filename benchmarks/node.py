@@ -21,7 +21,7 @@ from collections.abc import Callable
 import numpy as np
 
 from dopepp.parts.catalogue import load_part
-from dopepp.robot.nodes.messages import picture
+from dopepp.robot.nodes.messages import image_fields
 from dopepp.robot.nodes.ros2 import native
 from dopepp.virtual import PRESETS, Factory
 
@@ -44,7 +44,8 @@ class Camera:
         rendered = [factory.render(0, number) for number in range(9, 15)]
         header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": FRAME}
         self.images = [
-            native("sensor_msgs/Image", picture(rendering.image, header)) for rendering in rendered
+            native("sensor_msgs/Image", image_fields(rendering.image, header))
+            for rendering in rendered
         ]
         K = rendered[0].scene.K
         self.info = native(

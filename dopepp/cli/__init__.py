@@ -1,6 +1,6 @@
-"""The console command ``dopepp``; each subcommand imports what it needs when it is called.
+"""The console command ``dopepp``. Each subcommand imports its dependencies when it is called.
 
-To add a command, write a function in a module of its kind and one line in :data:`COMMANDS`.
+To add a command, write a function in the module of its kind and add it to :data:`COMMANDS`.
 """
 
 from __future__ import annotations
@@ -12,46 +12,54 @@ import typer
 from typer.core import TyperGroup
 
 from dopepp import __version__
-from dopepp.cli import calibrate, data, experiment, grasp, network, node, predict
-from dopepp.cli.errors import USERS_MISTAKE
+from dopepp.cli import (
+    calibrate,
+    data_commands,
+    experiment_commands,
+    grasp,
+    network_commands,
+    node,
+    predict,
+)
+from dopepp.core.errors import UserError
 
 COMMANDS: Final = (
     predict.predict,
-    network.doctor,
+    network_commands.doctor,
     node.node,
-    network.serve,
-    experiment.export,
-    network.benchmark,
-    data.render,
-    data.check,
-    data.download,
-    experiment.compare,
-    data.symmetries,
-    experiment.release,
+    network_commands.serve,
+    experiment_commands.export,
+    network_commands.benchmark,
+    data_commands.render,
+    data_commands.check,
+    data_commands.download,
+    experiment_commands.compare,
+    data_commands.symmetries,
+    experiment_commands.release,
 )
-"""Those whose options are their own, as ``--help`` lists them."""
+"""Commands with options of their own, in the order of ``--help``."""
 
 _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
-"""Of the click that this version of Typer brings along or imports."""
+"""Of the click that this version of Typer bundles or imports."""
 
 
-class _OneLine(TyperGroup):
-    """Tells a wrong option or a missing argument in one line, as any other mistake."""
+class _OneLineErrors(TyperGroup):
+    """Reports a wrong option or a missing argument in one line, like every other mistake."""
 
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
         except _UsageError as error:
             line = " ".join(error.format_message().split())  # type: ignore[attr-defined]
-            typer.echo(f"{line.rstrip('.')}; --help lists what there is", err=True)
-            raise typer.Exit(USERS_MISTAKE) from error
+            typer.echo(f"{line.rstrip('.')}; see --help", err=True)
+            raise typer.Exit(UserError.exit_code) from error
 
 
-app = typer.Typer(cls=_OneLine, no_args_is_help=True)
+app = typer.Typer(cls=_OneLineErrors, no_args_is_help=True)
 
 
-def _show_version(asked: bool) -> None:
-    if asked:
+def _show_version(is_requested: bool) -> None:
+    if is_requested:
         typer.echo(f"dopepp {__version__}")
         raise typer.Exit
 
@@ -59,17 +67,18 @@ def _show_version(asked: bool) -> None:
 @app.callback()
 def _configure(
     version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="print it")
+        bool,
+        typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version."),
     ] = False,
 ) -> None:
-    """6D poses of weakly textured parts, from the CAD file: train, measure, predict, export."""
+    """Estimate 6D poses of weakly textured parts from their CAD files."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
 
 
-for _entry in (experiment.train, experiment.evaluate):  # Hydra reads what follows, --help too
-    app.command(context_settings=experiment.HANDED_ON, add_help_option=False)(_entry)
+for _entry in (experiment_commands.train, experiment_commands.evaluate):
+    app.command(context_settings=experiment_commands.HYDRA_OPTIONS, add_help_option=False)(_entry)
 for _command in COMMANDS:
-    is_render = _command.__name__ == "render"
-    app.command(cls=data.RenderCommand if is_render else None)(_command)
+    is_render = _command is data_commands.render
+    app.command(cls=data_commands.RenderCommand if is_render else None)(_command)
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(grasp.app, name="grasp")

@@ -1,57 +1,62 @@
-"""``dopepp calibrate``: a camera, a tool, a bench, and where the camera is on the robot."""
+"""``dopepp calibrate``: calibrate a camera, a tool, a bench, and the camera's pose on the robot."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from dopepp.cli.errors import report_errors
-from dopepp.core.errors import UserError
+from dopepp.cli.common import report_errors
+from dopepp.core.errors import Interruption, UserError, interruptible
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from dopepp.drawing.pictures import Picture
+    from dopepp.drawing.pictures import Picture, Size
     from dopepp.robot.calibration.board import Board, BoardPose, Sighting
-    from dopepp.robot.calibration.files import Reading
     from dopepp.robot.calibration.hand_eye import HandEye
     from dopepp.robot.calibration.lens import LensCalibration
-    from dopepp.robot.calibration.quality import Explanation
+    from dopepp.robot.calibration.quality import CalibrationQuality
+    from dopepp.robot.calibration.records import PoseFormat
     from dopepp.robot.calibration.tool import Bench
 
-BOARD: Final = "e.g. charuco:8x11:20:15, chess:7x10:25, circles:4x11:40 (columns × rows, mm)"
+BOARD: Final = "charuco:8x11:20:15, chess:7x10:25 or circles:4x11:40 (columns × rows, mm)."
 
-Out = Annotated[Path, typer.Option(help="YAML to write")]
+Out = Annotated[Path, typer.Option(help="YAML file to write.")]
 Force = Annotated[
-    bool, typer.Option("--force", help="write it even where it is not to be trusted, marked so")
+    bool, typer.Option("--force", help="Also write a doubtful calibration, marked as untrusted.")
 ]
 BoardSpec = Annotated[str, typer.Option("--board", help=BOARD)]
-Pictures = Annotated[Path, typer.Argument(help="folder with pictures of the board")]
+Pictures = Annotated[Path, typer.Argument(help="Folder with pictures of the board.")]
 Poses = Annotated[
     Path,
-    typer.Argument(help="CSV, JSON or YAML: x y z and qw qx qy qz, rx ry rz or roll pitch yaw"),
+    typer.Argument(
+        help="CSV, JSON or YAML with x y z and qw qx qy qz, rx ry rz, or roll pitch yaw."
+    ),
 ]
-Unit = Annotated[str, typer.Option(help="of positions: m, mm, cm, inch")]
-Angles = Annotated[str, typer.Option(help="of rx ry rz and roll pitch yaw: rad, deg")]
+Unit = Annotated[str, typer.Option(help="Unit of positions: m, mm, cm or inch.")]
+Angles = Annotated[str, typer.Option(help="Unit of rx ry rz and roll pitch yaw: rad or deg.")]
 Quaternion = Annotated[
-    str, typer.Option(help="wxyz as the columns are named; xyzw if w stands in the last")
+    str, typer.Option(help="wxyz as the columns are named, or xyzw if w is in the last column.")
 ]
 Direction = Annotated[
-    str, typer.Option(help="flange-to-base as controllers show it, or base-to-flange")
+    str, typer.Option(help="flange-to-base, as controllers show poses, or base-to-flange.")
 ]
 
-app = typer.Typer(no_args_is_help=True, help=__doc__)
+app = typer.Typer(
+    no_args_is_help=True, help="Calibrate a camera, a tool, a bench, or the camera on the robot."
+)
 
 
 @app.command()
 def board(
     what: Annotated[str, typer.Argument(help=BOARD)],
-    out: Annotated[Path, typer.Option(help="PDF or PNG to print")],
+    out: Annotated[Path, typer.Option(help="PDF or PNG to print.")],
 ) -> None:
-    """Write a board to print, at true scale."""
+    """Write a calibration board for printing at true scale."""
     from dopepp.robot.calibration.board import parse_board
 
     with report_errors():
@@ -63,31 +68,31 @@ def camera(
     source: Annotated[
         str,
         typer.Argument(
-            help="pictures of the board: a folder, a video, a ROS bag, a "
-            "camera's number or address (Ctrl-C ends it)"
+            help="Pictures of the board: a folder, a video, a ROS bag, a camera's number or "
+            "address (Ctrl-C ends the recording)."
         ),
     ],
     board: BoardSpec,
     out: Out,
     force: Force = False,
 ) -> None:
-    """Calibrate a camera's lens from pictures of a board; write the file that --camera reads."""
+    """Calibrate a camera from pictures of a board, and write the file for --camera."""
     from dopepp.core.files import check_target
     from dopepp.robot.calibration.board import parse_board
-    from dopepp.robot.calibration.files import check_trust
     from dopepp.robot.calibration.lens import calibrate_lens, write_camera
+    from dopepp.robot.calibration.records import check_trust
 
     with report_errors():
         check_target(out, (".yaml", ".yml"))
         target = parse_board(board)
         if Path(source).is_dir() and not (Path(source) / "metadata.yaml").exists():
-            seen, size = _sightings(Path(source), target)
+            sightings, size = _folder_sightings(Path(source), target)
         else:
-            seen, size = _chosen_views(source, target)
-        found = calibrate_lens(seen, size)
-        _show_lens(found)
-        check_trust(found.findings, force)
-        write_camera(out, found.camera, not found.findings)
+            sightings, size = _stream_sightings(source, target)
+        calibration = calibrate_lens(sightings, size)
+        _show_lens(calibration)
+        check_trust(calibration.findings, force)
+        write_camera(out, calibration.camera, not calibration.findings)
     typer.echo(f"written: {out}")
 
 
@@ -101,18 +106,20 @@ def tcp(
     quaternion: Quaternion = "wxyz",
     direction: Direction = "flange-to-base",
 ) -> None:
-    """Find a tool's tip from poses of the flange in which it touches one point."""
-    from dopepp.robot.calibration.files import read_robot_poses, write_calibration
+    """Calibrate a tool's tip from flange poses in which the tip touches one fixed point."""
+    from dopepp.robot.calibration.records import read_robot_poses, write_calibration
     from dopepp.robot.calibration.tool import find_tip
 
     with report_errors():
-        reading = _reading(unit, angles, quaternion, direction)
-        tip = find_tip(read_robot_poses(poses).transforms(reading))
-        for number, residual in enumerate(tip.residuals):
-            typer.echo(f"pose {number + 1}: {1000 * residual:.2f} mm")
-        at = ", ".join(f"{1000 * one:.2f}" for one in tip.position)
-        off = ", ".join(f"{1000 * one:.2f}" for one in tip.deviations)
-        typer.echo(f"tip at ({at}) mm of the flange, ± ({off}) mm")
+        pose_format = _pose_format(unit, angles, quaternion, direction)
+        tip = find_tip(read_robot_poses(poses).transforms(pose_format))
+        for number, residual in enumerate(tip.residuals, 1):
+            typer.echo(f"pose {number}: {1000 * residual:.2f} mm")
+        position, deviations = (
+            ", ".join(f"{1000 * value:.2f}" for value in vector)
+            for vector in (tip.position, tip.deviations)
+        )
+        typer.echo(f"tip at ({position}) mm in the flange frame, ± ({deviations}) mm")
         values = {"tip": tip.position.tolist(), "deviations": tip.deviations.tolist()}
         write_calibration(out, "tool", values, tip.findings, force)
     typer.echo(f"written: {out}")
@@ -123,18 +130,19 @@ def bench(
     source: Annotated[
         Path,
         typer.Argument(
-            help="CSV with x, y, z that the tip has touched, or a folder with pictures of a board "
-            "that lies on the bench"
+            help="CSV with x, y, z of points that the tip touched, or a folder with pictures of a "
+            "board on the bench."
         ),
     ],
     out: Out,
     board: Annotated[str | None, typer.Option(help=BOARD)] = None,
-    camera: Annotated[Path | None, typer.Option(help="with --board: camera file")] = None,
+    camera: Annotated[Path | None, typer.Option(help="With --board: camera file.")] = None,
     hand_eye: Annotated[
-        Path | None, typer.Option(help="with --board: what `dopepp calibrate handeye` wrote")
+        Path | None, typer.Option(help="With --board: file from `dopepp calibrate handeye`.")
     ] = None,
     poses: Annotated[
-        Path | None, typer.Option(help="with --board and a camera in the hand: the robot's poses")
+        Path | None,
+        typer.Option(help="With --board and a camera on the flange: the robot's poses."),
     ] = None,
     unit: Unit = "m",
     angles: Angles = "rad",
@@ -142,12 +150,12 @@ def bench(
     direction: Direction = "flange-to-base",
     force: Force = False,
 ) -> None:
-    """Find the bench's plane and frame.
+    """Calibrate the plane and the frame of the bench.
 
-    From touched points: origin at the first, x towards the second, z up. From a board: its first
-    point and its columns, z out of the board.
+    From touched points, the origin is the first point, x points to the second and z upwards. From
+    a board, origin and x are the board's, and z points out of the board.
     """
-    from dopepp.robot.calibration.files import (
+    from dopepp.robot.calibration.records import (
         check_unit,
         read_points,
         transform_record,
@@ -156,19 +164,19 @@ def bench(
     from dopepp.robot.calibration.tool import find_bench
 
     with report_errors():
-        reading = _reading(unit, angles, quaternion, direction)
-        if board is None and source.is_dir():
-            got = f"{source}, a folder, without --board"
-            raise UserError(got, "a CSV, or pictures with --board", "say which board it is")
-        if board is None:
-            found = find_bench(read_points(source, check_unit(unit)))
-            names = [f"point {number + 1}" for number in range(len(found.residuals))]
+        pose_format = _pose_format(unit, angles, quaternion, direction)
+        if board is not None:
+            result, names = _bench_from_board(source, board, camera, hand_eye, poses, pose_format)
+        elif source.is_dir():
+            problem = f"{source}, a folder, without --board"
+            raise UserError(problem, "a CSV, or pictures with --board", "add --board")
         else:
-            found, names = _bench_of_board(source, board, camera, hand_eye, poses, reading)
-        for name, residual in zip(names, found.residuals, strict=True):
+            result = find_bench(read_points(source, check_unit(unit)))
+            names = [f"point {number}" for number in range(1, len(result.residuals) + 1)]
+        for name, residual in zip(names, result.residuals, strict=True):
             typer.echo(f"{name}: {1000 * residual:+.2f} mm off the plane")
-        values = {"T_base_bench": transform_record(found.T_base_bench)}
-        write_calibration(out, "bench", values, found.findings, force)
+        values = {"T_base_bench": transform_record(result.T_base_bench)}
+        write_calibration(out, "bench", values, result.findings, force)
     typer.echo(f"written: {out}")
 
 
@@ -177,8 +185,8 @@ def handeye(
     pictures: Pictures,
     poses: Poses,
     board: BoardSpec,
-    camera: Annotated[Path, typer.Option(help="camera file, as `dopepp calibrate camera` writes")],
-    mount: Annotated[str, typer.Option(help="where the camera is: hand or bench")],
+    camera: Annotated[Path, typer.Option(help="Camera file from `dopepp calibrate camera`.")],
+    mount: Annotated[str, typer.Option(help="Mount of the camera: hand (flange) or bench.")],
     out: Out,
     unit: Unit = "m",
     angles: Angles = "rad",
@@ -186,35 +194,40 @@ def handeye(
     direction: Direction = "flange-to-base",
     force: Force = False,
 ) -> None:
-    """Find where the camera is, from pictures of a board and the robot's poses."""
+    """Calibrate the camera's pose on the robot from pictures of a board and the robot's poses."""
     from dopepp.core.files import check_target
     from dopepp.geometry.camera_file import read_camera
     from dopepp.robot.calibration.board import board_pose, parse_board
-    from dopepp.robot.calibration.files import matched, read_robot_poses, write_calibration
     from dopepp.robot.calibration.hand_eye import calibrate_hand_eye, check_mount
-    from dopepp.robot.calibration.quality import check_poses, explain
+    from dopepp.robot.calibration.quality import assess, check_poses
+    from dopepp.robot.calibration.records import (
+        match_pictures,
+        read_robot_poses,
+        write_calibration,
+    )
 
     with report_errors():
         check_target(out, (".yaml", ".yml"))
-        seat = check_mount(mount)
-        reading = _reading(unit, angles, quaternion, direction)
-        robot, names = read_robot_poses(poses), _names(pictures)
-        paired = matched(robot, names)
-        seen, size = _sightings(pictures, parse_board(board))
+        checked_mount = check_mount(mount)
+        pose_format = _pose_format(unit, angles, quaternion, direction)
+        robot, names = read_robot_poses(poses), _picture_names(pictures)
+        pairs = match_pictures(robot, names)
+        sightings, size = _folder_sightings(pictures, parse_board(board))
         lens = read_camera(camera).for_picture(size)
-        rows = {names[picture]: row for row, picture in paired}
-        boards = [board_pose(one, lens) for one in seen if one.name in rows]
-        chosen = [rows[one.name] for one in boards]
-        flanges = check_poses(robot, chosen, reading, boards, seat)
-        found = calibrate_hand_eye(flanges, boards, seat)
-        worth = explain(flanges, boards, found)
-        _show_hand_eye(boards, found, worth)
-        write_calibration(out, "hand-eye", _hand_eye_record(found, worth), worth.findings, force)
+        rows = {names[picture]: row for row, picture in pairs}
+        boards = [board_pose(seen, lens) for seen in sightings if seen.name in rows]
+        chosen = [rows[seen.name] for seen in boards]
+        flanges = check_poses(robot, chosen, pose_format, boards, checked_mount)
+        calibration = calibrate_hand_eye(flanges, boards, checked_mount)
+        quality = assess(flanges, boards, calibration)
+        _show_hand_eye(boards, calibration, quality)
+        record = _hand_eye_record(calibration, quality)
+        write_calibration(out, "hand-eye", record, quality.findings, force)
     typer.echo(f"written: {out}")
 
 
-def _reading(unit: str, angles: str, quaternion: str, direction: str) -> Reading:
-    from dopepp.robot.calibration.files import Reading, check_unit
+def _pose_format(unit: str, angles: str, quaternion: str, direction: str) -> PoseFormat:
+    from dopepp.robot.calibration.records import PoseFormat, check_unit
 
     for name, value, allowed in (
         ("--angles", angles, ("rad", "deg")),
@@ -222,176 +235,191 @@ def _reading(unit: str, angles: str, quaternion: str, direction: str) -> Reading
         ("--direction", direction, ("flange-to-base", "base-to-flange")),
     ):
         if value not in allowed:
-            raise UserError(f"{name} {value}", " or ".join(allowed), "pass one of these")
-    return Reading(check_unit(unit), angles == "deg", quaternion, direction == "base-to-flange")
+            raise UserError(f"{name} {value}", " or ".join(allowed), "use an allowed value")
+    return PoseFormat(check_unit(unit), angles == "deg", quaternion, direction == "base-to-flange")
 
 
-def _names(folder: Path) -> list[str]:
+def _picture_names(folder: Path) -> list[str]:
     """Return the names of a folder's pictures, sorted."""
     from dopepp.core.files import PICTURES
 
     suffixes = (*PICTURES, ".tif", ".tiff")
-    names = sorted(one.name for one in folder.glob("*") if one.suffix.lower() in suffixes)
+    names = sorted(path.name for path in folder.glob("*") if path.suffix.lower() in suffixes)
     if not names:
-        got = f"{folder} without pictures"
-        raise UserError(got, f"a folder with {', '.join(suffixes)}", "pass the pictures' folder")
+        allowed = f"a folder with {', '.join(suffixes)}"
+        raise UserError(f"{folder} without pictures", allowed, "check the path of the folder")
     return names
 
 
-def _sightings(folder: Path, board: Board) -> tuple[list[Sighting], tuple[int, int]]:
-    """Find the board on a folder's pictures, which have one size."""
+def _folder_sightings(folder: Path, board: Board) -> tuple[list[Sighting], Size]:
+    """Find the board in a folder's pictures, which must have one size."""
     from dopepp.drawing.pictures import read_photo
 
-    seen, size = [], None
-    for name in _names(folder):
+    sightings: list[Sighting] = []
+    first_size, names = None, _picture_names(folder)
+    for name in names:
         picture = read_photo(folder / name)
-        own = (picture.shape[1], picture.shape[0])
-        if size is not None and own != size:
-            got = f"{folder / name} of {own[0]}×{own[1]} among pictures of {size[0]}×{size[1]}"
-            raise UserError(got, "pictures of one size", "leave out those of another camera")
-        size = own
-        sighting = _found(board, picture, name, quiet=False)
+        size = (picture.shape[1], picture.shape[0])
+        first_size = first_size or size
+        if size != first_size:
+            problem = f"{folder / name} of {size[0]}×{size[1]} pixels among pictures of "
+            problem += f"{first_size[0]}×{first_size[1]}"
+            raise UserError(problem, "pictures of one size", "remove those of another camera")
+        sighting = _find_board(board, picture, name, quiet=False)
         if sighting is not None:
-            seen.append(sighting)
-    if not seen or size is None:
-        raise _unseen(f"{folder}: the board is on none of {len(_names(folder))} pictures")
-    return seen, size
+            sightings.append(sighting)
+    return _check_sightings(sightings, first_size, f"{folder}", len(names))
 
 
-def _found(board: Board, picture: Picture, name: str, quiet: bool) -> Sighting | None:
-    """Find the board on a picture; where there is none, or more than one, say so."""
+def _stream_sightings(source: str, board: Board) -> tuple[list[Sighting], Size]:
+    """Find distinct views of the board in a video or a camera stream.
+
+    Stops at the end of the stream, on Ctrl-C, or when there are enough views.
+    """
+    from dopepp.inference.frames import open_sources
+    from dopepp.robot.calibration.lens import CHECKS_PER_S, Views
+
+    views, first_size, count = Views(0), None, 0
+    with suppress(Interruption), interruptible(""):
+        for opened in open_sources([source]):
+            is_live = opened.count is None
+            stride = 1 if is_live else max(1, round((opened.rate or 0) / CHECKS_PER_S))
+            for frame in opened.frames(stride):
+                size = (frame.image.shape[1], frame.image.shape[0])
+                if first_size is None:
+                    views, first_size = Views(size[0]), size
+                count += 1
+                name = Path(frame.name).name if opened.rate is None else f"frame {frame.number}"
+                is_usable = size == first_size
+                sighting = _find_board(board, frame.image, name, True) if is_usable else None
+                if sighting is not None and views.offer(sighting):
+                    typer.echo(f"{name}: view {len(views.kept)}", err=True)
+                if views.is_full:
+                    break
+    sightings = _check_sightings(views.kept, first_size, source, count)
+    typer.echo(f"{len(views.kept)} distinct views in {count} pictures", err=True)
+    return sightings
+
+
+def _find_board(board: Board, picture: Picture, name: str, quiet: bool) -> Sighting | None:
+    """Find the board in a picture; print if there is none (unless quiet) or more than one."""
     try:
         sighting = board.find(picture, name)
     except UserError as error:
-        typer.echo(f"{name}: left out, {error}", err=True)
+        typer.echo(f"{name}: skipped, {error}", err=True)
         return None
     if sighting is None and not quiet:
         typer.echo(f"{name}: no board", err=True)
     return sighting
 
 
-def _unseen(got: str) -> UserError:
-    fix = "check --board: kind, numbers of columns and rows, dictionary"
-    return UserError(got, "pictures of the board that --board describes", fix)
+def _check_sightings(
+    sightings: list[Sighting], size: Size | None, source: str, count: int
+) -> tuple[list[Sighting], Size]:
+    if not sightings or size is None:
+        raise UserError(
+            f"{source}: the board is on none of {count} pictures",
+            "pictures of the board that --board describes",
+            "check --board: kind, numbers of columns and rows, dictionary",
+        )
+    return sightings, size
 
 
-def _chosen_views(source: str, board: Board) -> tuple[list[Sighting], tuple[int, int]]:
-    """Find the board in a video or before a camera, until it ends, Ctrl-C, or views are enough."""
-    from contextlib import suppress
-
-    from dopepp.core.errors import Interruption, interruptible
-    from dopepp.inference.frames import open_sources
-    from dopepp.robot.calibration.lens import LOOKS_PER_S, Views
-
-    views, size, looked = Views(0), None, 0
-    with suppress(Interruption), interruptible(""):
-        for one in open_sources([source]):
-            stride = 1 if one.count is None else max(1, round((one.rate or 0) / LOOKS_PER_S))
-            for frame in one.frames(stride):
-                own = (frame.image.shape[1], frame.image.shape[0])
-                if size is None:
-                    views, size = Views(own[0]), own
-                name = Path(frame.name).name if one.rate is None else f"frame {frame.number}"
-                sighting = _found(board, frame.image, name, quiet=True) if own == size else None
-                looked += 1
-                if sighting is not None and views.offer(sighting):
-                    typer.echo(f"{name}: view {len(views.kept)}", err=True)
-                if views.is_full:
-                    break
-    if not views.kept or size is None:
-        raise _unseen(f"{source}: the board is on none of {looked} pictures")
-    typer.echo(f"{len(views.kept)} views that differ, of {looked} pictures", err=True)
-    return views.kept, size
-
-
-def _bench_of_board(
+def _bench_from_board(
     folder: Path,
     spec: str,
     camera: Path | None,
     hand_eye: Path | None,
     poses: Path | None,
-    reading: Reading,
+    pose_format: PoseFormat,
 ) -> tuple[Bench, list[str]]:
-    """Find the bench from pictures of a board on it; return their names, too."""
+    """Calibrate the bench from pictures of a board; return the pictures' names, too."""
     from dopepp.core.yaml import read_yaml
     from dopepp.geometry.camera_file import read_camera
     from dopepp.robot.calibration.board import board_pose, parse_board
-    from dopepp.robot.calibration.files import matched, read_robot_poses, read_transform
+    from dopepp.robot.calibration.records import match_pictures, read_robot_poses, read_transform
     from dopepp.robot.calibration.tool import bench_of_board
 
     if camera is None or hand_eye is None:
-        got = "--board without --camera and --hand-eye"
-        raise UserError(got, "both", "pass what `dopepp calibrate` camera and handeye have written")
+        problem = "--board without --camera and --hand-eye"
+        fix = "add the files from `dopepp calibrate camera` and `dopepp calibrate handeye`"
+        raise UserError(problem, "both options", fix)
     content = read_yaml(hand_eye)
     record = content if isinstance(content, dict) else {}
-    in_hand = "T_flange_cam" in record
-    if in_hand != (poses is not None):
-        got = f"{hand_eye} of a camera {'in the hand' if in_hand else 'on the bench'}, and "
-        got += "no --poses" if in_hand else "--poses"
-        fix = "add the robot's poses" if in_hand else "leave them out"
-        raise UserError(got, "--poses with a camera in the hand, and only then", fix)
-    T_mount_cam = read_transform(hand_eye, "T_flange_cam" if in_hand else "T_base_cam")
-    seen, size = _sightings(folder, parse_board(spec))
+    on_flange = "T_flange_cam" in record
+    if on_flange != (poses is not None):
+        problem = f"{hand_eye} of a camera on the {'flange' if on_flange else 'bench'}, "
+        problem += "without --poses" if on_flange else "with --poses"
+        fix = "add the robot's poses" if on_flange else "leave out --poses"
+        raise UserError(problem, "--poses exactly for a camera on the flange", fix)
+    T_mount_cam = read_transform(hand_eye, "T_flange_cam" if on_flange else "T_base_cam")
+    board = parse_board(spec)
+    sightings, size = _folder_sightings(folder, board)
     lens = read_camera(camera).for_picture(size)
-    boards = {one.name: board_pose(one, lens).T_cam_board for one in seen}
-    mounts = dict.fromkeys(boards, T_mount_cam)
+    boards = {seen.name: board_pose(seen, lens).T_cam_board for seen in sightings}
+    T_base_cam = dict.fromkeys(boards, T_mount_cam)
     if poses is not None:
-        robot, names = read_robot_poses(poses), _names(folder)
-        flanges = robot.transforms(reading)
-        paired = {names[picture]: flanges[row] @ T_mount_cam
-                  for row, picture in matched(robot, names)}  # fmt: skip
-        mounts = {name: paired[name] for name in boards if name in paired}
-    found = bench_of_board([mounts[name] @ boards[name] for name in mounts], parse_board(spec))
+        robot, names = read_robot_poses(poses), _picture_names(folder)
+        flanges, pairs = robot.transforms(pose_format), match_pictures(robot, names)
+        T_base_cam = {names[picture]: flanges[row] @ T_mount_cam for row, picture in pairs}
+    used = [name for name in boards if name in T_base_cam]
+    bench = bench_of_board([T_base_cam[name] @ boards[name] for name in used], board)
     if record.get("trusted") is not True:
-        found = replace(found, findings=(*found.findings, f"{hand_eye} is not to be trusted"))
-    return found, [*mounts]
+        bench = replace(bench, findings=(*bench.findings, f"{hand_eye} is not trusted"))
+    return bench, used
 
 
-def _show_lens(found: LensCalibration) -> None:
-    for name, error in zip(found.names, found.errors_px, strict=True):
+def _show_lens(calibration: LensCalibration) -> None:
+    for name, error in zip(calibration.names, calibration.errors_px, strict=True):
         typer.echo(f"{name}: {error:.3f} px")
-    for name in found.outliers:
-        typer.echo(f"{name}: left out, far worse than the others")
-    typer.echo(f"points cover {found.coverage:.0%} of the picture:")
-    for row in found.covered:
+    for name in calibration.outliers:
+        typer.echo(f"{name}: rejected, far worse than the others")
+    typer.echo(f"points cover {calibration.coverage:.0%} of the picture:")
+    for row in calibration.covered:
         typer.echo("  " + "".join("■ " if cell else "· " for cell in row))
-    K, off = found.camera.K, found.deviations
-    numbers = zip(("fx", "fy", "cx", "cy"), (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), off, strict=True)
-    typer.echo(", ".join(f"{name} {value:.2f} ± {by:.2f}" for name, value, by in numbers) + " px")
-    typer.echo(f"reprojection error {found.error_px:.3f} px over {len(found.names)} views")
+    K = calibration.camera.K
+    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    numbers = zip(values.items(), calibration.deviations, strict=True)
+    typer.echo(
+        ", ".join(f"{name} {value:.2f} ± {std:.2f}" for (name, value), std in numbers) + " px"
+    )
+    views = len(calibration.names)
+    typer.echo(f"reprojection error {calibration.error_px:.3f} px over {views} views")
 
 
-def _show_hand_eye(boards: Sequence[BoardPose], found: HandEye, worth: Explanation) -> None:
+def _show_hand_eye(
+    boards: Sequence[BoardPose], calibration: HandEye, quality: CalibrationQuality
+) -> None:
     from math import degrees
 
     for number, board in enumerate(boards):
-        left = "" if found.inliers[number] else "  left out: contradicts the others"
+        rejected = "" if calibration.inliers[number] else "  rejected: contradicts the others"
         typer.echo(
-            f"{board.name}: {degrees(found.turns[number]):.3f}°, "
-            f"{1000 * found.shifts[number]:.2f} mm; without it the camera moves by "
-            f"{1000 * worth.leave_one_out[number]:.2f} mm{left}"
+            f"{board.name}: {degrees(calibration.turns[number]):.3f}°, "
+            f"{1000 * calibration.shifts[number]:.2f} mm; without it the camera moves by "
+            f"{1000 * quality.leave_one_out[number]:.2f} mm{rejected}"
         )
-    turn, shift = found.robot_noise
-    turns = ", ".join(f"{degrees(axis):.0f}°" for axis in worth.diversity)
+    turn, shift = calibration.robot_noise
+    turns = ", ".join(f"{degrees(axis):.0f}°" for axis in quality.diversity)
     typer.echo(
-        f"the robot's own error as these show it: {degrees(turn):.3f}°, {1000 * shift:.2f} mm\n"
-        f"turns about the three main axes, RMS over pairs: {turns}\n"
-        f"to know it better: {worth.next_pose}\n"
-        f"expected error at the board's distance: {1000 * worth.shift:.2f} mm, "
-        f"{degrees(worth.turn):.3f}°"
+        f"estimated error of the robot: {degrees(turn):.3f}°, {1000 * shift:.2f} mm\n"
+        f"rotations about the three main axes, RMS over pairs: {turns}\n"
+        f"to improve the calibration: {quality.next_pose}\n"
+        f"expected error at the board's distance: {1000 * quality.shift:.2f} mm, "
+        f"{degrees(quality.turn):.3f}°"
     )
 
 
-def _hand_eye_record(found: HandEye, worth: Explanation) -> dict[str, object]:
-    from dopepp.robot.calibration.files import transform_record
+def _hand_eye_record(calibration: HandEye, quality: CalibrationQuality) -> dict[str, object]:
+    from dopepp.robot.calibration.records import transform_record
 
-    mount, other = ("flange", "base") if found.mount == "hand" else ("base", "flange")
+    mount, other = ("flange", "base") if calibration.mount == "hand" else ("base", "flange")
     return {
-        "mount": found.mount,
-        f"T_{mount}_cam": transform_record(found.T_mount_cam),
-        f"T_{other}_board": transform_record(found.T_other_board),
-        "covariance": [[float(one) for one in row] for row in found.covariance],
-        "expected_error": {"position": worth.shift, "rotation": worth.turn},
-        "poses_used": int(found.inliers.sum()),
+        "mount": calibration.mount,
+        f"T_{mount}_cam": transform_record(calibration.T_mount_cam),
+        f"T_{other}_board": transform_record(calibration.T_other_board),
+        "covariance": calibration.covariance.tolist(),
+        "expected_error": {"position": quality.shift, "rotation": quality.turn},
+        "poses_used": int(calibration.inliers.sum()),
         "frames": "camera: OpenCV (x right, y down, z forward); metres and radians",
     }

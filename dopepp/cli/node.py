@@ -1,132 +1,145 @@
-"""``dopepp node``: poses of what a robot's camera sees, over ROS, a bag, UDP or stdout."""
+"""``dopepp node``: publish poses in a camera's images over ROS 2, a bag, UDP or stdout."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 import typer
 
-from dopepp.cli.errors import resumable
-from dopepp.cli.options import Device, Intrinsics, MaxMs, Region, Track, check_region
+from dopepp.cli.common import (
+    Device,
+    Intrinsics,
+    MaxMs,
+    Model,
+    Region,
+    Track,
+    check_region,
+    resumable,
+)
 from dopepp.core.errors import UserError, require
-
-if TYPE_CHECKING:
-    from dopepp.robot.nodes.worker import Worker
 
 LINES: Final = ("--json", "--udp")
 
 TOPIC: Final = "/camera/image_raw"
 
 PACKAGES: Final = {"--ros2": ("rclpy", "ros2"), "--bag": ("rosbags", "bags")}
-"""What a way needs, and the extra that has it."""
+"""Package that a transport needs, and the extra that installs it."""
 
 
 def node(
-    model: Annotated[Path, typer.Argument(help="best.ckpt of a run, or a released network")],
+    model: Model,
     source: Annotated[
-        list[str] | None, typer.Argument(help="of --json and --udp: as `dopepp predict` takes it")
+        list[str] | None,
+        typer.Argument(help="With --json or --udp: sources as in `dopepp predict`."),
     ] = None,
-    ros2: Annotated[bool, typer.Option("--ros2", help="a node of ROS 2 (extra ros2)")] = False,
+    ros2: Annotated[bool, typer.Option("--ros2", help="Run as a ROS 2 node.")] = False,
     bag: Annotated[
-        Path | None, typer.Option(help="answer a recording: .bag, .mcap, a folder; with --out")
+        Path | None,
+        typer.Option(help="Process a recording (.bag, .mcap, a folder) and write --out."),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="recording to write, .mcap")] = None,
+    out: Annotated[Path | None, typer.Option(help="With --bag: recording to write, .mcap")] = None,
     json_lines: Annotated[
-        bool, typer.Option("--json", help="a line of JSON for each picture, on stdout")
+        bool, typer.Option("--json", help="Print a line of JSON for each picture.")
     ] = False,
-    udp: Annotated[str | None, typer.Option(help="HOST:PORT: these lines as datagrams")] = None,
+    udp: Annotated[
+        str | None, typer.Option(help="HOST:PORT: send these lines as UDP datagrams.")
+    ] = None,
     topic: Annotated[
         str | None,
-        typer.Option(help="of the pictures, raw or …/compressed; else /camera/image_raw"),
+        typer.Option(help="Image topic, raw or …/compressed (default: /camera/image_raw)."),
     ] = None,
-    name: Annotated[str, typer.Option(help="of the node, which its topics begin with")] = "dope",
+    name: Annotated[str, typer.Option(help="Name of the node and prefix of its topics.")] = "dope",
     params: Annotated[
-        Path | None, typer.Option(help="of --ros2: YAML of parameters to begin with")
+        Path | None, typer.Option(help="With --ros2: YAML file of initial parameters.")
     ] = None,
     intrinsics: Intrinsics = None,
-    camera: Annotated[Path | None, typer.Option(help="camera file in place of camera_info")] = None,
-    frame: Annotated[
-        str | None, typer.Option(help="the camera's optical frame, else that of the pictures")
+    camera: Annotated[
+        Path | None, typer.Option(help="Camera file that replaces camera_info.")
     ] = None,
-    conf: Annotated[float, typer.Option(help="least score of a pose, 0 to 1")] = 0.0,
+    frame: Annotated[
+        str | None,
+        typer.Option(help="Optical frame of the camera (default: the frame of the pictures)."),
+    ] = None,
+    conf: Annotated[float, typer.Option(help="Minimum score of a pose, 0 to 1.")] = 0.0,
     refine: Region = None,
     max_ms: MaxMs = None,
     track: Track = False,
     overlay: Annotated[
-        bool, typer.Option("--overlay", help="publish pictures with the poses drawn on them")
+        bool, typer.Option("--overlay", help="Also publish pictures with drawn poses.")
     ] = False,
     device: Device = "cpu",
 ) -> None:
-    """Say the poses on every picture of a camera, until Ctrl-C.
+    """Publish the poses in every picture of a camera, until Ctrl-C.
 
-    Exit codes: 0 done; 1 stopped (a camera delivers no more); 2 wrong input; 130, 143 interrupted.
+    Exit codes: 0 done; 1 stopped (the camera stream ended); 2 wrong input; 130 or 143 interrupted.
     """
     words = list(source or ())
-    with resumable("the node has ended"):
-        ways = {"--ros2": ros2, "--bag": bag, "--json": json_lines, "--udp": udp}
-        way = _way([one for one, given in ways.items() if given], words, out, params)
+    with resumable("the node has stopped"):
+        transports = {"--ros2": ros2, "--bag": bag, "--json": json_lines, "--udp": udp}
+        chosen = [option for option, is_given in transports.items() if is_given]
+        transport = _check_transport(chosen, words, out, params)
         check_region(refine)
 
         from dopepp.geometry.camera import camera_matrix
         from dopepp.inference.frames.source import choose_camera, given_camera
 
-        known = given_camera(None if intrinsics is None else camera_matrix(*intrinsics), camera)
+        K = None if intrinsics is None else camera_matrix(*intrinsics)
+        fixed_camera = given_camera(K, camera)
 
         from dopepp.inference.estimator import PoseEstimator
         from dopepp.inference.frames import open_sources
-        from dopepp.robot.nodes.worker import Settings, Worker
+        from dopepp.robot.nodes.worker import Worker, WorkerSettings
 
-        sources = open_sources(words, topic) if way in LINES else []
-        cameras = [known or choose_camera(None, None, one) for one in sources]
-        refining = "region" if track or refine else None
-        estimator = PoseEstimator.load(model, device, refining, max_ms=max_ms)
-        settings = Settings(conf, refining is not None, overlay)
-        worker = Worker(estimator, settings, known, frame, track)
-        if way in LINES:
-            from dopepp.robot.nodes.lines import say_lines
-
-            say_lines(worker, zip(sources, cameras, strict=True), udp)
-        elif bag is not None and out is not None:
-            _answer(worker, bag, out, topic, name)
-        else:
+        sources = open_sources(words, topic) if transport in LINES else []
+        cameras = [fixed_camera or choose_camera(None, None, opened) for opened in sources]
+        refinement = "region" if track or refine else None
+        estimator = PoseEstimator.load(model, device, refinement, max_ms=max_ms)
+        settings = WorkerSettings(conf, refinement is not None, overlay)
+        worker = Worker(estimator, settings, fixed_camera, frame, track)
+        if transport == "--ros2":
             from dopepp.robot.nodes.ros2 import run
 
             run(worker, topic or TOPIC, name, params)
+            return
+
+        from dopepp.robot.nodes.standalone import process_bag, send_lines
+
+        if transport in LINES:
+            send_lines(worker, zip(sources, cameras, strict=True), udp)
+        elif bag is not None and out is not None:
+            answers = process_bag(worker, bag, out, topic, name)
+            counts = [
+                None if answer is None else len(answer.result.detections) for answer in answers
+            ]
+            processed = [count for count in counts if count is not None]
+            skipped = len(counts) - len(processed)
+            note = f", {skipped} skipped" if skipped else ""
+            typer.echo(f"{out}: {sum(processed)} poses in {len(processed)} pictures{note}")
 
 
-def _way(given: Sequence[str], words: Sequence[str], out: Path | None, params: Path | None) -> str:
-    """Return which way was asked for; a UserError where options do not go together."""
-    if len(given) != 1:
-        got = " and ".join(given) or "no way in and out"
+def _check_transport(
+    chosen: Sequence[str], words: Sequence[str], out: Path | None, params: Path | None
+) -> str:
+    """Return the chosen transport; refuse options that exclude each other."""
+    if len(chosen) != 1:
+        problem = " and ".join(chosen) or "no input and output"
         allowed = "one of --ros2, --bag FILE --out FILE, --json, --udp HOST:PORT"
-        raise UserError(got, allowed, "say how pictures come in and poses go out")
-    way = given[0]
-    for wrong, got, allowed, fix in (
-        (way in LINES and not words, f"{way} without a source", "a camera, a video, pictures, …",
-         "name it behind the model"),
-        (way not in LINES and words, f"{way} with {words[:1]}", "no source: pictures come "
-         "from --topic, or from the recording", "leave it out"),
-        ((way == "--bag") != (out is not None), "--bag without --out, or --out without --bag",
-         "both", "add --out poses.mcap"),
-        (way != "--ros2" and params, f"--params with {way}", "--params with --ros2",
-         "leave it out"),
-    ):  # fmt: skip
-        if wrong:
-            raise UserError(got, allowed, fix)
-    if way in PACKAGES:
-        require(PACKAGES[way][0], way, PACKAGES[way][1])
-    return way
-
-
-def _answer(worker: Worker, bag: Path, out: Path, topic: str | None, name: str) -> None:
-    """Answer a recording, and say how many pictures there were and what was found."""
-    from dopepp.robot.nodes.bag import answer_bag
-
-    pictures = answered = poses = 0
-    for one in answer_bag(worker, bag, out, topic, name):
-        pictures, answered = pictures + 1, answered + (one is not None)
-        poses += 0 if one is None else len(one.result.detections)
-    left = pictures - answered
-    typer.echo(f"{out}: {poses} poses on {answered} pictures" + f", {left} left out" * bool(left))
+        raise UserError(problem, allowed, "choose how pictures come in and poses go out")
+    transport = chosen[0]
+    if transport in LINES and not words:
+        sources = "a camera, a video, pictures, …"
+        raise UserError(f"{transport} without a source", sources, "name it after the model")
+    if transport not in LINES and words:
+        allowed = "no source: the pictures come from --topic or from the recording"
+        raise UserError(f"{transport} with the source {words[0]}", allowed, "leave it out")
+    if (transport == "--bag") != (out is not None):
+        problem = "--out without --bag" if out else "--bag without --out"
+        raise UserError(problem, "both", "add --bag FILE" if out else "add --out poses.mcap")
+    if transport != "--ros2" and params:
+        raise UserError(f"--params with {transport}", "--params with --ros2", "leave it out")
+    if transport in PACKAGES:
+        package, extra = PACKAGES[transport]
+        require(package, transport, extra)
+    return transport

@@ -1,6 +1,6 @@
-"""What ``dopepp predict`` writes: pictures and videos with poses on them, JSON and CSV.
+"""Files that ``dopepp predict`` writes: pictures and videos with drawn poses, JSON and CSV.
 
-To add an output, write a class with what :class:`Output` has.
+To add an output, write a class with the methods of :class:`Output`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Final, Protocol
 
-from dopepp.core.errors import NO_SPACE, RunError, UserError
+from dopepp.core.errors import RunError, UserError, system_failure
 from dopepp.core.files import PICTURES, check_target, partial_path
 
 if TYPE_CHECKING:
@@ -27,36 +27,36 @@ VIDEO: Final = ".mp4"
 
 
 class Output(Protocol):
-    """Takes results one by one, of one source after the other."""
+    """Writes results, source by source."""
 
     def begin(self, source: FrameSource) -> None:
-        """Expect the results of a source."""
+        """Start the results of a source."""
 
     def take(self, result: PoseResult) -> None:
         """Write a result."""
 
     def close(self) -> None:
-        """Complete what was written, however the command ends."""
+        """Complete the files, however the command ends."""
 
 
 class Outputs:
-    """Several outputs as one; what the disk refuses is a :class:`RunError`."""
+    """Several outputs as one. A refused disk operation is a :class:`RunError`."""
 
     def __init__(self, outputs: Sequence[tuple[Path, Output]]) -> None:
         self._outputs = outputs
 
     def begin(self, source: FrameSource) -> None:
-        """Expect the results of a source."""
-        self._each(lambda one: one.begin(source))
+        """Start the results of a source."""
+        self._each(lambda output: output.begin(source))
 
     def take(self, result: PoseResult) -> None:
         """Write a result."""
-        self._each(lambda one: one.take(result))
+        self._each(lambda output: output.take(result))
 
     def _each(self, action: Callable[[Output], None]) -> None:
-        for path, one in self._outputs:
-            with _told(path):
-                action(one)
+        for path, output in self._outputs:
+            with _disk_errors(path):
+                action(output)
 
     def __enter__(self) -> Outputs:
         return self
@@ -65,40 +65,40 @@ class Outputs:
         self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
     ) -> None:
         with ExitStack() as stack:
-            for path, one in self._outputs:
-                stack.enter_context(_told(path))
-                stack.callback(one.close)
+            for path, output in self._outputs:
+                stack.enter_context(_disk_errors(path))
+                stack.callback(output.close)
 
 
-class Overlays:
-    """A folder with a picture for each picture, and a video for each video or camera."""
+class OverlayFolder:
+    """A folder with a picture for each input picture, and a video for each video or camera."""
 
     def __init__(self, folder: Path, stride: int = 1) -> None:
         check_target(folder / "picture.png")
         self._folder, self._stride = folder, stride
-        self._taken: set[str] = set()
+        self._names: set[str] = set()
         self._source: FrameSource | None = None
         self._video: VideoFile | None = None
 
     def begin(self, source: FrameSource) -> None:
-        """Complete the last source's video."""
+        """Complete the previous source's video."""
         self.close()
         self._source = source
 
     def take(self, result: PoseResult) -> None:
-        """Write the picture, or add it to the source's video."""
+        """Write the picture, or append it to the source's video."""
         assert self._source is not None
         if result.time is None:
             path = Path(result.name)
             suffix = path.suffix if path.suffix.lower() in PICTURES else ".png"
-            result.save(self._free(path.stem, suffix, path))
+            result.save(self._new_path(path.stem, suffix, path))
             return
         if self._video is None:
             from dopepp.drawing.pictures import VideoFile
 
-            own = Path(self._source.name)
             rate = (self._source.rate or 1.0) / self._stride
-            self._video = VideoFile(self._free(self._source.stem, VIDEO, own), rate)
+            path = self._new_path(self._source.stem, VIDEO, Path(self._source.name))
+            self._video = VideoFile(path, rate)
         self._video.write(result.plot(), result.time)
 
     def close(self) -> None:
@@ -107,22 +107,22 @@ class Overlays:
             video, self._video = self._video, None
             video.close()
 
-    def _free(self, stem: str, suffix: str, source: Path) -> Path:
-        """Return a name that nothing of this command has, and that is not the source itself."""
+    def _new_path(self, stem: str, suffix: str, source: Path) -> Path:
+        """Return a path that this command has not used yet and that is not the source."""
         name, number = f"{stem}{suffix}", 1
-        while name in self._taken:
+        while name in self._names:
             number += 1
             name = f"{stem}_{number}{suffix}"
-        self._taken.add(name)
+        self._names.add(name)
         path = self._folder / name
         if path.exists() and source.exists() and path.samefile(source):
-            got = f"--save {self._folder}, the folder of {source} itself"
-            raise UserError(got, "a folder of its own", "choose another one")
+            problem = f"--save {self._folder}, the folder of {source} itself"
+            raise UserError(problem, "a folder without the sources", "choose another folder")
         return path
 
 
 class JsonLines:
-    """A file with a line of JSON for each picture, found or not."""
+    """A file with a line of JSON for each picture, also for those without detections."""
 
     def __init__(self, path: Path) -> None:
         check_target(path)
@@ -134,26 +134,25 @@ class JsonLines:
         self._file = self._file or self._partial.open("wb", buffering=0)
 
     def take(self, result: PoseResult) -> None:
-        """Add a line, or on a full disk none."""
+        """Append a line; on a full disk, no part of it."""
         assert self._file is not None
         line, end = f"{result.to_json()}\n".encode(), self._file.tell()
         if self._file.write(line) < len(line):
-            self._file.truncate(end)  # no half of a line
+            self._file.truncate(end)
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def close(self) -> None:
-        """Put the file in its place."""
-        if self._file is None:
-            return
-        self._file.close()
-        self._partial.replace(self._path)
+        """Move the file to its path."""
+        if self._file is not None:
+            self._file.close()
+            self._partial.replace(self._path)
 
 
 class BopCsv:
     """A BOP challenge file: a scene for each source, an image for each picture.
 
-    Objects are counted from 1 in the checkpoint's order, or have the numbers in their names where
-    all are called as BOP's files are, ``obj_000005``.
+    Objects are numbered from 1 in the checkpoint's order. If all names look like BOP's files
+    (``obj_000005``), their numbers are used.
     """
 
     def __init__(self, path: Path) -> None:
@@ -163,36 +162,32 @@ class BopCsv:
         self._scene = -1
 
     def begin(self, source: FrameSource) -> None:
-        """Count the next scene."""
+        """Start the next scene."""
         self._scene += 1
 
     def take(self, result: PoseResult) -> None:
-        """Keep the poses until all are known."""
+        """Keep the poses until the file is written."""
         from dopepp.data.formats.bop.bop_models import model_numbers
         from dopepp.data.formats.bop.bop_results import BopResult
 
         numbers = model_numbers(list(result.shapes))
         seconds = sum(result.speed.values()) / 1000
-        self._rows += [
-            BopResult(self._scene, result.number, numbers[one.object], one.score, one.T_cam_obj,
-                seconds)
-            for one in result.detections
-        ]  # fmt: skip
+        for pose in result.detections:
+            number = numbers[pose.object]
+            row = BopResult(self._scene, result.number, number, pose.score, pose.T_cam_obj, seconds)
+            self._rows.append(row)
 
     def close(self) -> None:
-        """Write the file, where anything was looked at."""
-        if self._scene < 0:
-            return
-        from dopepp.data.formats.bop.bop_results import write_results
+        """Write the file, if any source was processed."""
+        if self._scene >= 0:
+            from dopepp.data.formats.bop.bop_results import write_results
 
-        write_results(self._path, self._rows)
+            write_results(self._path, self._rows)
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
+def _disk_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno in NO_SPACE:
-            raise RunError(f"no space left for {path}: free some") from error
-        raise RunError(f"{error.filename or path}: {error.strerror or error}") from error
+        raise RunError(system_failure(error, path)) from error

@@ -1,1 +1,1 @@
-"""What everything stands on, nothing of the field: errors, files, JSON, YAML, interruption."""
+"""Basics of every package: errors, validation, files, JSON, YAML and process pools."""

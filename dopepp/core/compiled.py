@@ -1,4 +1,4 @@
-"""How this package compiles its inner loops."""
+"""Compilation of inner loops with numba."""
 
 from __future__ import annotations
 
@@ -16,49 +16,50 @@ from numpy.typing import NDArray
 
 _log = logging.getLogger(__name__)
 
-Array = NDArray[Any]
-"""An argument of a compiled function; its docstring gives shape and type."""
-
-Scalar = Any
-"""A number of a compiled function that is float32 or float64, as its caller's arrays are."""
+Array = NDArray[Any]  # the docstring of a compiled function gives shape and type
+Scalar = Any  # a float32 or float64, like the arrays of the caller
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled(**options: Any) -> Callable[[Function], Function]:
-    """Compile with numba, without the GIL and single-threaded, because data loaders fork.
+    """Return a decorator that compiles a function with numba.
 
-    A division by zero gives what IEEE 754 says, as in numpy; a check for it would also keep loops
-    from becoming vector loops.
+    Compiled functions release the GIL and are single-threaded, because data loaders fork. Division
+    by zero follows IEEE 754, as in numpy; a check would prevent vectorised loops.
 
-    The machine code is kept on disk beside the package, or in the user's cache folder where that
-    is read-only; ``NUMBA_CACHE_DIR`` moves it. Plain loops compile many times faster than slices
-    that are assigned, array expressions, and calls with constants, each of which numba compiles
-    anew.
+    The machine code is cached beside the package, or in the user's cache folder if the package is
+    read-only; ``NUMBA_CACHE_DIR`` overrides both. Plain loops compile many times faster than slice
+    assignments, array expressions and calls with constants.
+
+    Args:
+        options: Further options of ``numba.njit``.
     """
     compiler = numba.njit(cache=True, nogil=True, error_model="numpy", **options)
     return cast("Callable[[Function], Function]", compiler)
 
 
-_beside: Final[list[str]] = []
-"""Functions that a process of its own calls once this process has to compile anything."""
+_warm_ups: Final[list[str]] = []
+"""Functions that a second process calls when this process starts to compile."""
 
 
 def compile_beside(function: str) -> None:
-    """Name a function, ``module:function``, that calls inner loops which will be needed later.
+    """Register a function that calls inner loops which this process will need later.
 
-    As soon as this process has to compile anything, as on a new machine, another one calls the
-    function. Both keep their machine code in the same place, so that two cores share the work.
+    When this process has to compile, as on a new machine, a second process calls the function. Both
+    use the same cache, so that two cores share the compilation.
+
+    Args:
+        function: ``module:function``.
     """
-    if function not in _beside:
-        _beside.append(function)
+    if function not in _warm_ups:
+        _warm_ups.append(function)
 
 
 class _Compilation(event.Listener):  # type: ignore[misc]  # numba has no types
-    """Shares the first compilation among processes, and says once why the first call takes long.
+    """Shares the first compilation with a second process, and logs why the first call takes long.
 
-    What is on disk already is not compiled. A compiler's many objects all live to its end, so
-    that searching them for garbage in between would take a quarter of the time.
+    Garbage collection is off meanwhile: it would take a quarter of the time and find nothing.
     """
 
     is_first, depth, collects = True, 0, False
@@ -70,9 +71,9 @@ class _Compilation(event.Listener):  # type: ignore[misc]  # numba has no types
         self.depth += 1
         if self.is_first:
             self.is_first = False
-            _log.info("compiling inner loops, once on this machine: ten seconds or so")
-            for function in _beside:
-                _call_beside(*function.split(":"))
+            _log.info("compiling inner loops, once on this machine: about ten seconds")
+            for function in _warm_ups:
+                _call_in_process(*function.split(":"))
 
     def on_end(self, event: event.Event) -> None:
         self.depth -= 1
@@ -80,14 +81,12 @@ class _Compilation(event.Listener):  # type: ignore[misc]  # numba has no types
             gc.enable()
 
 
-def _call_beside(module: str, function: str) -> None:
-    """Call a function in a process of its own; where there can be none, nothing happens."""
+def _call_in_process(module: str, function: str) -> None:
+    """Call a function in a second process, if one can be started."""
     code = f"import sys; sys.path[:] = {sys.path!r}; from {module} import {function} as f; f()"
     with contextlib.suppress(OSError):
-        subprocess.Popen(
-            [sys.executable, "-c", code], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )  # fmt: skip
+        null = subprocess.DEVNULL
+        subprocess.Popen([sys.executable, "-c", code], stdin=null, stdout=null, stderr=null)
 
 
 event.register("numba:compile", _Compilation())

@@ -1,7 +1,4 @@
-"""Ends of a run that are told in one line: a user's mistake, a failure, an interruption.
-
-Choices that need a package of an extra are refused in one line where it is not installed.
-"""
+"""Errors that end a run with one line: a user's mistake, a failure or an interruption."""
 
 from __future__ import annotations
 
@@ -15,85 +12,102 @@ from pathlib import Path
 from types import FrameType
 from typing import Final, NoReturn
 
+NO_SPACE: Final = (errno.ENOSPC, errno.EDQUOT)  # the disk is full, or the user's share of it
+RESUME: Final = "run the same command again to continue"
+
 
 class UserError(ValueError):
-    """A mistake in an input, a file or an option that its user can correct.
+    """A mistake in an input, a file or an option that the user can correct.
 
-    It states the value with its file and field, the allowed values, and the fix. Entry points print
-    it as one line and exit with code 2.
+    Args:
+        got: The value with its file and field.
+        allowed: The allowed values.
+        fix: How to correct the mistake.
     """
+
+    exit_code = 2
 
     def __init__(self, got: str, allowed: str, fix: str) -> None:
         self.got, self.allowed, self.fix = got, allowed, fix
         super().__init__(" ".join(f"got {got}; allowed: {allowed}; fix: {fix}".split()))
 
     def __reduce__(self) -> tuple[type[UserError], tuple[str, str, str]]:
-        """Survive the pickling between a loader's worker and its parent."""
+        """Support pickling between a data loader's worker and its parent."""
         return type(self), (self.got, self.allowed, self.fix)
 
 
 class RunError(RuntimeError):
-    """A run that cannot go on, through no mistake that could have been told at its start.
+    """A failure during a run that no check at its start could have detected."""
 
-    Entry points print it as one line and exit with code 1.
-    """
+    exit_code = 1
 
     def __init__(self, reason: str) -> None:
         super().__init__(" ".join(reason.split()))
 
 
-def require(package: str, choice: str, extra: str) -> ModuleSpec:
-    """Look up the package that a choice needs; a :class:`UserError` where it is not installed."""
-    spec = find_spec(package)
-    if spec is None:
-        raise UserError(
-            f"{choice} without the package {package}",
-            f"an installation with the extra {extra}",
-            f"pip install 'dopepp[{extra}]', or leave {choice} out",
-        )
-    return spec
-
-
-NO_SPACE: Final = (errno.ENOSPC, errno.EDQUOT)  # The disk is full, or the user's share of it
-RESUME: Final = "the same command goes on where this one stopped"
-
-
-class StoppedError(RuntimeError):
-    """A job that ended early through nobody's mistake, said in one line."""
+class StoppedError(RunError):
+    """A job that stopped early and can be resumed."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(f"{reason}; {RESUME}")
 
 
-def stopped(error: OSError, root: Path) -> StoppedError:
-    """Say in one line what the operating system refused."""
-    if error.errno in NO_SPACE:
-        return StoppedError(f"no space left for {root}: free some")
-    return StoppedError(f"{error.filename or root}: {error.strerror or error}")
-
-
 class Interruption(KeyboardInterrupt):
-    """Ctrl-C, or a scheduler's SIGTERM."""
+    """Ctrl-C, or SIGTERM from a scheduler."""
 
     def __init__(self, number: int, advice: str = RESUME) -> None:
         super().__init__(f"interrupted; {advice}")
         self.number, self.exit_code = int(number), 128 + number
 
 
+def require(package: str, choice: str, extra: str) -> ModuleSpec:
+    """Find the package that an option needs, without importing it.
+
+    Args:
+        package: Name of the package.
+        choice: The option that needs the package, for the message.
+        extra: The extra of dopepp that installs the package.
+
+    Raises:
+        UserError: The package is not installed.
+    """
+    spec = find_spec(package)
+    if spec is None:
+        raise UserError(
+            f"{choice} without the package {package}",
+            f"an installation with the extra {extra}",
+            f"pip install 'dopepp[{extra}]', or leave out {choice}",
+        )
+    return spec
+
+
+def system_failure(error: OSError, path: Path) -> str:
+    """Describe an operation that the operating system refused on a path."""
+    if error.errno in NO_SPACE:
+        return f"no space left for {path}: free some disk space"
+    return f"{error.filename or path}: {error.strerror or error}"
+
+
+def stopped(error: OSError, root: Path) -> StoppedError:
+    """Return the resumable error for an operation that the operating system refused."""
+    return StoppedError(system_failure(error, root))
+
+
 @contextmanager
 def interruptible(advice: str = RESUME) -> Iterator[None]:
-    """Raise :class:`Interruption` on SIGINT and SIGTERM while the block runs (main thread only).
+    """Raise :class:`Interruption` on SIGINT and SIGTERM inside the block (main thread only).
 
-    ``advice`` is what the interruption tells to do next.
+    Args:
+        advice: What the message of the interruption recommends.
     """
 
     def interrupt(number: int, _: FrameType | None) -> NoReturn:
         raise Interruption(number, advice)
 
     numbers = (signal.SIGINT, signal.SIGTERM)
-    kept = {number: signal.signal(number, interrupt) for number in numbers}
+    previous = {number: signal.signal(number, interrupt) for number in numbers}
     try:
         yield
     finally:
-        for number, handler in kept.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)

@@ -1,17 +1,17 @@
-"""Packages of a user's own, found by their entry points and enabled by name.
+"""Extension packages, discovered by their entry points and enabled by name.
 
-A package ``mine`` declares what it adds in its ``pyproject.toml``::
+A package ``mine`` declares its components in its ``pyproject.toml``::
 
     [project.entry-points."dopepp.backbones"]
     strided = "mine.backbones:Strided"
     [project.entry-points."dopepp.conf"]
     mine = "mine.conf"  # a folder of Hydra config files
 
-Groups are ``dopepp.`` and ``backbones``, ``attentions``, ``heads``, ``losses`` (classes),
+The groups are ``dopepp.`` with ``backbones``, ``attentions``, ``heads``, ``losses`` (classes),
 ``renderers`` (modules), ``formats`` (functions that open images) and ``conf``. The config files of
-every installed package are choices, since a file does nothing by itself. Code is imported only of
-packages that are enabled: by ``extensions=[mine]``, ``PoseEstimator.load(…, extensions=["mine"])``
-or the environment variable ``DOPEPP_EXTENSIONS=mine``, which worker processes inherit.
+every installed package are available, because a file runs no code. Code is imported only from
+enabled packages: by ``extensions=[mine]``, ``PoseEstimator.load(…, extensions=["mine"])`` or the
+environment variable ``DOPEPP_EXTENSIONS=mine``, which worker processes inherit.
 """
 
 from __future__ import annotations
@@ -30,23 +30,25 @@ _GROUPS: Final = ("backbones", "attentions", "heads", "losses", "renderers", "fo
 
 
 def enable(packages: Iterable[str]) -> None:
-    """Allow what these installed packages add, in this process and those that it starts.
+    """Enable installed packages, in this process and its child processes.
 
     Raises:
-        UserError: A package is not installed or adds nothing.
+        UserError: A package is not installed or has no entry points.
     """
     installed = {_package(entry) for group in _GROUPS for entry in _entries(group)}
     for package in packages:
         if package not in installed:
             allowed = ", ".join(sorted(installed)) or "installed packages with dopepp entry points"
-            raise UserError(f"extensions=[{package}]", allowed, f"install {package}, or leave it")
+            raise UserError(
+                f"extensions=[{package}]", allowed, f"install {package}, or leave it out"
+            )
     names = dict.fromkeys((*_enabled(), *packages))
     if names:
         os.environ[VARIABLE] = ",".join(names)
 
 
-def found(group: str) -> dict[str, str]:
-    """Return what enabled packages add to a group: names, and what they stand for, dotted."""
+def components(group: str) -> dict[str, str]:
+    """Return the dotted names of the enabled packages' components of a group, by name."""
     enabled = _enabled()
     if not enabled:
         return {}
@@ -58,23 +60,24 @@ def found(group: str) -> dict[str, str]:
 
 
 def advice(group: str, name: str) -> str:
-    """Return how to allow a name, or a dotted name, that no enabled package adds."""
+    """Return how to enable a component that no enabled package provides."""
     for entry in _entries(group):
         if name in (entry.name, entry.value.replace(":", ".")):
-            return f"enable the package that adds it: extensions=[{_package(entry)}]"
+            return f"enable its package: extensions=[{_package(entry)}]"
     package = name.partition(".")[0]
     return f"install the package {package} and enable it: extensions=[{package}]"
 
 
 def config_folders() -> Iterator[tuple[str, Path]]:
-    """Yield the name and the folder of config files of every installed package; import nothing."""
+    """Yield name and config folder of every installed package, without importing it."""
     for entry in _entries("conf"):
-        places = [] if entry.dist is None else [Path(str(entry.dist.locate_file("")))]
-        for place in (*places, *map(Path, sys.path)):
-            folder = place.joinpath(*entry.value.split("."))
-            if folder.is_dir():
-                yield _package(entry), folder
-                break
+        roots = [] if entry.dist is None else [Path(str(entry.dist.locate_file("")))]
+        folders = (
+            root.joinpath(*entry.value.split(".")) for root in (*roots, *map(Path, sys.path))
+        )
+        folder = next(filter(Path.is_dir, folders), None)
+        if folder is not None:
+            yield _package(entry), folder
 
 
 def _enabled() -> list[str]:

@@ -1,9 +1,8 @@
-"""Files that are there completely or not at all, also pictures and CSV; the user's cache.
+"""Atomic writing of files, pictures and CSV, and the user's cache folder.
 
-A file is written beside its place under a name of :func:`partial_path` and renamed when it is
-whole. What a killed process leaves is such a partial file, which :func:`is_abandoned` recognises.
-Nothing is synced: a file survives the death of its process, but not a power cut in the seconds
-after.
+A file is written beside its path under the name of :func:`partial_path` and then renamed. A killed
+process leaves such a partial file, which :func:`is_abandoned` detects. Files are not synced: they
+survive the death of their process, but not a power cut within seconds.
 """
 
 from __future__ import annotations
@@ -29,35 +28,48 @@ from dopepp.core.errors import UserError
 
 _SHIPPED: Final = Path(__file__).parents[1] / "conf"
 CONF: Final = _SHIPPED if _SHIPPED.is_dir() else Path(__file__).parents[2] / "conf"
-"""The files that users choose from: inside the package of a wheel, beside that of a checkout."""
+"""Folder of the config files: inside the package in a wheel, beside the package in a checkout."""
 
 PICTURES: Final = (".png", ".jpg", ".jpeg")
 """Suffixes of the pictures that :func:`write_picture` writes."""
 
 
 def write_png(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> None:
-    """Write an RGB image; a ValueError, where it is not uint8 (H, W, 3), or empty."""
+    """Write an RGB image as PNG, whatever the path's suffix.
+
+    Raises:
+        ValueError: The image is not uint8 of shape (H, W, 3), or is empty.
+    """
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
         raise ValueError(f"an image must be uint8 (H, W, 3), got {image.dtype} {image.shape}")
-    import cv2  # a tenth of a second, which a command that answers at once does not need
-
-    encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
-    write_whole(path, encoded.tobytes())
+    write_whole(path, _encoded(image, ".png"))
 
 
 def write_picture(path: Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
-    """Write an RGB image as its suffix says, one of :data:`PICTURES`."""
-    import cv2
+    """Write an RGB image in the format of the path's suffix, one of :data:`PICTURES`."""
+    write_whole(path, _encoded(image, path.suffix.lower()))
 
-    encoded = cv2.imencode(path.suffix.lower(), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
-    write_whole(path, encoded.tobytes())
+
+def _encoded(image: UInt8[np.ndarray, "height width 3"], suffix: str) -> bytes:
+    import cv2  # takes a tenth of a second, and not every command writes pictures
+
+    return bytes(cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes())
 
 
 def check_target(path: Path, suffixes: Sequence[str] = ()) -> None:
-    """Check that a file can be written, and make its folder; else a :class:`UserError`."""
+    """Check that a file can be written, and create its folder.
+
+    Args:
+        path: The file to write.
+        suffixes: Allowed suffixes (default: any).
+
+    Raises:
+        UserError: The suffix is not allowed, or the file cannot be written.
+    """
     if suffixes and path.suffix.lower() not in suffixes:
-        got = f"{path}, which is a folder" if path.is_dir() else f"{path} to write"
-        raise UserError(got, f"a file with one of the suffixes {', '.join(suffixes)}", "name it so")
+        problem = f"{path}, which is a folder" if path.is_dir() else f"{path} to write"
+        allowed = f"a file with one of the suffixes {', '.join(suffixes)}"
+        raise UserError(problem, allowed, "change the name")
     try:
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
@@ -65,24 +77,24 @@ def check_target(path: Path, suffixes: Sequence[str] = ()) -> None:
         partial_path(path).touch()
         partial_path(path).unlink()
     except OSError as error:
-        allowed = "a file that can be written"
-        raise UserError(f"{path}: {error.strerror}", allowed, "choose another place") from error
+        problem, fix = f"{path}: {error.strerror}", "choose another path"
+        raise UserError(problem, "a file that can be written", fix) from error
 
 
 def write_csv(
     path: Path | str, rows: Sequence[Mapping[str, object]], header: Sequence[str] = ()
 ) -> None:
-    """Write a CSV under headings, by default the fullest row's; what a row lacks is empty."""
+    """Write a CSV file. Missing values are empty; the default header is that of the longest row."""
     text = io.StringIO(newline="")
-    fullest: Mapping[str, object] = max(rows, key=len)
-    writer = csv.DictWriter(text, header or list(fullest), restval="", lineterminator="\n")
+    longest: Mapping[str, object] = max(rows, key=len)
+    writer = csv.DictWriter(text, header or list(longest), restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     write_whole(path, text.getvalue().encode())
 
 
 def read_csv(path: Path) -> list[dict[str, str]]:
-    """Return the rows of a CSV by heading, as far as it goes; none where there is no file."""
+    """Read the rows of a CSV, also of an incomplete one; a missing file has no rows."""
     if not path.is_file():
         return []
     with path.open(newline="", errors="replace") as stream:
@@ -90,7 +102,7 @@ def read_csv(path: Path) -> list[dict[str, str]]:
 
 
 def write_whole(path: Path | str, content: bytes) -> None:
-    """Write a file beside its place and rename it, so that a crash leaves no half of one."""
+    """Write a file atomically."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = partial_path(path)
@@ -103,15 +115,15 @@ def write_whole(path: Path | str, content: bytes) -> None:
 
 @contextmanager
 def draft(path: Path) -> Iterator[Path]:
-    """Yield a place for a file or folder that replaces a path, unless the block fails."""
+    """Yield a temporary path of a file or folder that replaces ``path``, unless the block fails."""
     folder = partial_path(path)
     folder.mkdir(parents=True)
     try:
-        place = folder / path.name
-        yield place
+        temporary = folder / path.name
+        yield temporary
         if path.is_dir():
             shutil.rmtree(path)
-        place.replace(path)
+        temporary.replace(path)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -120,45 +132,49 @@ PARTIAL_SUFFIX: Final = ".partial"
 
 _PARTIAL: Final = re.compile(r"\..+\.([0-9a-f]{8})-([0-9]+)\.partial")
 
-_ABANDONED_S: Final = 600.0
-"""Seconds after which a partial file of another machine is nobody's: no file takes that long."""
+_ABANDONED_S: Final = 600.0  # age of an abandoned partial file of another machine, seconds
 
 
 def partial_path(path: Path) -> Path:
-    """Return a name beside a file that no other process uses, on whichever machine it runs."""
+    """Return a path beside a file that no other process uses, on any machine."""
     return path.with_name(f".{path.name}.{_machine()}-{os.getpid()}{PARTIAL_SUFFIX}")
 
 
 def is_abandoned(path: Path, now: float) -> bool:
-    """Return whether a partial file's process is gone; ``now`` is by the file system's clock, s."""
+    """Return whether a partial file's process has ended.
+
+    Args:
+        path: The partial file.
+        now: Time of the file system's clock, seconds.
+    """
     match = _PARTIAL.fullmatch(path.name)
     if match and match[1] == _machine() and not _is_running(int(match[2])):
         return True
     try:
-        # A number may have passed on to another process, so age decides as well.
+        # The process id may have been reused, so the age counts as well.
         return now - path.stat().st_mtime > _ABANDONED_S
-    except FileNotFoundError:  # completed by its process in this moment
+    except FileNotFoundError:  # its process has just completed it
         return False
 
 
 def _is_running(process: int) -> bool:
-    """Tell whether a process of this machine exists; where that cannot be asked, that it does."""
-    if os.name != "posix":  # elsewhere, signal 0 is not a question
+    """Return whether a process of this machine exists, True if unknown."""
+    if os.name != "posix":  # signal 0 tests for existence on POSIX only
         return True
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
         return False
-    except PermissionError:  # somebody else's
+    except PermissionError:  # another user's process
         return True
     return True
 
 
 @cache
 def _machine() -> str:
-    """Return eight hex digits for the set of processes among which a process id is unique."""
-    # Containers may share a host's name and hosts may all be called ``localhost``, so on Linux the
-    # boot and the process namespace count as well.
+    """Return eight hex digits that identify the scope in which process ids are unique."""
+    # Host names are not unique (containers, ``localhost``), so on Linux the boot and the process
+    # namespace count as well.
     facts = [socket.gethostname()]
     boot, namespace = Path("/proc/sys/kernel/random/boot_id"), Path("/proc/self/ns/pid")
     if boot.is_file() and namespace.is_symlink():
@@ -167,5 +183,5 @@ def _machine() -> str:
 
 
 def cache_folder() -> Path:
-    """Return where dopepp keeps what it can make again (``XDG_CACHE_HOME``); it may be missing."""
+    """Return dopepp's cache folder (in ``XDG_CACHE_HOME``), which may not exist."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "dopepp")

@@ -1,7 +1,7 @@
-"""Strict JSON: what anybody may have written, read within bounds or refused in one line.
+"""Strict JSON for untrusted files.
 
-``json.loads`` accepts ``NaN`` and ``1e999``, keeps the last of two values under one key, and dies
-of deep nesting; here each of these is a :class:`~dopepp.core.errors.UserError`.
+``json.loads`` accepts ``NaN``, ``1e999`` and duplicate keys, and crashes on deep nesting. Here each
+of these raises :class:`~dopepp.core.errors.UserError`.
 """
 
 from __future__ import annotations
@@ -17,30 +17,33 @@ import numpy as np
 from dopepp.core.errors import UserError
 
 MAX_BYTES: Final = 64_000_000
-"""About 10,000 images of a BOP scene with ten objects each; parsed, JSON takes up to 20 times its
+"""About 10,000 images of a BOP scene with ten objects each. Parsed JSON takes up to 20 times its
 size in memory."""
 
-MAX_DEPTH: Final = 64
-"""Far beyond any format here (at most six), and low enough for every recursive function."""
+MAX_DEPTH: Final = 64  # the formats here need six
 
 _STRING: Final = r'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)'
-"""A string literal, or one that the end cuts off: so every quote is looked at once."""
+"""A string literal, also one that is cut off at the end of the text."""
 
 _STRING_BYTES: Final = re.compile(_STRING.encode(), re.DOTALL)
 _EXPONENT: Final = re.compile(rb"[eE]\+?0*[1-9]\d\d")
 _LONG_DIGITS: Final = 300
-"""What a number beyond float64's range has, one or the other: three digits of exponent, or many."""
+"""A number beyond float64's range has three digits of exponent, or this many digits."""
 
 _FLOAT: Final = r"-?\d+(?:\.\d+(?:[eE]\+?\d+)?|[eE]\+?\d+)"
 _NOT_FINITE: Final = re.compile(rf"{_STRING}|(-?Infinity|NaN)|({_FLOAT})", re.DOTALL)
 
 
 def read_json(path: str | Path, max_bytes: int = MAX_BYTES) -> object:
-    """Read a JSON file; a missing, too large or refused one (:func:`parse_json`) is a UserError."""
+    """Read a JSON file.
+
+    Raises:
+        UserError: The file is missing, too large, or refused by :func:`parse_json`.
+    """
     path = Path(path)
     allowed = f"a JSON file of at most {max_bytes / 1e6:.3g} MB"
     if not path.is_file():
-        raise UserError(f"{path}, no such file", allowed, "check the path or restore the file")
+        raise UserError(f"{path}, no such file", allowed, "check the path, or restore the file")
     try:
         with path.open("rb") as file:
             content = file.read(max_bytes + 1)
@@ -53,11 +56,15 @@ def read_json(path: str | Path, max_bytes: int = MAX_BYTES) -> object:
 
 
 def parse_json(text: str | bytes, where: str) -> object:
-    """Parse JSON text in UTF-8, with or without a byte order mark, of a size its caller bounds.
+    """Parse JSON text in UTF-8, with or without a byte order mark. The caller limits its size.
+
+    Args:
+        text: The text.
+        where: Name of the source, for messages.
 
     Raises:
-        UserError: It is no UTF-8, no JSON, has a key twice in one object, is nested more than 64
-            deep, or has a number that is not finite.
+        UserError: The text is not UTF-8 or JSON, has a duplicate key, nesting deeper than 64, or a
+            number that is not finite.
     """
     content = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
     bare = _STRING_BYTES.sub(b"", content)
@@ -66,18 +73,18 @@ def parse_json(text: str | bytes, where: str) -> object:
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise _bad(where, f"byte {error.start} is no UTF-8") from error
+        raise _bad(where, f"byte {error.start} is not UTF-8") from error
     try:
         return json.loads(
             text,
             object_pairs_hook=_object,
-            # Looking at every number takes longer than all the rest.
+            # Checking every number takes longer than everything else.
             parse_float=_finite if _may_overflow(bare) else None,
             parse_constant=_finite,
         )
     except json.JSONDecodeError as error:
-        got = f"line {error.lineno}, column {error.colno}: {error.msg}"
-        raise _bad(where, got) from error
+        problem = f"line {error.lineno}, column {error.colno}: {error.msg}"
+        raise _bad(where, problem) from error
     except _NotFiniteError as error:
         raise _bad(where, f"{_position(text)}{str(error)!r:.40}, no finite number") from error
     except ValueError as error:  # a key twice; an integer of thousands of digits
@@ -105,7 +112,7 @@ def _finite(text: str) -> float:
 
 
 def _position(text: str) -> str:
-    """Say where the first number stands that is not finite."""
+    """Return the position of the first number that is not finite, as text."""
     for match in _NOT_FINITE.finditer(text):
         if match[1] or (match[2] and math.isinf(float(match[2]))):
             line = text.count("\n", 0, match.start()) + 1
@@ -115,7 +122,7 @@ def _position(text: str) -> str:
 
 
 def _depth(bare: bytes) -> int:
-    """Return how deep the brackets of a text without strings are nested."""
+    """Return the nesting depth of a text without strings."""
     code = np.frombuffer(bare, np.uint8)
     opened = (code == ord("[")) | (code == ord("{"))
     closed = (code == ord("]")) | (code == ord("}"))
@@ -124,13 +131,13 @@ def _depth(bare: bytes) -> int:
 
 
 def _may_overflow(bare: bytes) -> bool:
-    """Tell whether a text without strings may have a number beyond float64's range."""
+    """Return whether a text without strings may have a number beyond float64's range."""
     code = np.frombuffer(bare, np.uint8)
     others = np.flatnonzero((code < ord("0")) | (code > ord("9")))
     runs = np.diff(others, prepend=-1, append=len(code))
     return bool(runs.max(initial=0) > _LONG_DIGITS) or _EXPONENT.search(bare) is not None
 
 
-def _bad(where: str, got: str) -> UserError:
+def _bad(where: str, problem: str) -> UserError:
     allowed = "UTF-8 JSON with finite numbers and each key once"
-    return UserError(f"{where}: {got}", allowed, "correct the file or write it again")
+    return UserError(f"{where}: {problem}", allowed, "correct the file, or write it again")

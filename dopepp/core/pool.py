@@ -1,11 +1,11 @@
 """Pools that apply a function to many items: processes of this machine, or a Ray cluster.
 
-A pool takes the pickled function once and yields each item with its future as soon as that is done.
-What the function raises belongs to its item, and so does a lost process: other items go on.
+A pool receives the pickled function once and yields each item with its future when it is done. An
+exception or a lost process affects its own item only.
 
-``concurrent.futures.ProcessPoolExecutor`` and loky do not keep these promises. They lose every item
-in progress with one process, do not say what it died of, and leave processes behind when their
-parent is killed. So each thread of a ``ThreadPoolExecutor`` has one process behind a pipe instead.
+``concurrent.futures.ProcessPoolExecutor`` and loky lose all items in progress when one process
+dies, do not report its exit code, and leave processes behind when their parent is killed. Here,
+each thread of a ``ThreadPoolExecutor`` has one process behind a pipe.
 
 To add an engine, write a :class:`Pool`.
 """
@@ -43,24 +43,24 @@ THREAD_LIMITS: Final = tuple(f"{library}_THREADS" for library in _LIMITED)
 """Environment variables that limit the threads of libraries loaded after they are set."""
 
 _ITEMS_PER_WORKER: Final = 2
-"""Items handed out per worker: no worker waits, and a cluster that scales itself sees a queue."""
+"""Submitted items per worker: no worker waits, and an autoscaling cluster sees a queue."""
 
 _PATIENCE_S: Final = 3.0
-"""Time that a process has to complete its item when the pool is stopped, before it is killed."""
+"""Time for a process to complete its item when the pool is stopped, before it is killed."""
 
 _CORES_EVERY_S: Final = 10.0
-"""How often the cluster is asked for its number of cores, which may change."""
+"""Interval of queries for the cluster's number of cores, which may change."""
 
 
 def available_cores() -> int:
-    """Return how many cores this process may use (Linux), or all of the machine's."""
+    """Return the number of cores that this process may use (Linux), or all of the machine's."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def physical_cores() -> int:
-    """Return how many cores this process may use; two hardware threads of a core count as one."""
+    """Return the number of physical cores that this process may use."""
     if not hasattr(os, "sched_getaffinity"):
         return os.cpu_count() or 1
     siblings = set()
@@ -71,18 +71,18 @@ def physical_cores() -> int:
 
 
 def cpu_fact(*names: str) -> str:
-    """Return the first processor's entry of /proc/cpuinfo under one of these names, or nothing."""
+    """Return the first entry of /proc/cpuinfo with one of these names, or an empty string."""
     path = Path("/proc/cpuinfo")
     lines = path.read_text().splitlines() if path.is_file() else []
     return next((line.partition(":")[2].strip() for line in lines if line.startswith(names)), "")
 
 
 class LostWorkerError(RuntimeError):
-    """A process, or a machine of the cluster, that died over an item."""
+    """A process, or a machine of the cluster, died while it processed an item."""
 
 
 class PickledFunction:
-    """A function from its pickle, unpickled with the first item, so that a failure belongs to it.
+    """A pickled function. It is unpickled with the first item, to which failures then belong.
 
     Calls return a pickled pair (value, error).
     """
@@ -99,12 +99,12 @@ class PickledFunction:
             return pickle.dumps((self._function(item), None))
         except (UserError, OSError) as error:
             return pickle.dumps((None, error))
-        except Exception:  # a defect: not every exception survives pickling, its text does
+        except Exception:  # a defect: not every exception can be pickled, but its text can
             return pickle.dumps((None, RuntimeError(traceback.format_exc())))
 
 
 def opened(answer: bytes) -> Any:
-    """Return what the function returned, from :class:`PickledFunction`'s answer, or raise."""
+    """Return the value from an answer of :class:`PickledFunction`, or raise its error."""
     value, error = pickle.loads(answer)
     if error is not None:
         raise error
@@ -112,10 +112,10 @@ def opened(answer: bytes) -> Any:
 
 
 class Pool(ABC):
-    """Applies a pickled function to items, several at once; a context manager that ends it."""
+    """Applies a pickled function to items in parallel; a context manager."""
 
     batch_size: int
-    """Pieces of work worth one item: few lose little when stopped, many cost less to hand out."""
+    """Recommended size of an item: small ones lose little when stopped, large ones cost less."""
 
     def __enter__(self) -> Pool:
         return self
@@ -125,27 +125,26 @@ class Pool(ABC):
 
     @abstractmethod
     def room(self) -> int:
-        """Return how many items may be handed out at a time."""
+        """Return how many items may be submitted at a time."""
 
     @abstractmethod
     def submit(self, item: object) -> Future[Any]:
-        """Hand out an item."""
+        """Submit an item."""
 
     def run(self, items: Iterable[Item]) -> Iterator[tuple[Item, Future[Any]]]:
-        """Yield items and their futures in the order in which they are done.
+        """Yield items and their futures in the order of completion.
 
-        A future raises what the function raised, or a :class:`LostWorkerError`. Items are read only
-        as far as there is :meth:`room`, and after what is done was yielded, because that may decide
-        what comes next.
+        A future raises the function's exception or :class:`LostWorkerError`. Further items are read
+        only after finished ones were yielded, because the consumer may decide what comes next.
         """
-        waiting, flying = iter(items), dict[Future[Any], Item]()
+        waiting, running = iter(items), dict[Future[Any], Item]()
         while True:
-            while len(flying) < self.room() and (item := next(waiting, None)) is not None:
-                flying[self.submit(item)] = item
-            if not flying:
+            while len(running) < self.room() and (item := next(waiting, None)) is not None:
+                running[self.submit(item)] = item
+            if not running:
                 return
-            for future in wait(flying, return_when=FIRST_COMPLETED).done:
-                yield flying.pop(future), future
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                yield running.pop(future), future
 
 
 class _Worker(threading.local):
@@ -158,14 +157,14 @@ class _Worker(threading.local):
 class ProcessPool(Pool):
     """Processes of this machine.
 
-    They are spawned, not forked: Mitsuba's thread pool does not survive a fork, and a spawned
-    process starts alike on every system, in about a second. They end after their item when the pipe
-    does, so they leave nothing half-written if the pool is stopped or this process is killed.
+    They are spawned, because Mitsuba's thread pool does not survive a fork; this takes about a
+    second. They complete their item when the pipe is closed, so that no file is half-written if the
+    pool is stopped or this process is killed.
 
     Args:
         content: Pickled function of one item.
-        num_workers: Most processes; they are started as items come, and again when lost.
-        environment: Variables of the processes' environment (default: one thread per library).
+        num_workers: Maximum number of processes. They are started on demand, and again when lost.
+        environment: Environment variables of the processes (default: one thread per library).
     """
 
     batch_size = 2
@@ -192,11 +191,11 @@ class ProcessPool(Pool):
             process.join()
 
     def room(self) -> int:
-        """Return how many items may be handed out at a time."""
+        """Return how many items may be submitted at a time."""
         return self._num_workers * _ITEMS_PER_WORKER
 
     def submit(self, item: object) -> Future[Any]:
-        """Hand out an item."""
+        """Submit an item."""
         return self._threads.submit(self._apply, item)
 
     def _apply(self, item: object) -> Any:
@@ -205,7 +204,7 @@ class ProcessPool(Pool):
         process = worker.process = worker.process or self._start()
         try:
             if is_new:
-                # Not an argument of the process, whose start would wait until megabytes are read.
+                # As an argument of the process, megabytes would delay its start.
                 worker.connection.send_bytes(self._content)
             worker.connection.send(item)
             answer = worker.connection.recv_bytes()
@@ -214,18 +213,17 @@ class ProcessPool(Pool):
             process.join(_PATIENCE_S)
             code = process.exitcode
             how = f"signal {-code}" if code is not None and code < 0 else f"code {code}"
-            raise LostWorkerError(
-                f"a worker process died ({how}); if memory was short, use fewer --workers"
-            ) from error
+            reason = f"a worker process died ({how}); if memory was short, use fewer --workers"
+            raise LostWorkerError(reason) from error
         return opened(answer)
 
     def _start(self) -> SpawnProcess:
         context = get_context("spawn")
-        self._worker.connection, there = context.Pipe()
-        process = context.Process(target=_serve, args=(there,))
+        self._worker.connection, remote = context.Pipe()
+        process = context.Process(target=_serve, args=(remote,))
         with _environment(self._environment):
             process.start()
-        there.close()  # so that the pipe ends when the process does
+        remote.close()  # so that the pipe ends with the process
         self._processes.append(process)
         self._connections.append(self._worker.connection)
         return process
@@ -236,17 +234,17 @@ class ProcessPool(Pool):
 
 
 def _block_signals() -> None:
-    """Let processes that this thread starts inherit blocked signals from their first moment."""
-    # Ctrl-C reaches every process of the terminal, but only the parent decides what to do.
+    """Block signals in the processes that this thread starts."""
+    # Ctrl-C reaches every process of the terminal, but only the parent should react.
     if hasattr(signal, "pthread_sigmask"):
         resource_tracker.ensure_running()  # it starts with the first process, and unblocks signals
         signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
 
 
 def _serve(connection: Connection) -> None:
-    """Take the function, then apply it to items until the pipe ends."""
+    """Receive the function, then apply it to items until the pipe ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # for systems without a signal mask
-    with suppress(EOFError, OSError):  # there is nobody left to work for
+    with suppress(EOFError, OSError):  # the parent has ended
         function = PickledFunction(connection.recv_bytes())
         while True:
             connection.send_bytes(function(connection.recv()))
@@ -257,38 +255,37 @@ _environment_lock = threading.Lock()
 
 @contextmanager
 def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Let a process that is started here inherit these environment variables."""
+    """Set environment variables for processes that are started in the block."""
     with _environment_lock:
-        kept = {name: os.environ[name] for name in variables if name in os.environ}
+        previous = {name: os.environ[name] for name in variables if name in os.environ}
         os.environ.update(variables)
         try:
             yield
         finally:
             for name in variables:
                 del os.environ[name]
-            os.environ.update(kept)
+            os.environ.update(previous)
 
 
 class ClusterPool(Pool):
-    """Tasks of a Ray cluster; the same results on any number of machines.
+    """Tasks of a Ray cluster.
 
-    Every machine must see the same files under the same paths and have the same dopepp. Ray repeats
-    the tasks of a machine that is lost. ``num_tasks`` counts the tasks done by the node's id.
+    All machines must have the same dopepp and the same files under the same paths. Ray repeats the
+    tasks of a lost machine. ``num_tasks`` counts the finished tasks by the node's id.
 
     Args:
         content: Pickled function of one item.
-        address: ``host:port`` of the cluster; None starts one on this machine that ends with it.
+        address: ``host:port`` of the cluster (default: start one on this machine for the pool).
         num_workers: Cores of a cluster on this machine.
-        asked_by: The choice that needs Ray, for messages.
-        option: The option that holds the address, for messages.
+        asked_by: The option that needs Ray, for messages.
+        option: The option with the address, for messages.
         task_options: Options of ``ray.remote`` for a task, e.g. ``num_gpus`` (default: one core).
 
     Raises:
         UserError: Ray is not installed, or there is no cluster at the address.
     """
 
-    batch_size = 8
-    """Ray takes about a millisecond to hand out a task."""
+    batch_size = 8  # Ray takes about a millisecond to submit a task
 
     def __init__(
         self,
@@ -301,7 +298,7 @@ class ClusterPool(Pool):
     ) -> None:
         self._ray = _connect(address, num_workers, asked_by, option)
         try:
-            # In a list, so that a worker fetches it once and not for every task.
+            # In a list, a worker fetches the object once and not for every task.
             self._content = [self._ray.put(content)]
             # Without SPREAD, Ray fills one machine before it uses the next.
             options = {"scheduling_strategy": "SPREAD", "num_cpus": 1} | task_options
@@ -317,14 +314,14 @@ class ClusterPool(Pool):
         _log.info("Ray: %d tasks on %d nodes", self.num_tasks.total(), len(self.num_tasks))
 
     def room(self) -> int:
-        """Return how many items may be handed out at a time."""
+        """Return how many items may be submitted at a time."""
         if time.monotonic() - self._asked_at >= _CORES_EVERY_S:
             cores = int(self._ray.cluster_resources().get("CPU", 0))
             self._room, self._asked_at = max(cores, 1) * _ITEMS_PER_WORKER, time.monotonic()
         return self._room
 
     def submit(self, item: object) -> Future[Any]:
-        """Hand out an item."""
+        """Submit an item."""
         result: Future[Any] = Future()
 
         def finish(answered: Future[tuple[bytes, str]]) -> None:
@@ -336,7 +333,7 @@ class ClusterPool(Pool):
                 reason = " ".join(str(error).split())
                 lost = LostWorkerError(f"Ray: {type(error).__name__}: {reason[:300]}")
                 result.set_exception(lost)
-            except Exception as error:  # the function's
+            except Exception as error:  # of the function
                 result.set_exception(error)
 
         answered = self._apply.remote(self._content, self._content[0].hex(), item).future()
@@ -345,9 +342,9 @@ class ClusterPool(Pool):
 
 
 def _connect(address: str | None, num_workers: int, asked_by: str, option: str) -> Any:
-    """Import Ray and connect to a cluster, or start one that only this machine reaches."""
+    """Import Ray, and connect to a cluster or start one on this machine."""
     require("ray", asked_by, "ray")
-    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # read when Ray starts, so it comes first
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # before the import, because Ray reads it then
     import ray
 
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
@@ -362,7 +359,7 @@ def _connect(address: str | None, num_workers: int, asked_by: str, option: str) 
     else:
         options["address"] = address
     try:
-        if address is not None:  # Ray itself would try for many minutes
+        if address is not None:  # Ray itself would retry for many minutes
             host, _, port = address.rpartition(":")
             socket.create_connection((host, int(port)), timeout=5.0).close()
         ray.init(**options)
@@ -370,22 +367,21 @@ def _connect(address: str | None, num_workers: int, asked_by: str, option: str) 
         raise UserError(
             f"{option} {address}: {error}",
             "host:port of a running Ray cluster that this machine belongs to",
-            "start one with `ray start --head`, or leave the address out",
+            "start one with `ray start --head`, or leave out the address",
         ) from error
     return ray
 
 
 _functions: dict[str, PickledFunction] = {}
-"""The current pool's function in this process; Ray keeps processes for several tasks and pools."""
+"""The current pool's function in this process. Ray reuses processes for several pools."""
 
 
 def _apply(content: list[Any], key: str, item: object) -> tuple[bytes, str]:
-    """Apply the function in a process of the cluster; return the answer and the node's id."""
+    """Apply the function in a process of the cluster; return its answer and the node's id."""
     import ray
 
     if key not in _functions:
         _functions.clear()
-        # Bytes, unpickled here: arrays out of Ray's store would be read-only, another type to the
-        # compiled loops.
+        # Arrays from Ray's store would be read-only, which is a different type in compiled loops.
         _functions[key] = PickledFunction(ray.get(content[0]))
     return _functions[key](item), ray.get_runtime_context().get_node_id()

@@ -1,11 +1,11 @@
-"""Typed objects from untrusted plain values, checked by pydantic in its strict JSON mode.
+"""Validation of plain values, by pydantic in its strict JSON mode.
 
-:func:`parse` turns a plain value, as a YAML or JSON file gives it, into a type: a frozen dataclass
-whose numbers have a :class:`Range`. :func:`check` validates an argument, :class:`Checked` the
-fields of a dataclass. The first mistake raises a :class:`~dopepp.core.errors.UserError`.
+:func:`parse` converts a plain value from a YAML or JSON file to a type, e.g. a frozen dataclass
+whose numbers have a :class:`Range`. :func:`check` validates an argument, and :class:`Checked` the
+fields of a dataclass. The first mistake raises :class:`~dopepp.core.errors.UserError`.
 
-Values are never coerced: ``"1"`` is no number and ``true`` is no integer. As in JSON, a list stands
-for a tuple and text for a path. A dataclass that refuses unknown fields has the line
+Values are never coerced: ``"1"`` is not a number and ``true`` is not an integer. As in JSON, a list
+stands for a tuple and text for a path. To refuse unknown fields, a dataclass has the line
 ``__pydantic_config__ = STRICT``.
 """
 
@@ -52,7 +52,7 @@ _WORDS: Final = {
 class Range:
     """Closed range of a number, as in ``Annotated[int, Range(1, 10)]``.
 
-    On a tuple, e.g. ``Annotated[tuple[int, int], Range(1, 10)]``, each number must lie within.
+    For a tuple, e.g. ``Annotated[tuple[int, int], Range(1, 10)]``, it holds for every number.
     """
 
     lowest: float
@@ -69,7 +69,7 @@ class Range:
         return f"{noun} from {self.lowest:{form}} to {self.highest:{form}}{self._unit}"
 
     def holds(self, value: Any) -> bool:
-        """Return whether a number, or each of a tuple's, lies within."""
+        """Return whether a number, or every number of a tuple, is inside."""
         numbers = value if isinstance(value, tuple) else (value,)
         return all(self.lowest <= number <= self.highest for number in numbers)
 
@@ -82,7 +82,7 @@ class Range:
 
         def check(value: object, inner: Callable[[object], Any]) -> Any:
             try:
-                # The list of a JSON array is a Python object here, and so would be no tuple.
+                # A JSON array is a list here, which is not a tuple in strict mode.
                 typed = inner(tuple(value) if isinstance(value, list) else value)
             except ValidationError:
                 raise refused from None
@@ -102,7 +102,7 @@ class Span(Range):
         return f"(smallest, largest) with {bounds}{self._unit}"
 
     def holds(self, value: Any) -> bool:
-        """Return whether both numbers lie within, the smallest first."""
+        """Return whether both numbers are inside and in ascending order."""
         smallest, largest = value
         return bool(self.lowest <= smallest <= largest <= self.highest)
 
@@ -114,7 +114,7 @@ Share = Annotated[float, Range(0.0, 1.0, "share")]
 
 
 class _Mistake(NamedTuple):
-    """A value that its type does not allow; ``got`` is empty where the value is missing."""
+    """A value that its type does not allow; ``got`` is empty for a missing value."""
 
     location: tuple[str | int, ...]
     got: str
@@ -148,9 +148,10 @@ def parse(kind: type[T], value: object, name: str = "", fix: str = "") -> T:
         if cause := _cause(error.errors()[0]):  # of a __post_init__
             raise cause from None
         first, *others = _mistakes(kind, value, error)
-        deeper = (one for one in others if one.location[: len(first.location)] == first.location)
-        # Of a union's alternatives, the one that fails deepest inside is the one that was meant.
-        mistake = max((first, *deeper), key=lambda one: len(one.location))
+        depth = len(first.location)
+        deeper = (other for other in others if other.location[:depth] == first.location)
+        # The alternative of a union that fails deepest inside is probably the intended one.
+        mistake = max((first, *deeper), key=lambda candidate: len(candidate.location))
         raise _user_error(mistake, name, fix) from None
     return typed
 
@@ -182,15 +183,15 @@ def check(
     except ValidationError as error:
         mistake = next(_mistakes(limited, value, error))
         owner = "" if of is None else f" of {getattr(of, 'name', None) or type(of).__name__}"
-        got = f"{mistake.name(name)}={mistake.got if mistake.location else shown(value)}{owner}"
-        raise UserError(got, mistake.allowed, f"change {name}") from None
+        problem = f"{mistake.name(name)}={mistake.got if mistake.location else shown(value)}{owner}"
+        raise UserError(problem, mistake.allowed, f"change {name}") from None
     return typed
 
 
 class Checked:
-    """Base of a frozen dataclass that refuses unknown fields and values out of their ranges.
+    """Base of a frozen dataclass that refuses unknown fields and values outside their ranges.
 
-    Ranges also hold for a dataclass that Python code makes.
+    Ranges are also checked when Python code creates the dataclass.
     """
 
     __pydantic_config__ = STRICT
@@ -212,7 +213,7 @@ def _ranged_fields(kind: Any) -> dict[str, Any]:
 
 
 def shown(value: object, most: int = 100) -> str:
-    """Return a value for a message, shortened; an endless integer is shown as its type."""
+    """Return a shortened value for a message; for an endless integer, its type."""
     try:
         return f"{value!r:.{most}}"
     except ValueError:
@@ -232,9 +233,9 @@ def _json(value: object, name: str) -> str:
     try:
         return json.dumps(value)
     except (TypeError, ValueError, RecursionError) as error:
-        got = f"{name}: {error}" if name else str(error)
+        problem = f"{name}: {error}" if name else str(error)
         allowed = "null, true/false, numbers, text, and lists and mappings of them"
-        raise UserError(got, allowed, "write plain values") from None
+        raise UserError(problem, allowed, "write plain values") from None
 
 
 def _user_error(mistake: _Mistake, root: str, fix: str) -> UserError:
@@ -247,7 +248,7 @@ def _user_error(mistake: _Mistake, root: str, fix: str) -> UserError:
 
 
 def _mistakes(kind: type[Any], value: object, error: ValidationError) -> Iterator[_Mistake]:
-    """Translate pydantic's errors; those of a union's alternatives become one mistake."""
+    """Translate pydantic's errors, and merge those of a union's alternatives."""
     located = [(_location(value, detail), detail) for detail in error.errors()]
     for location, group in groupby(located, key=lambda pair: pair[0]):
         details = [detail for _, detail in group]
@@ -263,7 +264,7 @@ def _mistakes(kind: type[Any], value: object, error: ValidationError) -> Iterato
 
 
 def _location(value: object, detail: ErrorDetails) -> tuple[str | int, ...]:
-    """Return the steps that lead into the value; pydantic adds the names of union members."""
+    """Return the path into the value, without the names of union members that pydantic adds."""
     location: list[str | int] = []
     for number, step in enumerate(detail["loc"]):
         is_missing = detail["type"].startswith("missing") and number == len(detail["loc"]) - 1
@@ -277,7 +278,7 @@ def _location(value: object, detail: ErrorDetails) -> tuple[str | int, ...]:
 
 
 def _cause(detail: ErrorDetails) -> UserError | None:
-    """Return the error that a dataclass raised itself."""
+    """Return the error that a dataclass itself raised."""
     cause = detail.get("ctx", {}).get("error")
     return cause if isinstance(cause, UserError) else None
 
@@ -310,13 +311,11 @@ def _fields(kind: Any, location: Sequence[str | int], value: Any) -> list[str]:
 
 
 def _dataclass(kind: Any, value: Any) -> Any:
-    """Return a type that is a dataclass, or the member of a union that stands for the value.
+    """Return a dataclass, or the member of a union that matches the value.
 
-    The members of a tagged union have a field ``kind``, whose default is their tag.
+    The members of a tagged union have a field ``kind`` with their tag as default.
     """
-    members = [
-        member for member in (kind, *typing.get_args(kind)) if dataclasses.is_dataclass(member)
-    ]
+    members = [*filter(dataclasses.is_dataclass, (kind, *typing.get_args(kind)))]
     tag = value.get("kind") if isinstance(value, Mapping) else None
     tagged = (member for member in members if getattr(member, "kind", None) == tag)
     return next(tagged, members[0] if members else None)

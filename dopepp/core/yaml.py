@@ -1,7 +1,7 @@
-"""Strict YAML: what anybody may have written (a run folder, a camera file), read within bounds.
+"""Strict YAML for untrusted files, such as run folders and camera files.
 
-``yaml.safe_load`` runs no code, but follows anchors to a list that stands for gigabytes and dies
-of deep nesting; here each of these is a :class:`~dopepp.core.errors.UserError`.
+``yaml.safe_load`` runs no code, but expands anchors to gigabytes and crashes on deep nesting. Here
+each of these raises :class:`~dopepp.core.errors.UserError`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import yaml
 
 from dopepp.core.errors import UserError
 
-MAX_BYTES: Final = 1_000_000  # Fifty times the largest config of a run
+MAX_BYTES: Final = 1_000_000  # fifty times the largest config of a run
 MAX_DEPTH: Final = 32
 
 
@@ -21,7 +21,7 @@ def read_yaml(path: Path) -> object:
     """Read a YAML file of mappings, lists, text, numbers, true/false and null.
 
     Raises:
-        UserError: The file cannot be read, is too large or damaged, is nested more than 32 deep, or
+        UserError: The file cannot be read, is too large or damaged, has nesting deeper than 32, or
             has an anchor, an alias or a tag.
     """
     try:
@@ -36,7 +36,11 @@ def read_yaml(path: Path) -> object:
 
 
 def parse_yaml(text: str, where: Path | str) -> object:
-    """Parse YAML text of a size its caller bounds; a :class:`UserError` as from `read_yaml`."""
+    """Parse YAML text. The caller limits its size.
+
+    Raises:
+        UserError: As :func:`read_yaml`.
+    """
     try:
         _check_events(text)
         return yaml.safe_load(text)
@@ -45,7 +49,7 @@ def parse_yaml(text: str, where: Path | str) -> object:
 
 
 def _check_events(text: str) -> None:
-    """Go through a text's structure before anything is made of it."""
+    """Check the structure of a text before it is loaded."""
     depth = 0
     for event in yaml.parse(text, yaml.SafeLoader):
         if isinstance(event, yaml.CollectionStartEvent):
@@ -61,6 +65,6 @@ def _check_events(text: str) -> None:
             raise ValueError(f"the tag {event.tag!r:.80}")
 
 
-def _bad(where: Path | str, got: str) -> UserError:
+def _bad(where: Path | str, problem: str) -> UserError:
     allowed = f"YAML of at most {MAX_BYTES / 1e6:g} MB, without anchors and tags"
-    return UserError(f"{where}, {got}", allowed, "use a file that you trust, or restore it")
+    return UserError(f"{where}, {problem}", allowed, "use a file that you trust, or restore it")

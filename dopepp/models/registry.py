@@ -62,7 +62,7 @@ class Registry(Generic[T]):
     @property
     def targets(self) -> tuple[str, ...]:
         """The allowed dotted names, sorted."""
-        added = extensions.found(self._group).values() if self._group else ()
+        added = extensions.components(self._group).values() if self._group else ()
         return tuple(sorted(self._targets.union(added)))
 
     def register(self, dotted: str) -> None:

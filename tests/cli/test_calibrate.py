@@ -12,8 +12,8 @@ from dopepp.core.files import write_png
 from dopepp.geometry.camera import camera_matrix, invert_transform, make_transform
 from dopepp.geometry.camera_file import Camera, read_camera
 from dopepp.robot.calibration.board import draw_view, parse_board
-from dopepp.robot.calibration.files import read_transform, transform_record, write_calibration
 from dopepp.robot.calibration.lens import write_camera
+from dopepp.robot.calibration.records import read_transform, transform_record, write_calibration
 
 BOARD = "charuco:8x6:25:19"
 
@@ -121,7 +121,7 @@ def video(cell):
 def test_of_a_video_the_views_that_differ_are_taken(run, cell, video, tmp_path):
     out = tmp_path / "camera.yaml"
     done = run("calibrate", "camera", video, "--board", BOARD, "--out", out, "--force")
-    assert "10 views that differ, of 15 pictures" in done.stderr
+    assert "10 distinct views in 15 pictures" in done.stderr
     assert read_camera(out).K[0, 0] == pytest.approx(cell[2].K[0, 0], rel=0.02)
 
 
@@ -145,7 +145,7 @@ def test_a_bench_is_found_from_a_board_on_it(run, refused, cell, tmp_path):
     assert np.linalg.norm(T[:3, 3] - [0.5, 0.1, 0.02]) < 0.001  # the board's place, as drawn
     for more, said in (
         ((), "--camera and --hand-eye"),
-        (("--hand-eye", hand_eye), "no --poses"),
+        (("--hand-eye", hand_eye), "without --poses"),
         (("--hand-eye", tmp_path / "none.yaml"), "none.yaml"),
     ):
         assert said in refused("calibrate", "bench", folder, *words, *more)

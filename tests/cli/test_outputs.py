@@ -111,7 +111,7 @@ def test_an_interruption_leaves_what_was_written(
     monkeypatch.setattr(Video, "frames", interrupted)
     out, poses, csv = tmp_path / "out", tmp_path / "poses.jsonl", tmp_path / "poses.csv"
     done = predict(files / "clip.avi", "--save", out, "--json", poses, "--csv", csv, code=code)
-    assert done.stderr.splitlines()[-1] == "interrupted; what was written is complete"
+    assert done.stderr.splitlines()[-1] == "interrupted; the written files are complete"
     assert frames(out / "clip.mp4") == 3
     assert len(lines(poses)) == len(read_results(csv, [1])) == 3
     assert sorted(one.name for one in tmp_path.rglob("*")) == [
@@ -131,7 +131,7 @@ def test_a_full_disk_is_one_line_and_code_1(predict, files, tmp_path, monkeypatc
 
     monkeypatch.setattr("dopepp.core.files.Path.write_bytes", full)
     done = predict(files / "000007.jpg", "--save", tmp_path / "out", "--json", poses, code=1)
-    assert done.stderr.splitlines()[-1] == f"no space left for {tmp_path}/out: free some"
+    assert done.stderr.splitlines()[-1] == f"no space left for {tmp_path}/out: free some disk space"
     assert poses.exists()
     assert not list(tmp_path.rglob("*.partial"))
 

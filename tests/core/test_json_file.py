@@ -42,7 +42,7 @@ def test_reads_what_json_writes(value, ascii_only, indent):
         ('{"a": 1', "line 1, column 8"),
         ("", "line 1, column 1"),
         ("[1] 2", "Extra data"),
-        (b'{"a": "\xff"}', "byte 7 is no UTF-8"),
+        (b'{"a": "\xff"}', "byte 7 is not UTF-8"),
         ("{'a': 1}", "line 1, column 2"),
         ("[" * 200_000, "nested more than 64"),
         ('{"a":' * 200_000, "nested more than 64"),

@@ -149,7 +149,7 @@ def labelled_images(data: DataConfig, parts: Parts, seed: int, split: Split) -> 
     assert data.root is not None
     if data.format in FORMATS:
         return FORMATS[data.format](data, data.root, parts, seed, split)
-    added = extensions.found("formats")
+    added = extensions.components("formats")
     if data.format not in added:
         formats, advice = ", ".join((*FORMATS, *added)), extensions.advice("formats", data.format)
         problem = f"data.format={data.format}"

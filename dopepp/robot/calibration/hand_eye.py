@@ -1,25 +1,25 @@
-"""Where the camera is on the robot: hand-eye and robot-world calibration.
+"""Hand-eye and robot-world calibration: the camera's pose on the robot.
 
-A robot says where its flange is, the camera sees a board. Of a camera in the hand,
+The robot reports its flange's pose, the camera observes a board. For a camera on the flange,
 
     T_base_flange · T_flange_cam · T_cam_board = T_base_board,
 
-of one on the bench, with the board in the hand,
+for a camera on the bench, with the board on the flange,
 
     T_flange_base · T_base_cam · T_cam_board = T_flange_board,
 
-for all poses i: M_i X B_i = Y with two unknowns, X where the camera is and Y where the board is.
-Y falls out of pairs of poses (AX = XB: Park and Martin 1994), or is solved for together with X
-(AX = ZB: Shah 2013). Both are closed forms of rotation first; the better of them starts a joint
-refinement that weighs every pose by what its picture tells and by the robot's own error, and
-leaves out poses that contradict the others.
+for all poses i: M_i X B_i = Y with the unknown poses X of the camera and Y of the board.
+Pairs of poses eliminate Y (AX = XB: Park and Martin 1994), or X and Y are solved for together
+(AX = ZB: Shah 2013). Both have closed-form solutions, rotation first. The better one initialises a
+joint refinement, which weights every pose by the covariances of its picture and of the robot, and
+rejects poses that contradict the others.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, cast
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -33,70 +33,66 @@ from dopepp.robot.calibration.board import BoardPose, Transforms, displaced
 Mount = Literal["hand", "bench"]
 
 Covariances = Float[np.ndarray, "poses 6 6"]
-Residuals = Float[np.ndarray, "poses 6"]  # turns (radians) and shifts (metres), camera axes
-Noise = Float[np.ndarray, "2"]  # deviations of a robot's turn and shift, radians and metres
+Residuals = Float[np.ndarray, "poses 6"]  # rotations (radians), translations (metres), camera axes
+Noise = Float[np.ndarray, "2"]  # standard deviations of a robot's rotation and position
 
 MIN_POSES: Final = 3
 
 ROBOT_NOISE: Final = (0.0005, 0.0005)
-"""Of a robot's pose to begin with: radians and metres; what the poses show replaces it."""
+"""Initial standard deviations of a robot's pose, radians and metres; then they are estimated."""
 
 OUTLIER: Final = 40.0
-"""Squared distance of a pose in standard deviations beyond which it contradicts the others: one
-in two million of those that do not, with six degrees of freedom."""
+"""Squared Mahalanobis distance of a rejected pose. With six degrees of freedom, one in two million
+correct poses exceeds it."""
 
-MEDIAN_CHI2: Final = 5.348
-"""Median of chi-squared with six degrees of freedom."""
+MEDIAN_CHI2: Final = 5.348  # median of chi-squared with six degrees of freedom
 
 
 @dataclass(frozen=True, eq=False)
 class HandEye:
-    """Where camera and board are."""
+    """Poses of the camera and the board."""
 
-    mount: Mount  # whether the camera is in the `hand` or on the `bench`
-    T_mount_cam: Transform  # where the camera is: T_flange_cam in the hand, T_base_cam on the bench
-    T_other_board: Transform  # where the board is: T_base_board, or T_flange_board
-    # Of a turn of the camera about its own origin and a shift, camera axes (radians, metres).
+    mount: Mount  # `hand` (the camera is on the flange) or `bench`
+    T_mount_cam: Transform  # T_flange_cam, or T_base_cam of a camera on the bench
+    T_other_board: Transform  # T_base_board, or T_flange_board
+    # Of a rotation of the camera about its origin and a shift, camera axes (radians, metres).
     covariance: Float[np.ndarray, "6 6"]
-    # How far every pose is turned from where the others expect it, radians.
-    turns: Float[np.ndarray, "poses"]
-    shifts: Float[np.ndarray, "poses"]  # how far it is shifted, metres
-    inliers: Bool[np.ndarray, "poses"]  # which poses were used
-    # The robot's own deviation that these show, radians and metres.
-    robot_noise: tuple[float, float]
+    turns: Float[np.ndarray, "poses"]  # rotation error of every pose, radians
+    shifts: Float[np.ndarray, "poses"]  # translation error, metres
+    inliers: Bool[np.ndarray, "poses"]  # poses that were not rejected
+    robot_noise: tuple[float, float]  # estimated error of the robot, radians and metres
 
 
 def check_mount(mount: str) -> Mount:
-    """Return where a camera may be; anything else is a :class:`UserError`."""
-    if mount == "hand":
-        return "hand"
-    if mount == "bench":
-        return "bench"
-    raise UserError(f"--mount {mount}", "hand or bench", "say where the camera is")
+    """Return a valid mount, or raise :class:`UserError`."""
+    if mount not in ("hand", "bench"):
+        raise UserError(f"--mount {mount}", "hand or bench", "choose the mount of the camera")
+    return cast("Mount", mount)
 
 
 def calibrate_hand_eye(
     T_base_flange: Transforms, boards: Sequence[BoardPose], mount: Mount
 ) -> HandEye:
-    """Find where the camera is from poses of the robot and of the board, pair by pair.
+    """Estimate the camera's pose from poses of the flange and of the board in its pictures.
 
     Raises:
-        UserError: There are fewer than three pairs, or the robot turned about one direction only.
+        UserError: There are fewer than three poses.
     """
     if len(boards) < MIN_POSES:
         raise UserError(
-            f"{len(boards)} poses with the board in sight", f"at least {MIN_POSES}, better 15",
-            "add poses, turned by 30° and more about different axes",
-        )  # fmt: skip
+            f"{len(boards)} poses with a visible board",
+            f"at least {MIN_POSES}, better 15",
+            "add poses, rotated by 30° and more about different axes",
+        )
     M, B, seen = equations(T_base_flange, boards, mount)
     starts = [solve(M, B) for solve in (park, shah)]
-    costs = [np.median(np.linalg.norm(_residuals(M, B, *one), axis=1)) for one in starts]
+    costs = [np.median(np.linalg.norm(_residuals(M, B, *start), axis=1)) for start in starts]
     X, Y = starts[int(np.argmin(costs))]
     inliers = np.ones(len(M), bool)
     robot = np.array(ROBOT_NOISE)
     for _ in range(4):
         X, Y, covariance = refined(M[inliers], B[inliers], seen[inliers], X, Y, robot)
-        robot = _robot_noise(_residuals(M, B, X, Y)[inliers], seen[inliers], robot)
+        robot = _robot_noise(_residuals(M, B, X, Y)[inliers], seen[inliers])
         distances = _distances(M, B, seen, X, Y, robot)
         scale = max(1.0, float(np.median(distances[inliers])) / MEDIAN_CHI2)
         inliers = distances <= OUTLIER * scale
@@ -113,18 +109,18 @@ def equations(
 ) -> tuple[Transforms, Transforms, Covariances]:
     """Return M and B of M_i X B_i = Y, and the covariances of B."""
     M = np.asarray(T_base_flange, np.float64)
-    B = np.stack([one.T_cam_board for one in boards])
-    covariances = np.stack([one.covariance for one in boards])
+    B = np.stack([board.T_cam_board for board in boards])
+    covariances = np.stack([board.covariance for board in boards])
     return (M if mount == "hand" else inverted(M)), B, covariances
 
 
 def park(M: Transforms, B: Transforms) -> tuple[Transform, Transform]:
     """Solve M_i X B_i = Y by pairs: (M_j⁻¹ M_i) X = X (B_j B_i⁻¹) (Park and Martin 1994).
 
-    The turns' vectors α = R_X β are aligned over all pairs, then shifts follow linearly.
+    The rotation vectors α = R_X β are aligned over all pairs. Translations follow linearly.
     """
     P, Q = pairs(M, B)
-    alpha, beta = (Rotation.from_matrix(one[:, :3, :3]).as_rotvec() for one in (P, Q))
+    alpha, beta = (Rotation.from_matrix(T[:, :3, :3]).as_rotvec() for T in (P, Q))
     R = nearest_rotation(alpha.T @ beta)
     system = (P[:, :3, :3] - np.eye(3)).reshape(-1, 3)
     target = (Q[:, :3, 3] @ R.T - P[:, :3, 3]).ravel()
@@ -138,14 +134,14 @@ def shah(M: Transforms, B: Transforms) -> tuple[Transform, Transform]:
     """Solve M_i X = Y B_i⁻¹ for X and Y at once (Shah 2013).
 
     vec(R_Y) = (R_C ⊗ R_M) vec(R_X) with C = B⁻¹, so both rotations are the leading singular
-    vectors of the sum over all poses; shifts follow linearly.
+    vectors of the sum over all poses. Translations follow linearly.
     """
     C = inverted(B)
     kronecker = np.einsum("nij,nkl->ikjl", C[:, :3, :3], M[:, :3, :3]).reshape(9, 9)
     left, _, right = np.linalg.svd(kronecker)
-    vectors = (one.reshape(3, 3).T for one in (left[:, 0], right[0]))  # known up to their signs
-    R_Y, R_X = (nearest_rotation(np.sign(np.linalg.det(one)) * one) for one in vectors)
-    system = np.concatenate([np.hstack([one[:3, :3], -np.eye(3)]) for one in M])
+    matrices = (vector.reshape(3, 3).T for vector in (left[:, 0], right[0]))  # up to their signs
+    R_Y, R_X = (nearest_rotation(np.sign(np.linalg.det(R)) * R) for R in matrices)
+    system = np.concatenate([np.hstack([T[:3, :3], -np.eye(3)]) for T in M])
     target = (C[:, :3, 3] @ R_Y.T - M[:, :3, 3]).ravel()
     shifts = np.linalg.lstsq(system, target, rcond=None)[0]
     return make_transform(R_X, shifts[:3]), make_transform(R_Y, shifts[3:])
@@ -160,10 +156,18 @@ def pairs(M: Transforms, B: Transforms) -> tuple[Transforms, Transforms]:
 def refined(
     M: Transforms, B: Transforms, seen: Covariances, X: Transform, Y: Transform, robot: Noise
 ) -> tuple[Transform, Transform, Float[np.ndarray, "6 6"]]:
-    """Return X and Y of robust least squares, and the covariance of X (:class:`HandEye`).
+    """Refine X and Y by robust least squares.
 
-    X and Y are starts, ``seen`` the covariances of B, ``robot`` the deviations of the robot's turn
-    (radians) and shift (metres).
+    Args:
+        M: Transforms of the robot, as in :func:`equations`.
+        B: Transforms of the board.
+        seen: Covariances of B.
+        X: Initial pose of the camera.
+        Y: Initial pose of the board.
+        robot: Standard deviations of the robot's rotation (radians) and position (metres).
+
+    Returns:
+        X, Y, and the covariance of X (see :class:`HandEye`).
     """
     whitening = np.linalg.inv(np.linalg.cholesky(_covariances(M, X, Y, seen, robot)))
 
@@ -172,16 +176,16 @@ def refined(
         return np.asarray((whitening @ _residuals(M, B, *moved)[..., None]).ravel())
 
     scale = np.tile(np.repeat([1e-3, 1e-3], 3), 2)
-    found = least_squares(residuals, np.zeros(12), x_scale=scale, loss="soft_l1", f_scale=3.0)
-    moved = displaced(np.stack([X, Y]), found.x.reshape(2, 6))
-    jacobian = np.asarray(found.jac)
+    solution = least_squares(residuals, np.zeros(12), x_scale=scale, loss="soft_l1", f_scale=3.0)
+    X, Y = displaced(np.stack([X, Y]), solution.x.reshape(2, 6))
+    jacobian = np.asarray(solution.jac)
     covariance = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14)[:6, :6]
-    turn = np.kron(np.eye(2), moved[0][:3, :3])  # to the camera's own axes
-    return moved[0], moved[1], turn.T @ covariance @ turn
+    to_cam = np.kron(np.eye(2), X[:3, :3])
+    return X, Y, to_cam.T @ covariance @ to_cam
 
 
 def _residuals(M: Transforms, B: Transforms, X: Transform, Y: Transform) -> Residuals:
-    """Return how the seen board is turned (about its origin) and shifted, camera axes."""
+    """Return rotation (about the board's origin) and translation errors, camera axes."""
     expected = invert_transform(X) @ inverted(M) @ Y
     turn = Rotation.from_matrix(B[:, :3, :3] @ expected[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
     return np.concatenate([turn, B[:, :3, 3] - expected[:, :3, 3]], axis=1)
@@ -190,43 +194,31 @@ def _residuals(M: Transforms, B: Transforms, X: Transform, Y: Transform) -> Resi
 def _covariances(
     M: Transforms, X: Transform, Y: Transform, seen: Covariances, robot: Noise
 ) -> Covariances:
-    """Return the covariances of the residuals: what pictures tell and what the robot adds."""
-    return np.asarray(seen + _robot_part(M, X, Y) @ np.diag(np.repeat(robot**2, 3)) @
-                      _robot_part(M, X, Y).transpose(0, 2, 1))  # fmt: skip
-
-
-def _robot_part(M: Transforms, X: Transform, Y: Transform) -> Covariances:
-    """Return how a small turn and shift of the robot's pose moves the board, camera axes.
-
-    The turn is about the origin of the frame that the camera is mounted on.
-    """
+    """Return the covariances of the residuals: those of the pictures plus the robot's."""
+    # A small rotation (about the origin of the camera's mount) and shift of the robot's pose move
+    # the board by this Jacobian, camera axes.
     to_cam = X[:3, :3].T
-    board = (inverted(M) @ Y)[:, :3, 3]  # in the frame of the mount
-    part = np.zeros((len(M), 6, 6))
-    part[:, :3, :3] = part[:, 3:, 3:] = to_cam
-    part[:, 3:, :3] = -to_cam @ _cross(board)
-    return part
+    jacobian = np.zeros((len(M), 6, 6))
+    jacobian[:, :3, :3] = jacobian[:, 3:, 3:] = to_cam
+    jacobian[:, 3:, :3] = -to_cam @ _cross((inverted(M) @ Y)[:, :3, 3])
+    variances = np.diag(np.repeat(robot**2, 3))
+    return np.asarray(seen + jacobian @ variances @ jacobian.transpose(0, 2, 1))
 
 
-def _robot_noise(residuals: Residuals, seen: Covariances, robot: Noise) -> Noise:
-    """Return the robot's deviations (radians, metres) that residuals show beyond the pictures'.
+def _robot_noise(residuals: Residuals, seen: Covariances) -> Noise:
+    """Estimate the robot's standard deviations (radians, metres) from residuals.
 
-    Robust: by medians. A robot is taken to be no better than a fifth of :data:`ROBOT_NOISE`.
+    Medians make the estimate robust. Its minimum is a fifth of :data:`ROBOT_NOISE`.
     """
-    variances = np.diagonal(seen, axis1=1, axis2=2)
-    beyond = np.array(
-        [
-            np.median(residuals[:, k : k + 3] ** 2 - 0.455 * variances[:, k : k + 3]) / 0.455
-            for k in (0, 3)
-        ]
-    )
-    return np.asarray(np.sqrt(np.maximum(beyond, (0.2 * np.array(ROBOT_NOISE)) ** 2)))
+    excess = residuals**2 - 0.455 * np.diagonal(seen, axis1=1, axis2=2)
+    variances = np.array([np.median(excess[:, k : k + 3]) / 0.455 for k in (0, 3)])
+    return np.asarray(np.sqrt(np.maximum(variances, (0.2 * np.array(ROBOT_NOISE)) ** 2)))
 
 
 def _distances(
     M: Transforms, B: Transforms, seen: Covariances, X: Transform, Y: Transform, robot: Noise
 ) -> Float[np.ndarray, "poses"]:
-    """Return every pose's squared distance from what is expected, standard deviations."""
+    """Return every pose's squared Mahalanobis distance from its expected pose."""
     residuals = _residuals(M, B, X, Y)
     whole = np.linalg.solve(_covariances(M, X, Y, seen, robot), residuals[..., None])[..., 0]
     return np.asarray((residuals * whole).sum(axis=1))
@@ -234,11 +226,11 @@ def _distances(
 
 def inverted(T: Transforms) -> Transforms:
     """Return the inverse of every rigid transform."""
-    turned = T[:, :3, :3].transpose(0, 2, 1)
-    back = np.tile(np.eye(4), (len(T), 1, 1))
-    back[:, :3, :3] = turned
-    back[:, :3, 3] = -(turned @ T[:, :3, 3:])[..., 0]
-    return back
+    R = T[:, :3, :3].transpose(0, 2, 1)
+    inverse = np.tile(np.eye(4), (len(T), 1, 1))
+    inverse[:, :3, :3] = R
+    inverse[:, :3, 3] = -(R @ T[:, :3, 3:])[..., 0]
+    return inverse
 
 
 def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
@@ -248,7 +240,7 @@ def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3
 
 
 def _cross(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
-    """Return the matrices that take the cross product with every vector."""
+    """Return the cross-product matrix of every vector."""
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     return np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)

@@ -1,11 +1,11 @@
-"""A camera's lens from pictures of a board (Zhang 2000, by OpenCV), and whether to trust it."""
+"""Camera calibration from pictures of a board (Zhang 2000, by OpenCV), and its quality."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,46 +14,48 @@ from jaxtyping import Bool, Float
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import check_target, write_whole
+from dopepp.drawing.pictures import Size
 from dopepp.geometry.camera_file import Camera
 from dopepp.robot.calibration.board import MIN_POINTS, Sighting
 
-Size = tuple[int, int]
-
-MIN_VIEWS: Final = 6  # of a trustworthy calibration; three would give a K
-CELLS: Final = (8, 6)  # of a picture, columns and rows, in which points are counted
+MIN_VIEWS: Final = 6  # of a trustworthy calibration; three views determine K
+CELLS: Final = (8, 6)  # columns and rows of the grid that measures the coverage
 MIN_COVERAGE: Final = 0.5
 MIN_TILT: Final = 0.2
-"""Standard deviation of the boards' normals: about 12°, from which on focal length and distance
-are told from each other."""
+"""Standard deviation of the boards' normals, about 12°. Smaller tilts do not separate the focal
+length from the distance."""
 
 MAX_ERROR_PX: Final = 1.0
-OUTLIER: Final = 3.0  # times the median view's error, from which on a view is left out
+OUTLIER: Final = 3.0  # error of a rejected view, as a multiple of the median view's
 LEAST_OUTLIER_PX: Final = 0.5
 
-APART: Final = 0.04
-"""Mean shift of a board's points between two views that differ, share of the picture's width."""
+MIN_SHIFT: Final = 0.04
+"""Mean shift of the points between two distinct views, as a share of the picture's width."""
 
 MAX_VIEWS: Final = 60
-LOOKS_PER_S: Final = 5.0  # how often a video is looked at
+CHECKS_PER_S: Final = 5.0  # frames of a video in which the board is searched, per second
 
 
 class Views:
-    """Keeps the views that differ; of those that do not, the one in which the board moved least.
+    """Keeps distinct views of a board, and of similar views the one with the least motion.
 
-    So a video is worth its pauses: what is blurred by motion gives way to what is not.
+    In a video, sharp pauses thus replace frames with motion blur.
+
+    Args:
+        width: Width of the pictures, pixels.
     """
 
     def __init__(self, width: int) -> None:
         self.kept: list[Sighting] = []
-        self._limit = APART * width
+        self._limit = MIN_SHIFT * width
         self._motions: list[float] = []
         self._last: Sighting | None = None
 
     def offer(self, sighting: Sighting) -> bool:
-        """Take the next sighting; tell whether it is a new view."""
+        """Add the next sighting; return whether it is a new view."""
         motion = np.inf if self._last is None else _shift(self._last, sighting)
         self._last = sighting
-        shifts = [_shift(one, sighting) for one in self.kept]
+        shifts = [_shift(view, sighting) for view in self.kept]
         nearest = int(np.argmin(shifts)) if shifts else 0
         if not shifts or shifts[nearest] > self._limit:
             self.kept.append(sighting)
@@ -65,40 +67,45 @@ class Views:
 
     @property
     def is_full(self) -> bool:
-        """Whether more views would cost time only."""
+        """Whether more views would only cost time."""
         return len(self.kept) >= MAX_VIEWS
 
 
-def _shift(one: Sighting, other: Sighting) -> float:
-    """Return the mean distance between the points that both show, pixels; infinite if too few."""
-    same = (one.points[:, None] == other.points[None]).all(axis=2)
-    first, second = np.nonzero(same)
-    if len(first) < MIN_POINTS:
+def _shift(first: Sighting, second: Sighting) -> float:
+    """Return the mean distance between common points, pixels; infinite for too few points."""
+    is_same = (first.points[:, None] == second.points[None]).all(axis=2)
+    rows, columns = np.nonzero(is_same)
+    if len(rows) < MIN_POINTS:
         return np.inf
-    return float(np.linalg.norm(one.pixels[first] - other.pixels[second], axis=1).mean())
+    return float(np.linalg.norm(first.pixels[rows] - second.pixels[columns], axis=1).mean())
 
 
 @dataclass(frozen=True, eq=False)
 class LensCalibration:
-    """A lens and what it was made of."""
+    """A calibrated camera and its quality."""
 
-    camera: Camera  # the calibrated camera
-    error_px: float  # RMS reprojection error over all views kept, pixels
-    names: tuple[str, ...]  # of the views
-    errors_px: Float[np.ndarray, "views"]  # the RMS reprojection error of each, pixels
-    # Names of views that were left out, since they are far worse than the others.
-    outliers: tuple[str, ...]
-    coverage: float  # share of the picture's cells (8×6) in which points were seen
-    covered: Bool[np.ndarray, "rows columns"]  # which cells these are
+    camera: Camera
+    error_px: float  # RMS reprojection error over all used views, pixels
+    names: tuple[str, ...]  # of the used views
+    errors_px: Float[np.ndarray, "views"]  # their RMS reprojection errors, pixels
+    outliers: tuple[str, ...]  # names of views that were rejected for their large errors
+    coverage: float  # share of the picture's cells (8×6) with points
+    covered: Bool[np.ndarray, "rows columns"]  # these cells
     deviations: Float[np.ndarray, "4"]  # standard deviations of fx, fy, cx, cy, pixels
-    findings: tuple[str, ...]  # why it is not to be trusted, and what to do; empty where it is
+    findings: tuple[str, ...]  # reasons not to trust the calibration, with remedies
 
 
 def calibrate_lens(sightings: Sequence[Sighting], size: Size) -> LensCalibration:
-    """Calibrate a camera from views of a board in pictures of (width, height).
+    """Calibrate a camera from views of a board.
 
-    Views that are far worse than the others are left out, once. A :class:`UserError`: there are
-    fewer than three views, or nothing comes out of them.
+    Views with far larger errors than the others are rejected, once.
+
+    Args:
+        sightings: The board's points in the pictures.
+        size: Width and height of the pictures, pixels.
+
+    Raises:
+        UserError: There are fewer than three views, or they determine no camera.
     """
     if len(sightings) < 3:
         raise UserError(
@@ -106,41 +113,48 @@ def calibrate_lens(sightings: Sequence[Sighting], size: Size) -> LensCalibration
             f"at least 3, better {MIN_VIEWS} or more",
             "take further ones, tilted by 20 to 40° in all directions and out to the corners",
         )
-    kept, outliers = list(sightings), []
-    lens = _solved(kept, size)
-    limit = max(LEAST_OUTLIER_PX, OUTLIER * float(np.median(lens[4])))
-    bad = lens[4] > limit
-    if bad.any() and (~bad).sum() >= 3:
-        outliers = [one.name for one, out in zip(kept, bad, strict=True) if out]
-        kept = [one for one, out in zip(kept, bad, strict=True) if not out]
-        lens = _solved(kept, size)
-    error, K, distortion, deviations, errors, tilt = lens
-    covered = _covered(kept, size)
-    camera = Camera(size, K, tuple(distortion.tolist()), "calibration")
+    views = list(sightings)
+    lens = _solve(views, size)
+    limit = max(LEAST_OUTLIER_PX, OUTLIER * float(np.median(lens.errors_px)))
+    is_kept = lens.errors_px <= limit
+    outliers: list[str] = []
+    if not is_kept.all() and is_kept.sum() >= 3:
+        outliers = [view.name for view, keep in zip(views, is_kept, strict=True) if not keep]
+        views = [view for view, keep in zip(views, is_kept, strict=True) if keep]
+        lens = _solve(views, size)
+    pixels = np.concatenate([view.pixels for view in views])
+    columns, rows = (
+        np.linspace(-0.5, side - 0.5, count + 1) for side, count in zip(size, CELLS, strict=True)
+    )
+    covered = np.histogram2d(pixels[:, 1], pixels[:, 0], bins=(rows, columns))[0] > 0
     coverage = float(covered.mean())
-    findings = _findings(len(kept), coverage, tilt, error)
-    names = tuple(one.name for one in kept)
     return LensCalibration(
-        camera, error, names, errors, tuple(outliers), coverage, covered, deviations, findings
+        Camera(size, lens.K, tuple(lens.distortion.tolist()), "calibration"),
+        lens.error_px,
+        tuple(view.name for view in views),
+        lens.errors_px,
+        tuple(outliers),
+        coverage,
+        covered,
+        lens.deviations,
+        _findings(len(views), coverage, lens.tilt, lens.error_px),
     )
 
 
-def write_camera(path: Path, camera: Camera, trusted: bool = True, name: str = "camera") -> None:
+def write_camera(path: Path, camera: Camera, trusted: bool = True) -> None:
     """Write a camera as ROS's ``camera_info`` YAML, which every ``--camera`` reads."""
     check_target(path, (".yaml", ".yml"))
     assert camera.size is not None
-    K = camera.K
-    P = np.hstack([K, np.zeros((3, 1))])
     lens = list(camera.distortion)
     content = {
         "image_width": camera.size[0],
         "image_height": camera.size[1],
-        "camera_name": name,
-        "camera_matrix": _matrix(K),
+        "camera_name": "camera",
+        "camera_matrix": _matrix(camera.K),
         "distortion_model": "rational_polynomial" if len(lens) > 5 else "plumb_bob",
         "distortion_coefficients": _matrix(np.array([lens or [0.0] * 5])),
         "rectification_matrix": _matrix(np.eye(3)),
-        "projection_matrix": _matrix(P),
+        "projection_matrix": _matrix(np.hstack([camera.K, np.zeros((3, 1))])),
     }
     remark = "" if trusted else "# NOT TRUSTED: written with --force; see the report\n"
     text = remark + yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
@@ -149,57 +163,44 @@ def write_camera(path: Path, camera: Camera, trusted: bool = True, name: str = "
 
 def _matrix(values: Float[np.ndarray, "rows columns"]) -> dict[str, object]:
     rows, columns = values.shape
-    return {"rows": rows, "cols": columns, "data": [float(one) for one in values.ravel()]}
+    return {"rows": rows, "cols": columns, "data": np.float64(values).ravel().tolist()}
 
 
-def _solved(
-    views: Sequence[Sighting], size: Size
-) -> tuple[float, Float[np.ndarray, "3 3"], Float[np.ndarray, "5"], Float[np.ndarray, "4"],
-           Float[np.ndarray, "views"], float]:  # fmt: skip
-    """Return error, K, distortion, deviations of K, error of each view, and how tilts vary."""
-    points = [one.points.astype(np.float32) for one in views]
-    pixels = [one.pixels.astype(np.float32) for one in views]
+class _Solution(NamedTuple):
+    error_px: float
+    K: Float[np.ndarray, "3 3"]
+    distortion: Float[np.ndarray, "5"]
+    deviations: Float[np.ndarray, "4"]  # of fx, fy, cx, cy
+    errors_px: Float[np.ndarray, "views"]
+    tilt: float  # standard deviation of the boards' normals
+
+
+def _solve(views: Sequence[Sighting], size: Size) -> _Solution:
+    points = [view.points.astype(np.float32) for view in views]
+    pixels = [view.pixels.astype(np.float32) for view in views]
     try:
         error, K, lens, turns, _, deviations, _, errors = cv2.calibrateCameraExtended(
             points, pixels, size, None, None
         )
     except cv2.error as reason:
-        raise UserError(
-            f"{len(views)} views of the board, from which no camera follows ({reason.err})",
-            "views tilted by 20 to 40° in several directions", "take further ones",
-        ) from reason  # fmt: skip
+        problem = f"{len(views)} views of the board that determine no camera ({reason.err})"
+        allowed = "views tilted by 20 to 40° in several directions"
+        raise UserError(problem, allowed, "take further ones") from reason
     normals = np.array([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
     tilt = float(np.linalg.norm(normals[:, :2].std(axis=0)))
-    return (
-        float(error), np.asarray(K), np.ravel(lens)[:5], np.ravel(deviations)[:4],
-        np.ravel(errors), tilt,
-    )  # fmt: skip
+    distortion, deviations = np.ravel(lens)[:5], np.ravel(deviations)[:4]
+    return _Solution(float(error), np.asarray(K), distortion, deviations, np.ravel(errors), tilt)
 
 
-def _covered(views: Sequence[Sighting], size: Size) -> Bool[np.ndarray, "rows columns"]:
-    pixels = np.concatenate([one.pixels for one in views])
-    edges = [np.linspace(-0.5, side - 0.5, count + 1) for side, count in zip(size, CELLS)]  # noqa: B905
-    counts, _, _ = np.histogram2d(pixels[:, 1], pixels[:, 0], bins=(edges[1], edges[0]))
-    return np.asarray(counts > 0)
-
-
-def _findings(views: int, coverage: float, tilt: float, error: float) -> tuple[str, ...]:
-    """Return why a calibration is not to be trusted."""
-    found = []
-    if views < MIN_VIEWS:
-        found.append(f"only {views} views: take at least {MIN_VIEWS}")
-    if coverage < MIN_COVERAGE:
-        found.append(
-            f"points cover {coverage:.0%} of the picture: bring the board to its borders and "
-            "corners, from near as well"
-        )
-    if tilt < MIN_TILT:
-        found.append(
-            "the board was held almost parallel in all views, which leaves the focal length open: "
-            "tilt it by 20 to 40° to the left, right, up and down"
-        )
-    if error > MAX_ERROR_PX:
-        found.append(
-            f"points are {error:.2f} px off: is the board flat, of the stated size, in focus?"
-        )
-    return tuple(found)
+def _findings(num_views: int, coverage: float, tilt: float, error_px: float) -> tuple[str, ...]:
+    """Return reasons not to trust a calibration."""
+    findings = {
+        f"only {num_views} views: take at least {MIN_VIEWS}": num_views < MIN_VIEWS,
+        f"points cover {coverage:.0%} of the picture: move the board to its borders and corners, "
+        "also close to the camera": coverage < MIN_COVERAGE,
+        "the board is almost parallel in all views, which leaves the focal length uncertain: "
+        "tilt it by 20 to 40° to the left, right, up and down": tilt < MIN_TILT,
+        f"the reprojection error is {error_px:.2f} px: check that the board is flat, in focus and "
+        "of the stated size": error_px > MAX_ERROR_PX,
+    }
+    return tuple(text for text, applies in findings.items() if applies)

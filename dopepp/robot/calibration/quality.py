@@ -1,7 +1,7 @@
-"""Whether to trust robot poses before a hand-eye calibration, and what the calibration is worth.
+"""Checks of robot poses before a hand-eye calibration, and the quality of its result.
 
-A motion turns robot and camera by the same angle, whatever the mounting is; so every way to read
-the file can be held against the pictures, before anything is calibrated.
+A motion rotates robot and camera by the same angle, wherever the camera is mounted. The pictures
+can therefore be compared with every possible reading of the file before the calibration.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from dopepp.core.errors import UserError
 from dopepp.geometry.rotation import Vector
 from dopepp.robot.calibration.board import BoardPose, Transforms
-from dopepp.robot.calibration.files import UNITS, Reading, RobotPoses
 from dopepp.robot.calibration.hand_eye import (
     HandEye,
     Mount,
@@ -27,184 +26,189 @@ from dopepp.robot.calibration.hand_eye import (
     pairs,
     refined,
 )
-from dopepp.robot.calibration.tool import named
+from dopepp.robot.calibration.records import UNITS, PoseFormat, RobotPoses
+from dopepp.robot.calibration.tool import axis_name
 
 MIN_TURN: Final = np.radians(5.0)  # between the two poses that are farthest from each other
-TURN: Final = np.radians(1.5)  # median disagreement of pairs' turns below which a reading is right
-SHIFT: Final = 0.01  # the same of shifts, metres
+TURN: Final = np.radians(1.5)  # largest median disagreement of rotations of a correct reading
+SHIFT: Final = 0.01  # the same of translations, metres
 MOUNTS: Final[tuple[Mount, Mount]] = ("hand", "bench")
-SCALE: Final = 1.03  # factor between robot's and camera's lengths that is none
+SCALE: Final = 1.03  # largest negligible factor between robot's and camera's lengths
 MIN_POSES: Final = 8
 
 MIN_DIVERSITY: Final = np.radians(15.0)
-"""Of turns about the second most common axis, RMS over pairs."""
+"""Of rotations about the second most common axis, RMS over pairs."""
 
 MAX_ERROR: Final = 0.003  # of a part at the board's distance, metres, one standard deviation
 MAX_TURN: Final = np.radians(0.5)
-MIN_USED: Final = 0.7  # share of the poses that agree with each other
+MIN_USED: Final = 0.7  # share of poses that agree with each other
 
 
 @dataclass(frozen=True)
 class Consistency:
-    """How well motions of robot and board agree.
+    """Agreement between the motions of robot and board."""
 
-    ``turn`` (radians) and ``shift`` (metres) are medians over pairs; ``scale`` is the factor that
-    the robot's lengths have to take.
-    """
-
-    turn: float
-    shift: float
-    scale: float
+    turn: float  # median rotation error over pairs, radians
+    shift: float  # median translation error, metres
+    scale: float  # factor that corrects the robot's lengths
 
     @property
     def is_rigid(self) -> bool:
-        """Whether one mounting explains all motions, but for the lengths' unit."""
+        """Whether one mount explains all motions, apart from the unit of lengths."""
         return self.turn < TURN and self.shift < SHIFT
 
     @property
     def is_right(self) -> bool:
-        """Whether one mounting explains all motions."""
+        """Whether one mount explains all motions."""
         return self.is_rigid and 1 / SCALE < self.scale < SCALE
 
 
-def consistency(M: Transforms, B: Transforms) -> Consistency:
-    """Compare the motions of robot and board; see :mod:`.hand_eye` for M and B."""
-    P, Q = pairs(M, B)
-    alpha, beta = (Rotation.from_matrix(one[:, :3, :3]).as_rotvec() for one in (P, Q))
-    weights = np.minimum(np.linalg.norm(alpha, axis=1), np.linalg.norm(beta, axis=1)) < 3.0
-    if weights.sum() < 3:
-        weights[:] = True
-    alpha, beta, P, Q = alpha[weights], beta[weights], P[weights], Q[weights]
+def consistency(T_base_flange: Transforms, B: Transforms, mount: Mount) -> Consistency:
+    """Compare the motions of robot and board; B is as in :func:`.hand_eye.equations`."""
+    P, Q = pairs(T_base_flange if mount == "hand" else inverted(T_base_flange), B)
+    alpha, beta = (Rotation.from_matrix(T[:, :3, :3]).as_rotvec() for T in (P, Q))
+    used = np.minimum(np.linalg.norm(alpha, axis=1), np.linalg.norm(beta, axis=1)) < 3.0
+    if used.sum() < 3:
+        used[:] = True
+    alpha, beta, P, Q = alpha[used], beta[used], P[used], Q[used]
     R = nearest_rotation(alpha.T @ beta)
-    for _ in range(5):  # robust: far pairs count less
-        error = np.linalg.norm(alpha - beta @ R.T, axis=1)
-        weight = 1 / (1 + (error / max(np.median(error), 1e-6)) ** 2)
-        R = nearest_rotation((weight[:, None] * alpha).T @ beta)
+    for _ in range(5):
+        weights = _robust_weights(np.linalg.norm(alpha - beta @ R.T, axis=1))
+        R = nearest_rotation((weights[:, None] * alpha).T @ beta)
     turn = float(np.median(np.linalg.norm(alpha - beta @ R.T, axis=1)))
     system = np.concatenate([P[:, :3, :3] - np.eye(3), P[:, :3, 3:]], axis=2)
     target = Q[:, :3, 3] @ R.T
-    weight = np.ones(len(P))
+    weights = np.ones(len(P))
     for _ in range(8):
-        root = np.sqrt(weight)[:, None]
-        solution = np.linalg.lstsq(
-            (system * root[..., None]).reshape(-1, 4), (target * root).ravel(), rcond=None
-        )[0]
-        error = np.linalg.norm(system @ solution - target, axis=1)
-        weight = 1 / (1 + (error / max(np.median(error), 1e-6)) ** 2)
-    return Consistency(turn, float(np.median(error)), float(solution[3]))
+        root = np.sqrt(weights)[:, None]
+        weighted = (system * root[..., None]).reshape(-1, 4)
+        solution = np.linalg.lstsq(weighted, (target * root).ravel(), rcond=None)[0]
+        errors = np.linalg.norm(system @ solution - target, axis=1)
+        weights = _robust_weights(errors)
+    return Consistency(turn, float(np.median(errors)), float(solution[3]))
+
+
+def _robust_weights(errors: Float[np.ndarray, "pairs"]) -> Float[np.ndarray, "pairs"]:
+    """Return smaller weights for errors above the median."""
+    return np.asarray(1 / (1 + (errors / max(np.median(errors), 1e-6)) ** 2))
 
 
 def check_poses(
     poses: RobotPoses,
     chosen: Sequence[int],
-    reading: Reading,
+    pose_format: PoseFormat,
     boards: Sequence[BoardPose],
     mount: Mount,
 ) -> Transforms:
-    """Return T_base_flange of the chosen poses, one a board, if they can be what they are said.
+    """Check robot poses against the board's poses.
+
+    Args:
+        poses: The robot's poses.
+        chosen: Index of the pose that belongs to each board.
+        pose_format: Conventions of the robot's poses.
+        boards: The board's poses in the pictures.
+        mount: Mount of the camera.
+
+    Returns:
+        T_base_flange of the chosen poses.
 
     Raises:
-        UserError: The robot or the board did not move; or poses and pictures contradict each
-            other, with the reading of the file that would be right where there is one.
+        UserError: The robot or the board did not move, or poses and pictures contradict each other.
+            The message names the conventions that would be right, if there are any.
     """
-    B = np.stack([one.T_cam_board for one in boards])
-    own = poses.transforms(reading)[list(chosen)]
-    _check_motion(B, "board, as the camera sees it,", poses.source)
-    found = _consistency(own, B, mount)
-    if found.is_right:
-        return own
-    if found.is_rigid:
-        raise UserError(*_scaled(found.scale, reading.unit, poses.source))
-    for other, words in _readings(poses, reading):
-        for seat in MOUNTS if mount == "hand" else MOUNTS[::-1]:
-            one = _consistency(poses.transforms(other)[list(chosen)], B, seat)
-            if one.is_rigid and abs(one.scale) > 1e-6:
-                raise _other(poses.source, words, seat == mount, one.scale, other.unit)
-    _check_motion(own, "robot", poses.source)
+    B = np.stack([board.T_cam_board for board in boards])
+    flanges = poses.transforms(pose_format)[list(chosen)]
+    _check_motion(B, "board, seen by the camera,", poses.source)
+    agreement = consistency(flanges, B, mount)
+    if agreement.is_right:
+        return flanges
+    if agreement.is_rigid:
+        raise _scale_error(agreement.scale, pose_format.unit, poses.source)
+    for other, advice in _other_formats(poses, pose_format):
+        for other_mount in MOUNTS if mount == "hand" else MOUNTS[::-1]:
+            fit = consistency(poses.transforms(other)[list(chosen)], B, other_mount)
+            if fit.is_rigid and abs(fit.scale) > 1e-6:
+                raise _format_error(poses.source, advice, other_mount == mount, fit.scale, other)
+    _check_motion(flanges, "robot", poses.source)
     if len(chosen) > 5:
-        for step in (1, -1):
-            rows, seen = (own[:-1], B[1:]) if step == 1 else (own[1:], B[:-1])
-            if _consistency(rows, seen, mount).is_right:
-                raise UserError(
-                    f"{poses.source}: poses fit the {'next' if step == 1 else 'last'} picture",
-                    "the pose of every picture beside it", "shift the list by one, or add names",
-                )  # fmt: skip
+        for which, rows, seen in (
+            ("next", flanges[:-1], B[1:]),
+            ("previous", flanges[1:], B[:-1]),
+        ):
+            if consistency(rows, seen, mount).is_right:
+                problem = f"{poses.source}: the poses fit the {which} picture"
+                fix = "shift the list by one, or add names"
+                raise UserError(problem, "the pose of every picture in its place", fix)
     raise UserError(
-        f"{poses.source}: turns of robot and camera differ by {np.degrees(found.turn):.1f}° and "
-        f"{1000 * found.shift:.0f} mm (medians of pairs)",
+        f"{poses.source}: rotations of robot and camera differ by "
+        f"{np.degrees(agreement.turn):.1f}° and {1000 * agreement.shift:.0f} mm (medians of pairs)",
         f"{np.degrees(TURN):g}° and {1000 * SHIFT:g} mm",
         "check that every pose was recorded with its picture, after the robot had come to rest, "
-        "and is the flange's (not a tool's that was changed in between)",
+        "and is the flange's (not that of a tool that was changed in between)",
     )
 
 
 def _check_motion(T: Transforms, what: str, source: str) -> None:
-    """Refuse poses among which nothing turns."""
+    """Refuse poses without rotations between them."""
     i, j = np.triu_indices(len(T), 1)
     between = T[i, :3, :3] @ T[j, :3, :3].transpose(0, 2, 1)
     largest = Rotation.from_matrix(between).magnitude().max(initial=0.0)
     if largest < MIN_TURN:
         raise UserError(
-            f"{source}: the {what} turns by {np.degrees(largest):.1f}° in all {len(T)} poses",
-            "turns of 30° and more about different axes",
+            f"{source}: the {what} rotates by {np.degrees(largest):.1f}° in all {len(T)} poses",
+            "rotations of 30° and more about different axes",
             "record the poses while the robot moves between pictures",
         )
 
 
-def _consistency(T_base_flange: Transforms, B: Transforms, mount: Mount) -> Consistency:
-    return consistency(T_base_flange if mount == "hand" else inverted(T_base_flange), B)
-
-
-def _readings(poses: RobotPoses, reading: Reading) -> Iterator[tuple[Reading, str]]:
-    """Yield other ways to read a file, with their words; the one as it is read first."""
-    yield reading, ""
+def _other_formats(poses: RobotPoses, pose_format: PoseFormat) -> Iterator[tuple[PoseFormat, str]]:
+    """Yield possible conventions of a file with the option that sets them, the given ones first."""
+    yield pose_format, ""
     if poses.kind == "quaternion":
-        last = reading.order == "wxyz"
-        yield (
-            replace(reading, order="xyzw" if last else "wxyz"),
-            f"quaternions with w {'last' if last else 'first'}: --quaternion "
-            f"{'xyzw' if last else 'wxyz'}",
-        )
+        order, position = ("xyzw", "last") if pose_format.order == "wxyz" else ("wxyz", "first")
+        advice = f"quaternions with w {position}: --quaternion {order}"
+        yield replace(pose_format, order=order), advice
     elif poses.kind != "matrix":
-        unit = "rad" if reading.degrees else "deg"
-        yield replace(reading, degrees=not reading.degrees), f"--angles {unit}"
+        unit = "rad" if pose_format.degrees else "deg"
+        yield replace(pose_format, degrees=not pose_format.degrees), f"--angles {unit}"
 
 
-def _other(source: str, words: str, same: bool, scale: float, unit: str) -> UserError:
-    """Return what is wrong where another reading is right."""
-    said = [words] if words else []
-    if not same:
-        said.append(
+def _format_error(
+    source: str, advice: str, same_mount: bool, scale: float, pose_format: PoseFormat
+) -> UserError:
+    """Return the error for poses that fit under other conventions."""
+    changes = [advice] if advice else []
+    if not same_mount:
+        changes.append(
             "poses from base to flange (--direction base-to-flange), or the camera on the other "
-            "side (--mount)"
+            "mount (--mount)"
         )
-    right = _unit(scale, unit)
-    if right is None:
-        said.append(f"lengths that are {scale:.4g} times the robot's")
-    elif right != unit:
-        said.append(f"--unit {right}")
-    got = f"{source}, whose poses contradict the pictures as they are read"
-    return UserError(got, "poses that fit: with " + ", and ".join(said), "pass that")
+    unit = _unit_of(scale, pose_format.unit)
+    if unit is None:
+        changes.append(f"lengths of {scale:.4g} times the robot's")
+    elif unit != pose_format.unit:
+        changes.append(f"--unit {unit}")
+    problem = f"{source}, whose poses contradict the pictures"
+    allowed = f"poses that fit, which would be: {', and '.join(changes)}"
+    return UserError(problem, allowed, "change these options")
 
 
-def _scaled(scale: float, unit: str, source: str) -> tuple[str, str, str]:
-    """Return what is wrong where turns fit and lengths do not."""
-    right = _unit(scale, unit)
+def _scale_error(scale: float, unit: str, source: str) -> UserError:
+    """Return the error for poses whose rotations fit and whose lengths do not."""
+    factor, right = 1 / scale, _unit_of(scale, unit)
     if right is not None:
-        return (
-            f"{source} in {unit}, which makes the robot's ways {1 / scale:.4g} times too long",
-            f"--unit {right}", "pass that",
-        )  # fmt: skip
-    return (
-        f"{source}: the robot's ways are {1 / scale:.3f} times those that the camera sees",
+        problem = f"{source} in {unit}, which makes the robot's motions {factor:.4g} times too long"
+        return UserError(problem, f"--unit {right}", "change the unit")
+    return UserError(
+        f"{source}: the robot's motions are {factor:.3f} times those seen by the camera",
         f"a factor from {1 / SCALE:.2f} to {SCALE:.2f}",
-        f"measure the board's squares: they would be {1 / scale:.3f} times as large as said, or "
+        f"measure the board's squares (they may be {factor:.3f} times as large as stated), or "
         "calibrate the camera again",
     )
 
 
-def _unit(scale: float, unit: str) -> str | None:
-    """Return the unit that a factor on the lengths means."""
+def _unit_of(scale: float, unit: str) -> str | None:
+    """Return the unit that a factor on the lengths implies."""
     for name, metres in UNITS.items():
         if 1 / SCALE < scale * UNITS[unit] / metres < SCALE:
             return name
@@ -212,80 +216,64 @@ def _unit(scale: float, unit: str) -> str | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Explanation:
-    """What a calibration is worth."""
+class CalibrationQuality:
+    """Quality of a hand-eye calibration."""
 
-    # Expected error (one standard deviation) of what is seen at the board's distance, metres.
-    shift: float
-    turn: float  # of its rotation, radians
-    # By how much the camera's place changes without each pose, metres.
-    leave_one_out: Float[np.ndarray, "poses"]
-    diversity: Vector  # RMS turn over pairs of poses about the three main axes, radians, descending
-    weakest: Vector  # axis of the camera's mount along which its place is known least
-    next_pose: str  # what to add, in words
-    findings: tuple[str, ...]  # why it is not to be trusted, and what to do; empty where it is
+    shift: float  # expected error of positions at the board's distance (1 σ), metres
+    turn: float  # expected error of the rotation (1 σ), radians
+    leave_one_out: Float[np.ndarray, "poses"]  # change of the camera without each pose, metres
+    diversity: Vector  # RMS rotation over pairs about the main axes, radians, descending
+    weakest: Vector  # least certain direction of the camera's position, in the mount's frame
+    next_pose: str  # the most useful pose to add
+    findings: tuple[str, ...]  # reasons not to trust the calibration, with remedies
 
 
-def explain(
+def assess(
     T_base_flange: Transforms, boards: Sequence[BoardPose], calibration: HandEye
-) -> Explanation:
-    """Say what a calibration is worth; the arguments are what it was made of."""
-    M, B, _ = equations(T_base_flange, boards, calibration.mount)
+) -> CalibrationQuality:
+    """Assess a hand-eye calibration from its result and its inputs."""
+    M, B, seen = equations(T_base_flange, boards, calibration.mount)
     alpha = Rotation.from_matrix(pairs(M, B)[0][:, :3, :3]).as_rotvec()
     diversity = np.linalg.svd(alpha, compute_uv=False) / np.sqrt(len(alpha))
-    distance = float(np.median([one.distance for one in boards]))
+    distance = float(np.median([board.distance for board in boards]))
     shift, turn = expected_error(calibration.covariance, distance)
-    to_mount = calibration.T_mount_cam[:3, :3]
-    place = to_mount @ calibration.covariance[3:, 3:] @ to_mount.T
-    weakest = np.linalg.eigh(place)[1][:, -1]
+    X, Y, used = calibration.T_mount_cam, calibration.T_other_board, calibration.inliers
+    weakest = np.linalg.eigh(X[:3, :3] @ calibration.covariance[3:, 3:] @ X[:3, :3].T)[1][:, -1]
     mount = "flange" if calibration.mount == "hand" else "base"
-    next_pose = (
-        f"turn the flange by 30° or more about an axis across the {mount}'s {named(weakest)}"
-    )
-    findings = []
-    left_out = [
-        board.name for board, used in zip(boards, calibration.inliers, strict=True) if not used
-    ]
-    num_used = len(boards) - len(left_out)
-    if num_used < MIN_POSES:
-        findings.append(f"only {num_used} poses: take at least {MIN_POSES}, better 15")
-    if num_used < MIN_USED * len(boards):
-        contradicting = f"{len(left_out)} of {len(boards)} poses contradict the others"
-        findings.append(f"{contradicting}: {', '.join(left_out)}")
-    if diversity[1] < MIN_DIVERSITY:
-        findings.append(f"the robot turned about almost one direction only: {next_pose}")
-    if shift > MAX_ERROR or turn > MAX_TURN:
-        findings.append(
-            f"expected error {1000 * shift:.1f} mm and {np.degrees(turn):.2f}° at the board's "
-            f"distance: {next_pose}"
-        )
-    moves = _moves_without(T_base_flange, boards, calibration)
-    return Explanation(shift, turn, moves, diversity, weakest, next_pose, tuple(findings))
+    axis = axis_name(weakest)
+    next_pose = f"rotate the flange by 30° or more about an axis across the {mount}'s {axis}"
+    rejected = [board.name for board, is_used in zip(boards, used, strict=True) if not is_used]
+    num_used = len(boards) - len(rejected)
+    findings = {
+        f"only {num_used} poses: take at least {MIN_POSES}, better 15": num_used < MIN_POSES,
+        f"{len(rejected)} of {len(boards)} poses contradict the others: {', '.join(rejected)}": (
+            num_used < MIN_USED * len(boards)
+        ),
+        f"the robot rotated about almost one direction only: {next_pose}": (
+            diversity[1] < MIN_DIVERSITY
+        ),
+        f"expected error {1000 * shift:.1f} mm and {np.degrees(turn):.2f}° at the board's "
+        f"distance: {next_pose}": shift > MAX_ERROR or turn > MAX_TURN,
+    }
+    changes = np.zeros(len(boards))
+    indices = np.flatnonzero(used)
+    for index in indices.tolist():
+        rest = indices[indices != index]
+        noise = np.array(calibration.robot_noise)
+        without, _, _ = refined(M[rest], B[rest], seen[rest], X, Y, noise)
+        changes[index] = np.linalg.norm(without[:3, 3] - X[:3, 3])
+    reasons = tuple(text for text, applies in findings.items() if applies)
+    return CalibrationQuality(shift, turn, changes, diversity, weakest, next_pose, reasons)
 
 
 def expected_error(covariance: Float[np.ndarray, "6 6"], distance: float) -> tuple[float, float]:
-    """Return the standard deviations of a point's place (metres) and of a turn (radians).
+    """Return the standard deviations of a point's position (metres) and of a rotation (radians).
 
-    The point is ``distance`` metres before the camera; the covariance is :class:`HandEye`'s.
+    Args:
+        covariance: The camera's, as in :class:`HandEye`.
+        distance: Distance of the point in front of the camera, metres.
     """
     across = np.array([[0, distance, 0], [-distance, 0, 0], [0, 0, 0]])
-    carry = np.hstack([across, np.eye(3)])
-    place = carry @ covariance @ carry.T
-    return float(np.sqrt(np.trace(place))), float(np.sqrt(np.trace(covariance[:3, :3])))
-
-
-def _moves_without(
-    T: Transforms, boards: Sequence[BoardPose], calibration: HandEye
-) -> Float[np.ndarray, "poses"]:
-    """Return by how much the camera moves without each pose, metres; 0 for those not used."""
-    moves = np.zeros(len(boards))
-    X, Y = calibration.T_mount_cam, calibration.T_other_board
-    M, B, seen = equations(T, boards, calibration.mount)
-    used = np.flatnonzero(calibration.inliers)
-    for one in used.tolist():
-        rest = used[used != one]
-        without, _, _ = refined(
-            M[rest], B[rest], seen[rest], X, Y, np.array(calibration.robot_noise)
-        )
-        moves[one] = np.linalg.norm(without[:3, 3] - X[:3, 3])
-    return moves
+    jacobian = np.hstack([across, np.eye(3)])
+    position = np.trace(jacobian @ covariance @ jacobian.T)
+    return float(np.sqrt(position)), float(np.sqrt(np.trace(covariance[:3, :3])))

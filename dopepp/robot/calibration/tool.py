@@ -1,4 +1,4 @@
-"""A tool's tip from poses that touch one point (pivot calibration), and a bench's frame."""
+"""Calibration of a tool's tip (pivot calibration) and of a bench's frame."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from dopepp.robot.calibration.hand_eye import nearest_rotation
 MIN_POSES: Final = 4
 
 MAX_AMPLIFICATION: Final = 6.0
-"""From a pose's error to the tip's: about 25° between the farthest poses."""
+"""Largest factor from a pose's error to the tip's: about 25° between the farthest poses."""
 
-MAX_RESIDUAL: Final = 0.002  # metres: more is no point that was touched
+MAX_RESIDUAL: Final = 0.002  # largest plausible residual, metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,78 +28,67 @@ class Tip:
     """A tool's tip."""
 
     position: Vector  # in the flange's frame, metres
-    pivot: Vector  # the point that was touched, in the base's frame, metres
-    residuals: Float[np.ndarray, "poses"]  # how far every pose's tip is from it, metres
+    residuals: Float[np.ndarray, "poses"]  # distance of every pose's tip from the point, metres
     deviations: Vector  # standard deviations of the position along the flange's axes, metres
-    amplification: float  # factor from the poses' errors to the tip's along the axis known least
-    weakest: Vector  # that axis in the flange's frame, a unit vector
-    findings: tuple[str, ...]  # why it is not to be trusted, and what to do; empty where it is
+    findings: tuple[str, ...]  # reasons not to trust the tip, with remedies
 
 
 def find_tip(T_base_flange: Float[np.ndarray, "poses 4 4"]) -> Tip:
-    """Find the tool's tip from poses of the flange in all of which it touches one point.
+    """Estimate the tip p from poses (R_i, t_i) that touch one point q: R_i p + t_i = q.
 
-    R_i p + t_i = q for all i is linear in the tip p and the point q. A :class:`UserError`: there
-    are fewer than four poses.
+    Raises:
+        UserError: There are fewer than four poses.
     """
     poses = np.asarray(T_base_flange, np.float64)
     if len(poses) < MIN_POSES:
-        raise UserError(
-            f"{len(poses)} poses", f"at least {MIN_POSES} that touch one point", "add further ones"
-        )
-    system = np.concatenate([np.hstack([one[:3, :3], -np.eye(3)]) for one in poses])
+        allowed = f"at least {MIN_POSES} that touch one point"
+        raise UserError(f"{len(poses)} poses", allowed, "add poses")
+    system = np.concatenate([np.hstack([pose[:3, :3], -np.eye(3)]) for pose in poses])
     target = -poses[:, :3, 3].ravel()
     solution, _, _, _ = np.linalg.lstsq(system, target, rcond=1e-6)
     residuals = (system @ solution - target).reshape(-1, 3)
     spread = np.sqrt((residuals**2).sum() / max(1, residuals.size - 6))
     covariance = np.linalg.pinv(system.T @ system, rcond=1e-12)[:3, :3]
+    deviations = spread * np.sqrt(np.diag(covariance))
     distances = np.linalg.norm(residuals, axis=1)
-    # What a pose tells of the tip on average, once the point is solved for.
+    # The mean information of a pose about the tip, once the point is eliminated.
     mean = poses[:, :3, :3].mean(axis=0)
     values, axes = np.linalg.eigh(np.eye(3) - mean.T @ mean)
     amplification = float(1 / np.sqrt(values[0])) if values[0] > 1e-9 else np.inf
-    weakest = axes[:, 0]
-    return Tip(
-        solution[:3], solution[3:], distances, spread * np.sqrt(np.diag(covariance)),
-        amplification, weakest, _doubts(amplification, weakest, distances),
-    )  # fmt: skip
-
-
-def _doubts(
-    amplification: float, weakest: Vector, residuals: Float[np.ndarray, "poses"]
-) -> tuple[str, ...]:
-    found = []
+    findings = []
     if amplification > MAX_AMPLIFICATION:
-        found.append(
-            f"the tip is open along the flange's {named(weakest)}: turn the tool by 30° or more "
-            f"about an axis across {named(weakest)} next"
+        axis = axis_name(axes[:, 0])
+        findings.append(
+            f"the tip is uncertain along the flange's {axis}: add poses with the tool rotated by "
+            f"30° or more about an axis across {axis}"
         )
-    worst = int(residuals.argmax())
-    if residuals[worst] > MAX_RESIDUAL:
-        found.append(
-            f"pose {worst + 1} is {1000 * residuals[worst]:.1f} mm off: was the tip on the point, "
-            "and are the poses those of the flange?"
+    worst = int(distances.argmax())
+    if distances[worst] > MAX_RESIDUAL:
+        findings.append(
+            f"pose {worst + 1} is {1000 * distances[worst]:.1f} mm off: check that the tip was on "
+            "the point, and that the poses are those of the flange"
         )
-    return tuple(found)
+    return Tip(solution[:3], distances, deviations, tuple(findings))
 
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """A plane of the robot's cell and a frame on it."""
+    """The plane of a bench with a frame on it."""
 
-    # z away from the plane, towards the robot's side; origin at the first point, x towards the
-    # second.
+    # z points away from the plane, towards the robot. Origin: the first point; x: to the second.
     T_base_bench: Transform
-    # Distance of every point from the plane, metres, above positive.
-    residuals: Float[np.ndarray, "points"]
-    findings: tuple[str, ...]  # why it is not to be trusted, and what to do; empty where it is
+    residuals: Float[np.ndarray, "points"]  # signed distances from the plane, metres
+    findings: tuple[str, ...]  # reasons not to trust the plane, with remedies
 
 
-def find_bench(touched: Float[np.ndarray, "points 3"], up: Vector | None = None) -> Bench:
-    """Find the plane of points that the tip has touched, in the base's frame, metres.
+def find_bench(touched: Float[np.ndarray, "points 3"]) -> Bench:
+    """Fit the bench's plane to touched points.
 
-    ``up`` is a direction that z must not oppose, the base's z where it is left out. A
-    :class:`UserError`: there are fewer than three points, or they lie on a line.
+    Args:
+        touched: Points in the base's frame, metres. The base's z axis resolves the normal's sign.
+
+    Raises:
+        UserError: There are fewer than three points, or they lie on a line.
     """
     points = np.asarray(touched, np.float64)
     if len(points) < 3:
@@ -107,10 +96,9 @@ def find_bench(touched: Float[np.ndarray, "points 3"], up: Vector | None = None)
     centre = points.mean(axis=0)
     values, axes = np.linalg.svd(points - centre, full_matrices=False)[1:]
     if values[1] < 0.1 * values[0]:
-        raise UserError(
-            "points along a line", "points all over the bench", "touch some beside the line"
-        )
-    z = axes[2] if axes[2] @ (np.array([0, 0, 1.0]) if up is None else up) >= 0 else -axes[2]
+        allowed, fix = "points all over the bench", "touch some away from the line"
+        raise UserError("points along a line", allowed, fix)
+    z = axes[2] if axes[2, 2] >= 0 else -axes[2]
     origin = points[0] - (points[0] - centre) @ z * z
     x = points[1] - points[0]
     x = x - x @ z * z
@@ -120,46 +108,55 @@ def find_bench(touched: Float[np.ndarray, "points 3"], up: Vector | None = None)
     worst = int(np.abs(residuals).argmax())
     findings = []
     if len(points) == 3:
-        findings.append("three points lie on every plane: touch two more, as a check")
+        findings.append("three points always lie on a plane: touch two more as a check")
     if abs(residuals[worst]) > MAX_RESIDUAL:
         findings.append(
             f"point {worst + 1} is {1000 * abs(residuals[worst]):.1f} mm off the plane: touch it "
-            "again, or is the bench not flat?"
+            "again, and check that the bench is flat"
         )
     return Bench(make_transform(rotation, origin), residuals, tuple(findings))
 
 
 def bench_of_board(T_base_board: Sequence[Transform], board: Board) -> Bench:
-    """Return the bench under a board that lies on it, from where pictures show the board.
+    """Return the bench under a board that lies on it.
 
-    z points out of the board, towards who sees it; origin and x are the board's. Residuals are how
-    far, along z, the middle of each picture's board is from the mean. A :class:`UserError`: there
-    is no picture.
+    z points out of the board. Origin and x are the board's. A residual is the distance along z of
+    the board's centre in a picture from the mean.
+
+    Args:
+        T_base_board: The board's pose from every picture.
+        board: The board.
+
+    Raises:
+        UserError: There is no pose.
     """
     if not len(T_base_board):
-        raise UserError("no picture with a pose", "one or more", "add the robot's poses of them")
+        fix = "add the robot's poses of the pictures"
+        raise UserError("no picture with a pose", "one or more", fix)
     poses, middle = np.stack(T_base_board), board.points.mean(axis=0)
     R = nearest_rotation(poses[:, :3, :3].sum(axis=0)) @ np.diag([1.0, -1.0, -1.0])
-    seen = poses[:, :3, :3] @ middle + poses[:, :3, 3]
-    away = seen - seen.mean(axis=0)
-    at = seen.mean(axis=0) - R @ (np.array([1.0, -1.0, -1.0]) * middle)
-    worst = int(np.linalg.norm(away, axis=1).argmax())
-    far = float(np.linalg.norm(away[worst]))
+    centres = poses[:, :3, :3] @ middle + poses[:, :3, 3]
+    offsets = centres - centres.mean(axis=0)
+    origin = centres.mean(axis=0) - R @ (np.array([1.0, -1.0, -1.0]) * middle)
+    distances = np.linalg.norm(offsets, axis=1)
+    worst = int(distances.argmax())
     findings = []
     if len(poses) == 1:
-        findings.append("one picture is no check: take two more, from elsewhere if the camera is "
-                        "in the hand")  # fmt: skip
-    if far > MAX_RESIDUAL:
         findings.append(
-            f"picture {worst + 1} shows the board {1000 * far:.1f} mm from where the others do: "
-            "was it moved, or is the hand-eye calibration of another setup?"
+            "a single picture is no check: take two more, from elsewhere if the camera is on the "
+            "flange"
         )
-    return Bench(make_transform(R, at), away @ R[:, 2], tuple(findings))
+    if distances[worst] > MAX_RESIDUAL:
+        findings.append(
+            f"picture {worst + 1} shows the board {1000 * distances[worst]:.1f} mm from its mean "
+            "position: check that it was not moved, and that the hand-eye calibration is current"
+        )
+    return Bench(make_transform(R, origin), offsets @ R[:, 2], tuple(findings))
 
 
-def named(axis: Vector) -> str:
-    """Return an axis in words: the frame's own where it is within 15°, else its direction."""
-    k = int(np.abs(axis).argmax())
-    if abs(axis[k]) > 0.966:
+def axis_name(direction: Vector) -> str:
+    """Return the name of the nearest axis within 15°, otherwise the direction's numbers."""
+    k = int(np.abs(direction).argmax())
+    if abs(direction[k]) > 0.966:
         return "xyz"[k] + " axis"
-    return "direction ({:.2f}, {:.2f}, {:.2f})".format(*axis)
+    return "direction ({:.2f}, {:.2f}, {:.2f})".format(*direction)

@@ -1,14 +1,14 @@
-"""Grasping in simulation: 200 grasps from pictures, as the paper counts them (4.3, Table 9)."""
+"""Simulated grasps by estimated poses, counted as in the paper (4.3, Table 9)."""
 
 import ctypes.util
 import logging
 import os
 import sys
 
-# MuJoCo chooses its OpenGL as it is imported: a window's, or EGL's where there is no display. Where
-# that is missing it could not be imported at all with it, and simulates without any.
+# MuJoCo chooses its OpenGL when it is imported: a window's, or EGL's without a display. Without
+# EGL the import would fail, so rendering is switched off; the simulation works.
 if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"} & {*os.environ}:
     os.environ["MUJOCO_GL"] = "egl" if ctypes.util.find_library("EGL") else "off"
 
-# PyOpenGL, which MuJoCo loads, tells everybody that it would be faster with another package.
+# MuJoCo loads PyOpenGL, which advertises an accelerator package.
 logging.getLogger("OpenGL.acceleratesupport").setLevel(logging.WARNING)

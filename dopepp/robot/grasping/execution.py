@@ -1,9 +1,10 @@
-"""A plan's motion in the simulated world, and what came of it."""
+"""Execution of a plan in the simulation, and its outcome."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any, Final
 
 import mujoco
@@ -13,44 +14,40 @@ from jaxtyping import Float
 from dopepp.robot.grasping.cell import JOINTS, STEP, Cell
 from dopepp.robot.grasping.planner import Gripper, Joints, Path, Plan
 
-SPEED: Final = 1.5  # fastest joint, rad/s, on average over a motion
-CLOSING_S: Final = 0.5
-"""Seconds over which the fingers' command ramps; it ends beyond zero width, so that they press."""
-
-CLOSED: Final = 255.0
-"""The command at which the fingers would meet: on a part of any width they press."""
+SPEED: Final = 1.5  # average speed of the fastest joint over a motion, rad/s
+CLOSING_S: Final = 0.5  # duration of the ramp of the fingers' command, seconds
+CLOSED: Final = 255.0  # command for zero width: the fingers press on a part of any width
 
 PAUSE_S: Final = 0.3
 SHAKE_S: Final = 1.2
 SHAKE_HZ: Final = 3.0
 SHAKE: Final = np.radians([0.0, 0.0, 0.0, 7.0, 7.0, 12.0])
-"""The wrist's swings, radians: about 1 g at the part."""
+"""Amplitudes of the wrist's oscillation, radians: about 1 g at the part."""
 
-HELD_HEIGHT: Final = 0.05  # metres above where it lay at which a part counts as held
-HIT_FORCE: Final = 5.0  # newtons from which on a touch before the fingers close is a collision
-LAG_S: Final = 0.2
-"""Damping over stiffness of the arm's servos: what a command leads by at a joint's speed."""
-
-FRAME_S: Final = 0.04  # seconds from frame to frame of a recording
+HELD_HEIGHT: Final = 0.05  # minimum rise of a part that counts as held, metres
+HIT_FORCE: Final = 5.0  # minimum contact force of a collision before the fingers close, newtons
+LAG_S: Final = 0.2  # damping over stiffness of the servos: time by which a command must lead
+FRAME_S: Final = 0.04  # interval of recorded states, seconds
 
 
 @dataclass
 class Outcome:
-    """What came of a motion."""
+    """Outcome of a motion."""
 
-    held: int | None = None  # number of the thing that was held after lift and shake; None for none
+    held: int | None = None  # number of the thing that was held after lifting and shaking
     collided: bool = False  # whether the robot hit something before its fingers closed
     times: list[float] = field(default_factory=list)  # of the recorded states, seconds
-    # Positions of all joints, as the simulation has them.
-    states: list[Float[np.ndarray, "positions"]] = field(default_factory=list)
+    states: list[Float[np.ndarray, "positions"]] = field(default_factory=list)  # qpos of MuJoCo
 
 
 class Execution:
-    """The arm at work.
+    """Executes a plan.
 
     Args:
-        zero: What the arm's joints are off, radians: it stands there when its controller believes
-            to be at 0.
+        cell: The model.
+        state: The state of the simulation, which is modified.
+        gripper: The gripper's kinematics.
+        zero: True joints of the arm when its controller reads 0, radians.
     """
 
     def __init__(self, cell: Cell, state: Any, gripper: Gripper, zero: Joints) -> None:
@@ -59,18 +56,18 @@ class Execution:
         self.outcome = Outcome()
 
     def stand(self, joints: Joints) -> None:
-        """Set the arm to where its controller reads joints, at rest, with open fingers."""
+        """Place the arm at rest at the joints that its controller reads, with open fingers."""
         state = self._state
         state.qpos[:JOINTS] = state.ctrl[:JOINTS] = joints + self._zero
         state.qvel[: JOINTS + 8] = 0.0
         mujoco.mj_forward(self._cell.model, state)
 
     def wait(self, seconds: float) -> None:
-        """Let time pass."""
+        """Simulate without a change of commands."""
         mujoco.mj_step(self._cell.model, self._state, nstep=round(seconds / STEP))
 
     def run(self, plan: Plan) -> Outcome:
-        """Carry out a plan: come, close, lift, shake."""
+        """Approach, close the fingers, lift and shake."""
         before = self._heights()
         self._command = self._gripper.command(plan.opening)
         for path in (plan.approach, plan.descent):
@@ -82,9 +79,7 @@ class Execution:
             self._command = (1 - share) * self._gripper.command(plan.opening) + share * CLOSED
             self._advance(here, np.zeros(JOINTS))
         self._rest(here)
-        for joints in _timed(plan.lift):
-            self._advance(*joints)
-        for joints in _shaken(plan.lift[-1]):
+        for joints in chain(_timed(plan.lift), _shaken(plan.lift[-1])):
             self._advance(*joints)
         self._rest(plan.lift[-1])
         risen = self._heights() - before
@@ -111,7 +106,7 @@ class Execution:
             self.outcome.states.append(state.qpos.copy())
 
     def _is_hit(self) -> bool:
-        """Tell whether the robot presses against something."""
+        """Return whether the robot presses against something."""
         state, force = self._state, np.zeros(6)
         pairs = self._cell.groups[state.contact.geom]
         for number in np.flatnonzero((pairs == 0).sum(axis=1) == 1):
@@ -122,21 +117,19 @@ class Execution:
 
 
 def _timed(path: Path) -> Iterator[tuple[Joints, Joints]]:
-    """Yield joints and their speeds at every step of the simulation, from rest to rest."""
+    """Yield joints and their speeds at every simulation step, from rest to rest."""
     lengths = np.abs(np.diff(path, axis=0)).max(axis=1)
-    places = np.concatenate([[0.0], np.cumsum(lengths)])
-    count = round(max(float(places[-1]) / SPEED, 0.4) / STEP)
+    distances = np.concatenate([[0.0], np.cumsum(lengths)])
+    count = round(max(float(distances[-1]) / SPEED, 0.4) / STEP)
     share = np.linspace(0, 1, count + 1)[1:]
-    smooth = share**3 * (10 - 15 * share + 6 * share**2)  # least jerk
-    joints = np.stack(
-        [np.interp(smooth * places[-1], places, one) for one in path.T], axis=1
-    )  # fmt: skip
+    smooth = share**3 * (10 - 15 * share + 6 * share**2) * distances[-1]  # minimum jerk
+    joints = np.stack([np.interp(smooth, distances, joint) for joint in path.T], axis=1)
     speeds = np.gradient(joints, STEP, axis=0)
     yield from zip(joints, speeds, strict=True)
 
 
 def _shaken(joints: Joints) -> Iterator[tuple[Joints, Joints]]:
-    """Yield joints and their speeds as the wrist swings."""
+    """Yield joints and their speeds while the wrist oscillates."""
     times = np.arange(0, SHAKE_S, STEP)
     fade = np.sin(np.pi * times / SHAKE_S) ** 0.5
     swings = (fade * np.sin(2 * np.pi * SHAKE_HZ * times))[:, None] * SHAKE

@@ -1,4 +1,4 @@
-"""Trials to look at: a video, a strip of pictures, a Rerun recording, what failures looked like."""
+"""Films of trials: a video, a strip of pictures, a Rerun recording, and pictures of failures."""
 
 from __future__ import annotations
 
@@ -18,33 +18,30 @@ from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.geometry.camera import invert_transform, project_keypoints
 from dopepp.robot.grasping.cell import TRAY, Cell
 from dopepp.robot.grasping.execution import FRAME_S
+from dopepp.robot.grasping.grasp_trial import Attempt, GraspTask, Record, Trials, TrialScene
 from dopepp.robot.grasping.rehearsal import MOUNT, TRUE_K
-from dopepp.robot.grasping.task import Record, Task
-from dopepp.robot.grasping.trial import Attempt, Scene, Trials
-from dopepp.robot.grasping.view import has_gl, open_gl
+from dopepp.robot.grasping.workbench import has_gl, open_gl
 
 VIDEO_SIZE: Final = (640, 480)
-EVERY: Final = 2  # recorded states from frame to frame of a video
+STRIDE: Final = 2  # recorded states per frame of a video
 STRIP: Final = (0.0, 0.3, 0.42, 0.53, 0.72, 1.0)
-"""Times of a strip's pictures, as shares of the motion: look, come, reach, close, lift, hold."""
+"""Times of a strip's pictures, as shares of the motion."""
 
 
 def show(
-    task: Task, records: Sequence[Record], folder: Path, video: Path | None, rerun: Path | None
+    task: GraspTask, records: Sequence[Record], folder: Path, video: Path | None, rerun: Path | None
 ) -> None:
-    """Write a picture of each kind of failure, and what is asked for of the first trial.
+    """Write a picture of each kind of failure, and the requested films of the first trial.
 
-    Trials are made again: they depend on the seed alone.
+    The trials are repeated, because they depend on the seed alone.
     """
     first = task.sources[0]
-    kinds = {
-        one.failure: one.number for one in reversed(records)
-        if one.failure and one.source == first.name
-    }  # fmt: skip
-    if not kinds and video is None and rerun is None:
+    failed = [record for record in records if record.failure and record.source == first.name]
+    examples = {record.failure: record.number for record in reversed(failed)}
+    if not examples and video is None and rerun is None:
         return
     trials = Trials(task)
-    for failure, number in kinds.items():
+    for failure, number in examples.items():
         scene = trials.scene(number)
         picture = strip(trials, scene, trials.attempt(scene, first))
         write_picture(folder / f"{failure.replace(' ', '_')}.jpg", picture)
@@ -59,11 +56,11 @@ def show(
             write_rerun(rerun, trials, scene, attempt)
 
 
-class Stage:
-    """Draws a scene's robot and things from beside; needs OpenGL (see :func:`open_gl`)."""
+class SideView:
+    """Renders the robot and the things of a scene from the side; needs OpenGL."""
 
-    def __init__(self, scene: Scene) -> None:
-        things = [one.thing for one in scene.lying]
+    def __init__(self, scene: TrialScene) -> None:
+        things = [item.thing for item in scene.things]
         self._cell = Cell(things, "all", T_flange_cam=MOUNT)
         self._state = self._cell.data()
         self._renderer = open_gl(self._cell.model, VIDEO_SIZE)
@@ -72,58 +69,60 @@ class Stage:
         self._camera.distance, self._camera.azimuth, self._camera.elevation = 0.66, 155.0, -18.0
 
     def draw(self, positions: Any) -> Picture:
-        """Draw a recorded state."""
+        """Render a recorded state."""
         self._state.qpos[:] = positions
         mujoco.mj_forward(self._cell.model, self._state)
         self._renderer.update_scene(self._state, self._camera)
         return np.ascontiguousarray(self._renderer.render())
 
 
-def seen(trials: Trials, scene: Scene, attempt: Attempt) -> Picture:
-    """Return the camera's picture with where the part was believed to be."""
-    if attempt.believed is None:
+def draw_estimate(trials: Trials, scene: TrialScene, attempt: Attempt) -> Picture:
+    """Return the camera's picture with the estimated pose of the part."""
+    if attempt.estimate is None:
         return scene.picture
     flange = trials.arm.flange(scene.joints)
     T_base_cam = flange @ scene.calibrated.knowledge.T_flange_cam
-    T_cam_obj = invert_transform(T_base_cam) @ attempt.believed
+    T_cam_obj = invert_transform(T_base_cam) @ attempt.estimate
     keypoints = project_keypoints(trials.part.cuboid, T_cam_obj, TRUE_K)
     return overlay(scene.picture, [Wireframe(keypoints)])
 
 
-def strip(trials: Trials, scene: Scene, attempt: Attempt) -> Picture:
-    """Return six pictures of a trial, the first as the camera saw it; without OpenGL that only."""
+def strip(trials: Trials, scene: TrialScene, attempt: Attempt) -> Picture:
+    """Return six pictures of a trial, the camera's first; without OpenGL, only the camera's."""
     states = attempt.outcome.states
-    tiles = [Tile(seen(trials, scene, attempt))]
+    tiles = [Tile(draw_estimate(trials, scene, attempt))]
     if states and has_gl():
-        stage = Stage(scene)
-        tiles += [Tile(stage.draw(states[round(at * (len(states) - 1))])) for at in STRIP[1:]]
+        view = SideView(scene)
+        chosen = [states[round(share * (len(states) - 1))] for share in STRIP[1:]]
+        tiles += [Tile(view.draw(state)) for state in chosen]
     return contact_sheet(tiles, columns=3, tile_width=320)
 
 
-def write_video(path: Path, trials: Trials, scene: Scene, attempt: Attempt) -> None:
-    """Write a trial as it went, with the camera's picture in a corner."""
-    stage = Stage(scene)
-    inset = cv2.resize(seen(trials, scene, attempt), (213, 160), interpolation=cv2.INTER_AREA)
-    with VideoFile(path, 1 / (EVERY * FRAME_S)) as video:
-        for time, state in list(
-            zip(attempt.outcome.times, attempt.outcome.states, strict=True)
-        )[::EVERY]:  # fmt: skip
-            picture = stage.draw(state)
-            picture[8:168, 8:221] = inset
-            video.write(picture, time)
+def write_video(path: Path, trials: Trials, scene: TrialScene, attempt: Attempt) -> None:
+    """Write a video of a trial with the camera's picture in a corner."""
+    view, picture = SideView(scene), draw_estimate(trials, scene, attempt)
+    inset = cv2.resize(picture, (213, 160), interpolation=cv2.INTER_AREA)
+    outcome = attempt.outcome
+    states = list(zip(outcome.times, outcome.states, strict=True))[::STRIDE]
+    with VideoFile(path, 1 / (STRIDE * FRAME_S)) as video:
+        for time, state in states:
+            frame = view.draw(state)
+            frame[8:168, 8:221] = inset
+            video.write(frame, time)
 
 
-def write_rerun(path: Path, trials: Trials, scene: Scene, attempt: Attempt) -> None:
-    """Write a trial as a Rerun recording: the robot's and the things' shapes over time."""
+def write_rerun(path: Path, trials: Trials, scene: TrialScene, attempt: Attempt) -> None:
+    """Write a trial as a Rerun recording of the moving shapes of robot and things."""
     require("rerun", "--rerun", "rerun")
     import rerun as rr
 
     recording = rr.RecordingStream("dopepp grasp")
-    with draft(path) as place:
-        recording.save(place)
+    with draft(path) as partial:
+        recording.save(partial)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        recording.log("picture", rr.Image(seen(trials, scene, attempt)), static=True)
-        model = Cell([one.thing for one in scene.lying], "all", T_flange_cam=MOUNT).model
+        picture = draw_estimate(trials, scene, attempt)
+        recording.log("picture", rr.Image(picture), static=True)
+        model = Cell([item.thing for item in scene.things], "all", T_flange_cam=MOUNT).model
         state = mujoco.MjData(model)
         bodies = _log_shapes(recording, model)
         for time, positions in zip(attempt.outcome.times, attempt.outcome.states, strict=True):
@@ -131,15 +130,14 @@ def write_rerun(path: Path, trials: Trials, scene: Scene, attempt: Attempt) -> N
             state.qpos[:] = positions
             mujoco.mj_kinematics(model, state)
             for body in bodies:
-                pose = rr.Transform3D(
-                    translation=state.xpos[body], mat3x3=state.xmat[body].reshape(3, 3)
-                )
+                position, rotation = state.xpos[body], state.xmat[body].reshape(3, 3)
+                pose = rr.Transform3D(translation=position, mat3x3=rotation)
                 recording.log(f"world/{body}", pose)
         recording.disconnect()
 
 
 def _log_shapes(recording: Any, model: Any) -> list[int]:
-    """Log every body's meshes and boxes that are to be seen; return the bodies."""
+    """Log the visible meshes and boxes of every body; return the bodies."""
     import rerun as rr
 
     bodies = set()
@@ -150,22 +148,15 @@ def _log_shapes(recording: Any, model: Any) -> list[int]:
             colour = model.mat_rgba[model.geom_matid[geom]]
         name = f"world/{body}/{geom}"
         if kind == mujoco.mjtGeom.mjGEOM_MESH:
-            mesh = model.geom_dataid[geom]
-            vertices, faces = (
-                getattr(model, f"mesh_{what}")[start : start + count]
-                for what, start, count in (
-                    ("vert", model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]),
-                    ("face", model.mesh_faceadr[mesh], model.mesh_facenum[mesh]),
-                )
-            )
-            shape = rr.Mesh3D(
+            mesh = model.mesh(model.geom_dataid[geom])
+            vertices = model.mesh_vert[mesh.vertadr[0] :][: mesh.vertnum[0]]
+            faces = model.mesh_face[mesh.faceadr[0] :][: mesh.facenum[0]]
+            shape: Any = rr.Mesh3D(
                 vertex_positions=vertices, triangle_indices=faces, albedo_factor=colour
             )
         elif kind == mujoco.mjtGeom.mjGEOM_BOX:
-            shape = rr.Boxes3D(
-                half_sizes=[model.geom_size[geom]], colors=[colour],
-                fill_mode=rr.components.FillMode.Solid,
-            )  # fmt: skip
+            half_sizes, solid = [model.geom_size[geom]], rr.components.FillMode.Solid
+            shape = rr.Boxes3D(half_sizes=half_sizes, colors=[colour], fill_mode=solid)
         else:
             continue
         rotation = np.zeros(9)

@@ -1,9 +1,8 @@
-"""From a part's pose to a motion of the arm that grips it: what a robot's controller can know.
+"""Planning of a grasp from a part's estimated pose, as in a robot's controller.
 
-The planner is given estimated poses, calibrated matrices and the model of its own robot, never the
-simulation's truth. Joints' paths are checked for collisions in a cell of its own, in which parts
-stand where they are believed to be. Inverse kinematics is mink's: differential steps towards the
-pose, within the joints' limits.
+The planner uses estimated poses, calibrated matrices and the robot's model, never the simulation's
+truth. Paths are checked for collisions in a separate model with the parts at their estimated poses.
+Inverse kinematics (by mink) takes differential steps within the joints' limits.
 """
 
 from __future__ import annotations
@@ -29,18 +28,17 @@ Joints = Float[np.ndarray, "6"]
 
 Path = Float[np.ndarray, "waypoints 6"]
 
-POSITION_TOLERANCE: Final = 1e-4
-ANGLE_TOLERANCE: Final = 1e-3  # metres and radians within which a pose is reached
+POSITION_TOLERANCE: Final = 1e-4  # metres
+ANGLE_TOLERANCE: Final = 1e-3  # radians
 STEPS: Final = 60  # of inverse kinematics; a reachable pose takes about ten
 COMMANDS: Final = np.linspace(0.0, 255.0, 18)  # of the gripper, open to closed
-LOW: Final = 0.005
-"""How far the middle of a part that lies on the bench may seem to be off its height, metres."""
+LOW: Final = 0.005  # largest height error of a part that lies on the bench, metres
 
 STEEPEST: Final = np.radians(40.0)  # largest angle between an approach and straight down
-RETREAT: Final = 0.06  # metres from which the gripper comes straight
-LIFT: Final = 0.12  # metres by which a part is lifted
-CHECKS: Final = 24  # places of a path between two waypoints at which collisions are looked for
-PENETRATION: Final = 1e-4  # metres from which on touching is a collision
+RETREAT: Final = 0.06  # length of the straight descent, metres
+LIFT: Final = 0.12  # height of the lift, metres
+CHECKS: Final = 24  # collision checks per radian of a path
+PENETRATION: Final = 1e-4  # minimum penetration of a collision, metres
 
 
 class Arm:
@@ -58,11 +56,19 @@ class Arm:
         return self._cell.flange_pose(self._configuration.data)
 
     def joints(self, T_base_flange: Transform, near: Joints = HOME) -> Joints | None:
-        """Return joints, close to others, that take the flange to a pose; None out of reach."""
+        """Solve the inverse kinematics.
+
+        Args:
+            T_base_flange: Pose of the flange.
+            near: Initial joints.
+
+        Returns:
+            The joints, or None if the pose is out of reach.
+        """
         self._configuration.update(np.array(near))
         self._task.set_target(mink.SE3.from_matrix(T_base_flange))
         for _ in range(STEPS):
-            if self._is_there(T_base_flange):
+            if self._has_reached(T_base_flange):
                 return np.array(self._configuration.q[:JOINTS])
             velocity = mink.solve_ik(
                 self._configuration, [self._task], 1.0, "daqp", limits=self._limits, damping=1e-6
@@ -70,22 +76,21 @@ class Arm:
             self._configuration.integrate_inplace(np.clip(velocity, -0.5, 0.5), 1.0)
         return None
 
-    def _is_there(self, T_base_flange: Transform) -> bool:
-        here = self._cell.flange_pose(self._configuration.data)
-        away = np.linalg.norm(here[:3, 3] - T_base_flange[:3, 3])
-        turned = rotation_angle(here[:3, :3].T @ T_base_flange[:3, :3])
-        return bool(away < POSITION_TOLERANCE and turned < ANGLE_TOLERANCE)
+    def _has_reached(self, T_base_flange: Transform) -> bool:
+        current = self._cell.flange_pose(self._configuration.data)
+        shift = np.linalg.norm(current[:3, 3] - T_base_flange[:3, 3])
+        turn = rotation_angle(current[:3, :3].T @ T_base_flange[:3, :3])
+        return bool(shift < POSITION_TOLERANCE and turn < ANGLE_TOLERANCE)
 
 
 @dataclass(frozen=True, eq=False)
 class Gripper:
-    """How the fingers move."""
+    """Kinematics of the fingers, at every command of :data:`COMMANDS`."""
 
-    # Distance between the pads at every command of `COMMANDS`, metres, descending.
-    widths: Float[np.ndarray, "commands"]
-    # How far the pads' ends are before the flange, metres: closing, they swing forward.
+    widths: Float[np.ndarray, "commands"]  # distance between the pads, metres, descending
+    # Distance of the pads' ends from the flange, metres. Closing fingers swing forward.
     reaches: Float[np.ndarray, "commands"]
-    joints: Float[np.ndarray, "commands 8"]  # the fingers' joints, for checks of collisions
+    joints: Float[np.ndarray, "commands 8"]  # of the fingers, for collision checks
 
     @property
     def widest(self) -> float:
@@ -97,17 +102,17 @@ class Gripper:
         return float(np.interp(-width, -self.widths, COMMANDS))
 
     def reach(self, width: float) -> float:
-        """Return how far the pads' ends are before the flange at a width, metres."""
+        """Return the distance of the pads' ends from the flange at a width, metres."""
         return float(np.interp(-width, -self.widths, self.reaches))
 
     def fingers(self, width: float) -> Float[np.ndarray, "8"]:
         """Return the fingers' joints at a width, metres."""
         command = self.command(width)
-        return np.array([np.interp(command, COMMANDS, one) for one in self.joints.T])
+        return np.array([np.interp(command, COMMANDS, joint) for joint in self.joints.T])
 
 
 def measure_gripper() -> Gripper:
-    """Drive the fingers from open to closed in free air and look where the pads are."""
+    """Measure the pads' positions in a simulation of the closing fingers."""
     cell = Cell()
     state = cell.data()
     widths, reaches, joints = [], [], []
@@ -126,29 +131,34 @@ def measure_gripper() -> Gripper:
 
 @dataclass(frozen=True, eq=False)
 class Knowledge:
-    """What calibrations have told the controller."""
+    """Calibrated parameters of the controller."""
 
-    T_flange_cam: Transform  # where the camera is in the hand
-    tip: Vector  # middle between the ends of the closed fingers, flange frame, metres
-    T_base_bench: Transform  # the bench; z is its normal
+    T_flange_cam: Transform
+    tip: Vector  # midpoint between the ends of the closed fingers, flange frame, metres
+    T_base_bench: Transform  # z is the bench's normal
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A motion: joints, radians, from where the arm is."""
+    """A motion: waypoints of the joints, radians."""
 
     approach: Path  # to above the part
     descent: Path  # straight to it
     lift: Path  # straight up
     opening: float  # of the fingers before they close, metres
-    grasp: Grasp  # which of the part's grasps it is
+    grasp: Grasp  # the part's grasp that the motion executes
 
 
-def rested(T_base_obj: Transform, hull: Hull, T_base_bench: Transform) -> Transform:
-    """Lay a part that seems to lie on the bench flat on it.
+def laid_flat(T_base_obj: Transform, hull: Hull, T_base_bench: Transform) -> Transform:
+    """Align the estimated pose of a part with the bench.
 
-    A picture from above tells a part's tilt and height least, the bench best. A part whose middle
-    is higher than :data:`LOW` allows leans on something and stays as it is.
+    A picture from above determines tilt and height poorly, and the bench determines them well. A
+    part whose height differs by more than :data:`LOW` leans on something, and its pose is kept.
+
+    Args:
+        T_base_obj: The estimated pose.
+        hull: Convex hull of the part.
+        T_base_bench: Pose of the bench.
     """
     up = T_base_bench[:3, 2]
     normals = hull.rests[0] @ T_base_obj[:3, :3].T
@@ -157,9 +167,8 @@ def rested(T_base_obj: Transform, hull: Hull, T_base_bench: Transform) -> Transf
     sine = float(np.linalg.norm(axis))
     turn = rotation_vector_to_matrix(axis * (np.arctan2(sine, cosine) / sine if sine else 0.0))
     centre = transform(T_base_obj, hull.centre)
-    flat = make_transform(
-        turn @ T_base_obj[:3, :3], centre + turn @ (T_base_obj[:3, 3] - centre)
-    )  # fmt: skip
+    position = centre + turn @ (T_base_obj[:3, 3] - centre)
+    flat = make_transform(turn @ T_base_obj[:3, :3], position)
     lowest = float(((transform(flat, hull.vertices) - T_base_bench[:3, 3]) @ up).min())
     if abs(lowest) > LOW:
         return T_base_obj
@@ -171,22 +180,34 @@ class Planner:
     """Plans grasps.
 
     Args:
-        cell: A model with as many things as parts may be believed in.
+        arm: The arm's kinematics.
+        gripper: The gripper's kinematics.
+        cell: A model with the largest possible number of parts.
+        knowledge: Calibrated parameters.
     """
 
     def __init__(self, arm: Arm, gripper: Gripper, cell: Cell, knowledge: Knowledge) -> None:
-        self._arm, self._gripper, self._cell, self._known = arm, gripper, cell, knowledge
+        self._arm, self._gripper, self._cell, self._knowledge = arm, gripper, cell, knowledge
         self._state = cell.data()
         model = cell.model
-        self._hand = np.array(["gripper/" in model.body(b).name for b in model.geom_bodyid])
+        self._hand = np.array(["gripper/" in model.body(body).name for body in model.geom_bodyid])
 
     def plan(
         self, poses: Sequence[Transform], grasps: Sequence[Grasp], start: Joints
     ) -> Plan | None:
-        """Return a motion that grips the first of the parts at poses; None where there is none."""
+        """Plan a motion.
+
+        Args:
+            poses: Poses T_base_obj of parts; the first is the part to grasp.
+            grasps: The part's grasps, the best first.
+            start: Joints of the arm.
+
+        Returns:
+            The motion for the first reachable grasp, or None.
+        """
         for number in range(self._cell.count):
-            away = make_transform(np.eye(3), np.array([2.0, number, 0.5]))
-            self._cell.put(self._state, number, poses[number] if number < len(poses) else away)
+            pose = make_transform(np.eye(3), np.array([2.0, number, 0.5]))  # out of the way
+            self._cell.put(self._state, number, poses[number] if number < len(poses) else pose)
         for grasp in grasps:
             for tool in self._tools(poses[0], grasp):
                 motion = self._motion(tool, grasp, start)
@@ -195,25 +216,25 @@ class Planner:
         return None
 
     def _tools(self, T_base_obj: Transform, grasp: Grasp) -> Iterator[Transform]:
-        """Yield poses of the closed pads' ends, T_base_tool, in which they grip the part."""
-        up = self._known.T_base_bench[:3, 2]
-        ends = np.array(
-            [[x, y, 0.0] for x in (-1, 1) for y in (-PAD_HALF[1], PAD_HALF[1])]
-        ) * [grasp.width / 2 + 2 * PAD_HALF[0], 1, 1]  # fmt: skip
+        """Yield poses of the closed pads' ends, T_base_tool, that grip the part."""
+        up = self._knowledge.T_base_bench[:3, 2]
+        half_width, half_pad = grasp.width / 2 + 2 * PAD_HALF[0], PAD_HALF[1]
+        signs = [[-1, -1, 0], [-1, 1, 0], [1, -1, 0], [1, 1, 0]]
+        ends = np.array(signs) * [half_width, half_pad, 0.0]
         for turned in (False, True):
             T = T_base_obj @ grasp.T_obj_tool(turned)
             steep = -float(T[:3, 2] @ up)
             if steep < np.cos(STEEPEST):
                 continue
-            points = ends @ T[:3, :3].T + T[:3, 3] - self._known.T_base_bench[:3, 3]
+            points = ends @ T[:3, :3].T + T[:3, 3] - self._knowledge.T_base_bench[:3, 3]
             room = (float((points @ up).min()) - ABOVE_BENCH) / steep
             if room >= 0:
-                for depth in sorted({min(room, one) for one in INSERTIONS}, reverse=True):
+                for depth in sorted({min(room, depth) for depth in INSERTIONS}, reverse=True):
                     yield make_transform(T[:3, :3], T[:3, 3] + depth * T[:3, 2])
 
     def _motion(self, T_base_tool: Transform, grasp: Grasp, start: Joints) -> Plan | None:
-        """Return the motion to a pose of the pads' ends, if the arm gets there unhindered."""
-        tip = self._known.tip.copy()
+        """Return the motion to a pose of the pads' ends, or None if it is not free or reachable."""
+        tip = self._knowledge.tip.copy()
         tip[2] += self._gripper.reach(grasp.width) - self._gripper.reach(0.0)
         T_base_flange = T_base_tool @ make_transform(np.eye(3), -tip)
         before = T_base_flange.copy()
@@ -228,12 +249,12 @@ class Planner:
         if not self._is_free(approach, grasp.opening):
             return None
         above = T_base_flange.copy()
-        above[:3, 3] += LIFT * self._known.T_base_bench[:3, 2]
+        above[:3, 3] += LIFT * self._knowledge.T_base_bench[:3, 2]
         lift = self._line(descent[-1], T_base_flange, above)
         return None if lift is None else Plan(approach, descent, lift, grasp.opening, grasp)
 
     def _line(self, start: Joints, T_from: Transform, T_to: Transform) -> Path | None:
-        """Return joints along a straight line of the flange, which keeps its orientation."""
+        """Return joints along a straight line of the flange with constant orientation."""
         path = [start]
         for share in np.linspace(0, 1, 7)[1:]:
             between = T_to.copy()
@@ -245,7 +266,7 @@ class Planner:
         return np.stack(path)
 
     def _is_free(self, path: Path, opening: float) -> bool:
-        """Tell whether the robot meets nothing along a path."""
+        """Return whether a path is free of collisions."""
         for here, there in pairwise(path):
             count = max(2, round(CHECKS * float(np.abs(there - here).max())))
             for share in np.linspace(0, 1, count):

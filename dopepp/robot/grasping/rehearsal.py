@@ -1,8 +1,8 @@
-"""The calibrations before the grasps (paper 4.3), in the simulation and with its errors.
+"""Simulated calibrations before the grasps (paper 4.3), with realistic errors.
 
-An arm's joints do not stand quite where its controller reads them, and nobody knows where the
-camera's bracket is. Tool, bench, lens and hand-eye are calibrated as a workshop would do it, by
-:mod:`dopepp.robot.calibration`, from touched points and pictures of a board.
+The arm's joints differ from the controller's readings, and the camera's bracket differs from its
+drawing. Tool, bench, lens and hand-eye are calibrated by :mod:`dopepp.robot.calibration`, from
+touched points and pictures of a board.
 """
 
 from __future__ import annotations
@@ -36,128 +36,126 @@ from dopepp.robot.grasping.cell import JOINTS, TRAY
 from dopepp.robot.grasping.planner import Arm, Joints, Knowledge
 
 SIZE: Final[Size] = (640, 480)  # of the camera's pictures, pixels
-FOCAL: Final = SIZE[0] / 2 / np.tan(np.radians(30.0))
-"""Pixels: 60° across, as the released networks were trained."""
-
-TRUE_K: Final[CameraMatrix] = camera_matrix(
-    FOCAL, FOCAL, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2
-)  # fmt: skip
+FOCAL: Final = SIZE[0] / 2 / np.tan(np.radians(30.0))  # 60° across, as in the networks' training
+TRUE_K: Final[CameraMatrix] = camera_matrix(FOCAL, FOCAL, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
 
 MOUNT: Final = make_transform(np.eye(3), np.array([0.0, 0.09, 0.11]))
-"""T_flange_cam as the bracket was drawn: beside the fingers, which it does not see, looking along
-the tool."""
+"""T_flange_cam in the drawing of the bracket: beside the fingers, outside the picture, looking
+along the tool."""
 
 BRACKET: Final = (np.radians(1.0), 0.003)
-"""How far it is off the drawing, standard deviations along each axis, radians and metres."""
+"""Standard deviations of the bracket's error about and along each axis, radians and metres."""
 
-ZERO: Final = np.radians(0.02)
-"""Standard deviation of a joint's zero, radians: 0.3 mm at the flange."""
-
-TOUCH: Final = 1e-4  # standard deviation of a touch, metres along each axis
+ZERO: Final = np.radians(0.02)  # standard deviation of a joint's zero: 0.3 mm at the flange
+TOUCH: Final = 1e-4  # standard deviation of a touched point along each axis, metres
 TOUCHES, VIEWS = 8, 15
 BOARD: Final = "charuco:8x6:20:15"
-_DOWN: Final = np.diag([1.0, -1.0, -1.0])  # rotation of a tool that looks straight down
+_DOWN: Final = np.diag([1.0, -1.0, -1.0])  # rotation of a tool that points straight down
 
 
 @dataclass(frozen=True, eq=False)
-class Robot:
-    """What is true of a robot and nobody knows."""
+class TrueRobot:
+    """True parameters of a robot, unknown to its controller."""
 
-    zero: Joints  # how far its joints are from where they are read, radians
-    T_flange_cam: Transform  # where the camera is
-    tip: Vector  # middle between the ends of the closed fingers, flange frame, metres
+    zero: Joints  # true joints minus the controller's readings, radians
+    T_flange_cam: Transform
+    tip: Vector  # midpoint between the ends of the closed fingers, flange frame, metres
 
 
 @dataclass(frozen=True, eq=False)
-class Calibrated:
-    """What the calibrations of a robot have found."""
+class CalibratedRobot:
+    """Results of a robot's calibrations, and their errors."""
 
     knowledge: Knowledge
-    camera: Camera  # the lens
-    hand_eye_mm: float  # how far the camera is off, at the distance of the parts, millimetres
-    hand_eye_deg: float  # by how much it is turned, degrees
-    tool_mm: float  # how far the tool's tip is off, millimetres
-    bench_mm: float  # how far the bench is off below the tray, millimetres
+    camera: Camera
+    hand_eye_mm: float  # error of the camera's pose at the distance of the parts, millimetres
+    hand_eye_deg: float  # its rotation error, degrees
+    tool_mm: float  # error of the tool's tip, millimetres
+    bench_mm: float  # error of the bench's height below the tray, millimetres
 
 
-def draw_robot(rng: Generator, tip: Vector) -> Robot:
-    """Draw the errors of a robot whose fingers end at a tip when closed."""
+def draw_robot(rng: Generator, tip: Vector) -> TrueRobot:
+    """Draw a robot's errors; ``tip`` is the true position of its closed fingers' ends."""
     turn, shift = (rng.normal(0, spread, 3) for spread in BRACKET)
-    off = make_transform(Rotation.from_rotvec(turn).as_matrix(), shift)
-    return Robot(rng.normal(0, ZERO, JOINTS), MOUNT @ off, tip)
+    error = make_transform(Rotation.from_rotvec(turn).as_matrix(), shift)
+    return TrueRobot(rng.normal(0, ZERO, JOINTS), MOUNT @ error, tip)
 
 
-def calibrate(robot: Robot, arm: Arm, rng: Generator, distance: float) -> Calibrated:
+def calibrate(robot: TrueRobot, arm: Arm, rng: Generator, distance: float) -> CalibratedRobot:
     """Calibrate tool, bench, lens and hand-eye; ``distance`` is that of the parts, metres."""
-    tip = find_tip(_pivoted(robot, arm, rng)).position
-    bench = find_bench(_touched(robot, arm, rng, tip)).T_base_bench
-    camera, T_flange_cam = _seen(robot, arm, rng)
-    known = Knowledge(T_flange_cam, tip, bench)
+    tip = find_tip(_pivot_poses(robot, arm, rng)).position
+    bench = find_bench(_touch_bench(robot, arm, rng, tip)).T_base_bench
+    camera, T_flange_cam = _calibrate_camera(robot, arm, rng)
     ahead = np.array([[0.0, 0.0, distance]])
-    away = transform(T_flange_cam, ahead) - transform(robot.T_flange_cam, ahead)
+    shift = transform(T_flange_cam, ahead) - transform(robot.T_flange_cam, ahead)
     turn = rotation_angle(T_flange_cam[:3, :3].T @ robot.T_flange_cam[:3, :3])
     height = bench[:3, 2] @ (TRAY - bench[:3, 3])
-    return Calibrated(
-        known, camera, 1000 * float(np.linalg.norm(away)), float(np.degrees(turn)),
-        1000 * float(np.linalg.norm(tip - robot.tip)), 1000 * abs(float(height)),
-    )  # fmt: skip
+    return CalibratedRobot(
+        Knowledge(T_flange_cam, tip, bench),
+        camera,
+        hand_eye_mm=1000 * float(np.linalg.norm(shift)),
+        hand_eye_deg=float(np.degrees(turn)),
+        tool_mm=1000 * float(np.linalg.norm(tip - robot.tip)),
+        bench_mm=1000 * abs(float(height)),
+    )
 
 
-Stand = tuple[Transform, Transform]
-"""T_base_flange where the flange is, and where the controller reads it to be."""
+FlangePair = tuple[Transform, Transform]
+"""T_base_flange: the true pose, and the controller's reading."""
 
 
-def _stand(robot: Robot, arm: Arm, goal: Transform) -> Stand | None:
-    """Lead the flange to a pose; None out of reach."""
+def _move(robot: TrueRobot, arm: Arm, goal: Transform) -> FlangePair | None:
+    """Move the flange to a pose; return None if it is out of reach."""
     joints = arm.joints(goal)
     return None if joints is None else (arm.flange(joints), arm.flange(joints - robot.zero))
 
 
-def _gathered(draw: Callable[[], Stand | None], count: int) -> list[Stand]:
-    """Draw poses until so many are in reach."""
+def _draw_reachable(draw: Callable[[], FlangePair | None], count: int) -> list[FlangePair]:
+    """Draw poses until ``count`` of them are in reach."""
     drawn = (draw() for _ in range(4 * count))
-    stands = [stand for stand in drawn if stand is not None][:count]
-    if len(stands) < count:
+    pairs = [pair for pair in drawn if pair is not None][:count]
+    if len(pairs) < count:
         raise RunError("the arm does not reach the poses of its calibration")
-    return stands
+    return pairs
 
 
-def _pivoted(robot: Robot, arm: Arm, rng: Generator) -> Float[np.ndarray, "poses 4 4"]:
-    """Return read poses of the flange in which the tip touches one point above the tray."""
+def _pivot_poses(robot: TrueRobot, arm: Arm, rng: Generator) -> Float[np.ndarray, "poses 4 4"]:
+    """Return readings of the flange's pose in which the tip touches one point above the tray."""
 
-    def draw() -> Stand | None:
+    def draw() -> FlangePair | None:
         turn = Rotation.from_rotvec([*rng.uniform(-0.5, 0.5, 2), rng.uniform(-1, 1)]).as_matrix()
         touched = TRAY + np.array([0.0, 0.0, 0.05]) + rng.normal(0, TOUCH, 3)
-        return _stand(robot, arm, make_transform(_DOWN @ turn, touched - _DOWN @ turn @ robot.tip))
+        return _move(robot, arm, make_transform(_DOWN @ turn, touched - _DOWN @ turn @ robot.tip))
 
-    return np.stack([read for _, read in _gathered(draw, TOUCHES)])
+    return np.stack([read for _, read in _draw_reachable(draw, TOUCHES)])
 
 
-def _touched(robot: Robot, arm: Arm, rng: Generator, tip: Vector) -> Float[np.ndarray, "points 3"]:
-    """Return points of the bench that the tip has touched, as the controller has them."""
+def _touch_bench(
+    robot: TrueRobot, arm: Arm, rng: Generator, tip: Vector
+) -> Float[np.ndarray, "points 3"]:
+    """Return the controller's readings of points where the tip touches the bench."""
 
-    def draw() -> Stand | None:
+    def draw() -> FlangePair | None:
         touched = TRAY + np.array([*rng.uniform(-0.1, 0.1, 2), 0.0]) + rng.normal(0, TOUCH, 3)
-        return _stand(robot, arm, make_transform(_DOWN, touched - _DOWN @ robot.tip))
+        return _move(robot, arm, make_transform(_DOWN, touched - _DOWN @ robot.tip))
 
-    return np.stack([transform(read, tip) for _, read in _gathered(draw, TOUCHES)])
+    return np.stack([transform(read, tip) for _, read in _draw_reachable(draw, TOUCHES)])
 
 
-def _seen(robot: Robot, arm: Arm, rng: Generator) -> tuple[Camera, Transform]:
+def _calibrate_camera(robot: TrueRobot, arm: Arm, rng: Generator) -> tuple[Camera, Transform]:
     """Calibrate lens and hand-eye from pictures of a board on the bench."""
-    board, true_camera = parse_board(BOARD), Camera(SIZE, TRUE_K, (), "the simulation's")
+    board, true_camera = parse_board(BOARD), Camera(SIZE, TRUE_K, (), "simulation")
     middle = board.points.mean(axis=0)
     T_base_board = make_transform(_DOWN, TRAY - _DOWN @ middle)
 
-    def draw() -> Stand | None:
-        T_base_cam = looking_at(
-            TRAY + np.array([*rng.uniform(-0.03, 0.03, 2), 0.0]), rng.uniform(0.2, 0.32),
-            rng.uniform(-0.6, 0.6, 2), rng.uniform(-1.0, 1.0),
-        )  # fmt: skip
-        return _stand(robot, arm, T_base_cam @ invert_transform(robot.T_flange_cam))
+    def draw() -> FlangePair | None:
+        point = TRAY + np.array([*rng.uniform(-0.03, 0.03, 2), 0.0])
+        distance, tilt = rng.uniform(0.2, 0.32), rng.uniform(-0.6, 0.6, 2)
+        T_base_cam = looking_at(point, distance, tilt, rng.uniform(-1.0, 1.0))
+        return _move(robot, arm, T_base_cam @ invert_transform(robot.T_flange_cam))
 
     sightings, flanges = [], []
-    for number, (flange, read) in enumerate(_gathered(draw, VIEWS)):
+    for number, (flange, read) in enumerate(_draw_reachable(draw, VIEWS)):
         T_cam_board = invert_transform(flange @ robot.T_flange_cam) @ T_base_board
         picture = draw_view(board, T_cam_board, true_camera, rng)
         sighting = board.find(picture, f"{number}")
@@ -165,16 +163,20 @@ def _seen(robot: Robot, arm: Arm, rng: Generator) -> tuple[Camera, Transform]:
             sightings.append(sighting)
             flanges.append(read)
     camera = calibrate_lens(sightings, SIZE).camera
-    boards = [board_pose(one, camera) for one in sightings]
+    boards = [board_pose(sighting, camera) for sighting in sightings]
     return camera, calibrate_hand_eye(np.stack(flanges), boards, "hand").T_mount_cam
 
 
 def looking_at(
     point: Vector, distance: float, tilt: Float[np.ndarray, "2"], roll: float
 ) -> Transform:
-    """Return T_base_cam of a camera that looks down at a point from a distance, metres.
+    """Return T_base_cam of a camera that looks down at a point.
 
-    ``tilt`` turns it about its x and y, ``roll`` about its axis, radians; all 0 look straight down.
+    Args:
+        point: The point in the base's frame, metres.
+        distance: Distance of the camera from the point, metres.
+        tilt: Rotation about the camera's x and y axes from straight down, radians.
+        roll: Rotation about its optical axis, radians.
     """
     turn = Rotation.from_rotvec([*tilt, 0.0]) * Rotation.from_rotvec([0.0, 0.0, roll])
     rotation = _DOWN @ turn.as_matrix()

@@ -1,5 +1,5 @@
-"""The node: poses of what a robot's camera sees, over ROS 2, bags, UDP and stdout.
+"""The node: poses in the images of a robot's camera, over ROS 2, bags, UDP and stdout.
 
-:mod:`.worker` does the work, :mod:`.messages` says it in ROS's words; each other module is one way
-in and out. To add one, hand pictures to a :class:`.worker.Worker` and its answers on.
+:mod:`.worker` estimates the poses and :mod:`.messages` converts them to ROS messages. The other
+modules are transports. To add one, pass pictures to a :class:`.worker.Worker` and send its answers.
 """

@@ -1,7 +1,7 @@
-"""What a node says of a picture, in ROS's messages as plain values.
+"""ROS messages of a node, as plain values.
 
-Poses are in the camera's optical frame, which is OpenCV's. Quaternions are (x, y, z, w) there, and
-a covariance is of shift and turn, in this order. Names of topics are DOPE's.
+Poses are in the camera's optical frame, which has OpenCV's axes. Quaternions are (x, y, z, w), and
+a covariance is of translation and rotation, in this order. Topics are named as in DOPE.
 """
 
 from __future__ import annotations
@@ -26,17 +26,12 @@ from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 from dopepp.robot.nodes.worker import Answer, Stamp
 
-MARKER_FACES: Final = 1000
-"""Triangles of a marker: a viewer shows the part, and a message of it has 36 kB."""
+MARKER_FACES: Final = 1000  # triangles of a marker; its message has 36 kB
 
-TRIANGLE_LIST: Final = 11
-ADD: Final = 0
-DELETE_ALL: Final = 3
-OK: Final = 0
-WARN: Final = 1  # these two are levels of a diagnosis
-OVERLAY: Final = "rgb_points"  # topic of the pictures with poses drawn on them
-DIAGNOSTICS: Final = ("/diagnostics", "diagnostic_msgs/DiagnosticArray")
-"""Topic and type of a diagnosis."""
+TRIANGLE_LIST, ADD, DELETE_ALL = 11, 0, 3  # type and actions of visualization_msgs/Marker
+OK, WARN = 0, 1  # levels of diagnostic_msgs/DiagnosticStatus
+OVERLAY: Final = "rgb_points"  # topic of the pictures with drawn poses
+DIAGNOSTICS: Final = ("/diagnostics", "diagnostic_msgs/DiagnosticArray")  # topic and type
 
 VISION: Final = {
     "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score\n",
@@ -52,70 +47,70 @@ VISION: Final = {
         "std_msgs/Header header\nvision_msgs/Detection3D[] detections\n"
     ),
 }
-"""Fields of ``vision_msgs``, which not every installation has."""
+"""Definitions of ``vision_msgs``, which not every installation has."""
 
 Fields = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Message:
-    """A message."""
+    """A message to publish."""
 
-    # Where it goes: `pose_part` is below the node's name (`/dope/pose_part`), `/tf` is not.
-    topic: str
-    kind: str  # its type, `package/Name`
-    fields: Fields  # its fields by name; a message inside it is a dict, a picture's data are bytes
+    topic: str  # `/tf`, or below the node's name without a slash (`pose_part`: `/dope/pose_part`)
+    kind: str  # type, `package/Name`
+    fields: Fields  # by name; nested messages are dicts, a picture's data are bytes
 
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """A part's triangles for markers, the same object each time."""
+    """A part's triangles for markers. The object is reused, so that converted points are cached."""
 
     corners: Float[np.ndarray, "points 3"]
 
     @cached_property
     def points(self) -> list[Fields]:
-        """Three points a triangle."""
-        return [_xyz(one) for one in self.corners]
+        """Three points per triangle."""
+        return [_xyz(corner) for corner in self.corners]
 
 
-class Speaker:
-    """Says what a worker has found.
+class AnswerFormatter:
+    """Converts the answers of a worker to messages.
 
     Args:
-        parts: The worker's, with meshes where there are any.
+        parts: The worker's parts, with meshes if available.
 
     Raises:
-        UserError: Two parts' names give one topic.
+        UserError: The names of two parts lead to the same topic.
     """
 
     def __init__(self, parts: Sequence[Part]) -> None:
         self._cuboids = {part.name: part.cuboid for part in parts}
         self._names = {part.name: re.sub(r"\W", "_", part.name, flags=re.ASCII) for part in parts}
         if len(set(self._names.values())) < len(parts):
-            got = f"parts {', '.join(self._names)}"
-            raise UserError(got, "names that differ in letters and digits", "rename one of them")
+            problem = f"parts {', '.join(self._names)}"
+            raise UserError(problem, "names that differ in letters and digits", "rename a part")
         self._triangles = {part.name: _triangles(part) for part in parts}
 
     def topics(self) -> list[tuple[str, str]]:
-        """Return every topic with its type, but for the diagnosis."""
-        own = [(f"pose_{name}", "geometry_msgs/PoseStamped") for name in self._names.values()]
-        own += [(f"poses_{name}", "geometry_msgs/PoseArray") for name in self._names.values()]
+        """Return every topic with its type, except for the diagnosis."""
+        names = self._names.values()
         return [
-            *own,
+            *((f"pose_{name}", "geometry_msgs/PoseStamped") for name in names),
+            *((f"poses_{name}", "geometry_msgs/PoseArray") for name in names),
             ("detections", "vision_msgs/Detection3DArray"),
             ("/tf", "tf2_msgs/TFMessage"),
             ("markers", "visualization_msgs/MarkerArray"),
             (OVERLAY, "sensor_msgs/Image"),
         ]
 
-    def messages(self, answer: Answer, wanted: Callable[[str], bool]) -> list[Message]:
-        """Return what there is to say about a picture on the topics that are wanted."""
+    def messages(self, answer: Answer, is_wanted: Callable[[str], bool]) -> list[Message]:
+        """Return an answer's messages on the topics that are wanted."""
         header = {"stamp": answer.stamp._asdict(), "frame_id": answer.frame_id}
         makers: dict[str, Callable[[], Fields]] = {}
         for name, word in self._names.items():
-            found = [one for one in answer.result.detections if one.object == name]
-            poses = [_pose(one.T_cam_obj) for one in sorted(found, key=lambda one: -one.score)]
+            copies = [pose for pose in answer.result.detections if pose.object == name]
+            copies.sort(key=lambda detection: -detection.score)
+            poses = [_pose(detection.T_cam_obj) for detection in copies]
             if poses:
                 makers[f"pose_{word}"] = partial(dict, header=header, pose=poses[0])
             makers[f"poses_{word}"] = partial(dict, header=header, poses=poses)
@@ -123,59 +118,65 @@ class Speaker:
             "detections": lambda: self._detections(answer, header),
             "/tf": lambda: self._transforms(answer, header),
             "markers": lambda: self._markers(answer, header),
-            OVERLAY: lambda: picture(answer.result.plot(), header),
+            OVERLAY: lambda: image_fields(answer.result.plot(), header),
         }
-        kinds = {topic: kind for topic, kind in self.topics() if topic in makers and wanted(topic)}
-        return [Message(topic, kind, makers[topic]()) for topic, kind in kinds.items()]
-
-    def _named(self, answer: Answer) -> list[tuple[str, Detection]]:
-        """Return every detection with its frame's name, ``<object>_<n>``."""
         return [
-            (f"{self._names[one.object]}_{number}", one)
-            for number, one in zip(answer.numbers, answer.result.detections, strict=True)
+            Message(topic, kind, makers[topic]())
+            for topic, kind in self.topics()
+            if topic in makers and is_wanted(topic)
+        ]
+
+    def _frames(self, answer: Answer) -> list[tuple[str, Detection]]:
+        """Return every detection with the name of its frame, ``<object>_<n>``."""
+        return [
+            (f"{self._names[detection.object]}_{number}", detection)
+            for number, detection in zip(answer.numbers, answer.result.detections, strict=True)
         ]
 
     def _detections(self, answer: Answer, header: Fields) -> Fields:
-        detections = [
-            {"header": header, "results": [_hypothesis(one)], "bbox": self._box(one), "id": name}
-            for name, one in self._named(answer)
-        ]
+        detections = []
+        for name, detection in self._frames(answer):
+            cuboid, centre = self._cuboids[detection.object], detection.T_cam_obj.copy()
+            centre[:3, 3] += centre[:3, :3] @ cuboid[-1]  # the box's, not the part's origin
+            box = {"center": _pose(centre), "size": _xyz(np.ptp(cuboid, axis=0))}
+            results = [_hypothesis(detection)]
+            detections.append({"header": header, "results": results, "bbox": box, "id": name})
         return {"header": header, "detections": detections}
-
-    def _box(self, one: Detection) -> Fields:
-        """Return the part's box, whose middle need not be the part's origin."""
-        cuboid, middle = self._cuboids[one.object], one.T_cam_obj.copy()
-        middle[:3, 3] += middle[:3, :3] @ cuboid[-1]
-        return {"center": _pose(middle), "size": _xyz(np.ptp(cuboid, axis=0))}
 
     def _transforms(self, answer: Answer, header: Fields) -> Fields:
         transforms = []
-        for name, one in self._named(answer):
-            pose = _pose(one.T_cam_obj)
-            shift_and_turn = {"translation": pose["position"], "rotation": pose["orientation"]}
-            transforms.append(
-                {"header": header, "child_frame_id": name, "transform": shift_and_turn}
-            )
+        for name, detection in self._frames(answer):
+            pose = _pose(detection.T_cam_obj)
+            transform = {"translation": pose["position"], "rotation": pose["orientation"]}
+            transforms.append({"header": header, "child_frame_id": name, "transform": transform})
         return {"transforms": transforms}
 
     def _markers(self, answer: Answer, header: Fields) -> Fields:
-        """Return the parts' triangles at their poses, in place of those of the last picture."""
+        """Return the parts' triangles, which replace those of the last picture."""
         markers: list[Fields] = [{"header": header, "action": DELETE_ALL}]
-        for index, one in enumerate(answer.result.detections):
-            colour = (np.array(COLOURS[index % len(COLOURS)]) / 255).tolist()
-            marker = {"header": header, "ns": one.object, "id": index, "type": TRIANGLE_LIST}
-            marker |= {"action": ADD, "pose": _pose(one.T_cam_obj), "scale": _xyz(np.ones(3))}
-            marker |= {"color": {**dict(zip("rgb", colour, strict=True)), "a": 0.8}}
-            markers.append(marker | {"points": self._triangles[one.object]})
+        for index, detection in enumerate(answer.result.detections):
+            red, green, blue = (np.array(COLOURS[index % len(COLOURS)]) / 255).tolist()
+            marker = {
+                "header": header,
+                "ns": detection.object,
+                "id": index,
+                "type": TRIANGLE_LIST,
+                "action": ADD,
+                "pose": _pose(detection.T_cam_obj),
+                "scale": _xyz(np.ones(3)),
+                "color": {"r": red, "g": green, "b": blue, "a": 0.8},
+                "points": self._triangles[detection.object],
+            }
+            markers.append(marker)
         return {"markers": markers}
 
 
-def diagnosis(stamp: Stamp, name: str, trouble: str, values: dict[str, str]) -> Message:
-    """Return how a node does; ``trouble`` is what is wrong, empty where nothing is."""
+def diagnosis(stamp: Stamp, name: str, problem: str, values: dict[str, str]) -> Message:
+    """Return the diagnosis of a node; an empty problem means that it is running."""
     status = {
-        "level": WARN if trouble else OK,
+        "level": WARN if problem else OK,
         "name": f"{name}: poses",
-        "message": trouble or "running",
+        "message": problem or "running",
         "hardware_id": "",
         "values": [{"key": key, "value": value} for key, value in values.items()],
     }
@@ -183,21 +184,20 @@ def diagnosis(stamp: Stamp, name: str, trouble: str, values: dict[str, str]) -> 
     return Message(*DIAGNOSTICS, {"header": header, "status": [status]})
 
 
-def picture(image: Picture, header: Fields) -> Fields:
+def image_fields(image: Picture, header: Fields) -> Fields:
     """Return an RGB picture as ``sensor_msgs/Image``."""
     height, width = image.shape[:2]
-    return {
-        "header": header, "height": height, "width": width, "encoding": "rgb8",
-        "is_bigendian": 0, "step": 3 * width, "data": image.tobytes(),
-    }  # fmt: skip
+    size = {"height": height, "width": width, "step": 3 * width}
+    layout = {"encoding": "rgb8", "is_bigendian": 0}
+    return {"header": header, **size, **layout, "data": image.tobytes()}
 
 
-def _hypothesis(one: Detection) -> Fields:
+def _hypothesis(detection: Detection) -> Fields:
     order = [3, 4, 5, 0, 1, 2]
-    covariance = one.covariance[np.ix_(order, order)]
+    covariance = detection.covariance[np.ix_(order, order)]
     return {
-        "hypothesis": {"class_id": one.object, "score": float(one.score)},
-        "pose": {"pose": _pose(one.T_cam_obj), "covariance": covariance.ravel().tolist()},
+        "hypothesis": {"class_id": detection.object, "score": float(detection.score)},
+        "pose": {"pose": _pose(detection.T_cam_obj), "covariance": covariance.ravel().tolist()},
     }
 
 
@@ -211,7 +211,7 @@ def _xyz(values: Float[np.ndarray, "3"]) -> Fields:
 
 
 def _triangles(part: Part) -> Triangles:
-    """Return a part's triangles, few enough to send with every picture; none without a mesh."""
+    """Return a part's simplified mesh; no triangles without a mesh."""
     if part.mesh is None:
         return Triangles(np.zeros((0, 3)))
     vertices, faces = part.mesh.vertices, part.mesh.faces

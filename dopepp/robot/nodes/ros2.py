@@ -1,9 +1,9 @@
-"""A node of ROS 2: the wheels of the extra ``ros2``, or the rclpy of an installed ROS.
+"""A ROS 2 node, with the wheels of the extra ``ros2`` or the rclpy of an installed ROS.
 
-Pictures are taken RELIABLE, unless the camera offers less: best effort loses large messages. The
-queue is short and emptied at once. A camera does not wait and a network takes its time, so one
-picture waits in a :class:`Slot` while the last one is processed, and a newer one replaces it.
-What has no messages installed (``vision_msgs``, ``tf2_msgs``) is left out, which is said.
+The subscription is RELIABLE unless the camera only offers best effort, which loses large messages.
+The queue is short. A camera is faster than a network, so the latest picture waits in a
+:class:`Slot` while its predecessor is processed. Topics whose messages are not installed
+(``vision_msgs``, ``tf2_msgs``) are skipped with a warning.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from dopepp.inference.frames.ros import info_topic
 from dopepp.robot.nodes.messages import (
     DIAGNOSTICS,
     OVERLAY,
+    AnswerFormatter,
     Fields,
     Message,
-    Speaker,
     Triangles,
     diagnosis,
 )
 from dopepp.robot.nodes.worker import Stamp, Worker
 
 QUEUE_IN: Final = 5
-"""With queues of one at both ends, a process that a busy machine lets wait for 33 ms loses pictures
-before anybody has chosen: 10 and 33 of 300 at 30 Hz. With many, it begins with old ones."""
+"""A shorter queue loses pictures when a busy machine delays the process. A longer one starts with
+old pictures."""
 
 QUEUE_OUT: Final = 10
-WAIT_S: Final = 0.2  # seconds between two looks at whether the node is to end
-RECENT: Final = 100  # pictures over which rates and latencies are told
+WAIT_S: Final = 0.2  # seconds between two checks whether the node should stop
+RECENT: Final = 100  # number of pictures over which rates and latencies are reported
 
 logger = logging.getLogger(__name__)
 
@@ -50,10 +50,16 @@ Item = TypeVar("Item")
 
 
 def run(worker: Worker, topic: str, name: str, params: Path | None = None) -> None:
-    """Answer the pictures on a topic until the process is interrupted.
+    """Process the pictures on a topic until the process is interrupted.
 
-    ``params`` is a YAML file of parameters as ROS 2 has them. A :class:`UserError`: a name, the
-    file or a parameter in it is wrong.
+    Args:
+        worker: Estimates the poses.
+        topic: Topic of the pictures.
+        name: Name of the node.
+        params: YAML file of ROS 2 parameters.
+
+    Raises:
+        UserError: A name, the file or a parameter in it is invalid.
     """
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
@@ -62,7 +68,7 @@ def run(worker: Worker, topic: str, name: str, params: Path | None = None) -> No
     if params is not None and not params.is_file():
         raise UserError(f"--params {params}, no such file", "a YAML file", "check the path")
     words = [] if params is None else ["--ros-args", "--params-file", str(params)]
-    with _told("--params" if params else "ROS 2"):
+    with _ros_errors("--params" if params else "ROS 2"):
         rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
     node = None
     try:
@@ -84,15 +90,15 @@ class _Node:
     def __init__(self, worker: Worker, topic: str, name: str) -> None:
         import rclpy
 
-        with _told(f"--name {name}, --topic {topic}"):
+        with _ros_errors(f"--name {name}, --topic {topic}"):
             self.handle = rclpy.create_node(name)
             self._topic = self.handle.resolve_topic_name(topic)
         self._worker, self._name = worker, name
         self._declare_parameters()
         self._clock = self.handle.get_clock()
-        self._speaker, self._pace = Speaker(worker.parts), Pace()
+        self._formatter, self._pace = AnswerFormatter(worker.parts), Pace()
         self._publishers: dict[str, Any] = {}
-        for published, kind in (*self._speaker.topics(), DIAGNOSTICS):
+        for published, kind in (*self._formatter.topics(), DIAGNOSTICS):
             self._advertise(published, kind)
         self.slot: Slot[tuple[Any, Any | None]] = Slot(self._answer)
         self._info: Any | None = None
@@ -103,24 +109,24 @@ class _Node:
         self.handle.create_timer(1.0, self._tick)
 
     def _declare_parameters(self) -> None:
-        """Declare the worker's settings; a file's values take the place of the command's."""
+        """Declare the worker's settings. A parameter file overrides the command's options."""
         settings = asdict(self._worker.settings)
         for name, value in settings.items():
-            with _told(f"parameter {name}"):
+            with _ros_errors(f"parameter {name}"):
                 self.handle.declare_parameter(name, value)
         values = {name: self.handle.get_parameter(name).value for name in settings}
-        self._worker.set(replace(self._worker.settings, **values))
+        self._worker.update(replace(self._worker.settings, **values))
         self.handle.add_on_set_parameters_callback(self._change)
 
     def _change(self, parameters: Any) -> Any:
-        """Take over changed parameters, all or none."""
+        """Apply changed parameters, all or none."""
         from rcl_interfaces.msg import SetParametersResult
 
         settings = self._worker.settings
         names = asdict(settings)
         changes = {entry.name: entry.value for entry in parameters if entry.name in names}
         try:
-            self._worker.set(replace(settings, **changes))
+            self._worker.update(replace(settings, **changes))
         except UserError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
@@ -131,7 +137,7 @@ class _Node:
             message = type_of(kind)
         except ImportError:
             package = kind.partition("/")[0]
-            logger.warning("without %s: %s is not published", package, full)
+            logger.warning("%s is not installed: %s is not published", package, full)
             return
         self._publishers[topic] = self.handle.create_publisher(message, full, QUEUE_OUT)
 
@@ -146,14 +152,14 @@ class _Node:
         qos = QoSProfile(depth=QUEUE_IN, reliability=policy)
         for subscription in self._subscriptions:
             self.handle.destroy_subscription(subscription)
-        # In this order a picture finds the camera_info that came with it.
+        # This order delivers the camera_info before its picture.
         self._subscriptions = [
             self.handle.create_subscription(info, info_topic(self._topic), self._take_info, qos),
             self.handle.create_subscription(image, self._topic, self._take_picture, qos),
         ]
 
     def _take_info(self, message: Any) -> None:
-        self._info = message  # which holds until the next
+        self._info = message  # valid until the next
 
     def _take_picture(self, message: Any) -> None:
         self.slot.put((message, self._info))
@@ -162,12 +168,12 @@ class _Node:
         answer = self._worker.take(*item, self._topic)
         if answer is None:
             return
-        for message in self._speaker.messages(answer, self._is_wanted):
+        for message in self._formatter.messages(answer, self._is_wanted):
             self._publish(message)
         self._pace.count(self._now() - answer.stamp.seconds)
 
     def _tick(self) -> None:
-        """Say once a second how the node does, and what keeps pictures from coming."""
+        """Publish the diagnosis once a second, and find out why no pictures arrive."""
         self._publish(self._diagnosis())
         if self.slot.received:
             return
@@ -177,11 +183,12 @@ class _Node:
             logger.warning("%s is published best effort: pictures may be lost", self._topic)
             self._subscribe()
         elif self._silent_s == 5:
-            own, kind = f"/{self._name}/{OVERLAY}", "sensor_msgs/msg/Image"
+            overlay, kind = f"/{self._name}/{OVERLAY}", "sensor_msgs/msg/Image"
             topics = self.handle.get_topic_names_and_types()
-            others = [name for name, kinds in topics if kind in kinds and name != own]
-            logger.warning("no picture on %s for 5 s; topics with pictures: %s (--topic)",
-                           self._topic, ", ".join(others) or "none")  # fmt: skip
+            names = [name for name, kinds in topics if kind in kinds and name != overlay]
+            others = ", ".join(names) or "none"
+            text = "no picture on %s for 5 s; topics with pictures: %s (--topic)"
+            logger.warning(text, self._topic, others)
 
     def _diagnosis(self) -> Message:
         self.slot.check()
@@ -189,8 +196,10 @@ class _Node:
         values = {key: str(value) for key, value in counts.items()} | self._pace.values()
         now = self._now()
         stamp = Stamp(int(now), int(1e9 * (now % 1)))
-        trouble = self._worker.trouble or f"no picture on {self._topic}" * (not self.slot.received)
-        return diagnosis(stamp, self._name, trouble, values)
+        problem = self._worker.problem
+        if not self.slot.received:
+            problem = problem or f"no picture on {self._topic}"
+        return diagnosis(stamp, self._name, problem, values)
 
     def _offers_less(self) -> bool:
         from rclpy.qos import ReliabilityPolicy
@@ -215,20 +224,20 @@ class _Node:
 
 
 @contextmanager
-def _told(what: str) -> Iterator[None]:
-    """Tell in one line what ROS refuses."""
+def _ros_errors(what: str) -> Iterator[None]:
+    """Turn an error of ROS into a :class:`UserError`."""
     try:
         yield
-    except Exception as error:  # rclpy's are of many kinds
-        allowed = "names and values that ROS 2 takes"
-        raise UserError(f"{what}: {error!s:.300}", allowed, "correct it") from error
+    except Exception as error:  # rclpy raises many types
+        allowed = "names and values that ROS 2 accepts"
+        raise UserError(f"{what}: {error!s:.300}", allowed, "correct the value") from error
 
 
 class Slot(Generic[Item]):
-    """Hands each picture to a thread of its own; one that comes while it works replaces the last.
+    """Passes pictures to a thread. While the thread is busy, a new picture replaces a waiting one.
 
     Args:
-        handle: What the thread does with it. What it raises ends the thread, and is raised again
+        handle: Processes a picture in the thread. An exception ends the thread and is raised again
             by :meth:`put` and :meth:`check`.
     """
 
@@ -242,7 +251,7 @@ class Slot(Generic[Item]):
         self._thread.start()
 
     def put(self, item: Item) -> None:
-        """Leave a picture, whatever was there."""
+        """Offer a picture."""
         self.check()
         with self._fresh:
             self.received += 1
@@ -251,12 +260,12 @@ class Slot(Generic[Item]):
             self._fresh.notify()
 
     def check(self) -> None:
-        """Raise what has ended the thread, if anything has."""
+        """Raise the exception that ended the thread, if any."""
         if self._error is not None:
             raise self._error
 
     def stop(self, wait_s: float = 5.0) -> None:
-        """Let the picture that is processed be the last."""
+        """Stop after the current picture."""
         with self._fresh:
             self._stopped = True
             self._fresh.notify()
@@ -276,7 +285,7 @@ class Slot(Generic[Item]):
 
 
 class Pace:
-    """How often a node answers, and how old a picture is by then."""
+    """Measures the rate and the latency of the answers."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -285,13 +294,13 @@ class Pace:
         self._answered = 0
 
     def count(self, latency_s: float) -> None:
-        """Count an answer, and how long ago its picture was taken."""
+        """Count an answer with the age of its picture."""
         self._times.append(self._clock())
         self._latencies.append(1000 * latency_s)
         self._answered += 1
 
     def values(self) -> dict[str, str]:
-        """Return what a diagnosis tells; nothing of what is not known yet."""
+        """Return the values that are already known, for a diagnosis."""
         values = {"answered": str(self._answered)}
         if len(self._times) > 1:
             span = self._times[-1] - self._times[0]
@@ -303,13 +312,13 @@ class Pace:
 
 
 def native(kind: str, fields: Fields) -> Any:
-    """Return ROS 2's message of plain values; what they leave out is 0 or empty."""
+    """Return the ROS 2 message of plain values. Missing fields are 0 or empty."""
     return _fill(type_of(kind)(), fields)
 
 
 @cache
 def type_of(kind: str) -> Any:
-    """Return the class of a message, by its package and name; an ImportError without it."""
+    """Return the class of a message type, ``package/Name``; may raise ImportError."""
     package, _, name = kind.partition("/")
     return getattr(import_module(f"{package}.msg"), name)
 
@@ -322,13 +331,13 @@ def _fill(message: Any, fields: Fields) -> Any:
 
 
 def _value(default: Any, kind: str, value: Any) -> Any:
-    """Return a field's value; ``kind`` is how ROS writes its type."""
+    """Return the value of a field, whose type ROS spells ``kind``."""
     if isinstance(value, dict):
         return _fill(default, value)
     if isinstance(value, Triangles):
         return _points(value)
     if isinstance(value, bytes) and isinstance(default, array.array):
-        return array.array("B", value)  # anything else is checked byte by byte
+        return array.array("B", value)  # ROS checks other types byte by byte
     if kind == "octet":
         return bytes([value])
     if isinstance(value, list) and value and isinstance(value[0], dict):

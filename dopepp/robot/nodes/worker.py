@@ -1,7 +1,7 @@
-"""Worker: what a node makes of each picture, whatever has brought it.
+"""Worker: processes the pictures of a node, whatever their transport.
 
-What is wrong with a picture or its camera ends nothing: it is said once, with what to do, and the
-next picture is looked at.
+An invalid picture or camera does not stop the node. The worker warns once, with a remedy, and
+continues with the next picture.
 """
 
 from __future__ import annotations
@@ -22,32 +22,32 @@ from dopepp.inference.pose_result import PoseResult, make_shape, spent_between
 from dopepp.inference.tracker import PoseTracker
 
 PATIENCE: Final = 5
-"""Pictures in a row without a ``camera_info`` before that is said: the first may come earlier."""
+"""Consecutive pictures without ``camera_info`` before the warning: the first may arrive early."""
 
-OPTICAL: Final = "optical"  # what the name of a frame has in it whose z looks forward (REP 103)
+OPTICAL: Final = "optical"  # part of the name of a frame whose z axis points forward (REP 103)
 
 logger = logging.getLogger(__name__)
 
 
 class Stamp(NamedTuple):
-    """When a picture was taken, as ROS counts: seconds since 1970 and nanoseconds."""
+    """Time of a picture as in ROS: seconds since 1970 and nanoseconds."""
 
     sec: int
     nanosec: int
 
     @property
     def seconds(self) -> float:
-        """Both as one number."""
+        """The time in seconds."""
         return self.sec + self.nanosec / 1e9
 
 
 @dataclass(frozen=True)
-class Settings:
-    """What may change while a node runs."""
+class WorkerSettings:
+    """Settings that may change while a node runs."""
 
-    confidence: float = 0.0  # least score of a pose, in [0, 1]
-    refine: bool = False  # whether poses are made precise on the picture
-    overlay: bool = False  # whether the picture with the poses drawn on it is wanted
+    confidence: float = 0.0  # minimum score of a pose, in [0, 1]
+    refine: bool = False  # whether poses are refined on the picture
+    overlay: bool = False  # whether pictures with drawn poses are published
 
     def __post_init__(self) -> None:
         check("confidence", self.confidence, float, Range(0, 1))
@@ -57,18 +57,18 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Poses on a picture, with its stamp and its camera's optical frame, which they are in."""
+    """Poses in a picture."""
 
-    stamp: Stamp
-    frame_id: str
+    stamp: Stamp  # of the picture
+    frame_id: str  # the camera's optical frame, in which the poses are
     result: PoseResult
 
     @property
     def numbers(self) -> list[int]:
-        """The n of every pose's frame ``<object>_<n>``.
+        """The number n in every pose's frame ``<object>_<n>``.
 
-        That is its identity where parts are followed, else its place among its object's, the best
-        score first.
+        The track's identity if parts are tracked, otherwise the rank among the detections of the
+        object, the best score first.
         """
         if self.result.identities is not None:
             return [*self.result.identities]
@@ -77,173 +77,193 @@ class Answer:
 
 
 class Worker:
-    """Looks at one picture after the other.
+    """Processes pictures in order.
 
     Args:
-        estimator: Finds the parts.
-        settings: To begin with; may be replaced at any time (:meth:`set`).
-        camera: Of all pictures, in place of what comes with each.
-        frame_id: Of the camera's optical frame, in place of the pictures' own.
-        track: Follow the parts from picture to picture, which refines.
-        say: Where warnings go.
+        estimator: Estimates the poses.
+        settings: Initial settings (see :meth:`update`).
+        camera: Camera of all pictures, in place of their ``camera_info``.
+        frame_id: The camera's optical frame, in place of the pictures' own.
+        track: Track the parts from frame to frame; this includes refinement.
+        warn: Receives warnings.
 
     Raises:
-        UserError: The settings ask for what this estimator cannot do.
+        UserError: The estimator does not support the settings.
     """
 
     def __init__(
         self,
         estimator: PoseEstimator,
-        settings: Settings | None = None,
+        settings: WorkerSettings | None = None,
         camera: Camera | None = None,
         frame_id: str | None = None,
         track: bool = False,
-        say: Callable[[str], None] = logger.warning,
+        warn: Callable[[str], None] = logger.warning,
     ) -> None:
         self._estimators = {estimator.refiner is not None: estimator}
-        self._camera, self._frame_id, self._say = camera, frame_id, say
+        self._camera, self._frame_id, self._send_warning = camera, frame_id, warn
         self._tracker = PoseTracker(self._estimator(True)) if track else None
-        self._said: set[str] = set()
+        self._warned: set[str] = set()
         self._last: Stamp | None = None
-        self._number = self._without_info = 0
+        self._number = self._num_without_info = 0
         self._shapes = {part.name: make_shape(part) for part in estimator.solid_parts}
-        self.trouble = ""
-        """What is wrong with the last picture, empty where nothing is."""
+        self.problem = ""
+        """The problem with the last picture, or an empty string."""
         self.parts = estimator.solid_parts
-        self.settings = Settings()
-        self.set(settings or Settings(refine=track or estimator.refiner is not None))
+        self.settings = WorkerSettings()
+        self.update(settings or WorkerSettings(refine=track or estimator.refiner is not None))
 
-    def set(self, settings: Settings) -> None:
-        """Change the settings; a :class:`UserError`, and no change, where they cannot be."""
+    def update(self, settings: WorkerSettings) -> None:
+        """Change the settings.
+
+        Raises:
+            UserError: The settings are not supported; the previous ones stay.
+        """
         if self._tracker is not None and not settings.refine:
             raise UserError("refine=false with --track", "refine=true", "start without --track")
         self._estimator(settings.refine)
         self.settings = settings
 
     def _estimator(self, refine: bool) -> PoseEstimator:
-        """Return the estimator that refines, or the one that does not; they share the network."""
+        """Return the estimator with or without refinement. Both share the network."""
         if refine not in self._estimators:
-            own = self._estimators[not refine]
+            base = self._estimators[not refine]
             self._estimators[refine] = (
-                own.refining("region", own.solid_parts) if refine
-                else PoseEstimator(own.network, own.checkpoint, own.device)
-            )  # fmt: skip
+                base.refining("region", base.solid_parts)
+                if refine
+                else PoseEstimator(base.network, base.checkpoint, base.device)
+            )
         return self._estimators[refine]
 
     def take(self, message: Any, info: Any | None, topic: str) -> Answer | None:
-        """Process the picture of a ROS message; ``info`` is the ``camera_info`` that holds for it.
+        """Process the picture of a ROS message.
 
-        None where that is not possible, which was said.
+        Args:
+            message: The picture.
+            info: The ``camera_info`` of the picture.
+            topic: Topic of the picture.
+
+        Returns:
+            The answer, or None after a warning if the picture cannot be processed.
         """
         try:
             image = decode_image(message)
-        except Exception as error:  # whatever is wrong with a message that anybody sent
-            fix = "let the driver send rgb8 or bgr8, or JPEG"
-            self._trouble("picture", f"a picture of {topic}: {error!s:.300}; fix: {fix}")
+        except Exception as error:  # messages come from anywhere: any error is the sender's
+            fix = "configure the driver to send rgb8, bgr8 or JPEG"
+            self._reject("picture", f"a picture of {topic}: {error!s:.300}; fix: {fix}")
             return None
         try:
             lens = None if info is None else CameraInfo.from_message(info)
         except Exception as error:
-            self._trouble("info", f"the camera_info beside {topic}: {error!s:.300}")
+            self._reject("info", f"the camera_info beside {topic}: {error!s:.300}")
             return None
         if lens is None and self._camera is None:
-            self._without_info += 1
-            if self._without_info == PATIENCE:
-                self._trouble(
-                    "no info", f"pictures on {topic} without a camera_info beside them: let the "
-                    "driver publish it, or pass --camera camera.yaml (`dopepp calibrate camera`)",
-                )  # fmt: skip
+            self._num_without_info += 1
+            if self._num_without_info == PATIENCE:
+                problem = f"pictures on {topic} without camera_info: let the driver publish it, or "
+                problem += "pass --camera camera.yaml (from `dopepp calibrate camera`)"
+                self._reject("no info", problem)
             return None
-        self._without_info = 0
+        self._num_without_info = 0
         stamp = stamp_of(message.header.stamp)
         frame_id = self._checked_frame(message.header.frame_id, lens, topic)
         self._check_time(stamp, topic)
         try:
             camera = self._camera or lens.camera(f"camera_info of {topic}", is_rectified(topic))  # type: ignore[union-attr]
-            cropped = self._camera is None and lens is not None and lens.roi is not None
+            is_cropped = self._camera is None and lens is not None and lens.roi is not None
             frame = CameraFrame(image, topic, self._number, stamp.seconds)
-            result = self.result(frame, camera, cropped)
-        except ValueError as error:  # a UserError, or fields of odd lengths
-            self._trouble("camera", str(error))
+            result = self.result(frame, camera, is_cropped)
+        except ValueError as error:  # a UserError, or fields of wrong lengths
+            self._reject("camera", str(error))
             return None
-        self.trouble = ""
+        self.problem = ""
         self._number += 1
         return Answer(stamp, frame_id, result)
 
     def result(self, frame: CameraFrame, camera: Camera, cropped: bool = False) -> PoseResult:
-        """Return the poses on a picture; a :class:`UserError` where the camera cannot be its.
+        """Estimate the poses in a picture.
 
-        Pictures that are ``cropped`` may have the principal point anywhere.
+        Args:
+            frame: The picture.
+            camera: Its camera.
+            cropped: Whether the principal point may be far from the centre.
+
+        Raises:
+            UserError: The camera has another image size.
         """
         size = (frame.image.shape[1], frame.image.shape[0])
         if camera.size is not None and camera.size != size:
-            raise UserError(
-                f"{camera.source} of {camera.size[0]}×{camera.size[1]}, and pictures of "
-                f"{size[0]}×{size[1]}", "one size", "let the driver publish the camera_info of "
-                "these pictures, or calibrate the camera at this size",
-            )  # fmt: skip
-        settings = self.settings
-        estimator = self._estimator(settings.refine)
+            sizes = f"{camera.size[0]}×{camera.size[1]}, and pictures of {size[0]}×{size[1]}"
+            fix = "let the driver publish the camera_info of these pictures, or calibrate the "
+            fix += "camera at this size"
+            raise UserError(f"{camera.source} of {sizes}", "one size", fix)
+        estimator = self._estimator(self.settings.refine)
         before, start = dict(estimator.spent_ms), time.perf_counter()
         image = camera.undistorted(frame.image)
         estimator.spent_ms["pre"] += 1000 * (time.perf_counter() - start)
-        ids: list[int] | None = None
         if self._tracker is None:
-            found = estimator.predict(image, camera.K, cropped=cropped)
+            detections = estimator.predict(image, camera.K, cropped=cropped)
+            ids = None
         else:
             tracks = self._tracker.track(image, camera.K, cropped)
-            found, ids = [one.detection for one in tracks], [one.identity for one in tracks]
-        chosen = [k for k, one in enumerate(found) if one.score >= settings.confidence]
+            detections = [track.detection for track in tracks]
+            ids = [track.identity for track in tracks]
+        least = self.settings.confidence
+        kept = [index for index, pose in enumerate(detections) if pose.score >= least]
         return PoseResult(
-            image, camera.K, [found[k] for k in chosen], spent_between(before, estimator.spent_ms),
-            frame.name, frame.number, frame.time, ids and [ids[k] for k in chosen], self._shapes,
-        )  # fmt: skip
+            image,
+            camera.K,
+            [detections[index] for index in kept],
+            spent_between(before, estimator.spent_ms),
+            frame.name,
+            frame.number,
+            frame.time,
+            ids and [ids[index] for index in kept],
+            self._shapes,
+        )
 
     def _checked_frame(self, frame_id: str, info: CameraInfo | None, topic: str) -> str:
-        """Return the frame that poses are in, and say what is odd about it."""
+        """Return the frame of the poses; warn if it is not an optical one."""
         if self._frame_id is not None:
             return self._frame_id
+        pictures = f"pictures on {topic} are in frame {frame_id!r:.80}"
         fix = "name the camera's optical frame: --frame camera_optical_frame"
         if OPTICAL not in frame_id:
-            self._warn(
-                "frame", f"pictures on {topic} are in frame {frame_id!r:.80}, which is not named "
-                f"as an optical one; poses have x right, y down and z forward in it; {fix}",
-            )  # fmt: skip
+            problem = f"{pictures}, which is not named as an optical one; poses have x right, "
+            self._warn("frame", f"{problem}y down and z forward in it; {fix}")
         elif info is not None and info.frame_id not in ("", frame_id):
-            self._warn(
-                "frame", f"pictures on {topic} are in frame {frame_id!r:.80}, their camera_info in "
-                f"{info.frame_id!r:.80}; the pictures' is used; {fix}",
-            )  # fmt: skip
+            problem = f"{pictures}, their camera_info in {info.frame_id!r:.80}; the pictures' frame"
+            self._warn("frame", f"{problem} is used; {fix}")
         return frame_id
 
     def _check_time(self, stamp: Stamp, topic: str) -> None:
-        """Say where pictures have no stamp, or one before the last; then follow parts anew."""
+        """Warn about missing or decreasing stamps; after a decrease, restart the tracking."""
         last, self._last = self._last, stamp
         if stamp == Stamp(0, 0):
-            self._warn(
-                "no stamp", f"pictures on {topic} without a stamp, which TF cannot place in time: "
-                "let the driver set header.stamp",
-            )  # fmt: skip
+            problem = f"pictures on {topic} without a stamp, which TF needs: "
+            self._warn("no stamp", f"{problem}let the driver set header.stamp")
         elif last is not None and stamp < last:
             back = last.seconds - stamp.seconds
             self._warn(
-                "back", f"stamps on {topic} went back by {back:.3f} s: a recording or simulation "
-                "that began again, or two cameras on one topic? parts are looked for anew",
-            )  # fmt: skip
+                "back",
+                f"stamps on {topic} went back by {back:.3f} s: a restarted recording or "
+                "simulation, or two cameras on one topic? Parts are detected anew",
+            )
             if self._tracker is not None:
                 self._tracker = PoseTracker(self._estimator(True))
 
-    def _trouble(self, kind: str, text: str) -> None:
-        """Say what keeps a picture from being processed."""
-        self.trouble = text
-        self._warn(kind, text)
+    def _reject(self, kind: str, problem: str) -> None:
+        """Record why a picture is not processed, and warn."""
+        self.problem = problem
+        self._warn(kind, problem)
 
     def _warn(self, kind: str, text: str) -> None:
-        if kind not in self._said:
-            self._said.add(kind)
-            self._say(text)
+        """Send a warning, once of each kind."""
+        if kind not in self._warned:
+            self._warned.add(kind)
+            self._send_warning(text)
 
 
 def stamp_of(stamp: Any) -> Stamp:
-    """Return a message's stamp."""
+    """Return the stamp of a message's header."""
     return Stamp(int(stamp.sec), int(stamp.nanosec))

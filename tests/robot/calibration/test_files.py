@@ -7,7 +7,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.robot.calibration.files import Reading, matched, read_robot_poses
+from dopepp.robot.calibration.records import PoseFormat, match_pictures, read_robot_poses
 
 TURN = Rotation.from_euler("xyz", [0.3, -0.5, 1.2])
 AT = [0.4, -0.1, 0.3]
@@ -34,11 +34,11 @@ def test_a_pose_is_the_same_in_every_format(tmp_path, rotation, suffix):
         text = (json.dumps if suffix == ".json" else yaml.safe_dump)([whole])
     path.write_text(text)
     poses = read_robot_poses(path)
-    T = poses.transforms(Reading())[0]
+    T = poses.transforms(PoseFormat())[0]
     assert poses.names == ("a.png",)
     assert np.allclose(T[:3, :3], TURN.as_matrix())
     assert np.allclose(T[:3, 3], AT)
-    assert np.allclose(poses.transforms(Reading(inverted=True))[0] @ T, np.eye(4))
+    assert np.allclose(poses.transforms(PoseFormat(inverted=True))[0] @ T, np.eye(4))
 
 
 def test_a_matrix_stands_for_both(tmp_path):
@@ -47,7 +47,7 @@ def test_a_matrix_stands_for_both(tmp_path):
     (tmp_path / "poses.json").write_text(json.dumps({"a.png": {"matrix": T.tolist()}}))
     poses = read_robot_poses(tmp_path / "poses.json")
     assert poses.names == ("a.png",)
-    assert np.allclose(poses.transforms(Reading())[0], T)
+    assert np.allclose(poses.transforms(PoseFormat())[0], T)
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def test_a_matrix_stands_for_both(tmp_path):
         ("p.csv", "x,y,z,rx,ry,rz\n1,2,3,0,0,nan\n", "pose 1: rz='nan'"),
         ("p.csv", "x,y,z,rx,ry,rz\n1,2,3,0,0\n", "pose 1: rz=None"),
         ("p.csv", "x,y,z,qw,qx,qy,qz\n1,2,3,0,0,0,0\n", "unit quaternions"),
-        ("p.json", "[1, 2]", "no list of records"),
+        ("p.json", "[1, 2]", "not a list of records"),
         ("p.json", '[{"matrix": [[1, 2], [3, 4]]}]', "4×4 numbers"),
         ("p.json", '[{"matrix": "x"}]', "4×4 numbers"),
         ("p.yaml", "&a [*a]", "anchors"),
@@ -76,10 +76,10 @@ def test_a_file_that_is_none_is_refused_in_one_line(tmp_path, name, text, said):
 def test_poses_go_with_their_pictures(tmp_path):
     path = tmp_path / "p.csv"
     path.write_text("image,x,y,z,rx,ry,rz\nb,1,2,3,0,0,0\na,1,2,3,0,0,0\n")
-    assert matched(read_robot_poses(path), ["a.png", "b.png", "c.png"]) == [(0, 1), (1, 0)]
+    assert match_pictures(read_robot_poses(path), ["a.png", "b.png", "c.png"]) == [(0, 1), (1, 0)]
     with pytest.raises(UserError, match="the first 'b'"):
-        matched(read_robot_poses(path), ["a.png"])
+        match_pictures(read_robot_poses(path), ["a.png"])
     path.write_text("x,y,z,rx,ry,rz\n1,2,3,0,0,0\n")
-    assert matched(read_robot_poses(path), ["a.png"]) == [(0, 0)]
+    assert match_pictures(read_robot_poses(path), ["a.png"]) == [(0, 0)]
     with pytest.raises(UserError, match="1 poses and 2 pictures"):
-        matched(read_robot_poses(path), ["a.png", "b.png"])
+        match_pictures(read_robot_poses(path), ["a.png", "b.png"])

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.robot.calibration.board import board_pose
-from dopepp.robot.calibration.files import Reading, read_robot_poses
 from dopepp.robot.calibration.hand_eye import calibrate_hand_eye
-from dopepp.robot.calibration.quality import check_poses, expected_error, explain
+from dopepp.robot.calibration.quality import assess, check_poses, expected_error
+from dopepp.robot.calibration.records import PoseFormat, read_robot_poses
 
 QUATERNION = ("qw", "qx", "qy", "qz")
 
@@ -41,11 +41,11 @@ def judge(given, path, reading, mount):
 @pytest.mark.parametrize(
     ("how", "reading"),
     [
-        ({}, Reading()),
-        ({"kind": "rotvec"}, Reading()),
-        ({"kind": "euler", "degrees": True}, Reading(degrees=True)),
-        ({"unit": 1e-3}, Reading("mm")),
-        ({"xyzw": True}, Reading(order="xyzw")),
+        ({}, PoseFormat()),
+        ({"kind": "rotvec"}, PoseFormat()),
+        ({"kind": "euler", "degrees": True}, PoseFormat(degrees=True)),
+        ({"unit": 1e-3}, PoseFormat("mm")),
+        ({"xyzw": True}, PoseFormat(order="xyzw")),
     ],
 )
 def test_poses_that_are_read_as_they_are_meant_pass(cell, tmp_path, mount, how, reading):
@@ -56,20 +56,20 @@ def test_poses_that_are_read_as_they_are_meant_pass(cell, tmp_path, mount, how, 
 
 FAULTS = [
     # what is written, how it is read, mounting said, what the message says
-    ({"unit": 1e-3}, Reading(), "hand", "--unit mm"),
-    ({"unit": 1e-2}, Reading(), "bench", "--unit cm"),
-    ({"unit": 0.0254}, Reading("mm"), "hand", "--unit inch"),
-    ({}, Reading("mm"), "hand", "--unit m"),
-    ({"xyzw": True}, Reading(), "hand", "--quaternion xyzw"),
-    ({"xyzw": True}, Reading(), "bench", "--quaternion xyzw"),
-    ({}, Reading(order="xyzw"), "hand", "--quaternion wxyz"),
-    ({"kind": "rotvec", "degrees": True}, Reading(), "hand", "--angles deg"),
-    ({"kind": "rotvec"}, Reading(degrees=True), "bench", "--angles rad"),
-    ({"kind": "euler", "degrees": True}, Reading(), "hand", "--angles deg"),
-    ({"xyzw": True, "unit": 1e-3}, Reading(), "hand", "--quaternion xyzw, and --unit mm"),
-    ({"kind": "euler", "degrees": True, "unit": 1e-3}, Reading(), "bench", "--unit mm"),
-    ({}, Reading(inverted=True), "hand", "--direction"),
-    ({}, Reading(inverted=True), "bench", "--direction"),
+    ({"unit": 1e-3}, PoseFormat(), "hand", "--unit mm"),
+    ({"unit": 1e-2}, PoseFormat(), "bench", "--unit cm"),
+    ({"unit": 0.0254}, PoseFormat("mm"), "hand", "--unit inch"),
+    ({}, PoseFormat("mm"), "hand", "--unit m"),
+    ({"xyzw": True}, PoseFormat(), "hand", "--quaternion xyzw"),
+    ({"xyzw": True}, PoseFormat(), "bench", "--quaternion xyzw"),
+    ({}, PoseFormat(order="xyzw"), "hand", "--quaternion wxyz"),
+    ({"kind": "rotvec", "degrees": True}, PoseFormat(), "hand", "--angles deg"),
+    ({"kind": "rotvec"}, PoseFormat(degrees=True), "bench", "--angles rad"),
+    ({"kind": "euler", "degrees": True}, PoseFormat(), "hand", "--angles deg"),
+    ({"xyzw": True, "unit": 1e-3}, PoseFormat(), "hand", "--quaternion xyzw, and --unit mm"),
+    ({"kind": "euler", "degrees": True, "unit": 1e-3}, PoseFormat(), "bench", "--unit mm"),
+    ({}, PoseFormat(inverted=True), "hand", "--direction"),
+    ({}, PoseFormat(inverted=True), "bench", "--direction"),
 ]
 
 
@@ -108,10 +108,10 @@ def one_early(given):
 @pytest.mark.parametrize(
     ("spoil", "mount", "said"),
     [
-        (same, "bench", "camera on the other side"),
-        (on_a_larger_board, "hand", r"squares: they would be 1\.2\d+ times"),
-        (standing_still, "hand", "the robot turns by 0"),
-        (one_picture, "hand", "the board, as the camera sees it, turns by 0"),
+        (same, "bench", "camera on the other mount"),
+        (on_a_larger_board, "hand", r"squares \(they may be 1\.2\d+ times"),
+        (standing_still, "hand", "the robot rotates by 0"),
+        (one_picture, "hand", "the board, seen by the camera, rotates by 0"),
         (one_late, "hand", "poses fit the"),
         (one_early, "hand", "poses fit the"),
     ],
@@ -123,27 +123,27 @@ def test_poses_that_are_not_those_of_the_pictures_are_recognised(
     spoil(given)
     path = write(tmp_path / "poses.csv", given.T_base_flange)
     with pytest.raises(UserError, match=said):
-        judge(given, path, Reading(), mount)
+        judge(given, path, PoseFormat(), mount)
 
 
 def test_poses_of_another_day_are_refused(cell, tmp_path):
     path = write(tmp_path / "poses.csv", cell(9).T_base_flange)
     with pytest.raises(UserError, match="medians of pairs"):
-        judge(cell(2), path, Reading(), "hand")
+        judge(cell(2), path, PoseFormat(), "hand")
 
 
 @pytest.mark.parametrize("seed", range(12))
 def test_good_poses_with_two_outliers_raise_no_alarm(cell, tmp_path, seed):
     given = cell(seed)
     given.T_base_flange[:2, :3, 3] += 0.03
-    judge(given, write(tmp_path / "poses.csv", given.T_base_flange), Reading(), "hand")
+    judge(given, write(tmp_path / "poses.csv", given.T_base_flange), PoseFormat(), "hand")
 
 
 def test_an_explanation_names_the_pose_that_matters_and_trusts_a_good_calibration(cell):
     given = cell(6)
     boards = [board_pose(one, given.camera) for one in given.sightings]
     found = calibrate_hand_eye(given.T_base_flange, boards, "hand")
-    worth = explain(given.T_base_flange, boards, found)
+    worth = assess(given.T_base_flange, boards, found)
     assert not worth.findings
     assert worth.shift < 0.001
     one = int(worth.leave_one_out.argmax())
@@ -157,7 +157,7 @@ def test_turns_about_one_axis_are_not_trusted(cell):
     given = cell(7, tilt=0.01)  # straight from above, turned about the optical axis only
     boards = [board_pose(one, given.camera) for one in given.sightings]
     found = calibrate_hand_eye(given.T_base_flange, boards, "hand")
-    worth = explain(given.T_base_flange, boards, found)
+    worth = assess(given.T_base_flange, boards, found)
     assert any("one direction only" in one for one in worth.findings)
     optical = given.T_mount_cam[:3, 2]
     assert abs(worth.weakest @ optical) > 0.9

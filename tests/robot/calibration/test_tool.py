@@ -25,7 +25,6 @@ def touching(rotations, noise=0.0, seed=0):
 def test_the_tip_is_exact_without_noise(seed, num):
     tip = find_tip(touching(Rotation.random(num, rng=np.random.default_rng(seed))))
     assert np.allclose(tip.position, TIP, atol=1e-9)
-    assert np.allclose(tip.pivot, PIVOT, atol=1e-9)
 
 
 def test_the_tip_is_found_within_its_deviations():
@@ -41,7 +40,6 @@ def test_the_tip_is_found_within_its_deviations():
 
 def test_turns_about_one_axis_leave_it_open():
     tip = find_tip(touching(Rotation.from_rotvec(np.outer(np.linspace(0, 2, 6), [0, 0, 1])), 1e-4))
-    assert abs(tip.weakest[2]) > 0.999
     assert "z axis" in tip.findings[0]
 
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from dopepp.parts.catalogue import load_part
+from dopepp.robot.grasping.grasp_trial import GraspTask, PoseSource, Trials
 from dopepp.robot.grasping.planner import Arm, measure_gripper
-from dopepp.robot.grasping.task import Source, Task
-from dopepp.robot.grasping.trial import Trials
 
 
 @pytest.fixture(scope="session")
@@ -26,7 +25,7 @@ def part():
 
 @pytest.fixture(scope="session")
 def trials():
-    return Trials(Task(sources=(Source("exact"),)))
+    return Trials(GraspTask(sources=(PoseSource("exact"),)))
 
 
 @pytest.fixture(scope="session")

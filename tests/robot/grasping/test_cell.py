@@ -12,9 +12,8 @@ from dopepp.core.errors import UserError
 from dopepp.geometry.camera import make_transform
 from dopepp.parts.catalogue import BUILTIN, load_part
 from dopepp.robot.grasping.cell import TRAY, Cell, Thing, convex_pieces
-from dopepp.robot.grasping.layouts import HEAP, LAYOUTS, SPREAD, Layout
 from dopepp.robot.grasping.rehearsal import SIZE
-from dopepp.robot.grasping.view import RasterView
+from dopepp.robot.grasping.workbench import HEAP, LAYOUTS, SPREAD, Layout, RasterView
 
 
 @pytest.mark.parametrize("name", sorted(BUILTIN))
@@ -75,14 +74,14 @@ def test_distractors_keep_clear_of_the_part(part):
 def test_a_part_that_lies_on_its_front_looks_up_and_turns_within_its_yaw(part):
     layout = Layout(part, "single", yaw_deg=20.0, rest="front")
     for seed in range(20):
-        T = layout.drop(np.random.default_rng(seed))
+        T = layout.draw_pose(np.random.default_rng(seed))
         np.testing.assert_allclose(T[:3, 2], [0, 0, 1], atol=1e-9)
         assert abs(np.degrees(np.arctan2(T[1, 0], T[0, 0]))) <= 20
 
 
 @pytest.mark.parametrize("shadows", [False, True])
 def test_a_picture_shows_the_part_and_repeats_with_its_seed(trials, scene, shadows):
-    view, bodies = RasterView(shadows), [item.body for item in scene.lying]
+    view, bodies = RasterView(shadows), [item.body for item in scene.things]
 
     def take(poses):
         return view.take(bodies, poses, scene.T_base_cam, np.random.default_rng(1))

@@ -9,16 +9,16 @@ import pytest
 
 from dopepp.core.errors import RunError, UserError
 from dopepp.core.pool import LostWorkerError, ProcessPool
-from dopepp.robot.grasping import experiment
-from dopepp.robot.grasping.experiment import (
+from dopepp.robot.grasping import grasp_experiment
+from dopepp.robot.grasping.grasp_experiment import (
     check_task,
-    counted,
+    count_records,
     markdown,
     parse_sources,
     run_trials,
     write_report,
 )
-from dopepp.robot.grasping.task import Record, Source, Task
+from dopepp.robot.grasping.grasp_trial import GraspTask, PoseSource, Record
 
 
 def record(number, *, recognised=True, caught=True, failure="", source="network", off=0.0):
@@ -51,7 +51,7 @@ def test_failures_are_counted_by_kind(records):
     text = markdown(records, {})
     row = next(line for line in text.splitlines() if line.startswith("| network |"))
     assert row.split("|")[-6:-1] == [" 1 ", " 0 ", " 1 ", " 0 ", " 2 "]
-    assert counted(records).trials == 3 * 54
+    assert count_records(records).trials == 3 * 54
 
 
 def test_all_formats_hold_every_trial(records, tmp_path):
@@ -67,7 +67,7 @@ def test_all_formats_hold_every_trial(records, tmp_path):
     assert (tmp_path / "grasps.md").read_text().count("\n") > 10
 
 
-TASK = Task(sources=(Source("exact"),))
+TASK = GraspTask(sources=(PoseSource("exact"),))
 
 
 def test_two_processes_make_the_trials_of_one(trials):
@@ -86,13 +86,13 @@ def test_a_lost_process_ends_the_experiment_in_one_line(monkeypatch):
             future.set_exception(LostWorkerError("a worker process died (signal 9)"))
             return future
 
-    monkeypatch.setattr(experiment, "ProcessPool", Lost)
+    monkeypatch.setattr(grasp_experiment, "ProcessPool", Lost)
     with pytest.raises(RunError, match=r"died \(signal 9\)"):
         list(run_trials(TASK, 2, workers=2))
 
 
 def test_sources_are_named_once_each_and_a_curve_is_many():
-    assert parse_sources("exact, exact,random") == (Source("exact"), Source("random"))
+    assert parse_sources("exact, exact,random") == (PoseSource("exact"), PoseSource("random"))
     names = [source.name for source in parse_sources("curve")]
     assert names[0] == "exact poses, off by 1 mm and 1°"
     assert len(set(names)) == len(names) == 6

@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 from dopepp.geometry.camera import make_transform
 from dopepp.robot.grasping.cell import HOME, STEP, TRAY
 from dopepp.robot.grasping.execution import SPEED, Execution, _timed
+from dopepp.robot.grasping.grasp_trial import PoseSource, Trials
 from dopepp.robot.grasping.grasps import Grasp
-from dopepp.robot.grasping.planner import rested
-from dopepp.robot.grasping.task import Source
-from dopepp.robot.grasping.trial import Trials
+from dopepp.robot.grasping.planner import laid_flat
 
 
 @pytest.fixture
@@ -23,7 +22,7 @@ def planner(trials, scene):
 
 
 def test_a_part_at_a_known_pose_is_caught(trials, scene):
-    attempt = trials.attempt(scene, Source("exact"))
+    attempt = trials.attempt(scene, PoseSource("exact"))
     assert attempt.record.caught
     assert attempt.record.recognised
     assert attempt.record.failure == ""
@@ -36,7 +35,7 @@ def test_a_part_at_a_known_pose_is_caught(trials, scene):
 def test_a_part_that_is_elsewhere_is_not_caught(trials, scene, monkeypatch):
     aside = [one @ make_transform(np.eye(3), [0.0, 0.05, 0.0]) for one in scene.targets]
     monkeypatch.setattr(trials, "_poses", lambda *_: aside)
-    record = trials.attempt(scene, Source("exact")).record
+    record = trials.attempt(scene, PoseSource("exact")).record
     assert not record.caught
     assert not record.recognised
     assert record.failure == "wrong pose"
@@ -45,7 +44,7 @@ def test_a_part_that_is_elsewhere_is_not_caught(trials, scene, monkeypatch):
 
 def test_nothing_seen_is_a_failure_of_its_own(trials, scene, monkeypatch):
     monkeypatch.setattr(trials, "_poses", lambda *_: [])
-    record = trials.attempt(scene, Source("exact")).record
+    record = trials.attempt(scene, PoseSource("exact")).record
     assert (record.seen, record.caught, record.failure) == (False, False, "not seen")
 
 
@@ -54,7 +53,7 @@ def test_one_seed_makes_one_trial(trials, scene):
     again = trials.scene(0)
     np.testing.assert_array_equal(again.picture, scene.picture)
     np.testing.assert_array_equal(again.T_base_cam, scene.T_base_cam)
-    first, second = (trials.attempt(one, Source("exact")).outcome for one in (scene, again))
+    first, second = (trials.attempt(one, PoseSource("exact")).outcome for one in (scene, again))
     np.testing.assert_array_equal(first.states[-1], second.states[-1])
 
 
@@ -96,7 +95,7 @@ def test_a_part_that_seems_to_lie_on_the_bench_is_laid_on_it(trials, tilt_deg, r
     flat = make_transform(np.eye(3), np.array([0.0, 0.5, 0.0235]))
     tilt = Rotation.from_euler("x", tilt_deg, degrees=True).as_matrix()
     seen = make_transform(tilt, flat[:3, 3] + np.array([0.0, 0.0, rise]))
-    laid = rested(seen, trials.layout.body.hull, bench)
+    laid = laid_flat(seen, trials.layout.body.hull, bench)
     if is_laid:
         np.testing.assert_allclose(laid[:3, 2], [0, 0, 1], atol=1e-9)
         assert laid[2, 3] == pytest.approx(0.0235, abs=1e-9)

@@ -47,7 +47,7 @@ def test_datagrams_hold_a_line_each(seen, four):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ((), "no way in and out"),
+        ((), "no input and output"),
         (("--json", "--ros2"), "--ros2 and --json"),
         (("--json",), "--json without a source"),
         (("{pictures}", "--json"), "neither --K nor --camera"),

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from dopepp.core.errors import UserError
 from dopepp.inference.pose_result import PoseResult
 from dopepp.recovery.detection import Detection
-from dopepp.robot.nodes.messages import MARKER_FACES, Speaker, diagnosis
+from dopepp.robot.nodes.messages import MARKER_FACES, AnswerFormatter, diagnosis
 from dopepp.robot.nodes.worker import Answer, Stamp
 
 
@@ -43,9 +43,11 @@ def transform(pose):
 
 
 def test_all_topics_tell_the_same_poses(answer, parts):
-    said = {one.topic: one for one in Speaker(parts).messages(answer, lambda _: True)}
+    said = {one.topic: one for one in AnswerFormatter(parts).messages(answer, lambda _: True)}
     name = parts[0].name
-    assert [one.topic for one in said.values()] == [name for name, _ in Speaker(parts).topics()]
+    assert [one.topic for one in said.values()] == [
+        name for name, _ in AnswerFormatter(parts).topics()
+    ]
     header = {"stamp": {"sec": 7, "nanosec": 5}, "frame_id": "camera_optical_frame"}
     best, second = (one.T_cam_obj for one in answer.result.detections)
     assert said[f"pose_{name}"].fields["header"] == header
@@ -67,7 +69,9 @@ def test_all_topics_tell_the_same_poses(answer, parts):
 def test_covariances_are_of_shift_and_turn_in_this_order(answer, parts):
     one = answer.result.detections[0]
     (said,) = (
-        m for m in Speaker(parts).messages(answer, lambda _: True) if m.topic == "detections"
+        m
+        for m in AnswerFormatter(parts).messages(answer, lambda _: True)
+        if m.topic == "detections"
     )
     numbers = said.fields["detections"][0]["results"][0]["pose"]["covariance"]
     ros = np.reshape(numbers, (6, 6))
@@ -77,7 +81,7 @@ def test_covariances_are_of_shift_and_turn_in_this_order(answer, parts):
 
 
 def test_boxes_and_markers_enclose_the_part(answer, parts):
-    said = {one.topic: one for one in Speaker(parts).messages(answer, lambda _: True)}
+    said = {one.topic: one for one in AnswerFormatter(parts).messages(answer, lambda _: True)}
     box = said["detections"].fields["detections"][0]["bbox"]
     size = np.array([box["size"][k] for k in "xyz"])
     marker = said["markers"].fields["markers"][1]
@@ -93,19 +97,21 @@ def test_boxes_and_markers_enclose_the_part(answer, parts):
 
 def test_nothing_found_is_said_too_and_only_what_is_wanted(answer, parts):
     empty = replace(answer, result=replace(answer.result, detections=[]))
-    said = {one.topic: one.fields for one in Speaker(parts).messages(empty, lambda _: True)}
+    said = {one.topic: one.fields for one in AnswerFormatter(parts).messages(empty, lambda _: True)}
     assert f"pose_{parts[0].name}" not in said
     assert said["detections"]["detections"] == []
     assert said["/tf"]["transforms"] == []
-    assert [one.topic for one in Speaker(parts).messages(empty, {"/tf"}.__contains__)] == ["/tf"]
+    assert [one.topic for one in AnswerFormatter(parts).messages(empty, {"/tf"}.__contains__)] == [
+        "/tf"
+    ]
 
 
 def test_names_are_made_fit_for_topics_or_refused(answer, parts):
     odd = replace(parts[0], name="part 1/ä")
-    topics = [topic for topic, _ in Speaker([odd]).topics()]
+    topics = [topic for topic, _ in AnswerFormatter([odd]).topics()]
     assert topics[0] == "pose_part_1__"
     with pytest.raises(UserError, match="differ in letters"):
-        Speaker([odd, replace(parts[0], name="part_1_.")])
+        AnswerFormatter([odd, replace(parts[0], name="part_1_.")])
 
 
 def test_a_diagnosis_warns_of_trouble():

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dopepp.robot.nodes.messages import diagnosis, picture
+from dopepp.robot.nodes.messages import diagnosis, image_fields
 from dopepp.robot.nodes.ros2 import Pace, Slot, _Node, native
-from dopepp.robot.nodes.worker import Settings, Stamp, Worker
+from dopepp.robot.nodes.worker import Stamp, Worker, WorkerSettings
 
 ROOT = Path(__file__).parents[3]
 
@@ -25,7 +25,7 @@ def test_messages_are_filled_by_their_own_types():
     assert (told.header.stamp.sec, told.status[0].level) == (3, b"\x01")
     assert told.status[0].values[0].value == "30"
     image = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
-    filled = native("sensor_msgs/Image", picture(image, {}))
+    filled = native("sensor_msgs/Image", image_fields(image, {}))
     np.testing.assert_array_equal(np.frombuffer(filled.data, np.uint8).reshape(2, 4, 3), image)
 
 
@@ -39,12 +39,12 @@ def test_parameters_change_while_it_runs(estimator, tmp_path):
     try:
         worker = Worker(estimator)
         node = _Node(worker, "/camera/image_raw", "dope_of_a_test")
-        assert worker.settings == Settings(confidence=0.25)
+        assert worker.settings == WorkerSettings(confidence=0.25)
         for value, taken in ((0.75, True), (7.0, False)):
             (result,) = node.handle.set_parameters([Parameter("confidence", value=value)])
             assert result.successful == taken
         assert "a number from 0 to 1" in result.reason
-        assert worker.settings == Settings(confidence=0.75)
+        assert worker.settings == WorkerSettings(confidence=0.75)
         node.slot.stop()
     finally:
         rclpy.try_shutdown()
@@ -61,7 +61,7 @@ def test_a_camera_that_offers_less_is_heard(estimator, seen, caplog):
             _Node(Worker(estimator), "/best", "dope_of_a_test"),
             rclpy.create_node("camera"),
         )
-        image = native("sensor_msgs/Image", picture(seen.pictures[0], {}))
+        image = native("sensor_msgs/Image", image_fields(seen.pictures[0], {}))
         publisher = camera.create_publisher(type(image), "/best", qos_profile_sensor_data)
         executor = SingleThreadedExecutor()
         executor.add_node(node.handle)

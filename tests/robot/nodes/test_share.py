@@ -9,14 +9,14 @@ import typer.main
 import yaml
 
 from dopepp.cli import app
-from dopepp.robot.nodes.messages import DIAGNOSTICS, Speaker
-from dopepp.robot.nodes.worker import Settings
+from dopepp.robot.nodes.messages import DIAGNOSTICS, AnswerFormatter
+from dopepp.robot.nodes.worker import WorkerSettings
 
 SHARE = Path(__file__).parents[3] / "dopepp" / "robot" / "nodes" / "share"
 
 
 def test_what_is_shipped_names_what_there_is(estimator):
-    topics = {f"/dope/{topic}" for topic, _ in Speaker(estimator.solid_parts).topics()}
+    topics = {f"/dope/{topic}" for topic, _ in AnswerFormatter(estimator.solid_parts).topics()}
     topics.add(DIAGNOSTICS[0])
     for name in ("dope.rviz", "dope.foxglove.json"):
         content = yaml.safe_load((SHARE / name).read_text())
@@ -24,7 +24,7 @@ def test_what_is_shipped_names_what_there_is(estimator):
         assert len(named) >= 2
         assert {one.partition(".")[0] for one in named} <= topics
     (parameters,) = yaml.safe_load((SHARE / "dope.yaml").read_text()).values()
-    Settings(**parameters["ros__parameters"])
+    WorkerSettings(**parameters["ros__parameters"])
 
 
 def test_the_launch_file_starts_the_command_with_options_it_has(monkeypatch):

@@ -9,7 +9,7 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera_file import Camera
-from dopepp.robot.nodes.worker import PATIENCE, Settings, Stamp, Worker
+from dopepp.robot.nodes.worker import PATIENCE, Stamp, Worker, WorkerSettings
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def said():
 
 @pytest.fixture
 def worker(estimator, said):
-    return Worker(estimator, say=said.append)
+    return Worker(estimator, warn=said.append)
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def test_poses_are_the_estimators_on_the_picture_without_distortion(
         np.testing.assert_allclose(one.T_cam_obj, other.T_cam_obj, atol=1e-9)
     assert (answer.stamp, answer.frame_id) == (Stamp(12, 250_000_000), "camera_optical_frame")
     assert not said
-    assert worker.trouble == ""
+    assert worker.problem == ""
 
 
 @pytest.mark.parametrize(
@@ -66,9 +66,9 @@ def test_a_wrong_camera_is_said_once_and_ends_nothing(take, worker, said, spoilt
     assert said_of_it in line
     assert fix in line
     assert "\n" not in line
-    assert worker.trouble == line
+    assert worker.problem == line
     assert take() is not None
-    assert worker.trouble == ""
+    assert worker.problem == ""
 
 
 def test_pictures_without_camera_info_are_told_after_a_few(take, said):
@@ -82,7 +82,7 @@ def test_pictures_without_camera_info_are_told_after_a_few(take, said):
 
 
 def test_a_camera_that_is_given_takes_the_place_of_camera_info(estimator, seen, messages, said):
-    worker = Worker(estimator, camera=Camera(None, seen.K, (), "--K"), say=said.append)
+    worker = Worker(estimator, camera=Camera(None, seen.K, (), "--K"), warn=said.append)
     answer = worker.take(messages.image(seen.pictures[0], 1), None, messages.topic)
     expected = estimator.predict(seen.pictures[0], seen.K)
     np.testing.assert_allclose(
@@ -146,18 +146,18 @@ def test_a_p_of_another_length_ends_nothing(take, said):
 
 def test_settings_change_while_it_runs(worker, take):
     plain = take().result.detections[0]
-    worker.set(replace(worker.settings, refine=True))
+    worker.update(replace(worker.settings, refine=True))
     refined = take().result.detections[0]
     assert refined.agreement is not None
     assert plain.agreement is None
-    worker.set(Settings(confidence=1.0))
+    worker.update(WorkerSettings(confidence=1.0))
     assert take().result.detections == []
     with pytest.raises(UserError, match="confidence=3"):
-        Settings(confidence=3)
+        WorkerSettings(confidence=3)
 
 
 def test_parts_that_are_followed_have_names_that_stay(estimator, seen, messages, said):
-    tracking = Worker(estimator, Settings(refine=True), track=True, say=said.append)
+    tracking = Worker(estimator, WorkerSettings(refine=True), track=True, warn=said.append)
     info = messages.info(seen.K, (320, 240), d=[0.0] * 5)
     numbers = [
         tracking.take(messages.image(seen.pictures[0], second), info, messages.topic).numbers
@@ -165,5 +165,5 @@ def test_parts_that_are_followed_have_names_that_stay(estimator, seen, messages,
     ]
     assert numbers == [[0]] * 3
     with pytest.raises(UserError, match="--track"):
-        tracking.set(Settings(refine=False))
+        tracking.update(WorkerSettings(refine=False))
     assert not said

@@ -5,16 +5,16 @@ from launch.actions import DeclareLaunchArgument, ExecuteProcess
 from launch.substitutions import LaunchConfiguration
 
 ARGUMENTS = {
-    "model": ("pretrained/pivconnector", "best.ckpt of a run, or a released network"),
-    "topic": ("/camera/image_raw", "of the pictures"),
-    "name": ("dope", "of the node"),
-    "params": (__file__.replace("_launch.py", ".yaml"), "YAML of parameters"),
+    "model": ("pretrained/pivconnector", "checkpoint (best.ckpt of a run) or released network"),
+    "topic": ("/camera/image_raw", "topic of the pictures"),
+    "name": ("dope", "name of the node"),
+    "params": (__file__.replace("_launch.py", ".yaml"), "YAML file of parameters"),
 }
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Start one node; it is started again where it ends."""
-    told = [
+    """Start a node, and restart it when it exits."""
+    arguments = [
         DeclareLaunchArgument(name, default_value=value, description=text)
         for name, (value, text) in ARGUMENTS.items()
     ]
@@ -22,4 +22,4 @@ def generate_launch_description() -> LaunchDescription:
     for name in ("topic", "name", "params"):
         words += [f"--{name}", LaunchConfiguration(name)]
     node = ExecuteProcess(cmd=words, output="screen", respawn=True, respawn_delay=1.0)
-    return LaunchDescription([*told, node])
+    return LaunchDescription([*arguments, node])

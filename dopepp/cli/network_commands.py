@@ -1,4 +1,4 @@
-"""A network on this machine: ``dopepp doctor``, ``benchmark`` and ``serve``."""
+"""Network commands: ``dopepp doctor``, ``benchmark`` and ``serve``."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from dopepp.cli.errors import report_errors
-from dopepp.cli.options import (
+from dopepp.cli.common import (
     CameraFile,
     Crop,
     Device,
@@ -19,45 +18,55 @@ from dopepp.cli.options import (
     Intrinsics,
     KSize,
     Meshes,
+    Model,
     Region,
     Unit,
     check_region,
+    report_errors,
 )
 from dopepp.core.errors import UserError
 
 if TYPE_CHECKING:
-    from dopepp.drawing.pictures import Picture
-    from dopepp.geometry.camera import CameraMatrix
     from dopepp.inference.benchmark import Timing
-    from dopepp.inference.estimator import PoseEstimator
 
-NUM_SCENES: Final = 10
-SIZE: Final = (640, 480)
-"""Rendered pictures, in turn, and their width and height."""
+NUM_SCENES: Final = 10  # number of rendered pictures that the benchmark cycles through
+SIZE: Final = (640, 480)  # their width and height
 
 
 def benchmark(
-    models: Annotated[list[Path], typer.Argument(help="checkpoints and exported files")],
-    image: Annotated[Path | None, typer.Option(help="a picture; else 640×480 renders")] = None,
+    models: Annotated[list[Path], typer.Argument(help="Checkpoints and exported files.")],
+    image: Annotated[
+        Path | None, typer.Option(help="Picture to use (default: 640×480 renders).")
+    ] = None,
     intrinsics: Intrinsics = None,
     refine: Region = None,
-    frames: Annotated[int, typer.Option("-n", min=1, max=100_000, help="frames to time")] = 50,
+    frames: Annotated[
+        int, typer.Option("-n", min=1, max=100_000, help="Number of timed frames.")
+    ] = 50,
     device: Device = "cpu",
 ) -> None:
-    """Print what a frame takes, from picture to poses, with the parts of it, in milliseconds."""
+    """Time the steps from a picture to its poses, in milliseconds per frame."""
     with report_errors():
+        from dopepp.drawing.pictures import read_photo
+        from dopepp.experiment.assembly.renders import validation_renders
+        from dopepp.geometry.camera import camera_matrix
         from dopepp.inference.benchmark import time_frames
         from dopepp.inference.estimator import PoseEstimator
         from dopepp.inference.runtimes import num_threads
         from dopepp.parts.catalogue import with_meshes
 
         if (image is None) != (intrinsics is None):
-            fix = "give --image FILE --K FX FY CX CY, or none of them"
-            raise UserError("one of --image and --K", "both or none of them", fix)
+            fix = "give --image FILE --K FX FY CX CY, or leave out both"
+            raise UserError("only one of --image and --K", "both or neither", fix)
         rows = []
         for path in models:
             estimator = PoseEstimator.load(path, device)
-            pictures = _pictures(estimator, path, image, intrinsics)
+            if image is not None and intrinsics is not None:
+                pictures = [(read_photo(image), camera_matrix(*intrinsics))]
+            else:
+                source = validation_renders(estimator.checkpoint, path, NUM_SCENES, SIZE)
+                samples = map(source.sample, range(NUM_SCENES))
+                pictures = [(sample.image, sample.K) for sample in samples]
             if refine is not None:
                 estimator = estimator.refining(refine, with_meshes(estimator.parts))
             rows.append(_row(path, time_frames(estimator, pictures, frames)))
@@ -66,26 +75,8 @@ def benchmark(
         _print_table(rows)
 
 
-def _pictures(
-    estimator: PoseEstimator,
-    path: Path,
-    image: Path | None,
-    intrinsics: tuple[float, float, float, float] | None,
-) -> list[tuple[Picture, CameraMatrix]]:
-    """Return the pictures to look at, with their camera matrices."""
-    from dopepp.drawing.pictures import read_photo
-    from dopepp.experiment.assembly.renders import validation_renders
-    from dopepp.geometry.camera import camera_matrix
-
-    if image is not None and intrinsics is not None:
-        return [(read_photo(image), camera_matrix(*intrinsics))]
-    source = validation_renders(estimator.checkpoint, path, NUM_SCENES, SIZE)
-    samples = [source.sample(index) for index in range(NUM_SCENES)]
-    return [(one.image, one.K) for one in samples]
-
-
 def _row(path: Path, timing: Timing) -> dict[str, str]:
-    """Return a line of the table: medians, and of whole frames the 95th percentile as well."""
+    """Return a row of the table: medians, and the 95th percentile of whole frames."""
     import numpy as np
 
     p50, p95 = np.percentile(timing.frame, (50, 95))
@@ -108,8 +99,10 @@ def _print_table(rows: list[dict[str, str]]) -> None:
 
 
 def doctor(
-    image: Annotated[Path, typer.Argument(help="a picture (PNG, JPEG, TIFF)")],
-    model: Annotated[Path, typer.Option(help="best.ckpt of a run, or a released network")],
+    image: Annotated[Path, typer.Argument(help="Picture (PNG, JPEG or TIFF).")],
+    model: Annotated[
+        Path, typer.Option(help="Checkpoint (best.ckpt of a run) or released network.")
+    ],
     intrinsics: Intrinsics = None,
     camera: CameraFile = None,
     K_size: KSize = None,
@@ -120,10 +113,10 @@ def doctor(
     unit: Unit = None,
     device: Device = "cpu",
 ) -> None:
-    """Say what is wrong with a picture, its camera or its part, and what to do, a line each.
+    """Diagnose a picture, its camera and its part, one finding with its remedy per line.
 
-    Findings come first, in the order of causes, then what is well. Exit codes: 0 nothing is wrong;
-    1 something is; 2 wrong input.
+    Problems come first, ordered by cause, then the passed checks. Exit codes: 0 no problem; 1
+    problems; 2 wrong input.
     """
     from dopepp.drawing.pictures import read_photo
     from dopepp.geometry.camera import camera_matrix
@@ -140,39 +133,39 @@ def doctor(
         from dopepp.parts.catalogue import with_meshes
 
         estimator = PoseEstimator.load(model, device)
-        known = with_meshes(estimator.parts, parts, unit) if parts else estimator.parts
-        estimator = estimator if refine is None else estimator.refining(refine, known)
+        solid_parts = with_meshes(estimator.parts, parts, unit) if parts else estimator.parts
+        estimator = estimator if refine is None else estimator.refining(refine, solid_parts)
         try:
-            case = Case(estimator, *lens.undistort(picture), known, distance, crop is not None)
+            case = Case(
+                estimator, *lens.undistort(picture), solid_parts, distance, crop is not None
+            )
         except UserError as error:
-            got = f"{error.got}; allowed: {error.allowed}"
-            findings = [Diagnosis("camera", got, error.fix)]
+            problem = f"{error.got}; allowed: {error.allowed}"
+            findings = [Diagnosis("camera", problem, error.fix)]
         else:
             findings = diagnose(case)
-    wrong = [one for one in findings if one.fix]
-    for one in (*wrong, *(one for one in findings if not one.fix)):
-        typer.echo(f"{'!!' if one.fix else 'ok'} {one}")
-    if wrong:
+    findings.sort(key=lambda finding: not finding.fix)
+    for finding in findings:
+        typer.echo(f"{'!!' if finding.fix else 'ok'} {finding}")
+    if findings and findings[0].fix:
         raise typer.Exit(1)
 
 
 def serve(
-    checkpoint: Annotated[
-        Path, typer.Argument(metavar="MODEL", help="best.ckpt of a run, or pretrained/NAME")
-    ],
+    model: Model,
     port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="else the first free one from 7860")
+        int | None, typer.Option(min=1, max=65535, help="Port (default: first free from 7860).")
     ] = None,
     refine: Region = None,
     device: Device = "cpu",
 ) -> None:
-    """Show a page for this machine's browser: drop a picture, see its poses, download them.
+    """Open a local web page that estimates poses on uploaded pictures.
 
-    Nobody else reaches it, and it loads nothing from elsewhere.
+    The page is reachable from this machine only and loads nothing from the network.
     """
     from dopepp.core.errors import Interruption, interruptible, require
 
-    # Gradio asks its own server for signs of life.
+    # Gradio polls its own server, which httpx would log.
     logging.getLogger("httpx").setLevel(logging.WARNING)
     with report_errors():
         require("gradio", "dopepp serve", "web")
@@ -180,7 +173,7 @@ def serve(
         from dopepp.inference.estimator import PoseEstimator
         from dopepp.inference.page import served
 
-        estimator = PoseEstimator.load(checkpoint, device, refine)
+        estimator = PoseEstimator.load(model, device, refine)
         with suppress(Interruption), interruptible(""), served(estimator, port) as address:
             typer.echo(f"{address} (Ctrl-C ends it)")
             Event().wait()

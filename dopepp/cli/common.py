@@ -1,0 +1,94 @@
+"""Options that several commands share, and how a command reports errors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dopepp.core.errors import RESUME, Interruption, RunError, UserError, interruptible
+
+Model = Annotated[Path, typer.Argument(help="Checkpoint (best.ckpt of a run) or released network.")]
+
+Intrinsics = Annotated[
+    tuple[float, float, float, float] | None,
+    typer.Option("--K", help="fx fy cx cy in pixels (instead of --camera)."),
+]
+
+CameraFile = Annotated[
+    Path | None,
+    typer.Option(help="Camera file: ROS, OpenCV, BOP, COLMAP, or text with a 3×3 matrix."),
+]
+
+KSize = Annotated[
+    tuple[int, int] | None,
+    typer.Option(
+        "--K-size", help="Width and height of the calibrated image, if the picture was resized."
+    ),
+]
+
+Crop = Annotated[
+    tuple[int, int, int, int] | None,
+    typer.Option(
+        help="x y width height of the picture in the calibrated image, if it was cropped."
+    ),
+]
+
+Distances = Annotated[
+    tuple[float, float] | None,
+    typer.Option(
+        "--distance", help="Nearest and farthest part in metres (default: the training range)."
+    ),
+]
+
+Region = Annotated[
+    str | None, typer.Option("--refine", help="region: refine the poses on the picture.")
+]
+
+MaxMs = Annotated[
+    float | None, typer.Option(help="Time limit of the refinement per picture, milliseconds.")
+]
+
+Track = Annotated[bool, typer.Option("--track", help="Track the parts from frame to frame.")]
+
+Meshes = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--part",
+        help="Mesh that replaces the checkpoint's: a built-in part, a file, or NAME=FILE.",
+    ),
+]
+
+Unit = Annotated[str | None, typer.Option(help="Unit of the mesh files: mm, cm, m or inch.")]
+
+Device = Annotated[str, typer.Option(help="PyTorch device, e.g. cpu or cuda.")]
+
+
+def check_region(refine: str | None) -> None:
+    """Refuse any refinement other than ``region``."""
+    if refine not in (None, "region"):
+        raise UserError(f"--refine {refine}", "region", "use --refine region, or leave it out")
+
+
+@contextmanager
+def report_errors() -> Iterator[None]:
+    """Print an expected error as one line and exit with its code."""
+    try:
+        yield
+    except (UserError, RunError, Interruption) as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(error.exit_code) from error
+
+
+@contextmanager
+def resumable(advice: str = RESUME) -> Iterator[None]:
+    """Report errors, and exit in order on Ctrl-C or SIGTERM.
+
+    Args:
+        advice: What the message of an interruption recommends.
+    """
+    with report_errors(), interruptible(advice):
+        yield

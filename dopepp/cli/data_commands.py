@@ -1,0 +1,163 @@
+"""Data set commands: ``dopepp render``, ``check``, ``download`` and ``symmetries``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperCommand
+
+from dopepp.cli.common import Unit, report_errors, resumable
+
+
+class RenderCommand(TyperCommand):
+    """Lists the presets in its help. The presets are read only for the help."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help."""
+        from dopepp.virtual.presets import PRESETS
+
+        (preset,) = (parameter for parameter in self.params if parameter.name == "preset")
+        preset.help = f"Kind of scene: {', '.join(PRESETS)}."  # type: ignore[attr-defined]
+        super().format_help(ctx, formatter)
+
+
+def render(
+    parts: Annotated[
+        list[str],
+        typer.Argument(
+            help="Mesh files (STL, OBJ, PLY, GLB, 3MF, OFF), built-in parts, or NAME=FILE."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder of the data set.")],
+    num: Annotated[int | None, typer.Option("-n", help="Number of images.")] = None,
+    unit: Unit = None,
+    layout: Annotated[str, typer.Option("--format", help="bop, ndds or webdataset.")] = "bop",
+    preset: Annotated[str, typer.Option(help="Kind of scene.")] = "paper",
+    size: Annotated[
+        str | None,
+        typer.Option(
+            help="Image size in pixels, WIDTHxHEIGHT (default: the preset's). The field of view "
+            "along the shorter side stays the same."
+        ),
+    ] = None,
+    camera: Annotated[
+        str | None, typer.Option(help="Camera file of the camera to simulate (ROS, OpenCV, BOP, …)")
+    ] = None,
+    working_distance: Annotated[
+        str | None,
+        typer.Option(help="With --camera: NEAREST,FARTHEST distance of the parts in metres."),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Number of processes (default: all cores).")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
+    preview: Annotated[
+        bool, typer.Option("--preview", help="Write a contact sheet, OUT.preview.png, and stop.")
+    ] = False,
+    shard: Annotated[
+        str, typer.Option(help="i/n: render only shard i of n, counted from 0.")
+    ] = "0/1",
+    engine: Annotated[str, typer.Option(help="local or ray.")] = "local",
+    ray_address: Annotated[
+        str | None, typer.Option(help="Address of a running Ray cluster (default: start one).")
+    ] = None,
+    renderer: Annotated[str, typer.Option(help="raster or photoreal.")] = "raster",
+    backgrounds: Annotated[
+        str, typer.Option(help="procedural, skimage, or a folder of photos.")
+    ] = "procedural",
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Change a field of the preset: lighting.num_lights=[1,3]"),
+    ] = None,
+    negatives: Annotated[
+        list[str] | None, typer.Option(help="Further parts, rendered as unlabelled distractors.")
+    ] = None,
+) -> None:
+    """Render labelled images of parts.
+
+    Run the same command again to continue after an interruption. Exit codes: 0 done; 1 stopped
+    (disk full, a worker process died); 2 wrong input; 130 or 143 interrupted.
+    """
+    with resumable():
+        from dopepp.data.render_job import make_job
+        from dopepp.data.render_run import run
+
+        job = make_job(
+            parts,
+            unit=unit,
+            preset=preset,
+            changes=changes or (),
+            size=size,
+            seed=seed,
+            backgrounds=backgrounds,
+            negatives=negatives or (),
+            renderer=renderer,
+            layout=layout,
+            camera=camera,
+            working_distance=working_distance,
+        )
+        if preview:
+            from dopepp.data.render_preview import (
+                write_preview,  # fonts and drawing take a second
+            )
+
+            typer.echo(write_preview(job, out))
+        else:
+            typer.echo(run(job, out, num, shard, workers, engine, ray_address))
+
+
+def check(
+    folder: Annotated[Path, typer.Argument(help="BOP, BOP-WebDataset, NDDS/FAT or YCB-Video.")],
+    most: Annotated[int, typer.Option(min=0, help="Maximum number of listed defects.")] = 10_000,
+) -> None:
+    """Check a data set and list every defect with its file and field, one per line.
+
+    Exit codes: 0 no defects; 1 defects; 2 no data set at this path.
+    """
+    from dopepp.data.check import check_dataset
+
+    with report_errors():
+        report = check_dataset(folder)
+    typer.echo("\n".join(report.lines(most)))
+    if not report.ok:
+        raise typer.Exit(1)
+
+
+def download(
+    name: Annotated[str, typer.Argument(help="voc2007: photos for --backgrounds, 460 MB.")],
+    out: Annotated[Path, typer.Option(help="Target folder.")] = Path("data"),
+) -> None:
+    """Download a public data set, verify its checksum, and print the folder of its photos."""
+    from rich.console import Console
+    from rich.progress import DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
+
+    from dopepp.data.download import download as fetch_and_unpack
+
+    columns = (DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
+    console = Console(stderr=True)
+    with resumable(), Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task(name, total=None)
+
+        def show(completed: int, total: int) -> None:
+            bar.update(task, completed=completed, total=total)
+
+        photos = fetch_and_unpack(name, out, show)
+    typer.echo(photos)
+
+
+def symmetries(
+    part: Annotated[
+        str, typer.Argument(help="Mesh file (STL, OBJ, PLY, GLB, 3MF, OFF) or built-in part.")
+    ],
+    unit: Unit = None,
+    tolerance: Annotated[
+        float, typer.Option(help="Largest allowed surface deviation, as a share of the diameter.")
+    ] = 0.01,
+) -> None:
+    """Find a part's symmetries and print its entry for BOP's models_info.json."""
+    from dopepp.data.part_symmetries import describe_symmetries
+
+    with report_errors():
+        typer.echo(describe_symmetries(part, unit, tolerance))

@@ -1,0 +1,280 @@
+"""Files of a calibration: reading robot poses and writing results.
+
+Poses of a robot's flange are read from CSV, JSON or YAML, one record per pose. A record has x, y, z
+and a rotation: qw, qx, qy, qz; or rx, ry, rz (rotation vector); or roll, pitch, yaw (about the
+fixed x, then y, then z). ``name`` is the name of the picture. In JSON and YAML, a ``matrix`` of 4×4
+numbers, row by row, may replace position and rotation.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import yaml
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from dopepp.core.errors import UserError
+from dopepp.core.files import check_target, write_whole
+from dopepp.core.json import read_json
+from dopepp.core.yaml import read_yaml
+from dopepp.geometry.camera import Transform
+from dopepp.geometry.rotation import is_rotation, matrix_to_quaternion
+
+UNITS: Final = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "inch": 0.0254}
+
+ROTATIONS: Final = {
+    "quaternion": ("qw", "qx", "qy", "qz"),
+    "rotation vector": ("rx", "ry", "rz"),
+    "roll, pitch, yaw": ("roll", "pitch", "yaw"),
+}
+
+NAMES: Final = ("name", "image", "picture", "file", "filename")
+MAX_BYTES: Final = 4_000_000
+
+FORMAT: Final = (
+    "one record per pose with x, y, z and qw, qx, qy, qz or rx, ry, rz or roll, pitch, yaw "
+    "(and the picture's name)"
+)
+
+Record = Mapping[object, object]
+
+
+@dataclass(frozen=True)
+class PoseFormat:
+    """Conventions of a file of poses."""
+
+    unit: str = "m"  # of positions: m, mm, cm or inch
+    degrees: bool = False  # whether angles are in degrees (default: radians)
+    order: str = "wxyz"  # `xyzw` if a quaternion's w is in the last column, whatever their names
+    inverted: bool = False  # whether the poses are T_flange_base
+
+
+@dataclass(frozen=True, eq=False)
+class RobotPoses:
+    """The poses of a file, in the file's conventions."""
+
+    names: tuple[str, ...]  # of their pictures; empty strings if the file has no names
+    positions: Float[np.ndarray, "poses 3"]  # x, y, z
+    kind: str  # a key of `ROTATIONS`, or `matrix`
+    rotations: Float[np.ndarray, "poses numbers"]  # the numbers of this kind
+    source: str  # the file
+
+    def transforms(self, pose_format: PoseFormat) -> Float[np.ndarray, "poses 4 4"]:
+        """Return T_base_flange of every pose, metres."""
+        numbers, degrees = self.rotations, pose_format.degrees
+        if self.kind == "quaternion":
+            is_w_first = pose_format.order == "wxyz"
+            rotations = Rotation.from_quat(numbers[:, [1, 2, 3, 0]] if is_w_first else numbers)
+        elif self.kind == "rotation vector":
+            rotations = Rotation.from_rotvec(numbers, degrees=degrees)
+        elif self.kind == "matrix":
+            rotations = Rotation.from_matrix(numbers.reshape(-1, 3, 3))
+        else:
+            rotations = Rotation.from_euler("xyz", numbers, degrees=degrees)
+        T = np.tile(np.eye(4), (len(self.names), 1, 1))
+        T[:, :3, :3] = rotations.as_matrix()
+        T[:, :3, 3] = self.positions * UNITS[pose_format.unit]
+        return np.linalg.inv(T) if pose_format.inverted else T
+
+
+def read_robot_poses(path: Path) -> RobotPoses:
+    """Read a file of robot poses.
+
+    Raises:
+        UserError: The file is missing, too large or damaged, does not have the fields of
+            :data:`FORMAT`, or has an invalid number.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".csv":
+        records = _read_csv(path)
+    elif suffix in (".json", ".yaml", ".yml"):
+        is_json = suffix == ".json"
+        records = _records(read_json(path, MAX_BYTES) if is_json else read_yaml(path), path)
+    else:
+        raise UserError(f"robot poses {path}", "a .csv, .json or .yaml file", f"write {FORMAT}")
+    if not records:
+        raise UserError(f"{path} without a pose", FORMAT, "add the poses")
+    names = tuple(
+        next((str(record[key]) for key in NAMES if record.get(key)), "") for record in records
+    )
+    if "matrix" in records[0]:
+        T = np.stack([_matrix(record, row, path) for row, record in enumerate(records, 1)])
+        rotations = T[:, :3, :3].reshape(-1, 9)
+        return RobotPoses(names, T[:, :3, 3], "matrix", rotations, str(path))
+    fields = {str(field).strip().lower() for field in records[0]}
+    kind = next((kind for kind, needed in ROTATIONS.items() if set(needed) <= fields), None)
+    if kind is None or not {"x", "y", "z"} <= fields:
+        problem = f"{path} with the columns {', '.join(sorted(fields))[:200]}"
+        raise UserError(problem, FORMAT, "rename the columns")
+    numbers = _numbers(records, ("x", "y", "z", *ROTATIONS[kind]), path)
+    if kind == "quaternion" and not (np.abs(numbers[:, 3:]).max(axis=1) > 1e-6).all():
+        raise UserError(f"{path}: a quaternion of zeros", "unit quaternions", "remove that pose")
+    return RobotPoses(names, numbers[:, :3], kind, numbers[:, 3:], str(path))
+
+
+def read_points(path: Path, unit: str) -> Float[np.ndarray, "points 3"]:
+    """Read a CSV of points that a tool's tip touched, x, y, z in the base's frame.
+
+    Returns:
+        The points in metres.
+
+    Raises:
+        UserError: As :func:`read_robot_poses`.
+    """
+    return _numbers(_read_csv(path), ("x", "y", "z"), path).reshape(-1, 3) * UNITS[unit]
+
+
+def check_unit(unit: str) -> str:
+    """Return a valid unit, or raise :class:`UserError`."""
+    if unit not in UNITS:
+        raise UserError(f"--unit {unit}", ", ".join(UNITS), "use an allowed unit")
+    return unit
+
+
+def _read_csv(path: Path) -> list[Record]:
+    try:
+        with path.open("rb") as file:
+            content = file.read(MAX_BYTES + 1)
+        text = content.decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        problem = f"{path}: {error!s:.200}"
+        raise UserError(problem, "a readable CSV file", "check the path") from error
+    if len(content) > MAX_BYTES:
+        problem = f"{path} of more than {MAX_BYTES / 1e6:g} MB"
+        raise UserError(problem, FORMAT, "check that this is the file of poses")
+    separator = ";" if text.partition("\n")[0].count(";") >= 3 else ","
+    rows = csv.DictReader(io.StringIO(text), delimiter=separator)
+    return [{str(key).strip().lower(): value for key, value in row.items()} for row in rows]
+
+
+def _records(content: object, path: Path) -> list[Record]:
+    """Return the records of a list, or of a mapping from pictures' names."""
+    if isinstance(content, Mapping):
+        content = [
+            {"name": name, **record} if isinstance(record, Mapping) else record
+            for name, record in content.items()
+        ]
+    if not isinstance(content, list) or not all(isinstance(item, Mapping) for item in content):
+        raise UserError(f"{path}: not a list of records", FORMAT, "write one record per pose")
+    return content
+
+
+def _numbers(
+    records: Sequence[Record], keys: Sequence[str], path: Path
+) -> Float[np.ndarray, "records keys"]:
+    """Return the fields of all records as finite numbers."""
+
+    def number(record: Record, key: str, row: int) -> float:
+        try:
+            value = float(record[key])  # type: ignore[arg-type]
+        except (KeyError, TypeError, ValueError):
+            value = np.nan
+        if not np.isfinite(value):
+            problem = f"{path}, pose {row}: {key}={record.get(key)!r:.50}"
+            raise UserError(problem, "a finite number", "correct or remove that pose")
+        return value
+
+    return np.array(
+        [[number(record, key, row) for key in keys] for row, record in enumerate(records, 1)]
+    )
+
+
+def _matrix(record: Record, row: int, path: Path) -> Transform:
+    try:
+        T = np.array(record["matrix"], np.float64).reshape(4, 4)
+    except (KeyError, TypeError, ValueError):
+        T = np.full((4, 4), np.nan)
+    R = T[:3, :3]
+    is_rigid = np.isfinite(T).all() and np.abs(R @ R.T - np.eye(3)).max() < 1e-2
+    if not is_rigid or np.linalg.det(R) < 0:
+        problem = f"{path}, pose {row}: matrix={record.get('matrix')!r:.80}"
+        allowed = "4×4 numbers of a rigid transform, row by row"
+        raise UserError(problem, allowed, "correct or remove that pose")
+    return T
+
+
+def match_pictures(poses: RobotPoses, pictures: Sequence[str]) -> list[tuple[int, int]]:
+    """Pair poses with pictures: by name if the poses have names, otherwise in order.
+
+    Returns:
+        Pairs of indices (pose, picture).
+
+    Raises:
+        UserError: A picture is missing, or without names, the numbers of poses and pictures differ.
+    """
+    if any(poses.names):
+        indices = {name: index for index, name in enumerate(pictures)}
+        indices |= {name.rpartition(".")[0]: index for index, name in enumerate(pictures)}
+        missing = [name for name in poses.names if name not in indices]
+        if missing:
+            raise UserError(
+                f"{poses.source}: {len(missing)} poses without a picture, the first "
+                f"{missing[0]!r:.80}",
+                f"names such as {pictures[0] if pictures else '…'!r}",
+                "correct the names, or check the folder of the pictures",
+            )
+        return [(row, indices[name]) for row, name in enumerate(poses.names)]
+    if len(poses.names) != len(pictures):
+        problem = f"{len(poses.names)} poses and {len(pictures)} pictures"
+        fix = "add a column `name` with the picture of every pose"
+        raise UserError(problem, "one pose for every picture", fix)
+    return [(index, index) for index in range(len(pictures))]
+
+
+def write_calibration(
+    path: Path, kind: str, values: Mapping[str, Any], findings: Sequence[str], force: bool
+) -> None:
+    """Write a trusted calibration, or by ``force`` a doubtful one, which is marked.
+
+    Raises:
+        UserError: There are findings and ``force`` is false, or the file cannot be written.
+    """
+    check_trust(findings, force)
+    check_target(path, (".yaml", ".yml"))
+    content = {"calibration": kind, "trusted": not findings, **values}
+    if findings:
+        content["doubts"] = list(findings)
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True)
+    write_whole(path, text.encode())
+
+
+def check_trust(findings: Sequence[str], force: bool) -> None:
+    """Refuse a calibration with findings, unless by force."""
+    if findings and not force:
+        problem = f"a calibration that is not trustworthy: {'; '.join(findings)}"
+        fix = "take further measurements as advised, or write it anyway with --force"
+        raise UserError(problem, "a calibration without findings", fix)
+
+
+def read_transform(path: Path, name: str) -> Transform:
+    """Read a transform from a calibration file, e.g. ``T_flange_cam``.
+
+    Raises:
+        UserError: The file cannot be read, or has no rigid transform of this name.
+    """
+    content = read_yaml(path)
+    values = content.get(name) if isinstance(content, Mapping) else None
+    try:
+        T = np.array(values["matrix"] if isinstance(values, Mapping) else None, np.float64)
+    except (KeyError, TypeError, ValueError):
+        T = np.zeros(0)
+    if T.shape != (4, 4) or not is_rotation(T[:3, :3], 1e-6) or not np.isfinite(T).all():
+        allowed = f"{name}: {{matrix: 4×4 numbers of a rigid transform}}"
+        raise UserError(f"{path} without {name}", allowed, "use a file from `dopepp calibrate`")
+    return T
+
+
+def transform_record(T: Transform) -> dict[str, object]:
+    """Return a transform as matrix, position (metres) and quaternion (w, x, y, z)."""
+    return {
+        "matrix": T.tolist(),
+        "position": T[:3, 3].tolist(),
+        "quaternion_wxyz": matrix_to_quaternion(T[:3, :3]).tolist(),
+    }

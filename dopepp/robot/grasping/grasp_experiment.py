@@ -1,0 +1,330 @@
+"""The grasp experiment: trials distributed to processes, and its report.
+
+Every trial depends only on the seed. The report has a JSON, a CSV and a Markdown file with Table 9,
+the failures and a curve.
+"""
+
+from __future__ import annotations
+
+import json
+import pickle
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from dopepp.core.errors import RunError, UserError
+from dopepp.core.files import check_target, write_csv, write_picture, write_whole
+from dopepp.core.pool import LostWorkerError, ProcessPool, available_cores
+from dopepp.core.validation import Range, check
+from dopepp.parts.catalogue import load_part
+from dopepp.robot.grasping.cell import Cell, convex_pieces
+from dopepp.robot.grasping.film import show
+from dopepp.robot.grasping.grasp_trial import (
+    BLOCK,
+    EXACT,
+    FAILURES,
+    GraspTask,
+    PoseSource,
+    Record,
+    Trials,
+)
+from dopepp.robot.grasping.grasps import find_grasps
+from dopepp.robot.grasping.rehearsal import SIZE
+from dopepp.robot.grasping.workbench import LAYOUTS, RENDERERS, open_gl
+
+MAX_TRIALS: Final = 100_000
+
+CURVE: Final = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
+"""Errors of exact poses, in millimetres and at the same time in degrees."""
+
+PAPER: Final = ((49, 47), (46, 46), (47, 43), (46, 45))
+"""Table 9: recognised and caught of every 50 grasps with a real arm."""
+
+SOURCES: Final[dict[str, tuple[PoseSource, ...]]] = {
+    "network": (PoseSource(),),
+    "exact": (PoseSource("exact"),),
+    "random": (PoseSource("random"),),
+    "true-matrices": (PoseSource(matrices="true"),),
+    "curve": tuple(PoseSource("exact", error=(error, error)) for error in CURVE),
+}
+"""Sources of poses by their name on the command line."""
+
+
+def parse_sources(text: str) -> tuple[PoseSource, ...]:
+    """Return the sources of a comma-separated list.
+
+    Raises:
+        UserError: A name is unknown.
+    """
+    names = dict.fromkeys(name.strip() for name in text.split(","))
+    for name in names:
+        _check_choice("--poses", name, SOURCES)
+    return tuple(source for name in names for source in SOURCES[name])
+
+
+def _check_choice(option: str, value: str, allowed: Iterable[str]) -> None:
+    if value not in allowed:
+        raise UserError(f"{option} {value}", ", ".join(allowed), f"change {option}")
+
+
+def check_task(task: GraspTask, poses: str, count: int) -> GraspTask:
+    """Check a task before the slow work, and set its sources of poses.
+
+    Raises:
+        UserError: An option has an invalid value, or the part has no network or no grasp.
+    """
+    _check_choice("--layout", task.layout, LAYOUTS)
+    _check_choice("--renderer", task.renderer, RENDERERS)
+    _check_choice("--rest", task.rest, ("front", "any"))
+    check("-n", count, int, Range(1, MAX_TRIALS))
+    check("--yaw", task.yaw_deg, float, Range(0, 180, "degrees"))
+    sources = parse_sources(poses)
+    needs_network = any(source.kind == "network" for source in sources)
+    if needs_network and task.network is None:
+        allowed = "a checkpoint of the part, or exact or random poses"
+        fix = "pass --network CHECKPOINT, or --poses exact"
+        raise UserError(f"part {task.part} without a network", allowed, fix)
+    part = load_part(task.part, task.unit)
+    find_grasps(part, task.grasps)
+    convex_pieces(part)  # takes a minute for a new mesh: here, and not in every process
+    return replace(task, sources=sources, network=task.network if needs_network else None)
+
+
+def make_experiment(
+    task: GraspTask,
+    count: int,
+    workers: int | None,
+    folder: Path,
+    video: Path | None,
+    rerun: Path | None,
+    report_progress: Callable[[str], object],
+) -> str:
+    """Run trials and write their report and pictures.
+
+    Args:
+        task: A task from :func:`check_task`.
+        count: Number of trials.
+        workers: Number of processes (default: all cores).
+        folder: Target folder.
+        video: Film of the first trial, .mp4 or .jpg.
+        rerun: Rerun recording of the first trial.
+        report_progress: Receives a line after every 50 trials.
+
+    Returns:
+        The tables in Markdown.
+
+    Raises:
+        UserError: A file cannot be written, a picture cannot be rendered, or no grasp is reachable.
+    """
+    targets = ((folder / "grasps.md", (".md",)), (video, (".mp4", ".jpg")), (rerun, (".rrd",)))
+    for path, suffixes in targets:
+        if path is not None:
+            check_target(path, suffixes)
+    if video is not None or task.renderer == "mujoco":
+        open_gl(Cell(shown="things").model, SIZE).close()  # fails now, not after all trials
+    start, records = time.monotonic(), []
+    for record in run_trials(task, count, workers or available_cores()):
+        records.append(record)
+        if len(records) % (len(task.sources) * BLOCK) == 0:
+            first = [record for record in records if record.source == task.sources[0].name]
+            report_progress(f"{len(first)} of {count}: {count_records(first).caught} caught")
+    facts = _facts(task, records, time.monotonic() - start)
+    write_report(folder, records, facts)
+    if all(record.failure == "no plan" for record in records):
+        raise UserError(
+            f"{task.grasps or task.part}: none of its grasps is reachable in {count} trials",
+            "grasps from above, for a face on which the part lies",
+            "find some with `dopepp grasp propose`, or change --rest",
+        )
+    show(task, records, folder, video, rerun)
+    return markdown(records, facts)
+
+
+def _facts(task: GraspTask, records: Sequence[Record], seconds: float) -> dict[str, object]:
+    """Return the facts at the top of a report."""
+    shift = max(record.hand_eye_mm for record in records)
+    turn = max(record.hand_eye_deg for record in records)
+    return {
+        "part": task.part,
+        "network": task.network and f"{task.network}, {'' if task.refine else 'not '}refined",
+        "layout": task.layout,
+        "pictures": task.renderer,
+        "seed": task.seed,
+        "hand-eye, worst": f"{shift:.2f} mm, {turn:.3f}°",
+        "MuJoCo": version("mujoco"),
+        "seconds": round(seconds),
+    }
+
+
+def run_trials(task: GraspTask, count: int, workers: int) -> Iterator[Record]:
+    """Run trials and yield their records as they are done.
+
+    Raises:
+        RunError: A process died.
+        UserError: A trial refuses the task.
+    """
+    run = _TrialRunner(task)
+    if workers == 1:
+        for number in range(count):
+            yield from run(number)
+        return
+    with ProcessPool(pickle.dumps(run), min(workers, count)) as pool:
+        for _, future in pool.run(range(count)):
+            try:
+                yield from future.result()
+            except LostWorkerError as error:
+                raise RunError(str(error)) from error
+
+
+class _TrialRunner:
+    """Runs a trial with every source of the task; picklable."""
+
+    def __init__(self, task: GraspTask) -> None:
+        self._task = task
+
+    @cached_property
+    def _trials(self) -> Trials:
+        return Trials(self._task)
+
+    def __call__(self, number: int) -> list[Record]:
+        scene = self._trials.scene(number)
+        return [self._trials.attempt(scene, source).record for source in self._task.sources]
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Successes among trials."""
+
+    trials: int
+    recognised: int
+    caught: int
+
+    def interval(self, count: int) -> tuple[float, float]:
+        """Return the 95 % Wilson interval of a count's share."""
+        from dopepp.metrics.functional import wilson_interval  # imports torch
+
+        return wilson_interval(count, self.trials)
+
+    def rate(self, count: int) -> str:
+        """Return a count as a share with its interval."""
+        low, high = self.interval(count)
+        return f"{100 * count / self.trials:.1f} % ({100 * low:.1f} – {100 * high:.1f})"
+
+
+def count_records(records: Sequence[Record]) -> Counts:
+    """Count the successes among trials."""
+    recognised = sum(record.recognised for record in records)
+    return Counts(len(records), recognised, sum(record.caught for record in records))
+
+
+def by_source(records: Sequence[Record]) -> dict[str, list[Record]]:
+    """Group records by the source of poses, each group sorted by trial."""
+    groups: dict[str, list[Record]] = {}
+    for record in sorted(records, key=lambda record: record.number):
+        groups.setdefault(record.source, []).append(record)
+    return groups
+
+
+def table_9(records: Sequence[Record]) -> list[str]:
+    """Return the paper's Table 9 beside the trials of one source, in Markdown."""
+    lines = [
+        "| grasps | recognised | caught | paper: recognised | caught |",
+        "| --- | ---: | ---: | ---: | ---: |",
+    ]
+    for first in range(0, len(records), BLOCK):
+        block, number = records[first : first + BLOCK], first // BLOCK
+        counts, paper = count_records(block), "– | –"
+        if number < len(PAPER) and len(block) == BLOCK:
+            paper = " | ".join(f"{count} ({2 * count} %)" for count in PAPER[number])
+        ours = " | ".join(
+            f"{count} ({100 * count / counts.trials:.0f} %)"
+            for count in (counts.recognised, counts.caught)
+        )
+        lines.append(f"| {first + 1}–{first + len(block)} | {ours} | {paper} |")
+    totals = (count_records(records), Counts(200, *map(sum, zip(*PAPER, strict=True))))
+    rates = [f"{total.rate(total.recognised)} | {total.rate(total.caught)}" for total in totals]
+    return [*lines, f"| all, with 95 % intervals | {' | '.join(rates)} |"]
+
+
+def sources_table(records: Sequence[Record]) -> list[str]:
+    """Return a table with a row for every source of poses, in Markdown."""
+    lines = [
+        "| poses | trials | recognised (ADD-0.1d) | caught | median error at the arm "
+        f"| {' | '.join(FAILURES)} |",
+        f"| --- | ---: | ---: | ---: | ---: {'| ---: ' * len(FAILURES)}|",
+    ]
+    for name, rows in by_source(records).items():
+        total = count_records(rows)
+        errors = np.array([(row.error_mm, row.error_deg) for row in rows if row.seen])
+        shift, turn = np.median(errors, axis=0) if len(errors) else (np.nan, np.nan)
+        failures = [str(sum(row.failure == failure for row in rows)) for failure in FAILURES]
+        lines.append(
+            f"| {name} | {total.trials} | {total.rate(total.recognised)} "
+            f"| {total.rate(total.caught)} | {shift:.2f} mm, {turn:.2f}° "
+            f"| {' | '.join(failures)} |"
+        )
+    return lines
+
+
+def markdown(records: Sequence[Record], facts: Mapping[str, Any]) -> str:
+    """Return the report in Markdown."""
+    first = next(iter(by_source(records).values()))
+    listed = [f"- {name}: {value}" for name, value in facts.items() if value is not None]
+    tables = {
+        f"Table 9: {first[0].source}": table_9(first),
+        "Poses and failures": sources_table(records),
+    }
+    lines = ["# Grasps in simulation", "", *listed, ""]
+    for title, table in tables.items():
+        lines += [f"## {title}", "", *table, ""]
+    return "\n".join(lines)
+
+
+def write_report(folder: Path, records: Sequence[Record], facts: Mapping[str, Any]) -> None:
+    """Write ``grasps.csv``, ``grasps.json``, ``grasps.md`` and, for a curve, ``curve.png``."""
+    groups = by_source(records)
+    rows = [asdict(record) for group in groups.values() for record in group]
+    write_csv(folder / "grasps.csv", rows)
+    # JSON has no NaN.
+    trials = [
+        {name: None if value != value else value for name, value in row.items()} for row in rows
+    ]
+    summaries = {name: _summary(group) for name, group in groups.items()}
+    content = {**facts, "sources": summaries, "trials": trials}
+    write_whole(folder / "grasps.json", (json.dumps(content, indent=1) + "\n").encode())
+    write_whole(folder / "grasps.md", markdown(records, facts).encode())
+    if any(record.off for record in records):
+        from dopepp.drawing.curves import figure_image
+
+        write_picture(folder / "curve.png", figure_image(curve(records)))
+
+
+def curve(records: Sequence[Record]) -> Any:
+    """Plot the share of caught parts over the error of exact poses."""
+    from dopepp.drawing.curves import RateCurve, rates_figure
+
+    points = []
+    for name, rows in by_source(records).items():
+        if name.startswith(EXACT):
+            total = count_records(rows)
+            rate = total.caught / total.trials
+            points.append((rows[0].off, rate, *total.interval(total.caught)))
+    rates = RateCurve(*(np.array(values) for values in zip(*sorted(points), strict=True)))
+    label = "error of the pose, in mm and in degrees"
+    return rates_figure({"caught": {"exact poses with errors": rates}}, label, 1)
+
+
+def _summary(rows: Sequence[Record]) -> dict[str, Any]:
+    total = count_records(rows)
+    return {
+        **asdict(total),
+        "recognised_interval": total.interval(total.recognised),
+        "caught_interval": total.interval(total.caught),
+        "failures": {name: sum(row.failure == name for row in rows) for name in FAILURES},
+    }

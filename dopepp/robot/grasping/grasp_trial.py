@@ -1,0 +1,320 @@
+"""A trial: a picture of the bench, a pose, a motion of the arm, and the outcome.
+
+A task and the records of its trials are plain values, so that they can be sent to processes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.random import Generator
+from scipy.spatial.transform import Rotation
+
+from dopepp.core.errors import UserError
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import Transform, invert_transform, make_transform, transform
+from dopepp.geometry.rotation import rotation_angle
+from dopepp.geometry.symmetry import symmetry_group
+from dopepp.parts.catalogue import load_part
+from dopepp.robot.grasping.cell import HOME, TRAY, Cell
+from dopepp.robot.grasping.execution import Execution, Outcome
+from dopepp.robot.grasping.grasps import find_grasps
+from dopepp.robot.grasping.planner import Arm, Joints, Planner, laid_flat, measure_gripper
+from dopepp.robot.grasping.rehearsal import (
+    MOUNT,
+    CalibratedRobot,
+    TrueRobot,
+    calibrate,
+    draw_robot,
+    looking_at,
+)
+from dopepp.robot.grasping.workbench import Layout, MujocoView, PlacedThing, RasterView
+
+if TYPE_CHECKING:
+    from dopepp.inference.estimator import PoseEstimator
+
+BLOCK: Final = 50  # trials with one calibration, as in Table 9
+EXACT: Final = "exact poses"
+FAILURES: Final = ("not seen", "wrong pose", "no plan", "collided", "slipped")
+
+DEFAULT_DISTANCE: Final = (0.18, 0.22)
+"""Distances of the camera without a trained range, metres."""
+
+TILT: Final = np.radians(17.0)
+"""Largest rotation of the camera about its x and y axes from straight down, radians."""
+
+SETTLE_S: Final = {"single": 0.2, "distractors": 0.4, "heap": 1.5}
+MAX_OBSTACLES: Final = 8  # number of parts in the planner's model
+RECOGNISED: Final = 0.1  # largest ADD of a recognised part, as a share of its diameter
+
+
+@dataclass(frozen=True)
+class PoseSource:
+    """Source of the poses by which parts are grasped."""
+
+    kind: str = "network"  # `network`, `exact` (the simulation's) or `random`
+    matrices: str = "calibrated"  # `calibrated` or `true` camera matrices for the network's poses
+    # Errors of exact poses in a random direction and about a random axis, millimetres and degrees.
+    error: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def name(self) -> str:
+        """Name in reports."""
+        if any(self.error):
+            return f"{EXACT}, off by {self.error[0]:g} mm and {self.error[1]:g}°"
+        true = ", true matrices" if self.matrices == "true" else ""
+        return {"network": "network", "exact": EXACT, "random": "random poses"}[self.kind] + true
+
+
+@dataclass(frozen=True)
+class GraspTask:
+    """Options of an experiment."""
+
+    part: str = "pivconnector"  # a built-in part or a mesh file
+    unit: str | None = None  # of the mesh file
+    grasps: Path | None = None  # file of grasps (default: the built-in part's)
+    network: str | None = None  # checkpoint, if a source of poses needs one
+    refine: bool = True  # whether the network's poses are refined
+    layout: str = "single"  # of `LAYOUTS`
+    renderer: str = "raster"  # of `RENDERERS`
+    yaw_deg: float = 180.0  # largest rotation of parts to either side
+    rest: str = "front"  # faces that point upwards; see `Layout`
+    seed: int = 0
+    sources: tuple[PoseSource, ...] = (PoseSource(),)
+
+
+@dataclass(frozen=True)
+class Record:
+    """Result of a trial with one source of poses."""
+
+    number: int  # of the trial, from 0; trials of the same number have the same scene
+    source: str  # name of the source
+    off: float  # deliberate error of the pose, millimetres and degrees
+    seen: bool  # whether there was a pose
+    recognised: bool  # whether ADD was below a tenth of the diameter
+    # The errors are in the arm's base frame and include those of the calibration. They are those
+    # before the part was laid flat, and NaN without a pose.
+    add_mm: float  # ADD, millimetres
+    error_mm: float  # of the part's origin, millimetres
+    error_deg: float  # of the rotation, degrees
+    caught: bool  # whether the part was held after lifting and shaking
+    failure: str  # one of `FAILURES`, or empty
+    hand_eye_mm: float  # error of the hand-eye calibration at the part's distance
+    hand_eye_deg: float  # its rotation error
+
+
+@dataclass(frozen=True, eq=False)
+class TrialScene:
+    """The scene of a trial before the grasp."""
+
+    number: int
+    cell: Cell
+    things: Sequence[PlacedThing]  # the parts first
+    start: Any  # state of the simulation
+    poses: list[Transform]  # of the things at rest, T_base_obj
+    robot: TrueRobot
+    calibrated: CalibratedRobot
+    joints: Joints  # that the controller reads while the picture is taken, radians
+    T_base_cam: Transform  # the true pose of the camera
+    picture: Picture
+
+    @property
+    def targets(self) -> list[Transform]:
+        """Poses of the parts, the highest first."""
+        placed = zip(self.things, self.poses, strict=True)
+        return sorted((pose for item, pose in placed if item.body.part), key=_height, reverse=True)
+
+
+@dataclass(eq=False)
+class Attempt:
+    """A record, and the motion that led to it."""
+
+    record: Record
+    outcome: Outcome = field(default_factory=Outcome)
+    estimate: Transform | None = None  # T_base_obj by which the part was grasped, if there was one
+
+
+class Trials:
+    """Runs the trials of a task. Trial i depends only on the task's seed and i."""
+
+    def __init__(self, task: GraspTask) -> None:
+        self.task, self.part = task, load_part(task.part, task.unit)
+        self.grasps = find_grasps(self.part, task.grasps)
+        self.layout = Layout(self.part, task.layout, task.yaw_deg, task.rest)
+        self.arm, self.gripper = Arm(), measure_gripper()
+        self.tip = np.array([0.0, 0.0, self.gripper.reach(0.0)])
+        self.distance = DEFAULT_DISTANCE if task.network is None else self._trained_distance()
+        part = self.part
+        self._symmetries = symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
+        self._raster = RasterView(task.renderer == "raster-shadows")
+        self.robot = cache(self._robot)
+        self._parts_cell = cache(lambda count: Cell([self.layout.thing] * count))
+        self._parts_view = cache(lambda count: MujocoView([self.layout.thing] * count))
+
+    @cached_property
+    def estimator(self) -> PoseEstimator:
+        """The network."""
+        from dopepp.inference.estimator import PoseEstimator
+
+        assert self.task.network is not None
+        refine = "region" if self.task.refine else None
+        return PoseEstimator.load(self.task.network, refine=refine)
+
+    def _trained_distance(self) -> tuple[float, float]:
+        """Return distances inside the network's training range, metres."""
+        names = [part.name for part in self.estimator.parts]
+        if self.part.name not in names:
+            problem = f"--network {self.task.network}, which does not know {self.part.name}"
+            allowed = f"a network of this part, not of {', '.join(names)}"
+            raise UserError(problem, allowed, "pass another network")
+        seen = self.estimator.checkpoint.seen.get(self.part.name)
+        if seen is None:
+            return DEFAULT_DISTANCE
+        near, far = seen.nearest, seen.farthest
+        return near + 0.4 * (far - near), near + 0.75 * (far - near)
+
+    def _robot(self, block: int) -> tuple[TrueRobot, CalibratedRobot]:
+        rng = np.random.default_rng([self.task.seed, block, 1])
+        robot = draw_robot(rng, self.tip)
+        return robot, calibrate(robot, self.arm, rng, float(np.mean(self.distance)))
+
+    def scene(self, number: int) -> TrialScene:
+        """Set up a trial and take its picture."""
+        rng = np.random.default_rng([self.task.seed, number])
+        robot, calibrated = self.robot(number // BLOCK)
+        things = self.layout.draw(rng)
+        # Models and renderers of scenes with parts only are cached.
+        is_parts_only = all(item.body.part is not None for item in things)
+        solids, count = [item.thing for item in things], len(things)
+        cell = self._parts_cell(count) if is_parts_only else Cell(solids)
+        state = cell.data()
+        for index, item in enumerate(things):
+            cell.put(state, index, item.T_base_obj)
+        joints, T_base_cam = self._aim_camera(robot, rng)
+        execution = Execution(cell, state, self.gripper, robot.zero)
+        execution.stand(joints)
+        execution.wait(SETTLE_S[self.task.layout])
+        poses = [cell.pose(state, index) for index in range(count)]
+        view: RasterView | MujocoView = self._raster
+        if self.task.renderer == "mujoco":
+            view = self._parts_view(count) if is_parts_only else MujocoView(solids)
+        picture = view.take([item.body for item in things], poses, T_base_cam, rng)
+        return TrialScene(
+            number, cell, things, state, poses, robot, calibrated, joints, T_base_cam, picture
+        )
+
+    def attempt(self, scene: TrialScene, source: PoseSource) -> Attempt:
+        """Grasp a part of a scene by the poses of a source."""
+        poses = self._poses(scene, source)
+        if not poses:
+            return Attempt(self._record(scene, source, None, None))
+        bench, hull = scene.calibrated.knowledge.T_base_bench, self.layout.body.hull
+        flat = [laid_flat(pose, hull, bench) for pose in poses][:MAX_OBSTACLES]
+        planner, estimate, outcome = self._planner(scene), poses[0], None
+        for number, target in enumerate(flat):
+            others = [*flat[:number], *flat[number + 1 :]]
+            plan = planner.plan([target, *others], self.grasps, scene.joints)
+            if plan is not None:
+                estimate, state = poses[number], copy(scene.start)
+                outcome = Execution(scene.cell, state, self.gripper, scene.robot.zero).run(plan)
+                break
+        record = self._record(scene, source, estimate, outcome)
+        return Attempt(record, outcome or Outcome(), estimate)
+
+    def _planner(self, scene: TrialScene) -> Planner:
+        count = 1 if self.task.layout == "single" else MAX_OBSTACLES
+        return Planner(self.arm, self.gripper, self._parts_cell(count), scene.calibrated.knowledge)
+
+    def _poses(self, scene: TrialScene, source: PoseSource) -> list[Transform]:
+        """Return the poses of parts for the controller, T_base_obj, the highest first."""
+        rng = np.random.default_rng([self.task.seed, scene.number, 2])
+        if source.kind == "random":
+            return [self.layout.draw_pose(rng)]
+        if source.kind == "exact":
+            return [_perturbed(pose, source.error, rng) for pose in scene.targets]
+        T_base_cam = scene.T_base_cam
+        if source.matrices != "true":
+            T_flange_cam = scene.calibrated.knowledge.T_flange_cam
+            T_base_cam = self.arm.flange(scene.joints) @ T_flange_cam
+        lens = scene.calibrated.camera
+        detections = self.estimator.predict(scene.picture, lens.K, lens.coefficients)
+        parts = [detection for detection in detections if detection.object == self.part.name]
+        # Keep the parts with at least half the best score.
+        poses = [
+            T_base_cam @ detection.T_cam_obj
+            for detection in parts
+            if detection.score >= parts[0].score / 2
+        ]
+        return sorted(poses, key=_height, reverse=True)
+
+    def _record(
+        self,
+        scene: TrialScene,
+        source: PoseSource,
+        estimate: Transform | None,
+        outcome: Outcome | None,
+    ) -> Record:
+        errors = (scene.calibrated.hand_eye_mm, scene.calibrated.hand_eye_deg)
+        trial = (scene.number, source.name, source.error[0])
+        if estimate is None:
+            nan = float("nan")
+            return Record(*trial, False, False, nan, nan, nan, False, "not seen", *errors)
+        adds = [self._add(estimate, target) for target in scene.targets]
+        add, target = min(adds), scene.targets[int(np.argmin(adds))]
+        shift = float(np.linalg.norm(estimate[:3, 3] - target[:3, 3]))
+        turn = float(np.degrees(rotation_angle(estimate[:3, :3].T @ target[:3, :3])))
+        is_recognised = bool(add < RECOGNISED * self.part.diameter)
+        parts = [index for index, item in enumerate(scene.things) if item.body.part]
+        is_caught = outcome is not None and outcome.held in parts
+        if is_caught:
+            failure = ""
+        elif not is_recognised:
+            failure = "wrong pose"
+        elif outcome is None:
+            failure = "no plan"
+        else:
+            failure = "collided" if outcome.collided else "slipped"
+        pose = (1000 * add, 1000 * shift, turn)
+        return Record(*trial, True, is_recognised, *pose, is_caught, failure, *errors)
+
+    def _add(self, estimate: Transform, target: Transform) -> float:
+        """Return the ADD to the nearest symmetric pose, metres."""
+        points = transform(estimate, self.part.points)
+        return min(
+            float(np.linalg.norm(points - transform(target @ S, self.part.points), axis=1).mean())
+            for S in self._symmetries
+        )
+
+    def _aim_camera(self, robot: TrueRobot, rng: Generator) -> tuple[Joints, Transform]:
+        """Draw joints of the arm from which the camera sees the tray; return the camera's pose."""
+        for _ in range(20):
+            point = TRAY + np.array([*rng.uniform(-0.01, 0.01, 2), 0.0])
+            distance = rng.uniform(*self.distance)
+            tilt, roll = rng.uniform(-TILT, TILT, 2), rng.uniform(-0.2, 0.2)
+            flange = looking_at(point, distance, tilt, roll) @ invert_transform(MOUNT)
+            joints = self.arm.joints(flange, HOME)
+            if joints is not None:
+                return joints, self.arm.flange(joints + robot.zero) @ robot.T_flange_cam
+        raise UserError(
+            f"--network {self.task.network}, trained for distances of "
+            f"{self.distance[0]:.2f} to {self.distance[1]:.2f} m",
+            "distances at which this arm can hold its camera over the tray, up to about 0.6 m",
+            "train for smaller distances: working_distance=[0.2,0.4]",
+        )
+
+
+def _height(T_base_obj: Transform) -> float:
+    return float(T_base_obj[2, 3])
+
+
+def _perturbed(pose: Transform, error: tuple[float, float], rng: Generator) -> Transform:
+    """Return a pose with an error in millimetres and degrees."""
+    direction, axis = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
+    turn = Rotation.from_rotvec(np.radians(error[1]) * axis).as_matrix()
+    return make_transform(turn @ pose[:3, :3], pose[:3, 3] + 0.001 * error[0] * direction)

@@ -1,0 +1,256 @@
+"""The bench of a trial: the things on it, and the camera's picture of them.
+
+To add a layout, write a method of :class:`Layout` and add its name to :data:`LAYOUTS`.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from numpy.random import Generator
+from scipy.spatial.transform import Rotation
+
+from dopepp.core.errors import UserError
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import Transform, invert_transform, make_transform
+from dopepp.geometry.rotation import matrix_to_quaternion
+from dopepp.parts.part import Part
+from dopepp.robot.grasping.cell import CAMERA, JOINTS, TRAY, Cell, Thing, convex_pieces
+from dopepp.robot.grasping.rehearsal import SIZE, TRUE_K
+from dopepp.virtual.backgrounds import ProceduralBackgrounds
+from dopepp.virtual.body import Body, distractor_shapes, make_body
+from dopepp.virtual.presets import PRESETS
+from dopepp.virtual.presets.table import Table, plane_of
+from dopepp.virtual.renderers import find_renderer
+from dopepp.virtual.scene import Scene, SceneObject
+from dopepp.virtual.sensor import capture
+
+LAYOUTS: Final = ("single", "distractors", "heap")  # methods of `Layout`
+SPREAD: Final = 0.025  # radius of the circle that contains a part's centre, metres
+DROP_HEIGHT: Final = 0.0005  # above the bench, metres
+HEAP: Final = (3, 5)  # minimum and maximum number of parts in a heap
+HEAP_SPREAD: Final = 0.05  # radius in which they fall, metres
+HEAP_TILT: Final = 15.0  # their largest initial tilt, degrees
+DISTRACTORS: Final = (2, 4)  # minimum and maximum number of things beside a part
+DISTRACTOR_RADIUS: Final = (0.012, 0.025)  # range of half their sizes, metres
+DISTRACTOR_AREA: Final = 0.11  # radius in which they stand, metres
+COLOUR: Final = (0.93, 0.55, 0.14)
+
+RENDERERS: Final = ("raster", "raster-shadows", "mujoco")
+"""Renderers of the camera's pictures: the project's as in the training of the released networks,
+on a bench without shadows; the same with the shadows of the parts; and MuJoCo's."""
+
+STYLE: Final = PRESETS["wide"]
+"""Preset of the released networks: light, materials and camera errors."""
+
+UPRIGHT: Final = np.radians([90.0, -90.0, 0.0, -90.0, 0.0, 0.0])
+"""Joints of an arm that points at the ceiling, outside the picture."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedThing:
+    """A thing, and its initial pose T_base_obj."""
+
+    body: Body
+    thing: Thing
+    T_base_obj: Transform
+
+
+class Layout:
+    """Draws the things on the bench.
+
+    Args:
+        part: The part to grasp.
+        name: One of :data:`LAYOUTS`.
+        yaw_deg: Largest rotation of parts about the vertical to either side, degrees. At 0, their x
+            axis points to the camera's right.
+        rest: ``front`` lays the part's +z axis upwards; ``any`` draws a resting face.
+    """
+
+    def __init__(self, part: Part, name: str, yaw_deg: float, rest: str) -> None:
+        self._name = name
+        self.part, self.body = part, make_body(part, is_target=True)
+        self.thing = Thing(convex_pieces(part), part.mesh, COLOUR)
+        self._yaw, self._rest = np.radians(yaw_deg), rest
+
+    def draw(self, rng: Generator) -> list[PlacedThing]:
+        """Draw the things, the parts first."""
+        things: list[PlacedThing] = getattr(self, self._name)(rng)
+        return things
+
+    def draw_pose(self, rng: Generator) -> Transform:
+        """Draw the pose of a part that lies alone in the tray."""
+        return self._placed(rng, SPREAD, DROP_HEIGHT, 0.0).T_base_obj
+
+    def _placed(self, rng: Generator, spread: float, height: float, tilt_deg: float) -> PlacedThing:
+        up = np.array([0.0, 0.0, 1.0])
+        if self._rest == "any":
+            normals, shares = self.body.hull.rests
+            up = -normals[rng.choice(len(shares), p=shares)]
+        upright = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0]
+        yaw, azimuth = rng.uniform(-self._yaw, self._yaw), rng.uniform(0, 2 * np.pi)
+        tilt = np.radians(rng.uniform(0, tilt_deg)) * np.array([np.cos(azimuth), np.sin(azimuth)])
+        turn = Rotation.from_rotvec([*tilt, 0.0]) * Rotation.from_rotvec([0.0, 0.0, yaw]) * upright
+        rotation = turn.as_matrix()
+        lowest = float((self.body.hull.vertices @ rotation[2]).min())
+        centre = rotation @ self.part.cuboid[-1]
+        offset = np.array([*_draw_in_disc(rng, spread), height - lowest])
+        position = TRAY + offset - [*centre[:2], 0.0]
+        return PlacedThing(self.body, self.thing, make_transform(rotation, position))
+
+    def single(self, rng: Generator) -> list[PlacedThing]:
+        """Place a part alone."""
+        return [self._placed(rng, SPREAD, DROP_HEIGHT, 0.0)]
+
+    def distractors(self, rng: Generator) -> list[PlacedThing]:
+        """Place a part among other things that do not touch it."""
+        things = self.single(rng)
+        occupied = [(things[0].T_base_obj[:3, 3], self.part.diameter / 2)]
+        shapes = distractor_shapes()
+        for _ in range(int(rng.integers(DISTRACTORS[0], DISTRACTORS[1] + 1))):
+            radius = rng.uniform(*DISTRACTOR_RADIUS)
+            shape = shapes[int(rng.integers(len(shapes)))]
+            body = shape.stretched(radius * rng.uniform(0.6, 1.0, 3))
+            for _ in range(20):
+                position = TRAY + np.array([*_draw_in_disc(rng, DISTRACTOR_AREA), 0.0])
+                if all(
+                    np.linalg.norm((position - centre)[:2]) > radius + other
+                    for centre, other in occupied
+                ):
+                    occupied.append((position, radius))
+                    things.append(_standing(body, position, rng))
+                    break
+        return things
+
+    def heap(self, rng: Generator) -> list[PlacedThing]:
+        """Drop parts onto each other."""
+        count = int(rng.integers(HEAP[0], HEAP[1] + 1))
+        heights = [0.002 + 0.02 * index for index in range(count)]
+        return [self._placed(rng, HEAP_SPREAD, height, HEAP_TILT) for height in heights]
+
+
+def _standing(body: Body, position: np.ndarray, rng: Generator) -> PlacedThing:
+    """Place a thing upright on the bench, with a random yaw."""
+    rotation = Rotation.from_rotvec([0.0, 0.0, rng.uniform(0, 2 * np.pi)]).as_matrix()
+    height = DROP_HEIGHT - float(body.surface.vertices[:, 2].min())
+    thing = Thing((np.asarray(body.hull.vertices),), None, (0.35, 0.45, 0.6))
+    T_base_obj = make_transform(rotation, position + np.array([0.0, 0.0, height]))
+    return PlacedThing(body, thing, T_base_obj)
+
+
+def _draw_in_disc(rng: Generator, radius: float) -> tuple[float, float]:
+    distance, angle = radius * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
+    return float(distance * np.cos(angle)), float(distance * np.sin(angle))
+
+
+class RasterView:
+    """The project's renderer: random materials and lights, a random picture on the bench.
+
+    Args:
+        shadows: Whether parts throw shadows on the bench.
+    """
+
+    def __init__(self, shadows: bool) -> None:
+        self._shadows = shadows
+        self._render = find_renderer("raster")
+        self._backgrounds = ProceduralBackgrounds()
+        # The preset defines blur and motion for pictures of its own height.
+        self._sensors = STYLE.sensors.resized(SIZE[1] / STYLE.height)
+
+    def take(
+        self,
+        bodies: Sequence[Body],
+        poses: Sequence[Transform],
+        T_base_cam: Transform,
+        rng: Generator,
+    ) -> Picture:
+        """Render bodies at poses T_base_obj on the bench."""
+        T_cam_base = invert_transform(T_base_cam)
+        objects = []
+        materials: dict[str, Any] = {}
+        for body, pose in zip(bodies, poses, strict=True):
+            material = STYLE.materials.draw(rng, body.surface)
+            if body.part is not None:  # copies of a part have the same material
+                material = materials.setdefault(body.part.name, material)
+            objects.append(SceneObject(body.surface, T_cam_base @ pose, material, body.part))
+        T_cam_table = table_pose(T_base_cam)
+        lights, ambient = STYLE.lighting.draw(rng, T_cam_table[:3, 3], T_cam_table[:3, 2])
+        picture = Table().draw_picture(rng, self._backgrounds, TRUE_K, SIZE, T_cam_table)
+        background = picture.seen(TRUE_K, SIZE, T_cam_table)
+        plane = plane_of(T_cam_table) if self._shadows else None
+        sensor = self._sensors.draw(rng)
+        scene = Scene(TRUE_K, background, tuple(objects), lights, ambient, plane, sensor)
+        return capture(self._render(scene).image, scene.sensor)
+
+
+class MujocoView:
+    """MuJoCo's renderer, which needs OpenGL: one colour per thing, a plain bench."""
+
+    def __init__(self, things: Sequence[Thing]) -> None:
+        self._cell = Cell(things, shown="things")
+        self._state = self._cell.data()
+        self._renderer = open_gl(self._cell.model, SIZE)
+        self._sensors = STYLE.sensors.resized(SIZE[1] / STYLE.height)
+        self._cell.model.cam_fovy[:] = np.degrees(2 * np.arctan(SIZE[1] / 2 / TRUE_K[1, 1]))
+
+    def take(
+        self,
+        bodies: Sequence[Body],
+        poses: Sequence[Transform],
+        T_base_cam: Transform,
+        rng: Generator,
+    ) -> Picture:
+        """Render the things at poses T_base_obj on the bench."""
+        model, state = self._cell.model, self._state
+        for number, pose in enumerate(poses):
+            self._cell.put(state, number, pose)
+        # OpenGL's cameras look along −z with y upwards.
+        model.cam_pos[:] = T_base_cam[:3, 3]
+        model.cam_quat[:] = matrix_to_quaternion(T_base_cam[:3, :3] @ np.diag([1.0, -1.0, -1.0]))
+        state.qpos[:JOINTS] = UPRIGHT
+        mujoco.mj_forward(model, state)
+        self._renderer.update_scene(state, camera=CAMERA)
+        picture: Picture = np.ascontiguousarray(self._renderer.render())
+        return capture(picture, self._sensors.draw(rng))
+
+
+def table_pose(T_base_cam: Transform) -> Transform:
+    """Return T_cam_table: the bench's plane, with its origin on the camera's optical axis."""
+    ahead = T_base_cam[:3, 2]
+    origin = T_base_cam[:3, 3] - T_base_cam[2, 3] / ahead[2] * ahead
+    return np.asarray(invert_transform(T_base_cam) @ make_transform(np.eye(3), origin))
+
+
+@cache
+def has_gl() -> bool:
+    """Return whether MuJoCo can render; log why not."""
+    try:
+        open_gl(Cell(shown="things").model, (64, 64)).close()
+    except UserError as error:
+        _log.warning("pictures of failures show the camera's view only: %s", error.got)
+        return False
+    return True
+
+
+def open_gl(model: Any, size: tuple[int, int]) -> Any:
+    """Return a MuJoCo renderer for pictures of (width, height).
+
+    Raises:
+        UserError: There is no OpenGL.
+    """
+    try:
+        return mujoco.Renderer(model, size[1], size[0])
+    except Exception as error:  # drivers raise many types
+        raise UserError(
+            f"MuJoCo pictures without OpenGL ({type(error).__name__}: {error!s:.100})",
+            "a display, or EGL (libegl1 and a driver)",
+            "install EGL, or leave out --video and --renderer mujoco",
+        ) from error

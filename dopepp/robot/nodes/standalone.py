@@ -1,0 +1,203 @@
+"""The node without ROS: lines of JSON on stdout or over UDP, and processing of recordings.
+
+A processed recording is an ``.mcap`` of ROS 2 with the node's topics and the pictures' stamps; a
+viewer opens it beside the original recording (extra ``bags``).
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from dopepp.core.errors import RunError, UserError, require
+from dopepp.core.files import check_target, draft
+from dopepp.geometry.camera_file import Camera
+from dopepp.inference.frames import FrameSource
+from dopepp.inference.frames.ros import Bag
+from dopepp.robot.nodes.messages import OVERLAY, VISION, AnswerFormatter, Fields, Triangles
+from dopepp.robot.nodes.worker import Answer, Stamp, Worker, stamp_of
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+MAX_DATAGRAM: Final = 65_507  # bytes that UDP over IPv4 carries
+SUFFIX: Final = ".mcap"
+
+logger = logging.getLogger(__name__)
+
+
+def send_lines(
+    worker: Worker, sources: Iterable[tuple[FrameSource, Camera]], address: str | None = None
+) -> None:
+    """Send the poses in every picture as a line of JSON, like ``dopepp predict --json``.
+
+    Args:
+        worker: Estimates the poses.
+        sources: Sources of pictures with their cameras.
+        address: ``host:port`` of a UDP receiver (default: stdout).
+
+    Raises:
+        UserError: The address is invalid, or a source cannot be read.
+        RunError: A camera stream ended, or nobody reads stdout any more.
+    """
+    with nullcontext(_print) if address is None else _datagrams(address) as send:
+        for source, camera in sources:
+            for frame in source.frames():
+                send(worker.result(frame, camera).to_json())
+
+
+@contextmanager
+def _datagrams(address: str) -> Iterator[Callable[[str], None]]:
+    target, has_warned = _parse_address(address), False
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+
+        def send(line: str) -> None:
+            nonlocal has_warned
+            content = f"{line}\n".encode()
+            if len(content) > MAX_DATAGRAM:
+                if not has_warned:
+                    text = "skipped a line of %d bytes, too long for a datagram (%d): raise --conf"
+                    logger.warning(f"{text}, or use --json", len(content), MAX_DATAGRAM)
+                has_warned = True
+                return
+            try:
+                sender.sendto(content, target)
+            except OSError as error:
+                raise RunError(f"--udp {address}: {error.strerror or error}") from error
+
+        yield send
+
+
+def _print(line: str) -> None:
+    try:
+        sys.stdout.write(f"{line}\n")
+        sys.stdout.flush()  # a reader must not wait for a full buffer
+    except BrokenPipeError as error:
+        raise RunError("the reader of the lines has ended") from error
+
+
+def _parse_address(text: str) -> tuple[str, int]:
+    """Return the IP address and port of ``host:port``."""
+    host, _, port = text.rpartition(":")
+    try:
+        if not host or not 0 < int(port) < 65_536:
+            raise ValueError(text)
+        addresses = socket.getaddrinfo(host, int(port), socket.AF_INET, socket.SOCK_DGRAM)
+    except (ValueError, OSError) as error:
+        allowed, fix = "HOST:PORT, e.g. 192.168.0.7:5005", "use the address of the receiver"
+        raise UserError(f"--udp {text:.100}", allowed, fix) from error
+    ip, number = addresses[0][4][:2]
+    return str(ip), int(number)
+
+
+def process_bag(
+    worker: Worker, source: Path, target: Path, topic: str | None, name: str
+) -> Iterator[Answer | None]:
+    """Write a recording of the answers to a recording's pictures.
+
+    Args:
+        worker: Estimates the poses.
+        source: A recording of ROS 1 or 2.
+        target: The ``.mcap`` to write.
+        topic: Topic of the pictures, if the recording has several.
+        name: Name of the node, which prefixes its topics.
+
+    Yields:
+        The answer to every picture, None if the picture was not processed.
+
+    Raises:
+        UserError: The recording is unreadable, or the target cannot be written.
+    """
+    require("rosbags", "--bag", "bags")
+    check_target(target, (SUFFIX,))
+    if target.exists() and target.samefile(source):
+        raise UserError(f"--out {target}, the recording itself", "another file", "change --out")
+    bag = Bag(source, topic)
+    with draft(target) as path, _Recorder(path, name, worker) as recorder:
+        for seconds, message, info in bag.messages():
+            answer = worker.take(message, info, bag.topic)
+            if answer is not None:
+                stamp = stamp_of(message.header.stamp)
+                if stamp == Stamp(0, 0):
+                    stamp = Stamp(int(seconds), int(1e9 * (seconds - int(seconds))))
+                recorder.write(answer, stamp)
+            yield answer
+
+
+class _Recorder:
+    """A ROS 2 recording of a node's topics."""
+
+    def __init__(self, path: Path, name: str, worker: Worker) -> None:
+        from rosbags import rosbag2
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        self._path, self._name, self._worker = path, name, worker
+        self._formatter = AnswerFormatter(worker.parts)
+        self._store = get_typestore(Stores.ROS2_HUMBLE)
+        for kind, text in VISION.items():
+            self._store.register(get_types_from_msg(text, kind))
+        # The library writes a folder: the .mcap, and metadata that the .mcap contains as well.
+        self._folder = path.with_name("recording")
+        plugin = rosbag2.StoragePlugin.MCAP
+        self._writer = rosbag2.Writer(self._folder, version=9, storage_plugin=plugin)
+        self._topics: dict[str, Any] = {}
+
+    def __enter__(self) -> _Recorder:
+        self._writer.open()
+        for topic, kind in self._formatter.topics():
+            if topic != OVERLAY or self._worker.settings.overlay:
+                full = topic if topic.startswith("/") else f"/{self._name}/{topic}"
+                self._topics[topic] = self._writer.add_connection(
+                    full, _ros2_kind(kind), typestore=self._store
+                )
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._writer.close()
+        if kind is None:
+            next(self._folder.glob(f"*{SUFFIX}")).replace(self._path)
+
+    def write(self, answer: Answer, stamp: Stamp) -> None:
+        """Write the messages of an answer at the time of its picture."""
+        for message in self._formatter.messages(answer, self._topics.__contains__):
+            kind = _ros2_kind(message.kind)
+            content = self._store.serialize_cdr(_filled(self._store, kind, message.fields), kind)
+            nanoseconds = stamp.sec * 10**9 + stamp.nanosec
+            self._writer.write(self._topics[message.topic], nanoseconds, content)
+
+
+def _ros2_kind(kind: str) -> str:
+    return kind.replace("/", "/msg/")
+
+
+def _filled(store: Typestore, kind: str, fields: Fields) -> Any:
+    """Return the library's message of plain values. Missing fields are 0 or empty."""
+    definitions = store.fielddefs[kind][1]
+    return store.types[kind](
+        **{name: _value(store, node, fields.get(name)) for name, node in definitions}
+    )
+
+
+def _value(store: Typestore, node: Any, value: Any) -> Any:
+    """Return the value of a field, whose type is ``node``."""
+    from rosbags.interfaces import Nodetype
+
+    what, detail = node
+    if what == Nodetype.NAME:
+        return _filled(store, detail, value or {})
+    if what == Nodetype.BASE:
+        return value if value is not None else "" if detail[0] == "string" else 0
+    (inner, kind), _ = detail
+    if inner == Nodetype.BASE and kind[0] != "string":
+        if isinstance(value, bytes):
+            return np.frombuffer(value, kind[0])
+        return np.array([] if value is None else value, kind[0])
+    items = value.points if isinstance(value, Triangles) else value or ()
+    return [_value(store, (inner, kind), item) for item in items]
