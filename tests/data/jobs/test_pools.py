@@ -36,7 +36,7 @@ def test_a_dead_worker_is_one_line(small_job, tmp_path):
             (process,) = pools[0]._processes
             os.kill(process.pid, signal.SIGKILL)
 
-    message = r"a worker process died \(signal 9\); if memory .*; the same command goes on"
+    message = r"a worker process died \(signal 9\); if memory .*; run the same command again"
     with pytest.raises(StoppedError, match=message):
         render_dataset(small_job("ndds"), tmp_path, NUM, open_pool, on_progress=kill_the_worker)
 

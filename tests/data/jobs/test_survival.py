@@ -63,7 +63,7 @@ def test_killed_at_random_moments_it_ends_with_the_same_files(layout, tmp_path, 
         codes.append(process.returncode)
         wait_for_group(process.pid)
         if process.returncode > 0:
-            assert err == "interrupted; the same command goes on where this one stopped\n"
+            assert err == "interrupted; run the same command again to continue\n"
             assert not list(out.rglob("*.partial"))
     # A run that was done before its signal came is no failure of the job.
     allowed = {signal.SIGKILL: -9, signal.SIGINT: 130, signal.SIGTERM: 143}
