@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
+from typer import Argument, Option
 
 from dopepp.cli.common import report_errors
 from dopepp.core.errors import Interruption, UserError, interruptible
@@ -25,26 +26,17 @@ if TYPE_CHECKING:
 
 BOARD: Final = "charuco:8x11:20:15, chess:7x10:25 or circles:4x11:40 (columns × rows, mm)."
 
-Out = Annotated[Path, typer.Option(help="YAML file to write.")]
-Force = Annotated[
-    bool, typer.Option("--force", help="Also write a doubtful calibration, marked as untrusted.")
-]
-BoardSpec = Annotated[str, typer.Option("--board", help=BOARD)]
-Pictures = Annotated[Path, typer.Argument(help="Folder with pictures of the board.")]
+Out = Annotated[Path, Option(help="YAML file to write.")]
+Force = Annotated[bool, Option("--force", help="Also write a doubtful calibration, marked.")]
+BoardSpec = Annotated[str, Option("--board", help=BOARD)]
+Pictures = Annotated[Path, Argument(help="Folder with pictures of the board.")]
 Poses = Annotated[
-    Path,
-    typer.Argument(
-        help="CSV, JSON or YAML with x y z and qw qx qy qz, rx ry rz, or roll pitch yaw."
-    ),
+    Path, Argument(help="CSV, JSON or YAML: x y z and a quaternion, rotation vector or angles.")
 ]
-Unit = Annotated[str, typer.Option(help="Unit of positions: m, mm, cm or inch.")]
-Angles = Annotated[str, typer.Option(help="Unit of rx ry rz and roll pitch yaw: rad or deg.")]
-Quaternion = Annotated[
-    str, typer.Option(help="wxyz as the columns are named, or xyzw if w is in the last column.")
-]
-Direction = Annotated[
-    str, typer.Option(help="flange-to-base, as controllers show poses, or base-to-flange.")
-]
+Unit = Annotated[str, Option(help="Unit of positions: m, mm, cm or inch.")]
+Angles = Annotated[str, Option(help="Unit of rx ry rz and roll pitch yaw: rad or deg.")]
+Quaternion = Annotated[str, Option(help="Order of a quaternion: wxyz or xyzw.")]
+Direction = Annotated[str, Option(help="flange-to-base (usual) or base-to-flange.")]
 
 app = typer.Typer(
     no_args_is_help=True, help="Calibrate a camera, a tool, a bench, or the camera on the robot."
@@ -53,8 +45,8 @@ app = typer.Typer(
 
 @app.command()
 def board(
-    what: Annotated[str, typer.Argument(help=BOARD)],
-    out: Annotated[Path, typer.Option(help="PDF or PNG to print.")],
+    what: Annotated[str, Argument(help=BOARD)],
+    out: Annotated[Path, Option(help="PDF or PNG to print.")],
 ) -> None:
     """Write a calibration board for printing at true scale."""
     from dopepp.robot.calibration.board import parse_board
@@ -67,7 +59,7 @@ def board(
 def camera(
     source: Annotated[
         str,
-        typer.Argument(
+        Argument(
             help="Pictures of the board: a folder, a video, a ROS bag, a camera's number or "
             "address (Ctrl-C ends the recording)."
         ),
@@ -129,21 +121,16 @@ def tcp(
 def bench(
     source: Annotated[
         Path,
-        typer.Argument(
+        Argument(
             help="CSV with x, y, z of points that the tip touched, or a folder with pictures of a "
             "board on the bench."
         ),
     ],
     out: Out,
-    board: Annotated[str | None, typer.Option(help=BOARD)] = None,
-    camera: Annotated[Path | None, typer.Option(help="With --board: camera file.")] = None,
-    hand_eye: Annotated[
-        Path | None, typer.Option(help="With --board: file from `dopepp calibrate handeye`.")
-    ] = None,
-    poses: Annotated[
-        Path | None,
-        typer.Option(help="With --board and a camera on the flange: the robot's poses."),
-    ] = None,
+    board: Annotated[str | None, Option(help=BOARD)] = None,
+    camera: Annotated[Path | None, Option(help="With --board: camera file.")] = None,
+    hand_eye: Annotated[Path | None, Option(help="With --board: hand-eye file.")] = None,
+    poses: Annotated[Path | None, Option(help="With a camera on the flange: poses.")] = None,
     unit: Unit = "m",
     angles: Angles = "rad",
     quaternion: Quaternion = "wxyz",
@@ -185,8 +172,8 @@ def handeye(
     pictures: Pictures,
     poses: Poses,
     board: BoardSpec,
-    camera: Annotated[Path, typer.Option(help="Camera file from `dopepp calibrate camera`.")],
-    mount: Annotated[str, typer.Option(help="Mount of the camera: hand (flange) or bench.")],
+    camera: Annotated[Path, Option(help="Camera file.")],
+    mount: Annotated[str, Option(help="Mount of the camera: hand or bench.")],
     out: Out,
     unit: Unit = "m",
     angles: Angles = "rad",
@@ -200,11 +187,7 @@ def handeye(
     from dopepp.robot.calibration.board import board_pose, parse_board
     from dopepp.robot.calibration.hand_eye import calibrate_hand_eye, check_mount
     from dopepp.robot.calibration.quality import assess, check_poses
-    from dopepp.robot.calibration.records import (
-        match_pictures,
-        read_robot_poses,
-        write_calibration,
-    )
+    from dopepp.robot.calibration.records import match_pictures, read_robot_poses, write_calibration
 
     with report_errors():
         check_target(out, (".yaml", ".yml"))

@@ -8,63 +8,51 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from dopepp.core.errors import RESUME, Interruption, RunError, UserError, interruptible
 
-Model = Annotated[Path, typer.Argument(help="Checkpoint (best.ckpt of a run) or released network.")]
+Model = Annotated[Path, Argument(help="Checkpoint (best.ckpt of a run) or released network.")]
 
 Intrinsics = Annotated[
     tuple[float, float, float, float] | None,
-    typer.Option("--K", help="fx fy cx cy in pixels (instead of --camera)."),
+    Option("--K", help="fx fy cx cy in pixels (instead of --camera)."),
 ]
 
 CameraFile = Annotated[
-    Path | None,
-    typer.Option(help="Camera file: ROS, OpenCV, BOP, COLMAP, or text with a 3×3 matrix."),
+    Path | None, Option(help="Camera file: ROS, OpenCV, BOP, COLMAP, or text with a 3×3 matrix.")
 ]
 
 KSize = Annotated[
     tuple[int, int] | None,
-    typer.Option(
-        "--K-size", help="Width and height of the calibrated image, if the picture was resized."
-    ),
+    Option("--K-size", help="Size of the calibrated image, if it was resized."),
 ]
 
 Crop = Annotated[
     tuple[int, int, int, int] | None,
-    typer.Option(
-        help="x y width height of the picture in the calibrated image, if it was cropped."
-    ),
+    Option(help="x y width height, if the calibrated image was cropped."),
 ]
 
 Distances = Annotated[
     tuple[float, float] | None,
-    typer.Option(
-        "--distance", help="Nearest and farthest part in metres (default: the training range)."
-    ),
+    Option("--distance", help="Range of the parts, metres (default: that of the training)."),
 ]
 
-Region = Annotated[
-    str | None, typer.Option("--refine", help="region: refine the poses on the picture.")
-]
+Region = Annotated[str | None, Option("--refine", help="region: refine the poses on the picture.")]
 
 MaxMs = Annotated[
-    float | None, typer.Option(help="Time limit of the refinement per picture, milliseconds.")
+    float | None, Option(help="Time limit of the refinement per picture, milliseconds.")
 ]
 
-Track = Annotated[bool, typer.Option("--track", help="Track the parts from frame to frame.")]
+Track = Annotated[bool, Option("--track", help="Track the parts from frame to frame.")]
 
 Meshes = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--part",
-        help="Mesh that replaces the checkpoint's: a built-in part, a file, or NAME=FILE.",
-    ),
+    list[str] | None, Option("--part", help="Replacement mesh: built-in part, file, or NAME=FILE.")
 ]
 
-Unit = Annotated[str | None, typer.Option(help="Unit of the mesh files: mm, cm, m or inch.")]
+Unit = Annotated[str | None, Option(help="Unit of the mesh files: mm, cm, m or inch.")]
 
-Device = Annotated[str, typer.Option(help="PyTorch device, e.g. cpu or cuda.")]
+Device = Annotated[str, Option(help="PyTorch device, e.g. cpu or cuda.")]
 
 
 def check_region(refine: str | None) -> None:

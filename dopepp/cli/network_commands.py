@@ -9,6 +9,7 @@ from threading import Event
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
+from typer import Argument, Option
 
 from dopepp.cli.common import (
     CameraFile,
@@ -34,15 +35,11 @@ SIZE: Final = (640, 480)  # their width and height
 
 
 def benchmark(
-    models: Annotated[list[Path], typer.Argument(help="Checkpoints and exported files.")],
-    image: Annotated[
-        Path | None, typer.Option(help="Picture to use (default: 640×480 renders).")
-    ] = None,
+    models: Annotated[list[Path], Argument(help="Checkpoints and exported files.")],
+    image: Annotated[Path | None, Option(help="Picture (default: renders).")] = None,
     intrinsics: Intrinsics = None,
     refine: Region = None,
-    frames: Annotated[
-        int, typer.Option("-n", min=1, max=100_000, help="Number of timed frames.")
-    ] = 50,
+    frames: Annotated[int, Option("-n", min=1, max=100_000, help="Frames.")] = 50,
     device: Device = "cpu",
 ) -> None:
     """Time the steps from a picture to its poses, in milliseconds per frame."""
@@ -99,10 +96,8 @@ def _print_table(rows: list[dict[str, str]]) -> None:
 
 
 def doctor(
-    image: Annotated[Path, typer.Argument(help="Picture (PNG, JPEG or TIFF).")],
-    model: Annotated[
-        Path, typer.Option(help="Checkpoint (best.ckpt of a run) or released network.")
-    ],
+    image: Annotated[Path, Argument(help="Picture (PNG, JPEG or TIFF).")],
+    model: Annotated[Path, Option(help="Checkpoint (best.ckpt of a run) or released network.")],
     intrinsics: Intrinsics = None,
     camera: CameraFile = None,
     K_size: KSize = None,
@@ -154,7 +149,7 @@ def doctor(
 def serve(
     model: Model,
     port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="Port (default: first free from 7860).")
+        int | None, Option(min=1, max=65535, help="Port (default: first free from 7860).")
     ] = None,
     refine: Region = None,
     device: Device = "cpu",

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import typer
+from typer import Argument, Option
 
 from dopepp.cli.common import (
     Device,
@@ -31,44 +32,24 @@ PACKAGES: Final = {"--ros2": ("rclpy", "ros2"), "--bag": ("rosbags", "bags")}
 def node(
     model: Model,
     source: Annotated[
-        list[str] | None,
-        typer.Argument(help="With --json or --udp: sources as in `dopepp predict`."),
+        list[str] | None, Argument(help="With --json or --udp: as in `dopepp predict`.")
     ] = None,
-    ros2: Annotated[bool, typer.Option("--ros2", help="Run as a ROS 2 node.")] = False,
-    bag: Annotated[
-        Path | None,
-        typer.Option(help="Process a recording (.bag, .mcap, a folder) and write --out."),
-    ] = None,
-    out: Annotated[Path | None, typer.Option(help="With --bag: recording to write, .mcap")] = None,
-    json_lines: Annotated[
-        bool, typer.Option("--json", help="Print a line of JSON for each picture.")
-    ] = False,
-    udp: Annotated[
-        str | None, typer.Option(help="HOST:PORT: send these lines as UDP datagrams.")
-    ] = None,
-    topic: Annotated[
-        str | None,
-        typer.Option(help="Image topic, raw or …/compressed (default: /camera/image_raw)."),
-    ] = None,
-    name: Annotated[str, typer.Option(help="Name of the node and prefix of its topics.")] = "dope",
-    params: Annotated[
-        Path | None, typer.Option(help="With --ros2: YAML file of initial parameters.")
-    ] = None,
+    ros2: Annotated[bool, Option("--ros2", help="Run as a ROS 2 node.")] = False,
+    bag: Annotated[Path | None, Option(help="Recording to process; with --out.")] = None,
+    out: Annotated[Path | None, Option(help="With --bag: recording to write, .mcap")] = None,
+    json_lines: Annotated[bool, Option("--json", help="Print lines of JSON.")] = False,
+    udp: Annotated[str | None, Option(help="HOST:PORT: send the lines over UDP.")] = None,
+    topic: Annotated[str | None, Option(help="Image topic (default: /camera/image_raw).")] = None,
+    name: Annotated[str, Option(help="Name of the node and prefix of its topics.")] = "dope",
+    params: Annotated[Path | None, Option(help="With --ros2: YAML of parameters.")] = None,
     intrinsics: Intrinsics = None,
-    camera: Annotated[
-        Path | None, typer.Option(help="Camera file that replaces camera_info.")
-    ] = None,
-    frame: Annotated[
-        str | None,
-        typer.Option(help="Optical frame of the camera (default: the frame of the pictures)."),
-    ] = None,
-    conf: Annotated[float, typer.Option(help="Minimum score of a pose, 0 to 1.")] = 0.0,
+    camera: Annotated[Path | None, Option(help="Camera file, for camera_info.")] = None,
+    frame: Annotated[str | None, Option(help="Optical frame (default: the pictures').")] = None,
+    conf: Annotated[float, Option(help="Minimum score of a pose, 0 to 1.")] = 0.0,
     refine: Region = None,
     max_ms: MaxMs = None,
     track: Track = False,
-    overlay: Annotated[
-        bool, typer.Option("--overlay", help="Also publish pictures with drawn poses.")
-    ] = False,
+    overlay: Annotated[bool, Option("--overlay", help="Publish drawn poses.")] = False,
     device: Device = "cpu",
 ) -> None:
     """Publish the poses in every picture of a camera, until Ctrl-C.

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from dopepp.cli.common import (
     CameraFile,
@@ -42,7 +43,7 @@ def predict(
     model: Model,
     source: Annotated[
         list[str],
-        typer.Argument(
+        Argument(
             help="Pictures, folders, 'frames/*.png', videos, ROS bags (.bag, .mcap, a folder), "
             "a camera number, or an rtsp:// or http:// stream."
         ),
@@ -51,45 +52,33 @@ def predict(
     camera: CameraFile = None,
     K_size: KSize = None,
     crop: Crop = None,
-    topic: Annotated[
-        str | None, typer.Option(help="Image topic of a ROS bag with several.")
-    ] = None,
+    topic: Annotated[str | None, Option(help="Image topic of a ROS bag with several.")] = None,
     distance: Distances = None,
     roi: Annotated[
-        tuple[int, int, int, int] | None,
-        typer.Option(help="Region of interest, x y width height in pixels; not with --track."),
+        tuple[int, int, int, int] | None, Option(help="Region of interest: x y width height.")
     ] = None,
-    conf: Annotated[float, typer.Option(help="Minimum score of a detection, 0 to 1.")] = 0.0,
-    stride: Annotated[int, typer.Option(help="Use every n-th frame only.")] = 1,
+    conf: Annotated[float, Option(help="Minimum score of a detection, 0 to 1.")] = 0.0,
+    stride: Annotated[int, Option(help="Use every n-th frame only.")] = 1,
     track: Track = False,
     refine: Annotated[
-        str | None,
-        typer.Option(help="region (on the picture), depth (with --depth), or region,depth."),
+        str | None, Option(help="region, depth (with --depth), or region,depth.")
     ] = None,
     max_ms: MaxMs = None,
-    depth: Annotated[
-        Path | None,
-        typer.Option(help="Depth image: 16-bit PNG aligned to the picture, 0 = unknown."),
-    ] = None,
-    depth_scale: Annotated[float, typer.Option(help="Metres per unit of --depth.")] = 0.001,
+    depth: Annotated[Path | None, Option(help="Aligned 16-bit PNG, 0 = unknown.")] = None,
+    depth_scale: Annotated[float, Option(help="Metres per unit of --depth.")] = 0.001,
     verify: Annotated[
-        bool,
-        typer.Option("--verify", help="Print how well the picture and a rendered part agree, 0–1."),
+        bool, Option("--verify", help="Compare rendered parts with the picture.")
     ] = False,
     parts: Meshes = None,
     unit: Unit = None,
     device: Device = "cpu",
-    save: Annotated[
-        Path | None, typer.Option(help="Folder for pictures and videos with drawn poses.")
-    ] = None,
+    save: Annotated[Path | None, Option(help="Folder for drawn pictures and videos.")] = None,
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="File with one line of JSON per picture.")
+        Path | None, Option("--json", help="File with a line per picture.")
     ] = None,
-    csv: Annotated[
-        Path | None, typer.Option(help="File of poses in the format of the BOP challenge.")
-    ] = None,
-    rerun: Annotated[Path | None, typer.Option(help="Recording for the Rerun viewer, .rrd")] = None,
-    show: Annotated[bool, typer.Option("--show", help="Open the Rerun viewer.")] = False,
+    csv: Annotated[Path | None, Option(help="Poses in the format of the BOP challenge.")] = None,
+    rerun: Annotated[Path | None, Option(help="Recording for the Rerun viewer, .rrd")] = None,
+    show: Annotated[bool, Option("--show", help="Open the Rerun viewer.")] = False,
 ) -> None:
     """Estimate poses in pictures and print one line of JSON per detection.
 

@@ -43,9 +43,7 @@ BLOCK: Final = 50  # trials with one calibration, as in Table 9
 EXACT: Final = "exact poses"
 FAILURES: Final = ("not seen", "wrong pose", "no plan", "collided", "slipped")
 
-DEFAULT_DISTANCE: Final = (0.18, 0.22)
-"""Distances of the camera without a trained range, metres."""
-
+DEFAULT_DISTANCE: Final = (0.18, 0.22)  # distances of the camera without a trained range, metres
 TILT: Final = np.radians(17.0)
 """Largest rotation of the camera about its x and y axes from straight down, radians."""
 

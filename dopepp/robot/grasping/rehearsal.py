@@ -70,8 +70,6 @@ class CalibratedRobot:
     camera: Camera
     hand_eye_mm: float  # error of the camera's pose at the distance of the parts, millimetres
     hand_eye_deg: float  # its rotation error, degrees
-    tool_mm: float  # error of the tool's tip, millimetres
-    bench_mm: float  # error of the bench's height below the tray, millimetres
 
 
 def draw_robot(rng: Generator, tip: Vector) -> TrueRobot:
@@ -89,15 +87,8 @@ def calibrate(robot: TrueRobot, arm: Arm, rng: Generator, distance: float) -> Ca
     ahead = np.array([[0.0, 0.0, distance]])
     shift = transform(T_flange_cam, ahead) - transform(robot.T_flange_cam, ahead)
     turn = rotation_angle(T_flange_cam[:3, :3].T @ robot.T_flange_cam[:3, :3])
-    height = bench[:3, 2] @ (TRAY - bench[:3, 3])
-    return CalibratedRobot(
-        Knowledge(T_flange_cam, tip, bench),
-        camera,
-        hand_eye_mm=1000 * float(np.linalg.norm(shift)),
-        hand_eye_deg=float(np.degrees(turn)),
-        tool_mm=1000 * float(np.linalg.norm(tip - robot.tip)),
-        bench_mm=1000 * abs(float(height)),
-    )
+    errors = (1000 * float(np.linalg.norm(shift)), float(np.degrees(turn)))
+    return CalibratedRobot(Knowledge(T_flange_cam, tip, bench), camera, *errors)
 
 
 FlangePair = tuple[Transform, Transform]

@@ -289,8 +289,7 @@ class Pace:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._times: deque[float] = deque(maxlen=RECENT)
-        self._latencies: deque[float] = deque(maxlen=RECENT)
+        self._times, self._latencies = deque[float](maxlen=RECENT), deque[float](maxlen=RECENT)
         self._answered = 0
 
     def count(self, latency_s: float) -> None:

@@ -15,8 +15,9 @@ def test_calibrations_are_right_within_what_they_say(arm, gripper):
     assert np.linalg.norm(T[:3, 3] - robot.T_flange_cam[:3, 3]) < 1e-3
     assert 0 < found.hand_eye_mm < 0.6
     assert 0 < found.hand_eye_deg < 0.1
-    assert 0 < found.tool_mm < 0.6
-    assert found.bench_mm < 0.6
+    tip, bench = found.knowledge.tip, found.knowledge.T_base_bench
+    assert 0 < np.linalg.norm(tip - robot.tip) < 0.6e-3
+    assert abs(bench[:3, 2] @ (TRAY - bench[:3, 3])) < 0.6e-3
     assert abs(found.camera.K - TRUE_K).max() < 2.5
     # The drawing of the bracket alone would have been far worse.
     assert np.linalg.norm(MOUNT[:3, 3] - robot.T_flange_cam[:3, 3]) > 2e-3
