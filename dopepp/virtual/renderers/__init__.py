@@ -30,7 +30,9 @@ def find_renderer(name: str) -> Renderer:
     Raises:
         UserError: The renderer is unknown, or its extra is not installed.
     """
-    modules = RENDERERS if name in RENDERERS else {**extensions.components("renderers"), **RENDERERS}
+    modules = (
+        RENDERERS if name in RENDERERS else {**extensions.components("renderers"), **RENDERERS}
+    )
     if name not in modules:
         fix = f"choose one of them, or {extensions.advice('renderers', name)}"
         raise UserError(f"renderer {name!r}", ", ".join(modules), fix)
