@@ -1,4 +1,4 @@
-"""Evaluate: ``python evaluate.py ckpt_path=outputs/…/checkpoints/best.ckpt``."""
+"""Evaluate a checkpoint: ``python evaluate.py ckpt_path=outputs/…/checkpoints/best.ckpt``."""
 
 from dopepp.experiment.entries import start
 

@@ -1,4 +1,4 @@
-"""Train: ``python train.py model=dopepp data=hybrid``; every option is a file in ``conf/``."""
+"""Train a network: ``python train.py model=dopepp data=hybrid``; see ``conf/`` for the options."""
 
 from dopepp.experiment.entries import start
 

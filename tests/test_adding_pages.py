@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_png
-from dopepp.experiment.assembly.registries import CALLBACKS
+from dopepp.experiment.assembly.build_system import CALLBACKS
 from dopepp.geometry.camera import camera_matrix, make_transform
 from dopepp.metrics.functional import distances
 from dopepp.models import backbones

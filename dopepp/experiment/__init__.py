@@ -1,1 +1,1 @@
-"""Experiments: the only package that knows Hydra; below it only plain values travel."""
+"""Experiments: the only package that imports Hydra; other packages receive plain values."""

@@ -1,4 +1,4 @@
-"""The words after ``train`` and ``evaluate``: short names, resumed runs, mistakes, completion."""
+"""Prepare the command line for Hydra, explain Hydra's errors and complete words in a shell."""
 
 from __future__ import annotations
 
@@ -21,34 +21,31 @@ from dopepp.core.files import CONF
 from dopepp.experiment import program
 from dopepp.experiment.sweep import multirun
 
-# The modules that load PyTorch are imported inside functions: a typo is told before.
+# Modules that load PyTorch are imported inside functions, so typing errors are reported at once.
 
 SHORT_NAMES: Final = {
     "camera": "virtual.camera",
     "working_distance": "virtual.working_distance",
     "max_tilt_deg": "virtual.scene.turning.tilt_deg",
 }
-"""What options of how a part is seen are called on the command line, and where they stand."""
+"""Options of the camera that have a short name on the command line."""
 EVALUATION_SHORT_NAMES: Final = {**SHORT_NAMES, "scale": "scale_factors"}
-"""``evaluate.py``'s; ``scale`` alone, without being short for something, would be a file of
-``conf/scale``, which chooses a training's sizes."""
+"""Short names for ``evaluate.py``. In a training, ``scale`` selects a file of ``conf/scale``."""
 
 
 def prepare(open_nodes: Sequence[str], short_names: Mapping[str, str], num_words: int) -> None:
-    """Rewrite ``sys.argv`` as Hydra, and Lightning's further processes, are to read it.
+    """Rewrite ``sys.argv`` for Hydra and for the further processes of Lightning.
 
-    That is everywhere the same list: records show it, and worker processes inherit it. Hydra's
-    interpolations cannot serve here, because an option that refers to another one is in the config
-    beside it.
+    Records and worker processes use the same list. Interpolations of Hydra cannot replace short
+    names, because both options would appear in the config.
 
     Args:
-        open_nodes: Nodes whose keys are not all in ``conf/``, so that they take any key: they are
-            checked later.
-        short_names: What options may be called instead of their names.
-        num_words: Words of the program.
+        open_nodes: Nodes that accept keys missing in ``conf/``; they are checked later.
+        short_names: Option for each short name.
+        num_words: Number of words of the program.
 
     Raises:
-        UserError: The folder to run in holds another run, or the run to resume is unreadable.
+        UserError: The chosen folder holds another run, or the run to resume is unreadable.
     """
     words, given = sys.argv[:num_words], sys.argv[num_words:]
     arguments = [_spelled_out(text, short_names, open_nodes) for text in given]
@@ -60,7 +57,7 @@ def prepare(open_nodes: Sequence[str], short_names: Mapping[str, str], num_words
 
 
 def _spelled_out(argument: str, short_names: Mapping[str, str], open_nodes: Sequence[str]) -> str:
-    """Call an option by its name, and let it add a key where that is allowed."""
+    """Replace a short name, and mark keys of open nodes as additions."""
     key, equals, value = argument.partition("=")
     named = f"{short_names.get(key, key)}{equals}{value}"
     inside = named.startswith(tuple(f"{node}." for node in open_nodes))
@@ -68,9 +65,9 @@ def _spelled_out(argument: str, short_names: Mapping[str, str], open_nodes: Sequ
 
 
 def _refuse_used_folder(arguments: Sequence[str]) -> None:
-    """Refuse to begin a run where another one is, before Hydra writes there.
+    """Raise a user error for a folder that holds a run, before Hydra writes there.
 
-    The further processes of a run get its folder from the first one.
+    Further processes of a run receive the folder of the first process and are not checked.
     """
     words = dict(text.partition("=")[::2] for text in arguments)
     folder = words.get("hydra.run.dir", "")
@@ -87,7 +84,7 @@ def _refuse_used_folder(arguments: Sequence[str]) -> None:
 
 
 def _resumed(arguments: list[str]) -> list[str]:
-    """For ``resume=RUN``, put the run's own overrides first and go on in its folder."""
+    """For ``resume=RUN``, add the overrides of the run and select its folder."""
     runs = [text.partition("=")[2] for text in arguments if text.startswith("resume=")]
     if not runs or runs[-1] in ("", "null"):
         return arguments
@@ -96,13 +93,13 @@ def _resumed(arguments: list[str]) -> list[str]:
     run = Path(runs[-1])
     overrides = read_overrides(run)
     if overrides is None:
-        return arguments  # the run itself says what is wrong with the folder
-    # No file of the run changes before it is known whether it may go on like this.
+        return arguments  # the run reports what is wrong with the folder
+    # Hydra must not write into the run before the checks of resuming have passed.
     return [*overrides, *arguments, f"hydra.run.dir={run}", "hydra.output_subdir=null"]
 
 
 def explain(error: Exception) -> UserError:
-    """Turn Hydra's or OmegaConf's message into one line with got, allowed and fix."""
+    """Convert an error of Hydra or OmegaConf into a user error."""
     text = " ".join(f"{error} {error.__cause__ or ''}".split())
     if match := re.search(r"Could not override '([^']+)'", text):
         key = match.group(1)
@@ -119,7 +116,7 @@ def explain(error: Exception) -> UserError:
 
 
 def _nearest(key: str) -> str:
-    """Name the option that was probably meant, or the program that has this one."""
+    """Return a hint at the most similar option, or at the program that has this option."""
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
         options = {name: set(_flat(compose(name))) for name in ("train", "evaluate")}
     for name, names in options.items():
@@ -139,11 +136,15 @@ def _flat(node: DictConfig, prefix: str = "") -> Iterator[str]:
 
 
 def complete(name: str, words: Sequence[str], incomplete: str) -> list[str]:
-    """Return what a shell may put in place of an incomplete word.
+    """Return the completions of an incomplete word for a shell.
 
-    ``name`` is the entry's, ``words`` stand before. A key with one choice left is offered with its
-    values, because a shell ends a single match with a space. Bash takes ``=`` for a word of its
-    own and replaces only what follows.
+    A single matching key is completed to its values, because a shell adds a space to a single
+    match. Bash splits words at ``=`` and replaces only the part after it.
+
+    Args:
+        name: ``train`` or ``evaluate``.
+        words: Words before the incomplete one.
+        incomplete: Word to complete.
     """
     line = re.sub(r" ?= ?", "=", " ".join([*words, incomplete]))
     is_value = list(words[-1:]) == ["="]
@@ -162,7 +163,7 @@ def complete(name: str, words: Sequence[str], incomplete: str) -> list[str]:
 
 
 def _scene(words: Sequence[str]) -> str:
-    """Return an override that writes out the preset's fields, which ``conf/`` does not list."""
+    """Return an override with all fields of the preset, which ``conf/`` does not list."""
     from dopepp.virtual.presets import PRESETS
 
     given = [word.partition("=")[2] for word in words if word.startswith("virtual.preset=")]

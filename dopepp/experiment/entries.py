@@ -1,9 +1,9 @@
-"""The two entry points: ``train.py`` or ``dopepp train``, ``evaluate.py`` or ``dopepp evaluate``.
+"""Entry points of ``train.py`` (``dopepp train``) and ``evaluate.py`` (``dopepp evaluate``).
 
-From a command to a plain config, and from errors to one line. What takes long to import is imported
-once a job has its folder and has said so.
+The module turns the command into a plain config, and errors into one line. Slow imports happen only
+after a job has printed its folder.
 
-Exit codes: 0 done, 1 failed, 2 a user's mistake, 130 interrupted, 143 asked to stop (SIGTERM).
+Exit codes: 0 success, 1 failure, 2 user error, 130 interrupted, 143 terminated (SIGTERM).
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, Final
 
 from hydra import version
 
-# hydra.main reads sys.argv itself, where `dopepp train` has a word more than Hydra knows.
+# hydra.main reads sys.argv itself, but `dopepp train` has one word more than Hydra expects.
 from hydra._internal.utils import _run_hydra, get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
@@ -36,48 +37,43 @@ from dopepp.experiment.sweep import multirun
 _log = logging.getLogger(__name__)
 
 Job = Callable[[dict[str, Any], Path], object]
-"""What is done with a plain config in a run's folder."""
+"""Function that runs with a plain config in a run folder."""
 
 FAILED: Final = 1
 USERS_MISTAKE: Final = 2
 
 _REFUSALS: Final = (*NO_SPACE, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EEXIST)
-"""What a disk may answer to any program; another ``OSError`` is one of this program."""
+"""Errors of the disk; any other ``OSError`` is a bug of this program."""
 
 
 def train(config: DictConfig) -> float | None:
-    """Run one job and return what a search maximises."""
-
-    def job(plain: Mapping[str, Any], run_dir: Path) -> object:
-        from dopepp.experiment.run.train import do_job
-
-        return do_job(plain, run_dir)
-
-    return run_job(config, job)
+    """Run one job of ``train.py`` and return the value that a search maximises."""
+    return run_job(config, _imported("dopepp.experiment.run.train:do_job"))
 
 
 def evaluate(config: DictConfig) -> None:
-    """Run one evaluation."""
+    """Run one evaluation of ``evaluate.py``."""
+    run_job(config, _imported("dopepp.experiment.run.evaluate:run_evaluation"))
 
-    def job(plain: Mapping[str, Any], run_dir: Path) -> object:
-        from dopepp.experiment.run.evaluate import run_evaluation
 
-        return run_evaluation(plain, run_dir)
-
-    run_job(config, job)
+def _imported(name: str) -> Job:
+    """Return a job that is imported when it runs, because importing PyTorch takes seconds."""
+    return lambda config, run_dir: resolve_name(name)(config, run_dir)
 
 
 _ENTRIES: Final = {
     "train": (train, ["virtual.scene"], command_line.SHORT_NAMES),
     "evaluate": (evaluate, ["data", "virtual"], command_line.EVALUATION_SHORT_NAMES),
 }
-"""By name: what Hydra calls, nodes that take keys which ``conf/`` does not name, short names."""
+"""Hydra task, nodes that accept keys missing in ``conf/``, and short names of each program."""
 
 
 def start(name: str, num_words: int = 1) -> None:
-    """Run ``train`` or ``evaluate`` as the command line says, and exit with its code.
+    """Run ``train`` or ``evaluate`` with the arguments of the command line.
 
-    Its first ``num_words`` words are the program: ``train.py``, or ``dopepp train``.
+    Args:
+        name: ``train`` or ``evaluate``.
+        num_words: Number of words of the program: 1 for ``train.py``, 2 for ``dopepp train``.
     """
     task, open_nodes, short_names = _ENTRIES[name]
 
@@ -101,12 +97,11 @@ def entry(
     short_names: Mapping[str, str] | None = None,
     num_words: int = 1,
 ) -> None:
-    """Run what hands ``sys.argv`` to Hydra and exit with its code.
+    """Run a main function that passes ``sys.argv`` to Hydra; print user errors as one line.
 
-    A user's mistake is printed as one line. The arguments are those of
-    :func:`~dopepp.experiment.command_line.prepare`.
+    The remaining arguments are those of :func:`~dopepp.experiment.command_line.prepare`.
     """
-    # Hydra would print its own pages of text and exit with 1; so it hands its errors on instead.
+    # With this variable Hydra raises its errors instead of printing pages of text.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     program.configure_logging()
     try:
@@ -119,15 +114,15 @@ def entry(
         if interruption.number == signal.SIGTERM and multirun.job_id() is not None and first:
             line = f"{line}; {multirun.requeue()}"
         _exit(line, interruption.exit_code)
-    except (HydraException, OmegaConfBaseException) as error:  # one of Hydra's is an OSError, too
+    except (HydraException, OmegaConfBaseException) as error:  # some HydraExceptions are OSErrors
         _exit(command_line.explain(error), USERS_MISTAKE)
-    except OSError as error:  # the jobs' own are dealt with: what is left is Hydra's
+    except OSError as error:  # jobs handle their own errors, so this is an error of Hydra
         if error.errno not in _REFUSALS:
             raise
         allowed, fix = "a folder that can be written", "set output_dir=…, or make it writable"
         problem = f"output folder {error.filename}: {error.strerror}"
         _exit(UserError(problem, allowed, fix), USERS_MISTAKE)
-    except UserError as error:  # of a sweeper or launcher; jobs deal with their own
+    except UserError as error:  # of a sweeper or launcher; jobs handle their own errors
         _exit(error, USERS_MISTAKE)
 
 
@@ -138,13 +133,13 @@ def _exit(line: object, code: int) -> None:
 
 
 def run_job(config: DictConfig, job: Job) -> float | None:
-    """Resolve the config once and run a job in Hydra's run folder.
+    """Resolve the config and run a job in Hydra's run folder.
 
-    In a multirun a failing job leaves ``failed.json``, one that a search has stopped
-    ``pruned.json``, and the others run. Returned is the objective of a multirun's training, for
-    Hydra's sweepers; None where there is none.
+    In a multirun, a failing job writes ``failed.json`` and a pruned trial ``pruned.json``; the
+    other jobs continue. A single run with a user error leaves no folder.
 
-    A run that is refused because of what its user asked for leaves no folder.
+    Returns:
+        The objective of a training in a multirun, for Hydra's sweepers, else None.
     """
     hydra = HydraConfig.get()
     run_dir = Path(hydra.runtime.output_dir)
@@ -156,7 +151,7 @@ def run_job(config: DictConfig, job: Job) -> float | None:
             return _run_one_of_many(config, job, run_dir)
     if program.is_first_process():
         program.say(f"begins in {program.shown(run_dir)}")
-    # Hydra's own file may be cut in the middle; a resumed run's are kept once accepted.
+    # Hydra's own file may be truncated. A resumed run stores its overrides after the checks.
     resumed = any(text.startswith("resume=") for text in hydra.overrides.task)
     try:
         if not resumed:
@@ -165,7 +160,7 @@ def run_job(config: DictConfig, job: Job) -> float | None:
             remember_overrides(run_dir)
             multirun.remember_run(sys.argv[1:], run_dir)
         job(_plain(config), run_dir)
-    # Here, because Hydra would print a stack before handing it on.
+    # Errors are handled here because Hydra would print a stack trace.
     except (UserError, OmegaConfBaseException) as error:
         if not resumed and program.is_first_process():
             _remove_unused(run_dir)
@@ -182,7 +177,7 @@ def run_job(config: DictConfig, job: Job) -> float | None:
 
 
 def _remove_unused(run_dir: Path) -> None:
-    """Remove the folder of a refused run, unless it holds more than how it was started."""
+    """Remove the folder of a rejected run, unless the run has written results."""
     from dopepp.experiment.results.folder import DIFFERENCE, OF_THE_START
 
     names = {path.name for path in run_dir.iterdir()}
@@ -193,14 +188,14 @@ def _remove_unused(run_dir: Path) -> None:
 
 
 def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | None:
-    """Run a job of a multirun, whose end stands in its folder."""
+    """Run a job of a multirun and record its end in its folder."""
     from dopepp.experiment.results import display
     from dopepp.experiment.results.folder import FAILURE_FILE, OBJECTIVE, PRUNED_FILE, write_json
     from dopepp.experiment.results.report import Report
     from dopepp.training.pruning import PrunedError
 
     hydra = HydraConfig.get()
-    for name in (FAILURE_FILE, PRUNED_FILE):  # of an attempt before this one
+    for name in (FAILURE_FILE, PRUNED_FILE):  # of an earlier attempt
         (run_dir / name).unlink(missing_ok=True)
     try:
         plain = _plain(config)
@@ -210,7 +205,7 @@ def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | Non
         return result.details.get(OBJECTIVE) if isinstance(result, Report) else None
     except KeyboardInterrupt:
         if not multirun.is_remote(hydra):
-            # What is finished: Hydra ends without its hook.
+            # Hydra skips its hook, so the finished jobs are compared here.
             multirun.compare_jobs(Path(hydra.sweep.dir), config)
         raise
     except PrunedError as end:
@@ -226,6 +221,6 @@ def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | Non
 
 
 def _plain(config: DictConfig) -> dict[str, Any]:
-    """Resolve every interpolation; below this line there are only plain values."""
+    """Resolve all interpolations and return plain values."""
     plain: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     return dict(plain)

@@ -1,4 +1,4 @@
-"""This process: how the program was started, what it prints, and which of a run's it is."""
+"""Describe this process: its command, its output and its rank."""
 
 from __future__ import annotations
 
@@ -13,40 +13,40 @@ from typing import Final
 
 _SCRIPTS: Final = ("train.py", "evaluate.py")
 _RANKS: Final = ("RANK", "LOCAL_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK")
-"""Environment variables that number a run's processes, as torchrun, Lightning, SLURM and LSF do."""
+"""Environment variables with the rank of a process (torchrun, Lightning, SLURM, LSF)."""
 
 
 def typed(verb: str) -> str:
-    """Return what one types here to ``train`` or to ``evaluate``."""
+    """Return the command for ``train`` or ``evaluate`` in the style of the present command."""
     script = Path(sys.argv[0]).name in _SCRIPTS
     return f"python {verb}.py" if script else f"dopepp {verb}"
 
 
 def shown(path: Path) -> str:
-    """Return a path as a person would type it here: relative where it is below this folder."""
+    """Return a path relative to the working directory if it lies below it, else absolute."""
     path = path.absolute()
     below = path.is_relative_to(Path.cwd())
     return str(path.relative_to(Path.cwd()) if below else path)
 
 
 def say(line: str) -> None:
-    """Print a line at once: Rich's console, which prints the others, takes long to import."""
+    """Print a line immediately, without Rich, whose import is slow."""
     sys.stdout.write(f"{line}\n")
     sys.stdout.flush()
 
 
 def command() -> list[str]:
-    """Return the words of the present command, the program without its folder."""
+    """Return the words of the present command, without the folder of the program."""
     return [Path(sys.argv[0]).name, *sys.argv[1:]]
 
 
 def line(words: Sequence[str]) -> str:
-    """Return a command's words as a line to type."""
+    """Return the words of a command as a shell line."""
     return ("python " if words[0].endswith(".py") else "") + shlex.join(words)
 
 
 def is_first_process() -> bool:
-    """Return whether this is the run's only process, or the first of several."""
+    """Return whether this is the first process of a run."""
     return all(os.environ.get(name, "0") in ("", "0") for name in _RANKS)
 
 
@@ -56,11 +56,10 @@ def configure_logging() -> None:
 
 
 def quiet_lightning() -> None:
-    """Leave out Lightning's messages that only repeat ours; for once it is imported.
+    """Suppress messages of Lightning that repeat ours, after Lightning has been imported.
 
-    Two warnings go as well: Lightning 2.6 makes a ``LeafSpec`` of every batch, which PyTorch calls
-    deprecated since 2.9, and nobody but Lightning can change that; and layers in evaluation mode,
-    which are those that a backbone keeps as they are.
+    Two warnings are suppressed as well: the use of ``LeafSpec`` in Lightning 2.6, which PyTorch 2.9
+    deprecates, and layers in evaluation mode, which are the frozen layers of a backbone.
     """
     warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
     warnings.filterwarnings(

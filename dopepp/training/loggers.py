@@ -1,6 +1,6 @@
 """Loggers whose failures do not end a run: a CSV table and a guard around other loggers.
 
-To add a logger, add a line to ``dopepp/experiment/assembly/registries.py`` and a file to
+To add a logger, add a line to ``dopepp/experiment/assembly/build_system.py`` and a file to
 ``conf/logger``.
 """
 

@@ -4,7 +4,7 @@ Poses are recovered from the maps and compared by the same accumulator as in eva
 another metric, add a field of :class:`~dopepp.metrics.row.PoseRow` and its name in :data:`LOGGED`.
 To draw another sheet of the first validation images, add a subclass of :class:`ValidationSheet`
 with a ``name`` and :meth:`~ValidationSheet.tiles`, a line in
-``dopepp/experiment/assembly/registries.py`` and an entry in ``conf/callbacks``.
+``dopepp/experiment/assembly/build_system.py`` and an entry in ``conf/callbacks``.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """PoseSystem: a network, a loss and an optimiser as a LightningModule.
 
 All exchangeable components are passed as objects. To add a callback, write a class in
-:mod:`dopepp.training`, and add a line to ``dopepp/experiment/assembly/registries.py`` and an entry
+:mod:`dopepp.training`, and add a line to ``dopepp/experiment/assembly/build_system.py`` and an entry
 to ``conf/callbacks``.
 """
 

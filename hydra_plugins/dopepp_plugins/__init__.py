@@ -1,5 +1,5 @@
-"""Hydra's ends of what lives in ``dopepp.experiment``.
+"""Hydra plugins that call ``dopepp.experiment``.
 
-Hydra instantiates sweepers and launchers only out of ``hydra_plugins``, and imports all of it at
-every start: these modules are thin and import nothing but Hydra.
+Hydra loads sweepers and launchers only from ``hydra_plugins`` and imports all of them at every
+start. Therefore these modules are short and import nothing but Hydra.
 """

@@ -1,4 +1,4 @@
-"""Config files of users' own packages, behind those of ``conf/``."""
+"""Add the config files of user packages to Hydra's search path."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ class Extensions(SearchPathPlugin):
     """Adds the folders that :mod:`dopepp.core.extensions` finds."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Add them last, so that none hides a file of ``conf/``."""
+        """Append the folders last, so that no file hides a file of ``conf/``."""
         from dopepp.core.extensions import config_folders
 
         for package, folder in config_folders():

@@ -1,4 +1,4 @@
-"""``hydra/launcher=joblib|submitit_slurm|ray``: their options are in ``conf/hydra/launcher``."""
+"""Launchers for ``hydra/launcher=joblib|submitit_slurm|ray``; see ``conf/hydra/launcher``."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class _RemoteLauncher(Launcher):
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
-        """Take what Hydra hands to every launcher."""
+        """Store the arguments that Hydra passes to every launcher."""
         self.hydra_context, self.task_function, self.config = hydra_context, task_function, config
 
     def launch(
@@ -35,23 +35,23 @@ class _RemoteLauncher(Launcher):
 
 
 class JoblibLauncher(_RemoteLauncher):
-    """Jobs in several processes of this machine."""
+    """Run jobs in several processes of this machine."""
 
     def __init__(self, n_jobs: int) -> None:
         super().__init__("on_joblib", n_jobs)
 
 
 class RayLauncher(_RemoteLauncher):
-    """Jobs as tasks of a Ray cluster."""
+    """Run jobs as tasks of a Ray cluster."""
 
     def __init__(self, address: str | None, num_cpus: float, num_gpus: float) -> None:
         super().__init__("on_ray", address, num_cpus, num_gpus)
 
 
 class SlurmLauncher(_RemoteLauncher):
-    """Jobs as a SLURM job array."""
+    """Run jobs as a SLURM job array."""
 
     def __init__(self, folder: str, cluster: str, max_num_timeout: int, **sbatch: Any) -> None:
         is_config, plain = OmegaConf.is_config, OmegaConf.to_container
-        given = {key: plain(one) if is_config(one) else one for key, one in sbatch.items()}
+        given = {key: plain(node) if is_config(node) else node for key, node in sbatch.items()}
         super().__init__("on_slurm", folder, cluster, max_num_timeout, given)

@@ -1,4 +1,4 @@
-"""``search=optuna``: a sweeper whose jobs are the trials of a study."""
+"""Sweeper for ``search=optuna``, whose jobs are the trials of a study."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from omegaconf import DictConfig
 
 
 class OptunaSweeper(Sweeper):
-    """Hands a search to :func:`dopepp.experiment.sweep.optuna_search.search`.
+    """Call :func:`dopepp.experiment.sweep.optuna_search.search`.
 
-    ``params`` are what an experiment wants to sweep over; a search takes its ``space`` alone.
+    Args:
+        params: Options over which the experiment itself sweeps; a search does not support them.
     """
 
     config: DictConfig
@@ -25,7 +26,7 @@ class OptunaSweeper(Sweeper):
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
-        """Take what Hydra hands to every sweeper, and prepare the chosen launcher."""
+        """Store the arguments that Hydra passes to every sweeper, and build the launcher."""
         from hydra.core.plugins import Plugins
 
         self.loader, self.config = hydra_context.config_loader, config
@@ -34,7 +35,7 @@ class OptunaSweeper(Sweeper):
         )
 
     def sweep(self, arguments: list[str]) -> Any:
-        """Search until the study has its trials."""
+        """Search until the study has all its trials."""
         from dopepp.core.errors import require
 
         require("optuna", "search=optuna", "search")

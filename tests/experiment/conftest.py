@@ -44,7 +44,7 @@ from types import SimpleNamespace
 import hydra, torch
 from dopepp.experiment.results.folder import METRICS_FILE, write_json
 from dopepp.experiment.entries import entry, run_job
-from dopepp.experiment.assembly.registries import CALLBACKS
+from dopepp.experiment.assembly.build_system import CALLBACKS
 from dopepp.training.pruning import raise_if_pruned
 
 EPOCHS = 4

@@ -1,1 +1,1 @@
-"""From the configuration to objects, data, network and trainer."""
+"""Build objects, data, network and trainer from a config."""

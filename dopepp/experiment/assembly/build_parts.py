@@ -1,4 +1,4 @@
-"""From the ``data`` config to the objects to learn, and to what is shown and not to be found."""
+"""Build the objects to learn, and the negatives to show, from the ``data`` config."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PAPER_OBJECTS: Final = (
 
 
 def build_parts(data: DataConfig) -> list[Part]:
-    """Build the objects to learn: of the labelled images in ``root``, else the listed parts."""
+    """Build the objects to learn: those of the labelled images in ``root``, or the listed parts."""
     return choose_symmetries(_read_parts(data), data.symmetries)
 
 
@@ -58,7 +58,7 @@ def _ycb_parts(root: Path, objects: Sequence[str] | None) -> list[Part]:
 
 
 def build_negatives(data: DataConfig, parts: Parts) -> list[Part]:
-    """Build what is shown and not to be found: the listed parts, and a BOP root's other models."""
+    """Build the negatives: the listed parts, and the remaining models of a BOP data set."""
     listed = [load_part(name, data.unit) for name in data.virtual.negatives]
     if data.root is None or data.format != "bop" or data.objects is None:
         return listed
@@ -68,5 +68,5 @@ def build_negatives(data: DataConfig, parts: Parts) -> list[Part]:
 
 @lru_cache(maxsize=1)
 def _all_models(root: Path) -> tuple[Part, ...]:
-    """Read a BOP data set's models, once for all the factories of a run."""
+    """Read the models of a BOP data set once per run."""
     return tuple(bop_parts(root))

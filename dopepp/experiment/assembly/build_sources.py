@@ -1,8 +1,8 @@
-"""From the ``data`` config to the DataModule, to what each split shows, and in which camera.
+"""Build the DataModule, the images of each split and their camera from the ``data`` config.
 
-A split's images are labelled ones in a format of the field, or renders. To add a format, write a
-source and an entry in :data:`FORMATS`, or an entry point ``dopepp.formats`` to an :data:`Opener` in
-a package of your own (:mod:`dopepp.core.extensions`).
+The images of a split are labelled images or renders. To add a format of labelled images, write a
+source and add it to :data:`FORMATS`, or publish an :data:`Opener` as an entry point
+``dopepp.formats`` of your own package (:mod:`dopepp.core.extensions`).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from dopepp.data.sample import DescribedSource
 from dopepp.data.transforms.augment import Photometric
 from dopepp.data.transforms.jitter import CameraJitter
 from dopepp.data.transforms.masking import RandomMask
-from dopepp.experiment.assembly.registries import build_optional
+from dopepp.experiment.assembly.build_system import build_optional
 from dopepp.experiment.assembly.renders import (
     held_out_renders,
     kept,
@@ -45,15 +45,18 @@ from dopepp.virtual.backgrounds import Backgrounds, find_backgrounds
 _log = logging.getLogger(__name__)
 
 _TRAINING_SHARE: Final = 0.8
-"""Of the images of a folder that training shares with validation or test."""
+"""Share of the training in a folder of images that it shares with validation or test."""
 
 
 def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModule:
-    """Build training images of this seed, and validation and test images of ``data.eval_seed``."""
+    """Build training images from ``seed`` and held-out images from ``data.eval_seed``."""
     backgrounds = find_backgrounds(data.virtual.backgrounds)
+    val = held_out_source(data, parts, "val")
+    if data.virtual.view is not None and isinstance(val, RenderedSource):
+        val = validation_windows(data, parts)
     return PoseDataModule(
         train=_train_source(data, parts, seed, backgrounds),
-        val=_validation_source(data, parts),
+        val=val,
         test=held_out_source(data, parts, "test"),
         object_names=[part.name for part in parts],
         input_size=data.network_input,
@@ -67,19 +70,11 @@ def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModul
     )
 
 
-def _validation_source(data: DataConfig, parts: Parts) -> DescribedSource:
-    """Build the validation images as training sees them: in a camera of its own, windows."""
-    source = held_out_source(data, parts, "val")
-    if data.virtual.view is None or not isinstance(source, RenderedSource):
-        return source
-    return validation_windows(data, parts)
-
-
 def held_out_source(data: DataConfig, parts: Parts, split: Split) -> DescribedSource:
-    """Build the validation or the test images alone, at their native resolution.
+    """Build the validation or test images at their native resolution.
 
-    These are labelled ones where there is a root, else renders that no other split uses. Validation
-    is on renders, too, where the labelled images show no object; the log says so.
+    They are labelled images if there is a root, else renders. Validation falls back to renders,
+    with a warning, if the labelled images show none of the objects.
     """
     if data.is_rendered(split):
         return held_out_renders(data, parts, split)
@@ -98,7 +93,7 @@ def held_out_source(data: DataConfig, parts: Parts, split: Split) -> DescribedSo
 def _train_source(
     data: DataConfig, parts: Parts, seed: int, backgrounds: Backgrounds
 ) -> DescribedSource:
-    """Mix real frames, their synthetic companions and renders."""
+    """Mix real images, synthetic images of the data set and renders."""
     real, synthetic = None, None
     if data.root is not None and data.real_fraction > 0:
         real = _real_frames(data, parts, seed)
@@ -130,7 +125,7 @@ def _train_source(
 
 
 def _real_frames(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
-    """Open the labelled images as the network sees them: in a camera of its own, windows."""
+    """Open the labelled training images, in windows if the user's camera is given."""
     frames, view = labelled_images(data, parts, seed, "train"), data.virtual.view
     if view is None:
         return kept(frames, data, data.cache, data.network_input)
@@ -161,11 +156,11 @@ def labelled_images(data: DataConfig, parts: Parts, seed: int, split: Split) -> 
 def synthetic_companions(
     data: DataConfig, parts: Parts, seed: int, backgrounds: Backgrounds
 ) -> DescribedSource | None:
-    """Open YCB-Video's own synthetic frames where its training list names any."""
-    if data.root is None or data.format != "ycb_video":
-        return None
+    """Open the synthetic images in the training list of YCB-Video, if any."""
     image_set = data.image_sets["train"]
-    if image_set is None or not read_image_set(data.root, image_set, "synthetic"):
+    if data.root is None or data.format != "ycb_video" or image_set is None:
+        return None
+    if not read_image_set(data.root, image_set, "synthetic"):
         return None
     return YcbVideoReader(
         data.root,
@@ -179,10 +174,10 @@ def synthetic_companions(
 
 
 def share_of(image_sets: Mapping[str, str | None], split: Split) -> tuple[float, float]:
-    """Return the range of its folder's images that a split takes, as fractions.
+    """Return the range of a folder's images that belongs to a split, as fractions.
 
-    A folder that several splits name is divided in order (training, validation, test): 80 % to
-    training if it is among them, the rest equally.
+    Splits that share a folder divide it in the order training, validation, test. Training gets
+    80 %; the remaining splits get equal shares.
     """
     sharing = [name for name in ("train", "val", "test") if image_sets[name] == image_sets[split]]
     first = _TRAINING_SHARE if sharing[0] == "train" and len(sharing) > 1 else 1 / len(sharing)
@@ -194,10 +189,10 @@ def share_of(image_sets: Mapping[str, str | None], split: Split) -> tuple[float,
 
 
 Opener = Callable[[DataConfig, Path, Parts, int, Split], DescribedSource]
-"""From data, root, parts, seed and split to the split's images."""
+"""Function from data, root, parts, seed and split to the images of the split."""
 
 FORMATS: Final[dict[str, Opener]] = {
-    # An image set of real frames, or the listed frames, the same for every split.
+    # The images are an image set, or the listed frames, which all splits share.
     "ycb_video": lambda data, root, parts, seed, split: YcbVideoReader(
         root, parts, data.image_set(split) if data.frames is None else None,
         frames=data.frames, seed=seed, read_depth=split == "test",
@@ -215,11 +210,11 @@ FORMATS: Final[dict[str, Opener]] = {
         download_dir=data.download_dir, read_depth=split == "test",
     ),
 }  # fmt: skip
-"""How the images of each format are opened."""
+"""Functions that open the images of each format."""
 
 
 def share_in_words(data: DataConfig) -> str | None:
-    """Say it where the test is only a share of the images in its folder; None where it is all."""
+    """Return a remark if the test images are only a share of their folder, else None."""
     if data.is_rendered("test") or data.format == "ycb_video":
         return None
     first, last = share_of(data.image_sets, "test")
@@ -236,10 +231,10 @@ def share_in_words(data: DataConfig) -> str | None:
 
 
 def fitted_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
-    """Choose, where a camera is given, scale and input size by how large the parts appear in it.
+    """Choose the camera scale and the input size by the apparent size of the parts.
 
-    Renders of a BOP data set's models have the camera of its pictures where none is given. What was
-    chosen stands in the config as if it had been given, and the log says it.
+    Without a camera, only renders of the models of a BOP data set are fitted, to the camera of its
+    pictures. The chosen values are logged and stored in the config.
     """
     config = _with_camera_of_pictures(config, parts)
     data, virtual = config.data, config.data.virtual
@@ -268,18 +263,16 @@ def fitted_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
 
 
 def _with_camera_of_pictures(config: RunConfig, parts: Parts) -> RunConfig:
-    """Return a config with the camera, and the distances, of the test's BOP pictures.
+    """Return a config with the camera and the distances of the BOP test pictures.
 
-    Only where renders are learned, no camera is given, nor, with real images, an input size.
+    The config changes only if training uses renders and neither a camera nor, with real images, an
+    input size is given.
     """
     data, virtual = config.data, config.data.virtual
     rendered = data.real_fraction == 0 or (data.real_fraction < 1 and data.input_size is None)
-    if (
-        not rendered
-        or data.format != "bop"
-        or virtual.camera is not None
-        or data.is_rendered("test")
-    ):
+    if not rendered or virtual.camera is not None:
+        return config
+    if data.format != "bop" or data.is_rendered("test"):
         return config
     source = labelled_images(data, parts, data.eval_seed, "test")
     if not isinstance(source, BopReader):
@@ -299,21 +292,9 @@ def _with_camera_of_pictures(config: RunConfig, parts: Parts) -> RunConfig:
             source.name,
             *distance,
         )
-    lens = LensConfig(
-        width=width,
-        height=height,
-        fx=float(K[0, 0]),
-        fy=float(K[1, 1]),
-        cx=float(K[0, 2]),
-        cy=float(K[1, 2]),
-    )
+    (fx, _, cx), (_, fy, cy), _ = K.tolist()
+    lens = LensConfig(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
     chosen = replace(virtual, camera=lens, working_distance=distance)
-    plain = {
-        **config.plain,
-        "virtual": {
-            **config.plain["virtual"],
-            "camera": vars(lens),
-            "working_distance": list(distance),
-        },
-    }
+    changed = {"camera": vars(lens), "working_distance": list(distance)}
+    plain = {**config.plain, "virtual": {**config.plain["virtual"], **changed}}
     return replace(config, plain=plain, data=replace(data, virtual=chosen))

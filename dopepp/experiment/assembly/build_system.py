@@ -1,30 +1,38 @@
-"""From the config to the LightningModule and the Trainer, as this machine is best at it."""
+"""Build the LightningModule and the Trainer from a config, and choose what suits this machine.
+
+To allow an optimiser, scheduler, callback or logger of your own, register its dotted name before
+the run starts (``CALLBACKS.register("my_package.my_module.MyCallback")``) or list it here.
+"""
 
 from __future__ import annotations
 
 import ctypes
+import inspect
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch import Trainer
+from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
+from torch import nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
 
 from dopepp.core.errors import UserError
 from dopepp.core.pool import cpu_fact
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment import program
-from dopepp.experiment.assembly.registries import CALLBACKS, optimizer_factory, scheduler_factory
 from dopepp.experiment.config.run_config import MapsConfig, RunConfig, TrainerConfig
 from dopepp.maps.codec import MapGeometry
 from dopepp.models.checkpoint import Checkpoint, load_network
 from dopepp.models.network import LOSSES, PoseNetwork, build_network
+from dopepp.models.registry import TARGET, Registry
 from dopepp.parts.part import Part
 from dopepp.parts.size import Seen
 from dopepp.recovery.detection import RecoveryOptions
@@ -32,8 +40,10 @@ from dopepp.training.loggers import MetricsTable
 from dopepp.training.optimizers import AveragedWeights
 from dopepp.training.processes import WatchedDDP
 from dopepp.training.run_checkpoints import AtomicCheckpointIO
-from dopepp.training.system import PoseSystem
+from dopepp.training.system import OptimizerFactory, PoseSystem, SchedulerFactory
 from dopepp.training.throughput import RunProgress, make_profiler
+
+T = TypeVar("T")
 
 # From glibc's malloc.h.
 _M_TRIM_THRESHOLD: Final = -1
@@ -41,14 +51,56 @@ _M_MMAP_MAX: Final = -4
 
 _PROBE_ITEMS: Final = 3
 _PROBE_S: Final = 2.0
-"""What the duration's estimate may cost: a few items and a few seconds of steps."""
+"""Effort for the estimate of the duration: number of items and seconds of steps."""
 
 _BF16_FLAGS: Final = frozenset({"amx_bf16", "bf16"})
-"""x86's and Arm's names of the instruction sets."""
+"""Names of the instruction sets on x86 and Arm."""
 
 _AMD_BF16_FLAG: Final = "avx512_bf16"
-"""Intel's multiply no faster with it than in float32, and convert besides: 0.7 times the images a
-second (``benchmarks/train_step.py``). There AMX is what makes bf16 fast."""
+"""Instruction set that makes bf16 fast on AMD only. On Intel it is slower than float32, and AMX is
+needed instead (``benchmarks/train_step.py``)."""
+
+OPTIMIZERS: Registry[Optimizer] = Registry(
+    "optimizer",
+    Optimizer,
+    (
+        "dopepp.training.optimizers.Muon",
+        *(f"torch.optim.{name}" for name in ("Adam", "AdamW", "RMSprop", "SGD")),
+    ),
+)
+SCHEDULERS: Registry[LRScheduler] = Registry(
+    "scheduler",
+    LRScheduler,
+    (f"torch.optim.lr_scheduler.{name}LR" for name in ("CosineAnnealing", "Linear", "OneCycle")),
+)
+CALLBACKS: Registry[Callback] = Registry(
+    "callback",
+    Callback,
+    (
+        "dopepp.training.pose_validation.AUCCurves",
+        "dopepp.training.pose_validation.BeliefMaps",
+        "dopepp.training.pose_validation.EarlyStop",
+        "dopepp.training.guards.EmptyMaps",
+        "dopepp.training.guards.FiniteSteps",
+        "dopepp.training.last_checkpoint.LastCheckpoint",
+        "dopepp.training.pose_validation.Overlays",
+        "dopepp.training.pose_validation.PoseMetricsCallback",
+        "dopepp.training.throughput.Throughput",
+        "dopepp.training.pruning.TrialReport",
+        "lightning.pytorch.callbacks.EarlyStopping",
+        "lightning.pytorch.callbacks.LearningRateMonitor",
+        "lightning.pytorch.callbacks.ModelCheckpoint",
+        "lightning.pytorch.callbacks.Timer",
+    ),
+)
+LOGGERS: Registry[Logger] = Registry(
+    "logger",
+    Logger,  # type: ignore[type-abstract]
+    ("lightning.pytorch.loggers.TensorBoardLogger", "lightning.pytorch.loggers.WandbLogger"),
+)
+
+_TOTAL_STEPS = ("total_steps", "T_max", "total_iters")
+"""Names that torch's schedulers use for the number of steps of a run."""
 
 
 def build_system(
@@ -58,7 +110,7 @@ def build_system(
     images: Mapping[str, Any] | None = None,
     seen: Mapping[str, Seen] | None = None,
 ) -> PoseSystem:
-    """Build network, loss and optimiser; the checkpoint keeps what the data's images are."""
+    """Build network, loss and optimiser; ``images`` describes the data in the checkpoint."""
     network, description = build_untrained(config, parts)
     description = replace(
         description,
@@ -88,7 +140,7 @@ def build_system(
 
 
 def build_untrained(config: RunConfig, parts: list[Part]) -> tuple[PoseNetwork, Checkpoint]:
-    """Build the chosen network and what it is to be trained for, its data left out."""
+    """Build the untrained network and its checkpoint description, without the data."""
     spec = {
         "backbone": config.model.backbone,
         "attention": config.model.attention,
@@ -104,12 +156,12 @@ def build_untrained(config: RunConfig, parts: list[Part]) -> tuple[PoseNetwork, 
 
 
 def map_geometry(maps: MapsConfig, stride: int) -> MapGeometry:
-    """Return how target maps are drawn, from the config's ``maps``."""
+    """Return the geometry of the target maps."""
     return MapGeometry(stride, maps.sigma, maps.field_radius)
 
 
 def _start_from(network: torch.nn.Module, path: Path) -> None:
-    """Copy a checkpoint's weights into a network of the same shape."""
+    """Copy the weights of a checkpoint into a network of the same architecture."""
     trained, _ = load_network(path)
     try:
         network.load_state_dict(trained.state_dict())
@@ -122,7 +174,7 @@ def _start_from(network: torch.nn.Module, path: Path) -> None:
 
 
 def build_trainer(config: RunConfig, run_dir: Path, trackers: Sequence[Logger] = ()) -> Trainer:
-    """Build Lightning's trainer with the config's callbacks, and trackers beside the CSV table."""
+    """Build Lightning's trainer with the callbacks, the CSV table and the trackers."""
     options, accelerator = config.trainer, config.trainer.accelerator
     if accelerator in ("auto", "gpu") and torch.cuda.is_available():
         accelerator = "cuda"
@@ -134,6 +186,9 @@ def build_trainer(config: RunConfig, run_dir: Path, trackers: Sequence[Logger] =
     callbacks = [CALLBACKS.build(node) for node in config.callbacks.values()]
     if config.ema is not None:
         callbacks.append(AveragedWeights(config.ema))
+    strategy: str | WatchedDDP = options.strategy
+    if strategy == "ddp" or (strategy == "auto" and options.num_processes > 1):
+        strategy = WatchedDDP(options.ddp_timeout_s)  # detects the death of a process
     table = MetricsTable(run_dir / "metrics.csv")
     try:
         return Trainer(
@@ -141,7 +196,7 @@ def build_trainer(config: RunConfig, run_dir: Path, trackers: Sequence[Logger] =
             accelerator=accelerator,
             devices=options.devices,
             num_nodes=options.num_nodes,
-            strategy=_strategy(options),
+            strategy=strategy,
             precision=precision,  # type: ignore[arg-type]
             max_epochs=options.max_epochs,
             max_steps=options.max_steps,
@@ -149,11 +204,11 @@ def build_trainer(config: RunConfig, run_dir: Path, trackers: Sequence[Logger] =
             default_root_dir=run_dir,
             logger=[table, *trackers],
             callbacks=[*callbacks, RunProgress()],
-            # A checkpoint is never newer than the table.
+            # The table is written before each checkpoint, so a checkpoint is never newer.
             plugins=[AtomicCheckpointIO(prepare=table.write, folder=run_dir)],
             enable_model_summary=False,
             num_sanity_val_steps=0,
-            # The DataModule's own sampler knows rank and epoch.
+            # The sampler of the DataModule handles rank and epoch.
             use_distributed_sampler=False,
         )
     except (MisconfigurationException, TypeError, ValueError) as error:
@@ -164,19 +219,11 @@ def build_trainer(config: RunConfig, run_dir: Path, trackers: Sequence[Logger] =
         ) from error
 
 
-def _strategy(options: TrainerConfig) -> str | WatchedDDP:
-    """Return several processes' strategy, which notices when one of them dies."""
-    chosen = options.strategy
-    if chosen == "ddp" or (chosen == "auto" and options.num_processes > 1):
-        return WatchedDDP(options.ddp_timeout_s)
-    return chosen
-
-
 def choose_precision(asked: str, accelerator: str) -> tuple[str, str]:
-    """Return Lightning's precision and the reason for it.
+    """Return Lightning's precision and the reason for the choice.
 
-    ``auto`` takes bf16 where the hardware computes in it: elsewhere it is emulated and slower. The
-    choice depends on the hardware alone, not on a timing, so that a run can be repeated.
+    ``auto`` selects bf16 if the hardware supports it, because emulation is slow. The choice depends
+    on the hardware only, not on timings, so runs are repeatable.
     """
     if asked != "auto":
         return asked, "as asked"
@@ -195,8 +242,8 @@ def choose_precision(asked: str, accelerator: str) -> tuple[str, str]:
 def keep_freed_memory() -> None:
     """Let glibc reuse large blocks instead of returning them to the system after each operation.
 
-    By default every large tensor is mapped afresh, and on a CPU the page faults take up to half of
-    a training step (see ``benchmarks/train_step.py``).
+    By default every large tensor is mapped anew, and page faults slow training on a CPU down
+    (``benchmarks/train_step.py``).
     """
     if sys.platform == "linux" and hasattr(ctypes.CDLL(None), "mallopt"):
         libc = ctypes.CDLL(None)
@@ -207,10 +254,10 @@ def keep_freed_memory() -> None:
 def estimate_training_s(
     network: PoseNetwork, datamodule: PoseDataModule, trainer: TrainerConfig, precision: str
 ) -> float:
-    """Estimate a CPU run's duration, seconds, from a few steps and a few items.
+    """Estimate the duration of a run on a CPU, in seconds, from a few steps and items.
 
-    Loading is spread over the workers but shares the cores with training, so both count. An item
-    is loaded twice: a cache makes the second time, and so all later epochs, cheaper.
+    Loading and training share the cores, so their times add up. Items are loaded twice, because a
+    cache makes all epochs after the first one faster.
     """
     per_epoch = len(datamodule.train_source)
     num_images = per_epoch * trainer.max_epochs
@@ -232,7 +279,7 @@ def _loading_s(datamodule: PoseDataModule) -> float:
 
 
 def _step_s_per_image(network: PoseNetwork, datamodule: PoseDataModule, precision: str) -> float:
-    """Time forward and backward: one image first, then as large a batch as a few seconds allow."""
+    """Time a training step per image, with as large a batch as a few seconds allow."""
     width, height = datamodule.input_size
 
     def step_s(count: int) -> float:
@@ -244,8 +291,8 @@ def _step_s_per_image(network: PoseNetwork, datamodule: PoseDataModule, precisio
         torch.autograd.backward(torch.stack(means).sum())
         return time.perf_counter() - start
 
-    network.eval()  # batch norm must not learn from these empty images
-    step_s(1)  # the first step chooses kernels and allocates memory
+    network.eval()  # keeps batch norm's statistics unchanged
+    step_s(1)  # warm-up: selects kernels and allocates memory
     single = step_s(1)
     count = max(1, min(datamodule.batch_size, int(_PROBE_S / single)))
     step_s(count)
@@ -253,3 +300,38 @@ def _step_s_per_image(network: PoseNetwork, datamodule: PoseDataModule, precisio
     network.zero_grad(set_to_none=True)
     network.train()
     return duration
+
+
+def optimizer_factory(node: Mapping[str, Any]) -> OptimizerFactory:
+    """Return a function from parameters to the optimiser that a node describes.
+
+    The node is checked immediately with a dummy parameter, so mistakes are reported at the start.
+    """
+
+    def make(parameters: Iterable[nn.Parameter]) -> Optimizer:
+        return OPTIMIZERS.build(node, params=list(parameters))
+
+    make([nn.Parameter()])
+    return make
+
+
+def scheduler_factory(node: Mapping[str, Any]) -> SchedulerFactory | None:
+    """Return a function from optimiser and number of steps to the schedule, or None if constant."""
+    if node.get(TARGET) is None:
+        return None
+    parameters = inspect.signature(SCHEDULERS.resolve(node[TARGET])).parameters
+    total = next(name for name in _TOTAL_STEPS if name in parameters)
+
+    def make(optimizer: Optimizer, num_steps: int) -> LRScheduler:
+        try:
+            return SCHEDULERS.build(node, optimizer=optimizer, **{total: max(1, num_steps)})
+        except ZeroDivisionError:  # OneCycleLR whose warm-up is exactly one step long
+            return SCHEDULERS.build(node, optimizer=optimizer, **{total: num_steps + 1})
+
+    return make
+
+
+def build_optional(kind: str, base: type[T], node: Mapping[str, Any]) -> T | None:
+    """Build the object of a node with a single permitted class; None if the node has no target."""
+    registry = Registry(kind, base, [f"{base.__module__}.{base.__qualname__}"])
+    return None if node.get(TARGET) is None else registry.build(node)

@@ -1,4 +1,4 @@
-"""From the ``data`` config to renders: those to learn, those held out, and their presets."""
+"""Build renders and their presets from the ``data`` config: for training and held out."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from dopepp.virtual.presets import Preset
 
 
 def training_renders(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
-    """Render at the size the network sees, which costs a fraction of the native one."""
+    """Render the training images at the size of the network's input, which saves time."""
     factory = _factory(data, parts, seen_preset(data), seed, data.virtual.renderer)
     source = RenderedSource(factory, data.samples_per_epoch)
     return kept(source, data, data.cache, data.network_input)
 
 
 def validation_windows(data: DataConfig, parts: Parts) -> DescribedSource:
-    """Render the validation images of a camera of the user's own as training sees them."""
+    """Render the validation images of the user's camera in the windows that training uses."""
     factory = _factory(data, parts, seen_preset(data), data.eval_seed, data.virtual.renderer)
     return RenderedSource(factory, data.num_val, "val")
 
@@ -37,18 +37,21 @@ def validation_windows(data: DataConfig, parts: Parts) -> DescribedSource:
 def held_out_renders(
     data: DataConfig, parts: Parts, split: Split, scale: float = 1.0
 ) -> DescribedSource:
-    """Render a range that no other split uses, at its native size, with parts of any scale."""
+    """Render the scenes of a held-out split at their native size, with scaled parts."""
     renderer, count = data.virtual.renderer, data.num_val
     cache: Cache = "none"
     if split == "test":
         renderer, count, cache = data.test.renderer or renderer, data.num_test, data.test.cache
-    factory = _factory(data, parts, choose_preset(data), data.eval_seed, renderer)
+    preset, view = data.preset, data.virtual.view
+    if view is not None:
+        preset = view.whole(preset, data.virtual.camera_scale or 1.0)
+    factory = _factory(data, parts, preset, data.eval_seed, renderer)
     name = "virtual" if renderer == "raster" else renderer
     return kept(RenderedSource(factory, count, split, name, scale), data, cache, None)
 
 
 def scaled_test_renders(data: DataConfig, parts: Parts, scale: float) -> DescribedSource:
-    """Build the test scenes, which must be renders, with a camera so many times as near."""
+    """Render the test scenes with a camera that is nearer by a factor."""
     if not data.is_rendered("test"):
         raise UserError(
             f"scale={scale:g} on the images in data.root={data.root}",
@@ -59,7 +62,7 @@ def scaled_test_renders(data: DataConfig, parts: Parts, scale: float) -> Describ
 
 
 def empty_renders(data: DataConfig, parts: Parts, split: Split, num_images: int) -> DescribedSource:
-    """Render a held-out range without the objects: what the network must be silent on."""
+    """Render the scenes of a held-out split without the objects."""
     scene = {**(data.virtual.scene or {}), "targets_per_image": [0, 0]}
     virtual = replace(data.virtual, scene=scene)
     empty = replace(data, virtual=virtual, num_val=num_images, num_test=num_images)
@@ -69,10 +72,15 @@ def empty_renders(data: DataConfig, parts: Parts, split: Split, num_images: int)
 def validation_renders(
     checkpoint: Checkpoint, path: Path, count: int, size: Size | None = None
 ) -> DescribedSource:
-    """Render a checkpoint's parts as its validation images, in pictures of another ``size``.
+    """Render the parts of a checkpoint as in its validation images.
 
-    Neither the data set that it was trained on is needed nor its other models shown. Pictures of a
-    camera that the checkpoint was trained for keep their size. The path is for messages.
+    The data set of the training is not needed, and its other models are not shown.
+
+    Args:
+        checkpoint: Checkpoint.
+        path: Path of the checkpoint, for messages.
+        count: Number of images.
+        size: Image size; ignored if the checkpoint was trained for a camera.
     """
     data = chosen_data({}, {}, trained_on(checkpoint.data), str(path))
     virtual = replace(data.virtual, preset=data.preset_name)
@@ -86,7 +94,7 @@ def validation_renders(
 def kept(
     source: DescribedSource, data: DataConfig, cache: Cache, input_size: tuple[int, int] | None
 ) -> DescribedSource:
-    """Put the chosen cache around a source.
+    """Wrap a source in the chosen cache.
 
     Raises:
         UserError: The cache does not fit.
@@ -99,14 +107,8 @@ def kept(
     return CachedSource(source, input_size, folder, identity=code_hash())
 
 
-def choose_preset(data: DataConfig) -> Preset:
-    """Return the preset with the config's changes, at the size of a camera's whole pictures."""
-    preset, view = data.preset, data.virtual.view
-    return preset if view is None else view.whole(preset, data.virtual.camera_scale or 1.0)
-
-
 def seen_preset(data: DataConfig) -> Preset:
-    """Return the same scenes as the network sees them: resized, or in windows of such pictures."""
+    """Return the preset at the network's input size: resized, or in windows of the pictures."""
     preset, view = data.preset, data.virtual.view
     if view is not None:
         return view.window(preset, data.virtual.camera_scale or 1.0, data.network_input)

@@ -1,4 +1,4 @@
-"""The composed configuration as typed values: the classes' docstrings say what each option means.
+"""Typed configs; the docstring of each class describes its options.
 
-To add an option, give it a line in ``conf/`` and a field in the class of its node.
+To add an option, add it to a file in ``conf/`` and to the class of its node.
 """

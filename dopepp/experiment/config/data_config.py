@@ -1,6 +1,6 @@
-"""The nodes ``data`` and ``virtual``: which images there are, and how renders are made.
+"""The config nodes ``data`` (images) and ``virtual`` (renders).
 
-A training states both; an evaluation takes its checkpoint's, with what the user gives instead.
+A training states both nodes. An evaluation takes them from its checkpoint, with the user's changes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dopepp.virtual.presets import Preset, preset_of, written_out
 from dopepp.virtual.presets.view import View, read_lens
 
 Node = Mapping[str, Any]
-"""``{"_target_": …, argument: …}`` for a registry; without a target there is no such thing."""
+"""``{"_target_": …, argument: …}`` for a registry; a node without target builds nothing."""
 Cache = Literal["none", "memory", "disk"]
 Count = Annotated[int, Range(1, MAX_ITEMS)]
 Seed = Annotated[int, Range(0, 2**32 - 1)]
@@ -26,18 +26,18 @@ Share = Annotated[float, Range(0, 1)]
 Side = Annotated[int, Range(8, 16384)]
 
 MAX_WORKERS: Final = 1024
-"""More loader processes than any machine here has cores: a slip of the keyboard."""
+"""Maximum number of loader processes; a larger number is a typing error."""
 
 _MULTIPLE: Final = 32
-"""What both sides of an input are multiples of, pixels."""
+"""Both sides of the network's input are multiples of this number of pixels."""
 
 _CLOSED: Final = ("data.jitter", "data.masking", "data.augment", "data.image_sets")
-"""Nodes of an evaluation's data in which every option that can be changed is there already."""
+"""Nodes to which an evaluation cannot add options."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LensConfig:
-    """A camera's picture size and camera matrix, pixels, as its file states them."""
+    """Picture size and camera matrix of a camera, pixels."""
 
     __pydantic_config__ = STRICT
     width: Side
@@ -50,20 +50,19 @@ class LensConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class VirtualConfig:
-    """How renders are made: the node ``virtual``.
+    """Options of the renders: the node ``virtual``.
 
     Attributes:
-        preset: Name of the scenes' description (:mod:`dopepp.virtual.presets`); None takes ``ycb``
-            with a ``data.root``, else ``paper``.
-        scene: Fields of the preset that are changed (:class:`~dopepp.virtual.presets.Preset`).
-        backgrounds: Folder of photos, ``skimage`` for its own photos; None for procedural pictures.
-        negatives: Parts that are shown but must not be found: built-in names or mesh files. Of a
-            BOP data set, models that are none of ``data.objects`` are shown anyway.
-        renderer: ``raster``, or ``photoreal``.
-        camera: That the parts are to be found with; a file is read once, and its numbers stand in
-            its place. None takes the preset's.
-        working_distance: Of the parts from this camera, nearest and farthest, metres.
-        camera_scale: By how much the network sees its pictures scaled; None chooses.
+        preset: Name of the scene preset (:mod:`dopepp.virtual.presets`); None selects ``ycb`` with
+            a ``data.root``, else ``paper``.
+        scene: Changed fields of the preset (:class:`~dopepp.virtual.presets.Preset`).
+        backgrounds: Folder of photos, or ``skimage`` for its photos; None uses procedural pictures.
+        negatives: Parts to show that must not be detected: built-in names or mesh files. Models of
+            a BOP data set that are not in ``data.objects`` are always shown.
+        renderer: ``raster`` or ``photoreal``.
+        camera: Camera of the application; None uses the camera of the preset.
+        working_distance: Nearest and farthest distance of the parts from the camera, metres.
+        camera_scale: Scale at which the network sees the camera's pictures; None selects it.
     """
 
     __pydantic_config__ = STRICT
@@ -87,7 +86,7 @@ class VirtualConfig:
 
     @property
     def view(self) -> View | None:
-        """The camera at its working distance; None where the preset's camera is taken.
+        """Camera with its working distance; None if the preset's camera is used.
 
         Raises:
             UserError: The camera or the working distance is missing or wrong.
@@ -105,12 +104,12 @@ class VirtualConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class TestConfig:
-    """The test images: labelled ones where there is a ``data.root``, else renders.
+    """Options of the test images: labelled images with a ``data.root``, else renders.
 
     Attributes:
-        renderer: What draws them; None takes that of ``virtual``. One that is named here makes them
-            renders also with a root.
-        cache: Where renders are kept; ``disk`` keeps them for the next evaluation.
+        renderer: Renderer of the test images; None uses the renderer of ``virtual``. A renderer
+            selects renders even with a ``data.root``.
+        cache: Cache of renders; ``disk`` keeps them for the next evaluation.
     """
 
     __pydantic_config__ = STRICT
@@ -120,44 +119,44 @@ class TestConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class DataConfig:
-    """Objects and images: the node ``data``, with how its renders are made.
+    """Objects and images: the node ``data``, including the options of the renders.
 
     Attributes:
-        name: Of the choice, for folders and tables.
+        name: Name for folders and tables.
         format: Format of the labelled images: a key of
             :data:`~dopepp.experiment.assembly.build_sources.FORMATS`.
         root: Folder of labelled images; None renders all images.
-        objects: Objects of the root to learn; None takes the paper's five of YCB-Video, else all.
-        parts: Built-in names or mesh files, without a root and for NDDS.
-        unit: Of the mesh files: m, cm, mm or inch; None as :mod:`dopepp.parts.mesh` takes them.
-        symmetries: Of the objects: None as the data set states them, else ``none``, ``auto``, a
-            file, or some objects' by name (:mod:`dopepp.data.part_symmetries`).
+        objects: Objects of the root to learn; None selects the paper's five objects of YCB-Video,
+            else all objects.
+        parts: Built-in names or mesh files; used without a root and for NDDS.
+        unit: Unit of the mesh files: m, cm, mm or inch; None as in :mod:`dopepp.parts.mesh`.
+        symmetries: Symmetries of the objects: None as the data set states them, ``none``, ``auto``,
+            a file, or symmetries by object name (:mod:`dopepp.data.part_symmetries`).
         real_fraction: Share of labelled images in an epoch.
-        synthetic_fraction: Share of YCB-Video's own synthetic images in what is not labelled.
-        frames: Frames of YCB-Video for training and test alike, instead of image sets.
-        image_sets: What each split takes of the root, by ``train``, ``val`` and ``test``: an image
-            set of YCB-Video, of other formats a folder, which several splits may share; None
-            renders the split.
-        targets: BOP's list of test images to use; None takes all, ``auto`` BOP's own list where
-            the root has it.
-        classes: Class in NDDS files to part, where the names differ.
-        download_dir: Where shards from URLs are kept; None downloads nothing.
-        jitter: Node of the camera jitter; without a target there is none.
-        masking: Node of the random masks; without a target there are none.
-        augment: Node of the photometric augmentation; without a target there is none.
-        virtual: How images are rendered.
-        test: What the test images are.
-        cache: ``memory`` and ``disk`` render each training image once and keep it.
-        cache_dir: Folder of ``disk``; None is the user's own cache.
-        samples_per_epoch: Images of an epoch.
-        num_val: Rendered validation images.
-        num_test: Rendered test images.
-        eval_seed: Of validation and test renders and of shading's patches, so that trainings of
-            several seeds are measured on the same images.
-        input_size: The network's input (width, height), pixels, multiples of 32; None chooses it
-            for ``virtual.camera``.
-        batch_size: Images in a step, of each process.
-        num_workers: Processes that load; None takes one a core.
+        synthetic_fraction: Share of YCB-Video's synthetic images among the unlabelled images.
+        frames: Frames of YCB-Video for training and test, instead of image sets.
+        image_sets: Image set (YCB-Video) or folder (other formats) of each split ``train``, ``val``
+            and ``test``. Splits may share a folder. None renders the split.
+        targets: BOP's list of test images; None uses all images, ``auto`` the list of the root if
+            there is one.
+        classes: Part for each class name in NDDS files, where the names differ.
+        download_dir: Folder for downloaded shards; None downloads nothing.
+        jitter: Node of the camera jitter, if any.
+        masking: Node of the random masks, if any.
+        augment: Node of the photometric augmentation, if any.
+        virtual: Options of the renders.
+        test: Options of the test images.
+        cache: Cache of training images; ``memory`` and ``disk`` render each image once.
+        cache_dir: Folder of the ``disk`` cache; None uses the user's cache folder.
+        samples_per_epoch: Number of images per epoch.
+        num_val: Number of rendered validation images.
+        num_test: Number of rendered test images.
+        eval_seed: Seed of validation and test renders and of the patches of shading, independent of
+            the training seed.
+        input_size: Input size (width, height) of the network, pixels, multiples of 32; None selects
+            it for ``virtual.camera``.
+        batch_size: Images per step and process.
+        num_workers: Loader processes; None uses one per core.
     """
 
     __pydantic_config__ = STRICT
@@ -192,7 +191,7 @@ class DataConfig:
 
     @classmethod
     def of(cls, data: object, virtual: object) -> DataConfig:
-        """Read both nodes; ``virtual`` None is one that says nothing.
+        """Read both nodes; ``virtual`` may be None for the defaults.
 
         Raises:
             UserError: An option is unknown, missing, of a wrong type or out of range.
@@ -201,7 +200,7 @@ class DataConfig:
             problem = f"data.virtual={shown(data['virtual'])}"
             raise UserError(problem, "virtual.… alone", "set virtual.…")
         parsed = replace(parse(cls, data, "data"), virtual=VirtualConfig.of(virtual))
-        _ = parsed.preset  # refuses a wrong field before anything is rendered
+        _ = parsed.preset  # raises for a wrong field before anything is rendered
         return parsed
 
     def __post_init__(self) -> None:
@@ -214,12 +213,12 @@ class DataConfig:
 
     @property
     def preset_name(self) -> str:
-        """Name of the scenes' description."""
+        """Name of the scene preset."""
         return self.virtual.preset or ("paper" if self.root is None else "ycb")
 
     @property
     def preset(self) -> Preset:
-        """The scenes that are rendered, ``virtual.scene``'s changes included."""
+        """Scene preset, including the changes of ``virtual.scene``."""
         return preset_of(self.preset_name, self.virtual.scene, "virtual.scene")
 
     @property
@@ -238,7 +237,7 @@ class DataConfig:
         return self.input_size
 
     def is_rendered(self, split: Split) -> bool:
-        """Tell whether a held-out split's images are renders."""
+        """Return whether the images of a held-out split are renders."""
         if self.root is None or (split == "test" and self.test.renderer is not None):
             return True
         return self.image_sets[split] is None
@@ -260,10 +259,13 @@ class DataConfig:
 
 
 def chosen_data(data: Node | None, virtual: Node | None, stored: object, source: str) -> DataConfig:
-    """Return the data to evaluate on: the checkpoint's, with what the user gives instead.
+    """Return the data to evaluate on: the data of the checkpoint with the user's changes.
 
-    ``data`` and ``virtual`` are whole nodes or options to change. ``stored`` is what the checkpoint
-    of the path ``source`` was trained on; it is not trusted.
+    Args:
+        data: Whole node ``data``, or options to change.
+        virtual: Whole node ``virtual``, or options to change.
+        stored: Data config of the checkpoint, which is not trusted.
+        source: Path of the checkpoint, for messages.
 
     Raises:
         UserError: Neither the user nor the checkpoint names the data, or an option is wrong.
@@ -292,15 +294,15 @@ def chosen_data(data: Node | None, virtual: Node | None, stored: object, source:
 
 
 def trained_on(description: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the data config that a checkpoint's description names, None where it names none."""
+    """Return the data config in a checkpoint's description, or None."""
     config = description.get("config")
     return config if isinstance(config, dict) else None
 
 
 def with_files(virtual: object) -> object:
-    """Return the node ``virtual`` with the contents of files in place of their paths.
+    """Return the node ``virtual`` with file paths replaced by the contents of the files.
 
-    A camera's numbers replace its file, and changes to a shipped preset a file of the user's own.
+    A camera file becomes its numbers; a preset file becomes changes to a built-in preset.
     """
     if not isinstance(virtual, Mapping):
         return virtual
@@ -308,14 +310,7 @@ def with_files(virtual: object) -> object:
     if isinstance(virtual.get("camera"), str):
         (width, height), K = read_lens(virtual["camera"])
         (fx, _, cx), (_, fy, cy), _ = K.tolist()
-        written["camera"] = {
-            "width": width,
-            "height": height,
-            "fx": fx,
-            "fy": fy,
-            "cx": cx,
-            "cy": cy,
-        }
+        written["camera"] = vars(LensConfig(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy))
     if isinstance(virtual.get("preset"), str):
         preset, scene = written_out(virtual["preset"], virtual.get("scene"))
         written |= {"preset": preset, "scene": scene}
@@ -323,7 +318,7 @@ def with_files(virtual: object) -> object:
 
 
 def _chosen_virtual(given: Mapping[str, Any], stored: object, source: str) -> VirtualConfig:
-    """Return how to render: a whole node as given, or the stored one with options changed."""
+    """Return the given whole node ``virtual``, or the stored node with changed options."""
     if not {"renderer", "preset"} <= set(given):  # else a file of conf/virtual
         if stored is None:
             raise UserError(
@@ -334,7 +329,7 @@ def _chosen_virtual(given: Mapping[str, Any], stored: object, source: str) -> Vi
 
 
 def _changed(base: object, changes: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Replace options, one by one also inside nodes."""
+    """Replace options recursively."""
     if not isinstance(base, Mapping):
         raise UserError(f"{where}={base!r:.100}", "a mapping", "write a whole node")
     merged = dict(base)

@@ -1,18 +1,22 @@
-"""What ``train.py`` and ``evaluate.py`` are asked to do: their whole configs, parsed once."""
+"""The configs of ``train.py`` and ``evaluate.py``, parsed once.
+
+To add a protocol of the evaluation, give :class:`Protocols` its option, write a module that
+measures and records it, and call the module in
+:func:`dopepp.experiment.results.recording.measure_and_record`.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal, TypeVar, get_args
 
 import torch
 
 from dopepp.core.errors import UserError
-from dopepp.core.validation import STRICT, Range, parse, shown
+from dopepp.core.validation import STRICT, Range, check, parse, shown
 from dopepp.experiment.config.data_config import Count, DataConfig, Node, Seed, Share, with_files
-from dopepp.experiment.config.protocols import Protocols
 from dopepp.models.layers import MAX_WIDTH, MIN_WIDTH
 from dopepp.training.targets import SymmetryOptions
 
@@ -22,12 +26,19 @@ _MOST: Final = 10**6
 _MAX_EPOCHS: Final = 10**9
 _MAX_WAIT_S: Final = 7 * 24 * 3600
 _MIN_CELLS: Final = 0.1
-"""A peak or disc narrower than this, in cells, is on no cell at all."""
+"""Minimum width of a peak or disc in cells; narrower ones may cover no cell."""
 _MAX_THRESHOLD: Final = 1000
-"""Above any map size in cells, angle in degrees and number of peaks that means something."""
+"""Upper limit for map sizes in cells, angles in degrees and numbers of peaks."""
 
 Cells = Annotated[float, Range(_MIN_CELLS, _MAX_THRESHOLD)]
 Rate = Annotated[float, Range(1e-12, 1e3)]
+
+
+QuantityName = Literal["distance", "visibility", "size", "rotation"]
+"""Quantities by which rates can be broken down (``dopepp.experiment.results.breakdown``)."""
+
+_MAX_SCALE: Final = 20.0
+"""Largest factor by which the camera moves nearer or farther."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,8 +46,8 @@ class ModelConfig:
     """The network and its loss: the node ``model``.
 
     Attributes:
-        name: What it is called in tables.
-        width: Factor on every channel count, of which the nodes below take their own.
+        name: Name in tables.
+        width: Factor on the channel counts of all nodes below.
         backbone: Node of :data:`~dopepp.models.network.BACKBONES`.
         attention: Node of :data:`~dopepp.models.network.ATTENTIONS`.
         head: Node of :data:`~dopepp.models.network.HEADS`.
@@ -54,7 +65,7 @@ class ModelConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class MapsConfig:
-    """The target maps: a belief peak's standard deviation and the field's discs' radius, cells."""
+    """Target maps: standard deviation of belief peaks and radius of the field's discs, cells."""
 
     __pydantic_config__ = STRICT
     sigma: Cells
@@ -63,19 +74,19 @@ class MapsConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainerConfig:
-    """How and where training runs: the node ``trainer``.
+    """Options of the training process: the node ``trainer``.
 
     Attributes:
-        accelerator: Lightning's name, or ``auto``.
-        devices: How many on each machine, a list of them, ``auto`` or -1 for all.
-        num_nodes: Machines.
-        strategy: ``ddp`` for several processes, ``auto``, or another of Lightning's.
-        precision: Lightning's name, or ``auto`` for bf16 where the hardware is fast at it.
-        max_epochs: Epochs to train.
-        max_steps: Steps of the optimiser to train; -1 sets no limit.
+        accelerator: Lightning's name of the accelerator, or ``auto``.
+        devices: Number of devices per machine, a list of devices, or ``auto`` or -1 for all.
+        num_nodes: Number of machines.
+        strategy: ``ddp`` for several processes, ``auto``, or another strategy of Lightning.
+        precision: Lightning's name of the precision, or ``auto`` for bf16 on suitable hardware.
+        max_epochs: Maximum number of epochs.
+        max_steps: Maximum number of optimiser steps; -1 sets no limit.
         profiler: ``simple`` or ``pytorch``.
-        ddp_timeout_s: How long a process waits for one that says nothing, seconds.
-        lightning: Further arguments of Lightning's Trainer, which refuses what it does not know.
+        ddp_timeout_s: Time that a process waits for an unresponsive process, seconds.
+        lightning: Further arguments of Lightning's Trainer.
     """
 
     __pydantic_config__ = STRICT
@@ -92,7 +103,7 @@ class TrainerConfig:
 
     @classmethod
     def node(cls, options: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the options with those that are Lightning's under ``lightning``."""
+        """Return the options, with those of Lightning moved below ``lightning``."""
         ours = {field.name for field in fields(cls)} - {"lightning"}
         lightning = {key: value for key, value in options.items() if key not in ours}
         return {**{key: options[key] for key in options if key in ours}, "lightning": lightning}
@@ -104,7 +115,7 @@ class TrainerConfig:
         Raises:
             UserError: ``trainer.devices`` is wrong.
         """
-        # Where torchrun has started this process, the others exist already.
+        # torchrun states the number of processes that it has started.
         world_size = os.environ.get("WORLD_SIZE", "")
         outside = int(world_size) if world_size.isdecimal() else 1
         return max(outside, self.num_nodes * self._num_devices())
@@ -128,7 +139,7 @@ class TrainerConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class CostConfig:
-    """``job=cost``: frames timed one by one, from picture to poses, and the network's batch."""
+    """Options of ``job=cost``: number of timed frames and batch size of the network alone."""
 
     __pydantic_config__ = STRICT
     num_frames: Annotated[int, Range(1, _MOST)]
@@ -137,9 +148,9 @@ class CostConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class LearningRateConfig:
-    """``job=lr_finder``: rates of the first and the last step, and the steps between them.
+    """Options of ``job=lr_finder``: first and last learning rate, and number of steps.
 
-    Training ends earlier where the loss diverges.
+    The sweep ends earlier if the loss diverges.
     """
 
     __pydantic_config__ = STRICT
@@ -155,31 +166,91 @@ class LearningRateConfig:
 
 @dataclass(frozen=True)
 class FalsePositiveTarget:
-    """How silent a network must be where its objects are not.
+    """Permitted rate of false positives on images without objects.
 
     Attributes:
-        num_empty: Images without objects, for choosing the threshold and again for checking it.
-        false_positive_rate: Share of them on which the threshold may let a detection pass; 1 sets
-            no threshold.
+        num_empty: Number of images without objects to choose the threshold, and as many to check
+            it.
+        false_positive_rate: Permitted share of these images with a detection; 1 sets no threshold.
     """
 
     num_empty: Count = 500
     false_positive_rate: Share = 0.005
 
 
-@dataclass(frozen=True, kw_only=True)
-class MeasurementConfig(FalsePositiveTarget):
-    """What a training and an evaluation have in common: how a network is measured.
+@dataclass(frozen=True)
+class Protocols:
+    """Protocols to measure in addition to the test set.
 
     Attributes:
-        plain: The whole config in plain values, as it is shown and written down.
-        shading, scale_factors, by, num_bins: What is measured beside the test set as it is, see
-            :class:`~dopepp.experiment.config.protocols.Protocols`.
-        tune: Whether to learn a factor on distances, a score and its threshold first.
-        refine: ``region`` measures, and tunes, with poses refined on the picture as well, ``depth``
-            where the images have depth, a list of the two by both.
-        output_dir: Folder of run folders.
-        extensions: Packages of one's own whose code may be used (:mod:`dopepp.core.extensions`).
+        shading: Shares of every object's visible area to cover, ascending, without 0.
+        scales: Factors on the apparent size of the parts, ascending, without 1.
+        by: Quantities by which rates are broken down.
+        num_bins: Number of bins per quantity.
+    """
+
+    shading: tuple[float, ...] = ()
+    scales: tuple[float, ...] = ()
+    by: tuple[QuantityName, ...] = ()
+    num_bins: int = 5
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any]) -> Protocols:
+        """Read the options; a training has no scales.
+
+        Raises:
+            UserError: An option is wrong.
+        """
+        shares = "shares of the visible area from 0 to 1, not 0 alone, e.g. [0.2,0.4,0.6,0.8]"
+        bounds = (1 / _MAX_SCALE, _MAX_SCALE)
+        factors = "factors from {:g} to {:g}, not 1 alone, e.g. [0.5,1,2]".format(*bounds)
+        return cls(
+            shading=_levels("shading", config["shading"], (0, 1), 0, shares),
+            scales=_levels("scale", config.get("scale_factors"), bounds, 1, factors),
+            by=_quantities(config["by"]),
+            num_bins=check("num_bins", config["num_bins"], int, Range(1, 1000)),
+        )
+
+    def __bool__(self) -> bool:
+        """Return whether any protocol is selected."""
+        return bool(self.shading or self.scales or self.by)
+
+
+def _levels(
+    option: str, given: object, bounds: tuple[float, float], usual: float, allowed: str
+) -> tuple[float, ...]:
+    """Read one or several levels, without the ``usual`` level, which is always measured."""
+    levels = [] if given is None else given if isinstance(given, list) else [given]
+    numbers: list[float] = [n for n in levels if isinstance(n, int | float) and type(n) is not bool]
+    wrong = len(numbers) < len(levels) or not all(bounds[0] <= n <= bounds[1] for n in numbers)
+    if wrong or (given is not None and set(numbers) <= {usual}):
+        raise UserError(f"{option}={given!r:.100}", allowed, f"change {option}")
+    return tuple(sorted({float(level) for level in numbers if level != usual}))
+
+
+def _quantities(given: object) -> tuple[QuantityName, ...]:
+    """Read ``by``: one or several quantities."""
+    names = [] if given is None else given if isinstance(given, list) else [given]
+    quantities: dict[object, QuantityName] = {name: name for name in get_args(QuantityName)}
+    wrong = [name for name in names if not isinstance(name, str) or name not in quantities]
+    if wrong or (given is not None and not names):
+        allowed = f"one or more of {', '.join(get_args(QuantityName))}"
+        raise UserError(f"by={given!r:.100}", allowed, "change by")
+    return tuple(dict.fromkeys(quantities[name] for name in names))
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasurementConfig(FalsePositiveTarget):
+    """Options that a training and an evaluation share.
+
+    Attributes:
+        plain: The whole config in plain values, as printed and stored.
+        shading, scale_factors, by, num_bins: Further protocols, see :class:`Protocols`.
+        tune: Whether to tune a distance factor, a score and its threshold before the measurement.
+        refine: Refinement to measure, and to tune, in addition: ``region`` on the picture,
+            ``depth`` on the depth image, or a list of both.
+        output_dir: Folder of the run folders.
+        extensions: User packages whose code may be used (:mod:`dopepp.core.extensions`).
     """
 
     __pydantic_config__ = STRICT
@@ -194,7 +265,7 @@ class MeasurementConfig(FalsePositiveTarget):
     extensions: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        _ = self.protocols  # refuses a wrong option
+        _ = self.protocols  # raises for a wrong option
 
     @property
     def protocols(self) -> Protocols:
@@ -204,33 +275,32 @@ class MeasurementConfig(FalsePositiveTarget):
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig(MeasurementConfig):
-    """``train.py``'s config.
+    """Config of ``train.py``.
 
     Attributes:
-        job: What is done with it.
-        cost: Of ``job=cost``.
-        lr_finder: Of ``job=lr_finder``.
-        table: Of a multirun, how its table is laid out
-            (:class:`~dopepp.experiment.results.paper.PaperTable`).
-        search: Of a multirun, what a search varies (:mod:`dopepp.experiment.sweep.optuna_search`).
-        recipe: Name of the loss, optimiser and schedule that were chosen together.
-        seed: Of initial weights, order and training images.
+        job: Job to run.
+        cost: Options of ``job=cost``.
+        lr_finder: Options of ``job=lr_finder``.
+        table: Table layout of a multirun (:class:`~dopepp.experiment.results.paper.PaperTable`).
+        search: Search of a multirun (:mod:`dopepp.experiment.sweep.optuna_search`).
+        recipe: Name of the combination of loss, optimiser and schedule.
+        seed: Seed of initial weights, order and training images.
         compile: Whether to compile the network with torch.
-        ema: Decay of an exponential moving average of the weights; None for none.
-        keep_checkpoints: Whether they stay when everything has run.
-        resume: Folder of the interrupted run to go on with.
-        resume_anyway: Whether to go on where what the network learns from has changed.
-        init_from: Checkpoint whose weights training begins with.
-        model: The network and its loss.
-        maps: The target maps.
-        recovery: Thresholds from maps to poses, by the names of
+        ema: Decay of an exponential moving average of the weights; None disables it.
+        keep_checkpoints: Whether to keep the checkpoints after the measurement.
+        resume: Folder of the interrupted run to resume.
+        resume_anyway: Whether to resume even if the training data or the loss have changed.
+        init_from: Checkpoint with the initial weights.
+        model: Network and loss.
+        maps: Target maps.
+        recovery: Options of the recovery from maps to poses, by the names of
             :class:`~dopepp.recovery.detection.RecoveryOptions`.
-        symmetry: How symmetric parts are learnt.
-        data: Objects, images, and how they are rendered.
-        optimizer: Node of an optimiser.
-        scheduler: Node of a schedule; without a target the rate is constant.
-        trainer: How and where training runs.
-        callbacks: Nodes of callbacks by name, in the order in which they are called.
+        symmetry: Treatment of symmetric parts in training.
+        data: Objects, images and options of the renders.
+        optimizer: Node of the optimiser.
+        scheduler: Node of the schedule; without a target the learning rate is constant.
+        trainer: Options of the training process.
+        callbacks: Nodes of callbacks by name, in calling order.
         logger: Nodes of experiment trackers by name.
     """
 
@@ -272,26 +342,26 @@ class RunConfig(MeasurementConfig):
         return replace(_parsed(cls, options), plain=plain, data=data)
 
     def stored_data(self) -> dict[str, Any]:
-        """Return what a checkpoint says of its data: the node ``data`` with ``virtual`` in it."""
+        """Return the data config for a checkpoint: the node ``data`` including ``virtual``."""
         return {**self.plain["data"], "virtual": self.plain.get("virtual")}
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationConfig(MeasurementConfig):
-    """``evaluate.py``'s config.
+    """Config of ``evaluate.py``.
 
     Attributes:
-        ckpt_path: The checkpoint to measure.
-        baseline: A second one, which comes first in tables.
-        results: A BOP challenge CSV of another method's poses.
-        method: That method's name; None takes it from the file's.
-        data: Data to measure on: whole, or options to change in the checkpoint's; see
+        ckpt_path: Checkpoint to measure.
+        baseline: Second checkpoint, which comes first in tables.
+        results: BOP challenge CSV with the poses of another method.
+        method: Name of that method; None derives it from the file name.
+        data: Data to measure on: a whole node, or changes to the data of the checkpoint; see
             :func:`~dopepp.experiment.config.data_config.chosen_data`.
-        virtual: How to render, idem.
-        bop_csv: Whether to write every method's poses as such a file.
-        all_measures: Whether to print the symmetric measures of parts without symmetries, too.
-        device: torch's name, or ``auto``.
-        num_pictures: Images that are drawn.
+        virtual: Options of the renders: a whole node, or changes to those of the checkpoint.
+        bop_csv: Whether to write the poses of every method as a BOP challenge CSV.
+        all_measures: Whether to print the symmetric measures of parts without symmetries.
+        device: torch's name of the device, or ``auto``.
+        num_pictures: Number of test images to draw.
     """
 
     ckpt_path: str | None
@@ -334,5 +404,5 @@ def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
 
 
 def below(key: str, nodes: Sequence[str]) -> bool:
-    """Tell whether an option is one of some nodes or stands below one."""
+    """Return whether an option is one of the nodes or below one of them."""
     return any(key == node or key.startswith(f"{node}.") for node in nodes)

@@ -1,1 +1,1 @@
-"""What was measured: reports, conditions, tables and comparisons."""
+"""Measurement of methods, reports, tables and comparisons."""

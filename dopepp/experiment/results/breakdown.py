@@ -1,7 +1,7 @@
-"""Rates per bin of a quantity, such as the distance: they tell where a method fails.
+"""Break rates down by bins of a quantity, such as the distance, to show where a method fails.
 
-To add a quantity, write a function of the instances of one object, name it in :data:`QUANTITIES`
-and in :data:`dopepp.experiment.config.protocols.QuantityName`.
+To add a quantity, write a function of the instances of one object and add it to :data:`QUANTITIES`
+and in :data:`dopepp.experiment.config.run_config.QuantityName`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 
 from dopepp.core.files import write_csv, write_png
 from dopepp.drawing.curves import figure_image, rates_figure
-from dopepp.experiment.config.protocols import QuantityName
+from dopepp.experiment.config.run_config import QuantityName
 from dopepp.experiment.results import display
 from dopepp.experiment.results.frame import PassRate, Row, Value, interval, pivot, rate_curves
 from dopepp.geometry.camera import project_keypoints
@@ -29,11 +29,11 @@ from dopepp.metrics.pose import MEAN, Gathered, PoseMetrics
 _log = logging.getLogger(__name__)
 
 Numbers = Float[np.ndarray, "n"]
-"""A number of each of n instances."""
+"""One number per instance."""
 
 
 class Quantity(NamedTuple):
-    """What instances are sorted by: its name and unit, its value of each, digits in tables."""
+    """Quantity to sort instances by: heading with unit, value per instance, decimals in tables."""
 
     heading: str
     of: Callable[[Gathered], Numbers]
@@ -41,24 +41,24 @@ class Quantity(NamedTuple):
 
 
 def sizes(instances: Gathered) -> Numbers:
-    """Return the root of the area of the projected cuboid, pixels of the image as it came.
+    """Return the square root of the area of the projected cuboid, in pixels of the original image.
 
-    The whole cuboid counts, with what is hidden or outside the image; unlike the distance it says
-    when a flat part is seen from its edge.
+    Occluded and truncated regions count. Unlike the distance, the size reveals that a flat part is
+    seen edge-on.
     """
     areas = []
     for T, K in zip(instances.T_gt.numpy(), instances.K.numpy(), strict=True):
         corners = project_keypoints(instances.part.cuboid, T, K)[:CENTROID]
-        # A corner behind the camera has no projection.
+        # Corners behind the camera have no projection.
         corners = corners[np.isfinite(corners).all(axis=1)].astype(np.float32)
         areas.append(cv2.contourArea(cv2.convexHull(corners)) if len(corners) > 2 else 0.0)
     return np.sqrt(np.array(areas, np.float64))
 
 
 def view_angles(instances: Gathered) -> Numbers:
-    """Return the angle between the object's +z axis and the way from it to the camera, degrees.
+    """Return the angle between the object's +z axis and the direction to the camera, degrees.
 
-    At 0° the +z face of the cuboid looks at the camera, at 90° it is seen from its edge.
+    At 0° the +z face of the cuboid faces the camera; at 90° the face is seen edge-on.
     """
     towards_camera, axes = -_centres(instances), instances.T_gt.numpy()[:, :3, 2]
     across = np.linalg.norm(np.cross(axes, towards_camera), axis=1)
@@ -77,14 +77,14 @@ QUANTITIES: Final[dict[QuantityName, Quantity]] = {
     "size": Quantity("apparent size (px)", sizes, 1),
     "rotation": Quantity("view angle (°)", view_angles, 1),
 }
-"""What rates can be broken down by."""
+"""Quantities by which rates can be broken down."""
 
 
 def bin_numbers(numbers: Numbers, num_bins: int) -> Int[np.ndarray, "n"]:
-    """Return each number's bin, counted from 0; bins have equal counts, equal numbers share one.
+    """Assign numbers to bins of equal counts, numbered from 0; equal numbers share a bin.
 
-    A number falls where the middle of its ranks does, so that a bin of many equal numbers (objects
-    that nothing hides) draws no others in. Bins that stay empty are left out.
+    The mean rank of a number determines its bin, so a large group of equal numbers (such as
+    unoccluded objects) does not pull other numbers into its bin. Empty bins are omitted.
     """
     middles = pd.Series(numbers, dtype=float).rank() - 0.5
     bins = np.floor(middles * num_bins / max(len(numbers), 1))
@@ -92,7 +92,7 @@ def bin_numbers(numbers: Numbers, num_bins: int) -> Int[np.ndarray, "n"]:
 
 
 class Bin(NamedTuple):
-    """The instances between two values of a quantity; ``middle`` is their median."""
+    """Range of a quantity; ``middle`` is the median of its instances."""
 
     low: float
     high: float
@@ -105,15 +105,14 @@ def break_down(
     num_bins: int,
     rates: Sequence[PassRate],
 ) -> tuple[list[Bin], list[Value]]:
-    """Measure rates per bin, over the instances of all objects together.
+    """Measure rates per bin over the instances of all objects.
 
-    Of the accumulators of the methods on one test set, the last one scores all objects, and its
-    instances decide the bins.
+    The last method scores all objects, so its instances determine the bins.
 
     Returns:
-        The bins, in ascending order, and bin by bin what each method reaches in them: how many
-        instances, the rates, the median rotation of those that were matched (degrees, to the
-        nearest symmetry) and the share that was missed. The condition is the middle of a bin.
+        The bins in ascending order, and the values of each method per bin: number of instances,
+        rates, median rotation error of matched instances (degrees, to the nearest symmetry) and
+        miss rate. The condition of a value is the middle of its bin.
     """
     instances = {name: _instances(each, quantity, rates) for name, each in metrics.items()}
     quantities = next(reversed(instances.values()))["quantity"]
@@ -133,7 +132,7 @@ def break_down(
 def _instances(
     metrics: PoseMetrics, quantity: QuantityName, rates: Sequence[PassRate]
 ) -> pd.DataFrame:
-    """Return quantity, rotation error and what passed of every instance of every object."""
+    """Return the quantity, the rotation error and the passed rates of all instances."""
     tables = []
     for gathered in map(metrics.instances, metrics.parts):
         passed = {rate.field: rate.passed(gathered).numpy() for rate in rates}
@@ -145,7 +144,7 @@ def _instances(
 def _in_bin(
     method: str, limits: Bin, table: pd.DataFrame, rates: Sequence[PassRate]
 ) -> Iterator[Value]:
-    """Measure one method in one bin; a rate of no instance does not exist."""
+    """Measure one method in one bin; rates without instances are NaN."""
     value, num = Value(method, MEAN, condition=limits.middle), len(table)
     yield value._replace(measure="num_instances", value=num)
     for rate in rates:
@@ -165,9 +164,9 @@ def record_breakdown(
     num_bins: int,
     rates: Sequence[PassRate],
 ) -> None:
-    """Print a table and write ``by_QUANTITY.csv`` and ``by_QUANTITY.png``; see :func:`break_down`.
+    """Print a table of :func:`break_down` and write ``by_QUANTITY.csv`` and ``by_QUANTITY.png``.
 
-    A test set without an instance that counts gives a warning instead.
+    Log a warning instead if no instance of the test set counts.
     """
     bins, values = break_down(metrics, quantity, num_bins, rates)
     if not bins:
@@ -203,7 +202,7 @@ def record_breakdown(
         rate.title: rate_curves([value for value in values if value.measure == rate.field])
         for rate in rates
     }
-    # Between two bins lie no instances; the line stands in the middle of the gap.
+    # There are no instances between two bins; the border is drawn in the middle of the gap.
     gaps = [(lower.high + upper.low) / 2 for lower, upper in pairwise(bins)]
     edges = np.array([bins[0].low, *gaps, bins[-1].high])
     figure = rates_figure(panels, title, len(rates), edges)

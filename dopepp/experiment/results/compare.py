@@ -1,7 +1,7 @@
-"""Comparing methods: ``compare.csv``, ``compare.md`` and ``compare_auc.{png,csv}``.
+"""Compare methods and write ``compare.csv``, ``compare.md`` and ``compare_auc.{png,csv}``.
 
-Of run folders, ``compare.png`` also has what they logged while they trained (paper Fig. 12), and
-the same test images through every model (paper Fig. 14).
+For run folders, ``compare.png`` also shows the logged training curves (paper Fig. 12) and the
+predictions of every model on the same test images (paper Fig. 14).
 """
 
 from __future__ import annotations
@@ -59,33 +59,33 @@ PICTURES_FILE: Final = "compare_pictures.png"
 LOG_FILE: Final = "metrics.csv"
 
 NUM_PICTURES: Final = 3
-"""Test images, the first ones: nobody has chosen them."""
+"""Number of test images to show; the first ones, so that nobody selects them."""
 
 _LOGGED: Final = {
     "train/loss": ("training loss", 1, True),
     "val/loss": ("validation loss", 1, True),
     "val/add_01d": ("validation ADD-0.1d (%)", 100, False),
 }
-"""Columns of a log that are drawn: label, factor, and whether the axis is logarithmic."""
+"""Columns of a log to draw: label, factor, and whether the axis is logarithmic."""
 
 _MIN_COLUMNS: Final = 3
-"""Tiles of fewer methods than this would be larger than anybody needs."""
+"""Minimum number of columns for the tile size; fewer methods would make the tiles too large."""
 _PANEL_PX: Final = 768
-"""Width of a panel, where there is none to take it from."""
+"""Width of a panel if there are no curves."""
 _GAP_PX: Final = 12
-"""Room between tiles."""
+"""Space between tiles."""
 _TOO_WIDE: Final = ("Δ rotation °", "rotation-S °", "parameters", "GMACs")
-"""What a terminal has no room for."""
+"""Columns that are omitted in the terminal."""
 
 
 def compare_reports(reports: Sequence[Report], folder: Path, baseline: str) -> None:
-    """Compare methods that were measured together; the baseline is the one of this name."""
+    """Compare methods that were measured together; ``baseline`` is a method's name."""
     entries = [Entry(report.name, [report], [None]) for report in reports]
     write_comparison(ordered(entries, baseline), folder)
 
 
 def write_comparison(entries: Sequence[Entry], folder: Path) -> dict[str, Any]:
-    """Print and write table and AUC curves; return the content of ``compare.md``."""
+    """Print and write the table and the AUC curves; return the content of ``compare.md``."""
     table = compared(entries)
     means = [report.mean for entry in entries for report in entry.reports]
     compact = headline(table, any(row.num_symmetries > 1 for row in means))
@@ -104,7 +104,7 @@ def write_comparison(entries: Sequence[Entry], folder: Path) -> dict[str, Any]:
 
 
 def accuracy_curves(entries: Sequence[Entry]) -> dict[str, np.ndarray]:
-    """Return the ADD of every instance of every object and seed, by method."""
+    """Return the ADD of all instances over objects and seeds, by method."""
     return {
         entry.name: np.concatenate([e for report in entry.reports for e in report.errors.values()])
         for entry in entries
@@ -123,14 +123,14 @@ def compare_paths(
 
     Args:
         paths: Folders of trainings, evaluations and multiruns.
-        out: New folder; one under ``outputs/compare`` by default.
-        baseline: Method that Δ is against: ``dope`` by default, else the first one.
-        num_pictures: Test images that are shown through every model.
-        table: Experiment's file in whose table the methods are laid out as well.
+        out: New folder (default: a folder below ``outputs/compare``).
+        baseline: Method that Δ refers to (default: ``dope``, else the first method).
+        num_pictures: Number of test images on which every model predicts.
+        table: File of an experiment whose table layout is used in addition.
 
     Raises:
-        UserError: A path holds no run, the baseline is none of the methods, the experiment has no
-            table, or ``out`` holds a comparison already.
+        UserError: A path holds no run, the baseline is not among the methods, the experiment has no
+            table, or ``out`` already holds a comparison.
     """
     layout = None if table is None else PaperTable.read(table)
     runs = find_runs(paths)
@@ -149,11 +149,11 @@ def compare_paths(
 def compare_runs(
     runs: Sequence[Run], folder: Path, baseline: str | None = None, num_pictures: int = NUM_PICTURES
 ) -> list[Entry]:
-    """Print and write a comparison of runs into a folder; returns its methods.
+    """Compare runs, print and write the comparison, and return the methods.
 
-    A method measured refined as well is two, its network and behind it the same refined; pictures
-    and curves of training are the networks'. The table is written first, so that it is there
-    whatever befalls curves and pictures.
+    A method that was also measured with refinement counts as two methods. Pictures and training
+    curves show the networks only. The table is written first, so it exists even if drawing curves
+    or pictures fails.
 
     Raises:
         UserError: The baseline is not among the methods.
@@ -194,7 +194,7 @@ def compare_runs(
 
 
 def _panels(entries: Sequence[Entry], folder: Path) -> list[Picture]:
-    """Draw what there is of loss, validation and accuracy curves; a method has one colour."""
+    """Draw the available loss, validation and accuracy curves, with one colour per method."""
     colours = {entry.name: f"C{number % 10}" for number, entry in enumerate(entries)}
     panels = []
     for column, (label, scale, log_y) in _LOGGED.items():
@@ -211,10 +211,16 @@ def _panels(entries: Sequence[Entry], folder: Path) -> list[Picture]:
 def training_lines(
     entries: Sequence[Entry], column: str, colours: Mapping[str, str], scale: float = 1.0
 ) -> list[PlotLine]:
-    """Return a line per method for a column of ``metrics.csv``, such as ``train/loss``.
+    """Return a line per method for a column of ``metrics.csv``, including unfinished runs.
 
-    Runs that did not finish have one, too; several seeds are drawn at the steps that all of them
-    have logged. Colours go by method; ``scale`` is a factor of the values.
+    Args:
+        entries: Methods.
+        column: Column of the log, such as ``train/loss``.
+        colours: Colour of each method.
+        scale: Factor on the values.
+
+    Returns:
+        Lines over the steps that all seeds of a method have logged.
     """
     lines = []
     for entry in (entry for entry in entries if not entry.refine):
@@ -228,7 +234,7 @@ def training_lines(
 
 
 def logged(path: Path, column: str) -> dict[int, float]:
-    """Return the finite numbers of a log's column by step, as far as the log goes."""
+    """Return the finite numbers of a column of a log, by step."""
     numbers = {}
     for row in read_csv(path):
         with suppress(KeyError, TypeError, ValueError):
@@ -239,8 +245,11 @@ def logged(path: Path, column: str) -> dict[int, float]:
 def picture_tiles(entries: Sequence[Entry], num: int = NUM_PICTURES) -> tuple[list[Tile], str]:
     """Predict on the first test images of the first method whose images can be opened.
 
-    Of several seeds the first run is shown, of several networks, one a part, one after the other.
-    Returns row by row the tiles of an image, one per method; and why some are missing.
+    The first seed of each method is shown. Networks of different parts are shown one after the
+    other.
+
+    Returns:
+        Tiles row by row (one row per image, one tile per method), and why images are missing.
     """
     measured = [run for entry in entries for run in entry.runs if run.report]
     kinds = list(dict.fromkeys(map(_parts, measured))) or [()]
@@ -254,12 +263,12 @@ def picture_tiles(entries: Sequence[Entry], num: int = NUM_PICTURES) -> tuple[li
 
 
 def _parts(run: Run) -> tuple[str, ...]:
-    """Return the names of the parts that a run was measured on."""
+    """Return the names of the parts on which a run was measured."""
     return tuple(sorted(run.report.errors)) if run.report is not None else ()
 
 
 class _Model:
-    """A method's network of some parts, of its first run; or why there is none."""
+    """The network of a method for some parts, from its first run, or the reason for its absence."""
 
     def __init__(self, entry: Entry, parts: tuple[str, ...]) -> None:
         self.name, self.reason = entry.name, entry.failure
@@ -275,10 +284,10 @@ class _Model:
             self.reason = str(error)
 
     def test_images(self, num: int) -> list[Sample]:
-        """Open the images that the run was measured on."""
+        """Open the images on which the run was measured."""
         assert self.estimator is not None
         stored, config = trained_on(self.estimator.checkpoint.data), self.run.config
-        # A training's config holds what its checkpoint stores; an evaluation's, what it changed.
+        # Only the config of an evaluation contains changes to the data of the checkpoint.
         given = config if "ckpt_path" in config else {}
         path = str(self.run.checkpoint)
         data = chosen_data(given.get("data"), given.get("virtual"), stored, path)
@@ -288,7 +297,7 @@ class _Model:
         return [source.sample(index, 0) for index in range(min(num, len(source)))]
 
     def tile(self, sample: Sample, colour: tuple[int, int, int]) -> Tile:
-        """Draw the answer to one image, or why there is none."""
+        """Draw the predictions on an image, or the reason for their absence."""
         reason = self.reason
         poses: Sequence[Detection] = []
         if self.estimator is not None:
@@ -311,7 +320,7 @@ class _Model:
 
 
 def _rows(models: Sequence[_Model], num: int) -> tuple[list[Tile], str]:
-    """Return the tiles of some images, one per method; and why there are none."""
+    """Return the tiles of some images, one per method, and the reason if there are none."""
     reasons = [f"{model.name}: {model.reason}" for model in models]
     loaded = [model for model in models if model.estimator is not None]
     samples: list[Sample] = []

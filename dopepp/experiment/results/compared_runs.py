@@ -1,6 +1,7 @@
-"""Run folders, and the methods of which they are seeds and parts.
+"""Read run folders and group the runs into methods.
 
-Trainings, evaluations and whole multiruns are read; failed and unfinished runs, too.
+A method is one or more trainings that differ only in seed or object. Trainings, evaluations and
+multiruns are read, including failed and unfinished runs.
 """
 
 from __future__ import annotations
@@ -30,23 +31,23 @@ from dopepp.experiment.results.frame import shown_rows
 from dopepp.experiment.results.report import Cost, Report
 
 BASELINE: Final = "dope"
-"""A method of this name stands first, and every other one's Δ is against it."""
+"""Default name of the baseline: the first method, to which every Δ refers."""
 
 _HYDRA: Final = ".hydra"
 _TRACES: Final = (_HYDRA, CONFIG_FILE, METRICS_FILE, FAILURE_FILE)
-"""A run leaves at least one of these."""
+"""Files and folders of which every run leaves at least one."""
 
 _ELSEWHERE: Final = ("output_dir", "resume", "ckpt_path", "baseline", "device", "num_pictures")
-"""Options that say where something is, not what is measured."""
+"""Options that state a location or a device and do not affect the result."""
 
 _BESIDE: Final = ("shading", "scale_factors", "by", "num_bins", "bop_csv", "all_measures")
-"""Options that measure more beside the result, and leave it as it is."""
+"""Options that request further measurements and do not affect the result."""
 
 _CHOSEN_SIZES: Final = (("data", "input_size"), ("virtual", "camera_scale"))
-"""Where null in a config is replaced by what suits the objects' sizes."""
+"""Options whose default (null) is replaced by a value that suits the sizes of the objects."""
 
 _LONGEST_NAME: Final = 60
-"""Characters of a name that tables and legends have room for."""
+"""Maximum length of a method's name in tables and legends."""
 
 
 @dataclass
@@ -54,13 +55,13 @@ class Run:
     """A run folder.
 
     Attributes:
-        overrides: Overrides that do not only name places.
-        report: Result; None where there is none.
-        failure: Why there is none, in one line; empty where none was asked for (``job=cost``).
-        config: Resolved config; empty where there is none.
-        recipe: Everything but seed and objects that decides about the result, as one text; empty
-            where unknown.
-        pruned: Whether it has no result because a search stopped it.
+        overrides: Overrides of the run, without those that only state a location.
+        report: Result on the test set, or None.
+        failure: Reason for a missing result; empty if no result was asked for (``job=cost``).
+        config: Resolved config; empty if the run has none.
+        recipe: All options that affect the result, except seed and objects, as one string; empty if
+            unknown.
+        pruned: Whether the result is missing because a search stopped the run.
     """
 
     folder: Path
@@ -77,14 +78,14 @@ class Run:
 
     @property
     def alike(self) -> tuple[str, str, str] | None:
-        """What the seeds of a method share: recipe, name and test set; None where unknown."""
+        """Recipe, name and test set, which all seeds of a method share; None if unknown."""
         if self.report is None or self.seed is None or not self.recipe:
             return None
         return self.recipe, self.report.name, self.report.test_set
 
     @property
-    def place(self) -> str:
-        """The folder's name; of a job, whose name is a number, with its multirun's."""
+    def short_path(self) -> str:
+        """Name of the folder; a numbered job is preceded by the name of its multirun."""
         folder = self.folder.resolve()
         return f"{folder.parent.name}/{folder.name}" if folder.name.isdigit() else folder.name
 
@@ -95,11 +96,11 @@ class Entry:
 
     Attributes:
         reports: Results on one test set, one per seed.
-        seeds: Seeds of the trainings, as many; None where unknown.
-        failure: Why there is no result, in one line; empty where only the cost was asked for.
-        pruned: Whether the reason is that a search stopped it, which is no failure.
-        runs: Run folders; empty where reports do not come from any.
-        refine: How its poses were refined; empty of the network's own.
+        seeds: Seed of each report's training; None if unknown.
+        failure: Reason for a missing result; empty if only the cost was asked for.
+        pruned: Whether a search stopped the run, which does not count as a failure.
+        runs: Run folders; empty if the reports were not read from a folder.
+        refine: Kind of refinement; empty for the poses of the network itself.
     """
 
     name: str
@@ -112,17 +113,17 @@ class Entry:
 
     @property
     def test_set(self) -> str:
-        """Fingerprint of the images; empty where it is not known."""
+        """Fingerprint of the test images; empty if unknown."""
         return self.reports[0].test_set if self.reports else ""
 
     @property
     def objects(self) -> list[str]:
-        """Names of the rows: every object, and the mean where there are several."""
+        """Names of the objects, followed by the mean if there are several."""
         return list(shown_rows(self.reports[0].rows)) if self.reports else []
 
     @property
     def cost(self) -> Cost:
-        """What the method costs; the time is the mean over seeds."""
+        """Cost of the method; the time is the mean over seeds."""
         costs = [report.cost for report in self.reports]
         costs = costs or [run.cost or Cost() for run in self.runs[:1]]
         times = [cost.ms_per_frame for cost in costs if cost.ms_per_frame is not None]
@@ -153,19 +154,17 @@ def _folders(path: Path) -> list[Path]:
 
 
 def read_run(folder: Path) -> Run:
-    """Read one run folder; whatever is missing or damaged in it becomes its failure."""
+    """Read one run folder; missing or damaged files become the run's failure."""
     config = _mapping(folder / CONFIG_FILE)
     run = Run(folder, "", overrides_of(folder), None, "", None, config, folder / BEST_CHECKPOINT)
     try:
-        run.report, run.cost = _result(folder)
+        _read_result(run)
     except UserError as error:
         run.failure = str(error)
-    except _NoResultError as end:
-        run.failure, run.pruned = str(end), end.pruned
     if run.report is not None and "checkpoint" in run.report.details:
         run.checkpoint = folder / str(run.report.details["checkpoint"])
     training, configs = config, [_as_asked(folder, config)] if config else []
-    if "ckpt_path" in config:  # an evaluation: what it measured says what was trained, and how
+    if "ckpt_path" in config:  # an evaluation: its checkpoint belongs to a training
         run.checkpoint = Path(str(config["ckpt_path"]))
         trained = run.checkpoint.parent.parent
         training = _mapping(trained / CONFIG_FILE)
@@ -179,7 +178,7 @@ def read_run(folder: Path) -> Run:
 
 
 def _model(config: Mapping[str, Any], run: Run) -> str:
-    """Return the model's name, of a run that ended early as far as it is known."""
+    """Return the name of the model, from the overrides if the run ended early."""
     model = config.get("model")
     if isinstance(model, dict) and "name" in model:
         return str(model["name"])
@@ -188,7 +187,7 @@ def _model(config: Mapping[str, Any], run: Run) -> str:
 
 
 def _as_asked(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a run's config without the sizes that were chosen for its objects, not asked for."""
+    """Return a run's config without the sizes that were chosen automatically."""
     asked, kept = _mapping(folder / _HYDRA / "config.yaml"), dict(config)
     for node, name in _CHOSEN_SIZES:
         if (asked.get(node) or {}).get(name, name) is None and isinstance(kept.get(node), dict):
@@ -197,7 +196,7 @@ def _as_asked(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _recipe(configs: Sequence[Mapping[str, Any]]) -> str:
-    """Return configs as one text, without seed, objects and what does not touch the result."""
+    """Return configs as one string, without seed, objects and options without effect on results."""
     kept = [_without(config, "seed", *_ELSEWHERE, *_BESIDE) for config in configs]
     for config in kept:
         if isinstance(config.get("data"), dict):
@@ -209,52 +208,45 @@ def _without(config: Mapping[str, Any], *keys: str) -> dict[str, Any]:
     return {key: value for key, value in config.items() if key not in keys}
 
 
-class _NoResultError(Exception):
-    """Why a run has no result, in one line; ``pruned`` where a search stopped it."""
-
-    def __init__(self, reason: str, pruned: bool = False) -> None:
-        super().__init__(reason)
-        self.pruned = pruned
-
-
-def _result(folder: Path) -> tuple[Report | None, Cost]:
-    """Return a run's result and cost; a job that measured its network's cost has no result."""
-    for name in (FAILURE_FILE, PRUNED_FILE):
-        if (folder / name).is_file():
-            reason = read_json(folder / name).get("reason", "without a reason")
-            raise _NoResultError(reason, name == PRUNED_FILE)
-    for name in (METRICS_FILE, COST_FILE):
-        if (folder / name).is_file():
-            stored = read_json(folder / name)
-            try:
-                if name == COST_FILE:
-                    return None, Cost(*(stored[key] for key in Cost.__annotations__))
-                report = Report.from_record(stored)
-                return report, report.cost
-            except (KeyError, TypeError, ValueError, AttributeError) as error:
-                raise _NoResultError(f"{name} is not of this version: {error!r}") from error
-    unfinished = f"unfinished: it left no {METRICS_FILE}"
-    if (folder / LAST_CHECKPOINT).is_file():
-        unfinished += f"; go on with resume={folder}"
-    raise _NoResultError(unfinished)
+def _read_result(run: Run) -> None:
+    """Set the result and cost of a run, or its failure; ``job=cost`` leaves only a cost."""
+    names = (FAILURE_FILE, PRUNED_FILE, METRICS_FILE, COST_FILE)
+    name = next((name for name in names if (run.folder / name).is_file()), None)
+    if name is None:
+        run.failure = f"unfinished: it left no {METRICS_FILE}"
+        if (run.folder / LAST_CHECKPOINT).is_file():
+            run.failure += f"; go on with resume={run.folder}"
+        return
+    record = read_json(run.folder / name)
+    try:
+        if name == METRICS_FILE:
+            run.report = Report.from_record(record)
+            run.cost = run.report.cost
+        elif name == COST_FILE:
+            run.cost = Cost(*(record[key] for key in Cost.__annotations__))
+        else:
+            run.failure = str(record.get("reason", "without a reason"))
+            run.pruned = name == PRUNED_FILE
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        run.failure = f"{name} is not of this version: {error!r}"
 
 
 def overrides_of(folder: Path) -> list[str]:
-    """Return what a run was overridden with, without Hydra's own and what only names places."""
+    """Return a run's overrides, without those of Hydra and those that only state a location."""
     listed = _yaml(folder / _HYDRA / "overrides.yaml")
     texts = [str(text).lstrip("+") for text in listed] if isinstance(listed, list) else []
-    places = tuple(f"{name}=" for name in _ELSEWHERE)
-    return [text for text in texts if not text.startswith(("hydra.", *places))]
+    ignored = tuple(f"{name}=" for name in _ELSEWHERE)
+    return [text for text in texts if not text.startswith(("hydra.", *ignored))]
 
 
 def _mapping(path: Path) -> dict[str, Any]:
-    """Read a YAML mapping; empty where there is none."""
+    """Read a YAML mapping; return an empty one if there is none."""
     content = _yaml(path)
     return content if isinstance(content, dict) else {}
 
 
 def _yaml(path: Path) -> Any:
-    """Read YAML; None where there is no file, or one cut short where the disk was full."""
+    """Read a YAML file; return None if it is missing or truncated."""
     try:
         return read_yaml(path) if path.is_file() else None
     except UserError:
@@ -262,16 +254,16 @@ def _yaml(path: Path) -> Any:
 
 
 def ordered(entries: Sequence[Entry], baseline: str = BASELINE) -> list[Entry]:
-    """Put the baseline, by its name or the first word of it, before all others."""
+    """Sort the baseline, given by its name or the first word of the name, to the front."""
     return sorted(entries, key=lambda e: baseline not in (e.name, e.name.split(" ")[0]))
 
 
 def group(runs: Sequence[Run]) -> list[Entry]:
-    """Put runs that differ in nothing but the seed into one entry, in order of the first one.
+    """Group runs that differ only in the seed into one entry, ordered by their first run.
 
-    They must have been measured on the same test set. Networks of other parts, trained alike with
-    the same seeds, join the entry: one network a part, as the paper has it. A run without a result
-    stands alone.
+    The runs must have the same test set. Networks of other parts with the same recipe and seeds
+    join the entry (one network per part, as in the paper). A run without a result forms its own
+    entry.
     """
     entries: list[Entry] = []
     for run in runs:
@@ -296,7 +288,7 @@ def group(runs: Sequence[Run]) -> list[Entry]:
 
 
 def with_refined(entries: Sequence[Entry]) -> list[Entry]:
-    """Return the methods, and behind each whose every run was measured refined, too, that."""
+    """Return the methods, each followed by its refined version if every run measured one."""
     pairs: list[Entry] = []
     for entry in entries:
         pairs.append(entry)
@@ -309,11 +301,11 @@ def with_refined(entries: Sequence[Entry]) -> list[Entry]:
 
 
 def _is_of_another_part(entry: Entry, method: Sequence[Entry]) -> bool:
-    """Tell whether an entry differs from those of a method in nothing but its parts."""
+    """Return whether an entry differs from the entries of a method only in its parts."""
     mine, theirs = entry.runs[0].alike, method[0].runs[0].alike
     if mine is None or theirs is None or mine[:2] != theirs[:2]:
         return False
-    names = {name for entry_of_method in method for name in entry_of_method.reports[0].errors}
+    names = {name for other in method for name in other.reports[0].errors}
     return set(entry.seeds) == set(method[0].seeds) and names.isdisjoint(entry.reports[0].errors)
 
 
@@ -329,8 +321,8 @@ def _join(method: Sequence[Entry]) -> Entry:
 def _name(entries: Sequence[Entry]) -> None:
     """Name each entry after its model and the overrides in which the entries differ.
 
-    Where these are too many, and where two entries would have one name, the folder's name serves;
-    where even that is the same, its path.
+    Names that are too long or not unique contain the name of the folder, or its path if even the
+    folders have the same name.
     """
     overrides = [
         [text for text in entry.runs[0].overrides if all(text in r.overrides for r in entry.runs)]
@@ -341,9 +333,9 @@ def _name(entries: Sequence[Entry]) -> None:
         rest = [text for text in differing if not text.startswith("model=")]
         entry.name = " ".join([entry.runs[0].model, *rest])
         if len(entry.name) > _LONGEST_NAME:
-            entry.name = f"{entry.runs[0].model} {entry.runs[0].place}"
-    for more in ("place", "folder"):
+            entry.name = f"{entry.runs[0].model} {entry.runs[0].short_path}"
+    for suffix in ("short_path", "folder"):
         counts = Counter(entry.name for entry in entries)
         for entry in entries:
             if counts[entry.name] > 1:
-                entry.name = f"{entry.name} {getattr(entry.runs[0], more)}"
+                entry.name = f"{entry.name} {getattr(entry.runs[0], suffix)}"

@@ -1,10 +1,10 @@
-"""Conditions that make a test set harder or easier, level by level: shading and scale.
+"""Measure methods under conditions that make the test set harder or easier: shading and scale.
 
-Shading (paper Table 3) covers more and more of every object, scale (paper Fig. 11) moves the camera
-nearer or farther. A condition leaves a table, a CSV file, curves and examples.
+Shading (paper Table 3) covers an increasing share of every object. Scale (paper Fig. 11) moves the
+camera nearer or farther. Each condition writes a table, a CSV file, curves and examples.
 
-To add one, describe it as a :class:`Condition` and write a function that measures a list of
-:class:`Level`; :func:`record_condition` writes it down.
+To add a condition, describe it as a :class:`Condition` and write a function that measures a list of
+:class:`Level`. :func:`record_condition` writes the result.
 """
 
 from __future__ import annotations
@@ -54,33 +54,33 @@ from dopepp.metrics.row import PoseRow
 _log = logging.getLogger(__name__)
 
 MAX_EXAMPLES: Final = 4
-"""Images on the sheet of examples; each is shown once per level."""
+"""Maximum number of images on the sheet of examples; each appears once per level."""
 
 _FIELDS: Final = ("auc_10cm", "median_rotation_deg", "miss_rate")
-"""Measures that stand beside the pass rates."""
+"""Measures to report in addition to the pass rates."""
 
 _LABELS: Final = ("method", "object")
 
 _MARGIN: Final = 0.3
-"""Around shaded objects on the sheet, as a share of their extent."""
+"""Margin around shaded objects on the sheet of examples, as a share of their extent."""
 
 _NOTABLE: Final = 0.05
-"""A change of the mean visible fraction that is worth a line."""
+"""Change of the mean visible fraction above which a note is written."""
 
 
 @dataclass(frozen=True)
 class Condition:
-    """What changes from level to level, and how its levels are shown.
+    """A quantity that changes from level to level, and how to display its levels.
 
     Attributes:
         name: Name of the option and of the files.
-        axis: What is changed, with the unit in which levels are shown.
-        level: Name of the CSV file's column of levels.
+        axis: Quantity with its unit, for axes and titles.
+        level: Column of the levels in the CSV file.
         form: Format of a level in that unit.
         introduction: Beginning of the page.
-        images: The images of its levels, of which a file has no poses.
-        per_unit: Factor from a level to that unit.
-        ratio: Whether levels are ratios, which a logarithmic axis spaces evenly.
+        images: Images of the levels, for error messages.
+        per_unit: Factor that converts a level to that unit.
+        ratio: Whether levels are ratios, which need a logarithmic axis.
     """
 
     name: str
@@ -93,11 +93,11 @@ class Condition:
     ratio: bool = False
 
     def heading(self, level: float) -> str:
-        """Return the heading of a level's column."""
+        """Return the column heading of a level."""
         return self.form.format(self.per_unit * level)
 
     def check_methods(self, methods: Mapping[str, Method]) -> None:
-        """Refuse files of poses: a method must be able to run on other images."""
+        """Raise a user error for files of poses, which cannot be run on other images."""
         for name, method in methods.items():
             if isinstance(method, FileMethod):
                 raise UserError(
@@ -137,10 +137,13 @@ much. An instance counts by what is visible of it from there, at least 10 %.""",
 
 @dataclass(frozen=True)
 class Level:
-    """What was measured at one level: a row per object and their mean, by method.
+    """Measurement at one level.
 
-    Facts are further columns of the CSV file, over all objects; ``note`` is what a reader must know
-    of this level, empty for nothing.
+    Attributes:
+        value: Level.
+        rows: Rows of all objects and their mean, by method.
+        facts: Further columns of the CSV file, over all objects.
+        note: Remark for the reader, or an empty string.
     """
 
     value: float
@@ -158,7 +161,12 @@ def record_condition(
 ) -> None:
     """Print the table and write ``NAME.csv``, ``.md``, ``.png`` and ``NAME_examples.png``.
 
-    Levels ascend; tiles are the examples, image by image, each at all levels.
+    Args:
+        run_dir: Run folder.
+        condition: Condition that was measured.
+        levels: Measurements in ascending order of the level.
+        tiles: Examples, image by image, each at all levels.
+        rates: Pass rates to report.
     """
     rows = [row for rows in levels[0].rows.values() for row in rows.values()]
     extra = ["median_rotation_s_deg"] if any(row.num_symmetries > 1 for row in rows) else []
@@ -185,7 +193,7 @@ def record_condition(
     sections = [f"## {title}\n\n{markdown(table)}" for title, table in tables.items()]
     text = "\n".join([f"{condition.introduction}\n", *(f"{line}\n" for line in notes), *sections])
     write_whole(path, text.encode())
-    panels = {}  # one per object and rate, in each every method that was measured on it
+    panels = {}  # one panel per object and rate, with one curve per method
     for name in dict.fromkeys(value.object for value in values if value.object != MEAN):
         for rate in rates:
             shown = [v for v in values if (v.object, v.measure) == (name, rate.field)]
@@ -202,7 +210,7 @@ def record_condition(
 def _values(
     levels: Sequence[Level], fields: Sequence[str], rates: Sequence[PassRate]
 ) -> Iterator[Value]:
-    """Return what was measured, by method, object and level."""
+    """Yield the measured values by method, object and level."""
     rated = [rate.field for rate in rates]
     for method, rows in levels[0].rows.items():
         for name in shown_rows(rows):
@@ -214,17 +222,14 @@ def _values(
 
 
 def check_masks(source: SampleSource) -> None:
-    """Read images until one has an instance mask, before anything takes time.
+    """Check early that the images have instance masks.
 
     Raises:
         UserError: No image has an instance mask, so there is nothing to shade.
     """
     samples = (source.sample(index) for index in range(len(source)))
-    if not any(
-        instance.mask is not None and instance.mask.any()
-        for s in samples
-        for instance in s.instances
-    ):
+    masks = (instance.mask for sample in samples for instance in sample.instances)
+    if not any(mask is not None and mask.any() for mask in masks):
         raise UserError(
             f"shading on {source.name}, {len(source):,} images without an instance mask",
             "images with masks: renders, label images of YCB-Video, mask_visib of BOP",
@@ -240,31 +245,36 @@ def measure_shading(
     unmasked: Sequence[Report],
     num_examples: int = MAX_EXAMPLES,
 ) -> tuple[list[Level], list[Tile]]:
-    """Measure every method at every share of the visible area of every instance, without 0.
+    """Measure every method with shares of the visible area of every instance covered.
 
-    The ground truth is that of the image as it came: an instance counts by what is visible of it
-    before the shading, or heavy shading would drop out of the measurement. ``seed`` is of the
-    patches, ``unmasked`` what was measured at 0.
+    The visible fraction before the shading decides whether an instance counts. Otherwise heavily
+    shaded instances would be excluded from the measurement.
 
-    Returns what was measured at 0 and at every share, and the examples, image by image.
+    Args:
+        methods: Methods by name.
+        source: Test images.
+        shares: Shares to cover, ascending, without 0.
+        seed: Seed of the patches.
+        unmasked: Reports of the methods without shading.
+        num_examples: Number of images on the sheet of examples.
+
+    Returns:
+        The levels, beginning with 0, and the examples, image by image.
     """
     metrics = {share: accumulators(methods) for share in shares}
     reached: dict[float, list[float]] = {share: [] for share in shares}
     tiles: list[Tile] = []
     for index in range(len(source)):
         sample = source.sample(index)
-        counts = [
-            instance.visible_fraction >= MIN_VISIBLE_FRACTION for instance in sample.instances
-        ]
+        counts = [truth.visible_fraction >= MIN_VISIBLE_FRACTION for truth in sample.instances]
         shaded = shade(sample, shares, seed, index)
         for variant in shaded:
             shares_reached = [np.nan if share is None else share for share in variant.reached]
             reached[variant.share] += compress(shares_reached, counts)
             for name, method in methods.items():
                 poses, _ = method.detect(variant.sample, image_id(sample, index))
-                metrics[variant.share][name].update(
-                    poses, sample.instances, sample.K, sample.size[0]
-                )
+                accumulator = metrics[variant.share][name]
+                accumulator.update(poses, sample.instances, sample.K, sample.size[0])
         num_shown = len(tiles) // (len(shares) + 1)
         if num_shown < min(num_examples, MAX_EXAMPLES) and any(counts):
             tiles += _examples(sample, shaded)
@@ -274,8 +284,8 @@ def measure_shading(
 
 
 def _shaded(share: float, metrics: Mapping[str, PoseMetrics], reached: Sequence[float]) -> Level:
-    """Sum up, and say how many instances are not shaded as much as they should be."""
-    # A share that is not known (NaN) is near no other.
+    """Summarise a level, with a note on instances whose covered share is out of tolerance."""
+    # The negated comparison also counts unknown shares (NaN).
     num_outside = sum(not abs(covered - share) <= TOLERANCE for covered in reached)
     finite = [covered for covered in reached if np.isfinite(covered)]
     mean = float(np.mean(finite)) if finite else math.nan
@@ -289,21 +299,20 @@ def _shaded(share: float, metrics: Mapping[str, PoseMetrics], reached: Sequence[
 
 
 def _examples(sample: Sample, shaded: Sequence[Shaded]) -> list[Tile]:
-    """Return the objects as they came and at every share, captioned with the shares reached."""
+    """Return tiles of the objects without shading and at every share."""
     window = _around_masks(sample)
     tiles = [Tile(sample.image[window], f"{sample.key}: unmasked")]
     for variant in shaded:
-        percentages = [
-            f"{100 * r:.1f}" for r in sorted(r for r in variant.reached if r is not None)
-        ]
-        covered = " … ".join(dict.fromkeys([*percentages[:1], *percentages[-1:]])) or "nothing"
+        reached = sorted(share for share in variant.reached if share is not None)
+        ends = [f"{100 * share:.1f}" for share in (*reached[:1], *reached[-1:])]
+        covered = " … ".join(dict.fromkeys(ends)) or "nothing"
         caption = f"{SHADING.heading(variant.share)} (reached {covered})"
         tiles.append(Tile(variant.sample.image[window], caption))
     return tiles
 
 
 def _around_masks(sample: Sample) -> tuple[slice, slice]:
-    """Return the image's rows and columns around all masks, with a margin."""
+    """Return row and column slices around all masks, with a margin."""
     masks = [instance.mask for instance in sample.instances if instance.mask is not None]
     shown = np.any(masks, axis=0) if masks else np.ones(sample.image.shape[:2], bool)
     left, top, width, height = cv2.boundingRect(np.uint8(shown if shown.any() else ~shown))
@@ -321,9 +330,16 @@ def measure_scales(
     unmoved: Measured,
     num_examples: int = MAX_EXAMPLES,
 ) -> tuple[list[Level], list[Tile]]:
-    """Measure every method at every scale; sources are the test set at every scale but 1.
+    """Measure every method at every scale.
 
-    Returns what was measured, by ascending scale, and the examples, image by image.
+    Args:
+        methods: Methods by name.
+        sources: Test set at every scale except 1.
+        unmoved: Measurement at scale 1.
+        num_examples: Number of images on the sheet of examples.
+
+    Returns:
+        The levels by ascending scale, and the examples, image by image.
     """
     num_examples = min(num_examples, MAX_EXAMPLES)
     measured = {1.0: unmoved}
@@ -331,9 +347,7 @@ def measure_scales(
         samples = (source.sample(index) for index in range(len(source)))
         measured[scale] = measure(methods, samples, num_examples)
     in_order = dict(sorted(measured.items()))
-    levels = [
-        _scale_level(scale, measured_level, unmoved) for scale, measured_level in in_order.items()
-    ]
+    levels = [_scale_level(scale, level, unmoved) for scale, level in in_order.items()]
     pictures = zip(*(level.tiles[:num_examples] for level in in_order.values()), strict=True)
     tiles = [
         replace(tile, caption=f"{tile.caption}, {SCALE.heading(scale)}")
@@ -344,7 +358,7 @@ def measure_scales(
 
 
 def _scale_level(scale: float, measured: Measured, unmoved: Measured) -> Level:
-    """Sum up, and say where the instances are not those of the test set or less is in sight."""
+    """Summarise a level, with a note if the instances or their visibility differ from scale 1."""
     rows = {report.name: report.rows for report in measured.reports}
     visible, usual = _visible_fractions(measured), _visible_fractions(unmoved)
     mean = float(visible.mean()) if len(visible) else math.nan
@@ -363,7 +377,7 @@ def _in_words(fractions: Float[np.ndarray, "n"]) -> str:
 
 
 def _visible_fractions(measured: Measured) -> Float[np.ndarray, "n"]:
-    """Return those of all instances that count; the last method scores all objects."""
+    """Return the visible fractions of all instances; the last method scores all objects."""
     metrics = next(reversed(measured.metrics.values()))
     gathered = [metrics.instances(name).visible_fractions for name in metrics.parts]
     return np.concatenate([fractions.numpy() for fractions in gathered])

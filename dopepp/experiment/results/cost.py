@@ -1,11 +1,10 @@
-"""``job=cost``: what a network costs in parameters, operations and time (paper Tables 4 and 8).
+"""Measure the parameters, operations and time of a network (``job=cost``, paper Tables 4 and 8).
 
-Nothing is trained. A frame goes the whole way of
-:meth:`~dopepp.inference.estimator.PoseEstimator.predict`, from a picture of the configured data's
-test set at its own resolution to poses. An untrained network finds nothing, and nothing would take
-no time. So the network's own maps are made, timed and put aside, and poses are recovered from what
-a trained network would answer: the true maps of the picture's objects, with noise
-(:data:`BELIEF_NOISE`).
+The network is not trained. Each frame passes through
+:meth:`~dopepp.inference.estimator.PoseEstimator.predict`, from a test picture at its own resolution
+to poses. An untrained network would detect nothing, and recovery would take no time. Therefore the
+network's maps are computed, timed and discarded, and poses are recovered from the true maps of the
+picture plus the noise of a trained network (:data:`BELIEF_NOISE`).
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from dopepp.experiment.assembly.build_system import build_untrained, map_geometr
 from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import VERSIONS_FILE, environment, write_config, write_json
-from dopepp.experiment.results.pages import write_job_readme
+from dopepp.experiment.results.pages import write_run_readme
 from dopepp.experiment.results.report import Cost
 from dopepp.geometry.camera import Letterbox
 from dopepp.inference.estimator import Maps, PoseEstimator
@@ -51,17 +50,15 @@ NOTE: Final = (
     "ms/frame: the whole way from a test picture to poses. The network is untrained and would find "
     "nothing, so poses are recovered from the picture's true maps with a trained network's noise."
 )
-"""What a reader of the times must know."""
+"""Note below tables with times."""
 
 BELIEF_NOISE: Final = 0.005
 FIELD_NOISE: Final = 0.05
-"""Standard deviations, cell by cell, of what is added to true maps. Recovery then takes as long as
-on the maps of the three released networks, within about a tenth: 7 to 8 peaks an image, there 9
-(``benchmarks/decode.py``). The 0.02 of the crowds in ``benchmarks/recovery.py`` is no trained
-network's: it fills every channel with peaks, 144 an image, and takes nearly twice as long."""
+"""Standard deviation per cell of the noise on the true maps. With it, recovery takes about as long
+as on the maps of trained networks (``benchmarks/decode.py``)."""
 
 WARM_UP: Final = 3
-"""Passes that allocate memory, choose kernels and compile; they are not timed."""
+"""Number of untimed passes, which allocate memory, select kernels and compile."""
 
 _NUM_PICTURES: Final = 8
 _BATCHES: Final = 3
@@ -69,18 +66,17 @@ _BATCHES: Final = 3
 
 @dataclass(frozen=True)
 class NetworkCost:
-    """What a network costs on this machine; sizes are (width, height), pixels.
+    """Cost of a network on this machine; sizes are (width, height) in pixels.
 
     Attributes:
-        backbone_weights: Weights of the backbone's convolutions, as the paper counts: no biases.
-        gmacs: Multiply-accumulates of one image of the input size, 10⁹.
-        picture_size: The timed pictures'; they are scaled into the input and padded no further than
-            the network needs.
-        threads: CPU threads.
-        ms_per_frame: Median time from one picture to its poses, milliseconds; in it
-            ``network_ms`` and, from maps to poses, ``recovery_ms``.
-        frames_per_s: Images of the input size that the network alone turns into maps in a second
-            in batches of ``batch_size``, the fastest of a few.
+        backbone_weights: Weights of the backbone's convolutions without biases, as in the paper.
+        gmacs: Multiply-accumulates for one image of the input size, 10⁹.
+        picture_size: Size of the timed pictures before they are scaled to the input size.
+        threads: Number of CPU threads.
+        ms_per_frame: Median time from a picture to its poses, milliseconds.
+        network_ms: Share of the network in ``ms_per_frame``.
+        recovery_ms: Share of the recovery (maps to poses) in ``ms_per_frame``.
+        frames_per_s: Throughput of the network alone in batches of ``batch_size``, fastest batch.
     """
 
     name: str
@@ -98,7 +94,7 @@ class NetworkCost:
     frames_per_s: float
 
     def texts(self) -> dict[str, str]:
-        """Return what tables print, heading to text."""
+        """Return texts for tables, by heading."""
         (width, height), (columns, rows) = self.picture_size, self.input_size
         return {
             "picture": f"{width}×{height}",
@@ -115,10 +111,12 @@ class NetworkCost:
 
 
 class RehearsedEstimator(PoseEstimator):
-    """An estimator that runs its network and then goes on with maps that it was given.
+    """Estimator that runs its network but recovers poses from given maps.
 
-    ``answer`` is what the next prediction recovers poses from, on the estimator's device. The
-    network was last given a picture, and its maps were there, at these seconds of ``perf_counter``.
+    Attributes:
+        answer: Maps for the next prediction, on the device of the estimator.
+        network_began: Start of the last network pass, in seconds of ``perf_counter``.
+        network_ended: End of the last network pass.
     """
 
     answer: Maps
@@ -126,17 +124,17 @@ class RehearsedEstimator(PoseEstimator):
     network_ended: float
 
     def maps(self, image: UInt8[np.ndarray, "height width 3"]) -> Maps:
-        """Run the network on the image and return the answer in place of its maps."""
+        """Run the network on the image and return ``answer`` instead of its maps."""
         self.network_began = time.perf_counter()
         super().maps(image)
         if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)  # else the network would still be at work
+            torch.cuda.synchronize(self.device)  # wait until the network has finished
         self.network_ended = time.perf_counter()
         return self.answer
 
 
 def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
-    """Count and time the chosen network, untrained; write ``cost.json`` and the frames' times."""
+    """Measure the untrained network of a config and write ``cost.json`` and the frame times."""
     torch.manual_seed(config.seed)
     has_gpu = torch.cuda.is_available() and config.trainer.accelerator != "cpu"
     parts = build_parts(config.data)
@@ -144,7 +142,7 @@ def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
     network, description = build_untrained(config, parts)
     parameters, gmacs = network_cost(network, description.input_size)
     source = held_out_source(config.data, parts, "test")
-    # Read or rendered now, so that no frame's time has that in it.
+    # Pictures are prepared first so that frame times exclude reading and rendering.
     samples = [source.sample(index) for index in range(min(_NUM_PICTURES, len(source)))]
     estimator = RehearsedEstimator(network, description, "cuda" if has_gpu else "cpu")
     geometry = map_geometry(config.maps, network.stride)
@@ -170,7 +168,7 @@ def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
     write_json(run_dir / VERSIONS_FILE, environment(config.seed, ""))
     write_whole(run_dir / FRAMES_FILE, frames.to_csv(float_format="%.6f").encode())
     save_frame_rates(run_dir / "frame_rate.png", {cost.name: frames})
-    write_job_readme(run_dir, f"Cost of {cost.name}")
+    write_run_readme(run_dir, f"Cost of {cost.name}")
     display.show_table(
         f"{cost.name}, untrained, on {cost.device}",
         [{"measure": measure, "": text} for measure, text in cost.texts().items()],
@@ -186,14 +184,18 @@ def time_frames(
     num_frames: int,
     seed: int,
 ) -> pd.DataFrame:
-    """Time frames from picture to poses, after :data:`WARM_UP` that are not timed.
+    """Time frames from picture to poses, after :data:`WARM_UP` untimed frames.
 
-    Pictures are taken in turn. Geometry and seed are of the maps that a trained network would
-    answer and of their noise.
+    Args:
+        estimator: Estimator to time.
+        samples: Pictures, which are used in turn.
+        geometry: Geometry of the maps.
+        num_frames: Number of timed frames.
+        seed: Seed of the noise on the maps.
 
     Returns:
-        By frame the ``seconds`` from picture to poses; in them are ``network_seconds``, from the
-        resized picture to maps, and ``recovery_seconds``, from maps to poses.
+        Per frame, the ``seconds`` from picture to poses, of which ``network_seconds`` for the
+        network and ``recovery_seconds`` for the recovery.
     """
     generator = torch.Generator().manual_seed(seed)
     rehearsed = [
@@ -213,9 +215,9 @@ def time_frames(
 def likely_maps(
     sample: Sample, estimator: PoseEstimator, geometry: MapGeometry, generator: torch.Generator
 ) -> Maps:
-    """Return the maps that a trained network would answer to a picture: the true ones, with noise.
+    """Simulate the maps of a trained network: true maps of a picture with noise.
 
-    They are those of the estimator's input, and on its device.
+    The maps have the input size of the estimator and are on its device.
     """
     size = estimator.checkpoint.input_size
     letterbox = Letterbox.fit(sample.size, size)
@@ -231,9 +233,9 @@ def likely_maps(
 
 
 def save_frame_rates(path: Path, frames: Mapping[str, pd.DataFrame]) -> None:
-    """Draw frames a second over time into a PNG, two curves per network (paper Fig. 13).
+    """Draw frames per second over time as a PNG (paper Fig. 13).
 
-    One is from picture to poses, the dashed one what the network alone would reach.
+    Each network has a solid curve (picture to poses) and a dashed curve (network alone).
     """
     lines = []
     for number, (name, times) in enumerate(frames.items()):
@@ -245,10 +247,13 @@ def save_frame_rates(path: Path, frames: Mapping[str, pd.DataFrame]) -> None:
 
 
 def full_size_cost(spec: Mapping[str, Any], input_size: tuple[int, int]) -> Cost:
-    """Measure the untrained network of a spec at width 1: what narrowing has saved.
+    """Measure the untrained network of a spec at width 1.
 
-    The input is (width, height), pixels (the paper's is 416×416). Of three timed forward passes
-    after one that is not, the median counts.
+    The time is the median of three forward passes after an untimed one.
+
+    Args:
+        spec: Spec of the network.
+        input_size: Input size (width, height), pixels; the paper uses 416×416.
     """
     widened = {
         key: {**node, "width": 1.0} if isinstance(node, Mapping) and "width" in node else node
@@ -267,7 +272,7 @@ def full_size_cost(spec: Mapping[str, Any], input_size: tuple[int, int]) -> Cost
 
 @torch.inference_mode()
 def _frames_per_s(estimator: PoseEstimator, batch_size: int, size: tuple[int, int]) -> float:
-    """Return what the network alone reaches in the fastest of some passes over random images."""
+    """Return the frames per second of the network alone, in its fastest pass over random images."""
     device = estimator.device
     shape = (batch_size, 3, size[1], size[0])
     images = torch.randint(0, 256, shape, dtype=torch.uint8, device=device)

@@ -1,6 +1,6 @@
-"""Methods side by side: the frame of a comparison, Δ to the baseline, and what to say of it.
+"""Compare methods: build the frame of a comparison with the differences (Δ) to a baseline.
 
-To compare a further measure, add an entry to :data:`COMPARED`: what an instance counts in it.
+To compare a further measure, add the score of an instance to :data:`COMPARED`.
 """
 
 from __future__ import annotations
@@ -41,17 +41,17 @@ _HEADLINE: Final = frozenset({
     "", "add_01d", "pass_5cm", "pass_10cm", "auc_10cm", "median_rotation_deg", "miss_rate",
     f"{DELTA}add_01d", f"{DELTA}auc_10cm", f"{DELTA}median_rotation_deg", *COST_FORMS,
 })  # fmt: skip
-"""Measures of the compact table; the full table has all, and every Δ of ``COMPARED``."""
+"""Measures of the compact table; the full table shows all measures and all Δ."""
 
 _SYMMETRIC: Final = frozenset({"add_or_s_01d", "median_rotation_s_deg"})
-"""More of them where an object has symmetries, of which the others know nothing."""
+"""Measures that the compact table adds for objects with symmetries."""
 
 Counted = Callable[[Report, str], Float[np.ndarray, "instances"]]
-"""A report and an object's name to what each instance of it counts."""
+"""Function from a report and an object's name to the score of every instance."""
 
 
 def _passes(threshold: float) -> Counted:
-    """Count an instance whose ADD is below a threshold, metres."""
+    """Score 1 for an instance whose ADD is below a threshold in metres, else 0."""
     return lambda report, name: (report.errors[name] < threshold).astype(np.float64)
 
 
@@ -62,25 +62,25 @@ COMPARED: Final[dict[str, tuple[Counted, StatisticName]]] = {
     "auc_10cm": (lambda report, name: np.clip(1 - report.errors[name] / 0.1, 0, 1), "mean"),
     "median_rotation_deg": (lambda report, name: report.rotation_deg[name], "median"),
 }
-"""Measures with a Δ, by their field of ``PoseRow``, as a statistic of what instances count."""
+"""Measures with a Δ, by their field of ``PoseRow``: instance score and its statistic."""
 
 
 def comparable(entry: Entry, baseline: Entry) -> bool:
-    """Tell whether two methods were measured on the same images."""
+    """Return whether two methods were measured on the same images."""
     return bool(entry.test_set) and entry.test_set == baseline.test_set
 
 
 def differences(entry: Entry, baseline: Entry | None, name: str) -> dict[str, Value]:
-    """Return the differences in an object's measures by field, of one method to another.
+    """Return the differences between two methods on an object, by field of ``PoseRow``.
 
-    Seeds are drawn in pairs where both methods have the same ones. What cannot be compared has no
-    number of differing instances.
+    The bootstrap draws seeds in pairs if both methods have the same seeds. Values of methods that
+    cannot be compared have no ``num_differing``.
     """
     values = {field: Value(entry.name, name, f"{DELTA}{field}") for field in COMPARED}
     objects = _scored(entry, name)
     if baseline is None or not comparable(entry, baseline) or objects != _scored(baseline, name):
         return values
-    # Sorted by seed, row s of both methods is of one seed where they have the same ones.
+    # Reports are sorted by seed so that equal seeds are paired.
     first, second = _by_seed(entry), _by_seed(baseline)
     unknown = None in entry.seeds or None in baseline.seeds
     same = len(first) == len(second) == 1 or (
@@ -95,7 +95,7 @@ def differences(entry: Entry, baseline: Entry | None, name: str) -> dict[str, Va
         if change is None:
             values[field] = values[field]._replace(num_differing=0)
             continue
-        # Few seeds may have stretched an interval beyond what two shares can differ by.
+        # With few seeds the interval may exceed the largest possible difference of two shares.
         limit = 1.0 if statistic == "mean" else math.inf
         values[field] = values[field]._replace(
             value=change.value,
@@ -108,7 +108,7 @@ def differences(entry: Entry, baseline: Entry | None, name: str) -> dict[str, Va
 
 
 def _scored(entry: Entry, name: str) -> list[str]:
-    """Return the objects with instances that a row is about: one, or for the mean all."""
+    """Return the objects with instances behind a row: one object, or all for the mean."""
     errors = entry.reports[0].errors
     return sorted(part for part in errors if len(errors[part]) and name in (part, MEAN))
 
@@ -119,11 +119,10 @@ def _by_seed(entry: Entry) -> list[Report]:
 
 
 def compared(entries: Sequence[Entry]) -> pd.DataFrame:
-    """Return the frame of a comparison as :func:`means`, method by method and object by object.
+    """Build the frame of a comparison, averaged over seeds, ordered by method and object.
 
-    The first entry with a result is the baseline, of refined poses its refined ones (see
-    :func:`_opposite`). The reference rows of its test set stand at the end. A method without a
-    result has one line, whose object says why.
+    The baseline is the first entry with a result (see :func:`_baseline_of`). The reference rows of
+    its test set come last. A method without a result has one row, whose object states the reason.
     """
     return means(make_frame(_values(entries)))
 
@@ -136,7 +135,7 @@ def _values(entries: Sequence[Entry]) -> Iterator[Value]:
         elif not entry.reports:
             yield from _cost_values(entry, "cost only")
         for name in entry.objects:
-            changes = differences(entry, _opposite(entry, entries), name)
+            changes = differences(entry, _baseline_of(entry, entries), name)
             for field in FIELDS:
                 for seed, report in zip(entry.seeds, entry.reports, strict=True):
                     (value,) = row_values(report.rows[name], [field])
@@ -148,10 +147,10 @@ def _values(entries: Sequence[Entry]) -> Iterator[Value]:
         yield from row_values(rows[MEAN] if len(rows) > 2 else next(iter(rows.values())))
 
 
-def _opposite(entry: Entry, entries: Sequence[Entry]) -> Entry | None:
-    """Return what an entry is set off against: the first with a result, refined if it is itself.
+def _baseline_of(entry: Entry, entries: Sequence[Entry]) -> Entry | None:
+    """Return the baseline of an entry: the first result with the same kind of refinement.
 
-    The first refined one is set off against the first of all, and that one against nothing.
+    The first refined entry is compared with the first entry, which has no baseline.
     """
     measured = [each for each in entries if each.reports]
     alike = [each for each in measured if each.refine == entry.refine]
@@ -159,7 +158,7 @@ def _opposite(entry: Entry, entries: Sequence[Entry]) -> Entry | None:
 
 
 def _cost_values(entry: Entry, name: str) -> Iterator[Value]:
-    """Return the cost in this run and, of a narrowed network, at full size behind it."""
+    """Yield the cost in this run and, for a narrowed network, the cost at full size."""
     costs = {"": entry.cost}
     if entry.reports and (wide := entry.reports[0].details.get(FULL_SIZE_COST)) is not None:
         costs["full-size "] = Cost(**wide)
@@ -170,9 +169,11 @@ def _cost_values(entry: Entry, name: str) -> Iterator[Value]:
 
 
 def headline(table: pd.DataFrame, symmetric: bool = False) -> list[Row]:
-    """Return the compact table: ``value ± deviation`` and ``Δ [interval]`` in one cell each.
+    """Return the compact table, with ``value ± deviation`` and ``Δ [interval]`` as cells.
 
-    ``symmetric`` says whether an object has symmetries.
+    Args:
+        table: Frame of a comparison.
+        symmetric: Whether any object has symmetries.
     """
     chosen = _HEADLINE | _SYMMETRIC if symmetric else _HEADLINE
     several = _has_seeds(table)
@@ -184,7 +185,7 @@ def headline(table: pd.DataFrame, symmetric: bool = False) -> list[Row]:
 
 
 def full(table: pd.DataFrame) -> list[Row]:
-    """Return everything, a number a cell: measures, deviations, Δ, its interval and verdict."""
+    """Return the full table, with one cell per measure, deviation, Δ, interval end and verdict."""
     several = _has_seeds(table)
 
     def cells(value: Value) -> Row:
@@ -203,19 +204,19 @@ def full(table: pd.DataFrame) -> list[Row]:
 
 
 def _labels(value: Value, with_seeds: bool) -> Row:
-    """Return the labels of a row; what has no measures of poses has no seeds."""
+    """Return the labels of a row; only pose measures have seeds."""
     if not with_seeds or value.measure not in FIELDS:
         return value.names
     return {**value.names, "seeds": ", ".join(map(str, value.seeds))}
 
 
 def _has_seeds(table: pd.DataFrame) -> bool:
-    """Tell whether any method was trained with several seeds."""
+    """Return whether any method was trained with several seeds."""
     return any(len(seeds) > 1 for seeds in table["seeds"])
 
 
 def notes(entries: Sequence[Entry], table: pd.DataFrame) -> list[str]:
-    """Return a sentence or two for each thing that the table alone does not say."""
+    """Return sentences that explain the table: baseline, intervals, noise and narrowed networks."""
     sentences: list[str] = []
     measured = [entry for entry in entries if entry.reports]
     networks = [entry for entry in measured if not entry.refine]
@@ -234,10 +235,10 @@ def notes(entries: Sequence[Entry], table: pd.DataFrame) -> list[str]:
 def _baseline_notes(
     baseline: Entry, others: Sequence[Entry], doubts: Sequence[str]
 ) -> Iterator[str]:
-    """Say what Δ is against, how sure it is, and what has none."""
+    """Yield sentences about the baseline, the intervals and the methods without Δ."""
     alike = [entry for entry in others if comparable(entry, baseline)]
     if alike:
-        yield _how(baseline, alike)
+        yield _interval_note(baseline, alike)
         yield from doubts
     seeds = set(baseline.seeds)
     several = [entry for entry in alike if max(len(entry.seeds), len(seeds)) > 1]
@@ -252,8 +253,8 @@ def _baseline_notes(
         yield f"{said}: {', '.join(unlike)}."
 
 
-def _how(baseline: Entry, alike: Sequence[Entry]) -> str:
-    """Say what Δ is against and what its interval knows of."""
+def _interval_note(baseline: Entry, alike: Sequence[Entry]) -> str:
+    """Return a sentence about the baseline of Δ and the sources of noise in its interval."""
     count = sum(len(errors) for errors in baseline.reports[0].errors.values())
     said = (
         f"Δ is against {baseline.name}, with its 95 % interval from a paired bootstrap over the "
@@ -270,7 +271,7 @@ def _how(baseline: Entry, alike: Sequence[Entry]) -> str:
 
 
 def noise(table: pd.DataFrame) -> list[str]:
-    """Name, for every method and object, the differences that may be chance."""
+    """Return sentences that list, by method and object, the differences that may be chance."""
     changes = table[table["num_differing"].notna()]
     several = changes["object"].nunique() > 1
     sentences = []
@@ -288,7 +289,7 @@ def noise(table: pd.DataFrame) -> list[str]:
 
 
 def _needed(change: Value) -> str:
-    """Say at how many seeds a difference of this size would be more than noise."""
+    """Return a remark on the number of seeds that would make a difference significant."""
     if math.isnan(change.seeds_to_tell) or change.value == 0:
         return ""
     if math.isinf(change.seeds_to_tell):

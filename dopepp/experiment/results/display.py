@@ -1,4 +1,4 @@
-"""What a person sees in the terminal."""
+"""Print configs, reports and tables to the terminal."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from dopepp.experiment.results.frame import header_of
 from dopepp.experiment.results.report import Report
 from dopepp.metrics.row import shown_columns
 
-# Tables are wider than a pipe's default of 80 columns; a terminal keeps its own width. No markup:
-# overrides, paths and messages hold square brackets of their own.
+# Tables are wider than the default of 80 columns for pipes; a terminal keeps its own width. Markup
+# is off because overrides, paths and messages contain square brackets.
 console = Console(highlight=False, markup=False, width=None if Console().is_terminal else 180)
 
 
@@ -39,7 +39,7 @@ def _branch(tree: Tree, config: Mapping[str, Any]) -> None:
 
 
 def show_sources(sources: Sequence[tuple[str, SourceInfo]]) -> None:
-    """Print where the images of each split come from and how many each source gives."""
+    """Print the sources of each split with their numbers of images and instances."""
     table = Table("split", "source", "images", "per epoch", "instances", title="data")
     for split, info in sources:
         instances = ", ".join(f"{name} {count:,}" for name, count in info.num_instances.items())
@@ -50,9 +50,11 @@ def show_sources(sources: Sequence[tuple[str, SourceInfo]]) -> None:
 
 
 def show_report(report: Report, all_measures: bool = False) -> None:
-    """Print a table per object: a line per measure, the reference rows beside the estimate.
+    """Print one table per object, with measures as rows and the references as further columns.
 
-    ``all_measures`` adds the symmetric measures of a part without symmetries.
+    Args:
+        report: Result to print.
+        all_measures: Whether to show the symmetric measures of parts without symmetries.
     """
     for name, (row, *references) in report.tables.items():
         if row.num_instances == 0:
@@ -72,9 +74,12 @@ def show_report(report: Report, all_measures: bool = False) -> None:
 
 
 def show_table(title: str, rows: Sequence[Mapping[str, str]], num_labels: int = 1) -> None:
-    """Print rows by heading, the first columns of words, the others of numbers.
+    """Print rows as a table; missing cells are empty.
 
-    The columns are those of the fullest row; a row may lack some.
+    Args:
+        title: Title of the table.
+        rows: Texts by heading.
+        num_labels: Number of left-aligned text columns; the remaining columns are right-aligned.
     """
     table = Table(title=title)
     header = header_of(rows)
@@ -87,7 +92,7 @@ def show_table(title: str, rows: Sequence[Mapping[str, str]], num_labels: int = 
 
 
 def show_files(run_dir: Path) -> None:
-    """Print what a run folder holds."""
+    """Print the files of a run folder and their sizes."""
     table = Table("file", "bytes")
     for path in sorted(run_dir.rglob("*")):
         hidden = any(part.startswith(".") for part in path.relative_to(run_dir).parts)

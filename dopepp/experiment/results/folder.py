@@ -1,4 +1,4 @@
-"""What a run leaves behind so that it can be understood and repeated."""
+"""Names of the files in a run folder, and the files that make a run repeatable."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ METRICS_FILE: Final = "metrics.json"
 FAILURE_FILE: Final = "failed.json"
 PRUNED_FILE: Final = "pruned.json"
 OBJECTIVE: Final = "objective"
-"""Key of ``metrics.json``: the validation value that the best checkpoint was chosen by."""
+"""Key of ``metrics.json``: validation value by which the best checkpoint was selected."""
 OVERRIDES_FILE: Final = Path(".hydra", "resume.json")
 OF_THE_START: Final = frozenset({".hydra", CONFIG_FILE, VERSIONS_FILE, "README.md"})
-"""What a run folder holds before anything is done, but for the working tree's difference."""
+"""Files of a run folder that are written before the work begins."""
 DIFFERENCE: Final = "working_tree_"
-"""How the name of that file begins."""
+"""Prefix of the file with the uncommitted changes of the working tree."""
 BEST_CHECKPOINT: Final = Path(FOLDER, BEST)
 LAST_CHECKPOINT: Final = Path(FOLDER, LAST)
 
 _MAX_DIFF_BYTES: Final = 10_000_000
-"""Of a larger difference to the last commit only the hash is kept."""
+"""Maximum size of the uncommitted changes to store; only the hash of larger ones is stored."""
 _MAX_UNTRACKED: Final = 100
 
 
@@ -52,7 +52,7 @@ def write_config(run_dir: Path, config: Mapping[str, Any]) -> None:
 
 
 def write_json(path: Path, record: Mapping[str, Any]) -> None:
-    """Write a record as JSON, whole; values JSON has no word for are an error."""
+    """Write a record as JSON atomically; non-finite numbers are an error."""
     write_whole(path, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())
 
 
@@ -75,9 +75,13 @@ def read_json(path: Path) -> dict[str, Any]:
 def write_environment(
     run_dir: Path, seed: int, data_fingerprint: str, changes: Sequence[str] = ()
 ) -> None:
-    """Write what a run is made with; a run that goes on keeps what it was made with before.
+    """Write the environment of a run; a resumed run keeps its earlier environments.
 
-    ``changes`` are those of its config since it was begun or last resumed.
+    Args:
+        run_dir: Run folder.
+        seed: Seed of the run.
+        data_fingerprint: Fingerprint of the data.
+        changes: Changes of the config since the run began or was last resumed.
     """
     path = run_dir / VERSIONS_FILE
     earlier: list[object] = []
@@ -97,7 +101,8 @@ def write_environment(
 
 
 def environment(seed: int, data_fingerprint: str) -> dict[str, Any]:
-    """Describe program, packages, working tree, hardware, seed, data and the moment."""
+    """Describe program, packages, working tree, hardware, seed, data and time."""
+    gpus = map(torch.cuda.get_device_properties, range(torch.cuda.device_count()))
     return {
         "dopepp": dopepp.__version__,
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -109,7 +114,14 @@ def environment(seed: int, data_fingerprint: str) -> dict[str, Any]:
             if isinstance(name := package.name, str)
         },
         "git": _git_state(),
-        "hardware": _hardware(),
+        "hardware": {
+            "processor": cpu_fact("model name") or platform.processor() or platform.machine(),
+            "cores": os.cpu_count(),
+            "threads": torch.get_num_threads(),
+            "memory_bytes": _memory_bytes(),
+            "gpus": [{"name": gpu.name, "memory_bytes": gpu.total_memory} for gpu in gpus],
+            "cuda": torch.version.cuda,
+        },
         "command": program.command(),
         "seed": seed,
         "data_fingerprint": data_fingerprint,
@@ -117,30 +129,16 @@ def environment(seed: int, data_fingerprint: str) -> dict[str, Any]:
     }
 
 
-def _hardware() -> dict[str, Any]:
-    return {
-        "processor": cpu_fact("model name") or platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
-        "threads": torch.get_num_threads(),
-        "memory_bytes": _memory_bytes(),
-        "gpus": [
-            {"name": gpu.name, "memory_bytes": gpu.total_memory}
-            for gpu in map(torch.cuda.get_device_properties, range(torch.cuda.device_count()))
-        ],
-        "cuda": torch.version.cuda,
-    }
-
-
 def _memory_bytes() -> int | None:
-    """Return the machine's memory, where the system tells."""
-    names = getattr(os, "sysconf_names", {})
-    if "SC_PHYS_PAGES" not in names or "SC_PAGE_SIZE" not in names:
+    """Return the size of the machine's memory, or None where the system does not report it."""
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError):
         return None
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def _git(*arguments: str) -> bytes | None:
-    """Return what git says where the package is; None where it refuses, or is not installed."""
+    """Run git in the folder of the package; return its output, or None if git fails."""
     command = ["git", "-C", str(Path(dopepp.__file__).parent), *arguments]
     try:
         return subprocess.run(command, check=True, capture_output=True, timeout=10).stdout
@@ -149,9 +147,9 @@ def _git(*arguments: str) -> bytes | None:
 
 
 def _git_state() -> dict[str, Any] | None:
-    """Return the commit the package was run from and how its files differ; None outside git.
+    """Return the commit of the package and its uncommitted files, or None outside git.
 
-    A package that is installed below somebody's own repository is not part of it.
+    A package that is installed inside another repository does not count as part of it.
     """
     is_part = _git("ls-files", "--error-unmatch", "__init__.py") is not None
     commit, status = _git("rev-parse", "HEAD"), _git("status", "--porcelain")

@@ -1,11 +1,11 @@
-"""The results frame: one long pandas table of what was measured; every other table is a view of it.
+"""The results frame: one long pandas table of all measured values; other tables are views of it.
 
-A row of the frame is a :class:`Value`. :func:`means` averages the frame over seeds, :func:`pivot`
-lays it out, and :func:`markdown`, :func:`~dopepp.core.files.write_csv` and
-:func:`~dopepp.experiment.results.display.show_table` write what comes out. The pass rates that all
-protocols report stand here as well: the paper's, the strict one, and one for symmetries.
+A row of the frame is a :class:`Value`. :func:`means` averages the frame over seeds, and
+:func:`pivot` arranges the values as a table. :func:`markdown`,
+:func:`~dopepp.core.files.write_csv` and :func:`~dopepp.experiment.results.display.show_table` write
+the table. The module also defines the pass rates that all protocols report.
 
-To add a rate, write it down below :class:`PassRate`; it needs a field in ``PoseRow``.
+To add a rate, define it below :class:`PassRate`. A rate needs a field in ``PoseRow``.
 """
 
 from __future__ import annotations
@@ -29,46 +29,46 @@ from dopepp.metrics.row import COLUMNS, NOT_AVAILABLE, Column, PoseRow, symmetry
 from dopepp.parts.part import Parts
 
 Row = dict[str, str]
-"""Heading to text."""
+"""Texts of a table row by column heading."""
 
 DELTA: Final = "Δ "
-"""Prefix of a measure that is a difference to the baseline."""
+"""Prefix of measures that are differences to the baseline."""
 
 COST_FORMS: Final = {"parameters": ",.0f", "GMACs": ".3f", "ms/frame": ".1f"}
-"""Measures of cost and how they are written."""
+"""Format of each cost measure."""
 
 FIELDS: Final = {column.field: column for column in COLUMNS}
-"""Columns of the measures of poses, by their field of ``PoseRow``."""
+"""Columns of the pose measures by their field of ``PoseRow``."""
 
 WITHIN: Final = "within noise"
 BEYOND: Final = "beyond noise"
 
 FEWEST_DIFFERING: Final = fewest_differing(0.95)
-"""Differing instances without which no difference is more than chance."""
+"""Minimum number of differing instances for a difference that is not due to chance."""
 
 _TEXTS: Final = ("method", "object", "measure", "overrides", "folder", "job", "state")
-"""Headings of columns that hold no numbers."""
+"""Headings of text columns."""
 
 Cell = TypeVar("Cell")
 
 
 class Value(NamedTuple):
-    """A row of the frame; numbers that do not exist are NaN.
+    """A row of the frame; missing numbers are NaN.
 
     Attributes:
         method: Name of the method or of the reference.
-        object: Name of the part, ``mean``, or the reason why there is no result.
+        object: Name of the part, ``mean``, or the reason for a missing result.
         measure: Field of ``PoseRow``, with :data:`DELTA` before it for a difference to the
             baseline, or a heading; empty for a method without values.
         value: Value in the field's unit.
-        seed: Seed of the training; None where it is not known.
-        condition: Level of a condition, or middle of a bin.
+        seed: Seed of the training, or None if unknown.
+        condition: Level of a condition, or the middle of a bin.
         low: Lower end of the 95 % interval.
         high: Upper end.
-        num_differing: Of a difference, instances on which the methods differ; NaN where they
-            cannot be compared.
-        seeds_to_tell: Of a difference, about how many seeds would tell it from chance.
-        deviation: Standard deviation over the seeds (of a sample) of a mean.
+        num_differing: For a difference, number of instances on which the methods differ; NaN if
+            the methods cannot be compared.
+        seeds_to_tell: For a difference, approximate number of seeds that would make it significant.
+        deviation: For a mean, sample standard deviation over the seeds.
         seeds: Seeds of the method on the object.
     """
 
@@ -87,33 +87,33 @@ class Value(NamedTuple):
 
     @property
     def names(self) -> Row:
-        """The labels of most tables."""
+        """Labels of a table row."""
         return {"method": self.method, "object": self.object}
 
     @property
     def is_change(self) -> bool:
-        """Whether it is a difference to the baseline."""
+        """Whether the value is a difference to the baseline."""
         return self.measure.startswith(DELTA)
 
     @property
     def within_noise(self) -> bool:
-        """Whether such a difference is to be expected of methods that are equally good."""
+        """Whether the difference may be due to chance."""
         return self.num_differing < FEWEST_DIFFERING or self.low <= 0 <= self.high
 
     @property
     def column(self) -> Column:
-        """How tables show it."""
+        """Column of the measure, which defines its format."""
         field = self.measure.removeprefix(DELTA)
         return FIELDS.get(field) or Column(field, field)
 
     @property
     def heading(self) -> str:
-        """Heading with its unit."""
+        """Column heading with the unit."""
         return f"{DELTA if self.is_change else ''}{self.column.heading}"
 
     @property
     def text(self) -> str:
-        """What tables show: ``n/a`` where there is no value, nothing where it makes no sense."""
+        """Text for tables: ``n/a`` for a missing value, empty where no value is expected."""
         form = COST_FORMS.get(self.measure.removeprefix("full-size "))
         if not self.measure or (self.is_change and math.isnan(self.num_differing)):
             return ""
@@ -123,7 +123,7 @@ class Value(NamedTuple):
 
     @property
     def spread(self) -> str:
-        """What tables show of the deviation; empty of one seed."""
+        """Text of the standard deviation; empty for a single seed."""
         if len(self.seeds) < 2 or self.is_change:
             return ""
         decimals = max(self.column.decimals, 1)
@@ -132,12 +132,12 @@ class Value(NamedTuple):
 
     @property
     def ends(self) -> list[str]:
-        """What tables show of the interval; nothing where there is none."""
+        """Texts of the interval's ends; empty without an interval."""
         return [] if math.isnan(self.low) else [self._shown(self.low), self._shown(self.high)]
 
     @property
     def summary(self) -> str:
-        """A mean with its deviation; Δ with its interval and, where it may be chance, that."""
+        """Mean ± deviation, or Δ with its interval and a mark if the difference may be chance."""
         if self.is_change and self.ends:
             unsure = f" {WITHIN}" if self.within_noise else ""
             return f"{self.text} [{', '.join(self.ends)}]{unsure}"
@@ -145,7 +145,7 @@ class Value(NamedTuple):
 
     @property
     def plain(self) -> int | float | None:
-        """The value as a CSV holds it: counts are integers, nothing is an empty cell."""
+        """Value for CSV files: counts are integers, None becomes an empty cell."""
         if math.isnan(self.value):
             return None
         return int(self.value) if self.measure.startswith("num_") else self.value
@@ -155,12 +155,12 @@ class Value(NamedTuple):
 
 
 def make_frame(values: Iterable[Value]) -> pd.DataFrame:
-    """Return the frame of some values, in their order."""
+    """Build a frame that keeps the order of the values."""
     return pd.DataFrame(list(values), columns=Value._fields).astype({"seed": "Int64"})
 
 
 def values_of(frame: pd.DataFrame, **wanted: object) -> list[Value]:
-    """Return the rows that have these values in these columns."""
+    """Return the rows of a frame whose columns have the ``wanted`` values."""
     chosen = np.ones(len(frame), bool)
     for name, value in wanted.items():
         chosen &= (frame[name] == value).to_numpy(bool)
@@ -173,7 +173,7 @@ def row_values(
     rates: Sequence[str] = (),
     condition: float = 0.0,
 ) -> Iterator[Value]:
-    """Return some fields of a row; ``rates`` name those that have an interval."""
+    """Yield the values of some fields of a row; ``rates`` are the fields that have an interval."""
     for field in fields:
         value = getattr(row, field)
         value = math.nan if value is None else float(value)
@@ -182,15 +182,16 @@ def row_values(
 
 
 def interval(rate: float, num: int) -> tuple[float, float]:
-    """Return Wilson's 95 % interval of a rate over so many instances; NaN where there are none."""
+    """Return Wilson's 95 % interval of a rate over ``num`` instances; NaN without instances."""
     exists = num > 0 and not math.isnan(rate)
     return wilson_interval(round(rate * num), num) if exists else (math.nan, math.nan)
 
 
 def means(frame: pd.DataFrame) -> pd.DataFrame:
-    """Average over seeds: a row per method, object, measure and condition.
+    """Average over seeds: one row per method, object, measure and condition.
 
-    A measure that one seed lacks does not exist: a mean over the others would flatter.
+    The mean is NaN if the value of any seed is missing, because a mean over the remaining seeds
+    would be biased.
     """
     groups = frame.groupby(["method", "object", "measure", "condition"], sort=False)
     complete = groups["value"].count() == groups.size()
@@ -204,7 +205,7 @@ def means(frame: pd.DataFrame) -> pd.DataFrame:
 def pivot(
     values: Iterable[Value], keys: Sequence[str], cells: Callable[[Value], Mapping[str, Cell]]
 ) -> list[dict[str, Cell]]:
-    """Lay values out: those with equal keys become one row, which has the cells of all of them."""
+    """Merge the cells of all values with equal keys into one table row."""
     rows: dict[tuple[object, ...], dict[str, Cell]] = {}
     for value in values:
         rows.setdefault(tuple(getattr(value, key) for key in keys), {}).update(cells(value))
@@ -212,17 +213,17 @@ def pivot(
 
 
 def heading(measure: str) -> str:
-    """Return the heading of a measure, with its unit."""
+    """Return the column heading of a measure, with its unit."""
     return Value("", "", measure).heading
 
 
 def header_of(rows: Sequence[Mapping[str, object]]) -> list[str]:
-    """Return all headings, those of the fullest row first."""
+    """Return all headings, beginning with those of the longest row."""
     return list(dict.fromkeys([*max(rows, key=len), *(key for row in rows for key in row)]))
 
 
 def markdown(rows: Sequence[Mapping[str, str]]) -> str:
-    """Return a Markdown table; numbers are aligned to the right."""
+    """Format rows as a Markdown table with right-aligned numbers."""
     header = header_of(rows)
     aligned = [
         "---" if number == 0 or title in _TEXTS else "---:" for number, title in enumerate(header)
@@ -234,7 +235,7 @@ def markdown(rows: Sequence[Mapping[str, str]]) -> str:
 
 
 def rate_curves(rates: Iterable[Value], per_unit: float = 1.0) -> dict[str, RateCurve]:
-    """Return a rate over the conditions, times ``per_unit``, that had instances, by method."""
+    """Return the curve of a rate over the conditions (times ``per_unit``) of each method."""
     points: dict[str, list[tuple[float, ...]]] = {}
     for rate in rates:
         point = (per_unit * rate.condition, rate.value, rate.low, rate.high)
@@ -244,16 +245,19 @@ def rate_curves(rates: Iterable[Value], per_unit: float = 1.0) -> dict[str, Rate
 
 
 def shown_rows(rows: Mapping[str, PoseRow]) -> dict[str, PoseRow]:
-    """Return the rows of all objects and, of several, of their mean."""
+    """Return the rows of all objects, and their mean if there are several."""
     return {name: row for name, row in rows.items() if name != MEAN or len(rows) > 2}
 
 
 @dataclass(frozen=True)
 class PassRate:
-    """The share of instances whose error is below a threshold.
+    """Share of instances whose error is below a threshold.
 
-    It has a field in a :class:`~dopepp.metrics.row.PoseRow`. The threshold is in diameters where
-    ``relative``, else in metres.
+    Attributes:
+        field: Field of :class:`~dopepp.metrics.row.PoseRow`.
+        error: Kind of error.
+        threshold: Threshold in diameters if ``relative``, else in metres.
+        relative: Whether the threshold scales with the diameter of the object.
     """
 
     field: str
@@ -263,11 +267,11 @@ class PassRate:
 
     @property
     def title(self) -> str:
-        """What stands above its curves."""
+        """Title of the rate's curves."""
         return heading(self.field).removesuffix(" %")
 
     def passed(self, instances: Gathered) -> Bool[Tensor, "n"]:
-        """Tell which instances of an object pass."""
+        """Return which instances of an object pass."""
         unit = instances.part.diameter if self.relative else 1.0
         errors: Tensor = getattr(instances.errors, self.error)
         return errors < self.threshold * unit
@@ -280,10 +284,10 @@ MSSD_01D: Final = PassRate("mssd_01d", "mssd", 0.1)
 
 
 def reported_rates(data: DataConfig, parts: Parts) -> tuple[PassRate, ...]:
-    """Return the rates for these data: the paper's and ADD-0.1d.
+    """Return the pass rates to report for a data set.
 
-    The paper's is ADD below 0.1 m on images of YCB-Video, below 0.05 m on parts. Where a part has
-    symmetries, of which ADD knows nothing, MSSD-0.1d stands beside them.
+    These are the paper's rate (ADD below 0.1 m on YCB-Video, below 0.05 m elsewhere) and ADD-0.1d.
+    If a part has symmetries, which ADD ignores, MSSD-0.1d is reported as well.
     """
     is_ycb = data.root is not None and data.format == "ycb_video"
     rates = (ADD_10CM if is_ycb else ADD_5CM), ADD_01D

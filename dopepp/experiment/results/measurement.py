@@ -1,7 +1,7 @@
-"""Measuring methods on a test set: one loop, one accumulator, for every kind of comparison.
+"""Measure methods on a test set.
 
-A method is an estimator that is run, or poses that a file brings. To measure something else, write
-a class with the methods of :class:`Method`.
+A method is an estimator or a file with poses. To measure something else, write a class with the
+methods of :class:`Method`.
 """
 
 from __future__ import annotations
@@ -47,38 +47,38 @@ ImageId = tuple[int, int]
 """BOP's scene_id and im_id."""
 
 _WARM_UP_FRAMES: Final = 3
-"""The first frames allocate memory and choose kernels; they are not timed."""
+"""Number of untimed first frames, which allocate memory and select kernels."""
 
 _BOP_KEY: Final = re.compile(r"(\d{1,9})[/_](\d{1,9})", re.ASCII)
 _NUMBERED_SOURCES: Final = ("bop", "webdataset", "ycb_video")
 
 
 class ScoredPose(PredictedPose, Protocol):
-    """What a measurement reads of a detection."""
+    """Attributes of a detection that a measurement needs."""
 
     @property
     def keypoints(self) -> Float[np.ndarray, "9 2"]:
-        """The cuboid projected with it, pixels."""
+        """Projected cuboid, pixels."""
 
 
 class Method(Protocol):
-    """Something that gives poses for the images of a test set.
+    """Source of poses for the images of a test set.
 
     Attributes:
-        parts: The objects it is scored on, as the test set has them.
+        parts: Objects to score, as defined by the test set.
     """
 
     parts: Parts
 
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
-        """Return the poses on an image and the seconds they took, None where unknown."""
+        """Return the poses in an image and the seconds it took, or None if unknown."""
 
     def cost(self, seconds: Sequence[float]) -> Cost:
-        """Return what it costs, given the known times of all images, in order."""
+        """Return the cost of the method, given the known times of all images in order."""
 
 
 class EstimatorMethod:
-    """An estimator, run on every image at its own size; scored on the objects that it knows."""
+    """Estimator that runs on images at their own size and is scored on its own objects."""
 
     def __init__(self, estimator: PoseEstimator, parts: Parts) -> None:
         names = {part.name for part in estimator.parts}
@@ -87,7 +87,7 @@ class EstimatorMethod:
         self._names = {part.name for part in self.parts}
 
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
-        """Run it; what it finds of objects that are not measured is left out."""
+        """Run the estimator and return the detections of measured objects."""
         start = time.perf_counter()
         detections = self.estimator.predict(
             sample.image, sample.K, depth=sample.depth, cropped=True
@@ -96,19 +96,19 @@ class EstimatorMethod:
         return [detection for detection in detections if detection.object in self._names], seconds
 
     def silence(self, sample: Sample) -> Reason | None:
-        """Return why it finds nothing on an image: how its best candidate ended, if one did."""
+        """Return why the best candidate in an image without detections was rejected, if any."""
         reasons = furthest(
             self.estimator.explain(sample.image, sample.K, sample.depth, cropped=True)
         )
         return next((reason for reason in reversed(reasons) if reason.object in self._names), None)
 
     def cost(self, seconds: Sequence[float]) -> Cost:
-        """Count parameters and operations, and take the median of the timed frames."""
+        """Return parameters, operations and the median time per frame."""
         checkpoint, network = self.estimator.checkpoint, self.estimator.network
-        if isinstance(network, ExportedNetwork):  # without the network's own modules
+        if isinstance(network, ExportedNetwork):  # an export has no modules to count
             parameters, gmacs = network.export.parameters, network.export.gmacs
         else:
-            with torch.device("meta"):  # as it was trained, where the estimator's is folded
+            with torch.device("meta"):  # as trained, because the estimator folds its network
                 trained = build_network(checkpoint.spec)
             parameters, gmacs = network_cost(trained, checkpoint.input_size)
         return Cost(parameters, gmacs, _median_ms(seconds[_WARM_UP_FRAMES:] or seconds))
@@ -116,7 +116,7 @@ class EstimatorMethod:
 
 @dataclass(frozen=True)
 class FilePose:
-    """A pose that a file brings; see :class:`ScoredPose`."""
+    """Pose from a file; see :class:`ScoredPose`."""
 
     object: str
     score: float
@@ -128,8 +128,12 @@ class FilePose:
 class FileMethod:
     """Poses of another program, read from a BOP challenge CSV.
 
-    ``numbers`` are those of the data set's objects, by name; poses of objects that are not measured
-    are left out.
+    Poses of objects that are not measured are ignored.
+
+    Args:
+        path: CSV file.
+        parts: Objects to score.
+        numbers: BOP number of every object by name.
     """
 
     def __init__(self, path: Path, parts: Parts, numbers: Mapping[str, int]) -> None:
@@ -142,7 +146,7 @@ class FileMethod:
             self._unused.setdefault((row.scene_id, row.im_id), []).append(row)
 
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
-        """Look the image up; of several times that its lines state, the largest counts."""
+        """Return the poses of an image and the largest time that its lines state."""
         rows = self._used.setdefault(image, self._unused.pop(image, []))
         poses = [
             FilePose(part.name, row.score, T, project_keypoints(part.cuboid, T, sample.K))
@@ -153,7 +157,7 @@ class FileMethod:
         return poses, seconds if seconds >= 0 else None
 
     def cost(self, seconds: Sequence[float]) -> Cost:
-        """Return the median of the stated times."""
+        """Return the median of the times in the file."""
         return Cost(ms_per_frame=_median_ms(seconds))
 
     def check_used(self) -> None:
@@ -183,10 +187,10 @@ class FileMethod:
 
 
 def object_numbers(data: DataConfig, parts: Parts) -> dict[str, int]:
-    """Return BOP's number of each object, by name.
+    """Return the BOP number of each object by name.
 
-    In a BOP data set they are those of ``models_info.json``, all of them; in YCB-Video the lines of
-    ``classes.txt``, which BOP's YCB-V has kept. Elsewhere parts are counted from 1.
+    Numbers come from ``models_info.json`` for BOP data sets and from the line numbers of
+    ``classes.txt`` for YCB-Video. Otherwise parts are numbered from 1.
     """
     root = data.root
     if root is not None and data.format in ("bop", "webdataset"):
@@ -198,10 +202,10 @@ def object_numbers(data: DataConfig, parts: Parts) -> dict[str, int]:
 
 
 def image_id(sample: Sample, index: int) -> ImageId:
-    """Return an image's BOP numbers.
+    """Return the BOP scene and image number of an image.
 
-    They are those in the key of a BOP data set or of YCB-Video, like ``000001/000017``, whose
-    numbers BOP's YCB-V has kept; elsewhere scene 0 and the image's place in the test set.
+    The numbers come from the key (such as ``000001/000017``) in BOP data sets and YCB-Video.
+    Otherwise they are scene 0 and the index of the image in the test set.
     """
     match = _BOP_KEY.fullmatch(sample.key)
     if match is None or sample.source.partition("/")[0] not in _NUMBERED_SOURCES:
@@ -215,12 +219,15 @@ def _median_ms(seconds: Sequence[float]) -> float | None:
 
 @dataclass
 class Measured:
-    """What came out of measuring methods: a report each, and pictures of the first images.
+    """Result of measuring methods on a test set.
 
-    ``poses`` is every pose of each method with its image and the seconds that the whole image took,
-    None where unknown; ``metrics`` is the accumulator of each. ``silent`` are the numbers of the
-    images with instances on which each found nothing, ``bop`` BOP's scores of each where they were
-    asked for and there are targets.
+    Attributes:
+        reports: One report per method.
+        tiles: Pictures of the first images.
+        poses: Poses of each method with their image and the seconds per image, or None if unknown.
+        metrics: Accumulator of each method.
+        silent: Indices of images with instances in which a method detected nothing.
+        bop: BOP scores of each method, if requested and the images have targets.
     """
 
     reports: list[Report]
@@ -238,12 +245,16 @@ def measure(
     *,
     bop: bool = False,
 ) -> Measured:
-    """Run methods, the baseline first where there is one, over the same images at native size.
+    """Run methods over the same images at their native size.
 
-    ``bop`` asks for BOP's scores as well.
+    Pictures show the ground truth in green, predictions of the last method in yellow and those of
+    the other methods in blue (paper Fig. 14).
 
-    Returns a report per method, and pictures with the truth in green, the last method's predictions
-    in yellow and those of the methods before it in blue (paper Fig. 14).
+    Args:
+        methods: Methods by name, the baseline first.
+        samples: Test images.
+        num_pictures: Number of images to draw.
+        bop: Whether to compute BOP scores.
     """
     metrics = accumulators(methods)
     seconds: dict[str, list[float]] = {name: [] for name in methods}
@@ -294,7 +305,7 @@ def measure(
 
 
 def depth_drawer() -> Draw:
-    """Return what draws the depth of parts alone; each part's mesh is prepared once."""
+    """Return a function that draws the depth of a single part; meshes are prepared once."""
     surfaces: dict[str, Surface] = {}
 
     def draw(part: Part, T_cam_obj: Transform, K: CameraMatrix, size: Size) -> DepthMap:
@@ -311,8 +322,8 @@ def depth_drawer() -> Draw:
 
 
 def accumulators(methods: Mapping[str, Method]) -> dict[str, PoseMetrics]:
-    """Return what scores each method's poses on its parts."""
-    # One process measures alone: after a distributed training the others have ended.
+    """Return a metric accumulator for each method."""
+    # Only one process measures: after a distributed training the other processes have ended.
     return {
         name: PoseMetrics(method.parts, name, sync_on_compute=False)
         for name, method in methods.items()

@@ -1,8 +1,8 @@
-"""Pages in Markdown: the README of a run or multirun, the text of a comparison, a release's card.
+"""Write Markdown pages: READMEs of runs and multiruns, comparisons and the cards of releases.
 
-Their texts are jinja2 templates in ``templates/``. A run's README says what was run, what came out,
-what each file is and how to go on; it is written when the run begins and again when it ends,
-however it ends. To explain a further file, add a line to :data:`FILES`.
+The texts are jinja2 templates in ``templates/``. The README of a run states the command, the
+result, the meaning of each file and the next steps. It is written when the run begins and again
+when the run ends. To describe a further file, add it to :data:`FILES`.
 """
 
 from __future__ import annotations
@@ -68,22 +68,13 @@ FILES: Final = {
     "failed.json": "why the job failed",
     "pruned.json": "why the search stopped it",
 }
-"""What a run may leave, in the order of a reader's interest."""
+"""Files that a run may write, ordered by relevance."""
 
-_PICTURES: Final = (
-    "overlay.png",
-    "auc.png",
-    "val_overlay.png",
-    "val_belief.png",
-    "lr_finder.png",
-    "frame_rate.png",
-    "shading.png",
-    "scale.png",
-    "scale_examples.png",
-)
+_PICTURES: Final = [name for name in FILES if name.endswith(".png") and name != "val_auc.png"]
+"""Pictures that a run's README shows."""
 
 MAX_BYTES: Final = 8_000_000
-"""Of a released file: it travels with the package."""
+"""Maximum size of a released file, which is part of the package."""
 
 _CARD_FIELDS: Final = (
     "num_instances",
@@ -106,16 +97,16 @@ def _templates() -> Environment:
 
 
 def write_page(path: Path, template: str, **content: object) -> None:
-    """Write a page from ``templates/TEMPLATE.md.j2`` and its content."""
+    """Render ``templates/TEMPLATE.md.j2`` with the content and write the page."""
     text = _templates().get_template(f"{template}.md.j2").render(content)
     write_whole(path, text.encode())
 
 
 class RunReadme:
-    """The README of one training; nothing is written before :meth:`begin`.
+    """README of a training.
 
-    A run that could not begin leaves what stands in its folder as it is. One whose README cannot
-    be written goes on without.
+    Nothing is written before :meth:`begin`, so a run that cannot begin leaves its folder unchanged.
+    A run continues if its README cannot be written.
     """
 
     def __init__(self, config: RunConfig, run_dir: Path) -> None:
@@ -123,7 +114,7 @@ class RunReadme:
         self._begun = False
 
     def begin(self) -> None:
-        """Say that the run is at work, and which process does it."""
+        """Write that the run is in progress, with its process."""
         self._begun = True
         since = datetime.now().astimezone().isoformat(" ", "seconds")
         self.end(
@@ -133,13 +124,13 @@ class RunReadme:
         )
 
     def end(self, state: str, reason: str = "", report: Report | None = None) -> None:
-        """Say how the run ended: one of this module's words, why in a line, what was measured."""
+        """Write how the run ended: the state, the reason and the result."""
         if not self._begun:
             return
         title = f"{self._config.model.name} on {self._config.data.name}: {state}"
         is_trial = not self._config.keep_checkpoints
         commands = [] if is_trial else self._next_commands(state, report)
-        _write_readme(self._folder, title, report, reason, commands, is_trial)
+        write_run_readme(self._folder, title, report, reason, commands, is_trial)
 
     def _next_commands(self, state: str, report: Report | None) -> list[str]:
         run = shlex.quote(program.shown(self._folder))
@@ -161,19 +152,24 @@ class RunReadme:
         ]
 
 
-def write_job_readme(folder: Path, title: str, report: Report | None = None) -> None:
-    """Write the README of what is no training, when it is done; ``title`` says what it was."""
-    _write_readme(folder, title, report)
-
-
-def _write_readme(
+def write_run_readme(
     folder: Path,
     title: str,
-    report: Report | None,
+    report: Report | None = None,
     reason: str = "",
     next_commands: Sequence[str] = (),
     is_trial: bool = False,
 ) -> None:
+    """Write the README of a training, an evaluation or another job.
+
+    Args:
+        folder: Run folder.
+        title: What was run.
+        report: Result on the test set.
+        reason: Why the run ended or how it stands, as a sentence.
+        next_commands: Commands that a reader may type next.
+        is_trial: Whether the run is a trial of a search, which keeps no checkpoints.
+    """
     present = read_json(folder / VERSIONS_FILE)
     calls = [call.get("command") for call in (*present.get("earlier", []), present)]
     with best_effort(str(folder / README_FILE)):
@@ -193,20 +189,20 @@ def _write_readme(
 
 
 def _result_table(name: str, rows: Sequence[PoseRow]) -> str:
-    """Return the table that the terminal showed, without its title."""
-    measures = shown_columns(rows[0])
-    return markdown(
-        [
-            {name: measure.heading, **{row.method: measure.text(row) for row in rows}}
-            for measure in measures
-        ]
-    )
+    """Return the table of an object as printed in the terminal, without its title."""
+    lines = []
+    for measure in shown_columns(rows[0]):
+        lines.append({name: measure.heading, **{row.method: measure.text(row) for row in rows}})
+    return markdown(lines)
 
 
 def write_multirun_readme(folder: Path, command: Sequence[str], jobs: Mapping[str, str]) -> None:
-    """Write the README of a multirun's folder.
+    """Write the README of a multirun.
 
-    ``jobs`` tells how each job stands, by its folder's name; it is empty while none has ended.
+    Args:
+        folder: Folder of the multirun.
+        command: Words of the command.
+        jobs: State of each job by the name of its folder; empty until the multirun ends.
     """
     rows = [{"job": f"[{job}]({job}/)", "state": state} for job, state in jobs.items()]
     with best_effort(str(folder / README_FILE)):
@@ -221,9 +217,13 @@ def write_multirun_readme(folder: Path, command: Sequence[str], jobs: Mapping[st
 
 
 def release(checkpoint: Path, results: Path, name: str, folder: Path) -> list[Path]:
-    """Write ``NAME.safetensors`` and its card ``NAME.md``; return both.
+    """Write ``NAME.safetensors`` and its card ``NAME.md``; return both paths.
 
-    ``results`` is ``metrics.json`` of a run or an evaluation of the checkpoint.
+    Args:
+        checkpoint: Checkpoint to release.
+        results: ``metrics.json`` of a run or an evaluation of the checkpoint.
+        name: Name of the release.
+        folder: Folder to write to.
 
     Raises:
         UserError: A file is of another kind, or the release is too large.
@@ -243,6 +243,13 @@ def release(checkpoint: Path, results: Path, name: str, folder: Path) -> list[Pa
     write_content(trained.to_file(), target)
     reported = [report] if report.refined is None else [report, report.refined]
     config = trained.data.get("config") or {}
+    columns = [column for column in COLUMNS if column.field in _CARD_FIELDS]
+    rows = [
+        {"object": row.object, "method": row.method}
+        | {column.heading: column.text(row) for column in columns}
+        for by_object in [*(report.rows for report in reported), *report.references.values()]
+        for row in shown_rows(by_object).values()
+    ]
     write_page(
         card,
         "card",
@@ -253,17 +260,6 @@ def release(checkpoint: Path, results: Path, name: str, folder: Path) -> list[Pa
         masks=(config.get("masking") or {}).get("probability", 0),
         refine="" if report.refined is None else " refine=region",
         report=report,
-        table=markdown(
-            [
-                {"object": row.object, "method": row.method}
-                | {
-                    column.heading: column.text(row)
-                    for column in COLUMNS
-                    if column.field in _CARD_FIELDS
-                }
-                for rows in [*(report.rows for report in reported), *report.references.values()]
-                for row in shown_rows(rows).values()
-            ]
-        ),
+        table=markdown(rows),
     )
     return [target, card]

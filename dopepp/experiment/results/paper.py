@@ -1,9 +1,9 @@
-"""The paper's tables: a sweep's runs in the paper's layout, beside what the paper printed.
+"""Write the runs of a sweep as a table in the paper's layout, next to the paper's figures.
 
-A config names its table under ``table`` (see ``conf/experiment/``).
+A config describes its table under ``table`` (see ``conf/experiment/``).
 
-To add a kind of table, write a function of layout, methods and folder that returns rows, and what
-must be said of them, and give it a line in :data:`KINDS`.
+To add a kind of table, write a function from layout, methods and folder to rows and notes, and add
+it to :data:`KINDS`.
 """
 
 from __future__ import annotations
@@ -57,36 +57,36 @@ TEXT_FILE: Final = "table.md"
 TABLE_FILE: Final = "table.csv"
 
 Printed = Mapping[str, Mapping[str, Mapping[str, int | float]]]
-"""Figures by label, object and measure."""
+"""Printed figures by label, object and measure."""
 
 _LABELS: Final = ("method", "object", "measure")
-"""Headings of what is no number."""
+"""Headings of text columns."""
 
 _METHOD, _OBJECT, _MEASURE = _LABELS
 _STRICT: Final = "add_01d"
 _NETWORK: Final = "network"
-"""What stands for the object, where there is none."""
+"""Key in place of an object for figures that belong to the whole network."""
 _PAPER: Final = "the paper"
 
 _PASS_FIELDS: Final = {rate.threshold: rate.field for rate in (ADD_5CM, ADD_10CM)}
 _MEASURED: Final = ("poses", "shading")
-"""Kinds that rest on trained networks."""
+"""Kinds of tables that need trained networks."""
 _UNTRAINED: Final = "dopepp.models.backbones.VGG19"
 
 
 @dataclass(frozen=True)
 class PaperTable:
-    """How a sweep's table is laid out.
+    """Layout of the table of a sweep.
 
     Attributes:
-        title: With the paper's number.
+        title: Title with the paper's table number.
         kind: A key of :data:`KINDS`.
-        threshold: Of the paper's pass rate: 0.05 m for parts, 0.1 m for YCB-Video.
-        labels: Override to what the paper calls it; a run that has several gets all of them.
-        paper: What the paper prints: by label, object and measure, which is a field of ``PoseRow``
-            (``pass`` for the paper's pass rate) or a heading; percent, or as the heading says.
-        recomputed: Other methods, measured with this project's functions; likewise.
-        notes: What must be said below the table.
+        threshold: Threshold of the paper's pass rate: 0.05 m for parts, 0.1 m for YCB-Video.
+        labels: Label in the paper for each override; several labels are joined.
+        paper: Figures that the paper prints, by label, object and measure. A measure is a field of
+            ``PoseRow`` (``pass`` for the paper's pass rate) or a heading. Rates are in percent.
+        recomputed: Figures of other methods, measured with the functions of this project.
+        notes: Notes below the table.
     """
 
     __pydantic_config__ = STRICT
@@ -130,22 +130,22 @@ class PaperTable:
 
     @property
     def pass_field(self) -> str:
-        """Field of a row that holds the paper's pass rate."""
+        """Field of ``PoseRow`` with the paper's pass rate."""
         return _PASS_FIELDS[self.threshold]
 
     def field(self, key: str) -> str:
-        """Return the field of ``PoseRow`` that a config's figure is of."""
+        """Return the field of ``PoseRow`` for a key of a config's figures."""
         return self.pass_field if key == "pass" else key
 
     def printed(self, label: str, measure: str) -> str:
-        """Return what the paper prints of a network."""
+        """Return the text of a figure that the paper prints for a network."""
         return _number(self.paper.get(label, {}).get(_NETWORK, {}).get(measure))
 
     def methods(self, entries: Sequence[Entry]) -> dict[str, Entry]:
-        """Return the methods by what the paper calls them, or by their own name.
+        """Return the methods by their label in the paper.
 
-        The own name serves where the paper's would stand for several. Refined poses are the paper's
-        method and what refined them.
+        Methods whose label is missing or not unique keep their own name. The label of refined poses
+        includes the refinement.
         """
         called = [self._label(entry) or entry.name for entry in entries]
         count = Counter(called)
@@ -161,9 +161,9 @@ class PaperTable:
 
 
 def write_paper_table(table: PaperTable, entries: Sequence[Entry], folder: Path) -> None:
-    """Print and write ``table.md`` and ``table.csv``, and the figure of a kind that has one."""
+    """Print the table and write ``table.md``, ``table.csv`` and the figure of the kind, if any."""
     title = ", ".join([table.title, *(_recipe(entries) if table.kind in _MEASURED else [])])
-    if table.kind not in _MEASURED:  # what a network costs is no matter of its poses
+    if table.kind not in _MEASURED:  # refinement does not affect the cost of a network
         entries = [entry for entry in entries if not entry.refine]
     methods = table.methods(entries)
     rows, doubts = KINDS[table.kind](table, methods, folder)
@@ -175,7 +175,7 @@ def write_paper_table(table: PaperTable, entries: Sequence[Entry], folder: Path)
 
 
 def _recipe(entries: Sequence[Entry]) -> list[str]:
-    """Say with which loss and schedule the networks were trained, ours or the paper's."""
+    """Return a remark on the recipe (loss and schedule) of the networks."""
     words = {str(run.config.get("recipe")) for entry in entries for run in entry.runs}
     recipes = sorted(words & {"ours", "paper"})
     return [f"recipe={' and '.join(recipes)}"] if recipes else []
@@ -197,7 +197,7 @@ def _notes(table: PaperTable, entries: Sequence[Entry]) -> list[str]:
 
 
 def _starts_untrained(config: Mapping[str, Any]) -> bool:
-    """Tell whether a run's network has a VGG19 that nobody has trained before."""
+    """Return whether the VGG19 of a run's network started without pretrained weights."""
     model = config.get("model")
     backbone = model.get("backbone") if isinstance(model, dict) else None
     if not isinstance(backbone, dict) or config.get("init_from") is not None:
@@ -206,14 +206,14 @@ def _starts_untrained(config: Mapping[str, Any]) -> bool:
 
 
 Laid = tuple[list[Row], list[str]]
-"""Rows, and the doubts about them."""
+"""Rows of a table, and notes on their uncertainty."""
 
 
 def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
-    """Return, object by object, a row per method: the paper's measures, then stricter ones.
+    """Return a row per object and method, with the paper's measures and stricter ones.
 
-    The first method with a result is what Δ is against, of refined poses the first refined. The
-    reference rows stand at the end.
+    The baseline of Δ is the first method with a result, or the first refined method for refined
+    poses. The reference rows come last.
     """
     table = compared([replace(entry, name=label) for label, entry in methods.items()])
     texts: dict[tuple[str, str], Row] = {}
@@ -221,14 +221,14 @@ def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
         texts.setdefault((value.method, value.object), {})[value.measure] = value.summary
     measured = [entry for entry in methods.values() if entry.reports]
     objects = list(dict.fromkeys(name for entry in measured for name in entry.objects))
-    if not objects:  # nothing was measured: the paper's figures and why there are no others
+    if not objects:  # without measurements, show the paper's figures and the reasons
         objects = list(dict.fromkeys(name for row in layout.paper.values() for name in row))
     rows = []
     for name in objects:
         for label in dict.fromkeys([*methods, *layout.recomputed, *layout.paper]):
             in_paper = layout.paper.get(label, {})
             recomputed = layout.recomputed.get(label, {})
-            # The paper's mean is over its own objects.
+            # The paper's mean only applies to the same set of objects.
             is_other_mean = name == MEAN and set(in_paper) != set(objects)
             printed = {} if is_other_mean else in_paper.get(name, {})
             entry = methods.get(label)
@@ -253,7 +253,7 @@ def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
 def _pose_row(
     layout: PaperTable, method: str, name: str, texts: Row, printed: Mapping[str, float]
 ) -> Row:
-    """Return a row: the text of every measure, what the paper prints of it, and Δ."""
+    """Return a row with the text, the paper's figure and the Δ of every measure."""
     row = {_METHOD: method, _OBJECT: name}
     for key in ("pass", "auc_10cm", _STRICT, "median_rotation_deg"):
         measure = layout.field(key)
@@ -271,11 +271,11 @@ def _number(value: float | None) -> str:
 
 
 def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
-    """Return pass rates at every share, the paper's and Δ beside them; draw them for all methods.
+    """Return pass rates at every share with the paper's figures and Δ, and draw their curves.
 
-    Rates are means over seeds. Δ is to the first method at the same share, of refined poses to the
-    first refined, whose own Δ is to the first of all; its interval is Student's t of the
-    differences of equal seeds.
+    Rates are means over seeds. Δ refers to the first method at the same share, or to the first
+    refined method for refined poses. The interval of Δ is Student's t interval of the differences
+    between equal seeds.
     """
     measures = layout.pass_field, _STRICT
     tables = {label: _shading(label, entry, measures) for label, entry in methods.items()}
@@ -312,8 +312,8 @@ def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path)
 def _shading(label: str, entry: Entry, measures: Sequence[str]) -> pd.DataFrame:
     """Return the rates of a method's runs by object, measure, share and seed.
 
-    A run's file may hold other methods, and its own twice, as the network's and refined. Of one
-    network a part, there is the mean as well.
+    The file of a run may contain other methods, and the same method with and without refinement.
+    The mean over objects is added if each network was trained on one part.
     """
     columns = ["object", "share", "num_instances", *measures]
     tables = [pd.DataFrame(columns=["seed", *columns])]
@@ -332,14 +332,14 @@ def _shading(label: str, entry: Entry, measures: Sequence[str]) -> pd.DataFrame:
     if len(objects) > 1 and MEAN not in objects:
         groups = rates.groupby(keys[1:], sort=False)
         mean = groups.agg(rate=("rate", "mean"), num_instances=("num_instances", "sum"))
-        # The mean is over what all parts have.
+        # The mean is restricted to shares and seeds that all parts have.
         whole = mean[groups.size() == len(objects)].reset_index()
         rates = pd.concat([rates, whole.assign(object=MEAN)])
     return rates.assign(method=label)
 
 
 def _pooled(rates: pd.DataFrame) -> Iterator[Value]:
-    """Return the mean of the rates of all seeds, as one over all their instances."""
+    """Yield the mean rate over seeds, with the interval over the instances of all seeds."""
     for (method, share), seeds in rates.groupby(["method", "share"], sort=False):
         rate = float(seeds["rate"].mean())
         low, high = interval(rate, int(seeds["num_instances"].sum()))
@@ -347,7 +347,7 @@ def _pooled(rates: pd.DataFrame) -> Iterator[Value]:
 
 
 def _by_share(points: pd.DataFrame, text: Callable[[pd.Series[float]], str]) -> Row:
-    """Return a text of the numbers of all seeds at every share."""
+    """Return a text for the numbers of all seeds at every share."""
     return {SHADING.heading(share): text(column.dropna()) for share, column in points.items()}
 
 
@@ -356,7 +356,7 @@ def _mean(rates: pd.Series[float]) -> str:
 
 
 def _change(points: pd.Series[float]) -> str:
-    """Return the mean difference to the baseline and, of several seeds, its 95 % interval."""
+    """Return the mean difference to the baseline and its 95 % interval over several seeds."""
     count, mean = len(points), points.mean()
     if count < 2:
         return f"{mean:+.1f}" if count else ""
@@ -365,7 +365,7 @@ def _change(points: pd.Series[float]) -> str:
 
 
 def parameter_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
-    """Return what was counted."""
+    """Return a row per network with its parameters and operations."""
 
     def row(label: str, cost: Mapping[str, Any]) -> Row:
         return {
@@ -379,7 +379,7 @@ def parameter_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Pat
 
 
 def time_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
-    """Return what was timed, then the paper's other methods; draw the frame rates (Fig. 13)."""
+    """Return a row per network with its times, then the paper's other methods; draw frame rates."""
     printed = f"{_PAPER}: ms/frame"
 
     def row(label: str, cost: Mapping[str, Any]) -> Row:
@@ -405,7 +405,7 @@ def time_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
 def _cost_rows(
     methods: Mapping[str, Entry], row: Callable[[str, Mapping[str, Any]], Row]
 ) -> list[Row]:
-    """Return a row per network, then those of which nobody knows the cost."""
+    """Return a row per network, then the networks without a measured cost."""
     paths = {label: entry.runs[0].folder / COST_FILE for label, entry in methods.items()}
     costs = {label: read_json(path) for label, path in paths.items() if path.is_file()}
     rows = [{_METHOD: label, **row(label, cost)} for label, cost in costs.items()]

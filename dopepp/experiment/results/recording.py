@@ -1,4 +1,4 @@
-"""Everything that a measurement leaves in its folder: tables, curves, pictures and poses."""
+"""Measure methods and write tables, curves, pictures and poses into the run folder."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dopepp.drawing.sheet import contact_sheet
 from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.assembly.renders import scaled_test_renders
 from dopepp.experiment.config.data_config import DataConfig
-from dopepp.experiment.config.protocols import Protocols
+from dopepp.experiment.config.run_config import Protocols
 from dopepp.experiment.results import conditions, display
 from dopepp.experiment.results.breakdown import record_breakdown
 from dopepp.experiment.results.compare import compare_reports
@@ -53,14 +53,23 @@ def measure_and_record(
     protocols: Protocols | None = None,
     refine: Refine | None = None,
 ) -> list[Report]:
-    """Measure methods on a test set; show and write tables, curves and pictures.
+    """Measure methods on a test set; print and write tables, curves and pictures.
 
-    Estimators go by name, the baseline first where there is one, and so do ``results``, BOP
-    challenge CSVs of other methods. The parts are those that are scored, as the test data have
-    them; ``details`` are further plain facts for ``metrics.json``. ``bop_csv`` writes the poses of
-    each method, ``all_measures`` prints the symmetric measures of every object. With ``refine``,
-    every estimator is measured without and with it; ``metrics.json`` is the last estimator's, with
-    its refined poses' under ``refined``, and a file's where there is no estimator.
+    ``metrics.json`` describes the last estimator, with its refined poses under ``refined``, or the
+    file of poses if there is no estimator.
+
+    Args:
+        estimators: Estimators by name, the baseline first.
+        parts: Objects to score, as defined by the test data.
+        data: Test data.
+        run_dir: Run folder.
+        num_pictures: Number of test images to draw.
+        details: Further plain values for ``metrics.json``.
+        results: BOP challenge CSVs of other methods, by name.
+        bop_csv: Whether to write the poses of each method.
+        all_measures: Whether to print symmetric measures of objects without symmetries.
+        protocols: Further protocols to measure.
+        refine: Refinement with which every estimator is measured in addition.
 
     Returns:
         A report per estimator, then per file.
@@ -75,11 +84,11 @@ def measure_and_record(
     methods: dict[str, Method] = {
         **{
             name: EstimatorMethod(estimator, parts)
-            for name, estimator in with_refined(estimators, refine, parts).items()
+            for name, estimator in with_refining(estimators, refine, parts).items()
         },
         **files,
     }
-    # What cannot be measured in the end is refused before anything is.
+    # Impossible protocols are rejected before anything is measured.
     if protocols.shading:
         conditions.SHADING.check_methods(methods)
         conditions.check_masks(source)
@@ -96,7 +105,7 @@ def measure_and_record(
         if report.name in measured.bop:
             display.console.print(f"{report.name}: {measured.bop[report.name].in_words()}")
     _show_silence(methods, measured.silent, source)
-    # What is compared later is the network's own result, unrefined; a file's where no network is.
+    # Later comparisons use the unrefined result of the network, or the file if there is none.
     reports = of_networks(measured.reports, len(files))
     refines = refine is not None and bool(estimators)
     main = reports[-2 if refines else -1]
@@ -127,14 +136,14 @@ def measure_and_record(
 
 
 def of_networks(reports: list[Report], num_files: int) -> list[Report]:
-    """Return the estimators' reports of a measurement; the files' where there is no estimator."""
+    """Return the reports of the estimators, or of the files if there is no estimator."""
     return reports[: len(reports) - num_files] or reports
 
 
-def with_refined(
+def with_refining(
     estimators: Mapping[str, PoseEstimator], refine: Refine | None, parts: Parts
 ) -> dict[str, PoseEstimator]:
-    """Return every estimator, and behind it the same one refining: two rows in every table."""
+    """Return every estimator, each followed by a refining copy if ``refine`` is set."""
     pairs: dict[str, PoseEstimator] = {}
     for name, estimator in estimators.items():
         pairs[name] = estimator
@@ -145,9 +154,9 @@ def with_refined(
 
 
 def refining(estimator: PoseEstimator, refine: Refine | None, parts: Parts) -> PoseEstimator:
-    """Return an estimator that refines, or for None the same one.
+    """Return a copy of an estimator that refines its poses; None returns the same estimator.
 
-    A checkpoint of an earlier version, which has no meshes, takes those of ``parts``.
+    Parts of the checkpoint without a mesh use the mesh of ``parts``.
     """
     if refine is None:
         return estimator
@@ -159,14 +168,14 @@ def refining(estimator: PoseEstimator, refine: Refine | None, parts: Parts) -> P
 
 
 def made_worse(network: Report, refined: Report) -> float:
-    """Return the share of instances whose ADD refinement has made larger by more than 1 mm."""
+    """Return the share of instances whose ADD grew by more than 1 mm through refinement."""
     pairs = [(network.errors[name], errors) for name, errors in refined.errors.items()]
     worse = np.concatenate([after > before + 0.001 for before, after in pairs])
     return float(worse.mean()) if len(worse) else 0.0
 
 
 def _draw(run_dir: Path, measured: Measured, num_images: int) -> None:
-    """Draw the accuracy curves of every method and object, and the first images' poses."""
+    """Draw the accuracy curves of every method and object, and the poses of the first images."""
     reports = measured.reports
     curves = {
         f"{report.name} {name}" if len(reports) > 1 else name: errors
@@ -181,7 +190,7 @@ def _draw(run_dir: Path, measured: Measured, num_images: int) -> None:
 def _show_silence(
     methods: Mapping[str, Method], silent: Mapping[str, Sequence[int]], source: SampleSource
 ) -> None:
-    """Print of every estimator on how many images it found nothing, and why."""
+    """Print the number of images without detections of each estimator, with the reasons."""
     for name, numbers in silent.items():
         method = methods[name]
         if numbers and isinstance(method, EstimatorMethod):
@@ -196,7 +205,7 @@ def _write_results(
     data: DataConfig,
     numbers: Mapping[str, int],
 ) -> None:
-    """Write every method's poses as a BOP challenge CSV."""
+    """Write the poses of every method as BOP challenge CSVs."""
     dataset, split = data.name, "test"
     if data.root is not None and not data.is_rendered("test"):
         dataset, split = data.root.resolve().name, data.image_set("test")

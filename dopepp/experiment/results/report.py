@@ -1,6 +1,7 @@
-"""One method's result on one test set, as ``metrics.json`` holds it.
+"""The result of one method on one test set, as stored in ``metrics.json``.
 
-Results on other images cannot be compared, so a report holds a fingerprint of its test images.
+A report holds a fingerprint of its test images, because results on different images cannot be
+compared.
 """
 
 from __future__ import annotations
@@ -22,21 +23,23 @@ from dopepp.metrics.row import PoseRow, mean_row
 from dopepp.parts.part import Parts
 
 _DECIMALS: Final = 6
-"""Of pixels and metres: machines differ in the last digits of what they compute."""
+"""Decimals of pixels and metres in a fingerprint; further digits differ between machines."""
 
 FULL_SIZE_COST: Final = "full_size_cost"
-"""Key of the details that holds what a narrowed network costs at full width and size."""
+"""Key of ``details``: cost of a narrowed network at full width and input size."""
 
 Errors = dict[str, Float[np.ndarray, "instances"]]
-"""An error of every instance, by object; infinite where it was missed."""
+"""Error of every instance by object; infinite for missed instances."""
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What a method costs; None where nobody knows.
+    """Cost of a method; None where unknown.
 
-    That is trained numbers, multiply-accumulates of one image of the input size (10⁹), and the
-    median time from image to poses, of an estimator in this run.
+    Attributes:
+        parameters: Number of trained parameters.
+        gmacs: Multiply-accumulates for one image of the input size, 10⁹.
+        ms_per_frame: Median time from image to poses, milliseconds.
     """
 
     parameters: int | None = None
@@ -46,20 +49,20 @@ class Cost:
 
 @dataclass
 class Report:
-    """One method's result on one test set.
+    """Result of one method on one test set.
 
     Attributes:
         name: Name of the method.
-        rows: Rows of every object, then their mean.
-        references: The same of each reference.
+        rows: Rows of all objects, followed by their mean.
+        references: Rows of each reference method.
         errors: ADD of every instance by object, metres.
         cost: Cost of the method.
-        num_images: Images of the test set.
-        details: Further plain facts.
-        rotation_deg: Rotation error of every instance by object.
+        num_images: Number of test images.
+        details: Further plain values for ``metrics.json``.
+        rotation_deg: Rotation error of every instance by object, degrees.
         diameters: Diameters of the objects, metres.
-        test_set: Fingerprint of the test set; empty where it is not known.
-        refined: Result of the same poses refined; None where they were not.
+        test_set: Fingerprint of the test set; empty if unknown.
+        refined: Result of the refined poses, or None.
     """
 
     name: str
@@ -76,19 +79,19 @@ class Report:
 
     @property
     def mean(self) -> PoseRow:
-        """The mean over objects."""
+        """Mean over objects."""
         return self.rows[MEAN]
 
     @property
     def tables(self) -> dict[str, list[PoseRow]]:
-        """Of every object, and the mean of several, the row and the reference rows beside it."""
+        """Row and reference rows of every object, and of the mean if there are several."""
         return {
             name: [row, *(rows[name] for rows in self.references.values())]
             for name, row in shown_rows(self.rows).items()
         }
 
     def to_record(self) -> dict[str, Any]:
-        """Return what ``metrics.json`` holds."""
+        """Return the content of ``metrics.json``."""
         return {
             "name": self.name,
             "num_images": self.num_images,
@@ -108,7 +111,7 @@ class Report:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Report:
-        """Read ``metrics.json`` back."""
+        """Restore a report from the content of ``metrics.json``."""
         refined = record.get("refined")
         report = cls(
             name=record["name"],
@@ -128,7 +131,7 @@ class Report:
 
     @classmethod
     def joined(cls, reports: Sequence[Report]) -> Report:
-        """Return the results of networks that differ in nothing but their parts as one method's."""
+        """Join the results of networks that differ only in their parts into one report."""
         reports = sorted(reports, key=lambda report: list(report.rows))
         first = reports[0]
         times = [time for report in reports if (time := report.cost.ms_per_frame) is not None]
@@ -155,13 +158,13 @@ def _rows(record: Mapping[str, Mapping[str, Any]]) -> dict[str, PoseRow]:
 
 
 def _joined_rows(groups: Sequence[Mapping[str, PoseRow]]) -> dict[str, PoseRow]:
-    """Put the rows of several tables into one and average them anew."""
+    """Join the rows of several tables and recompute the mean."""
     rows = {name: row for group in groups for name, row in group.items() if name != MEAN}
     return {**rows, MEAN: mean_row(list(rows.values()), groups[0][MEAN].method)}
 
 
 def _listed(errors: Errors) -> dict[str, list[float | None]]:
-    """Return errors as JSON has them, null where missed."""
+    """Convert errors to JSON values; missed instances become null."""
     return {
         name: [float(error) if np.isfinite(error) else None for error in values]
         for name, values in errors.items()
@@ -177,10 +180,10 @@ def _unlisted(record: Mapping[str, Sequence[float | None]]) -> Errors:
 
 
 class Fingerprint:
-    """A hash over a test set: its objects, and every image's name, camera and truth, in order.
+    """Hash over the objects of a test set and the name, camera and ground truth of every image.
 
-    The pixels are not in it, because they may differ in a bit from machine to machine; the name of
-    the source tells renderers apart, and the covered share shaded images.
+    Pixels are excluded because they may differ slightly between machines. The name of the source
+    distinguishes renderers; the covered share distinguishes shaded images.
     """
 
     def __init__(self, parts: Parts) -> None:
@@ -188,7 +191,7 @@ class Fingerprint:
         self._add(sorted((part.name, part.mesh_hash) for part in parts))
 
     def add(self, sample: Sample) -> None:
-        """Take the next image."""
+        """Add the next image."""
         truths = []
         for instance in sample.instances:
             counts = bool(instance.visible_fraction >= MIN_VISIBLE_FRACTION)
@@ -197,7 +200,7 @@ class Fingerprint:
         self._add([sample.source, sample.key, sample.size, _rounded(sample.K), truths])
 
     def word(self) -> str:
-        """Return the hash of what was taken so far."""
+        """Return the hash of all images added so far."""
         return self._hash.hexdigest()
 
     def _add(self, facts: object) -> None:
@@ -205,5 +208,5 @@ class Fingerprint:
 
 
 def _rounded(values: Float[np.ndarray, "rows columns"]) -> list[float]:
-    """Return rounded numbers, of which none is a negative zero."""
+    """Round numbers and replace negative zeros by zero."""
     return [float(value) + 0.0 for value in np.round(values, _DECIMALS).ravel()]

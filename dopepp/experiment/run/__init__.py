@@ -1,1 +1,1 @@
-"""The folder of a run: what it records, how it goes on, what is told of it."""
+"""Jobs of a run: training, evaluation, tuning, export, resuming and tracking."""

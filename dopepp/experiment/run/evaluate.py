@@ -1,4 +1,4 @@
-"""What ``evaluate.py`` does: measure checkpoints and files of poses, or tune a checkpoint."""
+"""Run ``evaluate.py``: measure checkpoints and files of poses, or tune a checkpoint."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dopepp.experiment.config.data_config import DataConfig, chosen_data, traine
 from dopepp.experiment.config.run_config import EvaluationConfig, FalsePositiveTarget
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import write_config, write_environment, write_json
-from dopepp.experiment.results.pages import write_job_readme
+from dopepp.experiment.results.pages import write_run_readme
 from dopepp.experiment.results.recording import measure_and_record, of_networks, refining
 from dopepp.experiment.results.report import Report
 from dopepp.experiment.run.resume import warn_of_other_images
@@ -38,7 +38,7 @@ def tune_and_record(
     run_dir: Path,
     target: FalsePositiveTarget,
 ) -> Path:
-    """Tune a checkpoint (:func:`tune`), write it beside the old one, tell; return its path."""
+    """Tune a checkpoint, write it next to the original and print the changes; return its path."""
     tuning = tune(estimator, data, parts, target)
     tuned = write_tuned(estimator.checkpoint, path, tuning.options)
     write_json(run_dir / "tuning.json", asdict(tuning))
@@ -47,7 +47,7 @@ def tune_and_record(
 
 
 def _show(tuning: Tuning, path: Path) -> None:
-    """Print what tuning changed, measured on test images, and where the checkpoint is."""
+    """Print the effect of tuning on test images, the options and the path of the checkpoint."""
     shown, empty = tuning.num_images
     title = f"tuned; measured on {shown} test images and {empty} without objects"
     table = Table("", "before", "after", title=title)
@@ -61,7 +61,7 @@ def _show(tuning: Tuning, path: Path) -> None:
 
 
 def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part]:
-    """Return the last estimator's parts as the test data have them; without one, all of these."""
+    """Return the last estimator's parts as the test data define them, or all without estimators."""
     if not estimators:
         return build_parts(data)
     names = [part.name for part in estimators[-1].parts]
@@ -79,7 +79,7 @@ def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part
 
 
 def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
-    """Parse ``evaluate.py``'s config; measure a checkpoint, another method's poses, or both."""
+    """Parse the config of ``evaluate.py``; measure a checkpoint, a file of poses, or both."""
     program.quiet_lightning()
     asked = EvaluationConfig.of(config)
     extensions.enable(asked.extensions)
@@ -100,9 +100,8 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     stored = None if checkpoint is None else trained_on(checkpoint.data)
     data = chosen_data(asked.data, asked.virtual, stored, measured)
     write_config(run_dir, asked.plain)
-    write_environment(
-        run_dir, data.eval_seed, "" if checkpoint is None else checkpoint.data_fingerprint
-    )
+    fingerprint = "" if checkpoint is None else checkpoint.data_fingerprint
+    write_environment(run_dir, data.eval_seed, fingerprint)
     parts = parts_of(loaded, data)
     share = share_in_words(data)
     if share is not None:
@@ -114,7 +113,7 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
         return []
     file = None if asked.results is None else Path(asked.results)
     others = []
-    if file is not None:  # BOP's file names begin with the method's
+    if file is not None:  # BOP file names begin with the name of the method
         others = [file.stem.partition("_")[0] if asked.method is None else str(asked.method)]
     names = _names(loaded, others)
     files = {} if file is None else {names[-1]: file}
@@ -130,7 +129,7 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
         protocols=asked.protocols,
         refine=asked.refine,
     )
-    write_job_readme(run_dir, f"Evaluation of {measured}", of_networks(reports, len(files))[-1])
+    write_run_readme(run_dir, f"Evaluation of {measured}", of_networks(reports, len(files))[-1])
     return reports
 
 
@@ -141,7 +140,7 @@ def _tune_only(
     data: DataConfig,
     run_dir: Path,
 ) -> None:
-    """Tune the one checkpoint and measure nothing else."""
+    """Tune the checkpoint without measuring it further."""
     if asked.protocols:
         raise UserError(
             "tune=true with shading, scale or by", "one of the two", "tune first, then measure"
@@ -158,10 +157,9 @@ def _tune_only(
 
 
 def _names(loaded: Sequence[PoseEstimator], others: Sequence[str]) -> list[str]:
-    """Return the methods' names; of two with one name, the first is called the baseline."""
-    names = [str(estimator.checkpoint.data.get("name", "estimate")) for estimator in loaded] + list(
-        others
-    )
+    """Return unique names of the methods; duplicates are marked as baseline or checkpoint."""
+    checkpoints = [estimator.checkpoint for estimator in loaded]
+    names = [*(str(checkpoint.data.get("name", "estimate")) for checkpoint in checkpoints), *others]
     for number, name in enumerate(names[:-1]):
         if name in names[number + 1 :]:
             names[number] += " (baseline)" if number == 0 else " (checkpoint)"

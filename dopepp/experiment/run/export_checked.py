@@ -1,10 +1,10 @@
-"""Exporting a checkpoint: made, quantised on renders, measured, checked, and only then written."""
+"""Export a checkpoint to a runtime, and check the export before writing it."""
 
 from __future__ import annotations
 
 import logging
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,15 +30,15 @@ from dopepp.models.network import network_cost
 _log = logging.getLogger(__name__)
 
 NUM_CHECKED: Final = 20
-"""Rendered pictures on which the export is compared with PyTorch."""
+"""Number of rendered pictures on which the export is compared with PyTorch."""
 
 NUM_IMAGES: Final = 100
-"""Of each, scenes to calibrate on and others to measure on."""
+"""Number of scenes to calibrate on, and of further scenes to measure on."""
 
 
 @dataclass(frozen=True)
 class Exported:
-    """A file that was written, how near it is to the checkpoint, and what to type next."""
+    """Path of an export, its description, its agreement with the checkpoint and next commands."""
 
     path: Path
     export: Export
@@ -53,18 +53,19 @@ def export(
     out: Path | None = None,
     num_images: int = NUM_IMAGES,
 ) -> Exported:
-    """Write a checkpoint's network as one file (OpenVINO: a folder) and return what it is.
+    """Write the network of a checkpoint as one file (OpenVINO: a folder).
 
     Args:
         path: The checkpoint.
         layout: One of :data:`~dopepp.inference.export.EXPORTERS`.
         precision: One of :data:`~dopepp.inference.export.PRECISIONS`.
-        out: The file (default: beside the checkpoint; of a released one, in this folder).
+        out: Path of the export (default: next to the checkpoint, or the working directory for a
+            released checkpoint).
         num_images: Rendered scenes to calibrate int8 on, and as many to measure ADD-0.1d on.
 
     Raises:
-        UserError: The checkpoint, an option or the place is wrong, or an extra is missing.
-        RunError: The export does not answer what the checkpoint does; nothing was written.
+        UserError: The checkpoint, an option or the path is wrong, or an extra is missing.
+        RunError: The export disagrees with the checkpoint; nothing was written.
     """
     target = _target(path, layout, precision, out)
     if runtimes.is_export(path):
@@ -90,7 +91,8 @@ def export(
                 add_01d=_accuracy(original, PoseEstimator.load(draft_path), source, num_images),
             )
             save(draft_path, checkpoint, described)
-        agreement = _compared(PoseEstimator.load(draft_path), original, source)
+        pictures = [(sample.image, sample.K) for sample in map(source.sample, range(NUM_CHECKED))]
+        agreement = compare_export(PoseEstimator.load(draft_path), original, pictures)
         if not (agreement.is_exact if precision == "fp32" else np.isfinite(agreement.maps)):
             raise RunError(f"{target} was not written: it differs from {path}: {agreement}")
     return Exported(target, described, agreement, _commands(target, checkpoint))
@@ -98,7 +100,7 @@ def export(
 
 @contextmanager
 def _written(target: Path) -> Iterator[Path]:
-    """Yield a path beside the target that becomes the target; a :class:`RunError` if it cannot."""
+    """Yield a temporary path that is moved to the target; a failure becomes a run error."""
     try:
         with draft(target) as draft_path:
             yield draft_path
@@ -108,10 +110,8 @@ def _written(target: Path) -> Iterator[Path]:
 
 def _target(path: Path, layout: str, precision: str, out: Path | None) -> Path:
     """Return the path of the export, or raise a user error if an option or the path is wrong."""
-    for name, value, allowed in (
-        ("format", layout, EXPORTERS),
-        ("precision", precision, PRECISIONS),
-    ):
+    choices = {"format": (layout, EXPORTERS), "precision": (precision, PRECISIONS)}
+    for name, (value, allowed) in choices.items():
         if value not in allowed:
             raise UserError(f"--{name} {value}", ", ".join(allowed), "choose one of them")
     ending = EXPORTERS[layout][1]
@@ -123,11 +123,7 @@ def _target(path: Path, layout: str, precision: str, out: Path | None) -> Path:
     if (is_file and out.suffix != ending) or (not is_file and out.suffix in (".xml", ".onnx")):
         what = f"a file NAME{ending}" if is_file else "a folder"
         raise UserError(f"--out {out} for --format {layout}", what, "name it so")
-    others = (
-        [path for path in out.iterdir() if path.suffix not in (".xml", ".bin")]
-        if out.is_dir()
-        else []
-    )
+    others = [path for path in out.glob("*") if path.suffix not in (".xml", ".bin")]
     if (is_file and out.is_dir()) or (not is_file and out.is_file()) or others:
         problem = f"--out {out}, where there is something else"
         raise UserError(problem, "a new place, or one of an earlier export", "choose another place")
@@ -137,7 +133,7 @@ def _target(path: Path, layout: str, precision: str, out: Path | None) -> Path:
 
 
 def _seen(estimator: PoseEstimator, sample: Sample) -> list[Pixels]:
-    """Return a picture in the sizes in which the network sees it."""
+    """Return a picture at the input sizes of the network."""
     views = estimator.views(sample.image, sample.K)
     return [np.ascontiguousarray(view.pixels.transpose(2, 0, 1)[None]) for view in views]
 
@@ -145,7 +141,7 @@ def _seen(estimator: PoseEstimator, sample: Sample) -> list[Pixels]:
 def _accuracy(
     original: PoseEstimator, exported: PoseEstimator, source: SampleSource, count: int
 ) -> dict[str, float]:
-    """Measure ADD-0.1d of both on the same scenes."""
+    """Measure ADD-0.1d of the checkpoint and its export on the same scenes."""
     _log.info("measuring both on %d other validation scenes", count)
     estimators = {"fp32": original, "int8": exported}
     methods = {
@@ -155,17 +151,10 @@ def _accuracy(
     return {report.name: report.mean.add_01d or 0.0 for report in measured.reports}
 
 
-def _compared(
-    exported: PoseEstimator, original: PoseEstimator, source: SampleSource
-) -> ExportAgreement:
-    samples: Sequence[Sample] = [source.sample(index) for index in range(NUM_CHECKED)]
-    return compare_export(exported, original, [(sample.image, sample.K) for sample in samples])
-
-
 def _commands(path: Path, checkpoint: Checkpoint) -> tuple[str, str]:
-    """Return the lines that predict with an export and that measure it.
+    """Return the commands that predict with an export and evaluate it.
 
-    The export names no folder of this machine, so the second one does where the data need it.
+    An export contains no folders of this machine, so the second command states them if needed.
     """
     config = trained_on(checkpoint.data) or {}
     words = [f"ckpt_path={path}"]

@@ -1,9 +1,9 @@
-"""``job=lr_finder``: which learning rate to begin with; nothing is kept of what is trained.
+"""Suggest a learning rate (``job=lr_finder``); the trained weights are discarded.
 
-Lightning's tuner makes the sweep: a short training whose rate grows from step to step (Smith,
-"Cyclical Learning Rates for Training Neural Networks", WACV 2017, section 3.3). The suggestion is
-read off here. Lightning's own takes the steepest slope over the rate instead of over its logarithm,
-so it is always near the sweep's beginning, and its running mean lags by up to fifty steps.
+Lightning's tuner runs the sweep: a short training whose rate grows from step to step (Smith,
+"Cyclical Learning Rates for Training Neural Networks", WACV 2017, section 3.3). This module derives
+the suggestion. Lightning's own suggestion uses the slope over the rate instead of its logarithm, so
+it is always near the beginning of the sweep, and its running mean lags behind.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from dopepp.experiment.assembly.build_system import build_system, build_trainer
 from dopepp.experiment.config.run_config import LearningRateConfig, RunConfig
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import write_config, write_environment
-from dopepp.experiment.results.pages import write_job_readme
+from dopepp.experiment.results.pages import write_run_readme
 from dopepp.training.system import PoseSystem
 
 TABLE_FILE: Final = "lr_finder.csv"
@@ -37,16 +37,15 @@ PICTURE_FILE: Final = "lr_finder.png"
 
 _MIN_STEPS: Final = 10
 _MOST: Final = 10**6
-"""Epochs, since the steps end the sweep."""
+"""Maximum number of epochs; the number of steps ends the sweep."""
 
 _SMOOTHING: Final = 0.05
-"""Standard deviation of the smoothing, as a share of the sweep: noise of single batches goes, the
-valley stays."""
+"""Standard deviation of the smoothing as a share of the sweep; it removes the noise of batches."""
 _SKIPPED: Final = 0.1
-"""Share of the sweep at its beginning in which nothing is looked for: the optimiser's averages and
-batch norm's statistics are still settling."""
+"""Ignored share at the beginning of the sweep, in which the optimiser's averages and the statistics
+of batch norm settle."""
 _MIN_FALL: Final = 0.05
-"""A loss that falls by less than this share in the whole sweep says nothing."""
+"""Minimum relative fall of the loss for a suggestion."""
 
 
 Steps = Float[np.ndarray, "steps"]
@@ -54,9 +53,11 @@ Steps = Float[np.ndarray, "steps"]
 
 @dataclass(frozen=True)
 class Suggestion:
-    """What a sweep says: the rate at which the loss falls fastest, which is the one to begin with.
+    """Suggested learning rate.
 
-    At ``lowest`` the loss is lowest; it diverges somewhere above.
+    Attributes:
+        steepest: Rate at which the loss falls fastest, which is the suggestion.
+        lowest: Rate with the lowest loss; the loss diverges above it.
     """
 
     steepest: float
@@ -64,10 +65,13 @@ class Suggestion:
 
 
 def find_learning_rate(config: RunConfig, run_dir: Path) -> Suggestion | None:
-    """Train with a rate that grows from step to step; print, write and return what it suggests.
+    """Train with a growing learning rate; print, write and return the suggestion.
 
-    The chosen optimiser with its other settings; no schedule, no validation, no checkpoint. A
-    :class:`UserError`: a choice is wrong; a ``RunError``: the loss is not finite from the start.
+    The sweep uses the chosen optimiser without schedule, validation and checkpoints.
+
+    Raises:
+        UserError: An option is wrong.
+        RunError: The loss diverges within the first steps.
     """
     if config.resume is not None:
         raise UserError(
@@ -90,12 +94,12 @@ def find_learning_rate(config: RunConfig, run_dir: Path) -> Suggestion | None:
             f"{config.lr_finder.min_lr:g}; set a smaller lr_finder.min_lr"
         )
     suggestion = _report(rates, losses, run_dir)
-    write_job_readme(run_dir, f"Learning rate of {config.model.name}")
+    write_run_readme(run_dir, f"Learning rate of {config.model.name}")
     return suggestion
 
 
 def _short_training(config: RunConfig) -> RunConfig:
-    """Return the config without all that the sweep does not need, validations among it."""
+    """Return the config of a training without schedule, validation and callbacks."""
     trainer = replace(
         config.trainer,
         max_steps=-1,
@@ -116,11 +120,11 @@ def _short_training(config: RunConfig) -> RunConfig:
 def _sweep(
     trainer: Trainer, system: PoseSystem, datamodule: PoseDataModule, options: LearningRateConfig
 ) -> tuple[Steps, Steps]:
-    """Return rate and loss of every step up to where the loss diverges or is not finite."""
+    """Return rate and loss of every step until the loss diverges."""
     passes: list[float] = []
 
     def note(module: object, inputs: object, output: tuple[Tensor, object]) -> None:
-        # Lightning keeps its running mean alone, and would go on with losses that are not finite.
+        # Lightning stores only a running mean and would continue with infinite losses.
         passes.append(float(output[0].detach()))
         if not math.isfinite(passes[-1]):
             trainer.should_stop = True
@@ -143,7 +147,7 @@ def _sweep(
 
 
 def suggest(rates: Steps, losses: Steps) -> Suggestion | None:
-    """Read a rate off a sweep: rates ascend, losses are finite; None if the loss did not fall."""
+    """Suggest a rate from ascending rates and finite losses; None if the loss did not fall."""
     first = int(_SKIPPED * len(rates))
     smoothed = smooth(losses)[first:]
     if len(smoothed) < 3:
@@ -158,7 +162,7 @@ def suggest(rates: Steps, losses: Steps) -> Suggestion | None:
 
 
 def smooth(values: Steps) -> Steps:
-    """Return a Gaussian mean over neighbours, of what there is near the ends."""
+    """Return a Gaussian moving average, normalised at the ends."""
     position = np.arange(len(values))
     width = max(1.0, _SMOOTHING * len(values))
     weight = np.exp(-0.5 * ((position[:, None] - position) / width) ** 2)
@@ -166,7 +170,7 @@ def smooth(values: Steps) -> Steps:
 
 
 def _report(rates: Steps, losses: Steps, run_dir: Path) -> Suggestion | None:
-    """Write table and picture, and print the line that a person came for."""
+    """Write the table and the picture, print the suggestion and return it."""
     smoothed = smooth(losses)
     rows = [
         {"step": step, "learning_rate": rate, "loss": loss, "smoothed_loss": mean}
@@ -180,12 +184,9 @@ def _report(rates: Steps, losses: Steps, run_dir: Path) -> Suggestion | None:
     axes.set_xscale("log")
     axes.set_ylim(min(losses.min(), 0.95 * smoothed.min()), 1.1 * smoothed.max())
     if suggestion is not None:
-        axes.axvline(
-            suggestion.steepest, color="C3", label=f"falls fastest: {suggestion.steepest:.2g}"
-        )
-        axes.axvline(
-            suggestion.lowest, color="C7", linestyle=":", label=f"lowest: {suggestion.lowest:.2g}"
-        )
+        steepest, lowest = suggestion.steepest, suggestion.lowest
+        axes.axvline(steepest, color="C3", label=f"falls fastest: {steepest:.2g}")
+        axes.axvline(lowest, color="C7", linestyle=":", label=f"lowest: {lowest:.2g}")
         axes.legend()
     write_png(run_dir / PICTURE_FILE, figure_image(figure))
     text = (

@@ -1,13 +1,13 @@
-"""Going on with a run: what it is built from, and what may have changed since.
+"""Check whether a run can be resumed with the present config and images.
 
-Every difference between the run's config and the present one is told in a line. What the network
-learns from (:data:`LEARNT_FROM`, and the images themselves) may change only with
-``resume_anyway=true``; the network and the kind of optimiser may not change at all, because the
-saved state fits no others. All else is accepted: how long, where, with which callbacks, how fast.
+Every difference between the stored and the present config is reported. Options that affect what the
+network learns (:data:`LEARNT_FROM`) and the images may change only with ``resume_anyway=true``. The
+network and the kind of optimiser must not change, because the saved state would not fit. All other
+options may change, such as the duration, the device and the callbacks.
 
-Files, meshes or the rendering code may change under the same options. So a checkpoint holds, of
-every split, what its sources say of themselves and how its first image looks: its labels and a
-picture of 16 × 12 pixels, which another machine's rounding does not change.
+Files, meshes or the rendering code may change while the options stay the same. Therefore a
+checkpoint describes the sources and the first image of every split: its labels and a picture of
+16 × 12 pixels, which is robust against rounding on other machines.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ LEARNT_FROM: Final = (
     "seed", "data", "virtual", "maps", "symmetry", "model.loss",
     "trainer.devices", "trainer.num_nodes", "trainer.accumulate_grad_batches",
 )  # fmt: skip
-"""Options that decide images, targets, loss, and which images make a step."""
+"""Options that determine images, targets, loss and the composition of batches."""
 _NOT_LEARNT_FROM: Final = (
     "data.num_workers", "data.cache_dir", "data.download_dir", "data.num_test", "data.test",
     "data.image_sets.test", "data.targets",
 )  # fmt: skip
-"""… with these exceptions: where renders are kept, who loads, and the test images."""
+"""Exceptions from :data:`LEARNT_FROM`: caches, loader processes and the test images."""
 _THIS_CALL: Final = ("resume", "resume_anyway", "output_dir")
 _NETWORK: Final = ("model.backbone", "model.attention", "model.head", "model.width")
 _OPTIMIZER: Final = "optimizer._target_"
@@ -67,26 +67,30 @@ _OVERRIDE: Final = re.compile(r"(\+\+?|~)?(?P<key>[A-Za-z_][\w/.@:]*)(=.*)?", re
 
 @dataclass(frozen=True)
 class ConfigDifference:
-    """One option, by its dotted name, whose value is not as it was; both values as text."""
+    """An option, by its dotted name, with its old and new value as text."""
 
     key: str
     old: str
     new: str
 
     def __str__(self) -> str:
-        """Return the line a person reads."""
+        """Return the difference as a line of text."""
         return f"{self.key}: {self.old} → {self.new}"
 
 
 def check_resume(
     run: Path, config: RunConfig, saved: Checkpoint, payload: Mapping[str, Any]
 ) -> list[ConfigDifference]:
-    """Return the accepted differences between a run and the config that is to go on with it.
+    """Return the accepted differences between a run and the config that resumes it.
 
-    ``payload`` is what a checkpoint of the present run would say of itself.
+    Args:
+        run: Folder of the interrupted run.
+        config: Present config.
+        saved: Last checkpoint of the run.
+        payload: Description of a checkpoint of the present config.
 
     Raises:
-        UserError: The network or the kind of optimiser differs, or what is learnt from does and
+        UserError: The network or the kind of optimiser differs, or the data or the loss differ and
             ``resume_anyway`` is not set.
     """
     path = run / CONFIG_FILE
@@ -94,22 +98,20 @@ def check_resume(
     if not isinstance(before, Mapping):
         raise UserError(f"{path} with a {type(before).__name__}", "a config", "check the run")
     differences = config_differences(before, config.plain)
-    state = [difference for difference in differences if difference.key == _OPTIMIZER]
+    state = [change for change in differences if change.key == _OPTIMIZER]
     if saved.spec != payload["spec"] or state:
-        network = [
-            difference for difference in differences if below(difference.key, _NETWORK)
-        ] + state
+        network = [change for change in differences if below(change.key, _NETWORK)]
         raise UserError(
-            f"resume={run}, whose network differs from the chosen one ({_listed(network)})"
+            f"resume={run}, whose network differs from the chosen one ({_listed(network + state)})"
             if not state
             else f"resume={run} with another optimiser ({_listed(state)})",
             "the model, the number of objects and the optimiser of that run",
             f"leave them as they were, or start anew with init_from={run / BEST_CHECKPOINT}"
             " where the network is the same",
         )
-    learnt = [difference for difference in differences if below(difference.key, LEARNT_FROM)]
-    learnt = [difference for difference in learnt if not below(difference.key, _NOT_LEARNT_FROM)]
-    if not learnt:  # else the images are others for that reason
+    learnt = [change for change in differences if below(change.key, LEARNT_FROM)]
+    learnt = [change for change in learnt if not below(change.key, _NOT_LEARNT_FROM)]
+    if not learnt:  # changed options already explain changed images
         learnt = image_differences(saved.data.get("images"), payload["data"].get("images"))
     if learnt and not config.resume_anyway:
         raise UserError(
@@ -121,19 +123,19 @@ def check_resume(
 
 
 def config_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[ConfigDifference]:
-    """Return the options in which two configs differ, but for what belongs to one call alone."""
-    old_options, new_options = (dict(flat(config)) for config in (old, new))
+    """Return the options in which two configs differ, except those of a single call."""
+    before, after = dict(flat(old)), dict(flat(new))
     return [
-        ConfigDifference(key, _text(old_options, key), _text(new_options, key))
-        for key in {**old_options, **new_options}
-        if old_options.get(key) != new_options.get(key) and not below(key, _THIS_CALL)
+        ConfigDifference(key, *(str(options.get(key, _ABSENT)) for options in (before, after)))
+        for key in {**before, **after}
+        if before.get(key) != after.get(key) and not below(key, _THIS_CALL)
     ]
 
 
 def image_differences(saved: object, present: object) -> list[ConfigDifference]:
-    """Say where training and validation images are others though the options may be the same."""
+    """Return differences of training and validation images that options do not explain."""
     if not isinstance(saved, Mapping) or not isinstance(present, Mapping):
-        return []  # a checkpoint that train.py has not written
+        return []  # the checkpoint was not written by train.py
     return [
         ConfigDifference(f"{split} images", "as trained on", f"others ({'; '.join(lines)})")
         for split in ("train", "val")
@@ -143,10 +145,13 @@ def image_differences(saved: object, present: object) -> list[ConfigDifference]:
 
 
 def trusted_overrides(stored: object, source: Path) -> list[str]:
-    """Return a run's own overrides without those that belong to the call it was started with.
+    """Return the overrides of a run, without those of a single call.
 
-    A run's folder may come from anybody. On the command line Hydra takes flags, and builds whatever
-    its own nodes name; so neither is taken from a folder. The rest must be overrides.
+    A run folder is not trusted. Hydra's flags and nodes could execute arbitrary code, so they are
+    not read from a folder.
+
+    Raises:
+        UserError: The stored value is not a list of overrides.
     """
     if not isinstance(stored, list) or not all(isinstance(text, str) for text in stored):
         raise UserError(f"{source} without a list of overrides", "key=value lines", "check the run")
@@ -166,12 +171,12 @@ def trusted_overrides(stored: object, source: Path) -> list[str]:
 
 
 def read_overrides(run: Path) -> list[str] | None:
-    """Return the overrides that a run was started with; None where a file is missing or cut."""
+    """Return the overrides of a run, or None if a file is missing or truncated."""
     resume_file, overrides, hydra = (run / path for path in (OVERRIDES_FILE, OVERRIDES, _HYDRA))
     if resume_file.is_file():
         return trusted_overrides(read_json(resume_file).get("overrides"), resume_file)
-    # Killed before it wrote its own file. Hydra writes the overrides last
-    # and once more in another file: a file that was cut in the middle does not agree with it.
+    # The run was killed before it wrote its own file. Hydra writes the overrides into two files,
+    # and a truncated file differs from the other one.
     if not overrides.is_file():
         return None
     stored = read_yaml(overrides)
@@ -181,7 +186,7 @@ def read_overrides(run: Path) -> list[str] | None:
 
 
 def remember_overrides(run: Path) -> None:
-    """Write down how a run was started, or goes on: Hydra's own file may be cut in the middle."""
+    """Store the overrides of a run atomically, as Hydra does not."""
     if not HydraConfig.initialized():
         return
     overrides = [str(text) for text in HydraConfig.get().overrides.task]
@@ -195,25 +200,21 @@ def _task(hydra: object) -> object:
     return hydra
 
 
-def _text(entries: Mapping[str, object], key: str) -> str:
-    return str(entries[key]) if key in entries else _ABSENT
-
-
 def _listed(differences: Sequence[ConfigDifference]) -> str:
     return ", ".join(map(str, differences)) or "the number of objects"
 
 
 _LOOK_SIZE: Final = (16, 12)
 _MAX_LEVELS: Final = 2.0
-"""Mean difference of two small pictures, in grey levels, above which they show something else."""
+"""Mean difference of two small pictures, in grey levels, above which they count as different."""
 _MAX_LABEL: Final = 1e-4
-"""Difference of two camera matrices (relative) or poses (metres) above which they are others."""
+"""Difference of camera matrices (relative) or poses (metres) that counts as a change."""
 _LONG: Final = 40
-"""Values with more characters are not shown."""
+"""Maximum number of characters of a shown value."""
 
 
 def describe_images(source: DescribedSource) -> dict[str, Any]:
-    """Describe a split's images in plain values."""
+    """Describe the sources and the first image of a split in plain values."""
     sources = {
         f"{number} {info.name}": {"images": info.num_images, **info.identity}
         for number, info in enumerate(source.describe())
@@ -222,7 +223,7 @@ def describe_images(source: DescribedSource) -> dict[str, Any]:
 
 
 def differing_images(stored: Mapping[str, Any], present: Mapping[str, Any]) -> list[str]:
-    """Say in which points two descriptions of images differ; nothing where they do not."""
+    """Return the differences between two descriptions of images."""
     old, new = dict(flat(stored["sources"])), dict(flat(present["sources"]))
     lines = [
         f"{key}: {_shown(old.get(key))} → {_shown(new.get(key))}"
@@ -253,7 +254,7 @@ def _look(sample: Sample) -> dict[str, Any]:
 
 
 def _picture_difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> float:
-    """Return the mean absolute difference, grey levels; infinite for other sizes."""
+    """Return the mean absolute difference in grey levels; infinite for different sizes."""
     if before["size"] != now["size"]:
         return np.inf
     pictures = (
@@ -269,10 +270,12 @@ def _shown(value: object) -> str:
 
 
 def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Parts) -> None:
-    """Warn of test images that changed under the checkpoint's own options, and of other shapes.
+    """Warn of changed shapes, and of test images that changed while the options stayed the same.
 
-    ``parts`` are the checkpoint's objects as these data have them. A test set of other options is
-    what its user wants.
+    Args:
+        checkpoint: Checkpoint to evaluate.
+        data: Test data; data with other options are not compared.
+        parts: Objects of the checkpoint as the test data define them.
     """
     pairs = zip(checkpoint.parts, parts, strict=True)
     others = [a.name for a, b in pairs if a.mesh_hash and b.mesh_hash not in ("", a.mesh_hash)]
@@ -280,16 +283,15 @@ def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Parts)
         _log.warning("the checkpoint was trained on another shape of %s", ", ".join(others))
     stored, config = checkpoint.data.get("images"), trained_on(checkpoint.data)
     if not isinstance(stored, dict) or config is None:
-        return  # a checkpoint that train.py has not written
+        return  # the checkpoint was not written by train.py
     try:
         trained_data = chosen_data(None, None, config, "the checkpoint")
     except UserError:
-        return  # nor does one whose data nobody can read
+        return  # the data config of the checkpoint cannot be read
     if _test_set(trained_data) != _test_set(data):
         return
-    differences = differing_images(
-        stored["test"], describe_images(held_out_source(data, parts, "test"))
-    )
+    present = describe_images(held_out_source(data, parts, "test"))
+    differences = differing_images(stored["test"], present)
     if differences:
         _log.warning(
             "the test images are not those of the checkpoint's own figures, "
@@ -299,14 +301,7 @@ def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Parts)
 
 
 def _test_set(data: DataConfig) -> list[object]:
-    """Return the options that name a test set; the others cannot mean another one."""
+    """Return the options that define the test set."""
     named = (data.format, data.root, data.objects, data.parts, data.unit, data.frames, data.virtual)
-    return [
-        *named,
-        data.image_sets,
-        data.num_test,
-        data.eval_seed,
-        data.test.renderer,
-        data.targets,
-        data.classes or {},
-    ]
+    chosen = (data.image_sets, data.num_test, data.eval_seed, data.test.renderer, data.targets)
+    return [*named, *chosen, data.classes or {}]

@@ -1,7 +1,7 @@
-"""Experiment trackers, Weights & Biases and TensorBoard: a run is a run there, ended with it.
+"""Log runs to experiment trackers (Weights & Biases and TensorBoard).
 
-A multirun ends with a run of its own that holds the comparison. Nothing that a tracker does or
-fails to do changes a run (:class:`~dopepp.training.loggers.GuardedLogger`).
+A multirun adds a separate run with the comparison. Errors of a tracker do not affect the training
+(:class:`~dopepp.training.loggers.GuardedLogger`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from lightning.pytorch.loggers import WandbLogger
 from dopepp.core.errors import UserError
 from dopepp.core.files import read_csv
 from dopepp.drawing.pictures import read_rgb
-from dopepp.experiment.assembly.registries import LOGGERS
+from dopepp.experiment.assembly.build_system import LOGGERS
 from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.results.compare import CURVES_FILE, LOSS_FILE, PICTURES_FILE, TABLE_FILE
 from dopepp.experiment.results.compared_runs import overrides_of
@@ -30,16 +30,16 @@ from dopepp.models.registry import TARGET
 from dopepp.training.loggers import GuardedLogger
 
 _PICTURES: Final = ("overlay", "auc", "shading", "shading_examples")
-"""A run's pictures of its test images, without ``.png``."""
+"""Pictures of a run's test images to log, without ``.png``."""
 _COMPARISON: Final = "comparison"
 
 _UNSAID: Final = ("experiment=", "scale=", "logger", "model=", "data=", "resume", "table")
-"""Overrides that a run's name has no need of: they are the group's, or said by its first words."""
+"""Overrides that are omitted in a run's name, because group, model or data state them."""
 
 
 @contextmanager
 def tracked(config: RunConfig, run_dir: Path) -> Iterator[list[GuardedLogger]]:
-    """Yield a training's trackers, and end the run with each of them however the training ends."""
+    """Yield the trackers of a training and close them when the training ends."""
     chosen = [override for override in overrides_of(run_dir) if not override.startswith(_UNSAID)]
     name = " ".join([config.model.name, config.data.name, *chosen])
     group = run_dir.resolve().parent.name if run_dir.name.isdigit() else None
@@ -57,10 +57,12 @@ def _open(
     kind: str,
     begun: str | None = None,
 ) -> Iterator[list[GuardedLogger]]:
-    """Build trackers and close them; what a node says itself comes first."""
+    """Build trackers and close them; options of a node take precedence."""
     trackers = []
     for node in (nodes or {}).values():
-        target = LOGGERS.resolve(node.get(TARGET))  # a wrong name is no failure of a logger
+        target = LOGGERS.resolve(
+            node.get(TARGET)
+        )  # a wrong name is a user error, not a failure of the tracker
         options: dict[str, Any] = {"save_dir": str(folder)}
         if issubclass(target, WandbLogger):
             options |= {"name": name, "group": group, "job_type": kind, "version": begun}
@@ -76,14 +78,14 @@ def _open(
 
 
 def _begun_id(run_dir: Path) -> str | None:
-    """Return the id that Weights & Biases gave a run before it was interrupted."""
+    """Return the Weights & Biases id of an interrupted run, or None."""
     folders = sorted((run_dir / "wandb").glob("*run-*-*"), key=lambda path: path.stat().st_mtime)
     match = re.fullmatch(r"(?:offline-)?run-\d+_\d+-(\w+)", folders[-1].name) if folders else None
     return match.group(1) if match else None
 
 
 def log_report(trackers: Sequence[GuardedLogger], report: Report, run_dir: Path) -> None:
-    """Tell trackers what a run was measured at: test figures, reference rows, curves, pictures."""
+    """Log the result of a run: test figures, reference rows and pictures."""
     figures = _figures("test", report.rows)
     for reference, rows in report.references.items():
         figures |= _figures(f"reference/{reference}", rows)
@@ -93,7 +95,7 @@ def log_report(trackers: Sequence[GuardedLogger], report: Report, run_dir: Path)
 
 
 def _figures(prefix: str, rows: Mapping[str, PoseRow]) -> dict[str, float]:
-    """Return every measure there is by a name with slashes; of one object, no mean beside it."""
+    """Return all measures by names with slashes; the mean is omitted for a single object."""
     return {
         f"{prefix}/{name}/{column.field}": value
         for name, row in shown_rows(rows).items()
@@ -103,7 +105,7 @@ def _figures(prefix: str, rows: Mapping[str, PoseRow]) -> dict[str, float]:
 
 
 def log_comparison(nodes: Mapping[str, Any] | None, folder: Path) -> None:
-    """Tell trackers how a multirun's jobs compare, in a run of its own in their group."""
+    """Log the comparison of a multirun as a separate run in the group of its jobs."""
     with _open(nodes, folder, _COMPARISON, folder.resolve().name, _COMPARISON) as trackers:
         for tracker in trackers:
             for file in (TABLE_FILE, PAPER_TABLE_FILE):
@@ -119,7 +121,7 @@ def _send_pictures(tracker: GuardedLogger, paths: Mapping[str, Path]) -> None:
     for name, path in paths.items():
         try:
             picture = read_rgb(path) if path.is_file() else None
-        except UserError:  # cut short where the disk was full
+        except UserError:  # the file is truncated, for example by a full disk
             picture = None
         if picture is not None:
             tracker.log_picture(name, picture)

@@ -1,7 +1,7 @@
-"""What ``train.py`` does: a training, from its config to a run folder with a measured checkpoint.
+"""Run the jobs of ``train.py``: train a network from its config and measure its best checkpoint.
 
-To add another ``job=``, write a function of config and run folder, give it a line in :data:`JOBS`
-and its name to :class:`~dopepp.experiment.config.run_config.RunConfig`.
+To add another ``job=``, write a function of config and run folder, add it to :data:`JOBS` and its
+name to :class:`~dopepp.experiment.config.run_config.RunConfig`.
 """
 
 from __future__ import annotations
@@ -72,18 +72,18 @@ QUICKSTART: Final = "experiment=quickstart"
 
 
 def do_job(config: Mapping[str, Any], run_dir: Path) -> object:
-    """Parse ``train.py``'s composed config and do the job that it names."""
+    """Parse the composed config of ``train.py`` and run its job."""
     program.quiet_lightning()
     parsed = RunConfig.of(config)
     extensions.enable(parsed.extensions)
     if parsed.table is not None:
-        PaperTable.of(parsed.table)  # a mistake in it shows before the work, not after
+        PaperTable.of(parsed.table)  # reports a mistake before the work begins
     _refuse_parallel_multirun(parsed.trainer)
     return JOBS[parsed.job](parsed, run_dir)
 
 
 def _refuse_parallel_multirun(trainer: TrainerConfig) -> None:
-    """Refuse jobs of several processes, of which each would start as the first one did."""
+    """Raise for several processes in a multirun, because each would start the sweep again."""
     if not HydraConfig.initialized() or HydraConfig.get().mode != RunMode.MULTIRUN:
         return
     if trainer.num_processes > 1:
@@ -101,7 +101,7 @@ def run_training(config: RunConfig, run_dir: Path) -> Report:
     Raises:
         UserError: A choice, a file or an option is wrong.
         PrunedError: A search stopped the training.
-        Interruption: A signal ended it; the message names the last checkpoint.
+        Interruption: A signal ended the training; the message names the last checkpoint.
     """
     explanation = pages.RunReadme(config, run_dir)
     try:
@@ -136,7 +136,9 @@ def _train(
         )
     seed_everything(config.seed, verbose=False)
     keep_freed_memory()
-    display.console.quiet = bool(getattr(rank_zero_only, "rank", 0))  # the first process reports
+    display.console.quiet = bool(
+        getattr(rank_zero_only, "rank", 0)
+    )  # only the first process reports
     parts = build_parts(config.data)
     config = fitted_to_camera(config, parts)
     datamodule = build_datamodule(config.data, parts, config.seed)
@@ -149,7 +151,7 @@ def _train(
     images = {split: describe_images(source) for split, source in sources.items()}
     system = build_system(config, parts, fingerprint, images, datamodule.seen(parts))
     resume_from, changes = _resume_path(config, system)
-    # Whatever it refuses, nothing is written yet.
+    # Lightning may reject the options, so the trainer is built before anything is written.
     trainer = build_trainer(config, run_dir, trackers=trackers)
     weights = system.network.state_dict().values()
     check_room(run_dir, sum(value.numel() * value.element_size() for value in weights))
@@ -169,7 +171,7 @@ def _train(
     _fit(trainer, system, datamodule, resume_from, run_dir)
     raise_if_pruned(trainer)
     if not trainer.is_global_zero:
-        raise SystemExit(0)  # the first process alone measures and reports
+        raise SystemExit(0)  # only the first process measures and reports
     _say_how_it_ended(trainer, run_dir)
     report = _measure_run(config, parts, run_dir, trainer)
     log_report(trackers, report, run_dir)
@@ -186,7 +188,7 @@ def _fit(
     resume_from: Path | None,
     run_dir: Path,
 ) -> None:
-    """Train; what ends it early says how it can go on."""
+    """Train; errors that end the training early state how to resume it."""
     try:
         trainer.fit(system, datamodule=datamodule, ckpt_path=resume_from, weights_only=True)
     except SystemExit as end:
@@ -195,14 +197,14 @@ def _fit(
         raise
     except RunError as error:
         if not trainer.is_global_zero and not isinstance(error, ProcessDiedError):
-            raise SystemExit(1) from error  # all end for one reason, and the first says it
+            raise SystemExit(1) from error  # the first process reports the common reason
         kept = (run_dir / LAST_CHECKPOINT).is_file()
         advice = f"go on with resume={run_dir}" if kept else "no checkpoint was saved yet"
         raise RunError(f"{error}; {advice}") from error
 
 
 def _say_how_it_ended(trainer: Trainer, run_dir: Path) -> None:
-    """Say where training stopped early, and where its time went."""
+    """Print the reason for early stopping, and the profile."""
     for stopping in trainer.early_stopping_callbacks:
         if isinstance(stopping, EarlyStop) and stopping.impatient:
             display.console.print(
@@ -217,7 +219,7 @@ def _say_how_it_ended(trainer: Trainer, run_dir: Path) -> None:
 def _announce_duration(
     options: TrainerConfig, system: PoseSystem, datamodule: PoseDataModule, trainer: Trainer
 ) -> None:
-    """Without an accelerator, say how long the run will take and what takes less."""
+    """Without an accelerator, print the expected duration and a faster alternative."""
     if trainer.accelerator.__class__.__name__ != "CPUAccelerator" or not trainer.is_global_zero:
         return
     seconds = estimate_training_s(system.network, datamodule, options, str(trainer.precision))
@@ -231,7 +233,7 @@ def _announce_duration(
 def _resume_path(
     config: RunConfig, system: PoseSystem
 ) -> tuple[Path | None, list[ConfigDifference]]:
-    """Return the interrupted run's checkpoint, and what has changed since and may have."""
+    """Return the checkpoint of the interrupted run and the accepted changes since then."""
     resume = config.resume
     if resume is None:
         if config.resume_anyway:
@@ -253,20 +255,16 @@ def _resume_path(
 
 
 def _advice(run_dir: Path) -> str:
-    """Say what an interrupted run has saved and how it goes on."""
+    """Return what an interrupted run has saved, and how to resume it."""
     step = saved_step(run_dir / LAST_CHECKPOINT)
     saved = f"saved up to step {step} in {LAST_CHECKPOINT}" if step else "nothing saved yet"
     return f"{saved}; go on with resume={run_dir}"
 
 
 def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Trainer) -> Report:
-    """Measure the best checkpoint of a finished run and write everything down."""
-    checkpoints = [
-        callback
-        for callback in trainer.checkpoint_callbacks
-        if isinstance(callback, ModelCheckpoint)
-    ]
-    path = Path(checkpoints[0].best_model_path) if checkpoints else Path()
+    """Measure the best checkpoint of a finished run and record the result."""
+    savers = [saver for saver in trainer.checkpoint_callbacks if isinstance(saver, ModelCheckpoint)]
+    path = Path(savers[0].best_model_path) if savers else Path()
     if not path.is_file():
         path = run_dir / LAST_CHECKPOINT
         _log.warning("the run ended before its first validation: measuring %s", path.name)
@@ -276,12 +274,12 @@ def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Traine
         try:
             tuned = refining(estimator, config.refine, parts)
             path = tune_and_record(tuned, path, parts, config.data, run_dir, config)
-        except UserError as error:  # a network that learned little is measured as it is
+        except UserError as error:  # a poorly trained network is measured without tuning
             display.console.print(f"not tuned: {error}")
         else:
             estimator = PoseEstimator.load(path, device)
     details: dict[str, Any] = {"checkpoint": str(path.relative_to(run_dir))}
-    score = checkpoints[0].best_model_score if checkpoints else None
+    score = savers[0].best_model_score if savers else None
     if score is not None and score.isfinite():
         details[OBJECTIVE] = float(score)
     if config.model.width != 1.0:

@@ -1,17 +1,20 @@
-"""Distance factor, score and threshold of a checkpoint, from validation images, checked on others.
+"""Tune the distance factor, the score and the threshold of a checkpoint on validation images.
 
-The factor is the median ratio of true to estimated distances. The score's weights are fitted to
-"ADD below a tenth of the diameter"; the threshold is the lowest at which the network keeps silent
-on images without its objects. All go into a new checkpoint.
+The factor is the median ratio of true to estimated distances. The weights of the score are fitted
+to "ADD below a tenth of the diameter". The threshold is the lowest one that satisfies the permitted
+rate of false positives on images without the objects. Test images check the result, which is
+written to a new checkpoint.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import copy
+import hashlib
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import torch
@@ -24,13 +27,15 @@ from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.assembly.renders import empty_renders
 from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.config.run_config import FalsePositiveTarget
-from dopepp.experiment.run.memory import Memory
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.runtimes import Runtime
 from dopepp.metrics.functional import add, add_s, expected_calibration_error, mahalanobis
 from dopepp.metrics.pose import assign, counted
 from dopepp.metrics.row import symmetry_transforms
 from dopepp.models.checkpoint import Checkpoint
+from dopepp.models.heads import Stage
+from dopepp.models.network import Images
 from dopepp.models.storage import write_atomic
 from dopepp.parts.part import Part, Parts
 from dopepp.recovery.detection import (
@@ -49,14 +54,18 @@ from dopepp.recovery.detection import (
 )
 
 HIDDEN: Final = 0.4
-"""Share of each object that is hidden on the validation images that refined poses' scores learn
-from a second time: a network names a part that is hidden with little belief, and the picture may
-agree all the same."""
+"""Share of each object that is covered in additional validation images for the score of refined
+poses. It adds detections of low belief whose refined pose may still be correct."""
+
+MOST_BYTES: Final = 2**30
+"""Limit of the cache: 1,400 pictures of 400×400 pixels with the maps of one part."""
+
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
 class Scored:
-    """The detections on a set of images, and how many instances there were to be found."""
+    """Detections in a set of images, and the number of images and instances."""
 
     features: Float[np.ndarray, "n features"]
     scores: Float[np.ndarray, "n"]
@@ -66,7 +75,7 @@ class Scored:
     num_instances: int
 
     def loudest(self, scores: Float[np.ndarray, "n"]) -> Float[np.ndarray, "images"]:
-        """Return the best score on every image; 0 where nothing was found."""
+        """Return the best score in every image; 0 without a detection."""
         best = np.zeros(self.num_images)
         np.maximum.at(best, self.image, scores)
         return best
@@ -74,7 +83,7 @@ class Scored:
 
 @dataclass(frozen=True)
 class Figures:
-    """How good scores and a threshold are: ``recall`` counts right poses above the threshold."""
+    """Quality of scores and threshold; ``recall`` counts correct poses above the threshold."""
 
     calibration_error: float
     false_positive_rate: float
@@ -83,7 +92,7 @@ class Figures:
 
 @dataclass(frozen=True)
 class Tuning:
-    """Recovery options to change, and figures on test images, with objects and without."""
+    """Tuned recovery options, and their effect on test images with and without objects."""
 
     options: dict[str, float]
     before: Figures
@@ -94,12 +103,12 @@ class Tuning:
 def tune(
     estimator: PoseEstimator, data: DataConfig, parts: Parts, target: FalsePositiveTarget
 ) -> Tuning:
-    """Choose factor, weights and threshold on validation images; measure them on test images.
+    """Choose factors, weights and threshold on validation images and measure them on test images.
 
-    An estimator that refines gets those of the network first, then those of its refined poses.
+    For an estimator that refines, the network is tuned first, then the refined poses.
 
     Raises:
-        UserError: The network finds nothing, or all that it finds is right or wrong.
+        UserError: There are no detections, or all of them are correct or wrong.
     """
     old, refiner, memory = estimator.recovery, estimator.refiner, Memory()
     estimator = memory.behind(estimator)
@@ -114,7 +123,7 @@ def tune(
         return score_images(estimator, parts, *sources)
 
     estimator.refiner = None
-    # Every detection counts here, whatever its score.
+    # All detections count here, regardless of their score.
     heard = replace(old, min_score=0.0, covariance_factor=1.0)
     before = _figures(scored(heard, test), scored(heard, empty_test), old.min_score)
     estimator.recovery = replace(heard, distance_factor=1.0)
@@ -126,7 +135,7 @@ def tune(
     heard = replace(new, min_score=0.0)
     if refiner is not None:
         estimator.refiner = refiner
-        # Features are of the network's score, which an earlier tuning's would hide.
+        # The features need the score of the network, not the score of an earlier tuning.
         candidate = min(new.min_score, CANDIDATE)
         heard = replace(new.unrefined(), min_score=candidate)
         shown = scored(heard, validation, Hidden(validation))
@@ -141,7 +150,7 @@ def tune(
 def fit_factors(
     pairs: Sequence[tuple[Detection, Float[np.ndarray, "equivalents 4 4"]]],
 ) -> dict[str, float]:
-    """Fit the factors on distances and covariances to poses that were found with factors of 1."""
+    """Fit the factors on distances and covariances to poses estimated with factors of 1."""
     estimated = np.reshape([detection.T_cam_obj for detection, _ in pairs], (-1, 4, 4))
     true = np.reshape([equivalents[0] for _, equivalents in pairs], (-1, 4, 4))
     distance = fit_distance_factor(estimated, true)
@@ -164,10 +173,10 @@ def choose(
     *,
     refined: bool = False,
 ) -> dict[str, float]:
-    """Choose the weights and the threshold from detections on images with objects and without.
+    """Choose weights and threshold from detections in images with and without objects.
 
     Raises:
-        UserError: There is nothing to learn from.
+        UserError: There are no detections, or all of them are correct or wrong.
     """
     features = np.concatenate([shown.features, empty.features])
     correct = np.concatenate([shown.correct, empty.correct])
@@ -183,20 +192,16 @@ def choose(
     weights = fit_weights(features, correct)
     loudest = np.sort(empty.loudest(score(empty.features, weights)))[::-1]
     allowed = int(false_positive_rate * empty.num_images)
-    # A detection passes from the threshold on, so it lies just above the first that must not.
+    # A score equal to the threshold passes, so it lies just above the first rejected score.
     threshold = float(np.nextafter(loudest[allowed], 1.0)) if allowed < len(loudest) else 0.0
+    names = ["min_score", *(f"score_{feature}" for feature in FEATURES)]
     if refined:
-        names = [
-            "refined_min_score",
-            *(f"refined_{feature}" for feature in REFINED_FEATURES),
-        ]
-    else:
-        names = ["min_score", *(f"score_{feature}" for feature in FEATURES)]
+        names = [f"refined_{name}" for name in ("min_score", *REFINED_FEATURES)]
     return dict(zip(names, [threshold, *map(float, weights)], strict=True))
 
 
 def score_images(estimator: PoseEstimator, parts: Parts, *sources: SampleSource) -> Scored:
-    """Run an estimator over sources and judge every detection; features are of what it does."""
+    """Run an estimator over sources and judge every detection."""
     refined = estimator.refiner is not None
     names = REFINED_FEATURES if refined else FEATURES
     rows: list[tuple[np.ndarray, float, bool, int]] = []
@@ -224,13 +229,12 @@ def score_images(estimator: PoseEstimator, parts: Parts, *sources: SampleSource)
 def matched_poses(
     estimator: PoseEstimator, parts: Parts, source: SampleSource
 ) -> list[tuple[Detection, Float[np.ndarray, "equivalents 4 4"]]]:
-    """Return detections, each with all poses that look like the one of the instance it found."""
+    """Return matched detections with all poses equivalent to that of their instance."""
     matches = []
     for _, _, part, detections, instances in _by_object(estimator, parts, source):
         group = symmetry_transforms(part).numpy()
-        for detection, number in zip(
-            detections, assign(part.cuboid[CENTROID], detections, instances), strict=True
-        ):
+        numbers = assign(part.cuboid[CENTROID], detections, instances)
+        for detection, number in zip(detections, numbers, strict=True):
             if number >= 0 and counted(instances[number]):
                 matches.append((detection, instances[number].T_cam_obj @ group))
     return matches
@@ -239,7 +243,7 @@ def matched_poses(
 def _by_object(
     estimator: PoseEstimator, parts: Parts, *sources: SampleSource
 ) -> Iterator[tuple[int, Sample, Part, list[Detection], list[Instance]]]:
-    """Yield detections and instances of every image, numbered over all sources, and part."""
+    """Yield the detections and instances of every image and part, with the image number."""
     images = ((source, index) for source in sources for index in range(len(source)))
     for number, (source, index) in enumerate(images):
         sample = source.sample(index, 0)
@@ -251,22 +255,22 @@ def _by_object(
 
 
 class Hidden:
-    """Images of a source with :data:`HIDDEN` of every masked object's visible pixels covered."""
+    """Source whose masked objects are covered by the share :data:`HIDDEN`."""
 
     def __init__(self, source: SampleSource) -> None:
         self._source, self.name = source, f"{source.name}, hidden"
 
     def __len__(self) -> int:
-        """Return how many images there are."""
+        """Return the number of images."""
         return len(self._source)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Return an image."""
+        """Return the covered image."""
         return shade(self._source.sample(index, epoch), [HIDDEN], 0, index)[0].sample
 
 
 def write_tuned(checkpoint: Checkpoint, path: Path, options: Mapping[str, float]) -> Path:
-    """Write a checkpoint with other recovery options beside the old one; returns its path."""
+    """Write a checkpoint with changed recovery options next to the original; return its path."""
     tuned = replace(checkpoint, recovery={**checkpoint.recovery, **options})
     target = path.with_name(f"{path.stem}_tuned.ckpt")
     write_atomic(tuned.to_file(), target)
@@ -276,9 +280,9 @@ def write_tuned(checkpoint: Checkpoint, path: Path, options: Mapping[str, float]
 def _judge(
     part: Part, detections: Sequence[Detection], true: Sequence[Instance]
 ) -> tuple[Bool[np.ndarray, "found"], Bool[np.ndarray, "found"]]:
-    """Return which detections of an object are right (ADD(-S) below 0.1 d), and which are judged.
+    """Return which detections are correct (ADD(-S) below 0.1 d), and which are judged at all.
 
-    As in every evaluation, one of an instance too hidden to count is neither right nor wrong.
+    As in every evaluation, detections of heavily occluded instances are not judged.
     """
     numbers = assign(part.cuboid[CENTROID], detections, true)
     counts = np.array([number < 0 or counted(true[number]) for number in numbers], bool)
@@ -300,3 +304,71 @@ def _figures(test: Scored, empty: Scored, threshold: float) -> Figures:
     loud = empty.loudest(np.where(empty.scores >= threshold, 1.0, 0.0))
     right = test.correct & (test.scores >= threshold)
     return Figures(error, float(loud.mean()), float(right.sum()) / max(test.num_instances, 1))
+
+
+class Memory:
+    """Cache for pictures and maps, which tuning needs several times.
+
+    Items are stored until the limit is reached; further items are computed each time.
+    """
+
+    def __init__(self, most_bytes: int = MOST_BYTES) -> None:
+        self._free = most_bytes
+        self._kept: dict[Hashable, Any] = {}
+
+    def recall(self, key: Hashable, make: Callable[[], Made], size: Callable[[Made], int]) -> Made:
+        """Return the stored item of a key, or make it; ``size`` returns its bytes."""
+        if key in self._kept:
+            return self._kept[key]  # type: ignore[no-any-return]
+        made = make()
+        if size(made) <= self._free:
+            self._free -= size(made)
+            self._kept[key] = made
+        return made
+
+    def of(self, source: SampleSource) -> SampleSource:
+        """Return a source that caches its items of epoch 0."""
+        return _RememberedSource(source, self, source.name)
+
+    def behind(self, estimator: PoseEstimator) -> PoseEstimator:
+        """Return a copy of an estimator that caches the maps of each picture."""
+        network, remembering = estimator.network, copy.copy(estimator)
+        remembering.network = _RememberedNetwork(
+            network, self, network.stride, network.size_multiple
+        )
+        return remembering
+
+
+@dataclass
+class _RememberedSource:
+    source: SampleSource
+    memory: Memory
+    name: str
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def sample(self, index: int, epoch: int = 0) -> Sample:
+        if epoch:
+            return self.source.sample(index, epoch)
+        return self.memory.recall((id(self), index), lambda: self.source.sample(index), _num_bytes)
+
+
+@dataclass
+class _RememberedNetwork:
+    network: Runtime
+    memory: Memory
+    stride: int
+    size_multiple: int
+
+    def maps(self, images: Images) -> Stage:
+        pixels = images.permute(0, 2, 3, 1).contiguous().cpu().numpy()
+        key = (id(self), pixels.shape, hashlib.blake2b(pixels.tobytes()).digest())
+        return self.memory.recall(
+            key, lambda: self.network.maps(images), lambda maps: sum(each.nbytes for each in maps)
+        )
+
+
+def _num_bytes(sample: Sample) -> int:
+    arrays = [sample.image, sample.depth, *(each.mask for each in sample.instances)]
+    return sum(each.nbytes for each in arrays if each is not None)

@@ -1,1 +1,1 @@
-"""Jobs of a multirun in other processes and on other machines: ``hydra/launcher=…``."""
+"""Multiruns: comparison of jobs, runners for other processes and hyperparameter search."""

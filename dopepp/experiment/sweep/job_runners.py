@@ -1,4 +1,4 @@
-"""Jobs in other processes: of this machine, of a Ray cluster, or of SLURM as one job array.
+"""Run jobs in processes of this machine, on a Ray cluster, or as a SLURM job array.
 
 To add a launcher, write a :data:`Runner`, a class in ``hydra_plugins.dopepp_plugins.launchers`` and
 a file in ``conf/hydra/launcher``.
@@ -41,12 +41,12 @@ _ANYWHERE: Final = (
     "mem_gb",
     "name",
 )
-"""What submitit calls by these names on every kind of cluster; the rest is SLURM's own."""
+"""Options that submitit names equally on every cluster; other options belong to SLURM."""
 
 
 @dataclass(frozen=True)
 class Jobs:
-    """What the jobs of a multirun have in common; travels to the processes that run them."""
+    """Common data of the jobs of a multirun, which is sent to their processes."""
 
     context: HydraContext
     config: DictConfig
@@ -55,16 +55,16 @@ class Jobs:
 
     @classmethod
     def of(cls, context: HydraContext, config: DictConfig, task: TaskFunction) -> Jobs:
-        """Gather it in the process that launches."""
+        """Collect the data in the launching process."""
         return cls(context, config, task, Singleton.get_state())
 
     @property
     def folder(self) -> Path:
-        """The folder of the multirun; a job's is its number in it."""
+        """Folder of the multirun; the folder of a job is its number below it."""
         return Path(str(self.config.hydra.sweep.dir))
 
     def __call__(self, job: tuple[int, list[str]]) -> JobReturn:
-        """Run one job, a number and its overrides, in this process."""
+        """Run a job, given by number and overrides, in this process."""
         number, overrides = job
         setup_globals()
         Singleton.set_state(self.state)
@@ -78,55 +78,53 @@ class Jobs:
             job_subdir_key="hydra.sweep.subdir",
             hydra_context=self.context,
         )
-        # Configs hold classes that Hydra imports twice, so that they cannot be sent back.
+        # Configs contain classes that Hydra imports twice, so they cannot be pickled.
         result.cfg = result.hydra_cfg = None
         return result
 
     def checkpoint(self, job: tuple[int, list[str]]) -> Any:
-        """Near SLURM's time limit: submit the same job once more, which goes on in its folder."""
+        """Submit the same job again near SLURM's time limit; it resumes in its folder."""
         from submitit.helpers import DelayedSubmission
 
         return DelayedSubmission(self, job)
 
 
 Ended = Iterator[tuple[int, JobReturn | Exception]]
-"""Jobs by number as they end: an exception in place of one whose process was lost."""
+"""Results of jobs by number as they end; an exception if the process was lost."""
 
 Runner = Callable[[Jobs, Mapping[int, list[str]]], Ended]
-"""Runs jobs, given as overrides by number."""
+"""Function that runs jobs, given as overrides by number."""
 
 
 def launch(
     jobs: Jobs, overrides: Sequence[Sequence[str]], first: int, run: Runner
 ) -> list[JobReturn]:
-    """Run jobs, numbered from ``first``, and wait for all; a lost one has failed, others go on."""
+    """Run jobs, numbered from ``first``, and wait for all; a lost job counts as failed."""
     jobs.folder.mkdir(parents=True, exist_ok=True)
-    numbered = {first + index: list(override_list) for index, override_list in enumerate(overrides)}
+    numbered = {number: list(texts) for number, texts in enumerate(overrides, first)}
     returns: dict[int, JobReturn] = {}
     for number, result in run(jobs, numbered):
         if isinstance(result, Exception):
-            result = _lost(jobs.folder / str(number), result)
+            folder = jobs.folder / str(number)
+            folder.mkdir(parents=True, exist_ok=True)
+            reason = f"{type(result).__name__}: {' '.join(str(result).split())}"
+            write_json(folder / FAILURE_FILE, {"reason": f"its process was lost: {reason}"})
+            # An error status would make Hydra end the multirun.
+            result = JobReturn(status=JobStatus.COMPLETED)
         returns[number] = result
         display.console.print(f"job {number} ended, {len(returns)} of {len(numbered)}")
     return [returns[number] for number in numbered]
 
 
-def _lost(folder: Path, error: Exception) -> JobReturn:
-    """Write down, in place of the job itself, that it failed."""
-    folder.mkdir(parents=True, exist_ok=True)
-    reason = f"its process was lost: {type(error).__name__}: {' '.join(str(error).split())}"
-    write_json(folder / FAILURE_FILE, {"reason": reason})
-    # To Hydra, it ended like any failed job: an error here would end the multirun.
-    return JobReturn(status=JobStatus.COMPLETED)
-
-
 def on_joblib(n_jobs: int) -> Runner:
-    """Return a runner that keeps so many jobs going in processes of this machine."""
+    """Return a runner of ``n_jobs`` parallel processes on this machine."""
     check("hydra.launcher.n_jobs", n_jobs, int, Range(1, _MOST))
     require("joblib", "hydra/launcher=joblib", "joblib")
 
     def run(jobs: Jobs, overrides: Mapping[int, list[str]]) -> Ended:
-        from joblib.externals.loky.cloudpickle_wrapper import dumps  # also of scripts' objects
+        from joblib.externals.loky.cloudpickle_wrapper import (
+            dumps,
+        )  # also pickles objects of scripts
 
         share = str(max(available_cores() // n_jobs, 1))
         limits = {name: os.environ.get(name, share) for name in THREAD_LIMITS}
@@ -136,9 +134,12 @@ def on_joblib(n_jobs: int) -> Runner:
 
 
 def on_ray(address: str | None, num_cpus: float, num_gpus: float) -> Runner:
-    """Return a runner of jobs that occupy so many cores and accelerators of a cluster.
+    """Return a runner on a Ray cluster.
 
-    ``address`` is the cluster's ``host:port``; None starts one on this machine for these jobs.
+    Args:
+        address: ``host:port`` of the cluster; None starts a cluster on this machine.
+        num_cpus: Cores per job.
+        num_gpus: Accelerators per job.
     """
 
     def run(jobs: Jobs, overrides: Mapping[int, list[str]]) -> Ended:
@@ -151,7 +152,7 @@ def on_ray(address: str | None, num_cpus: float, num_gpus: float) -> Runner:
             available_cores(),
             "hydra/launcher=ray",
             "hydra.launcher.address",
-            # Not repeated: a job that took its process down once would do so again.
+            # A job that crashed its process would probably crash it again.
             max_retries=0,
             num_cpus=num_cpus,
             num_gpus=num_gpus,
@@ -162,7 +163,7 @@ def on_ray(address: str | None, num_cpus: float, num_gpus: float) -> Runner:
 
 
 def _run(pool: Pool, overrides: Mapping[int, list[str]]) -> Ended:
-    """Yield the results of jobs, or the loss of their process."""
+    """Yield the results of jobs, or an exception if their process was lost."""
     with pool:
         for (number, _), future in pool.run(overrides.items()):
             try:
@@ -172,13 +173,13 @@ def _run(pool: Pool, overrides: Mapping[int, list[str]]) -> Ended:
 
 
 def on_slurm(folder: str, cluster: str, max_num_timeout: int, sbatch: Mapping[str, Any]) -> Runner:
-    """Return a runner that submits an array and waits for it.
+    """Return a runner that submits a job array and waits for it.
 
     Args:
-        folder: Of SLURM's own logs.
-        cluster: ``slurm``, or submitit's ``local``: processes of this machine.
-        max_num_timeout: How often a job that reaches its time limit is queued again.
-        sbatch: Options by submitit's names; None leaves one to the cluster.
+        folder: Folder of SLURM's logs.
+        cluster: ``slurm``, or ``local`` for processes of this machine.
+        max_num_timeout: Maximum number of times that a job is requeued at its time limit.
+        sbatch: Options by submitit's names; None uses the default of the cluster.
     """
     require("submitit", "hydra/launcher=submitit_slurm", "slurm")
     given = {key: value for key, value in sbatch.items() if value is not None}
@@ -186,6 +187,7 @@ def on_slurm(folder: str, cluster: str, max_num_timeout: int, sbatch: Mapping[st
 
     def run(jobs: Jobs, overrides: Mapping[int, list[str]]) -> Ended:
         import submitit
+        from submitit.core.utils import FailedJobError, UncompletedJobError
 
         try:
             slurm = {"cluster": cluster, "slurm_max_num_timeout": max_num_timeout}
@@ -202,10 +204,7 @@ def on_slurm(folder: str, cluster: str, max_num_timeout: int, sbatch: Mapping[st
         for handle in submitit.helpers.as_completed(handles):
             try:
                 yield numbers[handle.job_id], handle.result()
-            except (
-                submitit.core.utils.UncompletedJobError,
-                submitit.core.utils.FailedJobError,
-            ) as error:
+            except (UncompletedJobError, FailedJobError) as error:
                 yield numbers[handle.job_id], error
 
     return run

@@ -1,10 +1,10 @@
-"""Multirun and SLURM: every job is a row, failed ones too; it ends with a comparison and its table.
+"""Support multiruns and SLURM: compare the jobs of a multirun and resume requeued jobs.
 
-A launcher of Hydra's own (``basic``) runs jobs one after another in this process and terminal; any
-other one has several at work at a time, so each writes into a file of its own folder.
+Hydra's launcher ``basic`` runs jobs one after another in this process. Other launchers run several
+jobs at a time, so each job prints to a file in its folder.
 
-SLURM starts a requeued job with the same command; so the folder of the run that the command began
-is written down under ``OUTPUT_DIR/.slurm``, by job and command, and the job goes on in it.
+SLURM starts a requeued job with the same command. Therefore the run folder of each command is
+stored under ``OUTPUT_DIR/.slurm``, and a requeued job resumes the run in that folder.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from dopepp.core.files import write_whole
 from dopepp.core.yaml import read_yaml
 from dopepp.experiment import program
 
-# Hydra makes its hooks before any job, of a single run, too: what they need is imported late.
+# Hydra creates its hooks before any job, even in a single run, so slow imports stand in functions.
 
 
 LOG_FILE: Final = "job.log"
@@ -36,10 +36,10 @@ _STANDARD_OUT_AND_ERROR: Final = (1, 2)
 
 
 class AnnounceJobs(Callback):
-    """Hydra's hook at the start of a multirun: says where to look."""
+    """Hydra's hook at the start of a multirun: prints the folders."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Name the folder, and the file that each job of another process prints to."""
+        """Print the folder of the multirun and the log file of remote jobs."""
         folder = config.hydra.sweep.dir
         program.say(f"begins in {folder}")
         if is_remote(config.hydra):
@@ -49,24 +49,24 @@ class AnnounceJobs(Callback):
 class CompareJobs(Callback):
     """Hydra's hook at the end of a multirun.
 
-    Hydra skips the hook when a job raises, so a failing job writes ``failed.json`` and returns;
-    the sweep then ends non-zero here, after the table.
+    Hydra skips the hook if a job raises. Therefore a failing job writes ``failed.json`` and
+    returns, and this hook ends the multirun with exit code 1 after the comparison.
     """
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Say in the sweep's folder what runs there."""
+        """Write the README of the multirun."""
         from dopepp.experiment.results.pages import write_multirun_readme
 
         write_multirun_readme(Path(str(config.hydra.sweep.dir)), program.command(), {})
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Compare all jobs of the sweep folder; exit with code 1 if one failed."""
+        """Compare all jobs of the multirun; exit with code 1 if a job failed."""
         if not compare_jobs(Path(str(config.hydra.sweep.dir)), config):
             raise SystemExit(1)
 
 
 def compare_jobs(folder: Path, config: DictConfig) -> bool:
-    """Compare the jobs that a sweep's folder holds; return whether none has failed."""
+    """Compare the jobs in the folder of a multirun; return whether all succeeded."""
     from dopepp.experiment.results import display
     from dopepp.experiment.results.compare import compare_runs
     from dopepp.experiment.results.compared_runs import read_run
@@ -88,13 +88,13 @@ def compare_jobs(folder: Path, config: DictConfig) -> bool:
 
 
 def _node(config: DictConfig, key: str) -> dict[str, Any] | None:
-    """Return a node of a config in plain values, None where there is none."""
+    """Return a node of a config in plain values, or None."""
     node: Any = OmegaConf.to_container(config[key], resolve=True) if config.get(key) else None
     return node if isinstance(node, dict) else None
 
 
 def _state(job: Path) -> str:
-    """Say how a job stands, by what is in its folder."""
+    """Return the state of a job from the files in its folder."""
     from dopepp.experiment.results.cost import COST_FILE
     from dopepp.experiment.results.folder import FAILURE_FILE, METRICS_FILE, PRUNED_FILE, read_json
 
@@ -107,13 +107,13 @@ def _state(job: Path) -> str:
 
 
 def is_remote(hydra: Any) -> bool:
-    """Return whether the launcher of Hydra's own config runs jobs in other processes."""
+    """Return whether the launcher runs jobs in other processes."""
     return str(hydra.launcher._target_) != _OWN_PROCESS
 
 
 @contextmanager
 def own_output(path: Path) -> Iterator[None]:
-    """Send all that this process and its children print to the end of a file."""
+    """Append the output of this process and its children to a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     before = [os.dup(number) for number in _STANDARD_OUT_AND_ERROR]
     try:
@@ -134,9 +134,9 @@ def _redirect(targets: list[int]) -> None:
 
 
 def goes_on(config: Mapping[str, Any], run_dir: Path) -> bool:
-    """Tell whether a job was interrupted in this very folder, with this very config.
+    """Return whether a job was interrupted in this folder with the same config.
 
-    So does a SLURM job that was queued again, and a search that was started again.
+    This is the case for requeued SLURM jobs and for restarted searches.
     """
     from dopepp.experiment.results.folder import CONFIG_FILE, LAST_CHECKPOINT
     from dopepp.experiment.run.resume import config_differences
@@ -154,7 +154,7 @@ _log = logging.getLogger(__name__)
 
 
 def job_id() -> str | None:
-    """Return this job's id, a task's of an array as ``scontrol`` writes it; None outside SLURM."""
+    """Return the id of this SLURM job in the notation of ``scontrol``; None outside SLURM."""
     job, array = os.environ.get("SLURM_JOB_ID"), os.environ.get("SLURM_ARRAY_JOB_ID")
     if array is not None:
         job = f"{array}_{os.environ.get('SLURM_ARRAY_TASK_ID', '')}"
@@ -162,17 +162,12 @@ def job_id() -> str | None:
 
 
 def requeue() -> str:
-    """Ask SLURM to start this job again and say what came of it."""
+    """Ask SLURM to requeue this job; return a message about the outcome."""
     job = job_id()
     assert job is not None
     try:
-        subprocess.run(
-            ["scontrol", "requeue", job],
-            check=True,
-            capture_output=True,
-            text=True,
-            timeout=30,
-        )
+        command = ["scontrol", "requeue", job]
+        subprocess.run(command, check=True, capture_output=True, text=True, timeout=30)
     except (OSError, subprocess.SubprocessError) as error:
         reason = getattr(error, "stderr", None) or error
         return f"SLURM did not requeue job {job}: {' '.join(str(reason).split())}"
@@ -180,14 +175,14 @@ def requeue() -> str:
 
 
 def remember_run(command: Sequence[str], run_dir: Path) -> None:
-    """Write down which folder this job's command has begun; nothing outside SLURM."""
+    """Store the run folder of this SLURM job and command; do nothing outside SLURM."""
     note = _note(command)
     if note is not None:
         write_whole(note, f"{run_dir.absolute()}\n".encode())
 
 
 def begun_run(command: Sequence[str]) -> Path | None:
-    """Return the folder that this command began before the job was requeued, if it was."""
+    """Return the run folder of this command if the SLURM job was requeued, else None."""
     note = _note(command)
     restarts = os.environ.get("SLURM_RESTART_COUNT", "0")
     if note is None or restarts == "0" or not note.is_file():
@@ -198,7 +193,7 @@ def begun_run(command: Sequence[str]) -> Path | None:
 
 
 def _note(command: Sequence[str]) -> Path | None:
-    """Return the file for this job and command: a job's script may hold several commands."""
+    """Return the file for this job and command; the script of a job may contain several."""
     job = job_id()
     if job is None:
         return None

@@ -1,10 +1,10 @@
-"""Searching: trials are asked from a study, run by Hydra's launcher, and told to it.
+"""Search hyperparameters: run the trials of an Optuna study with Hydra's launcher.
 
-A trial's number is its job's. Trials that a command left ``RUNNING`` are run first by the next one,
-each in its own folder, where a training goes on from its last checkpoint. A study is opened by one
-command at a time, and never mixes trials of different configurations.
+A trial and its job have the same number. Trials that an interrupted command left ``RUNNING`` are
+resumed first, each in its own folder from its last checkpoint. Only one command may use a study at
+a time, and all trials of a study have the same configuration.
 
-To vary an option, write a sweep of Hydra's, ``key=interval(0, 1)``, into ``search.space`` or on the
+To vary an option, add a Hydra sweep such as ``key=interval(0, 1)`` to ``search.space`` or to the
 command line.
 """
 
@@ -54,12 +54,12 @@ _NO_PART: Final = (
     "hydra", "output_dir", "resume", "search.num_trials", "search.num_parallel", "search.storage",
     "search.space", "callbacks.trial.storage",
 )  # fmt: skip
-"""What may differ between two commands of one study; of the space, its texts are compared."""
+"""Options that may differ between commands of a study; the space is compared as text."""
 
 
 @dataclass(frozen=True)
 class Space:
-    """Options that vary, with their texts as written, and the overrides that every trial has."""
+    """Varied options with their distributions and texts, and the overrides of every trial."""
 
     varied: dict[str, distributions.BaseDistribution]
     texts: dict[str, str]
@@ -73,11 +73,11 @@ def search(
     arguments: Sequence[str],
     swept: Sequence[str],
 ) -> list[JobReturn]:
-    """Run trials until the study has as many finished ones as ``search.num_trials``.
+    """Run trials until ``search.num_trials`` trials of the study have finished.
 
     Raises:
-        UserError: An option of the search is wrong, the study does not belong to this command, or
-            the experiment sweeps over options (``swept``) by itself.
+        UserError: An option of the search is wrong, the study belongs to another command, or the
+            experiment itself sweeps over options (``swept``).
     """
     if swept:
         raise UserError(
@@ -93,7 +93,7 @@ def search(
         loader.load_sweep_config(config, example)
     folder = Path(str(config.hydra.sweep.dir))
     plain = OmegaConf.to_container(config, resolve=False)
-    # All that decides a trial's result, and what it is varied by.
+    # All options that affect the result of a trial, and the search space.
     facts = {key: str(value) for key, value in flat(plain) if not below(key, _NO_PART)}
     facts |= {f"search.space {key}": text for key, text in space.texts.items()}
     with alone(folder, str(options["study"])):
@@ -106,14 +106,14 @@ def search(
 
 
 class _Trials:
-    """The trials of a study, each a job in a folder of its number."""
+    """The trials of a study; each trial is a job in the folder of its number."""
 
     def __init__(self, study: optuna.Study, space: Space, launcher: Launcher, folder: Path) -> None:
         self._study, self._space, self._launcher, self._folder = study, space, launcher, folder
         numbers = {trial.number for trial in study.get_trials(deepcopy=False)}
         names = [path.name for path in folder.iterdir() if path.name.isdigit()]
         foreign = [name for name in names if int(name) not in numbers]
-        if foreign:  # a trial must not go on in the folder of another study's
+        if foreign:  # a trial must not resume the job of another study
             raise UserError(
                 f"{folder} with the jobs {', '.join(sorted(foreign))} of another study",
                 f"a folder of the study {study.study_name} alone",
@@ -121,37 +121,35 @@ class _Trials:
             )
 
     def run(self, wanted: int, at_a_time: int) -> list[JobReturn]:
-        """Finish what an earlier command has left, then run new ones until so many are finished."""
+        """Finish the trials of an earlier command, then run new ones until ``wanted`` ended."""
         returns: list[JobReturn] = []
         self._tell(self._running())
         left = self._running()
         if left:
-            numbers = ", ".join(str(trial.number) for trial in left)
-            display.console.print(f"study {self._study.study_name} goes on with trials {numbers}")
+            names = ", ".join(str(trial.number) for trial in left)
+            display.console.print(f"study {self._study.study_name} goes on with trials {names}")
         for trials in _consecutive(left, at_a_time):
             returns += self._launch(trials)
         ended = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)
         while (missing := wanted - len(self._study.get_trials(False, ended))) > 0:
             asked = range(min(missing, at_a_time))
-            numbers_asked = {self._study.ask(self._space.varied).number for _ in asked}
-            returns += self._launch(
-                [trial for trial in self._running() if trial.number in numbers_asked]
-            )
+            numbers = {self._study.ask(self._space.varied).number for _ in asked}
+            returns += self._launch([trial for trial in self._running() if trial.number in numbers])
         return returns
 
     def _launch(self, trials: Sequence[FrozenTrial]) -> Sequence[JobReturn]:
-        """Run trials of consecutive numbers and tell the study how they ended."""
+        """Run trials of consecutive numbers and report their outcomes to the study."""
         jobs = [overrides(self._space, trial.params) for trial in trials]
         returns = self._launcher.launch(jobs, initial_job_idx=trials[0].number)
         self._tell(trials)
         numbers = {trial.number for trial in trials}
         for trial in self._running():
-            if trial.number in numbers:  # its process died without a word
+            if trial.number in numbers:  # the process died without a result
                 self._study.tell(trial.number, state=TrialState.FAIL)
         return returns
 
     def _tell(self, trials: Sequence[FrozenTrial]) -> None:
-        """Tell the study about those trials whose jobs have ended."""
+        """Report the outcomes of ended trials to the study."""
         for trial in trials:
             state, value = outcome(self._folder / str(trial.number))
             if state != TrialState.RUNNING:
@@ -162,7 +160,7 @@ class _Trials:
 
 
 def _consecutive(trials: Sequence[FrozenTrial], at_most: int) -> Iterator[Sequence[FrozenTrial]]:
-    """Yield runs of consecutive numbers: a launcher counts up from the first one's."""
+    """Yield groups of trials with consecutive numbers, as launchers require."""
     for _, run in groupby(enumerate(trials), lambda pair: pair[1].number - pair[0]):
         left = [trial for _, trial in run]
         for first in range(0, len(left), at_most):
@@ -170,7 +168,7 @@ def _consecutive(trials: Sequence[FrozenTrial], at_most: int) -> Iterator[Sequen
 
 
 def _report(study: optuna.Study, options: Mapping[str, Any]) -> None:
-    """Print how the trials ended, and the best one as overrides."""
+    """Print the outcomes of the trials, and the best trial as overrides."""
     states = Counter(trial.state.name.lower() for trial in study.get_trials(deepcopy=False))
     counts = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
     display.console.print(f"study {study.study_name}: {counts}; {options['storage']}")
@@ -181,7 +179,11 @@ def _report(study: optuna.Study, options: Mapping[str, Any]) -> None:
 
 
 def read_space(loader: ConfigLoader, space: Sequence[str], arguments: Sequence[str]) -> Space:
-    """Read ``search.space`` and the command line, whose overrides win; a mistake is a UserError."""
+    """Read the search space; overrides of the command line take precedence.
+
+    Raises:
+        UserError: An entry is not a sweep, or there is nothing to vary.
+    """
     parser = OverridesParser.create(config_loader=loader)
     try:
         entries = parser.parse_overrides([str(text) for text in space])
@@ -208,11 +210,11 @@ def read_space(loader: ConfigLoader, space: Sequence[str], arguments: Sequence[s
 
 
 def _distribution(sweep: Override) -> distributions.BaseDistribution:
-    """Return what Optuna draws an option from."""
+    """Return the Optuna distribution of a sweep."""
     value = sweep.value()
     try:
         if isinstance(value, IntervalSweep):
-            low: Any = value.start  # ints where the interval was cast to int
+            low: Any = value.start  # integers if the interval was cast to int
             high: Any = value.end
             kind = (
                 distributions.IntDistribution
@@ -239,7 +241,7 @@ def _bad_entry(problem: str) -> UserError:
 
 
 def examples(space: Space) -> list[list[str]]:
-    """Return overrides that try every option once, to see whether they compose."""
+    """Return overrides that contain every choice once, to check that they compose."""
     first = {key: _ends(choices)[0] for key, choices in space.varied.items()}
     tried = [first]
     for key, distribution in space.varied.items():
@@ -248,7 +250,7 @@ def examples(space: Space) -> list[list[str]]:
 
 
 def _ends(distribution: Any) -> list[object]:
-    """Return every choice, or one number of a range: another one composes as well."""
+    """Return all choices, or one number of a range, since all numbers compose alike."""
     return list(getattr(distribution, "choices", ())) or [distribution.low]
 
 
@@ -258,7 +260,7 @@ def overrides(space: Space, params: dict[str, object]) -> list[str]:
 
 
 def chosen(params: dict[str, object]) -> list[str]:
-    """Return what a trial varies as overrides; four digits of a number fit into a table."""
+    """Return the varied options as overrides, with four significant digits."""
     return [
         f"{key}={value:.4g}" if isinstance(value, float) else f"{key}={value}"
         for key, value in params.items()
@@ -267,7 +269,11 @@ def chosen(params: dict[str, object]) -> list[str]:
 
 @contextmanager
 def alone(folder: Path, study: str) -> Iterator[None]:
-    """Refuse a second command that searches in the same folder; ends with the process."""
+    """Lock a folder against a second search; the lock ends with the process.
+
+    Raises:
+        UserError: Another command is searching in the folder.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / ".search.lock").open("w") as stream:
         try:
@@ -282,15 +288,15 @@ def alone(folder: Path, study: str) -> Iterator[None]:
 
 
 def open_study(options: Mapping[str, Any], facts: Mapping[str, str], seed: int) -> optuna.Study:
-    """Open a study, or begin it.
+    """Open or create a study.
 
     Args:
-        options: Of the search.
-        facts: Options that decide a trial's result besides what is varied.
-        seed: Of the draws; a command that goes on draws others than the first one.
+        options: Options of the search.
+        facts: Fixed options that affect the result of a trial.
+        seed: Seed of the sampler; resumed studies use a different state.
 
     Raises:
-        UserError: The study was begun with other facts, or its storage cannot be opened.
+        UserError: The study was created with other facts, or its storage cannot be opened.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     name = str(options["study"])
@@ -312,7 +318,7 @@ def open_study(options: Mapping[str, Any], facts: Mapping[str, str], seed: int) 
 
 
 def _check_same(before: Mapping[str, str], now: Mapping[str, str], study: str) -> None:
-    """Refuse to mix trials that cannot be compared."""
+    """Raise a user error if the trials of a study could not be compared."""
     keys = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
     if not keys:
         return
@@ -327,7 +333,7 @@ def _check_same(before: Mapping[str, str], now: Mapping[str, str], study: str) -
 
 
 def outcome(folder: Path) -> tuple[TrialState, float | None]:
-    """Read from a job's folder how its trial ended: without a finite objective it has failed."""
+    """Return state and objective of a trial; a trial without a finite objective has failed."""
     if (folder / PRUNED_FILE).is_file():
         return TrialState.PRUNED, None
     if (folder / FAILURE_FILE).is_file():

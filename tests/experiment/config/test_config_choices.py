@@ -14,11 +14,18 @@ from dopepp.core.errors import UserError
 from dopepp.data.transforms.augment import Photometric
 from dopepp.data.transforms.jitter import CameraJitter
 from dopepp.data.transforms.masking import RandomMask
-from dopepp.experiment.assembly import registries
 from dopepp.experiment.assembly.build_parts import build_parts
 from dopepp.experiment.assembly.build_sources import build_datamodule
-from dopepp.experiment.assembly.build_system import build_system, build_trainer
-from dopepp.experiment.assembly.registries import SCHEDULERS, optimizer_factory, scheduler_factory
+from dopepp.experiment.assembly.build_system import (
+    CALLBACKS,
+    LOGGERS,
+    OPTIMIZERS,
+    SCHEDULERS,
+    build_system,
+    build_trainer,
+    optimizer_factory,
+    scheduler_factory,
+)
 from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.run.tracking import tracked
 from dopepp.models.network import ATTENTIONS, BACKBONES, HEADS, LOSSES
@@ -34,10 +41,10 @@ REGISTRIES: dict[str, Registry[Any]] = {
     "data/jitter": Registry("jitter", CameraJitter, [f"{TRANSFORMS}.jitter.CameraJitter"]),
     "data/masking": Registry("masking", RandomMask, [f"{TRANSFORMS}.masking.RandomMask"]),
     "data/augment": Registry("augmentation", Photometric, [f"{TRANSFORMS}.augment.Photometric"]),
-    "optimizer": registries.OPTIMIZERS,
+    "optimizer": OPTIMIZERS,
     "scheduler": SCHEDULERS,
-    "callbacks": registries.CALLBACKS,
-    "logger": registries.LOGGERS,
+    "callbacks": CALLBACKS,
+    "logger": LOGGERS,
 }
 FILES = sorted(CONF.rglob("*.yaml"))
 OF_HYDRA = ("hydra/launcher", "hydra/sweeper")

@@ -349,7 +349,7 @@ def test_the_readmes_of_jobs_and_sweeps(report, compare_golden):
     (folder / "frame_rate.png").touch()
     texts = []
     for known in (None, report):
-        pages.write_job_readme(folder, "Cost of x", known)
+        pages.write_run_readme(folder, "Cost of x", known)
         texts.append((folder / "README.md").read_text())
     command = ["train.py", "-m", "seed=1,2"]
     for jobs in ({}, {"0": "finished", "1": "failed: a | b"}):

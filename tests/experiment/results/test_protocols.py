@@ -8,7 +8,7 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.command_line import EVALUATION_SHORT_NAMES
-from dopepp.experiment.config.protocols import Protocols
+from dopepp.experiment.config.run_config import Protocols
 from dopepp.experiment.entries import entry
 
 OPTIONS: dict[str, Any] = {"shading": None, "by": None, "num_bins": 5, "scale_factors": None}

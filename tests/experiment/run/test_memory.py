@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from dopepp.data.sample import Instance, Sample
-from dopepp.experiment.run.memory import Memory
+from dopepp.experiment.run.tuning import Memory
 from dopepp.geometry.camera import camera_matrix
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.checkpoint import Checkpoint
