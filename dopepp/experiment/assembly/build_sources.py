@@ -281,14 +281,14 @@ def _with_camera_of_pictures(config: RunConfig, parts: Parts) -> RunConfig:
     distance = virtual.working_distance or annotated
     if distance is None:
         raise UserError(
-            f"no annotated object in {source.name}, which would tell how far away they are",
+            f"no annotated object in {source.name}, so the working distance is unknown",
             "working_distance=[near,far], metres",
             "state the distances at which the camera is to find the parts",
         )
     if virtual.working_distance is None:
         _log.info(
             "%s: renders are as its camera sees parts at %g – %g m, as they are annotated there; "
-            "camera=FILE working_distance=[near,far] say it otherwise",
+            "set camera=FILE and working_distance=[near,far] to change this",
             source.name,
             *distance,
         )

@@ -122,13 +122,13 @@ def _target(path: Path, layout: str, precision: str, out: Path | None) -> Path:
     is_file = ending.startswith(".")
     if (is_file and out.suffix != ending) or (not is_file and out.suffix in (".xml", ".onnx")):
         what = f"a file NAME{ending}" if is_file else "a folder"
-        raise UserError(f"--out {out} for --format {layout}", what, "name it so")
+        raise UserError(f"--out {out} for --format {layout}", what, "change --out")
     others = [path for path in out.glob("*") if path.suffix not in (".xml", ".bin")]
     if (is_file and out.is_dir()) or (not is_file and out.is_file()) or others:
-        problem = f"--out {out}, where there is something else"
-        raise UserError(problem, "a new place, or one of an earlier export", "choose another place")
+        problem = f"--out {out}, where something else exists"
+        raise UserError(problem, "a new path, or an earlier export", "choose another path")
     if out.exists() and path.exists() and out.samefile(path):
-        raise UserError(f"--out {out}, which is the checkpoint", "another place", "choose one")
+        raise UserError(f"--out {out}, which is the checkpoint", "another path", "choose one")
     return out
 
 

@@ -75,7 +75,7 @@ def find_learning_rate(config: RunConfig, run_dir: Path) -> Suggestion | None:
     """
     if config.resume is not None:
         raise UserError(
-            f"resume={config.resume} with job=lr_finder", "init_from=…, or neither", "leave it"
+            f"resume={config.resume} with job=lr_finder", "init_from=…, or neither", "remove resume"
         )
     seed_everything(config.seed, verbose=False)
     parts = build_parts(config.data)

@@ -164,7 +164,9 @@ def trusted_overrides(stored: object, source: Path) -> list[str]:
         if match["key"] in ("resume", "resume_anyway", "hydra.run.dir"):
             continue
         if "hydra" in re.split(r"[/.@:]", match["key"]):
-            _log.warning("%s: %r is left out, Hydra's own options come from you", source, text)
+            _log.warning(
+                "%s: %r is left out, options of Hydra are not read from a run", source, text
+            )
             continue
         kept.append(text)
     return kept
@@ -294,7 +296,7 @@ def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Parts)
     differences = differing_images(stored["test"], present)
     if differences:
         _log.warning(
-            "the test images are not those of the checkpoint's own figures, "
+            "the test images differ from those of the checkpoint's own measurement, "
             "though their configuration is the same: %s",
             "; ".join(differences),
         )
