@@ -77,7 +77,7 @@ class Run:
     pruned: bool = False
 
     @property
-    def alike(self) -> tuple[str, str, str] | None:
+    def method_key(self) -> tuple[str, str, str] | None:
         """Recipe, name and test set, which all seeds of a method share; None if unknown."""
         if self.report is None or self.seed is None or not self.recipe:
             return None
@@ -267,8 +267,9 @@ def group(runs: Sequence[Run]) -> list[Entry]:
     """
     entries: list[Entry] = []
     for run in runs:
-        alike = [each for each in entries if run.alike and run.alike == each.runs[0].alike]
-        entry = next((each for each in alike if run.seed not in each.seeds), None)
+        key = run.method_key
+        same = [entry for entry in entries if key and key == entry.runs[0].method_key]
+        entry = next((entry for entry in same if run.seed not in entry.seeds), None)
         if entry is None:
             entry = Entry("", failure=run.failure, pruned=run.pruned)
             entries.append(entry)
@@ -302,8 +303,8 @@ def with_refined(entries: Sequence[Entry]) -> list[Entry]:
 
 def _is_of_another_part(entry: Entry, method: Sequence[Entry]) -> bool:
     """Return whether an entry differs from the entries of a method only in its parts."""
-    mine, theirs = entry.runs[0].alike, method[0].runs[0].alike
-    if mine is None or theirs is None or mine[:2] != theirs[:2]:
+    key, method_key = entry.runs[0].method_key, method[0].runs[0].method_key
+    if key is None or method_key is None or key[:2] != method_key[:2]:
         return False
     names = {name for other in method for name in other.reports[0].errors}
     return set(entry.seeds) == set(method[0].seeds) and names.isdisjoint(entry.reports[0].errors)
@@ -328,8 +329,8 @@ def _name(entries: Sequence[Entry]) -> None:
         [text for text in entry.runs[0].overrides if all(text in r.overrides for r in entry.runs)]
         for entry in entries
     ]
-    for entry, mine in zip(entries, overrides, strict=True):
-        differing = [text for text in mine if not all(text in other for other in overrides)]
+    for entry, common in zip(entries, overrides, strict=True):
+        differing = [text for text in common if not all(text in other for other in overrides)]
         rest = [text for text in differing if not text.startswith("model=")]
         entry.name = " ".join([entry.runs[0].model, *rest])
         if len(entry.name) > _LONGEST_NAME:

@@ -87,11 +87,11 @@ def differences(entry: Entry, baseline: Entry | None, name: str) -> dict[str, Va
         not unknown and sorted(map(str, entry.seeds)) == sorted(map(str, baseline.seeds))
     )
     for field, (counted, statistic) in COMPARED.items() if objects else ():
-        mine, theirs = (
+        scores, baseline_scores = (
             [np.stack([counted(report, part) for report in method]) for part in objects]
             for method in (first, second)
         )
-        change = paired_difference(mine, theirs, statistic, same_seeds=same)
+        change = paired_difference(scores, baseline_scores, statistic, same_seeds=same)
         if change is None:
             values[field] = values[field]._replace(num_differing=0)
             continue
@@ -246,28 +246,28 @@ def _baseline_notes(
         reason = f"Not of the same seeds as {baseline.name}, so not paired over them"
         yield f"{reason}: {', '.join(unpaired)}."
     if not baseline.test_set:
-        said = f"Without Δ: {baseline.name} does not say which images it was measured on"
-        yield f"{said}; evaluate.py measures it again."
+        sentence = f"Without Δ: {baseline.name} does not say which images it was measured on"
+        yield f"{sentence}; evaluate.py measures it again."
     elif unlike := [entry.name for entry in others if not comparable(entry, baseline)]:
-        said = f"Without Δ, because not measured on the same images as {baseline.name}"
-        yield f"{said}: {', '.join(unlike)}."
+        sentence = f"Without Δ, because not measured on the same images as {baseline.name}"
+        yield f"{sentence}: {', '.join(unlike)}."
 
 
 def _interval_note(baseline: Entry, alike: Sequence[Entry]) -> str:
     """Return a sentence about the baseline of Δ and the sources of noise in its interval."""
     count = sum(len(errors) for errors in baseline.reports[0].errors.values())
-    said = (
+    sentence = (
         f"Δ is against {baseline.name}, with its 95 % interval from a paired bootstrap over the "
         f"same {count:,} test instances"
     )
     alone = [entry.name for entry in (baseline, *alike) if len(entry.reports) == 1]
     if len(alone) == len(alike) + 1:
-        return f"{said}. One training each: the noise of training is not in it."
+        return f"{sentence}. One training each: the noise of training is not in it."
     if alone:
         names = ", ".join(alone)
         unknown = "the noise of that training is not in it"
-        return f"{said} and over seeds. Of {names} there is one training: {unknown}."
-    return f"{said} and over the seeds of the trainings."
+        return f"{sentence} and over seeds. Of {names} there is one training: {unknown}."
+    return f"{sentence} and over the seeds of the trainings."
 
 
 def noise(table: pd.DataFrame) -> list[str]:
@@ -283,8 +283,8 @@ def noise(table: pd.DataFrame) -> list[str]:
             measures = (f"{value.column.heading}{_needed(value)}" for value in unsure)
             sentences.append(f"Within noise, {subject}: {', '.join(measures)}.")
     if (existing["num_differing"] < FEWEST_DIFFERING).any():
-        said = f"Where methods differ on fewer than {FEWEST_DIFFERING} instances"
-        sentences.append(f"{said}, no difference is called more than noise.")
+        sentence = f"Where methods differ on fewer than {FEWEST_DIFFERING} instances"
+        sentences.append(f"{sentence}, no difference is called more than noise.")
     return sentences
 
 

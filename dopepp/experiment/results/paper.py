@@ -188,9 +188,9 @@ def _notes(table: PaperTable, entries: Sequence[Entry]) -> list[str]:
         if any(entry.refine for entry in entries):
             notes.append(REFINED_NOTE)
         if any(_starts_untrained(run.config) for entry in entries for run in entry.runs):
-            said = "DOPE's VGG19 started untrained, as nothing is downloaded"
+            sentence = "DOPE's VGG19 started untrained, as nothing is downloaded"
             option = "model.backbone.weights_path=FILE"
-            notes.append(f"{said}; {option} starts it from a file of torchvision's.")
+            notes.append(f"{sentence}; {option} starts it from a file of torchvision's.")
     if not table.paper:
         notes.append("The paper prints no such table.")
     return notes
