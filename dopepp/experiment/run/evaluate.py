@@ -111,12 +111,15 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     if asked.tune:
         _tune_only(asked, loaded, parts, data, run_dir)
         return []
-    file = None if asked.results is None else Path(asked.results)
-    others = []
-    if file is not None:  # BOP file names begin with the name of the method
-        others = [file.stem.partition("_")[0] if asked.method is None else str(asked.method)]
-    names = _names(loaded, others)
-    files = {} if file is None else {names[-1]: file}
+    names = [str(estimator.checkpoint.data.get("name", "estimate")) for estimator in loaded]
+    files: dict[str, Path] = {}
+    if asked.results is not None:  # BOP file names begin with the name of the method
+        file = Path(asked.results)
+        names.append(file.stem.partition("_")[0] if asked.method is None else str(asked.method))
+        files = {names[-1]: file}
+    for number, name in enumerate(names[:-1]):
+        if name in names[number + 1 :]:
+            names[number] += " (baseline)" if number == 0 else " (checkpoint)"
     reports = measure_and_record(
         dict(zip(names, loaded, strict=False)),
         parts,
@@ -154,13 +157,3 @@ def _tune_only(
     estimator = refining(loaded[0], asked.refine, parts)
     tune_and_record(estimator, Path(asked.ckpt_path), parts, data, run_dir, asked)
     display.show_files(run_dir)
-
-
-def _names(loaded: Sequence[PoseEstimator], others: Sequence[str]) -> list[str]:
-    """Return unique names of the methods; duplicates are marked as baseline or checkpoint."""
-    checkpoints = [estimator.checkpoint for estimator in loaded]
-    names = [*(str(checkpoint.data.get("name", "estimate")) for checkpoint in checkpoints), *others]
-    for number, name in enumerate(names[:-1]):
-        if name in names[number + 1 :]:
-            names[number] += " (baseline)" if number == 0 else " (checkpoint)"
-    return names
