@@ -38,8 +38,11 @@ def test_a_released_checkpoint_for_pytorch(tmp_path):
 
 
 def test_a_check_that_fails_writes_nothing(monkeypatch, tmp_path):
-    compare = module.compare
-    monkeypatch.setattr(module, "compare", lambda *all_: replace(compare(*all_), maps=2e-4))
+    compare_export = module.compare_export
+
+    monkeypatch.setattr(
+        module, "compare_export", lambda *models: replace(compare_export(*models), maps=2e-4)
+    )
     with pytest.raises(RunError, match=r"pivconnector\.safetensors was not written: it differs"):
         export(RELEASED, "safetensors")
     assert list(tmp_path.iterdir()) == []
