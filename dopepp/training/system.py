@@ -1,8 +1,8 @@
 """PoseSystem: a network, a loss and an optimiser as a LightningModule.
 
 All exchangeable components are passed as objects. To add a callback, write a class in
-:mod:`dopepp.training`, and add a line to ``dopepp/experiment/assembly/build_system.py`` and an entry
-to ``conf/callbacks``.
+:mod:`dopepp.training`, and add a line to ``dopepp/experiment/assembly/build_system.py`` and an
+entry to ``conf/callbacks``.
 """
 
 from __future__ import annotations
