@@ -286,11 +286,6 @@ print(sorted({{"torch", "lightning", "torchmetrics", "ray", "webdataset"}} & set
     assert (done.out, done.code) == ("[]\n", 0), done.err
 
 
-def test_the_command_line_starts_light(command):
-    code = "import sys, dopepp.cli; print({'numpy', 'cv2', 'torch', 'numba'} & set(sys.modules))"
-    assert command("-c", code).out == "set()\n"
-
-
 @pytest.mark.parametrize("verb", [["predict", "x.ckpt"], ["doctor", "--model", "x.ckpt"]])
 def test_a_missing_camera_is_told_before_pytorch_is_imported(verb, command, tmp_path):
     picture = tmp_path / "a.png"

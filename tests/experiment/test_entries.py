@@ -34,16 +34,6 @@ def test_the_console_answers_before_it_imports_pytorch(command, arguments, code,
     assert done.out.endswith("set()\n")
 
 
-def test_a_network_is_read_without_pytorchs_compiler(command):
-    code = """
-import sys
-from dopepp import PoseEstimator
-PoseEstimator.load("pretrained/pivconnector")
-print({"torch._dynamo", "sympy", "lightning", "matplotlib"} & set(sys.modules))
-"""
-    assert command("-c", code, code=0).out == "set()\n"
-
-
 def test_a_refused_run_leaves_no_folder(call, tiny_options, tmp_path):
     output = f"output_dir={tmp_path}"
     call("train.py", *tiny_options, "data.parts=[none.stl]", output, code=2)

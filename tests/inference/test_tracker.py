@@ -78,6 +78,22 @@ def stage():
     return Stage(pivconnector(), servoholder())
 
 
+@pytest.fixture
+def tracker(stage):
+    """A tracker that has seen one part for a frame."""
+    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
+    tracker = PoseTracker(stage)
+    assert len(tracker.track(IMAGE, K)) == 1
+    return tracker
+
+
+def test_the_network_settles_a_doubt_where_it_agrees_better(stage, tracker):
+    stage.agreement, stage.network_agreement = 0.5, 0.4
+    assert not tracker.track(IMAGE, K)[0].detected
+    stage.network_agreement = 0.8
+    assert tracker.track(IMAGE, K)[0].detected
+
+
 def test_follows_a_part_and_looks_only_when_due(stage):
     tracker = PoseTracker(stage, detect_every=10)
     for frame in range(30):
@@ -104,10 +120,7 @@ def test_a_steady_motion_is_foreseen(stage):
     assert stage.refinements == before + 1  # where it was expected, at once
 
 
-def test_a_lost_part_is_looked_for_and_keeps_its_identity(stage):
-    tracker = PoseTracker(stage)
-    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
-    assert len(tracker.track(IMAGE, K)) == 1
+def test_a_lost_part_is_looked_for_and_keeps_its_identity(stage, tracker):
     stage.hidden = {"a"}
     for _ in range(7):
         assert tracker.track(IMAGE, K) == []
@@ -149,10 +162,8 @@ def test_two_parts_of_a_kind_keep_their_identities_when_one_comes_back(stage):
     assert again == {**places, 2: 0.0}
 
 
-def test_a_sudden_move_is_followed_without_the_network(stage):
-    tracker = PoseTracker(stage)
-    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
-    for _ in range(5):
+def test_a_sudden_move_is_followed_without_the_network(stage, tracker):
+    for _ in range(4):
         tracker.track(IMAGE, K)
     stage.unknown_to_network = {"a"}
     stage.put("a", pivconnector(), (0.015, 0.0, 0.3), (math.radians(8), 0.0, 0.0))
@@ -176,10 +187,7 @@ def test_the_network_outvotes_a_track_that_sits_elsewhere(stage):
     assert detected == [False] * 5 + [True]
 
 
-def test_the_network_looks_at_what_agrees_little_and_must_agree_more(stage):
-    tracker = PoseTracker(stage)
-    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
-    tracker.track(IMAGE, K)
+def test_the_network_looks_at_what_agrees_little_and_must_agree_more(stage, tracker):
     stage.agreement = 0.84  # not enough less than usual to be in doubt
     elsewhere = make_transform(np.eye(3), np.array([0.0, 0.03, 0.3]))
     beside = replace(stage._detection("pivconnector", elsewhere), agreement=0.8)
@@ -219,26 +227,18 @@ def test_a_part_in_doubt_goes_on_as_it_was_going(stage):
     assert (track.identity, track.detected) == (0, True)
 
 
-def test_the_network_settles_a_doubt_where_it_agrees_better(stage):
-    tracker = PoseTracker(stage)
-    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
-    tracker.track(IMAGE, K)
-    stage.agreement, stage.network_agreement = 0.5, 0.4
-    assert not tracker.track(IMAGE, K)[0].detected
-    stage.network_agreement = 0.8
-    assert tracker.track(IMAGE, K)[0].detected
-
-
-def test_bad_input(stage):
-    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
-    tracker = PoseTracker(stage)
-    with pytest.raises(UserError, match="uint8"):
-        tracker.track(IMAGE[..., 0], K)
-    with pytest.raises(UserError, match="detect_every=0"):
-        PoseTracker(stage, detect_every=0)
-    stage.refiner = None
-    with pytest.raises(UserError, match="refine='region'"):
-        PoseTracker(stage)
+@pytest.mark.parametrize(
+    ("options", "image", "refiner", "message"),
+    [
+        ({}, IMAGE[..., 0], True, "uint8"),
+        ({"detect_every": 0}, IMAGE, True, "detect_every=0"),
+        ({}, IMAGE, None, "refine='region'"),
+    ],
+)
+def test_bad_input(options, image, refiner, message, stage):
+    stage.refiner = refiner
+    with pytest.raises(UserError, match=message):
+        PoseTracker(stage, **options).track(image, K)
 
 
 START = make_transform(rotation_vector_to_matrix(np.array([0.3, -0.2, 1.0])), [0.02, -0.01, 0.3])

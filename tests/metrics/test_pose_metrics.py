@@ -128,26 +128,32 @@ def test_rows_agree_with_the_functions():
     np.testing.assert_allclose(metric.errors("box", "mssd"), surface, rtol=1e-12)
 
 
-BAD = [np.full((4, 4), bad) for bad in (math.nan, math.inf)]
-
-
 @pytest.mark.parametrize(
-    ("found", "error", "counts"),
+    ("found", "truths", "counts", "errors"),
     [
         # Of two the better score counts; the other is a false positive.
-        ([(0.2, pose(0)), (0.9, pose(0.03))], 0.03, (1, 0.5, 0)),
+        ([(0.2, pose(0)), (0.9, pose(0.03))], [(0, 1)], (1, 1, 0.5, 0), [0.03]),
         # Farther than ten centimetres, or no pose at all: a miss and a false positive.
-        ([(0.9, pose(0.11))], math.inf, (1, 0, 1)),
-        ([(0.9, BAD[0])], math.inf, (1, 0, 1)),
-        ([(0.9, BAD[1])], math.inf, (1, 0, 1)),
+        ([(0.9, pose(0.11))], [(0, 1)], (1, 1, 0, 1), [math.inf]),
+        *(
+            ([(0.9, np.full((4, 4), bad))], [(0, 1)], (1, 1, 0, 1), [math.inf])
+            for bad in (math.nan, math.inf)
+        ),
+        # An instance hardly visible neither counts nor makes a false positive …
+        ([(0.9, pose(0.3))], [(0, 0.1), (0.3, 0.0999)], (1, 0, 0, 1), [math.inf]),
+        # … and a second detection there has no instance left to explain it.
+        ([(s, pose(0.3)) for s in (0.9, 0.8)], [(0, 0.1), (0.3, 0.0999)], (1, 1, 0, 1), [math.inf]),
+        # An instance that counts is matched before a hidden one.
+        ([(0.9, pose(0.01))], [(0.01, 0.05), (0, 0.9)], (1, 0, 1, 0), [0.01]),
     ],
 )
-def test_what_stands_for_an_instance(found, error, counts):
+def test_what_stands_for_an_instance(found, truths, counts, errors):
     metric = PoseMetrics([part("box")])
-    metric.update([Detection("box", score, T) for score, T in found], [truth("box", pose())])
+    instances = [truth("box", pose(x), visible) for x, visible in truths]
+    metric.update([Detection("box", score, T) for score, T in found], instances)
     row = metric.compute()["box"]
-    assert (row.false_positives, row.precision, row.miss_rate) == counts
-    assert metric.errors("box") == pytest.approx([error])
+    assert (row.num_instances, row.false_positives, row.precision, row.miss_rate) == counts
+    assert metric.errors("box") == pytest.approx(errors)
     assert not any(isinstance(v, float) and math.isnan(v) for v in asdict(row).values())
 
 
@@ -158,26 +164,6 @@ def test_the_distance_is_taken_between_centres_not_origins():
     metric = PoseMetrics([far])
     metric.update([Detection("far", 1, pose(0, (0, 0, 0.4)))], [truth("far", pose())])
     assert metric.compute()["far"].miss_rate == 1
-
-
-def test_an_instance_hardly_visible_neither_counts_nor_makes_a_false_positive():
-    metric = PoseMetrics([part("box")])
-    hidden = truth("box", pose(0.3), visible=0.0999)
-    metric.update([Detection("box", 0.9, pose(0.3))], [truth("box", pose(0), 0.1), hidden])
-    row = metric.compute()["box"]
-    assert (row.num_instances, row.miss_rate, row.false_positives) == (1, 1, 0)
-    # A second prediction there has no instance left to explain it.
-    metric.update([Detection("box", s, pose(0.3)) for s in (0.9, 0.8)], [hidden])
-    assert metric.compute()["box"].false_positives == 1
-
-
-def test_an_instance_that_counts_is_matched_before_a_hidden_one():
-    metric = PoseMetrics([part("box")])
-    metric.update(
-        [Detection("box", 0.9, pose(0.01))],
-        [truth("box", pose(0.01), 0.05), truth("box", pose(0.0), 0.9)],
-    )
-    assert metric.errors("box") == pytest.approx([0.01])
 
 
 def test_objects_do_not_match_each_other():
@@ -196,8 +182,11 @@ def test_parts_must_have_names_of_their_own(names):
         PoseMetrics([part(name) for name in names])
 
 
-def test_all_missed_gives_zero_and_no_nan():
+@pytest.mark.filterwarnings("ignore:The ``compute`` method of metric PoseMetrics was called")
+def test_all_missed_gives_zero_and_nothing_at_all_is_not_available():
     metric = PoseMetrics([part("box")])
+    for row in metric.compute().values():
+        assert row == PoseRow(row.object, "estimate", num_instances=0, false_positives=0)
     for _ in range(3):
         metric.update([], [truth("box", pose())])
     row = metric.compute()["box"]
@@ -206,14 +195,6 @@ def test_all_missed_gives_zero_and_no_nan():
              "add_or_s_01d", "auc_or_s_10cm", "pass_5cm_5deg")  # fmt: skip
     expected = PoseRow("box", "estimate", 3, miss_rate=1.0, false_positives=0)
     assert row == replace(expected, **dict.fromkeys(zeros, 0.0))
-
-
-@pytest.mark.filterwarnings("ignore:The ``compute`` method of metric PoseMetrics was called")
-def test_nothing_at_all_is_not_available():
-    metric = PoseMetrics([part("a"), part("b")])
-    for row in metric.compute().values():
-        assert row == PoseRow(row.object, "estimate", num_instances=0, false_positives=0)
-    assert metric.errors("a").shape == (0,)
 
 
 def test_an_object_without_ground_truth_stays_out_of_the_mean():

@@ -106,11 +106,6 @@ def test_a_built_in_part_and_a_checkpoints_have_no_unit():
     assert size_in_words(np.array([0.0031, 0.2, 0.04])) == "200 × 40 × 3.1 mm"
 
 
-def test_a_record_comes_back():
-    seen = Seen(20.0, 90.5, 0.3, 0.8)
-    assert Seen.parse(list(seen)) == seen
-
-
 @pytest.mark.parametrize(
     "record",
     [None, 4, [1, 2, 3], [9.0, 2.0, 0.1, 0.2], [1, 2, 0.2, 0.1], [1, 2, 0, 1], [1, "2", 0.1, 0.2],

@@ -122,17 +122,6 @@ def test_a_run_cut_at_any_hook_ends_as_if_it_had_not_been(every, runs, whole, tm
         assert_ends_as(folder, system, cut, runs(cut, Cut(None)))
 
 
-def test_a_run_cut_again_and_again(runs, whole, tmp_path):
-    folder, system, _ = whole
-    for _ in range(40):
-        try:  # every life gets a few hooks further
-            again = runs(tmp_path, Cut(12))
-        except CutError:
-            continue
-        break
-    assert_ends_as(folder, system, tmp_path, again)
-
-
 def test_the_clock_and_the_share_of_time_decide(runs, tmp_path):
     patient, thrifty = LastCheckpoint(every_s=3600), LastCheckpoint(every_s=0, max_share=1e-6)
     for name, last in (("patient", patient), ("thrifty", thrifty)):
