@@ -249,13 +249,6 @@ def test_a_shard_that_is_none(text):
         Shard.parse(text)
 
 
-@pytest.mark.parametrize("num", [0, -5, 10**9 + 1])
-def test_a_count_that_cannot_be(num, tmp_path, small_job):
-    with pytest.raises(UserError, match=f"-n {num}; allowed: 1 to 1,000,000,000"):
-        render_dataset(small_job(), tmp_path / "out", num, InlinePool)
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_part_can_be_given_a_name(tmp_path):
     assert named_part("left=servoholder", None).name == "left"
     names = [part.name for part in make_job(["a=servoholder", "b=pivconnector"]).factory.parts]
@@ -293,14 +286,6 @@ def test_a_defect_comes_with_its_traceback(tmp_path, monkeypatch, small_job):
     monkeypatch.setattr(NddsWriter, "write", lambda *_: dict[str, str]()["defect"])
     with pytest.raises(RuntimeError, match=r"(?s)test_rendering\.py.*KeyError: 'defect'"):
         render_dataset(small_job("ndds"), tmp_path, 2, InlinePool)
-
-
-def test_a_part_that_the_preset_cannot_show_is_one_line(tmp_path, small_job):
-    small = ["horizontal_fov_deg=5", "placement.lateral=0", "min_visible_fraction=0.95"]
-    job = small_job(preset="paper", changes=small)
-    with pytest.raises(UserError, match="part servoholder"):
-        render_dataset(job, tmp_path / "out", 2, InlinePool)
-    assert not (tmp_path / "out").exists()
 
 
 def test_the_bar_shows_count_rate_and_time_left():

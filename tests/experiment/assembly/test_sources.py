@@ -140,12 +140,6 @@ def test_a_mistake_in_the_data_is_one_line(override, got, tiny):
     assert "\n" not in str(error.value)
 
 
-def test_a_mistake_in_the_camera_jitter_is_one_line(tiny):
-    with pytest.raises(UserError, match="shift=2") as error:
-        counts(tiny("data/jitter=camera", "data.jitter.shift=2").data)
-    assert "\n" not in str(error.value)
-
-
 def test_a_unit_matters_to_files_only(tiny):
     (part,) = build_parts(tiny("data.unit=parsec").data)
     assert part.name == "pivconnector"

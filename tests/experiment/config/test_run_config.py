@@ -17,7 +17,7 @@ from dopepp.experiment.config.run_config import EvaluationConfig, RunConfig
             "data.batch_size=0", "data.num_val=0",
             "data.num_workers=-1", "data.real_fraction=1.5", "data.input_size=64", "data.root=1",
             "lr_finder.num_steps=9", "trainer.max_epochs=0", "+trainer.num_nodes=0",
-            "trainer.ddp_timeout_s=0",
+            "trainer.ddp_timeout_s=0", "cost.batch_size=0.5",
         )),
         ("+data.colour=red", "data.colour='red'"),
         ("+virtual.colour=red", "virtual.colour='red'"),

@@ -109,13 +109,6 @@ def test_bins_ascend_and_equal_values_share_one(values, num_bins):
         assert np.ptp(counts) <= 1
 
 
-def test_many_equal_values_draw_no_others_into_their_bin():
-    values = np.array([0.3] + [1.0] * 30 + [0.5, 0.9])
-    bins = bin_numbers(values, 5)
-    assert len(set(bins[values == 1])) == 1
-    assert not set(bins[values < 1]) & set(bins[values == 1])
-
-
 def test_rates_of_bins_are_those_of_their_instances(measured, tmp_path):
     metrics, truths, offsets = measured
     record_breakdown(tmp_path, {"dopepp": metrics}, "distance", 4, RATES)

@@ -53,17 +53,9 @@ def test_counts_are_the_papers_and_times_are_written(parsed, tmp_path, capsys):
     assert read_rgb(tmp_path / "frame_rate.png").std() > 0
 
 
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("job=mow", "job='mow'; allowed: train, cost"),
-        ("cost.batch_size=0.5", "cost.batch_size=0.5"),
-        ("recovery.max_peaks=0", "recovery.max_peaks=0"),
-    ],
-)
-def test_impossible_jobs(composed, tmp_path, override, message):
-    with pytest.raises(UserError, match=message):
-        do_job(composed(*SMALL, "job=cost", override), tmp_path)
+def test_an_impossible_job_leaves_nothing(composed, tmp_path):
+    with pytest.raises(UserError, match=r"recovery\.max_peaks=0"):
+        do_job(composed(*SMALL, "job=cost", "recovery.max_peaks=0"), tmp_path)
     assert not any(tmp_path.iterdir())
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -115,22 +116,12 @@ def test_poses_beside_the_test_set_are_left_out(root, composed, tmp_path, caplog
     assert f"left out 1 poses on images that are not in the test set and {others} of" in caplog.text
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"scene_id": 3}, r"poses are all on other images, the first in scene 3, image 0"),
-        ({"obj_id": 9}, r"line 2: obj_id 9; allowed: the data set's objects: 1, 2"),
-        ({"T_cam_obj": np.diag([2.0, 2, 2, 1])}, r"line 2: R '2\.0 0\.0"),
-    ],
-)
-def test_a_file_that_does_not_fit_the_data(change, message, root, composed, tmp_path):
+def test_a_file_that_does_not_fit_the_data(root, composed, tmp_path):
     path = tmp_path / "results.csv"
-    one = vars(results(root)[0])
-    write_results(path, [BopResult(**{**one, **change})])
+    write_results(path, [replace(results(root)[0], scene_id=3)])
     config = composed(*options(root, f"results={path}"), config="evaluate")
-    with pytest.raises(UserError, match=message) as error:
+    with pytest.raises(UserError, match=r"results\.csv.* on other images, the first in scene 3"):
         run_evaluation(config, tmp_path / "run")
-    assert "results.csv" in str(error.value)
 
 
 def test_an_evaluation_needs_something_to_measure(composed, tmp_path):
