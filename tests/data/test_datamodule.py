@@ -181,8 +181,7 @@ def test_collate_pads_instances(fake_source):
     two.instances.append(replace(two.instances[0], label="can", masked_fraction=0.25))
     batch = collate([one, none, two], {"can": 0, "box": 1})
     assert batch.object_index.tolist() == [[1, PADDING], [PADDING] * 2, [1, 0]]
-    assert batch.images.dtype == torch.uint8
-    assert batch.images.shape == (3, 3, 48, 64)
+    assert (batch.images.dtype, batch.images.shape) == (torch.uint8, (3, 3, 48, 64))
     assert batch.images.is_contiguous(memory_format=torch.channels_last)
     np.testing.assert_array_equal(batch.images[2].permute(1, 2, 0).numpy(), two.image)
     np.testing.assert_allclose(batch.K[0].numpy(), one.K)
@@ -194,8 +193,7 @@ def test_collate_pads_instances(fake_source):
     assert (batch.T_cam_obj[padding] == torch.eye(4)).all()
     assert batch.visible_fraction[padding].eq(0).all()
     assert batch.masked_fraction[2].tolist() == [0.0, 0.25]
-    assert batch.keys == ["0/0", "0/1", "0/2"]
-    assert batch.sources == ["fake"] * 3
+    assert (batch.keys, batch.sources) == (["0/0", "0/1", "0/2"], ["fake"] * 3)
     assert len(batch) == 3
 
 
@@ -210,5 +208,4 @@ def test_to_moves_tensors_and_keeps_the_rest(fake_source):
     moved = batch.to("meta", non_blocking=True)
     assert isinstance(moved, Batch)
     assert moved.images.device.type == moved.object_index.device.type == "meta"
-    assert moved.object_index.dtype == torch.int64
-    assert moved.keys == batch.keys
+    assert (moved.object_index.dtype, moved.keys) == (torch.int64, batch.keys)

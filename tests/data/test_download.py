@@ -189,8 +189,7 @@ def test_a_data_set_is_unpacked_once(server, tmp_path, monkeypatch, caplog):
         folder = download("tiny", tmp_path / "data")
     assert "free for tests" in caplog.text
     assert folder == tmp_path / "data" / "tiny" / "set" / "photos"
-    assert names(folder) == ["a.jpg", "b.jpg"]
-    assert names(tmp_path / "data") == ["tiny"]
+    assert (names(folder), names(tmp_path / "data")) == (["a.jpg", "b.jpg"], ["tiny"])
     assert download("tiny", tmp_path / "data") == folder
     assert len(server.ranges) == 1
 

@@ -55,13 +55,10 @@ def test_png_and_csv_hold_the_curves(tmp_path):
     assert table.shape == (201, 3)
     np.testing.assert_allclose(table[:, 0], np.arange(201) * 0.0005, atol=1e-9)
     at = {round(row[0], 4): row[1:].tolist() for row in table}
-    assert at[0.0] == [0, 0]
-    assert at[0.0005] == [0, 0.5]
-    assert at[0.01] == [0, 0.5]
+    assert (at[0.0], at[0.0005], at[0.01]) == ([0, 0], [0, 0.5], [0, 0.5])
     assert at[0.0105] == [0, 1]
     assert at[0.02] == [0, 1]  # strictly below
-    assert at[0.0205] == [0.5, 1]
-    assert at[0.1] == [0.5, 1]
+    assert (at[0.0205], at[0.1]) == ([0.5, 1], [0.5, 1])
     image = cv2.imread(str(tmp_path / "run.1" / "auc_curves.png"))
     assert image.shape[0] > 300
     assert image.std() > 5

@@ -100,8 +100,7 @@ def test_evaluation_needs_the_checkpoint_alone(trained, evaluate):
     run, (folder, _) = trained[0], evaluate()
     ours, theirs = (json.loads((f / "metrics.json").read_text()) for f in (folder, run))
     # The same images, the same poses: the same figures as at the end of training.
-    assert ours["objects"] == theirs["objects"]
-    assert ours["add"] == theirs["add"]
+    assert (ours["objects"], ours["add"]) == (theirs["objects"], theirs["add"])
     assert {path.name for path in folder.iterdir()} >= {
         "auc.png", "auc.csv", "overlay.png", "config.yaml", "versions.json", "README.md",
     }  # fmt: skip

@@ -92,8 +92,7 @@ def test_letterbox_image_goes_where_its_points_go(input_size):
     image = np.repeat(np.round(blob).astype(np.uint8)[..., None], 3, axis=2)
     box = Letterbox.fit((200, 150), input_size)
     resized = box.image(image)
-    assert resized.shape == (box.height, box.width, 3)
-    assert resized.dtype == np.uint8
+    assert (resized.shape, resized.dtype) == ((box.height, box.width, 3), np.uint8)
     rows, columns = np.mgrid[: box.height, : box.width]
     weight = resized[..., 1].astype(float)
     centre = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()

@@ -144,8 +144,7 @@ def test_every_format_says_the_same(text, size, lens, tmp_path):
     path.write_text(text, encoding="utf-8")
     camera = read_camera(path)
     assert_array_equal(camera.K, K)
-    assert (camera.size, camera.distortion) == (size, lens)
-    assert camera.source == str(path)
+    assert (camera.size, camera.distortion, camera.source) == (size, lens, str(path))
 
 
 @pytest.mark.parametrize(

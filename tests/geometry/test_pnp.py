@@ -53,8 +53,7 @@ def add(T: np.ndarray | None, truth: np.ndarray, cuboid: np.ndarray) -> float:
 
 def check(result: PnPResult, object_points: np.ndarray) -> None:
     """What holds for every result, whatever went in."""
-    assert result.inliers.shape == (len(object_points),)
-    assert result.inliers.dtype == bool
+    assert (result.inliers.shape, result.inliers.dtype) == ((len(object_points),), bool)
     assert (result.T_cam_obj is None) == bool(result.reason)
     if result.T_cam_obj is None:
         assert result.reprojection_error_px == np.inf

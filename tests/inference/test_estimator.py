@@ -96,8 +96,7 @@ def test_loads_what_was_saved(estimator, parts):
     for ours, theirs in zip(estimator.parts, parts, strict=True):
         assert_allclose(ours.cuboid, theirs.cuboid)
     assert not estimator.network.training
-    assert estimator.recovery.peak_threshold == 0.03
-    assert estimator.recovery.max_peaks == 8
+    assert (estimator.recovery.peak_threshold, estimator.recovery.max_peaks) == (0.03, 8)
     assert estimator.recovery.sigma == 1.5
 
 

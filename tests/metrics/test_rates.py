@@ -64,10 +64,8 @@ def test_auc_refuses_other_methods_and_empty_ranges():
 
 def test_pass_rate_is_strict_and_misses_count():
     errors = torch.tensor([0.0, 0.05, 0.1, math.inf, math.nan], dtype=torch.float64)
-    assert pass_rate(errors, 0.05) == 0.2
-    assert pass_rate(errors, 0.1) == 0.4
-    assert pass_rate(torch.empty(0), 0.1) == 0.0
-    assert pass_rate(errors[3:], 0.1) == 0.0
+    assert (pass_rate(errors, 0.05), pass_rate(errors, 0.1)) == (0.2, 0.4)
+    assert (pass_rate(torch.empty(0), 0.1), pass_rate(errors[3:], 0.1)) == (0.0, 0.0)
 
 
 def test_match_breaks_ties_by_order_and_includes_the_limit():
@@ -132,8 +130,7 @@ def test_average_precision_at_the_ends():
 def test_average_recall_is_the_mean_of_strict_pass_rates():
     errors = torch.tensor([0.05, 0.07, 0.3, torch.inf, torch.nan])
     rates = [pass_rate(errors, threshold) for threshold in BOP_THRESHOLDS]
-    assert rates[0] == 0.0
-    assert rates[-1] == pytest.approx(0.6)
+    assert (rates[0], rates[-1]) == (0.0, pytest.approx(0.6))
     assert average_recall(errors, BOP_THRESHOLDS) == pytest.approx(sum(rates) / 10)
     assert average_recall(torch.zeros(0), BOP_MSPD_THRESHOLDS) == 0.0
     assert (len(BOP_THRESHOLDS), BOP_THRESHOLDS[2], BOP_MSPD_THRESHOLDS[-1]) == (10, 0.15, 50.0)

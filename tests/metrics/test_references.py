@@ -92,8 +92,7 @@ def test_without_instances_and_with_a_single_one():
         assert (row.num_instances, row.add_01d) == (0, None)
     rows = reference_rows(plate(), poses(Rotation.random(1, random_state=0)))
     assert rows[CHANCE_RANGE].add_01d is None
-    assert rows[CHANCE_RANGE].num_instances == 1
-    assert rows[BEST_CONSTANT].add_01d == 1.0
+    assert (rows[CHANCE_RANGE].num_instances, rows[BEST_CONSTANT].add_01d) == (1, 1.0)
 
 
 def test_symmetries_hold_wherever_the_origin_lies():

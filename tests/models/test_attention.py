@@ -37,8 +37,7 @@ def test_cbam_is_equations_5_and_6(kernel_size):
 
 def test_cbam_defaults_to_the_paper():
     module = CBAM(128)
-    assert module.spatial.kernel_size == (3, 3)
-    assert module.mlp[0].out_features == 128 // 16
+    assert (module.spatial.kernel_size, module.mlp[0].out_features) == ((3, 3), 128 // 16)
 
 
 def test_se_weighs_channels_by_their_mean():

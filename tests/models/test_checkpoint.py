@@ -71,8 +71,7 @@ def test_round_trip(checkpoint, saved, part):
         assert getattr(loaded, name) == getattr(checkpoint, name)
     assert loaded.data_fingerprint == "abc"
     assert isinstance(loaded.recovery["max_instances"], int)
-    assert loaded.parts[0].name == "bracket"
-    assert loaded.parts[0].mesh_hash == part.mesh_hash
+    assert (loaded.parts[0].name, loaded.parts[0].mesh_hash) == ("bracket", part.mesh_hash)
     np.testing.assert_array_equal(loaded.parts[0].cuboid, part.cuboid)
     np.testing.assert_array_equal(loaded.parts[0].points, part.points)
     assert not network.training

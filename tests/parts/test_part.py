@@ -14,8 +14,7 @@ def box(size: tuple[float, float, float]) -> Mesh:
 
 def test_measures_a_box():
     part = make_part("box", box((0.03, 0.04, 0.12)))
-    assert part.name == "box"
-    assert part.diameter == pytest.approx(0.13, rel=1e-15)
+    assert (part.name, part.diameter) == ("box", pytest.approx(0.13, rel=1e-15))
     half = np.array([0.015, 0.02, 0.06])
     np.testing.assert_allclose(part.cuboid, cuboid_keypoints(-half, half), atol=1e-18)
     assert part.points.shape == (2000, 3)

@@ -111,8 +111,7 @@ def test_what_is_written_is_read_by_us_and_by_the_library(array, text, tmp_path_
     assert metadata == {"text": text}
     for name, tensor in tensors.items():
         for other in (loaded[name], library[name]):
-            assert other.dtype == tensor.dtype
-            assert other.shape == tensor.shape
+            assert (other.dtype, other.shape) == (tensor.dtype, tensor.shape)
             assert other.numpy().tobytes() == tensor.numpy().tobytes()
 
 

@@ -77,8 +77,7 @@ def test_the_identity_knows_names_and_sizes_but_not_the_place(tmp_path):
     write_photos(tmp_path / "a", 3)
     write_photos(tmp_path / "b", 3)
     first, again = (PhotoBackgrounds(tmp_path / name).identity() for name in "ab")
-    assert first == again
-    assert first[:2] == ["photos", "3"]
+    assert (first, first[:2]) == (again, ["photos", "3"])
     (tmp_path / "b" / "0001.jpg").rename(tmp_path / "b" / "new.jpg")
     renamed = PhotoBackgrounds(tmp_path / "b").identity()
     (tmp_path / "b" / "new.jpg").write_bytes(b"longer or shorter")
@@ -215,8 +214,7 @@ class Grey:
 def covered(number: int, seed: int, size=(96, 64)) -> float:
     clutter = ClutteredBackgrounds(Grey(), (number, number))
     image = clutter.draw(np.random.default_rng(seed), *size)
-    assert image.shape == (size[1], size[0], 3)
-    assert image.dtype == np.uint8
+    assert (image.shape, image.dtype) == ((size[1], size[0], 3), np.uint8)
     return float((image != 77).any(axis=2).mean())
 
 

@@ -44,15 +44,12 @@ def digest(rendered: Rendered) -> str:
 
 def test_shapes_and_types():
     rendered = make_factory().render(0, 0)
-    assert rendered.image.shape == (128, 128, 3)
-    assert rendered.image.dtype == np.uint8
-    assert rendered.depth.dtype == np.float32
-    assert rendered.instances.dtype == np.int16
+    assert (rendered.image.shape, rendered.image.dtype) == ((128, 128, 3), np.uint8)
+    assert (rendered.depth.dtype, rendered.instances.dtype) == (np.float32, np.int16)
     assert rendered.visible_fractions.shape == (len(rendered.scene.objects),)
     assert rendered.scene.objects[0].label in ("servoholder", "pivconnector")
     np.testing.assert_array_equal(rendered.depth > 0, rendered.instances >= 0)
-    assert rendered.scene.keypoints(0).shape == (9, 2)
-    assert rendered.scene.targets == (0,)
+    assert (rendered.scene.keypoints(0).shape, rendered.scene.targets) == ((9, 2), (0,))
 
 
 @pytest.mark.parametrize(

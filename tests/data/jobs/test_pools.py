@@ -60,8 +60,7 @@ def test_one_worker_two_workers_and_two_nodes_write_the_same_bytes(
         assert len(pools[0].num_tasks) == 2  # both nodes had work
     one = contents(tmp_path / "1")
     assert sum(len(content) for content in one.values()) > 1000 * NUM
-    assert contents(tmp_path / "2") == one
-    assert contents(tmp_path / "ray") == one
+    assert (contents(tmp_path / "2"), contents(tmp_path / "ray")) == (one, one)
 
 
 @pytest.mark.slow

@@ -53,8 +53,7 @@ def test_every_window_holds_a_centre_and_chance_moves_it():
 
 def test_a_picture_smaller_than_the_window_is_padded():
     (sample,) = windows(1, window=(200, 64))
-    assert sample.size == (200, 64)
-    assert sample.instances[0].mask.shape == (64, 200)
+    assert (sample.size, sample.instances[0].mask.shape) == ((200, 64), (64, 200))
     assert not sample.image[:, 160:].any()
     assert sample.image[:, :160].any(axis=(0, 2)).all()
 

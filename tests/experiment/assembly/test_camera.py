@@ -76,8 +76,7 @@ def test_training_sees_windows_and_who_measures_whole_pictures(my_part):
         assert sample.K[0, 0] == pytest.approx(FOCAL * data.virtual.camera_scale)
     for split in ("val", "test"):
         sample = held_out_source(data, parts, split).sample(0)
-        assert sample.size == (1280, 720)
-        assert sample.K[0, 0] == FOCAL
+        assert (sample.size, sample.K[0, 0]) == ((1280, 720), FOCAL)
         assert 0.38 < sample.instances[0].T_cam_obj[2, 3] < 0.72
     corners = {tuple(module.train_item(0, n).K[:2, 2].round(3)) for n in range(4)}
     assert len(corners) == 4

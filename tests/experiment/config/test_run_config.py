@@ -79,12 +79,10 @@ def test_terms_of_a_refinement_are_one_or_a_list(override, terms, composed):
 def test_values_are_typed_and_the_plain_config_stays(composed):
     plain = composed("data.root=photos", "+trainer.limit_val_batches=2", "ema=0.5", "shading=0.4")
     config = RunConfig.of(plain)
-    assert config.plain == plain
-    assert config.data.root == Path("photos")
+    assert (config.plain, config.data.root) == (plain, Path("photos"))
     assert (config.data.input_size, config.data.parts[0]) == ((416, 416), "servoholder")
     assert config.trainer.lightning["limit_val_batches"] == 2
     assert config.protocols.shading == (0.4,)
     assert type(config.recovery["max_peaks"]) is int
-    assert config.num_empty == 500
-    assert config.stored_data()["virtual"] == plain["virtual"]
+    assert (config.num_empty, config.stored_data()["virtual"]) == (500, plain["virtual"])
     assert (config.ema, config.logger, config.search) == (0.5, None, None)

@@ -226,8 +226,7 @@ def test_a_log_is_read_as_far_as_it_goes(tmp_path):
     path = tmp_path / "metrics.csv"
     assert logged(path, "train/loss") == {}
     path.write_text("step,train/loss\n0,1.5\n1,\n2,nan\nx,1\n3,0.5\n4")
-    assert logged(path, "train/loss") == {0: 1.5, 3: 0.5}
-    assert logged(path, "val/loss") == {}
+    assert (logged(path, "train/loss"), logged(path, "val/loss")) == ({0: 1.5, 3: 0.5}, {})
 
 
 # The whole

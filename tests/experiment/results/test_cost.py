@@ -32,8 +32,7 @@ def test_counts_are_the_papers_and_times_are_written(parsed, tmp_path, capsys):
     config = parsed("experiment=table4_parameters", *SMALL, "model.width=1", "job=cost")
     cost = measure_cost(config, tmp_path)
     assert torch.is_grad_enabled()  # as before
-    assert cost.backbone_weights == 1_107_776
-    assert cost.input_size == (32, 32)
+    assert (cost.backbone_weights, cost.input_size) == (1_107_776, (32, 32))
     assert cost.picture_size == (128, 128)  # the quickstart's own
     frames = pd.read_csv(tmp_path / "frames.csv")
     assert len(frames) == 4

@@ -40,8 +40,7 @@ def test_the_state_of_the_working_tree(working_tree, tmp_path):
     git("commit", "-qm", "Begin")
     write_environment(tmp_path / "clean", 7, "abc")
     state = read_json(tmp_path / "clean" / VERSIONS_FILE)["git"]
-    assert (state["dirty"], state["untracked"]) == (False, [])
-    assert len(state["commit"]) == 40
+    assert (state["dirty"], state["untracked"], len(state["commit"])) == (False, [], 40)
 
     (tree / "dopepp" / "__init__.py").write_text("one = 2\n")
     (tree / "new.py").write_text("")

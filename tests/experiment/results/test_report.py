@@ -41,8 +41,7 @@ def test_a_report_survives_json(errors, share, ms):
     np.testing.assert_array_equal(back.errors["part0"], report.errors["part0"])
     np.testing.assert_array_equal(back.rotation_deg["part0"], report.rotation_deg["part0"])
     assert (back.diameters, back.test_set) == ({"part0": 0.1}, "abc")
-    assert back.rows == report.rows
-    assert back.references == report.references
+    assert (back.rows, back.references) == (report.rows, report.references)
     assert (back.name, back.cost, back.num_images) == ("dopepp", report.cost, 4)
     assert back.details == report.details
     assert back.refined is not None

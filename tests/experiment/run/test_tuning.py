@@ -128,8 +128,7 @@ def test_what_finds_a_hidden_instance_is_not_judged():
     # One explains itself by the instance that is hardly visible; its duplicate is wrong, and so
     # are both on the image without the part.
     assert result.correct.tolist() == [False, False, False]
-    assert result.scores.tolist() == [0.8, 0.9, 0.8]
-    assert result.num_instances == 0
+    assert (result.scores.tolist(), result.num_instances) == ([0.8, 0.9, 0.8], 0)
 
 
 def test_poses_are_paired_with_the_instances_that_they_find():
@@ -206,7 +205,6 @@ def test_the_tuned_checkpoint_stands_beside_the_old_one(tiny_spec, tmp_path, nam
     )
     assert path == tmp_path / "best_tuned.ckpt"
     tuned = PoseEstimator.load(path)
-    assert tuned.recovery.max_angle_deg == 30.0
-    assert tuned.recovery.min_score == 0.5
+    assert (tuned.recovery.max_angle_deg, tuned.recovery.min_score) == (30.0, 0.5)
     assert tuned.recovery.distance_factor == 0.95
     assert tuned.recovery.score_weights == (-1.5, 1.0, 0.0, 0.0, 0.0)

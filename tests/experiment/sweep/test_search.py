@@ -41,8 +41,7 @@ def loader():
 )
 def test_every_form(text, expected, loader):
     space = read_space(loader, [f"x.y={text}"], [])
-    assert space.varied == {"x.y": expected}
-    assert space.texts == {"x.y": text}
+    assert (space.varied, space.texts) == ({"x.y": expected}, {"x.y": text})
 
 
 def test_the_command_line_adds_replaces_and_fixes(loader):

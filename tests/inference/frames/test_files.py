@@ -101,8 +101,7 @@ def test_pictures_of_any_mode_are_rgb(tmp_path, mode):
     image.save(path)
     (source,) = open_sources([path])
     (frame,) = source.frames()
-    assert frame.image.shape == (48, 64, 3)
-    assert frame.image.dtype == np.uint8
+    assert (frame.image.shape, frame.image.dtype) == ((48, 64, 3), np.uint8)
     assert np.abs(frame.image.mean(axis=2) - levels).max() <= 2
 
 

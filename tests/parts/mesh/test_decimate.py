@@ -114,13 +114,11 @@ def test_the_part_is_measured_before_it_is_decimated(monkeypatch, caplog):
     monkeypatch.setattr(part, "decimate", lambda v, f, uv: decimate(v, f, uv, 500))
     with caplog.at_level(logging.WARNING):
         fewer = make_part("a", mesh)
-    assert len(caplog.records) == 1
-    assert caplog.text.count("\n") == 1
+    assert (len(caplog.records), caplog.text.count("\n")) == (1, 1)
     message = rf"part 'a': {len(mesh.faces)} triangles decimated to \d+; vertices moved"
     assert re.match(message + r" by up to [\d.]+ mm$", caplog.records[0].message)
     assert len(fewer.mesh.faces) <= 500
-    assert fewer.mesh.faces.dtype == np.int32
-    assert fewer.mesh_hash == whole.mesh_hash
+    assert (fewer.mesh.faces.dtype, fewer.mesh_hash) == (np.int32, whole.mesh_hash)
     assert fewer.diameter == whole.diameter
     np.testing.assert_array_equal(fewer.cuboid, whole.cuboid)
     np.testing.assert_array_equal(fewer.points, whole.points)

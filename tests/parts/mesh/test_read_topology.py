@@ -37,8 +37,7 @@ def test_edges_agree_with_trimesh():
     assert topology.num_crowded == 0
     tip = np.vstack([vertices, [[9.0, 9.0, 9.0]]])
     fin = np.vstack([faces, [[faces[0, 0], faces[0, 1], len(vertices)]]])
-    assert find_topology(tip, fin).num_crowded == 1
-    assert find_topology(tip, fin).num_open == 2
+    assert (find_topology(tip, fin).num_crowded, find_topology(tip, fin).num_open) == (1, 2)
     soup = mesh.triangles.reshape(-1, 3)  # corners at one position are one
     assert find_topology(soup, np.arange(len(soup)).reshape(-1, 3)).is_closed
 

@@ -25,8 +25,7 @@ def test_a_part_at_a_known_pose_is_caught(trials, scene):
     attempt = trials.attempt(scene, PoseSource("exact"))
     assert attempt.record.caught
     assert attempt.record.recognised
-    assert attempt.record.failure == ""
-    assert attempt.record.add_mm == 0
+    assert (attempt.record.failure, attempt.record.add_mm) == ("", 0)
     # It hangs in the air at the end, and lay on the bench before.
     states = attempt.outcome.states
     assert states[-1][-5] > states[0][-5] + 0.1
@@ -38,8 +37,7 @@ def test_a_part_that_is_elsewhere_is_not_caught(trials, scene, monkeypatch):
     record = trials.attempt(scene, PoseSource("exact")).record
     assert not record.caught
     assert not record.recognised
-    assert record.failure == "wrong pose"
-    assert record.error_mm == pytest.approx(50)
+    assert (record.failure, record.error_mm) == ("wrong pose", pytest.approx(50))
 
 
 def test_nothing_seen_is_a_failure_of_its_own(trials, scene, monkeypatch):

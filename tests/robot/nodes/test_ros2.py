@@ -133,5 +133,4 @@ def test_pace_tells_rate_and_latency():
     for latency in (0.01, 0.02, 0.03):
         pace.count(latency)
     told = pace.values()
-    assert told["rate (1/s)"] == "10.0"
-    assert told["latency, median (ms)"] == "20.0"
+    assert (told["rate (1/s)"], told["latency, median (ms)"]) == ("10.0", "20.0")

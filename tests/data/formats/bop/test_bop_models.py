@@ -39,8 +39,7 @@ def test_parts_come_back_with_symmetries_in_metres(tmp_path):
     assert record["name"] == "Rolle Ø4"
     assert record["symmetries_discrete"][0][3::4] == pytest.approx([1, -2, 3, 1])
     (entry,) = record["symmetries_continuous"]
-    assert entry["axis"] == [0, 0, 1]
-    assert entry["offset"] == pytest.approx([10, 0, -20])
+    assert (entry["axis"], entry["offset"]) == ([0, 0, 1], pytest.approx([10, 0, -20]))
     assert record["diameter"] == pytest.approx(1000 * np.hypot(0.04, 0.05))
     assert [record[f"min_{a}"] for a in "xyz"] == pytest.approx([-20, -20, -25])
     assert [record[f"size_{a}"] for a in "xyz"] == pytest.approx([40, 40, 50])

@@ -89,8 +89,7 @@ def test_conventions_in_literal_numbers(scene, block):
         None,
     )
     np.testing.assert_allclose(instance.keypoints, projected[:, 0], atol=1e-9)
-    assert instance.visible_fraction == 0.75
-    assert instance.mask.sum() == 100
+    assert (instance.visible_fraction, instance.mask.sum()) == (0.75, 100)
     assert instance.mask[10, 30]
     np.testing.assert_allclose(sample.depth, 0.25)  # 500 units of 0.5 mm
     assert (sample.image[..., 0] == 200).all()  # red

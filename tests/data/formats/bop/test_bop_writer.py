@@ -37,8 +37,7 @@ def test_annotation_of_a_plate_in_literal_numbers(plate, tmp_path, write_set):
     labels = make_labels(sample, {"plate": 7}, {"plate": (plate, make_surface(plate.mesh))})
     assert labels.camera == {"cam_K": [100, 0, 15.5, 0, 100, 11.5, 0, 0, 1], "depth_scale": 0.1}
     (truth,) = labels.truths
-    assert truth["obj_id"] == 7
-    assert truth["cam_R_m2c"] == [1, 0, 0, 0, 1, 0, 0, 0, 1]
+    assert (truth["obj_id"], truth["cam_R_m2c"]) == (7, [1, 0, 0, 0, 1, 0, 0, 0, 1])
     np.testing.assert_allclose(truth["cam_t_m2c"], [0, 0, 201], atol=1e-12)
     (info,) = labels.infos
     # Columns 15.5 ± 10 are pixels 6 – 25, rows 11.5 ± 5 pixels 7 – 16.
@@ -46,8 +45,7 @@ def test_annotation_of_a_plate_in_literal_numbers(plate, tmp_path, write_set):
         "bbox_obj": [6, 7, 19, 9], "bbox_visib": [10, 7, 9, 9], "px_count_all": 200,
         "px_count_valid": 160, "px_count_visib": 100, "visib_fract": 0.5,
     }  # fmt: skip
-    assert labels.depth[10, 12] == 2000
-    assert labels.depth[10, 22] == 1500
+    assert (labels.depth[10, 12], labels.depth[10, 22]) == (2000, 1500)
     assert labels.depth[0, 0] == 0
     write_set(BopWriter, tmp_path, [plate], [sample])
     assert json.loads((tmp_path / "camera.json").read_text()) == {
@@ -81,8 +79,7 @@ def test_truncated_hidden_and_far_objects(plate):
     assert labels.infos[1]["bbox_obj"] == labels.infos[1]["bbox_visib"] == [-1, -1, -1, -1]
     assert labels.infos[1]["px_count_visib"] == 0
     # 20 m do not fit into 16 bits of 0.1 mm.
-    assert labels.camera["depth_scale"] == 1.0
-    assert labels.depth[10, 5] == 20_000
+    assert (labels.camera["depth_scale"], labels.depth[10, 5]) == (1.0, 20_000)
 
 
 def test_refuses_a_folder_of_something_else(boxes, tmp_path):

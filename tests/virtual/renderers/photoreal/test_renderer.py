@@ -53,8 +53,7 @@ def test_labels_agree_with_the_rasteriser(photoreal, preset, seed):
     expected, found = render(scene), photoreal(scene)
     assert_same_labels(found, expected)
     # The labels are not the rasteriser's by construction: each renderer casts its own.
-    assert found.image.dtype == np.uint8
-    assert found.depth.dtype == np.float32
+    assert (found.image.dtype, found.depth.dtype) == (np.uint8, np.float32)
     assert found.instances.dtype == np.int16
     # The same lamps and colours, so about the same picture.
     assert abs(found.image.astype(float).mean() - expected.image.mean()) < 12

@@ -154,8 +154,7 @@ def test_edges_are_anti_aliased_by_coverage(scene_of, sheet):
     inside = float(rendered.image[60, 100, 0])
     assert rendered.image[60, 79, 0] == 90
     assert rendered.image[60, 80, 0] == pytest.approx((90 + inside) / 2, abs=1)
-    assert rendered.instances[60, 80] == -1
-    assert rendered.instances[60, 81] == 0
+    assert (rendered.instances[60, 80], rendered.instances[60, 81]) == (-1, 0)
 
 
 def middle_depth(path: Path, scene_of: MakeScene, turn: np.ndarray) -> float:
