@@ -189,8 +189,8 @@ def test_options_of_training_and_evaluation_exist(path):
         else:
             continue
         short = ENTRIES.get(tuple(words[:2]), SHORT_NAMES)
-        overrides = [re.sub(r"^\w+", lambda key, short=short: short.get(key[0], key[0]), one)
-                     for one in overrides]  # fmt: skip
+        overrides = [re.sub(r"^\w+", lambda key, short=short: short.get(key[0], key[0]), override)
+                     for override in overrides]  # fmt: skip
         problems = [problem for one in overrides if (problem := option_problem(one))]
         # A guide may tell its reader to write the file.
         bad += [problem for problem in problems if f"`{problem.removeprefix('no ')}`" not in text]

@@ -36,7 +36,7 @@ def test_an_interrupted_command_goes_on_where_it_was(gpu, tmp_path):
     lines = (tmp_path / "rows.md").read_text().splitlines()
     assert lines[0] == MACHINE
     assert "| network | ms | images/s |" in lines
-    assert lines[-3:] == [f"| {one} | 1.23 | 1234 |" for one in ("dope", "dopepp", "dopepp_fast")]
+    assert lines[-3:] == [f"| {item} | 1.23 | 1234 |" for item in ("dope", "dopepp", "dopepp_fast")]
 
 
 def test_a_row_that_failed_says_why_and_is_tried_again(gpu, tmp_path):

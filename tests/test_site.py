@@ -72,9 +72,9 @@ def test_what_scripts_and_the_notebook_import_is_there():
     for path, source in scripts.items():
         for node in ast.walk(ast.parse(source)):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("dopepp"):
-                for one in node.names:
+                for name in node.names:
                     try:
-                        exec(f"from {node.module} import {one.name}", {})
+                        exec(f"from {node.module} import {name.name}", {})
                     except ImportError as error:
                         missing.append(f"{path}: {error}")
     assert missing == []
@@ -88,6 +88,6 @@ def test_the_notebook_runs(monkeypatch, tmp_path):
     client = nbclient.NotebookClient(notebook, resources={"metadata": {"path": str(tmp_path)}})
     client.execute()
     printed = "".join(
-        one.get("text", "") for cell in client.nb.cells for one in cell.get("outputs", [])
+        item.get("text", "") for cell in client.nb.cells for item in cell.get("outputs", [])
     )
     assert "refined: found on 20 of 20" in printed

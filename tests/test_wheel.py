@@ -27,14 +27,17 @@ def test_it_holds_every_file_that_the_program_reads(monkeypatch):
     exec((ROOT / "setup.py").read_text(), {})
     build = Distribution({**seen, "script_name": "setup.py"}).get_command_obj("build_py")
     build.ensure_finalized()
-    held = {str(Path(one).relative_to(build.build_lib)) for one in build.get_outputs(False)}
+    held = {str(Path(item).relative_to(build.build_lib)) for item in build.get_outputs(False)}
     wanted = {
         path.relative_to(ROOT)
         for folder in ("dopepp", "hydra_plugins", "conf")
         for path in (ROOT / folder).rglob("*")
         if path.is_file() and "__pycache__" not in path.parts
     }
-    there = {str(Path("dopepp", one) if one.parts[0] == "conf" else one) for one in wanted}
+    there = {
+        str(Path("dopepp", element) if element.parts[0] == "conf" else element)
+        for element in wanted
+    }
     assert there == held
     assert {"dopepp/conf/train.yaml", "dopepp/conf/model/backbone/dsc.yaml"} <= held
 

@@ -75,11 +75,11 @@ def test_predict_follows_parts_through_a_folder(run, refused, tmp_path):
     camera = rendered.scene.K[[0, 1, 0, 1], [0, 1, 2, 2]]
     done = run("predict", released, frames, "--K", *camera, "--track", "--save", drawn)
     records = [json.loads(line) for line in done.stdout.splitlines()]
-    assert [Path(one["image"]).name for one in records] == ["000.png", "001.png", "002.png"]
+    assert [Path(entry["image"]).name for entry in records] == ["000.png", "001.png", "002.png"]
     assert {one["identity"] for one in records} == {0}
     true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj
-    for one in records:
-        assert np.linalg.norm(np.array(one["T_cam_obj"])[:3, 3] - true[:3, 3]) < 0.003
+    for record in records:
+        assert np.linalg.norm(np.array(record["T_cam_obj"])[:3, 3] - true[:3, 3]) < 0.003
     assert len(list(drawn.iterdir())) == 3
     assert "without a picture" in refused("predict", released, drawn.parent, "--K", *camera)
 

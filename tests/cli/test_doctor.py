@@ -57,7 +57,10 @@ def test_a_good_picture_is_well(run, folder):
     ],
 )
 def test_what_is_wrong_comes_first(run, folder, options, line):
-    paths = [str(folder / one) if "." in one and one[0].isalpha() else one for one in options]
+    paths = [
+        str(folder / option) if "." in option and option[0].isalpha() else option
+        for option in options
+    ]
     done = run("doctor", "--model", MODEL, *paths, code=1)
     assert done.stdout.startswith(line)
     assert "; fix: " in done.stdout.splitlines()[0]
@@ -73,7 +76,9 @@ def test_what_is_wrong_comes_first(run, folder, options, line):
     ],
 )
 def test_wrong_input_is_one_line(refused, folder, options, line):
-    paths = [str(folder / one) if one[-4:] in (".png", ".txt") else one for one in options]
+    paths = [
+        str(folder / option) if option[-4:] in (".png", ".txt") else option for option in options
+    ]
     assert line in refused("doctor", "--model", MODEL, *paths)
 
 

@@ -65,24 +65,24 @@ def test_everything_about_pictures_and_a_video(predict, files, rendered, tmp_pat
     out, poses, csv = tmp_path / "out", tmp_path / "poses.jsonl", tmp_path / "poses.csv"
     sources = (f"{files}/0*", files / "clip.avi")
     done = predict(*sources, "--save", out, "--json", poses, "--csv", csv, "--stride", 2)
-    assert sorted(one.name for one in out.iterdir()) == ["000007.jpg", "clip.mp4"]
+    assert sorted(path.name for path in out.iterdir()) == ["000007.jpg", "clip.mp4"]
     assert frames(out / "clip.mp4") == 3
     true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj
-    found = lines(poses)
-    assert [one["number"] for one in found] == [7, 0, 2, 4]
-    assert [one["time"] for one in found] == [None, 0, pytest.approx(0.2), pytest.approx(0.4)]
-    for one in found:
-        assert "x right, y down, z forward" in one["frame"]
-        T = np.array(one["detections"][0]["T_cam_obj"])
+    result = lines(poses)
+    assert [one["number"] for one in result] == [7, 0, 2, 4]
+    assert [one["time"] for one in result] == [None, 0, pytest.approx(0.2), pytest.approx(0.4)]
+    for record in result:
+        assert "x right, y down, z forward" in record["frame"]
+        T = np.array(record["detections"][0]["T_cam_obj"])
         assert np.linalg.norm(T[:3, 3] - true[:3, 3]) < 0.02
     rows = read_results(csv, [1])
-    assert [(one.scene_id, one.im_id) for one in rows] == [(0, 7), (1, 0), (1, 2), (1, 4)]
-    for row, one in zip(rows, found, strict=True):
-        np.testing.assert_allclose(row.T_cam_obj, one["detections"][0]["T_cam_obj"], atol=1e-9)
+    assert [(row.scene_id, row.im_id) for row in rows] == [(0, 7), (1, 0), (1, 2), (1, 4)]
+    for row, entry in zip(rows, result, strict=True):
+        np.testing.assert_allclose(row.T_cam_obj, entry["detections"][0]["T_cam_obj"], atol=1e-9)
     assert len(done.stdout.splitlines()) == 4
     told = done.stderr.splitlines()
     assert len(told) == 4
-    assert all("speed: pre " in one and one.endswith(" ms") for one in told)
+    assert all("speed: pre " in item and item.endswith(" ms") for item in told)
     assert told[1].startswith("1/3 clip.avi: 1 pose; ")
 
 
@@ -114,7 +114,7 @@ def test_an_interruption_leaves_what_was_written(
     assert done.stderr.splitlines()[-1] == "interrupted; the written files are complete"
     assert frames(out / "clip.mp4") == 3
     assert len(lines(poses)) == len(read_results(csv, [1])) == 3
-    assert sorted(one.name for one in tmp_path.rglob("*")) == [
+    assert sorted(path.name for path in tmp_path.rglob("*")) == [
         "clip.mp4", "out", "poses.csv", "poses.jsonl",
     ]  # fmt: skip
 

@@ -82,8 +82,8 @@ def folder(rendered, K, tmp_path_factory):
 def test_a_camera_file_says_what_k_says(poses, folder, four):
     (expected,) = poses(folder / "whole.png", *four)
     for name in ("K.txt", "plain.json"):
-        (found,) = poses(folder / "whole.png", "--camera", folder / name)
-        np.testing.assert_allclose(found, expected, atol=1e-9)
+        (result,) = poses(folder / "whole.png", "--camera", folder / name)
+        np.testing.assert_allclose(result, expected, atol=1e-9)
     (deep,) = poses(folder / "deep.png", *four)
     np.testing.assert_allclose(deep, expected, atol=1e-9)
 
@@ -95,18 +95,18 @@ def test_resized_and_cut_pictures_give_the_whole_ones_pose(poses, folder, four, 
         ("half.png", ("--K-size", 640, 480)),
         ("cut.png", ("--crop", 8, 0, 632, 400)),
     ):
-        (found,) = poses(folder / name, *plain, *said)
-        assert np.linalg.norm(found[:3, 3] - true) < 0.001
+        (result,) = poses(folder / name, *plain, *said)
+        assert np.linalg.norm(result[:3, 3] - true) < 0.001
 
 
 def test_the_lens_counts(poses, folder, rendered, tmp_path):
     true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj[:3, 3]
     picture, refine = folder / "lens.png", ("--refine", "region")
     lens = ("--camera", folder / "lens.yaml", *refine, "--save", tmp_path)
-    (found,) = poses(picture, *lens)
-    assert np.linalg.norm(found[:3, 3] - true) < 0.0005
+    (result,) = poses(picture, *lens)
+    assert np.linalg.norm(result[:3, 3] - true) < 0.0005
     without = poses(picture, "--camera", folder / "K.txt", *refine)
-    assert all(np.linalg.norm(one[:3, 3] - true) > 0.001 for one in without)
+    assert all(np.linalg.norm(item[:3, 3] - true) > 0.001 for item in without)
     drawn = tmp_path / "lens.png"
     # Drawn on the picture as a pinhole sees it, which is the rendered one.
     shown = cv2.imread(str(drawn))[200:450, 20:300, ::-1].astype(float)

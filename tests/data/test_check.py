@@ -24,7 +24,7 @@ NDDS = ("000000.json", "000000.png", "_object_settings.json")
         ([f"bracket/{BOP}", *(f"plate/{name}" for name in NDDS)],
          r"2 data sets: bracket \(BOP\), plate \(NDDS\)"),
         ([f"bracket/{BOP}"], r"1 data sets: bracket \(BOP\)"),
-        ([f"{one}/{name}" for one in "ab" for name in (*NDDS, RECORD_FILE)],
+        ([f"{item}/{name}" for item in "ab" for name in (*NDDS, RECORD_FILE)],
          r"2 data sets: a \(NDDS\), b \(NDDS\)"),
         ([f"set{n}/{BOP}" for n in range(10)], r"10 data sets: set0 .*set7 \(BOP\) and 2 more"),
     ],

@@ -43,9 +43,9 @@ def batches(datamodule: PoseDataModule, epoch: int) -> list[Batch]:
 
 def assert_same(first: list[Batch], second: list[Batch]) -> None:
     assert len(first) == len(second)
-    for one, other in zip(first, second, strict=True):
+    for left, other in zip(first, second, strict=True):
         for entry in fields(Batch):
-            a, b = getattr(one, entry.name), getattr(other, entry.name)
+            a, b = getattr(left, entry.name), getattr(other, entry.name)
             if isinstance(a, Tensor):
                 assert torch.equal(a.nan_to_num(), b.nan_to_num())
             else:
@@ -148,9 +148,9 @@ def test_sizes_and_distances_of_a_part_are_those_of_the_validation_images(build,
     can = replace(part, name="can")
     source = fake_source(5)
     depths = [
-        (one.T_cam_obj @ [*part.cuboid[8], 1])[2]
+        (detection.T_cam_obj @ [*part.cuboid[8], 1])[2]
         for index in range(5)
-        for one in source.sample(index).instances
+        for detection in source.sample(index).instances
     ]
     sample = source.sample(0)
     focal = math.sqrt(sample.K[0, 0] * sample.K[1, 1]) * 64 / max(sample.size)
@@ -176,17 +176,19 @@ def test_wrong_options(build):
 
 def test_collate_pads_instances(fake_source):
     source = fake_source()
-    one, none, two = source.sample(0), source.sample(1), source.sample(2)
+    first, none, two = source.sample(0), source.sample(1), source.sample(2)
     none.instances = []
     two.instances.append(replace(two.instances[0], label="can", masked_fraction=0.25))
-    batch = collate([one, none, two], {"can": 0, "box": 1})
+    batch = collate([first, none, two], {"can": 0, "box": 1})
     assert batch.object_index.tolist() == [[1, PADDING], [PADDING] * 2, [1, 0]]
     assert (batch.images.dtype, batch.images.shape) == (torch.uint8, (3, 3, 48, 64))
     assert batch.images.is_contiguous(memory_format=torch.channels_last)
     np.testing.assert_array_equal(batch.images[2].permute(1, 2, 0).numpy(), two.image)
-    np.testing.assert_allclose(batch.K[0].numpy(), one.K)
+    np.testing.assert_allclose(batch.K[0].numpy(), first.K)
     np.testing.assert_allclose(batch.T_cam_obj[2, 1].numpy(), two.instances[1].T_cam_obj, rtol=1e-6)
-    np.testing.assert_allclose(batch.keypoints[0, 0].numpy(), one.instances[0].keypoints, rtol=1e-6)
+    np.testing.assert_allclose(
+        batch.keypoints[0, 0].numpy(), first.instances[0].keypoints, rtol=1e-6
+    )
     padding = batch.object_index == PADDING
     assert batch.keypoints[padding].isnan().all()
     assert not batch.keypoints[~padding].isnan().any()

@@ -35,17 +35,17 @@ def test_the_command_prints_an_entry_that_training_reads(stl, tmp_path):
         path = tmp_path / "models_info.json"
         path.write_text(json.dumps(content))
         (read,) = choose_symmetries([load_part(stl, "mm")], str(path))
-        (found,) = choose_symmetries([load_part(stl, "mm")], "auto")
-        assert np.allclose(read.symmetries_discrete, found.symmetries_discrete, atol=1e-12)
+        (actual,) = choose_symmetries([load_part(stl, "mm")], "auto")
+        assert np.allclose(read.symmetries_discrete, actual.symmetries_discrete, atol=1e-12)
 
 
 def test_nothing_is_found_or_taken_away_unless_asked(stl):
     part = load_part(stl, "mm")
     assert choose_symmetries([part], None) == [part]
     assert part.symmetries_discrete is None
-    (found,) = choose_symmetries([part], "auto")
-    assert choose_symmetries([found], None) == [found]
-    (bare,) = choose_symmetries([found], "none")
+    (result,) = choose_symmetries([part], "auto")
+    assert choose_symmetries([result], None) == [result]
+    (bare,) = choose_symmetries([result], "none")
     assert bare.symmetries_discrete is None
     assert bare.symmetries_continuous == ()
 

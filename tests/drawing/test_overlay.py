@@ -130,9 +130,9 @@ def test_enlarging_keeps_pixel_centres():
 def test_the_legend_names_each_label_once_in_its_colour():
     nowhere = np.full((9, 2), math.nan)
     frames = [Wireframe(nowhere, GREEN, "truth"), Wireframe(nowhere, GREEN, "truth")]
-    one = overlay(black(640, 480), frames)
-    assert one.any()
-    assert np.array_equal(one, overlay(black(640, 480), frames[:1]))
-    colours = one[one.sum(axis=2) > 300].astype(float)
+    frame = overlay(black(640, 480), frames)
+    assert frame.any()
+    assert np.array_equal(frame, overlay(black(640, 480), frames[:1]))
+    colours = frame[frame.sum(axis=2) > 300].astype(float)
     assert (colours / GREEN).std(axis=1).max() < 0.05
     assert not overlay(black(640, 480), [Wireframe(nowhere, GREEN)]).any()

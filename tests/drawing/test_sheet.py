@@ -50,7 +50,7 @@ def test_a_long_line_is_pale_and_smooth_and_what_it_is_compared_with_dashed():
     )
     assert np.std(np.asarray(smooth.get_ydata())) < 0.5 * np.std(np.asarray(pale.get_ydata()))
     assert smooth.get_label() == "dope"
-    assert [one.get_linestyle() for one in (smooth, other)] == ["-", "--"]
+    assert [item.get_linestyle() for item in (smooth, other)] == ["-", "--"]
 
 
 @settings(max_examples=30)
@@ -207,5 +207,5 @@ def test_a_belief_lies_over_the_pixels_its_cell_covers():
 
 def test_beliefs_beyond_their_range_are_clipped():
     image = np.full((96, 160, 3), 90, np.uint8)
-    one, seven = (heat_picture(image, np.full((12, 20), value, np.float32)) for value in (1, 7))
-    np.testing.assert_array_equal(one, seven)
+    first, seven = (heat_picture(image, np.full((12, 20), value, np.float32)) for value in (1, 7))
+    np.testing.assert_array_equal(first, seven)

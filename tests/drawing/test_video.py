@@ -13,10 +13,10 @@ from dopepp.drawing.pictures import VideoFile
 
 
 def frames(path) -> list[np.ndarray]:
-    capture, found = cv2.VideoCapture(str(path)), []
+    capture, result = cv2.VideoCapture(str(path)), []
     while (one := capture.read())[0]:
-        found.append(one[1][..., ::-1])
-    return found
+        result.append(one[1][..., ::-1])
+    return result
 
 
 def level(number: int, size: tuple[int, int] = (48, 32)) -> np.ndarray:
@@ -28,11 +28,11 @@ def test_pictures_stand_at_their_times(tmp_path):
         for number, time in enumerate((7.0, 7.1, 7.4, 7.41, 99.0)):
             video.write(level(number), time)
         assert not video.path.exists()
-    shown = [round(one.mean() / 20) for one in frames(video.path)]
+    shown = [round(frame.mean() / 20) for frame in frames(video.path)]
     # The third comes late and stands for what it missed; the fourth has no place of its own; the
     # last stands for two seconds of the minute and a half before it.
     assert shown == [0, 1, 2, 2, 2, *[4] * 20]
-    assert [one.name for one in video.path.parent.iterdir()] == ["clip.mp4"]
+    assert [path.name for path in video.path.parent.iterdir()] == ["clip.mp4"]
 
 
 @pytest.mark.parametrize("size", [(47, 31), (48, 31)])

@@ -24,8 +24,8 @@ def end_of(pid: int, within_s: float) -> int:
     deadline = time.monotonic() + within_s
     while time.monotonic() < deadline:
         with contextlib.suppress(ChildProcessError):  # not adopted yet
-            found, status = os.waitpid(pid, os.WNOHANG)
-            if found:
+            result, status = os.waitpid(pid, os.WNOHANG)
+            if result:
                 return os.waitstatus_to_exitcode(status)
         time.sleep(0.2)
     os.kill(pid, signal.SIGKILL)

@@ -44,25 +44,25 @@ def records(path: Path) -> Iterator[Any]:
 
 
 def values(items: Iterable[Any]) -> dict[str, Any]:
-    return {one.key or "/".join(one.nested_key): json.loads(one.value_json) for one in items}
+    return {item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in items}
 
 
 def read(path: Path) -> Any:
     """Return what one file says of its run."""
-    found = SimpleNamespace(config={}, summary={}, history=[])
+    result = SimpleNamespace(config={}, summary={}, history=[])
     for record in records(path):
         kind = record.WhichOneof("record_type")
         if kind == "run":
-            found.name, found.group = record.run.display_name, record.run.run_group
-            found.job_type = record.run.job_type
-            found.config |= values(record.run.config.update)
+            result.name, result.group = record.run.display_name, record.run.run_group
+            result.job_type = record.run.job_type
+            result.config |= values(record.run.config.update)
         elif kind in ("config", "summary"):
-            getattr(found, kind).update(values(getattr(record, kind).update))
+            getattr(result, kind).update(values(getattr(record, kind).update))
         elif kind == "history":
-            found.history.append(values(record.history.item))
+            result.history.append(values(record.history.item))
         elif kind == "exit":
-            found.exit_code = record.exit.exit_code
-    return found
+            result.exit_code = record.exit.exit_code
+    return result
 
 
 def tracked(path: Path, patience: float = 30.0) -> SimpleNamespace:
@@ -130,7 +130,7 @@ def test_every_job_is_a_run_and_the_comparison_one_more(sweep):
         assert run.name.startswith(f"{model} virtual")
         assert (run.group, run.job_type, run.exit_code) == (sweep.name, "train", 0)
         assert run.config["model"]["name"] == model
-        steps = [one["trainer/global_step"] for one in run.history if "train/loss" in one]
+        steps = [step["trainer/global_step"] for step in run.history if "train/loss" in step]
         assert steps == sorted(steps)
         assert len(steps) == 2  # of this job's two steps, and no other's
         measured = json.loads((sweep / job / "metrics.json").read_text())
@@ -145,7 +145,7 @@ def test_every_job_is_a_run_and_the_comparison_one_more(sweep):
             "val": {"overlay", "auc", "belief"},
         }.items():
             folder = f"wandb/offline-run-*/files/media/images/{kind}"
-            assert {one.name.split("_")[0] for one in (sweep / job).glob(f"{folder}/*")} == names
+            assert {path.name.split("_")[0] for path in (sweep / job).glob(f"{folder}/*")} == names
     comparison = only(sweep)
     assert (comparison.name, comparison.job_type) == ("comparison", "comparison")
     assert (comparison.group, comparison.exit_code) == (sweep.name, 0)
@@ -154,7 +154,7 @@ def test_every_job_is_a_run_and_the_comparison_one_more(sweep):
     assert table["columns"][:2] == ["method", "object"]
     assert [row[0] for row in table["data"]][:2] == ["dope", "dopepp"]
     pictures = sweep.glob("wandb/offline-run-*/files/media/images/*.png")
-    assert {one.name.rsplit("_", 2)[0] for one in pictures} == {
+    assert {picture.name.rsplit("_", 2)[0] for picture in pictures} == {
         "compare_auc", "compare_pictures", "compare_loss",
     }  # fmt: skip
 
@@ -170,7 +170,7 @@ def test_a_resumed_run_goes_on_in_the_same_run(call, find_run, tiny, tmp_path):
     assert before.name == after.name
     assert before.group == after.group == ""
     first, second = (
-        {one["trainer/global_step"] for one in run.history if "train/loss" in one}
+        {step["trainer/global_step"] for step in run.history if "train/loss" in step}
         for run in (before, after)
     )
     assert max(first) < min(second)

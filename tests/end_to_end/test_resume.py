@@ -215,8 +215,8 @@ def test_two_killed_processes_end_as_whole_ones(start, command, tiny, tmp_path):
     assert last(killed)["global_step"] % per_epoch, "a checkpoint in the middle of an epoch"
     command("train.py", f"resume={killed}", timeout=600, code=0)
     assert steps(killed) == steps(whole) == list(range(3 * per_epoch))
-    one, other = (last(run)["state_dict"] for run in (killed, whole))
-    assert all(torch.equal(one[name], value) for name, value in other.items())
+    first, other = (last(run)["state_dict"] for run in (killed, whole))
+    assert all(torch.equal(first[name], value) for name, value in other.items())
 
 
 @pytest.mark.timeout(600)

@@ -356,8 +356,8 @@ def test_the_lens_is_taken_out_of_a_picture():
     cv2.circle(picture, (round(x * 16), round(y * 16)), 4 * 16, (255, 255, 255), -1, shift=4)
     straight = CAMERA.undistorted(picture)[..., 0].astype(float)
     rows, columns = np.mgrid[:480, :640]
-    found = np.array([(straight * columns).sum(), (straight * rows).sum()]) / straight.sum()
+    result = np.array([(straight * columns).sum(), (straight * rows).sum()]) / straight.sum()
     expected = seen(point, UNSAID)[0]
-    assert_allclose(found, expected, atol=0.3)
+    assert_allclose(result, expected, atol=0.3)
     assert np.linalg.norm(expected - (x, y)) > 5
     assert UNSAID.undistorted(picture) is picture

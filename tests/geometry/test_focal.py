@@ -33,12 +33,12 @@ def test_exact_keypoints_tell_the_focal_length(cuboid, factor):
 
 
 def test_its_deviation_says_how_far_off_it_is():
-    found = [seen(BOX, 30, 2.0, noise_px=1.0, seed=seed) for seed in range(15)]
-    off = np.log([one.factor for one in found]) - np.log(2)
-    deviations = np.array([one.deviation for one in found])
+    result = [seen(BOX, 30, 2.0, noise_px=1.0, seed=seed) for seed in range(15)]
+    off = np.log([focal.factor for focal in result]) - np.log(2)
+    deviations = np.array([item.deviation for item in result])
     assert np.abs(off).max() < 0.3
     assert 0.6 < np.std(off / deviations) < 1.7
-    assert np.median([one.gain for one in found]) > 10
+    assert np.median([one.gain for one in result]) > 10
 
 
 def test_a_plate_that_faces_the_camera_does_not_tell():
@@ -47,8 +47,8 @@ def test_a_plate_that_faces_the_camera_does_not_tell():
 
 
 def test_the_right_lens_gains_nothing():
-    found = [seen(BOX, 30, 1.0, noise_px=1.0, seed=seed) for seed in range(8)]
-    assert max(one.gain for one in found) < 2
+    result = [seen(BOX, 30, 1.0, noise_px=1.0, seed=seed) for seed in range(8)]
+    assert max(item.gain for item in result) < 2
 
 
 def test_seven_keypoints_are_too_few():

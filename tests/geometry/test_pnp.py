@@ -154,9 +154,9 @@ def test_a_point_without_a_proper_sigma_or_covariance_is_missing(bad):
 
 
 def opencv(cuboid: np.ndarray, pixels: np.ndarray, flag: int) -> np.ndarray | None:
-    found, vector, translation = cv2.solvePnP(cuboid, pixels, K, None, flags=flag)
+    result, vector, translation = cv2.solvePnP(cuboid, pixels, K, None, flags=flag)
     turn = rotation_vector_to_matrix(vector.ravel())
-    return make_transform(turn, translation.ravel()) if found else None
+    return make_transform(turn, translation.ravel()) if result else None
 
 
 @pytest.mark.parametrize("name", ["box", "can", "plate"])
@@ -195,18 +195,18 @@ def test_widenings_are_solved_in_turn_until_two_thirds_agree(name):
         least = 2 * np.isfinite(pixels[:, 0]).sum() / 3
         best = None
         for factor in (1.0, 2.0, 4.0):
-            one = solve_pnp(cuboid, pixels, K, factor)
-            if best is None or one.inliers.sum() > best.inliers.sum():
-                best, chosen = one, factor
+            item = solve_pnp(cuboid, pixels, K, factor)
+            if best is None or item.inliers.sum() > best.inliers.sum():
+                best, chosen = item, factor
             if best.inliers.sum() >= least:
                 break
         widened.add(chosen)
-        found = solve_pnp(cuboid, pixels, K, widenings=(1.0, 2.0, 4.0))
-        assert found.reason == best.reason
-        assert_array_equal(found.inliers, best.inliers)
+        result = solve_pnp(cuboid, pixels, K, widenings=(1.0, 2.0, 4.0))
+        assert result.reason == best.reason
+        assert_array_equal(result.inliers, best.inliers)
         if best.T_cam_obj is not None:
-            assert_allclose(found.T_cam_obj, best.T_cam_obj, atol=1e-9)
-            assert_allclose(found.covariance, best.covariance, rtol=1e-6, atol=1e-12)
+            assert_allclose(result.T_cam_obj, best.T_cam_obj, atol=1e-9)
+            assert_allclose(result.covariance, best.covariance, rtol=1e-6, atol=1e-12)
     assert len(widened) == 3
 
 
@@ -284,10 +284,10 @@ def test_the_mirrored_start_saves_plates_from_the_wrong_tilt():
     for _ in range(40):
         truth = make_transform(random_rotation(rng), np.array([0.02, -0.01, 0.9]))
         pixels = project_keypoints(cuboid, truth, K) + rng.normal(size=(9, 2)) * 0.3
-        found = solve_pnp(cuboid, pixels, K, 0.3).T_cam_obj
+        result = solve_pnp(cuboid, pixels, K, 0.3).T_cam_obj
         at_truth, at_found = (
             np.fmin(((project(transform(T, cuboid), K) - pixels) ** 2).sum(1) / 0.3**2, 9).sum()
-            for T in (truth, found)
+            for T in (truth, result)
         )
         assert at_found <= at_truth
 

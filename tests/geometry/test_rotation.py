@@ -39,18 +39,18 @@ def test_quaternion_to_matrix_is_scipys(quaternion):
 def test_matrix_to_quaternion_is_scipys_up_to_sign(quaternion):
     matrix = Rotation.from_quat(quaternion).as_matrix()
     x, y, z, w = Rotation.from_matrix(matrix).as_quat()
-    found = matrix_to_quaternion(matrix)
-    assert found[0] >= 0
-    assert np.linalg.norm(found) == pytest.approx(1)
-    assert abs(found @ [w, x, y, z]) == pytest.approx(1, abs=1e-12)
+    result = matrix_to_quaternion(matrix)
+    assert result[0] >= 0
+    assert np.linalg.norm(result) == pytest.approx(1)
+    assert abs(result @ [w, x, y, z]) == pytest.approx(1, abs=1e-12)
 
 
 @wide
 @given(AXES, st.sampled_from([0.0, 1e-12, 1e-6, 0.1, 2.0, 3.14]))
 def test_rotation_vectors_are_found_again(axis: list[float], angle: float) -> None:
     vector = angle * np.array(axis) / np.linalg.norm(axis)
-    found = matrix_to_rotation_vector(rotation_vector_to_matrix(vector))
-    assert_allclose(found, vector, rtol=1e-9, atol=1e-14)
+    result = matrix_to_rotation_vector(rotation_vector_to_matrix(vector))
+    assert_allclose(result, vector, rtol=1e-9, atol=1e-14)
 
 
 @pytest.mark.parametrize("axis", np.eye(3))
@@ -99,8 +99,8 @@ def test_rotation_angle_keeps_its_digits_near_0_and_pi(axis, angle):
 
 def test_rotation_angle_of_a_batch():
     rotations = Rotation.random(6, random_state=0)
-    found = rotation_angle(rotations.as_matrix().reshape(2, 3, 3, 3))
-    assert_allclose(found, rotations.magnitude().reshape(2, 3), atol=1e-12)
+    result = rotation_angle(rotations.as_matrix().reshape(2, 3, 3, 3))
+    assert_allclose(result, rotations.magnitude().reshape(2, 3), atol=1e-12)
 
 
 def test_random_rotations_are_uniform():
@@ -127,8 +127,8 @@ def test_is_rotation():
 def test_the_nearest_rotation_is_the_polar_factor(seed):
     rng = np.random.default_rng(seed)
     bent = random_rotation(rng) + rng.normal(scale=0.05, size=(4, 3, 3))
-    found = nearest_rotation(bent)
-    assert_allclose(found, [polar(one)[0] for one in bent], atol=1e-12)
+    result = nearest_rotation(bent)
+    assert_allclose(result, [polar(item)[0] for item in bent], atol=1e-12)
     # Of a mirror image, too, it is a rotation, and none beside it is nearer.
     mirrored = -bent[0]
     (nearest,) = nearest_rotation(mirrored[None])

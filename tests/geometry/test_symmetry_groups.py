@@ -26,7 +26,7 @@ def test_measured_generators_make_the_exact_group(name, seed):
     rng = np.random.default_rng(seed)
     frame = Rotation.random(random_state=seed).as_matrix()
     true = frame @ Rotation.create_group(name).as_matrix() @ frame.T
-    group = exact_group(np.array([perturbed(one, 0.7, rng) for one in true[1:]]))
+    group = exact_group(np.array([perturbed(item, 0.7, rng) for item in true[1:]]))
     assert group is not None
     assert len(group) == len(true)
     assert (group[0] == np.eye(3)).all()
@@ -39,7 +39,7 @@ def test_exact_generators_stay_exact():
     half_turns = np.array([np.diag([-1.0, -1, 1]), np.diag([1.0, -1, -1])])
     group = exact_group(half_turns)
     assert group is not None
-    diagonals = {tuple(np.diag(one)) for one in group}
+    diagonals = {tuple(np.diag(item)) for item in group}
     assert diagonals == {(1, 1, 1), (-1, -1, 1), (1, -1, -1), (-1, 1, -1)}
     assert is_group(group)
 
@@ -66,7 +66,7 @@ def test_a_ball_has_rotations_all_over_and_a_bounded_number_of_them():
     assert np.allclose(group[:, :3, :3] @ centre + group[:, :3, 3], centre)
     wanted = Rotation.random(200, random_state=4)
     have = Rotation.from_matrix(group[:, :3, :3])
-    away = [(one.inv() * have).magnitude().min() for one in wanted]
+    away = [(item.inv() * have).magnitude().min() for item in wanted]
     assert max(away) < 0.2
 
 

@@ -38,7 +38,9 @@ def first(estimator, image, K, parts=None, **options):
     """Return the subject of the first thing that is wrong, or nothing."""
     findings = diagnose(Case(estimator, image, K, parts or estimator.parts, **options))
     assert len(findings) == len(CHECKS)
-    assert all(one.sentence and str(one).startswith(f"{one.subject}: ") for one in findings)
+    assert all(
+        finding.sentence and str(finding).startswith(f"{finding.subject}: ") for finding in findings
+    )
     return next((one.subject for one in findings if one.fix), "")
 
 
@@ -78,7 +80,7 @@ def test_what_spoils_a_picture_is_named_first(estimator, factory, fault, subject
 def test_a_part_that_is_too_small_is_named_with_its_distance(estimator, factory):
     rendered = factory.render(0, 3, scale=0.4)
     case = Case(estimator, rendered.image, rendered.scene.K, estimator.parts)
-    (wrong,) = [one for one in diagnose(case) if one.fix]
+    (wrong,) = [finding for finding in diagnose(case) if finding.fix]
     true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj[2, 3]
     assert wrong.subject == "size"
     assert f"{case.elsewhere.T_cam_obj[2, 3]:.3g} m" in wrong.sentence
@@ -107,14 +109,14 @@ def test_a_part_out_of_the_picture_or_covered_is_missed(estimator, factory, empt
 
 def test_a_part_that_is_larger_than_the_picture_is_missed(estimator, factory):
     rendered = [factory.render(0, index, scale=2.0) for index in range(4)]
-    firsts = Counter(first(estimator, one.image, one.scene.K) for one in rendered)
+    firsts = Counter(first(estimator, item.image, item.scene.K) for item in rendered)
     assert firsts["visibility"] + firsts["size"] >= 3, firsts
 
 
 def test_a_distance_where_the_part_is_not_is_told(estimator, factory):
     rendered = factory.render(0, 1)
     case = Case(estimator, rendered.image, rendered.scene.K, estimator.parts, distances=(1.0, 3.0))
-    wrong = next(one for one in diagnose(case) if one.fix)
+    wrong = next(finding for finding in diagnose(case) if finding.fix)
     assert wrong.subject == "size"
     assert "unit" in wrong.fix
 
@@ -126,7 +128,7 @@ def test_a_mesh_of_another_size_is_named_before_all_else(estimator, factory, fac
     mesh = replace(PART.mesh, vertices=factor * PART.mesh.vertices)
     image, K = np.zeros((128, 128, 3), np.uint8), factory.scene(0, 0).K
     case = Case(estimator, image, K, [replace(estimator.parts[0], mesh=mesh)])
-    wrong = next(one for one in diagnose(case) if one.fix)
+    wrong = next(finding for finding in diagnose(case) if finding.fix)
     assert wrong.subject == "part"
     assert f"{factor:.3g} times" in wrong.sentence
     assert fix in wrong.fix
@@ -139,7 +141,7 @@ def test_a_part_without_mesh_or_sizes_is_diagnosed(factory):
     rendered = factory.render(0, 0)
     for image in (rendered.image, np.full_like(rendered.image, 90)):
         case = Case(PoseEstimator(network, checkpoint), image, rendered.scene.K, checkpoint.parts)
-        findings = {one.subject: one for one in diagnose(case)}
+        findings = {finding.subject: finding for finding in diagnose(case)}
         assert "does not know in which sizes" in findings["size"].sentence
         assert (findings["visibility"].fix == "") == (image is rendered.image)
 

@@ -113,9 +113,9 @@ def test_it_says_what_it_knows():
 def test_any_image_size(estimator, size):
     longest = max(size)
     K = camera_matrix(longest, longest, size[0] / 2 - 0.5, size[1] / 2 - 0.5)
-    for one in estimator.predict(image(*size), K):
-        assert one.object in ("bracket", "plate")
-        assert np.isfinite(one.T_cam_obj).all()
+    for detection in estimator.predict(image(*size), K):
+        assert detection.object in ("bracket", "plate")
+        assert np.isfinite(detection.T_cam_obj).all()
 
 
 def test_the_network_sees_the_letterboxed_image(estimator):
@@ -144,19 +144,19 @@ def test_poses_and_pixels_refer_to_the_given_image(checkpoint_path, size):
             make_transform(random_rotation(rng), np.array([x, 0.0, 0.4])) for x in (-0.07, 0.07)
         ]
         oracle.show(size, K, list(enumerate(truth)))
-        found = oracle.predict(image(*size), K)
-        assert sorted(one.object for one in found) == ["bracket", "plate"]
-        for one in found:
-            index = ["bracket", "plate"].index(one.object)
+        detections = oracle.predict(image(*size), K)
+        assert sorted(estimate.object for estimate in detections) == ["bracket", "plate"]
+        for detection in detections:
+            index = ["bracket", "plate"].index(detection.object)
             part = oracle.parts[index]
-            there, here = (transform(T, part.cuboid) for T in (truth[index], one.T_cam_obj))
+            there, here = (transform(T, part.cuboid) for T in (truth[index], detection.T_cam_obj))
             assert np.linalg.norm(there - here, axis=1).mean() < 0.1 * part.diameter
             pixels = project_keypoints(part.cuboid, truth[index], K)
-            assert_allclose(one.keypoints, pixels, atol=0.005 * width)
-            seen = ~np.isnan(one.peaks).any(1)
+            assert_allclose(detection.keypoints, pixels, atol=0.005 * width)
+            seen = ~np.isnan(detection.peaks).any(1)
             assert seen.sum() >= 5
-            assert_allclose(one.peaks[seen], pixels[seen], atol=0.002 * width)
-            assert one.reprojection_error_px < 0.003 * width
+            assert_allclose(detection.peaks[seen], pixels[seen], atol=0.002 * width)
+            assert detection.reprojection_error_px < 0.003 * width
 
 
 def test_distorted_images_are_undistorted_first(estimator, monkeypatch):
@@ -183,8 +183,8 @@ def test_views_and_lists_are_taken(estimator):
     copied = estimator.predict(np.ascontiguousarray(bgr[..., ::-1]), K_VGA)
     listed = estimator.predict(np.ascontiguousarray(bgr[..., ::-1]), K_VGA.tolist())
     assert len(flipped) == len(copied) == len(listed)
-    for one, two in zip(flipped, copied, strict=True):
-        assert_allclose(one.T_cam_obj, two.T_cam_obj)
+    for detection, two in zip(flipped, copied, strict=True):
+        assert_allclose(detection.T_cam_obj, two.T_cam_obj)
 
 
 IMAGE, CAMERA = r"\(height, width, 3\) uint8 in RGB order", "pinhole matrix|field of view"
@@ -268,22 +268,22 @@ def error(pose):
 
 def test_refines_with_depth_where_it_is_given(parts_path):
     estimator, rendered = seen(parts_path, "depth")
-    found = estimator.predict(rendered.image, K_VGA, depth=rendered.depth)[0]
+    detection = estimator.predict(rendered.image, K_VGA, depth=rendered.depth)[0]
     alone = estimator.predict(rendered.image, K_VGA)[0]
-    assert error(found.T_cam_obj) < 0.002 < 0.009 < error(alone.T_cam_obj)
-    assert (found.kept, alone.kept) == ("", "no depth image was given")
+    assert error(detection.T_cam_obj) < 0.002 < 0.009 < error(alone.T_cam_obj)
+    assert (detection.kept, alone.kept) == ("", "no depth image was given")
     assert_array_equal(
-        found.keypoints, project_keypoints(estimator.cuboids[0], found.T_cam_obj, K_VGA)
+        detection.keypoints, project_keypoints(estimator.cuboids[0], detection.T_cam_obj, K_VGA)
     )
 
 
 def test_refines_on_the_picture(parts_path):
     estimator, rendered = seen(parts_path, "region", nearer=0.0)
-    found = estimator.predict(rendered.image, K_VGA)[0]
+    detection = estimator.predict(rendered.image, K_VGA)[0]
     turned = rotation_vector_to_matrix(np.array([0.04, 0.04, -0.03])) @ TRUE[:3, :3]
     off = make_transform(turned, TRUE[:3, 3] + (0.001, 0.002, 0.002))
     covariance = np.diag(np.square([0.04] * 3 + [0.002, 0.002, 0.005]))
-    given = replace(found, T_cam_obj=off, covariance=covariance)
+    given = replace(detection, T_cam_obj=off, covariance=covariance)
     (refined,) = estimator.refined([given], rendered.image, K_VGA)
     assert refined.kept == ""
     assert refined.agreement > 0.9

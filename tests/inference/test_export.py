@@ -82,31 +82,31 @@ def test_the_same_maps_for_any_batch_height_and_width(exported, original):
         images = pictures(*shape)
         with torch.inference_mode():
             pairs = zip(theirs.network.maps(images), ours.network.maps(images), strict=True)
-        for one, other in pairs:
+        for first, other in pairs:
             assert other.std() > 0.01
             # A random network's field is up to 20 long, a trained one's 1.
             size = max(1.0, float(other.abs().max()))
-            torch.testing.assert_close(one / size, other / size, atol=1e-4, rtol=0)
+            torch.testing.assert_close(first / size, other / size, atol=1e-4, rtol=0)
 
 
 def test_a_renamed_file_is_the_same_estimator(exported, original, tmp_path):
     ending = "".join(exported.suffixes)
     moved = tmp_path / f"renamed{ending}"
     (shutil.copytree if exported.is_dir() else shutil.copy)(exported, moved)
-    theirs, ours = (PoseEstimator.load(one, refine="region") for one in (moved, original))
+    theirs, ours = (PoseEstimator.load(item, refine="region") for item in (moved, original))
     assert replace(theirs.checkpoint, state_dict={}).to_payload() == ours.checkpoint.to_payload()
     assert theirs.recovery == ours.recovery
     picture = pictures(96, 128, 3).numpy()
-    found, expected = (one.predict(picture, K) for one in (theirs, ours))
-    assert len(found) == len(expected)
-    for one, other in zip(found, expected, strict=True):
-        assert_allclose(one.T_cam_obj, other.T_cam_obj, atol=1e-4)
+    detections, expected = (estimator.predict(picture, K) for estimator in (theirs, ours))
+    assert len(detections) == len(expected)
+    for detection, other in zip(detections, expected, strict=True):
+        assert_allclose(detection.T_cam_obj, other.T_cam_obj, atol=1e-4)
 
 
 @pytest.mark.slow
 def test_weights_in_half_precision_take_half_the_place(original, tmp_path):
     pytest.importorskip("onnxscript")
-    whole, half = (written(original, "onnx", tmp_path / one, one) for one in ("fp32", "fp16"))
+    whole, half = (written(original, "onnx", tmp_path / item, item) for item in ("fp32", "fp16"))
     described = len(half.read_bytes()) - 2 * len(whole.read_bytes())
     assert described < 0
     images = pictures(1, 3, 96, 128)

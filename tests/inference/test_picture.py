@@ -75,21 +75,21 @@ def test_a_checkpoint_that_does_not_know_sizes_looks_in_that_of_its_images():
 )
 def test_every_distance_is_looked_at_in_a_size_that_was_learned(focal, near, ratio, share):
     far = near * ratio
-    found = boxes((1280, 960), focal, (near, far))
+    result = boxes((1280, 960), focal, (near, far))
     native = 0.1 * focal / (near * ratio**share)
-    shown = [native * box.scale_x for box in found]
-    fits = any(48 / MARGIN**2 <= one <= 98 * MARGIN**2 for one in shown)
+    shown = [native * box.scale_x for box in result]
+    fits = any(48 / MARGIN**2 <= item <= 98 * MARGIN**2 for item in shown)
     # Farther away than the largest picture shows.
     too_small = native * np.sqrt(MAX_PIXELS / (1280 * 960)) < 98 * MARGIN**2
     assert fits or too_small
-    assert all(box.width * box.height <= 1.01 * MAX_PIXELS for box in found)
+    assert all(box.width * box.height <= 1.01 * MAX_PIXELS for box in result)
 
 
 def test_anywhere_reaches_from_a_part_that_fills_the_picture_to_the_smallest():
-    found = boxes((640, 480), 600.0, "any")
-    assert found[0].scale_x * 480 <= 98 * MARGIN
-    assert found[-1].scale_x > 0.6
-    assert all(b.scale_x > a.scale_x for a, b in pairwise(found))
+    result = boxes((640, 480), 600.0, "any")
+    assert result[0].scale_x * 480 <= 98 * MARGIN
+    assert result[-1].scale_x > 0.6
+    assert all(b.scale_x > a.scale_x for a, b in pairwise(result))
 
 
 @pytest.mark.parametrize("distances", [(0.5, 0.3), (0.0, 1.0), (0.1, np.inf), (0.1, 0.2, 0.3)])
@@ -110,8 +110,8 @@ def test_the_best_of_all_scales_is_kept():
 
 
 def test_two_of_one_scale_are_two():
-    one, two = detection(0, 0.5), detection(4, 0.4)
-    assert merge_scales([[one, two], []]) == [one, two]
+    first, two = detection(0, 0.5), detection(4, 0.4)
+    assert merge_scales([[first, two], []]) == [first, two]
 
 
 @pytest.fixture(scope="module")
@@ -139,8 +139,8 @@ def num_right(estimator, scenes):
     part, passed = estimator.parts[0], 0
     for scene in scenes:
         true = scene.objects[scene.targets[0]].T_cam_obj
-        for one in estimator.predict(render(scene).image, scene.K)[:1]:
-            away = transform(one.T_cam_obj, part.points) - transform(true, part.points)
+        for detection in estimator.predict(render(scene).image, scene.K)[:1]:
+            away = transform(detection.T_cam_obj, part.points) - transform(true, part.points)
             passed += np.linalg.norm(away, axis=1).mean() < 0.1 * part.diameter
     return passed
 
@@ -149,7 +149,7 @@ def num_right(estimator, scenes):
 def test_other_cameras_find_as_much_as_that_of_training(estimator, scenes, size):
     usual = num_right(estimator, scenes)
     assert usual >= 5
-    assert num_right(estimator, [through(one, size) for one in scenes]) >= usual - 2
+    assert num_right(estimator, [through(scene, size) for scene in scenes]) >= usual - 2
 
 
 def test_a_part_out_of_reach_is_found_where_one_looks_farther(estimator, scenes):
@@ -161,7 +161,10 @@ def test_a_part_out_of_reach_is_found_where_one_looks_farther(estimator, scenes)
     K[:2, 2] = scene.K[:2, 2]
 
     def found(distances=None):
-        depths = [one.T_cam_obj[2, 3] for one in estimator.predict(image, K, distances=distances)]
+        depths = [
+            detection.T_cam_obj[2, 3]
+            for detection in estimator.predict(image, K, distances=distances)
+        ]
         return bool(depths) and abs(depths[0] / (3 * true[2, 3]) - 1) < 0.15
 
     assert not found((0.1, 0.15))
@@ -175,14 +178,14 @@ def test_a_region_is_looked_at_as_a_picture_of_its_own(estimator, scenes):
     canvas[50:178, 70:198] = image
     shifted = K.copy()
     shifted[:2, 2] += 70, 50
-    (alone,), (found,) = (
+    (alone,), (detections,) = (
         estimator.predict(image, K),
         estimator.predict(canvas, shifted, roi=(70, 50, 128, 128)),
     )
-    assert np.allclose(found.T_cam_obj, alone.T_cam_obj)
+    assert np.allclose(detections.T_cam_obj, alone.T_cam_obj)
     for pixels in ("peaks", "keypoints"):
         moved = getattr(alone, pixels) + np.array([70, 50])
-        assert np.allclose(getattr(found, pixels), moved, equal_nan=True)
+        assert np.allclose(getattr(detections, pixels), moved, equal_nan=True)
 
 
 @pytest.mark.parametrize("roi", [(-1, 0, 10, 10), (0, 0, 200, 10), (5, 5, 0, 10)])

@@ -35,9 +35,9 @@ def pose(x: float = 0.0, z: float = 0.3, turn: float = 0.5) -> np.ndarray:
 def result(*poses: np.ndarray, size: tuple[int, int] = (640, 480), **fields: object) -> PoseResult:
     image = np.full((*size[::-1], 3), 128, np.uint8)
     speed = {"pre": 1.0, "network": 2.0, "decode": 3.0, "refine": 0.0}
-    found = [detection(one, 0.9 - 0.1 * number) for number, one in enumerate(poses)]
+    result = [detection(pose, 0.9 - 0.1 * number) for number, pose in enumerate(poses)]
     given = {"name": "a.png", "shapes": SHAPES} | fields
-    return PoseResult(image, K, found, speed, **given)
+    return PoseResult(image, K, result, speed, **given)
 
 
 @pytest.mark.parametrize("image", range(4))
@@ -64,13 +64,13 @@ def test_lines_and_text_grow_with_the_picture(factor):
     small = result(pose(), pose(0.06))
     large = replace(
         small, image=np.full((height, width, 3), 128, np.uint8), K=own_K,
-        detections=[replace(one, keypoints=one.keypoints * factor) for one in small.detections],
+        detections=[replace(d, keypoints=d.keypoints * factor) for d in small.detections],
     )  # fmt: skip
     drawn, expected = large.plot(), small.plot()
     assert drawn.shape[1] >= 640
     shrunk = cv2.resize(drawn, (640, 480), interpolation=cv2.INTER_AREA)
-    touched, own = ((np.abs(one - 128.0) > 40).any(axis=2) for one in (expected, shrunk))
-    near = [cv2.dilate(one.astype(np.uint8), np.ones((9, 9))) > 0 for one in (touched, own)]
+    touched, own = ((np.abs(item - 128.0) > 40).any(axis=2) for item in (expected, shrunk))
+    near = [cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) > 0 for mask in (touched, own)]
     assert (touched & near[1]).sum() > 0.9 * touched.sum()
     assert (own & near[0]).sum() > 0.9 * own.sum()
     assert own.sum() == pytest.approx(touched.sum(), rel=0.5)
@@ -108,7 +108,7 @@ def test_json_names_frame_units_and_what_is_no_number():
     )  # fmt: skip
     np.testing.assert_allclose(whole["K"], K)
     assert whole["speed_ms"] == {"pre": 1.0, "network": 2.0, "decode": 3.0, "refine": 0.0}
-    assert [one["identity"] for one in whole["detections"]] == [3, 5]
+    assert [record["identity"] for record in whole["detections"]] == [3, 5]
     np.testing.assert_allclose(whole["detections"][1]["T_cam_obj"], pose(0.1))
     assert np.shape(whole["detections"][0]["covariance"]) == (6, 6)
     behind = json.loads(result(pose(z=-0.3)).to_json())["detections"][0]

@@ -54,11 +54,11 @@ def test_a_picture_gives_what_predict_gives(estimator, rendered, K, tmp_path):
 
 def test_a_video_is_followed(estimator, clip, K):
     results = list(estimator.stream(clip, K, track=True))
-    assert [one.time for one in results] == pytest.approx([0, 0.1, 0.2, 0.3])
+    assert [frame.time for frame in results] == pytest.approx([0, 0.1, 0.2, 0.3])
     assert [list(one.identities) for one in results] == [[0]] * 4
-    moved = [one.detections[0].keypoints[-1, 0] for one in results]
+    moved = [result.detections[0].keypoints[-1, 0] for result in results]
     assert 1 < moved[-1] - moved[0] < 4  # of three pixels; a tracker's first steps are careful
-    assert [one.number for one in estimator.stream(clip, K, stride=3)] == [0, 3]
+    assert [item.number for item in estimator.stream(clip, K, stride=3)] == [0, 3]
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,7 @@ class Stage:
 
     def refined(self, given, image, K):
         self.refinements += len(given)
-        return [self._refined(one) for one in given]
+        return [self._refined(item) for item in given]
 
     def _refined(self, one):
         for name, (part, pose) in self.actors.items():
@@ -152,10 +152,10 @@ def test_two_parts_of_a_kind_keep_their_identities_when_one_comes_back(stage):
     tracker = PoseTracker(stage, detect_every=5)
     stage.put("left", pivconnector(), (-0.1, 0.0, 0.4))
     stage.put("right", pivconnector(), (0.1, 0.0, 0.4))
-    places = {one.identity: one.detection.T_cam_obj[0, 3] for one in tracker.track(IMAGE, K)}
+    places = {track.identity: track.detection.T_cam_obj[0, 3] for track in tracker.track(IMAGE, K)}
     stage.hidden = {"left"}
     seen = [tracker.track(IMAGE, K) for _ in range(4)][-1]
-    assert [one.detection.T_cam_obj[0, 3] for one in seen] == [0.1]
+    assert [item.detection.T_cam_obj[0, 3] for item in seen] == [0.1]
     stage.hidden = set()
     stage.put("third", pivconnector(), (0.0, 0.1, 0.4))
     again = {one.identity: one.detection.T_cam_obj[0, 3] for one in tracker.track(IMAGE, K)}
@@ -180,7 +180,7 @@ def test_the_network_outvotes_a_track_that_sits_elsewhere(stage):
     true = stage.predict
     turned = make_transform(np.diag([-1.0, -1.0, 1.0]), np.array([0.0, 0.0, 0.3]))
     stage.predict = lambda *given, **options: [
-        replace(one, T_cam_obj=turned) for one in true(*given, **options)
+        replace(option, T_cam_obj=turned) for option in true(*given, **options)
     ]
     detected = [tracker.track(IMAGE, K)[0].detected for _ in range(6)]
     # Frame 5 disagrees, so frame 6 looks again.
@@ -258,14 +258,14 @@ def test_what_a_frame_says_is_kalmans_update() -> None:
     root = rng.normal(size=(12, 12)) * np.tile(NOISE, 2)[:, None]
     forecast = Motion(START, rng.normal(size=6) * 0.01, root @ root.T, np.zeros(6))
     measured = rng.normal(size=6) * 1e-4  # small, so that turns add up
-    found = filtered(forecast, moved(START, measured))
+    result = filtered(forecast, moved(START, measured))
     H = np.eye(6, 12)
     P, R = forecast.covariance, np.diag(NOISE**2)
     gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
-    assert_allclose(found.covariance, P - gain @ H @ P, atol=1e-12)
+    assert_allclose(result.covariance, P - gain @ H @ P, atol=1e-12)
     after = gain @ measured
-    assert_allclose(step_between(START, found.T_cam_obj), after[:6], atol=1e-9)
-    assert_allclose(found.velocity, forecast.velocity + after[6:], atol=1e-9)
+    assert_allclose(step_between(START, result.T_cam_obj), after[:6], atol=1e-9)
+    assert_allclose(result.velocity, forecast.velocity + after[6:], atol=1e-9)
 
 
 def test_a_filter_foresees_a_steady_motion() -> None:

@@ -23,11 +23,11 @@ def estimator():
 def result(estimator):
     from dopepp.virtual import PRESETS, Factory
 
-    one = Factory([pivconnector()], PRESETS["quickstart"].reframed(320, 240), 2).render(0, 9)
+    item = Factory([pivconnector()], PRESETS["quickstart"].reframed(320, 240), 2).render(0, 9)
     shapes = {part.name: make_shape(part) for part in estimator.parts}
-    found = estimator.predict(one.image, one.scene.K)
-    assert found
-    return PoseResult(one.image, one.scene.K, found, {}, "clip.mp4", 3, 0.3, shapes=shapes)
+    detections = estimator.predict(item.image, item.scene.K)
+    assert detections
+    return PoseResult(item.image, item.scene.K, detections, {}, "clip.mp4", 3, 0.3, shapes=shapes)
 
 
 def test_a_recording_has_everything(estimator, result, tmp_path):
@@ -37,7 +37,7 @@ def test_a_recording_has_everything(estimator, result, tmp_path):
         nothing = PoseResult(result.image, result.K, [], {}, "clip.mp4", 4, 0.4)
         viewer.take(nothing)
         assert not path.exists()
-    assert [one.name for one in path.parent.iterdir()] == ["out.rrd"]
+    assert [file.name for file in path.parent.iterdir()] == ["out.rrd"]
     chunks = rerun.chunk.RrdReader(path).stream().to_chunks()
     logged = {chunk.entity_path for chunk in chunks}
     name = "pivconnector_0"

@@ -75,9 +75,9 @@ def estimator():
 @pytest.fixture(scope="module")
 def whole(estimator, scene, picture):
     """The pose on the whole picture."""
-    (found,) = estimator.predict(picture, scene.K)
-    assert not found.kept
-    return found.T_cam_obj
+    (detection,) = estimator.predict(picture, scene.K)
+    assert not detection.kept
+    return detection.T_cam_obj
 
 
 @settings(max_examples=8, derandomize=True, database=None)
@@ -91,11 +91,11 @@ def test_the_metric_pose_stays(estimator, scene, picture, whole, view):
     keypoints = project_keypoints(pivconnector().cuboid, whole, scene.K)
     seen, K = made(view, picture, scene.K, keypoints)
     assert view is not VGA or seen.shape == (480, 640, 3)
-    found = estimator.predict(seen, K, LENS if view.lens else None, cropped=True)
-    assert found, "nothing found"
+    detections = estimator.predict(seen, K, LENS if view.lens else None, cropped=True)
+    assert detections, "nothing found"
     back = np.eye(4)
     back[:3, :3] = quarter_turn(-view.turns)
-    T = back @ found[0].T_cam_obj
+    T = back @ detections[0].T_cam_obj
     assert 1000 * np.linalg.norm(T[:3, 3] - whole[:3, 3]) < MOST_MM
     assert math.degrees(rotation_angle(T[:3, :3] @ whole[:3, :3].T)) < MOST_DEG
 

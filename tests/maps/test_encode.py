@@ -53,8 +53,8 @@ def test_maps_are_what_their_definition_says():
     keypoints[2, 2, 5:7] = [[-0.4, 40], [40, 87.4]]
     objects = np.array([[0, 0, 1, -1], [1, 1, 1, 0], [-1, -1, 0, 1]])
     expected = by_hand(keypoints, objects, 2, (11, 15), GEOMETRY)
-    found = encode(torch.tensor(keypoints), torch.tensor(objects), 2, (11, 15), GEOMETRY)
-    for ours, theirs in zip(found, expected, strict=True):
+    result = encode(torch.tensor(keypoints), torch.tensor(objects), 2, (11, 15), GEOMETRY)
+    for ours, theirs in zip(result, expected, strict=True):
         assert ours.dtype == torch.float32
         assert_close(ours, torch.tensor(theirs).float(), atol=2e-5, rtol=0)
 

@@ -22,9 +22,9 @@ Z = norm.ppf(0.975)
 
 def difference(*arguments: Any, **options: Any) -> Difference:
     """Return a difference that exists."""
-    found = paired_difference(*arguments, **options)
-    assert found is not None
-    return found
+    result = paired_difference(*arguments, **options)
+    assert result is not None
+    return result
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ def test_with_one_seed_it_is_scipys_paired_percentile_bootstrap(name, reference,
     rng = np.random.default_rng(11)
     mine, other = rng.gamma(2, 5, 121), rng.gamma(2, 6, 121)
     mine = 0.6 * mine + 0.4 * other
-    found = difference(
+    result = difference(
         [mine[None]], [other[None]], name, num_resamples=20_000, confidence=confidence, seed=5
     )
     expected = bootstrap(
@@ -44,10 +44,10 @@ def test_with_one_seed_it_is_scipys_paired_percentile_bootstrap(name, reference,
         paired=True, n_resamples=20_000, method="percentile", confidence_level=confidence,
         rng=np.random.default_rng(6),
     ).confidence_interval  # fmt: skip
-    assert found.value == pytest.approx(reference(mine) - reference(other), abs=1e-12)
+    assert result.value == pytest.approx(reference(mine) - reference(other), abs=1e-12)
     width = expected.high - expected.low
-    assert found.low == pytest.approx(expected.low, abs=0.04 * width)
-    assert found.high == pytest.approx(expected.high, abs=0.04 * width)
+    assert result.low == pytest.approx(expected.low, abs=0.04 * width)
+    assert result.high == pytest.approx(expected.high, abs=0.04 * width)
 
 
 def test_seeds_and_instances_add_their_variances():
@@ -60,11 +60,11 @@ def test_seeds_and_instances_add_their_variances():
         + rng.normal(0, 0.8, (num_seeds, num))
     )
     base = rng.normal(size=(num_seeds, num))
-    found = difference([base + d], [base], few_seeds=False, num_resamples=12_000)
+    result = difference([base + d], [base], few_seeds=False, num_resamples=12_000)
     by_seed, by_instance = d.mean(axis=1), d.mean(axis=0)
     rest = d - by_seed[:, None] - by_instance + d.mean()
     variance = by_instance.var() / num + by_seed.var() / num_seeds + rest.var() / (num_seeds * num)
-    assert (found.high - found.low) / 2 == pytest.approx(Z * np.sqrt(variance), rel=0.06)
+    assert (result.high - result.low) / 2 == pytest.approx(Z * np.sqrt(variance), rel=0.06)
 
 
 @pytest.mark.parametrize("num_seeds", [2, 3, 5])
@@ -74,8 +74,8 @@ def test_few_seeds_are_not_believed_too_much(num_seeds):
     for trial in range(150):
         noise = rng.normal(0, 0.1, (2, num_seeds))[:, :, None]
         mine, other = rng.normal(0, 0.05, (2, num_seeds, 40)) + noise
-        found = difference([mine + 0.05], [other], num_resamples=400, seed=trial)
-        hits += found.low <= 0.05 <= found.high
+        result = difference([mine + 0.05], [other], num_resamples=400, seed=trial)
+        hits += result.low <= 0.05 <= result.high
     assert hits > 0.9 * 150
 
 
@@ -88,12 +88,12 @@ def test_the_methods_change_places_and_the_interval_its_sign(seed, num, seeds, n
     rng = np.random.default_rng(seed)
     mine, other = rng.integers(0, 4, (2, seeds, num)).astype(float)
     options = {"same_seeds": True, "num_resamples": 200, "seed": seed}
-    one = difference([mine], [other], name, **options)
+    option = difference([mine], [other], name, **options)
     back = difference([other], [mine], name, **options)
-    assert (one.low, one.high) == pytest.approx((-back.high, -back.low), abs=1e-9)
-    assert (one.value, one.num_differing) == (-back.value, back.num_differing)
+    assert (option.low, option.high) == pytest.approx((-back.high, -back.low), abs=1e-9)
+    assert (option.value, option.num_differing) == (-back.value, back.num_differing)
     again = difference([mine], [other], name, **options)
-    assert one == again
+    assert option == again
     itself = difference([mine], [mine], name, same_seeds=same)
     assert itself.value == 0
     assert itself.within_noise
@@ -119,9 +119,9 @@ def test_a_median_over_misses_does_not_exist():
 
 def test_resamples_without_a_hit_are_left_out():
     mine = np.array([[3.0, np.inf, np.inf, np.inf]])
-    found = difference([mine], [np.full((1, 4), 5.0)], "median", num_resamples=500)
-    assert (found.value, found.low, found.high) == (-2, -2, -2)
-    assert found.within_noise  # all of four instances: not enough
+    result = difference([mine], [np.full((1, 4), 5.0)], "median", num_resamples=500)
+    assert (result.value, result.low, result.high) == (-2, -2, -2)
+    assert result.within_noise  # all of four instances: not enough
 
 
 @pytest.mark.parametrize("num", [1, 5, 6])
@@ -129,12 +129,12 @@ def test_fewer_than_six_differing_instances_prove_nothing(num):
     other = np.zeros((1, 50))
     mine = other.copy()
     mine[0, :num] = 1
-    found = difference([mine], [other])
-    assert (found.num_differing, found.fewest) == (num, 6)
-    assert found.within_noise == (num < 6)
-    one = difference([mine[:, :1]], [other[:, :1]])
-    assert (one.low, one.high) == (1, 1)
-    assert one.within_noise
+    result = difference([mine], [other])
+    assert (result.num_differing, result.fewest) == (num, 6)
+    assert result.within_noise == (num < 6)
+    item = difference([mine[:, :1]], [other[:, :1]])
+    assert (item.low, item.high) == (1, 1)
+    assert item.within_noise
 
 
 def test_the_sign_test_says_how_many():
@@ -146,11 +146,11 @@ def test_the_sign_test_says_how_many():
 def test_several_objects_count_alike():
     rng = np.random.default_rng(1)
     a, b = rng.random((2, 2, 30)), rng.random((2, 2, 300))
-    found = difference([a[0], b[0]], [a[1], b[1]])
+    result = difference([a[0], b[0]], [a[1], b[1]])
     expected = ((a[0] - a[1]).mean() + (b[0] - b[1]).mean()) / 2
-    assert found.value == pytest.approx(expected, abs=1e-12)
+    assert result.value == pytest.approx(expected, abs=1e-12)
     alone = difference([a[0]], [a[1]])
-    assert found.high - found.low < alone.high - alone.low
+    assert result.high - result.low < alone.high - alone.low
 
 
 def test_pairs_of_seeds_cancel_what_they_share():
@@ -217,7 +217,7 @@ def test_too_few_images_are_not_made_up_for_by_seeds():
     mine, other = np.zeros((3, 10)), np.zeros((3, 10))
     mine[:, 0] = 1
     assert seeds_to_tell([mine], [other]) == np.inf
-    found = difference([mine], [other])
-    assert found.seeds_to_tell == np.inf
+    result = difference([mine], [other])
+    assert result.seeds_to_tell == np.inf
     alone = difference([mine[:1]], [other[:1]])
     assert alone.seeds_to_tell is None

@@ -47,7 +47,7 @@ def poses(n: int, seed: int, near: bool = False) -> list[Tensor]:
     R_est = R_gt * turn if near else Rotation.random(n, random_state=rng)
     t_gt = rng.normal([0, 0, 1], 0.1, (n, 3))
     t_est = t_gt + rng.normal(0, 0.01, (n, 3))
-    return [torch.from_numpy(one) for one in (R_est.as_matrix(), t_est, R_gt.as_matrix(), t_gt)]
+    return [torch.from_numpy(item) for item in (R_est.as_matrix(), t_est, R_gt.as_matrix(), t_gt)]
 
 
 def cloud(n: int, seed: int = 0) -> Tensor:
@@ -138,7 +138,7 @@ def test_rotation_error_equals_scipy(angle, axis, seed):
     axis = axis / np.linalg.norm(axis) if np.linalg.norm(axis) > 1e-3 else np.array([1.0, 0, 0])
     base = Rotation.random(random_state=seed)
     turned = Rotation.from_rotvec(angle * axis) * base
-    matrices = (torch.from_numpy(one.as_matrix())[None] for one in (turned, base))
+    matrices = (torch.from_numpy(item.as_matrix())[None] for item in (turned, base))
     # 1e-13 degrees is the rounding of the matrices themselves.
     magnitude = np.degrees((turned * base.inv()).magnitude())
     assert rotation_error_deg(*matrices).item() == pytest.approx(magnitude, rel=REL, abs=1e-13)
@@ -210,8 +210,8 @@ def test_mahalanobis_distance_equals_scipy():
     turns = Rotation.from_matrix(R_gt.numpy()) * Rotation.from_matrix(R_est.numpy()).inv()
     steps = np.column_stack([turns.as_rotvec(), (t_gt - t_est).numpy()])
     expected = [
-        scipy_distance.mahalanobis(step, np.zeros(6), np.linalg.inv(one.numpy()))
-        for step, one in zip(steps, covariance, strict=True)
+        scipy_distance.mahalanobis(step, np.zeros(6), np.linalg.inv(first.numpy()))
+        for step, first in zip(steps, covariance, strict=True)
     ]
     assert_allclose(mahalanobis(R_est, t_est, R_gt, t_gt, covariance), expected, rtol=1e-6)
 
@@ -250,7 +250,7 @@ def test_a_pose_that_is_not_finite_is_a_miss(bad, which):
 
 
 def test_no_poses_have_no_errors():
-    none = [one[:0] for one in poses(1, 0)]
+    none = [pose[:0] for pose in poses(1, 0)]
     for error in ERRORS.values():
         assert error(*none, cloud(5)).shape == (0,)
     assert rotation_error_deg(none[0], none[2]).shape == (0,)
@@ -275,7 +275,7 @@ def test_wrong_shapes_are_refused(pose, points, message):
 
 
 def test_single_precision_inputs_are_computed_in_double():
-    rounded = [one.float() for one in (*poses(3, 9), cloud(10))]
+    rounded = [pose.float() for pose in (*poses(3, 9), cloud(10))]
     result = add(*rounded)
     assert result.dtype == torch.float64
-    assert torch.equal(result, add(*(one.double() for one in rounded)))
+    assert torch.equal(result, add(*(item.double() for item in rounded)))

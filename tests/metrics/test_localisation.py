@@ -47,11 +47,11 @@ def matched_loop(errors, threshold):
     """bop_toolkit's greedy matching, estimate by estimate."""
     taken = []
     for row in errors:
-        best, found = threshold, None
+        best, result = threshold, None
         for number, error in enumerate(row):
             if number not in taken and error < best:
-                best, found = error, number
-        taken += [] if found is None else [found]
+                best, result = error, number
+        taken += [] if result is None else [result]
     return len(taken)
 
 
@@ -132,10 +132,10 @@ def test_recalls_by_hand():
 def test_targets_are_those_of_the_list_else_the_visible_and_as_many_estimates_count():
     away = Pose("box", 0.9, pose(0.3))
     right = Pose("box", 0.5, pose())
-    one = [truth(pose())]
+    item = [truth(pose())]
     # One target: the best scored estimate alone counts, whichever is the nearest.
-    assert scores([([right, away], one)]).add_or_s_01d == 0
-    assert scores([([right, replace(away, score=0.1)], one)]).add_or_s_01d == 1
+    assert scores([([right, away], item)]).add_or_s_01d == 0
+    assert scores([([right, replace(away, score=0.1)], item)]).add_or_s_01d == 1
     hidden = truth(pose(0.3), visible=0.05)
     assert scores([([right], [truth(pose()), hidden])]).num_targets == 1
     listed = [truth(pose(), wanted=False), truth(pose(0.3), visible=0.05, wanted=True)]
@@ -154,7 +154,7 @@ def test_add_or_s_is_over_the_vertices(seed, symmetric):
     given_part = part(mesh=mesh, points=vertices.mean(0)[None], symmetries_discrete=turns)
     T_est, T_gt = pose(0.01 * rng.normal(), 30 * rng.normal()), pose(0.01 * rng.normal())
     estimated, true = (vertices @ T[:3, :3].T + T[:3, 3] for T in (T_est, T_gt))
-    nearest = [np.linalg.norm(estimated - one, axis=1).min() for one in true]
+    nearest = [np.linalg.norm(estimated - item, axis=1).min() for item in true]
     error = np.mean(nearest if symmetric else np.linalg.norm(estimated - true, axis=1))
     got = scores([([Pose("box", 1.0, T_est)], [truth(T_gt)])], given_part)
     assert got.add_or_s_01d == (error < 0.1 * given_part.diameter)

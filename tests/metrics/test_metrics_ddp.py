@@ -43,8 +43,8 @@ def feed(target: PoseMetrics, images: range) -> None:
         E = T.copy()
         E[:3, 3] += rng.normal(0, 0.01, 3)
         # Two scores only, so that ties run across the ranks.
-        found = Detection("box", 0.5 + 0.1 * (i % 2), E)
-        detections = [] if i % 3 == 0 else [found] * (1 + i % 2)
+        result = Detection("box", 0.5 + 0.1 * (i % 2), E)
+        detections = [] if i % 3 == 0 else [result] * (1 + i % 2)
         K = np.array([[500.0 + i, 0, 320], [0, 500, 240], [0, 0, 1]])
         target.update(detections, [Instance("box", T, np.zeros((9, 2)))], K, 640 + 10 * i)
 

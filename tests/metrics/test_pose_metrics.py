@@ -52,9 +52,9 @@ def test_errors_are_compared_with_what_estimates_state_of_themselves():
     metric = PoseMetrics([replace(part("box"), symmetries_discrete=flip[None])])
     for number in range(1500):
         T = pose(0, tuple(rng.normal(size=3)))
-        found = moved(T, 3 * deviation * rng.normal(size=6))
-        found = found @ flip if number % 2 else found
-        metric.update([Detection("box", 1, found, np.diag(deviation**2))], [truth("box", T)])
+        result = moved(T, 3 * deviation * rng.normal(size=6))
+        result = result @ flip if number % 2 else result
+        metric.update([Detection("box", 1, result, np.diag(deviation**2))], [truth("box", T)])
     assert metric.compute()["box"].median_deviations == pytest.approx(3, rel=0.05)
     assert metric.compute()[MEAN].median_deviations == pytest.approx(3, rel=0.05)
     metric.update([], [truth("box", pose())])  # a miss states nothing
@@ -279,8 +279,8 @@ def test_average_precision_by_hand(images, expected):
     metric = PoseMetrics([part("box")])
     for score, error in images:
         shift = error if isinstance(error, float) else 0.0
-        found = [] if error is MISSED else [Detection("box", score, pose(shift))]
-        metric.update(found, [] if error is STRAY else [truth("box", pose())])
+        result = [] if error is MISSED else [Detection("box", score, pose(shift))]
+        metric.update(result, [] if error is STRAY else [truth("box", pose())])
     assert metric.compute()["box"].average_precision == pytest.approx(expected)
 
 

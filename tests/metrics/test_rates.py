@@ -27,14 +27,14 @@ REL = 1e-9
 
 def voc_loop(errors: list[float], maximum: float) -> float:
     """YCB-Video's rule, written from its description: right-sided rectangles over sorted errors."""
-    total, previous, found = 0.0, 0.0, 0
+    total, previous, result = 0.0, 0.0, 0
     for error in sorted(e for e in errors if e <= maximum):
-        found += 1
-        total += (error - previous) * found / len(errors)
+        result += 1
+        total += (error - previous) * result / len(errors)
         previous = error
-    if found == 0:
+    if result == 0:
         return 0.0
-    return (total + (maximum - previous) * found / len(errors)) / maximum
+    return (total + (maximum - previous) * result / len(errors)) / maximum
 
 
 ERRORS = st.lists(
@@ -104,10 +104,10 @@ def test_average_precision_is_its_definition(seed, count):
     scores = rng.integers(0, 10, count) / 10.0
     correct = rng.random(count) < 0.6
     instances = int(correct.sum()) + int(rng.integers(0, 5)) or 1
-    found, curve = 0, []
+    actual, curve = 0, []
     for rank, index in enumerate(np.argsort(-scores, kind="mergesort"), start=1):
-        found += bool(correct[index])
-        curve.append((found / instances, found / rank))
+        actual += bool(correct[index])
+        curve.append((actual / instances, actual / rank))
     levels = np.linspace(0.0, 1.0, 101)
     best = [max((p for r, p in curve if r >= level), default=0.0) for level in levels]
     result = average_precision(torch.from_numpy(scores), torch.from_numpy(correct), instances)

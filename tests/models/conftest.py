@@ -38,7 +38,7 @@ def small_spec(make_spec):
 
 
 @pytest.fixture
-def small_fast_spec(make_spec: SpecMaker) -> dict[str, Any]:
+def small_fast_spec(make_spec):
     """The fast DOPE++ at a sixteenth of its channels, with lists as YAML and JSON give them."""
     shape = {"backbone_channels": [64, 192, 256, 256], "backbone_blocks": [1, 2, 1, 2]}
     sizes = {"backbone_width": 0.0625, "attention_reduction": 2, "head_width": 0.0625}

@@ -14,7 +14,7 @@ def num_weights(module: nn.Module) -> int:
 def test_paper_counts_without_biases():
     assert num_weights(DSC()) == 1_107_776
     normed = DSC(batch_norm=True).modules()
-    assert all(one.bias is None for one in normed if isinstance(one, nn.Conv2d))
+    assert all(item.bias is None for item in normed if isinstance(item, nn.Conv2d))
     assert num_weights(VGG19Original()) == 9_696_960
 
 
@@ -49,7 +49,9 @@ def test_a_pyramid_counts_as_its_blocks_do():
     up = (40 * 24 + block(24, 24) * 2, 24 * 16)
     backbone = Pyramid((8, 16, 24, 40), (1, 2, 1, 1), (2, 0))
     assert num_weights(backbone) == 9 * 48 * 8 + sum(down) + sum(up)
-    assert all(one.bias is None for one in backbone.modules() if isinstance(one, nn.Conv2d))
+    assert all(
+        module.bias is None for module in backbone.modules() if isinstance(module, nn.Conv2d)
+    )
 
 
 @pytest.mark.parametrize("backbone", [Pyramid, EfficientNetLite])

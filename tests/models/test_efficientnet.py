@@ -30,16 +30,16 @@ def pretrained():
 def test_the_way_down_is_the_published_networks(published, pretrained):
     torch.manual_seed(0)
     pixels = torch.randint(0, 256, (1, 3, 256, 320)).float()
-    mean, std = (torch.tensor(one).view(1, 3, 1, 1) for one in (IMAGENET_MEAN, IMAGENET_STD))
+    mean, std = (torch.tensor(item).view(1, 3, 1, 1) for item in (IMAGENET_MEAN, IMAGENET_STD))
     expected = published._swish(published._bn0(published._conv_stem((pixels - 127) / 128)))
     features, first = (pixels - mean) / std, 0
     for blocks, last in zip(pretrained.down, ENDS, strict=True):
-        found = blocks(features)
+        result = blocks(features)
         for block in published._blocks[first : last + 1]:
             expected = block(expected)
         # Beyond a picture's edge the first convolution sees another grey: 127, not the mean colour.
         inside = slice(14, -14) if first == 0 else slice(None)
-        difference = (found - expected)[..., inside, inside].abs().max()
+        difference = (result - expected)[..., inside, inside].abs().max()
         assert difference < 1e-4 * expected.abs().max()
         features, first = expected, last + 1
 
@@ -65,7 +65,9 @@ def test_frozen_layers_stay_and_the_others_learn(frozen, count):
     torch.manual_seed(0)
     backbone = EfficientNetLite(width=0.125, frozen=frozen).train()
     before = {name: value.clone() for name, value in backbone.state_dict().items()}
-    optimizer = torch.optim.SGD([one for one in backbone.parameters() if one.requires_grad], 0.1)
+    optimizer = torch.optim.SGD(
+        [parameter for parameter in backbone.parameters() if parameter.requires_grad], 0.1
+    )
     backbone(torch.randn(2, 3, 64, 64)).square().mean().backward()
     optimizer.step()
     kept = {f"down.{number}" for number in range(count)}

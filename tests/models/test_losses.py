@@ -127,10 +127,10 @@ def test_terms_are_float32_under_autocast_and_stages_add_up(loss):
     belief, field = targets()
     stage = (belief.bfloat16().requires_grad_(), field.bfloat16())
     with torch.autocast("cpu", torch.bfloat16):
-        one, _ = loss([stage], belief, field)
+        first, _ = loss([stage], belief, field)
         two, parts = loss([stage, stage], belief, field)
-    assert one.dtype == torch.float32
-    assert two.item() == pytest.approx(2 * one.item())
+    assert first.dtype == torch.float32
+    assert two.item() == pytest.approx(2 * first.item())
     assert two.item() == pytest.approx(sum(float(part) for part in parts.values()))
     two.backward()
 

@@ -35,8 +35,8 @@ def test_every_combination_gives_stages_of_the_right_shape(
         assert field.shape == (2, 16 * num_objects, 4, 8)
         assert torch.isfinite(belief).all()
         assert torch.isfinite(field).all()
-    for one, same in zip(stages[0], network(images.float())[0], strict=True):
-        assert torch.equal(one, same)
+    for image, same in zip(stages[0], network(images.float())[0], strict=True):
+        assert torch.equal(image, same)
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_the_copy_for_inference_answers_the_same_without_batch_norm(make_spec, b
     options |= {} if head == "SharedTrunk" else {"head_batch_norm": True}
     network = build_network(make_spec(backbone, "CBAM", head, **options)).double()
     images = torch.randint(0, 256, (2, 3, 64, 64), dtype=torch.uint8)
-    for norm in (one for one in network.modules() if isinstance(one, nn.BatchNorm2d)):
+    for norm in (module for module in network.modules() if isinstance(module, nn.BatchNorm2d)):
         for values, least in ((norm.running_var, 0.2), (norm.weight, 0.5), (norm.bias, -0.5)):
             nn.init.uniform_(values, least, least + 1)
         nn.init.normal_(norm.running_mean)
@@ -86,7 +86,7 @@ def test_every_scale_of_a_multi_scale_stage_answers_maps_of_its_own(make_spec, s
     # The loss of the coarsest maps alone reaches no convolution of the fusion.
     answers[0][0].sum().backward()
     branch = network.head.belief_branches[0]
-    assert all(one.grad is None for one in network.head.field_branches.parameters())
+    assert all(parameter.grad is None for parameter in network.head.field_branches.parameters())
     assert branch.down_quarter[-1].weight.grad is not None
     assert all(one.grad is None for one in branch.up_quarter.parameters())
 
@@ -185,10 +185,10 @@ def test_later_stages_read_activated_beliefs_and_the_field():
 def test_multiscale_has_the_paper_convolutions():
     # Per branch at width 128, biases included: 11 convs 3×3 down, then three convsets of 3 1×1 and
     # 2 3×3 (two of them begin at 256 channels), two more 1×1, and the output.
-    three, one = 9 * 128 * 128 + 128, 128 * 128 + 128
+    three, first = 9 * 128 * 128 + 128, 128 * 128 + 128
     down = 11 * three
-    convset = 3 * one + 2 * three
-    up = 3 * convset + 2 * one + 2 * 128 * 128  # two convsets read 256 channels
+    convset = 3 * first + 2 * three
+    up = 3 * convset + 2 * first + 2 * 128 * 128  # two convsets read 256 channels
     expected = sum(down + up + outputs * 129 for outputs in (9, 16))
     assert num_parameters(MultiScale(128, 1)) == expected
 

@@ -39,7 +39,7 @@ HOSTILE = [
 
 @pytest.mark.parametrize(
     ("part", "target"),
-    [*(("backbone", one) for one in HOSTILE), ("attention", "os.system"), ("head", "os.system")],
+    [*(("backbone", item) for item in HOSTILE), ("attention", "os.system"), ("head", "os.system")],
 )
 def test_other_targets_are_refused(make_spec, part, target):
     spec = make_spec()

@@ -41,8 +41,8 @@ BRACKET = box(62, 31, 40)
 )  # fmt: skip
 def test_bodies_are_counted_without_cavities(meshes, sizes):
     whole = trimesh.util.concatenate(meshes)
-    found = body_extents(np.array(whole.vertices), np.array(whole.faces))
-    np.testing.assert_allclose(found, sizes)
+    result = body_extents(np.array(whole.vertices), np.array(whole.faces))
+    np.testing.assert_allclose(result, sizes)
 
 
 def test_an_open_surface_is_a_body():
@@ -83,14 +83,14 @@ def test_the_log_says_the_size_and_the_unit_taken(unit, level, words, written, c
 def test_an_unlikely_size_is_a_warning(side, unit, written, caplog):
     with caplog.at_level(logging.WARNING):
         load_part(written(box(2 * side, side, side)), unit)
-    (record,) = [one for one in caplog.records if one.levelno == logging.WARNING]
+    (record,) = [entry for entry in caplog.records if entry.levelno == logging.WARNING]
     assert "is the unit right?" in record.getMessage()
 
 
 def test_several_bodies_are_said_once(written, caplog):
     with caplog.at_level(logging.INFO):
         load_part(written(BRACKET, box(5, 5, 8, at=(100, 0, 0))), "mm")
-    lines = [one.getMessage() for one in caplog.records if "bodies" in one.getMessage()]
+    lines = [record.getMessage() for record in caplog.records if "bodies" in record.getMessage()]
     assert lines == [
         "bracket: 134 × 40 × 31 mm, read in mm; 2 bodies (62 × 40 × 31 mm, 8.0 × 5.0 × 5.0 mm), "
         "which are rendered and detected as one part"

@@ -72,14 +72,14 @@ def test_a_vector_that_points_elsewhere_joins_nobody(vector):
 
 def test_the_stronger_of_two_peaks_wins():
     score = np.array([0.5, 0.9])
-    (one,) = group(one_corner([[40, 0], [0, 50]], [[-1, 0], [0, -1]], [[0, 0]], score))
-    assert_array_equal(one.position[0], [0, 50])
+    (item,) = group(one_corner([[40, 0], [0, 50]], [[-1, 0], [0, -1]], [[0, 0]], score))
+    assert_array_equal(item.position[0], [0, 50])
 
 
 def test_a_corner_on_the_centroid_needs_no_direction():
-    found = one_corner([[3, 0]], [[1, 0]], [[0, 0]])
-    assert direction_evidence(found, WIDE, 8.0)[0, 0, 0] == 0
-    assert direction_evidence(found, WIDE, 2.0)[0, 0, 0] == -np.inf
+    result = one_corner([[3, 0]], [[1, 0]], [[0, 0]])
+    assert direction_evidence(result, WIDE, 8.0)[0, 0, 0] == 0
+    assert direction_evidence(result, WIDE, 2.0)[0, 0, 0] == -np.inf
 
 
 def test_corners_in_one_direction_are_told_apart_by_the_others():
@@ -92,11 +92,11 @@ def test_corners_in_one_direction_are_told_apart_by_the_others():
         toward /= np.linalg.norm(toward, axis=-1, keepdims=True)
         toward += 0.05 * rng.normal(size=toward.shape)
         order = rng.permuted(np.tile(np.arange(6), (8, 1)), axis=1)[..., None]
-        found = peaks(
+        result = peaks(
             np.take_along_axis(corners, order, 1), np.take_along_axis(toward, order, 1), centroids
         )
-        for n, one in enumerate(group(found)):
-            right += (one.position[:8] == corners[:, n]).all(1).sum()
+        for n, first in enumerate(group(result)):
+            right += (first.position[:8] == corners[:, n]).all(1).sum()
             total += 8
     assert right >= 0.97 * total
 
@@ -108,9 +108,9 @@ def test_the_triple_with_the_most_evidence_predicts_the_corners():
         corners, centroids = crowd(rng, 3)
         corners = corners + rng.normal(0, 3, corners.shape)
         toward = 0.05 * rng.normal(size=corners.shape)  # so short that all may belong together
-        found = peaks(corners, toward, centroids)
-        evidence = direction_evidence(found, math.pi, 8.0)
-        expected, deviation = _predict(found.position, evidence, centroids, found.area_px)
+        result = peaks(corners, toward, centroids)
+        evidence = direction_evidence(result, math.pi, 8.0)
+        expected, deviation = _predict(result.position, evidence, centroids, result.area_px)
         for i, centroid in enumerate(centroids):
             best = -np.inf
             for triple in combinations(range(8), 3):
@@ -124,7 +124,7 @@ def test_the_triple_with_the_most_evidence_predicts_the_corners():
                     size = np.linalg.norm(predicted, axis=1).mean()
                     variance = PREDICTION_PX**2 + (PERSPECTIVE * size) ** 2
                     squared = ((corners - centroid - predicted[:, None]) ** 2).sum(-1)
-                    gain = np.log(found.area_px / (2 * np.pi * variance)) - squared / 2 / variance
+                    gain = np.log(result.area_px / (2 * np.pi * variance)) - squared / 2 / variance
                     total = np.maximum(evidence[i] + gain, 0).max(1).sum()
                     if total > best + 1e-9:
                         best, answer = total, (predicted + centroid, np.sqrt(variance))
@@ -133,11 +133,11 @@ def test_the_triple_with_the_most_evidence_predicts_the_corners():
 
 
 def test_a_pose_found_before_decides():
-    found = one_corner([[40, 0], [60, 0]], [[-1, 0], [-1, 0]], [[0, 0]])
+    result = one_corner([[40, 0], [60, 0]], [[-1, 0], [-1, 0]], [[0, 0]])
     expected = np.full((1, 8, 2), np.nan)
     expected[0, 0] = 61, 1
-    evidence = direction_evidence(found, WIDE, 8.0)
-    assert_array_equal(associate(found, evidence, expected)[0].position[0], [60, 0])
+    evidence = direction_evidence(result, WIDE, 8.0)
+    assert_array_equal(associate(result, evidence, expected)[0].position[0], [60, 0])
 
 
 def test_no_centroid_no_instance():
@@ -163,7 +163,7 @@ def test_wide_peaks_count_less(box, K, pose):
             KeypointGroup(pixels, np.ones(9), covariance)
             for covariance in (honest, np.tile(9.0 * np.eye(2), (9, 1, 1)))
         ]
-        errors.append([error(solve_group(one, box, K).T_cam_obj, truth, box) for one in groups])
+        errors.append([error(solve_group(group, box, K).T_cam_obj, truth, box) for group in groups])
     told, untold = np.median(errors, axis=0)
     assert told < 0.5 * untold
 

@@ -92,7 +92,7 @@ def test_the_factor_is_the_median_ratio_of_distances():
 def test_the_covariance_grows_and_the_score_does_not():
     fitted = RecoveryOptions(score_bias=0.5, score_spread=-1.0, covariance_factor=2.5)
     sure = replace(fitted, covariance_factor=1.0)
-    before, after = (calibrated(detection(), CUBOID, K, one) for one in (sure, fitted))
+    before, after = (calibrated(detection(), CUBOID, K, item) for item in (sure, fitted))
     assert after.score == before.score
     np.testing.assert_allclose(after.covariance, 2.5 * before.covariance)
 
@@ -107,7 +107,7 @@ def test_the_covariance_factor_is_that_of_chi_squared():
 
 def test_refined_poses_keep_the_networks_score_until_another_is_fitted():
     said = [replace(detection(), score=0.2), replace(detection(), score=0.8)]
-    assert [one.score for one in rescored(said, RecoveryOptions())] == [0.8, 0.2]
+    assert [estimate.score for estimate in rescored(said, RecoveryOptions())] == [0.8, 0.2]
     options = RecoveryOptions(min_score=0.5)
     assert options.of_candidates() is options
     fitted = RecoveryOptions(
@@ -129,8 +129,8 @@ def test_missing_keypoints_and_worse_fits_are_seen():
     peaks = project(transform(T, CUBOID), K)
     peaks[[1, 4, 6]] = np.nan
     whole, poor = (
-        detection_features(one, CUBOID, K)
-        for one in (detection(), detection(peaks=peaks, reprojection_error_px=5.0))
+        detection_features(item, CUBOID, K)
+        for item in (detection(), detection(peaks=peaks, reprojection_error_px=5.0))
     )
     assert whole[FEATURES.index("found")] == 0
     assert poor[FEATURES.index("found")] == pytest.approx(-3 / 9)
@@ -148,8 +148,8 @@ def test_corners_behind_the_camera_have_no_say():
 @settings(max_examples=50)
 @given(belief=st.floats(0, 1), error=st.floats(0, 1e6), variance=st.floats(0, 1e12))
 def test_features_are_finite_whatever_the_detection(belief, error, variance):
-    one = detection(belief=belief, reprojection_error_px=error, covariance=variance * np.eye(6))
-    features = detection_features(one, CUBOID, K)
+    item = detection(belief=belief, reprojection_error_px=error, covariance=variance * np.eye(6))
+    features = detection_features(item, CUBOID, K)
     assert features.shape == (len(FEATURES),)
     assert np.isfinite(features).all()
     assert 0 < float(score(features, 10 * np.ones(len(FEATURES)))) < 1

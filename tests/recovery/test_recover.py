@@ -30,10 +30,10 @@ def test_all_instances_come_back(name, count, box, plate, make_scene, pose):
             T = pose(rng, x, y, 0.55)
             T[:3, 3] -= T[:3, :3] @ cuboid[8]
             scene.place(0, T)
-        found = recover(*scene.maps(), scene.cuboids, scene.K)
-        assert len(found) == count
-        assert max(scene.error(0, one.T_cam_obj) for one in found) < 0.1
-        centres = [transform(one.T_cam_obj, cuboid[8])[:2] for one in found]
+        detections = recover(*scene.maps(), scene.cuboids, scene.K)
+        assert len(detections) == count
+        assert max(scene.error(0, estimate.T_cam_obj) for estimate in detections) < 0.1
+        centres = [transform(detection.T_cam_obj, cuboid[8])[:2] for detection in detections]
         assert len({tuple(np.round(centre / 0.09).astype(int)) for centre in centres}) == count
 
 
@@ -43,10 +43,15 @@ def test_two_objects_in_one_network(make_scene, box, plate, pose):
         scene = make_scene(box, plate)
         for index, (x, y) in zip([0, 1, 1, 0], PLACES, strict=True):
             scene.place(index, pose(rng, x, y, 0.55))
-        found = recover(*scene.maps(), scene.cuboids, scene.K, names=["box", "plate"])
-        assert sorted(one.object for one in found) == ["box", "box", "plate", "plate"]
-        for one in found:
-            assert scene.error(["box", "plate"].index(one.object), one.T_cam_obj) < 0.1
+        detections = recover(*scene.maps(), scene.cuboids, scene.K, names=["box", "plate"])
+        assert sorted(estimate.object for estimate in detections) == [
+            "box",
+            "box",
+            "plate",
+            "plate",
+        ]
+        for detection in detections:
+            assert scene.error(["box", "plate"].index(detection.object), detection.T_cam_obj) < 0.1
 
 
 @pytest.mark.parametrize("name", ["box", "plate"])
@@ -58,27 +63,27 @@ def test_three_missing_corners_are_borne(name, request, make_scene, pose):
         belief, field = scene.maps()
         missing = rng.permutation(8)[:3]
         belief[missing] = 0
-        found = recover(belief, field, scene.cuboids, scene.K)
-        good += len(found) == 1 and scene.error(0, found[0].T_cam_obj) < 0.1
-        for one in found:
-            assert np.isnan(one.peaks[missing]).all()
-            assert np.isfinite(one.keypoints).all()
-            assert one.score == pytest.approx(6 / 9, abs=0.25)
+        detections = recover(belief, field, scene.cuboids, scene.K)
+        good += len(detections) == 1 and scene.error(0, detections[0].T_cam_obj) < 0.1
+        for detection in detections:
+            assert np.isnan(detection.peaks[missing]).all()
+            assert np.isfinite(detection.keypoints).all()
+            assert detection.score == pytest.approx(6 / 9, abs=0.25)
     assert good >= 36
 
 
 def test_what_a_detection_says(make_scene, box, pose):
     scene = make_scene(box).place(0, pose(np.random.default_rng(4)))
-    (one,) = recover(*scene.maps(), scene.cuboids, scene.K, names=["bracket"])
-    assert one.object == "bracket"
-    assert 0.8 < one.score <= 1
+    (detection,) = recover(*scene.maps(), scene.cuboids, scene.K, names=["bracket"])
+    assert detection.object == "bracket"
+    assert 0.8 < detection.score <= 1
     truth = project_keypoints(box, scene.poses[0], scene.K)
-    assert_allclose(one.keypoints, project_keypoints(box, one.T_cam_obj, scene.K))
-    assert_allclose(one.keypoints, truth, atol=0.5)
-    assert_allclose(one.peaks, truth, atol=0.5)
-    rms = np.sqrt(((one.peaks - one.keypoints) ** 2).sum(1).mean())
-    assert one.reprojection_error_px == pytest.approx(rms, abs=1e-6)
-    assert_array_equal(one.T_cam_obj[3], [0, 0, 0, 1])
+    assert_allclose(detection.keypoints, project_keypoints(box, detection.T_cam_obj, scene.K))
+    assert_allclose(detection.keypoints, truth, atol=0.5)
+    assert_allclose(detection.peaks, truth, atol=0.5)
+    rms = np.sqrt(((detection.peaks - detection.keypoints) ** 2).sum(1).mean())
+    assert detection.reprojection_error_px == pytest.approx(rms, abs=1e-6)
+    assert_array_equal(detection.T_cam_obj[3], [0, 0, 0, 1])
 
 
 def test_best_score_comes_first_and_stays_within_one(make_scene, box, pose):
@@ -97,7 +102,9 @@ def test_best_score_comes_first_and_stays_within_one(make_scene, box, pose):
 def test_what_is_absent_is_not_found(make_scene, box, plate, pose):
     scene = make_scene(box, plate).place(1, pose(np.random.default_rng(2)))
     belief, field = scene.maps()
-    assert [one.object for one in recover(belief, field, scene.cuboids, scene.K)] == ["1"]
+    assert [detection.object for detection in recover(belief, field, scene.cuboids, scene.K)] == [
+        "1"
+    ]
     assert recover(0 * belief, 0 * field, scene.cuboids, scene.K) == []
 
 
@@ -116,12 +123,12 @@ def test_a_batch_is_its_images_each_with_its_own_camera(make_scene, box, plate, 
     for scene, found, (one_belief, one_field) in zip(scenes, batch, maps, strict=True):
         alone = recover(one_belief, one_field, scene.cuboids, scene.K)
         assert len(found) == len(alone) == 2
-        for one, other in zip(found, alone, strict=True):
-            assert one.object == other.object
-            assert one.score == pytest.approx(other.score, abs=1e-6)
-            assert_allclose(one.T_cam_obj, other.T_cam_obj, atol=1e-5)
-            assert_allclose(one.peaks, other.peaks, atol=1e-3)
-            assert scene.error(int(one.object), one.T_cam_obj) < 0.1
+        for detection, other in zip(found, alone, strict=True):
+            assert detection.object == other.object
+            assert detection.score == pytest.approx(other.score, abs=1e-6)
+            assert_allclose(detection.T_cam_obj, other.T_cam_obj, atol=1e-5)
+            assert_allclose(detection.peaks, other.peaks, atol=1e-3)
+            assert scene.error(int(detection.object), detection.T_cam_obj) < 0.1
 
 
 def test_maps_in_half_precision_and_channels_last(make_scene, box, pose):
@@ -130,8 +137,8 @@ def test_maps_in_half_precision_and_channels_last(make_scene, box, pose):
     belief, field = (
         maps[None].bfloat16().to(memory_format=torch.channels_last) for maps in scene.maps()
     )
-    ((one,),) = recover_batch(belief, field, scene.cuboids, scene.K[None])
-    assert scene.error(0, one.T_cam_obj) < 0.1
+    ((detection,),) = recover_batch(belief, field, scene.cuboids, scene.K[None])
+    assert scene.error(0, detection.T_cam_obj) < 0.1
 
 
 @pytest.mark.parametrize(
@@ -166,11 +173,11 @@ def test_what_ends_the_way_is_told_with_how_far_it_got(
     scene = make_scene(box).place(0, pose(np.random.default_rng(10)))
     belief, field = scene.maps()
     assert explain(belief, field, scene.cuboids, scene.K) == []
-    (one,) = explain(factor * belief, field, scene.cuboids, scene.K, names=["box"], **options)
-    assert (one.object, one.kind) == ("box", kind)
-    assert re.search(text, str(one))
+    (detection,) = explain(factor * belief, field, scene.cuboids, scene.K, names=["box"], **options)
+    assert (detection.object, detection.kind) == ("box", kind)
+    assert re.search(text, str(detection))
     if factor == factor:
-        assert one.best == pytest.approx(factor, rel=0.25)
+        assert detection.best == pytest.approx(factor, rel=0.25)
 
 
 def test_too_few_corners_and_a_part_of_two_cells_are_reasons(make_scene, box, pose):
@@ -196,7 +203,7 @@ def test_the_best_candidate_of_each_object_and_many_images_in_a_line():
         reason("refined", 0.1, "box"), reason("empty", 0.0, "disc"),
     ]  # fmt: skip
     line = "box: refined 0.1; plate: score 0.2 (the best of 4); disc: empty 0.0"
-    assert [str(one) for one in reversed(furthest(reasons))] == line.replace(
+    assert [str(item) for item in reversed(furthest(reasons))] == line.replace(
         " (the best of 4)", ""
     ).split("; ")
     assert (explained(reasons), explained([])) == (line, "")
@@ -219,8 +226,8 @@ def test_crowds_with_noise_on_their_maps(name, sigma, request, make_scene, pose)
         belief, field = scene.maps(sigma)
         belief = belief + 0.02 * torch.randn(belief.shape, generator=generator)
         field = field + 0.05 * torch.randn(field.shape, generator=generator)
-        found = recover(belief, field, scene.cuboids, scene.K, sigma=sigma)
-        errors = np.array([scene.errors(0, one.T_cam_obj) for one in found])
+        detections = recover(belief, field, scene.cuboids, scene.K, sigma=sigma)
+        errors = np.array([scene.errors(0, detection.T_cam_obj) for detection in detections])
         right += int((errors.min(0) < 0.1).sum())
     assert right >= 36
 
@@ -230,9 +237,9 @@ def test_the_covariance_is_that_of_the_peaks(make_scene, box, pose):
     scene = make_scene(box).place(0, pose(np.random.default_rng(12)))
     (sharp,) = recover(*scene.maps(), scene.cuboids, scene.K)
     (wide,) = recover(*scene.maps(1.5), scene.cuboids, scene.K)
-    for one in (sharp, wide):
-        assert_allclose(one.covariance, one.covariance.T, rtol=1e-6)
-        assert np.linalg.eigvalsh(one.covariance).min() > 0
+    for detection in (sharp, wide):
+        assert_allclose(detection.covariance, detection.covariance.T, rtol=1e-6)
+        assert np.linalg.eigvalsh(detection.covariance).min() > 0
     assert np.trace(wide.covariance) > 4 * np.trace(sharp.covariance)
 
 
@@ -266,9 +273,9 @@ def test_corners_pulled_in_at_the_border_harm_the_pose_less(plate, pose):
             torch.from_numpy(points)[None, None], torch.zeros(1, 1, dtype=torch.long), 1,
             (16, 16), MapGeometry(8, 1.0),
         )  # fmt: skip
-        (found,) = recover(belief[0], field[0], plate[None], K)
+        (detection,) = recover(belief[0], field[0], plate[None], K)
         unweighted = solve_pnp(plate, points, K).T_cam_obj
         assert unweighted is not None
-        for errors, estimate in ((ours, found.T_cam_obj), (plain, unweighted)):
+        for errors, estimate in ((ours, detection.T_cam_obj), (plain, unweighted)):
             errors.append(np.linalg.norm(transform(estimate, plate) - transform(T, plate), axis=1))
     assert np.mean(ours) < 0.6 * np.mean(plain)

@@ -85,27 +85,27 @@ def decode(case: dict[str, Any]) -> list[Detection]:
         cuboid = cuboid_keypoints(case["centre"] - half, case["centre"] + half)
     cuboids = np.stack([cuboid] * case["objects"]) if case["objects"] else np.zeros((0, 9, 3))
     K = camera_matrix(case["focal"], case["focal"], case["principal"], case["principal"])
-    found = recover(belief, field, cuboids, K)
+    detections = recover(belief, field, cuboids, K)
     reasons = explain(belief, field, cuboids, K)
     assert all("\n" not in str(reason) for reason in reasons)
-    return found
+    return detections
 
 
 def check(case: dict[str, Any]) -> None:
     try:
-        found = decode(case)
+        result = decode(case)
     except ValueError:  # documented; a UserError is one, too
         if sound(case):
             raise
         return
-    for one in found:
-        assert np.isfinite(one.T_cam_obj).all()
-        assert np.isfinite(one.covariance).all()
-        assert np.isfinite(one.reprojection_error_px)
-        assert 0 <= one.score <= 1
-        assert 0 <= one.belief <= 1
+    for detection in result:
+        assert np.isfinite(detection.T_cam_obj).all()
+        assert np.isfinite(detection.covariance).all()
+        assert np.isfinite(detection.reprojection_error_px)
+        assert 0 <= detection.score <= 1
+        assert 0 <= detection.belief <= 1
         np.testing.assert_allclose(
-            one.T_cam_obj[:3, :3] @ one.T_cam_obj[:3, :3].T, np.eye(3), atol=1e-6
+            detection.T_cam_obj[:3, :3] @ detection.T_cam_obj[:3, :3].T, np.eye(3), atol=1e-6
         )
 
 

@@ -136,7 +136,7 @@ def read_all(source: Any) -> None:
     for index in range(len(source)):
         sample = source.sample(index)
         assert np.isfinite(sample.K).all()
-        assert all(np.isfinite(one.T_cam_obj).all() for one in sample.instances)
+        assert all(np.isfinite(detection.T_cam_obj).all() for detection in sample.instances)
     source.contains("obj_000001")
     source.describe()
 

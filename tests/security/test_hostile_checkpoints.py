@@ -259,5 +259,5 @@ def test_weights_that_are_no_numbers_find_nothing_and_crash_nothing(value, saved
     path = saved(spoil)
     image = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
     with bounded():
-        found = PoseEstimator.load(path).predict(image, camera_matrix(80, 80, 32, 24))
-    assert all(np.isfinite(one.T_cam_obj).all() for one in found)
+        detections = PoseEstimator.load(path).predict(image, camera_matrix(80, 80, 32, 24))
+    assert all(np.isfinite(detection.T_cam_obj).all() for detection in detections)

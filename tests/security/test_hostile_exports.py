@@ -47,7 +47,7 @@ def model(payload):
         nodes,
         "maps",
         [helper.make_tensor_value_info("pixels", TensorProto.UINT8, ["n", 3, "h", "w"])],
-        [helper.make_tensor_value_info(one, FLOAT, ["n", k, "r", "c"]) for one, k in
+        [helper.make_tensor_value_info(first, FLOAT, ["n", k, "r", "c"]) for first, k in
          (("belief", 9), ("field", 16))],
         [numpy_helper.from_array(value, name) for name, value in weights.items()],
     )  # fmt: skip

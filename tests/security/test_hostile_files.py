@@ -234,7 +234,7 @@ def entry(
 
 
 def tar(*entries: tarfile.TarInfo, content: bytes = b"") -> bytes:
-    return b"".join(one.tobuf(tarfile.GNU_FORMAT) for one in entries) + content + bytes(10_240)
+    return b"".join(entry.tobuf(tarfile.GNU_FORMAT) for entry in entries) + content + bytes(10_240)
 
 
 def pax(records: dict[str, str]) -> bytes:

@@ -55,8 +55,8 @@ def packed(text: bytes, binary: bytes, length: int | None = None) -> bytes:
 
 def array(**changes: Any) -> list[dict[str, Any]]:
     """Two arrays in the first view."""
-    one = {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}
-    return [one | changes, one]
+    item = {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}
+    return [item | changes, item]
 
 
 def textured(picture: bytes) -> bytes:

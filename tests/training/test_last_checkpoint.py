@@ -75,8 +75,8 @@ def runs(make_system, make_noise, make_trainer):
         last = last or LastCheckpoint(every_s=0, max_share=1)
         callbacks = [*more, Throughput(), LearningRateMonitor("step"), cut, best, last]
         trainer = make_trainer(folder, callbacks, **{"max_epochs": 2, **options})
-        found = newest_checkpoint(folder)
-        path = found and found[0]
+        result = newest_checkpoint(folder)
+        path = result and result[0]
         trainer.fit(system, datamodule=make_noise(), ckpt_path=path, weights_only=True)
         return system
 
@@ -187,9 +187,9 @@ def assert_average(folder: Path, states: Sequence[dict[str, torch.Tensor]]) -> N
         for name, value in state.items():
             moving = value.is_floating_point()
             expected[name] = decay * expected[name] + (1 - decay) * value if moving else value
-    found = last_state(folder, "state_dict")
-    assert found.keys() == expected.keys()
-    for name, value in found.items():
+    result = last_state(folder, "state_dict")
+    assert result.keys() == expected.keys()
+    for name, value in result.items():
         torch.testing.assert_close(value, expected[name], rtol=1e-5, atol=1e-7)
 
 

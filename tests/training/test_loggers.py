@@ -90,7 +90,7 @@ class Broken(Logger):
         self._note("name")
         return "broken"
 
-    log_hyperparams, log_metrics, save, finalize = (noting(one) for one in CALLS[2:])
+    log_hyperparams, log_metrics, save, finalize = (noting(item) for item in CALLS[2:])
 
 
 def use(logger: GuardedLogger) -> None:

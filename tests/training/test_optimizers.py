@@ -21,12 +21,12 @@ def step(optimizer, parameters, gradients):
 def test_singular_values_come_near_one_and_directions_stay(rows, columns, seed):
     matrix = np.random.default_rng(seed).normal(size=(rows, columns))
     U, S, Vt = np.linalg.svd(matrix, full_matrices=False)
-    found = orthogonalised(torch.tensor(matrix)).numpy()
-    inside = U.T @ found @ Vt.T
+    result = orthogonalised(torch.tensor(matrix)).numpy()
+    inside = U.T @ result @ Vt.T
     kept = np.diag(inside)[S / np.linalg.norm(S) > 0.002]
     assert ((kept > 0.65) & (kept < 1.25)).all()
     assert np.allclose(inside, np.diag(np.diag(inside)), atol=1e-6)
-    assert np.allclose(U @ inside @ Vt, found, atol=1e-6)
+    assert np.allclose(U @ inside @ Vt, result, atol=1e-6)
 
 
 def test_a_matrix_of_zeros_takes_no_step():
@@ -69,7 +69,9 @@ def test_a_run_goes_on_from_its_state_to_the_last_bit():
         for number in range(10):
             if number >= steps.start:
                 torch.manual_seed(number)
-                step(optimizer, parameters, [torch.randn_like(one) for one in parameters])
+                step(
+                    optimizer, parameters, [torch.randn_like(parameter) for parameter in parameters]
+                )
             optimizer._opt_called = True  # so that torch does not warn of steps left out
             schedule.step()
             if number + 1 == steps.stop:
@@ -82,7 +84,7 @@ def test_a_run_goes_on_from_its_state_to_the_last_bit():
     run(whole, Muon(whole), range(10))
     muon = Muon(first)
     run(first, muon, range(5))
-    second = [nn.Parameter(one.detach().clone()) for one in first]
+    second = [nn.Parameter(item.detach().clone()) for item in first]
     resumed = Muon(second)
     resumed.load_state_dict(muon.state_dict())
     run(second, resumed, range(5, 10))

@@ -76,9 +76,9 @@ def test_poses_that_look_alike_get_the_same_keypoints(part):
     group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous, 0.3)
     expected = handling.equivalents(make_batch(poses, part)).keypoints[:, 0, 0]
     for S in group:
-        found = handling.equivalents(make_batch(poses @ S, part)).keypoints[:, 0, 0]
+        result = handling.equivalents(make_batch(poses @ S, part)).keypoints[:, 0, 0]
         # Poses exactly on a border may go either way: none of 40 random ones lies within 1e-4.
-        assert (found - expected).abs().max() < 0.02
+        assert (result - expected).abs().max() < 0.02
 
 
 @pytest.mark.parametrize("part", [PLATE, CAN, CONE], ids=lambda part: part.name)
@@ -88,11 +88,11 @@ def test_the_first_choice_is_the_best_of_the_whole_group(part):
     poses = random_poses(20, seed=6)
     fixed = part.cuboid[8]
     poses[:, :3, 3] = (0, 0, 0.3) - poses[:, :3, :3] @ fixed
-    found = handling.equivalents(make_batch(poses, part)).keypoints[:, 0, 0].numpy()
+    result = handling.equivalents(make_batch(poses, part)).keypoints[:, 0, 0].numpy()
     group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous, np.pi / 360)
     # A round part's axis, +z, is to point up in the image: to −y.
     reference = FACING if part is PLATE else np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    for T, keypoints in zip(poses, found, strict=True):
+    for T, keypoints in zip(poses, result, strict=True):
         equivalents = T @ group
         score = np.trace(reference.T @ equivalents[:, :3, :3], axis1=1, axis2=2)
         best = project_keypoints(part.cuboid, equivalents[score.argmax()], K)
@@ -102,13 +102,13 @@ def test_the_first_choice_is_the_best_of_the_whole_group(part):
 def test_choices_of_a_box_are_permutations_of_its_corners():
     handling = SymmetryHandling([PLATE], SymmetryOptions(border_deg=360))
     batch = make_batch(random_poses(10, seed=7), PLATE)
-    found = handling.equivalents(batch)
-    assert found.keypoints.shape == (10, 1, 4, 9, 2)
-    assert found.allowed.all()
+    result = handling.equivalents(batch)
+    assert result.keypoints.shape == (10, 1, 4, 9, 2)
+    assert result.allowed.all()
     own = batch.keypoints[:, 0]
     for image in range(10):
         orders = set()
-        for keypoints in found.keypoints[image, 0]:
+        for keypoints in result.keypoints[image, 0]:
             away = torch.cdist(keypoints, own[image])
             assert away.amin(dim=1).max() < 1e-2
             orders.add(tuple(away.argmin(dim=1).tolist()))
@@ -119,10 +119,10 @@ def test_choices_of_a_box_are_permutations_of_its_corners():
 def test_parts_without_symmetries_and_padding_are_left_bit_by_bit():
     handling = SymmetryHandling([PLAIN, PLATE], SymmetryOptions(border_deg=360))
     batch = make_batch(random_poses(3, seed=8), PLAIN)
-    found = handling.equivalents(batch)
-    assert torch.equal(found.keypoints[:, :, 0], batch.keypoints)
-    assert found.allowed[..., 0].all()
-    assert not found.allowed[..., 1:].any()
+    result = handling.equivalents(batch)
+    assert torch.equal(result.keypoints[:, :, 0], batch.keypoints)
+    assert result.allowed[..., 0].all()
+    assert not result.allowed[..., 1:].any()
     padded = replace(batch, object_index=torch.full((3, 1), PADDING))
     assert not handling.equivalents(padded).allowed[..., 1:].any()
     assert not SymmetryHandling([PLAIN], SymmetryOptions()).active
@@ -148,9 +148,9 @@ def plate_system(make_system):
 
 def test_targets_are_the_choice_that_the_maps_are_nearest_to(plate_system):
     batch = make_batch(face_on((0.0, 85.0)), PLATE)
-    found = plate_system.symmetry.equivalents(batch)
+    result = plate_system.symmetry.equivalents(batch)
     geometry = plate_system.geometry
-    first, second = (draw_maps(batch, found.keypoints[:, :, n], 1, geometry) for n in (0, 1))
+    first, second = (draw_maps(batch, result.keypoints[:, :, n], 1, geometry) for n in (0, 1))
     assert not torch.allclose(first[0], second[0])
     for says in (first, second):
         stages = [(says[0].clamp(min=1e-9).log(), says[1])]

@@ -182,8 +182,8 @@ def test_crops_lie_inside_of_their_photo(tmp_path):
 
 @pytest.mark.parametrize("size", [(640, 480), (97, 301), (33, 20), (7, 5), (1, 1)])
 def test_procedural_pictures_depend_on_the_generator_only(size):
-    one, other = ProceduralBackgrounds(), ProceduralBackgrounds()
-    images = [one.draw(np.random.default_rng(seed), *size) for seed in range(8)]
+    first, other = ProceduralBackgrounds(), ProceduralBackgrounds()
+    images = [first.draw(np.random.default_rng(seed), *size) for seed in range(8)]
     for seed in reversed(range(8)):
         again = other.draw(np.random.default_rng(seed), *size)
         assert again.shape == (size[1], size[0], 3)

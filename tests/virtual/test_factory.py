@@ -130,7 +130,7 @@ def test_given_negatives_come_first_and_once(box_part):
 
 def test_seed_epoch_and_index_all_matter():
     factories, places = [make_factory(0), make_factory(1)], [(0, 0), (0, 1), (1, 0), (1, 1)]
-    assert len({digest(one.render(*place)) for one in factories for place in places}) == 8
+    assert len({digest(factory.render(*place)) for factory in factories for place in places}) == 8
 
 
 BOX = make_part("box", Mesh(np.eye(3), np.array([(0, 1, 2)], np.int32)))

@@ -79,9 +79,9 @@ def test_only_the_camera_moves(name, scale):
             assert other.material == item.material
             np.testing.assert_array_equal(other.T_cam_obj[:3, :3], item.T_cam_obj[:3, :3])
             np.testing.assert_allclose(other.T_cam_obj[:3, 3], item.T_cam_obj[:3, 3] + shift)
-        for one, other in zip(scene.lights, near.lights, strict=True):
-            np.testing.assert_allclose(other.position, one.position + shift)
-            assert (one.intensity, one.reach) == (other.intensity, other.reach)
+        for first, other in zip(scene.lights, near.lights, strict=True):
+            np.testing.assert_allclose(other.position, first.position + shift)
+            assert (first.intensity, first.reach) == (other.intensity, other.reach)
         assert (scene.ambient, scene.sensor) == (near.ambient, near.sensor)
         if scene.plane is None:
             np.testing.assert_array_equal(scene.background, near.background)
@@ -118,7 +118,9 @@ def test_once_as_large_is_the_image_itself(name):
 
 
 def test_without_a_part_the_camera_stays():
-    distractors = [one for scene in scenes("wide", 1) for one in scene.objects if not one.is_target]
+    distractors = [
+        item for scene in scenes("wide", 1) for item in scene.objects if not item.is_target
+    ]
     assert distractors
     np.testing.assert_array_equal(approach(distractors, 3.0), np.zeros(3))
 

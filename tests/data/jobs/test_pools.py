@@ -58,9 +58,9 @@ def test_one_worker_two_workers_and_two_nodes_write_the_same_bytes(
 
         render_dataset(job, tmp_path / "ray", NUM, open_pool, Shard(number, 2))
         assert len(pools[0].num_tasks) == 2  # both nodes had work
-    one = contents(tmp_path / "1")
-    assert sum(len(content) for content in one.values()) > 1000 * NUM
-    assert (contents(tmp_path / "2"), contents(tmp_path / "ray")) == (one, one)
+    whole = contents(tmp_path / "1")
+    assert sum(len(content) for content in whole.values()) > 1000 * NUM
+    assert (contents(tmp_path / "2"), contents(tmp_path / "ray")) == (whole, whole)
 
 
 @pytest.mark.slow

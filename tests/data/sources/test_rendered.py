@@ -80,10 +80,10 @@ def test_what_litters_the_background_belongs_to_the_identity():
 
 def test_another_scale_is_the_same_test_set_from_elsewhere(factory):
     usual, near = (RenderedSource(factory, 2, "test", scale=scale) for scale in (1.0, 0.5))
-    one, other = usual.sample(1), near.sample(1)
-    assert one.key == other.key
-    np.testing.assert_allclose(other.instances[0].keypoints[8], one.instances[0].keypoints[8])
-    assert (one.image != other.image).any()
+    first, other = usual.sample(1), near.sample(1)
+    assert first.key == other.key
+    np.testing.assert_allclose(other.instances[0].keypoints[8], first.instances[0].keypoints[8])
+    assert (first.image != other.image).any()
     ((described,), (there,)) = usual.describe(), near.describe()
     # Caches and checkpoints of the usual images stay valid.
     assert there.identity == {**described.identity, "scale": 0.5}

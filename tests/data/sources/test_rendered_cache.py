@@ -15,13 +15,13 @@ def assert_same(first: Sample, second: Sample) -> None:
     np.testing.assert_array_equal(first.image, second.image)
     np.testing.assert_array_equal(first.K, second.K)
     assert (first.source, first.key) == (second.source, second.key)
-    for one, other in zip(first.instances, second.instances, strict=True):
-        assert (one.label, one.visible_fraction) == (other.label, other.visible_fraction)
-        np.testing.assert_array_equal(one.T_cam_obj, other.T_cam_obj)
-        np.testing.assert_array_equal(one.keypoints, other.keypoints)
-        assert (one.mask is None) == (other.mask is None)
-        if one.mask is not None and other.mask is not None:
-            np.testing.assert_array_equal(one.mask, other.mask)
+    for instance, other in zip(first.instances, second.instances, strict=True):
+        assert (instance.label, instance.visible_fraction) == (other.label, other.visible_fraction)
+        np.testing.assert_array_equal(instance.T_cam_obj, other.T_cam_obj)
+        np.testing.assert_array_equal(instance.keypoints, other.keypoints)
+        assert (instance.mask is None) == (other.mask is None)
+        if instance.mask is not None and other.mask is not None:
+            np.testing.assert_array_equal(instance.mask, other.mask)
 
 
 def test_keeps_every_field_renders_once_and_ignores_the_epoch(fake_source):

@@ -23,10 +23,10 @@ def windows(number: int, window=(96, 64), picture=(160, 120)) -> list[Sample]:
 def test_poses_and_pixels_stay_together():
     for sample in windows(8):
         assert sample.size == (96, 64)
-        for one in sample.instances:
-            expected = project_keypoints(PART.cuboid, one.T_cam_obj, sample.K)
-            np.testing.assert_allclose(one.keypoints, expected, atol=1e-6)
-            assert one.mask.shape == (64, 96)
+        for detection in sample.instances:
+            expected = project_keypoints(PART.cuboid, detection.T_cam_obj, sample.K)
+            np.testing.assert_allclose(detection.keypoints, expected, atol=1e-6)
+            assert detection.mask.shape == (64, 96)
 
 
 def test_a_window_is_a_piece_of_the_resized_picture():
@@ -47,8 +47,8 @@ def test_every_window_holds_a_centre_and_chance_moves_it():
     places = {tuple(sample.K[:2, 2]) for sample in shown}
     assert len(places) > 35
     again = windows(40)
-    for one, other in zip(shown, again, strict=True):
-        np.testing.assert_array_equal(one.image, other.image)
+    for first, other in zip(shown, again, strict=True):
+        np.testing.assert_array_equal(first.image, other.image)
 
 
 def test_a_picture_smaller_than_the_window_is_padded():
@@ -75,9 +75,9 @@ def test_without_an_object_a_window_is_anywhere():
 @pytest.mark.parametrize("has_mask", [True, False])
 def test_what_a_window_cuts_off_is_not_visible(has_mask):
     sample = WHOLE.sample(0)
-    one = sample.instances[0]
+    instance = sample.instances[0]
     if not has_mask:
-        one.mask = None
+        instance.mask = None
     columns = np.flatnonzero(WHOLE.sample(0).instances[0].mask.any(axis=0))
     middle = int(columns.mean())
     halves = [
@@ -85,7 +85,7 @@ def test_what_a_window_cuts_off_is_not_visible(has_mask):
         crop_sample(sample, middle, 0, (320 - middle, 240)),
     ]
     fractions = [half.instances[0].visible_fraction for half in halves]
-    assert sum(fractions) == pytest.approx(one.visible_fraction, abs=1e-3)
+    assert sum(fractions) == pytest.approx(instance.visible_fraction, abs=1e-3)
     assert min(fractions) > 0.1
     aside = crop_sample(sample, 0, 0, (2, 2)).instances[0]
     assert aside.visible_fraction == 0

@@ -30,8 +30,8 @@ def posed(rng: np.random.Generator) -> tuple[Sample, np.ndarray]:
     T_cam_obj = make_transform(random_rotation(rng), np.array([0.02, -0.03, 0.6]))
     corners = rng.uniform(-0.05, 0.05, (9, 3))
     pixels, _ = cv2.projectPoints(corners, T_cam_obj[:3, :3], T_cam_obj[:3, 3], K, None)
-    one = Instance("box", T_cam_obj, pixels[:, 0], 0.8)
-    return Sample(np.full((96, 128, 3), 90, np.uint8), K, [one]), corners
+    item = Instance("box", T_cam_obj, pixels[:, 0], 0.8)
+    return Sample(np.full((96, 128, 3), 90, np.uint8), K, [item]), corners
 
 
 @settings(max_examples=50)
@@ -40,10 +40,10 @@ def test_keypoints_are_the_posed_points_of_the_new_camera(seed, roll, shift):
     rng = np.random.default_rng(seed)
     sample, points = posed(rng)
     seen = CameraJitter(roll, (0.5, 2.0), shift)(sample, rng)
-    (one,) = seen.instances
-    rotation, place = one.T_cam_obj[:3, :3], one.T_cam_obj[:3, 3]
+    (detection,) = seen.instances
+    rotation, place = detection.T_cam_obj[:3, :3], detection.T_cam_obj[:3, 3]
     expected, _ = cv2.projectPoints(points, rotation, place, seen.K, None)
-    np.testing.assert_allclose(one.keypoints, expected[:, 0], atol=1e-6)
+    np.testing.assert_allclose(detection.keypoints, expected[:, 0], atol=1e-6)
     assert place[2] == pytest.approx(0.6)  # the camera rolls and zooms, it does not travel
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(rotation), 1)
@@ -60,9 +60,9 @@ def test_masks_are_those_of_the_scene_rendered_through_the_new_camera(factory):
         scene = factory.scene(0, index)
         objects = tuple(replace(o, T_cam_obj=turn @ o.T_cam_obj) for o in scene.objects)
         again = render(replace(scene, K=seen.K, objects=objects))
-        for one, number in zip(seen.instances, again.scene.targets, strict=True):
+        for instance, number in zip(seen.instances, again.scene.targets, strict=True):
             expected = again.instances == number
-            overlap = (one.mask & expected).sum() / (one.mask | expected).sum()
+            overlap = (instance.mask & expected).sum() / (instance.mask | expected).sum()
             assert overlap > 0.93
         rolls.append(np.degrees(np.arctan2(turn[1, 0], turn[0, 0])))
     assert min(rolls) < -20
@@ -85,8 +85,8 @@ def test_the_picture_moves_with_the_keypoints():
 def test_what_leaves_the_picture_is_not_visible():
     mask = np.zeros((100, 100), bool)
     mask[40:60, 90:100] = True
-    one = Instance("box", np.eye(4), np.zeros((9, 2)), 0.5, mask)
-    sample = Sample(np.zeros((100, 100, 3), np.uint8), np.eye(3), [one])
+    item = Instance("box", np.eye(4), np.zeros((9, 2)), 0.5, mask)
+    sample = Sample(np.zeros((100, 100, 3), np.uint8), np.eye(3), [item])
     seen = [CameraJitter(0, (1, 1), 0.1)(sample, np.random.default_rng(n)) for n in range(40)]
     for other in seen:
         (moved,) = other.instances
@@ -97,8 +97,8 @@ def test_what_leaves_the_picture_is_not_visible():
 
 def test_without_a_mask_the_cuboids_outline_tells_what_is_visible():
     keypoints = np.array([[90.0, 40], [98, 40], [98, 60], [90, 60]] * 2 + [[94, 50]])
-    one = Instance("box", np.eye(4), keypoints, 0.5)
-    sample = Sample(np.zeros((100, 100, 3), np.uint8), np.eye(3), [one])
+    point = Instance("box", np.eye(4), keypoints, 0.5)
+    sample = Sample(np.zeros((100, 100, 3), np.uint8), np.eye(3), [point])
     for seed in range(20):
         (moved,) = CameraJitter(0, (1, 1), 0.1)(sample, np.random.default_rng(seed)).instances
         inside = np.clip(99.5 - moved.keypoints[0, 0], 0, 8) / 8
@@ -112,11 +112,11 @@ def test_no_jitter_changes_nothing_but_the_depth(factory):
     same = STILL(sample, np.random.default_rng(0))
     np.testing.assert_array_equal(same.image, sample.image)
     np.testing.assert_allclose(same.K, sample.K)
-    for one, before in zip(same.instances, sample.instances, strict=True):
-        np.testing.assert_array_equal(one.mask, before.mask)
-        np.testing.assert_allclose(one.keypoints, before.keypoints)
-        np.testing.assert_allclose(one.T_cam_obj, before.T_cam_obj)
-        assert one.visible_fraction == before.visible_fraction
+    for instance, before in zip(same.instances, sample.instances, strict=True):
+        np.testing.assert_array_equal(instance.mask, before.mask)
+        np.testing.assert_allclose(instance.keypoints, before.keypoints)
+        np.testing.assert_allclose(instance.T_cam_obj, before.T_cam_obj)
+        assert instance.visible_fraction == before.visible_fraction
 
 
 @pytest.mark.parametrize(

@@ -270,10 +270,10 @@ def test_patches_are_several_crops_of_the_own_background(seed):
 def test_more_shading_contains_less_and_depends_on_nothing_else():
     sample = addressed(ellipse(36, 40, 20, 28))
     together = shade(sample, SHARES, 5, 7)
-    for share, one in zip(SHARES, together, strict=True):
+    for share, first in zip(SHARES, together, strict=True):
         (alone,) = shade(sample, [share], 5, 7)
-        np.testing.assert_array_equal(alone.sample.image, one.sample.image)
-        assert alone.reached == one.reached
+        np.testing.assert_array_equal(alone.sample.image, first.sample.image)
+        assert alone.reached == first.reached
     for less, more in pairwise(together):
         changed = (less.sample.image != sample.image).any(axis=2)
         np.testing.assert_array_equal(more.sample.image[changed], less.sample.image[changed])

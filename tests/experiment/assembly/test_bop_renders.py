@@ -115,7 +115,7 @@ def test_a_checkpoint_renders_its_own_parts_where_its_data_set_is_not(config, tm
     preset, sample = source.factory.preset, source.sample(2)
     assert (len(source), preset.name) == (3, "ycb")
     assert "blue" not in [part.name for part in source.factory.negatives]
-    assert {one.label for one in sample.instances} <= {"red"}
+    assert {instance.label for instance in sample.instances} <= {"red"}
 
 
 def test_a_model_of_the_same_mesh_is_no_other_part(config, root, tmp_path):
@@ -148,9 +148,9 @@ def test_real_frames_among_renders_are_windows_of_the_same_scale(config, root):
     for sample in samples:
         assert sample.size == (width, height)
         assert sample.K[0, 0] == pytest.approx(0.9 * 210, rel=0.02)
-        for one in sample.instances:
-            shown = project_keypoints(cuboids[one.label], one.T_cam_obj, sample.K)
-            np.testing.assert_allclose(one.keypoints, shown, atol=1e-6)
+        for instance in sample.instances:
+            shown = project_keypoints(cuboids[instance.label], instance.T_cam_obj, sample.K)
+            np.testing.assert_allclose(instance.keypoints, shown, atol=1e-6)
 
 
 def test_labelled_training_images_must_be_there_where_a_share_of_them_is_asked_for(config):
@@ -179,9 +179,9 @@ def test_true_poses_from_a_file_have_full_marks_in_every_score(call, root, tmp_p
     source = BopReader(root, bop_parts(root), "test", targets="auto")
     numbers = {"red": 1, "blue": 2}
     rows = [
-        BopResult(0, index, numbers[one.label], 1.0, one.T_cam_obj)
+        BopResult(0, index, numbers[instance.label], 1.0, instance.T_cam_obj)
         for index in range(len(source))
-        for one in source.sample(index).instances
+        for instance in source.sample(index).instances
     ]
     path = tmp_path / "truth_set-test.csv"
     write_results(path, rows)

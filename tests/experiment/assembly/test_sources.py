@@ -47,11 +47,11 @@ def test_without_a_root_all_is_rendered_and_that_is_said_once(tiny, caplog):
 def test_every_seed_is_measured_on_the_same_images_and_splits_share_none(tiny):
     data = tiny().data
     parts = build_parts(data)
-    one, other = (build_datamodule(data, parts, seed) for seed in (1, 2))
+    part, other = (build_datamodule(data, parts, seed) for seed in (1, 2))
     changed = build_datamodule(replace(data, eval_seed=5), parts, 1)
-    seen = [one.train_source.sample(0, 0).image.mean()]
+    seen = [part.train_source.sample(0, 0).image.mean()]
     for split in ("val_source", "test_source"):
-        images = [getattr(module, split).sample(0, 0).image for module in (one, other, changed)]
+        images = [getattr(module, split).sample(0, 0).image for module in (part, other, changed)]
         np.testing.assert_array_equal(images[0], images[1])
         assert not np.array_equal(images[0], images[2])
         seen.append(images[0].mean())
@@ -97,7 +97,9 @@ def test_an_object_without_ground_truth_in_the_test_set_is_not_available(tiny, y
     assert absent["num_instances"] == 0
     assert absent["add_01d"] is None
     row = report.rows["010_potted_meat_can"]
-    assert {one.heading: one.text(row) for one in shown_columns(row)}["ADD-0.1d %"] == "n/a"
+    assert {column.heading: column.text(row) for column in shown_columns(row)}[
+        "ADD-0.1d %"
+    ] == "n/a"
     # The mean is over the object that was there.
     assert report.mean.add_01d == report.rows["003_cracker_box"].add_01d
 

@@ -74,16 +74,16 @@ def test_there_are_choices_to_check():
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(CONF)))
 def test_a_file_names_only_allowed_targets(path):
     group = str(path.parent.relative_to(CONF))
-    found = list(targets(yaml.safe_load(path.read_text()) or {}))
+    result = list(targets(yaml.safe_load(path.read_text()) or {}))
     if path.name == "train.yaml" and group == ".":
-        assert [issubclass(get_class(one), Callback) for one in found] == [True, True]
+        assert [issubclass(get_class(item), Callback) for item in result] == [True, True]
         return
     if group in OF_HYDRA:
-        assert [one.startswith("hydra_plugins.dopepp_plugins.") for one in found] == [True]
+        assert [target.startswith("hydra_plugins.dopepp_plugins.") for target in result] == [True]
         return
     group = "callbacks" if group == "search" else group
-    assert not found or group in REGISTRIES, f"{path} builds {found}, which no registry guards"
-    for target in found:
+    assert not result or group in REGISTRIES, f"{path} builds {result}, which no registry guards"
+    for target in result:
         REGISTRIES[group].resolve(target)
 
 

@@ -58,10 +58,10 @@ def fed(
         for number, (T, offset) in enumerate(zip(own, offsets[name], strict=True)):
             estimate = T.copy()
             estimate[0, 3] += offset
-            found = [Detection(name, 0.5, estimate)] if np.isfinite(offset) else []
+            result = [Detection(name, 0.5, estimate)] if np.isfinite(offset) else []
             visible = 0.05 + number / len(own)  # the first does not count
             instance = Instance(name, T, np.zeros((9, 2)), min(1.0, visible))
-            metrics.update([one for one in found if name in metrics.parts], [instance], K, 640)
+            metrics.update([item for item in result if name in metrics.parts], [instance], K, 640)
     return metrics
 
 
@@ -155,9 +155,9 @@ def test_methods_share_the_bins_and_keep_their_own_objects(measured):
         alone[0],
         str(alone[1]),
     )
-    dope = [one for one in values if one.method == "dope"]
-    assert sum(one.value for one in dope if one.measure == "num_instances") == 28
-    assert {one.text for one in dope if one.measure == "add_01d"} <= {"n/a", "100.0"}
+    dope = [value for value in values if value.method == "dope"]
+    assert sum(value.value for value in dope if value.measure == "num_instances") == 28
+    assert {item.text for item in dope if item.measure == "add_01d"} <= {"n/a", "100.0"}
 
 
 @pytest.mark.filterwarnings("ignore:The ``compute`` method of metric PoseMetrics was called")
@@ -170,7 +170,7 @@ def test_without_instances_there_is_a_warning(tmp_path, caplog):
 def test_the_papers_rate_goes_with_the_data():
     data: Any = SimpleNamespace(format="ycb_video", root=Path("data"))
     parts = [part("a")]
-    assert [one.field for one in reported_rates(data, parts)] == ["pass_10cm", "add_01d"]
+    assert [column.field for column in reported_rates(data, parts)] == ["pass_10cm", "add_01d"]
     data.root = None
     assert [one.field for one in reported_rates(data, parts)] == ["pass_5cm", "add_01d"]
 
@@ -180,7 +180,7 @@ def test_of_a_symmetric_part_its_symmetries_count(tmp_path):
     symmetric = replace(part("a"), symmetries_discrete=half_turn[None])
     data: Any = SimpleNamespace(format="bop", root=None)
     rates = reported_rates(data, [symmetric])
-    assert [one.field for one in rates][2:] == ["mssd_01d"]
+    assert [column.field for column in rates][2:] == ["mssd_01d"]
     metrics = PoseMetrics([symmetric])
     for T in poses(10):
         metrics.update([Detection("a", 0.5, T @ half_turn)], [Instance("a", T, np.zeros((9, 2)))],

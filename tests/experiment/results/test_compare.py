@@ -31,7 +31,7 @@ def entry(report_of):
     """Make a method of trainings with these errors."""
 
     def make(name, *errors, seeds=None, **options):
-        reports = [report_of(name, one, **options) for one in errors]
+        reports = [report_of(name, error, **options) for error in errors]
         return Entry(name, reports, list(seeds or range(len(reports))))
 
     return make
@@ -42,9 +42,9 @@ def entry(report_of):
 
 def test_differences_are_those_of_the_rows(entry):
     rng = np.random.default_rng(0)
-    one, other = (entry(name, rng.gamma(1, 0.02, 60)) for name in "ab")
-    for field, difference in differences(one, other, "part").items():
-        mine, theirs = (getattr(of.reports[0].rows["part"], field) for of in (one, other))
+    first, other = (entry(name, rng.gamma(1, 0.02, 60)) for name in "ab")
+    for field, difference in differences(first, other, "part").items():
+        mine, theirs = (getattr(of.reports[0].rows["part"], field) for of in (first, other))
         assert difference.value == pytest.approx(mine - theirs, abs=1e-12)
 
 
@@ -75,7 +75,7 @@ def test_what_has_other_objects_or_no_instances_is_not_set_off(entry):
     assert set(table[table["method"] == "dope"]["object"]) == {"bolt", "nut", MEAN}
     empty = entry("dope", BAD)
     empty.reports[0].errors["part"] = np.zeros(0)
-    assert all(np.isnan(one.value) for one in differences(empty, empty, "part").values())
+    assert all(np.isnan(value.value) for value in differences(empty, empty, "part").values())
 
 
 def test_a_measure_that_one_seed_lacks_does_not_exist(entry):
@@ -102,7 +102,7 @@ def test_refined_poses_stand_behind_their_network(entry, report_of):
     assert changes["dopepp + region"] == "+68.8"
     # Refined in one seed of two is no row.
     both = Entry("x", [report_of("x", BAD, refined=GOOD), report_of("x", BAD)], [0, 1])
-    assert [one.name for one in with_refined([both])] == ["x"]
+    assert [item.name for item in with_refined([both])] == ["x"]
 
 
 def test_networks_of_a_part_each_have_a_mean(report_of):
@@ -140,7 +140,7 @@ def test_runs_that_differ_in_the_seed_are_one_method(tmp_path, report_of, write_
         write_run(tmp_path / str(number), overrides, report_of(model, GOOD), **place)
     write_run(tmp_path / "4", ["model=dope", "seed=3"], "out of memory")
     entries = group(find_runs([tmp_path]))
-    assert [one.name for one in entries] == ["dope", "dopepp", "dope seed=3"]
+    assert [entry.name for entry in entries] == ["dope", "dopepp", "dope seed=3"]
     assert [one.seeds for one in entries] == [[1, 2], [1, 2], []]
     assert entries[2].failure == "out of memory"
 
@@ -150,7 +150,7 @@ def test_whatever_else_differs_keeps_runs_apart(tmp_path, report_of, write_run):
     write_run(tmp_path / "1", ["seed=2", "lr=3"], report_of("dopepp", GOOD), lr=3)
     write_run(tmp_path / "2", ["seed=3"], report_of("dopepp", GOOD, test_set="others"))
     write_run(tmp_path / "3", ["seed=1"], report_of("dopepp", GOOD))  # the same once more
-    names = [one.name.replace(tmp_path.name, "x") for one in group(find_runs([tmp_path]))]
+    names = [entry.name.replace(tmp_path.name, "x") for entry in group(find_runs([tmp_path]))]
     unlike = ["dopepp seed=1 x/0", "dopepp seed=2 lr=3", "dopepp seed=3", "dopepp seed=1 x/3"]
     assert names == unlike
 
@@ -160,7 +160,7 @@ def test_jobs_are_named_by_what_differs_and_no_two_alike(tmp_path, write_run):
     write_run(tmp_path / "0", [*common, "model=dope", "+optimizer=adam"])
     write_run(tmp_path / "1", [*common, "model=dopepp", "optimizer=sgd"])
     write_run(tmp_path / "10", [*common, "model=dopepp", "x=" + 60 * "y"])
-    names = [one.name for one in group(find_runs([tmp_path]))]
+    names = [entry.name for entry in group(find_runs([tmp_path]))]
     assert names == ["dope optimizer=adam", "dopepp optimizer=sgd", f"dopepp {tmp_path.name}/10"]
     folders = [write_run(tmp_path / place / "run", ["model=dope"], "gone") for place in "ab"]
     entries = group(find_runs(folders))
@@ -183,8 +183,8 @@ def test_an_evaluation_is_what_its_checkpoint_was_trained_as(tmp_path, report_of
     first = read_run(evaluations[0])
     assert (first.seed, first.model) == (1, "dopepp")
     assert first.checkpoint == tmp_path / "run1" / "checkpoints" / "best.ckpt"
-    (one,) = group(find_runs(evaluations))
-    assert one.seeds == [1, 2]
+    (entry,) = group(find_runs(evaluations))
+    assert entry.seeds == [1, 2]
     # Beside the trainings themselves it is something else: measured with other options.
     assert len(group(find_runs([*evaluations, tmp_path / "run1"]))) == 2
 
@@ -207,9 +207,9 @@ def test_a_damaged_or_unfinished_run_is_a_row_with_the_reason(
     (run / file).parent.mkdir(exist_ok=True)
     (run / file).write_text(content)
     (run / CONFIG_FILE).write_text("a: [")
-    (one,) = group(find_runs([tmp_path]))
-    assert reason in one.failure
-    assert "\n" not in one.failure
+    (entry,) = group(find_runs([tmp_path]))
+    assert reason in entry.failure
+    assert "\n" not in entry.failure
 
 
 def test_a_folder_given_twice_counts_once_and_one_without_runs_is_a_mistake(

@@ -43,13 +43,13 @@ class Finder:
         self.offset, self.sees = offset, sees
 
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[FilePose], float | None]:
-        found = []
-        for one in sample.instances:
-            if self.sees(sample, one):
-                T = one.T_cam_obj.copy()
+        result = []
+        for instance in sample.instances:
+            if self.sees(sample, instance):
+                T = instance.T_cam_obj.copy()
                 T[0, 3] += self.offset
-                found.append(FilePose(one.label, 1.0, T, one.keypoints))
-        return found, None
+                result.append(FilePose(instance.label, 1.0, T, instance.keypoints))
+        return result, None
 
     def cost(self, seconds: Sequence[float]) -> Cost:
         return Cost()
@@ -115,12 +115,12 @@ def test_every_method_is_measured_at_every_share(tmp_path):
     assert list(table) == [(name, share) for name in METHODS for share in (0, *SHARES)]
     for (method, share), row in table.items():
         assert float(row["share_reached"]) == pytest.approx(share, abs=0.001)
-        found = 1 - share >= NEEDED[method]
-        assert float(row["pass_5cm"]) == found
-        assert float(row["add_01d"]) == (found and method == "dopepp")
-        assert float(row["miss_rate"]) == 1 - found
-        assert float(row["auc_10cm"]) == pytest.approx(found * (1 - METHODS[method].offset / 0.1))
-        assert row["median_rotation_deg"] == ("0.0" if found else "")
+        result = 1 - share >= NEEDED[method]
+        assert float(row["pass_5cm"]) == result
+        assert float(row["add_01d"]) == (result and method == "dopepp")
+        assert float(row["miss_rate"]) == 1 - result
+        assert float(row["auc_10cm"]) == pytest.approx(result * (1 - METHODS[method].offset / 0.1))
+        assert row["median_rotation_deg"] == ("0.0" if result else "")
     check_pictures(tmp_path, SHADING, 4)
 
 
@@ -158,7 +158,7 @@ def test_every_method_is_measured_at_every_scale(tiny, tmp_path, caplog):
         np.testing.assert_allclose(farther[:3], 2 * centre[:3])
     assert not any(scaled[20.0].sample(index).instances for index in range(3))  # too near to stand
 
-    farthest = 1.05 * max(one.T_cam_obj[2, 3] for one in usual)
+    farthest = 1.05 * max(detection.T_cam_obj[2, 3] for detection in usual)
     methods = {
         "dope": Finder(part, 0.02, lambda _, one: bool(one.T_cam_obj[2, 3] < farthest)),
         "dopepp": Finder(part, 0.005, lambda *_: True),
@@ -174,12 +174,12 @@ def test_every_method_is_measured_at_every_scale(tiny, tmp_path, caplog):
             assert row["num_instances"] == "0"
             assert (row["visible_fraction"], row["add_01d"]) == ("", "")
             continue
-        found = method == "dopepp" or scale == 1
+        result = method == "dopepp" or scale == 1
         assert row["num_instances"] == "3"
         assert float(row["visible_fraction"]) > 0.7
-        assert float(row["pass_5cm"]) == found
+        assert float(row["pass_5cm"]) == result
         assert float(row["add_01d"]) == (method == "dopepp")
-        assert float(row["miss_rate"]) == 1 - found
+        assert float(row["miss_rate"]) == 1 - result
     note = "Instances that count at ×20: none; at ×1: 3, of which "
     assert note in caplog.text
     assert [tile.caption for tile in tiles] == [f"test/0/0, ×{scale}" for scale in ("0.5", 1, 20)]

@@ -85,8 +85,11 @@ def test_an_untrained_networks_frames_end_in_the_pictures_poses(parsed):
     for sample in samples:
         estimator.answer = likely_maps(sample, estimator, geometry, torch.Generator())
         truth = transform(sample.instances[0].T_cam_obj, points)
-        found = estimator.predict(sample.image, sample.K)[:1]
-        errors = [np.linalg.norm(transform(one.T_cam_obj, points) - truth, axis=1) for one in found]
+        detections = estimator.predict(sample.image, sample.K)[:1]
+        errors = [
+            np.linalg.norm(transform(detection.T_cam_obj, points) - truth, axis=1)
+            for detection in detections
+        ]
         right.append(any(error.mean() < 0.1 * estimator.parts[0].diameter for error in errors))
     assert sum(right) >= 7
 
@@ -104,4 +107,4 @@ def test_the_exchanged_maps_have_the_networks_own_shape(parsed, size):
     estimator.network.register_forward_hook(lambda *args: own.append(args[-1][-1]))
     estimator.predict(sample.image, sample.K)
     ((belief, field),) = own
-    assert [one.shape for one in estimator.answer] == [belief[0].shape, field[0].shape]
+    assert [item.shape for item in estimator.answer] == [belief[0].shape, field[0].shape]

@@ -61,10 +61,10 @@ def test_a_run_that_goes_on_keeps_what_it_was_made_with(tmp_path):
     written = read_json(tmp_path / VERSIONS_FILE)
     assert (written["seed"], written["data_fingerprint"]) == (3, "data3")
     assert written["changes"] == ["seed: 2 → 3", "a: b → c"]
-    assert [(one["seed"], one["changes"]) for one in written["earlier"]] == [
+    assert [(record["seed"], record["changes"]) for record in written["earlier"]] == [
         (1, []), (2, ["seed: 1 → 2"]),
     ]  # fmt: skip
-    assert all("earlier" not in one for one in written["earlier"])
+    assert all("earlier" not in item for item in written["earlier"])
 
 
 def test_packages_hardware_and_code():

@@ -278,12 +278,12 @@ def test_bins(num_methods, compare_golden):
         T = np.eye(4)
         T[:3, 3] = [0, 0, 0.2 + 0.05 * number]
         truth = SimpleNamespace(label=part.name, T_cam_obj=T, visible_fraction=1.0, wanted=None)
-        for name, one in metrics.items():
+        for name, first in metrics.items():
             estimate = T.copy()
             estimate[0, 3] += 0.003 * number
             pose = SimpleNamespace(object=part.name, score=0.5, T_cam_obj=estimate, covariance=None)
-            found = [] if number % 7 == 3 and name == "dope" else [pose]
-            one.update(found, [truth], np.diag([600.0, 600, 1]), 640)
+            result = [] if number % 7 == 3 and name == "dope" else [pose]
+            first.update(result, [truth], np.diag([600.0, 600, 1]), 640)
     record_breakdown(Path(), metrics, "distance", 3, (ADD_5CM, ADD_01D))
     compare_golden(f"bins_{num_methods}", "by_distance.csv")
 

@@ -48,10 +48,10 @@ def results(root: Path, offset: float = 0.0) -> list[BopResult]:
     source = BopReader(root, parts, "train_pbr")
     poses = []
     for index in range(len(source)):
-        for one in source.sample(index).instances:
-            T = one.T_cam_obj.copy()
+        for instance in source.sample(index).instances:
+            T = instance.T_cam_obj.copy()
             T[0, 3] += offset
-            poses.append(BopResult(0, index, numbers[one.label], 0.5, T, 0.25))
+            poses.append(BopResult(0, index, numbers[instance.label], 0.5, T, 0.25))
     return poses
 
 
@@ -78,8 +78,10 @@ def test_a_file_goes_through_tables_and_curves_and_comes_back(root, composed, tm
     assert "ADD-S-0.1d %" not in shown
 
     written = tmp_path / "run" / f"posecnn_{root.name.replace('-', '')}-train-pbr.csv"
-    for back, one in zip(read_results(written, {1, 2}), read_results(path, {1, 2}), strict=False):
-        np.testing.assert_allclose(back.T_cam_obj[:3, 3], one.T_cam_obj[:3, 3], atol=1e-6)
+    for back, detection in zip(
+        read_results(written, {1, 2}), read_results(path, {1, 2}), strict=False
+    ):
+        np.testing.assert_allclose(back.T_cam_obj[:3, 3], detection.T_cam_obj[:3, 3], atol=1e-6)
     again = composed(*options(root, f"results={written}", "method=again"), config="evaluate")
     (second,) = run_evaluation(again, tmp_path / "second")
     assert {name: vars(row) | {"method": ""} for name, row in second.rows.items()} == {
@@ -97,7 +99,7 @@ def test_a_folder_is_the_networks_whatever_file_is_measured_beside_it(root, comp
     network = ("ckpt_path=pretrained/pivconnector", "refine=region")
     config = composed(*options(root, f"results={path}", *network), config="evaluate")
     reports = run_evaluation(config, tmp_path / "run")
-    assert [one.name for one in reports] == ["dopepp_fast", "dopepp_fast + region", "other"]
+    assert [report.name for report in reports] == ["dopepp_fast", "dopepp_fast + region", "other"]
     written = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert written == reports[0].to_record()
     assert written["refined"]["name"] == "dopepp_fast + region"
@@ -112,7 +114,7 @@ def test_poses_beside_the_test_set_are_left_out(root, composed, tmp_path, caplog
     arguments = options(root, f"results={path}", "data.objects=[pivconnector]", "num_pictures=0")
     (report,) = run_evaluation(composed(*arguments, config="evaluate"), tmp_path / "run")
     assert list(report.rows) == ["pivconnector", "mean"]
-    others = sum(one.obj_id == 1 for one in poses)
+    others = sum(pose.obj_id == 1 for pose in poses)
     assert f"left out 1 poses on images that are not in the test set and {others} of" in caplog.text
 
 

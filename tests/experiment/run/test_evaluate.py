@@ -16,9 +16,9 @@ def test_refined_poses_are_measured_beside_the_networks(composed, tmp_path):
     network, refined = run_evaluation(composed(*options, config="evaluate"), tmp_path)
     assert (network.name, refined.name) == ("dopepp_fast", "dopepp_fast + region")
     before, after = network.errors["pivconnector"], refined.errors["pivconnector"]
-    found = np.isfinite(before)
-    assert found.sum() >= 5
-    assert np.median(after[found]) < np.median(before[found]) / 3
+    result = np.isfinite(before)
+    assert result.sum() >= 5
+    assert np.median(after[result]) < np.median(before[result]) / 3
     written = read_json(tmp_path / METRICS_FILE)
     assert (written["name"], written["refined"]) == ("dopepp_fast", refined.to_record())
     assert written["made_worse"] == made_worse(network, refined)
@@ -40,6 +40,6 @@ def test_silent_images_are_counted_by_reason(composed, tmp_path, capsys):
     write_atomic(strict.to_file(), tmp_path / "strict.ckpt")
     options = (f"ckpt_path={tmp_path / 'strict.ckpt'}", "+data.num_test=3")
     run_evaluation(composed(*options, config="evaluate"), tmp_path / "run")
-    (line,) = [one for one in capsys.readouterr().out.splitlines() if "images silent:" in one]
+    (line,) = [row for row in capsys.readouterr().out.splitlines() if "images silent:" in row]
     assert line.startswith("dopepp_fast: 3 of 3 images silent: ")
     assert "below the threshold (best score" in line

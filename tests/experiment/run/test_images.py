@@ -13,16 +13,16 @@ from dopepp.parts.catalogue import pivconnector, servoholder
 def sample(key: str = "0/1") -> Sample:
     T = np.eye(4)
     T[:3, 3] = 0.01, -0.02, 0.4
-    one = Instance("pivconnector", T, np.zeros((9, 2)), 0.8)
+    item = Instance("pivconnector", T, np.zeros((9, 2)), 0.8)
     return Sample(
-        np.zeros((4, 6, 3), np.uint8), np.diag([600.0, 600.0, 1.0]), [one], None, "s", key
+        np.zeros((4, 6, 3), np.uint8), np.diag([600.0, 600.0, 1.0]), [item], None, "s", key
     )
 
 
 def word(*samples: Sample) -> str:
     fingerprint = Fingerprint([pivconnector()])
-    for one in samples:
-        fingerprint.add(one)
+    for sample in samples:
+        fingerprint.add(sample)
     return fingerprint.word()
 
 

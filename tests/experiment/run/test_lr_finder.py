@@ -24,9 +24,9 @@ def losses(middle: float, noise: float = 0.0, seed: int = 0) -> np.ndarray:
 @pytest.mark.parametrize("noise", [0.0, 0.1])
 def test_the_rate_at_which_the_loss_falls_fastest(middle, noise):
     for seed in range(10):
-        found = suggest(RATES, losses(middle, noise, seed))
-        assert middle / 4 < found.steepest < 4 * middle
-        assert found.steepest < found.lowest < 300 * middle
+        result = suggest(RATES, losses(middle, noise, seed))
+        assert middle / 4 < result.steepest < 4 * middle
+        assert result.steepest < result.lowest < 300 * middle
 
 
 def test_a_loss_that_does_not_fall_suggests_nothing():

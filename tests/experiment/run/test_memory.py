@@ -60,8 +60,8 @@ def test_a_network_runs_once_on_a_picture(tiny_spec):
     remembering = Memory().behind(estimator)
     first, second = (Noise().sample(index).image for index in range(2))
     for image in (first, second, first, first[::-1].copy(), second):
-        for one, same in zip(remembering.maps(image), estimator.maps(image), strict=True):
-            torch.testing.assert_close(one, same, rtol=0, atol=0)
+        for left, same in zip(remembering.maps(image), estimator.maps(image), strict=True):
+            torch.testing.assert_close(left, same, rtol=0, atol=0)
     assert len(passes) == 5 + 3
     remembering.recovery = None  # its own: the estimator's stays
     assert estimator.recovery is not None

@@ -75,11 +75,11 @@ def resumed(tiny, tmp_path):
 
     def go_on(*overrides: str, spec: str = "a", **splits: Pictures) -> list[str]:
         saved = Checkpoint({"net": "a"}, {}, [], (64, 64), 8, 1.0, data={"images": images})
-        present = {**images, **{name: describe_images(one) for name, one in splits.items()}}
+        present = {**images, **{name: describe_images(first) for name, first in splits.items()}}
         payload = {"spec": {"net": spec}, "data": {"images": copy.deepcopy(present)}}
         config = tiny(*overrides) if overrides else started
         accepted = check_resume(tmp_path / "run", config, saved, payload)
-        return [str(one) for one in accepted]
+        return [str(item) for item in accepted]
 
     return go_on
 
@@ -137,7 +137,7 @@ def test_what_is_learnt_from_changes_only_when_that_is_said(resumed):
     assert error.value.fix.endswith("add resume_anyway=true")
     accepted = resumed(*LEARNT_FROM, harmless, "resume_anyway=true")
     for line in (*LEARNT_FROM.values(), "trainer.max_epochs: 1 → 9"):
-        assert sum(one.startswith(line) for one in accepted) == 1, line
+        assert sum(item.startswith(line) for item in accepted) == 1, line
 
 
 @pytest.mark.parametrize("split", ["train", "val"])

@@ -50,7 +50,7 @@ def test_chosen_scores_are_calibrated_and_silent_on_other_images():
     options = choose(scored(0, 3000), scored(1, 1000, right=False))
     weights = np.array([options[f"score_{name}"] for name in FEATURES])
     shown, empty = scored(2, 3000), scored(3, 1000, right=False)
-    scores = np.concatenate([score(one.features, weights) for one in (shown, empty)])
+    scores = np.concatenate([score(item.features, weights) for item in (shown, empty)])
     correct = np.concatenate([shown.correct, empty.correct])
     assert expected_calibration_error(torch.from_numpy(scores), torch.from_numpy(correct)) < 0.05
     loud = empty.loudest(score(empty.features, weights)) >= options["min_score"]
@@ -133,8 +133,8 @@ def test_what_finds_a_hidden_instance_is_not_judged():
 
 def test_poses_are_paired_with_the_instances_that_they_find():
     near, stray = found(POSE, 0.9, 0.05), found(POSE, 0.8, 3.0)
-    ((one, true),) = matched_poses(estimator(near, stray), [PART], Images(POSE))
-    assert one is near
+    ((pose, true),) = matched_poses(estimator(near, stray), [PART], Images(POSE))
+    assert pose is near
     assert np.array_equal(true, POSE[None])
     flip = np.diag([-1.0, -1.0, 1.0, 1.0])
     symmetric = replace(PART, symmetries_discrete=flip[None])
@@ -152,9 +152,9 @@ def test_the_factors_of_a_network_that_is_too_near_and_too_sure():
         step = 2.0 * deviation * rng.normal(size=6)
         turn = rotation_vector_to_matrix(step[:3])
         T = make_transform(turn @ POSE[:3, :3], 0.9 * (POSE[:3, 3] + step[3:]))
-        one = replace(found(T, 0.9), covariance=np.diag(deviation**2))
+        item = replace(found(T, 0.9), covariance=np.diag(deviation**2))
         equivalents = [POSE, POSE @ flip]
-        pairs.append((one, np.array(equivalents[:: -1 if number % 3 == 0 else 1])))
+        pairs.append((item, np.array(equivalents[:: -1 if number % 3 == 0 else 1])))
     factors = fit_factors(pairs)
     assert factors["distance_factor"] == pytest.approx(1 / 0.9, rel=0.01)
     assert factors["covariance_factor"] == pytest.approx(4.0, rel=0.1)

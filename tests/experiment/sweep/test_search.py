@@ -91,15 +91,15 @@ def test_the_same_command_goes_on_and_the_best_trial_is_named(call_fast, tmp_pat
         code, out, err = call_fast(*FAST, "search.num_trials=4")
         assert code == 0, err
         assert [int(number) for number, _ in started(tmp_path)] == [0, 1, 2, 3]
-    found = trials(tmp_path)
-    assert [trial.state for trial in found] == [TrialState.COMPLETE] * 4
-    for trial, (number, lr) in zip(found, started(tmp_path), strict=True):
+    result = trials(tmp_path)
+    assert [trial.state for trial in result] == [TrialState.COMPLETE] * 4
+    for trial, (number, lr) in zip(result, started(tmp_path), strict=True):
         assert (tmp_path / "search" / "s" / number / "metrics.json").is_file()
         assert trial.number == int(number)
         assert trial.params["optimizer.lr"] == pytest.approx(float(lr), rel=1e-3)
-    drawn = {trial.params["optimizer.lr"] for trial in found}
+    drawn = {trial.params["optimizer.lr"] for trial in result}
     assert len(drawn) == 4  # the second command did not draw the first one's again
-    best = max(found, key=lambda trial: trial.value or 0)
+    best = max(result, key=lambda trial: trial.value or 0)
     assert f"best trial {best.number}, objective {best.value:.4f}: optimizer.lr=" in out
     assert "study s: 4 complete" in out
 
@@ -114,9 +114,9 @@ def test_interrupted_trials_run_again_under_their_numbers(call_fast, tmp_path, m
     assert code == 130
     assert "goes on with trials 0" in out
     assert call_fast(*FAST, "search.num_trials=3")[0] == 0
-    found = trials(tmp_path)
-    assert [trial.state for trial in found] == [TrialState.COMPLETE] * 3
-    assert found[0].params == drawn
+    result = trials(tmp_path)
+    assert [trial.state for trial in result] == [TrialState.COMPLETE] * 3
+    assert result[0].params == drawn
     assert [int(number) for number, _ in started(tmp_path)] == [0, 0, 1, 1, 2]
 
 
@@ -143,18 +143,18 @@ def test_a_failing_trial_does_not_stop_the_study(call_fast, tmp_path, monkeypatc
 def test_trials_below_the_median_are_pruned(call_fast, tmp_path):
     rule = ("search.prune_after_trials=2", "search.prune_after_epochs=1", "search.num_trials=6")
     assert call_fast(*SEARCH, LR, *rule)[0] == 0
-    found = trials(tmp_path)
-    pruned = [trial for trial in found if trial.state == TrialState.PRUNED]
+    result = trials(tmp_path)
+    pruned = [trial for trial in result if trial.state == TrialState.PRUNED]
     assert pruned
     assert all(trial.number >= 2 for trial in pruned)
-    for trial in found:
+    for trial in result:
         # Only finished trials count, and those of before: one ran after the other.
-        before = [one for one in found[: trial.number] if one.state == TrialState.COMPLETE]
+        before = [item for item in result[: trial.number] if item.state == TrialState.COMPLETE]
         reported = trial.intermediate_values
         for epoch in (1, 2):
             if epoch not in reported or trial.number < 2:
                 continue
-            median = statistics.median(one.intermediate_values[epoch] for one in before)
+            median = statistics.median(trial.intermediate_values[epoch] for trial in before)
             best = max(value for step, value in reported.items() if step <= epoch)
             is_last = epoch == max(reported)
             assert (best < median) == (is_last and trial.state == TrialState.PRUNED)

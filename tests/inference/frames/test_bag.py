@@ -65,7 +65,7 @@ class Recording:
         large = {"k": K, "d": LENS, "p": P, "r": np.eye(3).ravel().tolist()}
         names = {name: name.upper() if self._is_ros1 else name for name in large}
         roi = self._store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-        arrays = {names[one]: np.array(value, np.float64) for one, value in large.items()}
+        arrays = {names[first]: np.array(value, np.float64) for first, value in large.items()}
         fixed = {"height": 48, "width": 64, "distortion_model": "plumb_bob"}
         self.write(topic, "CameraInfo", 1, binning_x=0, binning_y=0, roi=roi,
                    **(fixed | arrays | changes))  # fmt: skip
@@ -84,8 +84,8 @@ def test_pictures_times_and_camera_of_a_recording(kind, tmp_path):
         (source,) = open_sources([path])
         frames = list(source.frames())
         assert [one.time for one in frames] == [1.5, 2.5, 3.5]
-        for second, one in enumerate(frames, 1):
-            np.testing.assert_array_equal(one.image, PICTURE // second)
+        for second, frame in enumerate(frames, 1):
+            np.testing.assert_array_equal(frame.image, PICTURE // second)
         assert (source.count, source.rate) == (3, pytest.approx(1, abs=1e-6))
         assert source.camera.size == (64, 48)
         np.testing.assert_allclose(source.camera.K.ravel(), K)

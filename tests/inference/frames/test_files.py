@@ -36,7 +36,7 @@ def clip(tmp_path):
 
 
 def levels(*given: object, stride: int = 1) -> list[int]:
-    frames = [one for source in open_sources(given) for one in source.frames(stride)]
+    frames = [frame for source in open_sources(given) for frame in source.frames(stride)]
     return [round(float(one.image.mean()) / 20) for one in frames]
 
 
@@ -46,7 +46,7 @@ def test_a_folder_a_pattern_and_the_shells_list_are_one_sequence(folder):
     assert len(open_sources(sorted(folder.glob("*.png")))) == 1
     assert levels(folder, stride=2) == [0, 10]
     (source,) = open_sources([str(folder)])
-    assert [Path(one.name).name for one in source.frames()] == [
+    assert [Path(frame.name).name for frame in source.frames()] == [
         "frame0.png", "frame2.png", "frame10.png",
     ]  # fmt: skip
     assert [one.number for one in source.frames()] == [0, 1, 2]
@@ -57,7 +57,7 @@ def test_pictures_named_by_numbers_have_these(folder):
     for name in ("000007", "000012"):
         (folder / "frame0.png").with_stem(name).write_bytes((folder / "frame0.png").read_bytes())
     (source,) = open_sources([f"{folder}/0*.png"])
-    assert [one.number for one in source.frames()] == [7, 12]
+    assert [frame.number for frame in source.frames()] == [7, 12]
 
 
 def test_a_video_has_numbers_and_times(clip):
@@ -65,7 +65,7 @@ def test_a_video_has_numbers_and_times(clip):
     assert (source.count, source.rate) == (12, 10)
     assert levels(clip) == list(range(12))
     frames = list(source.frames(stride=5))
-    assert [one.number for one in frames] == [0, 5, 10]
+    assert [frame.number for frame in frames] == [0, 5, 10]
     assert [one.time for one in frames] == pytest.approx([0, 0.5, 1])
     assert levels(clip, stride=5) == [0, 5, 10]
 

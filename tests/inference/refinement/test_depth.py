@@ -188,7 +188,7 @@ def test_depth_is_as_sure_as_its_independent_errors(box):
     fine = cv2.resize(depth, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
     K_fine = camera_matrix(1200, 1200, 639.5, 479.5)
     again = DepthEvidence(surface, box.diameter, fine, K_fine, prior).descend()
-    deviations = [np.sqrt(np.linalg.inv(one.information)[5, 5]) for one in (end, again)]
+    deviations = [np.sqrt(np.linalg.inv(item.information)[5, 5]) for item in (end, again)]
     assert_allclose(deviations[1], deviations[0], rtol=0.2)
     assert 5e-5 < deviations[0] < 5e-4
 

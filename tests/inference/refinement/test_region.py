@@ -221,12 +221,12 @@ def test_of_a_followed_part_a_blurred_edge_outweighs_its_colours() -> None:
     colours = np.broadcast_to(grey[:, None], (64, 64, 3)).astype(np.uint8)
     # The mixed colours beyond the edge were learned as the part's.
     odds = np.broadcast_to(np.where(columns < 34.5, 3.0, -3.0), (64, 64)).astype(np.float32)
-    found, followed = (
+    result, followed = (
         find_shifts(odds, colours, contour, 8.0, 1.0, weights).mean[right]
         for weights in (FOUND, FOLLOWED)
     )
     assert_allclose(followed, 0.0, atol=0.7)
-    assert found.min() > 1.5
+    assert result.min() > 1.5
 
 
 @pytest.mark.parametrize("extent", [40.0, 150.0, 900.0])
@@ -273,8 +273,8 @@ def test_tiles_tell_a_part_of_two_colours_before_the_same_two() -> None:
 
 def test_descent_without_evidence_returns_to_the_prior() -> None:
     prior = Prior(TRUE, np.diag(1 / DEVIATIONS**2))
-    found = descend(started(1), prior, [lambda pose, known: (np.zeros((6, 6)), np.zeros(6))], 8)
-    assert_allclose(found.T_cam_obj, TRUE, atol=1e-6)
+    result = descend(started(1), prior, [lambda pose, known: (np.zeros((6, 6)), np.zeros(6))], 8)
+    assert_allclose(result.T_cam_obj, TRUE, atol=1e-6)
     assert descend(TRUE, prior, [lambda pose, known: None], 8) is None
 
 
@@ -354,9 +354,11 @@ def test_a_pose_that_was_known_well_is_not_given_up(refiner: RegionRefiner, seed
     # A picture adds little to it, and moves it by a fraction of a pixel either way.
     deviations = np.repeat([math.radians(0.05), 0.00005], 3)
     start = moved(TRUE, np.random.default_rng(seed).normal(size=6) * deviations)
-    found = refiner.refine(picture(pivconnector()), K, start, np.diag(deviations**2), followed=True)
-    assert not found.reason
-    assert max(off(found.T_cam_obj)) < 0.15
+    refined = refiner.refine(
+        picture(pivconnector()), K, start, np.diag(deviations**2), followed=True
+    )
+    assert not refined.reason
+    assert max(off(refined.T_cam_obj)) < 0.15
     grey = refiner.refine(
         picture(pivconnector(), around=PART_COLOUR, noise=0), K, start, np.diag(deviations**2)
     )
@@ -408,10 +410,10 @@ def test_far_from_a_covariance_that_is_too_sure_the_part_is_found_where_it_is_as
     image = tiled(pivconnector(), 0.3)
     near = refiner.refine(image, K, start, sure)
     assert max(off(near.T_cam_obj)) > 5
-    found = refiner.refine(image, K, start, sure, starts=list)
-    assert not found.reason
-    assert max(off(found.T_cam_obj)) < 1.5
-    assert found.agreement >= SURE
+    refined = refiner.refine(image, K, start, sure, starts=list)
+    assert not refined.reason
+    assert max(off(refined.T_cam_obj)) < 1.5
+    assert refined.agreement >= SURE
     # Nothing there: the given pose stays, however far one looks.
     nothing = refiner.refine(np.full_like(image, 128), K, start, sure, starts=list)
     assert "alike" in nothing.reason

@@ -143,10 +143,10 @@ def test_distances_are_those_to_all_triangles(name):
     surface = SurfaceTree(np.asarray(mesh.vertices), np.asarray(mesh.faces))
     points = np.random.default_rng(1).uniform(-0.7, 0.7, (500, 3)) * mesh.extents
     _, expected, _ = trimesh.proximity.closest_point_naive(mesh, points)
-    found = surface.distances(points)
-    assert (found > expected - 1e-12).all()
-    assert np.abs(found - expected).max() < 0.004 * mesh.scale
-    assert np.quantile(np.abs(found - expected), 0.98) < 1e-12
+    result = surface.distances(points)
+    assert (result > expected - 1e-12).all()
+    assert np.abs(result - expected).max() < 0.004 * mesh.scale
+    assert np.quantile(np.abs(result - expected), 0.98) < 1e-12
 
 
 def test_points_are_spread_by_area_and_lie_on_their_triangles():

@@ -43,10 +43,10 @@ def test_a_printed_board_has_its_true_size(what, tmp_path):
     board = parse_board(what)
     said = board.write(tmp_path / "board.pdf")
     board.write(tmp_path / "board.png")
-    width, height = (float(one) for one in re.match(r"([\d.]+) × ([\d.]+) mm", said).groups())
+    width, height = (float(group) for group in re.match(r"([\d.]+) × ([\d.]+) mm", said).groups())
     box = re.search(rb"/MediaBox \[([^\]]*)\]", (tmp_path / "board.pdf").read_bytes())[1].split()
     assert np.allclose(
-        [float(one) for one in box], [0, 0, width / 25.4 * 72, height / 25.4 * 72], atol=0.05
+        [float(item) for item in box], [0, 0, width / 25.4 * 72, height / 25.4 * 72], atol=0.05
     )
     with Image.open(tmp_path / "board.png") as image:
         assert np.allclose(

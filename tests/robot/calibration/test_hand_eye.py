@@ -9,7 +9,7 @@ from dopepp.robot.calibration.hand_eye import calibrate_hand_eye, equations, par
 
 
 def boards_of(cell):
-    return [board_pose(one, cell.camera) for one in cell.sightings]
+    return [board_pose(sighting, cell.camera) for sighting in cell.sightings]
 
 
 def apart(T, other):
@@ -45,16 +45,16 @@ def test_the_camera_is_found_within_a_millimetre_and_its_covariance(cell, mount)
     squares = []
     for seed in range(8):
         given = cell(seed, mount=mount)
-        found = calibrate_hand_eye(given.T_base_flange, boards_of(given), mount)
-        turn, shift = apart(given.T_mount_cam, found.T_mount_cam)
+        result = calibrate_hand_eye(given.T_base_flange, boards_of(given), mount)
+        turn, shift = apart(given.T_mount_cam, result.T_mount_cam)
         assert turn < 0.1
         assert shift < 1.0
         R = given.T_mount_cam[:3, :3]
         error = np.concatenate([
-            Rotation.from_matrix(R.T @ found.T_mount_cam[:3, :3]).as_rotvec(),
-            R.T @ (found.T_mount_cam[:3, 3] - given.T_mount_cam[:3, 3]),
+            Rotation.from_matrix(R.T @ result.T_mount_cam[:3, :3]).as_rotvec(),
+            R.T @ (result.T_mount_cam[:3, 3] - given.T_mount_cam[:3, 3]),
         ])  # fmt: skip
-        squares.append(error @ np.linalg.solve(found.covariance, error) / 6)
+        squares.append(error @ np.linalg.solve(result.covariance, error) / 6)
     assert 0.4 < np.mean(squares) < 2.5
 
 
@@ -64,9 +64,9 @@ def test_poses_that_contradict_the_others_are_left_out(cell):
     given.T_base_flange[11, :3, :3] = (
         given.T_base_flange[11, :3, :3] @ Rotation.from_euler("x", 3, degrees=True).as_matrix()
     )
-    found = calibrate_hand_eye(given.T_base_flange, boards_of(given), "hand")
-    assert set(np.flatnonzero(~found.inliers)) == {3, 11}
-    assert apart(given.T_mount_cam, found.T_mount_cam)[1] < 1.0
+    result = calibrate_hand_eye(given.T_base_flange, boards_of(given), "hand")
+    assert set(np.flatnonzero(~result.inliers)) == {3, 11}
+    assert apart(given.T_mount_cam, result.T_mount_cam)[1] < 1.0
 
 
 def test_joint_refinement_is_better_than_its_start(cell):

@@ -13,8 +13,8 @@ from dopepp.robot.calibration.lens import MAX_VIEWS, Views, calibrate_lens, writ
 @pytest.fixture(scope="module")
 def views(cell):
     """Views with the board near and far, out to the picture's corners."""
-    found = cell(3, num=4)
-    camera, rng = found.camera, np.random.default_rng(1)
+    result = cell(3, num=4)
+    camera, rng = result.camera, np.random.default_rng(1)
     board = parse_board("charuco:9x7:25:18")
     sightings = []
     for number in range(16):
@@ -29,24 +29,24 @@ def views(cell):
 
 def test_the_lens_is_found_within_its_deviations(views):
     camera, sightings = views
-    found = calibrate_lens(sightings, camera.size)
-    K, true = found.camera.K, camera.K
+    result = calibrate_lens(sightings, camera.size)
+    K, true = result.camera.K, camera.K
     errors = np.array([K[0, 0] - true[0, 0], K[1, 1] - true[1, 1], *(K[:2, 2] - true[:2, 2])])
-    assert (np.abs(errors) < 4 * found.deviations).all()
+    assert (np.abs(errors) < 4 * result.deviations).all()
     assert np.abs(errors).max() < 1.0
-    assert found.error_px == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
-    assert not found.findings
-    assert not found.outliers
+    assert result.error_px == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
+    assert not result.findings
+    assert not result.outliers
 
 
 def test_the_file_is_read_by_every_camera_option(views, tmp_path):
     camera, sightings = views
-    found = calibrate_lens(sightings, camera.size).camera
-    write_camera(tmp_path / "camera.yaml", found)
+    result = calibrate_lens(sightings, camera.size).camera
+    write_camera(tmp_path / "camera.yaml", result)
     again = read_camera(tmp_path / "camera.yaml")
-    assert again.size == found.size
-    assert np.array_equal(again.K, found.K)
-    assert again.distortion == found.distortion
+    assert again.size == result.size
+    assert np.array_equal(again.K, result.K)
+    assert again.distortion == result.distortion
 
 
 def test_a_view_that_contradicts_the_others_is_named_and_left_out(views):
@@ -55,16 +55,18 @@ def test_a_view_that_contradicts_the_others_is_named_and_left_out(views):
     bent = replace(
         sightings[5], pixels=sightings[5].pixels + 6 * rng.normal(size=sightings[5].pixels.shape)
     )
-    found = calibrate_lens([*sightings[:5], bent, *sightings[6:]], camera.size)
-    assert found.outliers == ("5.png",)
-    assert abs(found.camera.K[0, 0] - camera.K[0, 0]) < 1.5
+    result = calibrate_lens([*sightings[:5], bent, *sightings[6:]], camera.size)
+    assert result.outliers == ("5.png",)
+    assert abs(result.camera.K[0, 0] - camera.K[0, 0]) < 1.5
 
 
 def test_views_in_the_middle_alone_are_not_trusted(views):
     camera, sightings = views
     wide = tuple(3 * side for side in camera.size)
-    middle = [replace(one, pixels=one.pixels + np.array(camera.size)) for one in sightings]
-    assert any("cover" in one for one in calibrate_lens(middle, wide).findings)
+    middle = [
+        replace(sighting, pixels=sighting.pixels + np.array(camera.size)) for sighting in sightings
+    ]
+    assert any("cover" in finding for finding in calibrate_lens(middle, wide).findings)
 
 
 def test_parallel_views_are_not_trusted(views):
@@ -76,7 +78,7 @@ def test_parallel_views_are_not_trusted(views):
             camera.K, camera.coefficients)[0][:, 0])
         for k in range(8)
     ]  # fmt: skip
-    assert any("parallel" in one for one in calibrate_lens(parallel, camera.size).findings)
+    assert any("parallel" in finding for finding in calibrate_lens(parallel, camera.size).findings)
 
 
 def test_two_views_are_refused(views):
@@ -97,7 +99,7 @@ def test_frames_that_add_nothing_give_way_to_stiller_ones():
     places = [60, 90, 100, 102, 130, 200, 260, 290, 300, 300, 310]
     new = [views.offer(at(x, str(x))) for x in places]
     assert new == [True] + 4 * [False] + [True, True] + 4 * [False]
-    assert [one.name for one in views.kept] == ["102", "200", "300"]
+    assert [view.name for view in views.kept] == ["102", "200", "300"]
 
 
 def test_other_corners_of_the_board_are_another_view():

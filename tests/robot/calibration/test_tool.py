@@ -48,7 +48,7 @@ def test_a_touch_beside_the_point_is_named():
         Rotation.from_euler("xyz", np.random.default_rng(1).uniform(-0.7, 0.7, (9, 3)))
     )
     poses[4, :3, 3] += [0.01, 0, 0]
-    assert any("pose 5" in one for one in find_tip(poses).findings)
+    assert any("pose 5" in finding for finding in find_tip(poses).findings)
 
 
 def test_three_touches_are_refused():
@@ -62,11 +62,11 @@ def test_a_bench_is_found_with_its_frame():
         Rotation.from_euler("xyz", [3, -4, 60], degrees=True).as_matrix(), [0.5, 0.1, -0.02]
     )
     local = np.array([[0, 0, 0], [0.3, 0, 0], [0.1, 0.2, 0], [0.3, 0.3, 0], [-0.1, 0.2, 0]])
-    found = find_bench(transform(T, local) + 1e-4 * rng.normal(size=local.shape))
-    assert np.allclose(found.T_base_bench[:3, :3], T[:3, :3], atol=2e-3)
-    assert np.allclose(found.T_base_bench[:3, 3], T[:3, 3], atol=3e-4)
-    assert not found.findings
-    assert np.linalg.det(found.T_base_bench[:3, :3]) == pytest.approx(1)
+    result = find_bench(transform(T, local) + 1e-4 * rng.normal(size=local.shape))
+    assert np.allclose(result.T_base_bench[:3, :3], T[:3, :3], atol=2e-3)
+    assert np.allclose(result.T_base_bench[:3, 3], T[:3, 3], atol=3e-4)
+    assert not result.findings
+    assert np.linalg.det(result.T_base_bench[:3, :3]) == pytest.approx(1)
 
 
 @pytest.mark.parametrize(
@@ -80,19 +80,19 @@ def test_points_that_are_no_plane_are_refused(points, said):
 
 def test_a_point_off_the_plane_is_named():
     points = np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0], [0.3, 0.3, 0], [0.15, 0.15, 0.02]])
-    assert any("point 5" in one for one in find_bench(points).findings)
+    assert any("point 5" in finding for finding in find_bench(points).findings)
 
 
 def test_a_bench_is_found_under_a_board():
     board, rng = parse_board("charuco:8x6:25:19"), np.random.default_rng(0)
     T = make_transform(Rotation.from_euler("xyz", [184, 3, 40], degrees=True).as_matrix(), PIVOT)
     seen = [make_transform(T[:3, :3], T[:3, 3] + 2e-4 * rng.normal(size=3)) for _ in range(5)]
-    found = bench_of_board(seen, board)
-    assert not found.findings
+    result = bench_of_board(seen, board)
+    assert not result.findings
     # The board's z goes into the bench.
     flipped = make_transform(T[:3, :3] @ np.diag([1.0, -1, -1]), T[:3, 3])
-    assert np.allclose(found.T_base_bench, flipped, atol=5e-4)
-    assert np.abs(found.residuals).max() < 1e-3
+    assert np.allclose(result.T_base_bench, flipped, atol=5e-4)
+    assert np.abs(result.residuals).max() < 1e-3
     seen[3] = make_transform(T[:3, :3], T[:3, 3] + [0, 0, 0.01])
-    assert any("picture 4" in one for one in bench_of_board(seen, board).findings)
+    assert any("picture 4" in finding for finding in bench_of_board(seen, board).findings)
     assert "no check" in bench_of_board(seen[:1], board).findings[0]

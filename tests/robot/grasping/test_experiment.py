@@ -40,7 +40,7 @@ def records():
 
 
 def test_recognised_and_caught_are_counted_per_50(records):
-    text = markdown([one for one in records if one.source == "network"], {"seed": 0})
+    text = markdown([record for record in records if record.source == "network"], {"seed": 0})
     assert "| 1–50 | 49 (98 %) | 47 (94 %) | 49 (98 %) | 47 (94 %) |" in text
     assert "| 51–54 | 4 (100 %) | 3 (75 %) | – | – |" in text
     # Wilson's interval of 181 of 200, by its formula.
@@ -61,8 +61,8 @@ def test_all_formats_hold_every_trial(records, tmp_path):
     content = json.loads((tmp_path / "grasps.json").read_text())
     assert len(rows) == len(content["trials"]) == len(records)
     assert content["sources"]["network"]["caught"] == 50
-    unseen = [one for one in content["trials"] if not one["seen"]]
-    assert [(one["number"], one["add_mm"]) for one in unseen] == [(49, None)]
+    unseen = [trial for trial in content["trials"] if not trial["seen"]]
+    assert [(record["number"], record["add_mm"]) for record in unseen] == [(49, None)]
     assert (tmp_path / "curve.png").is_file()
     assert (tmp_path / "grasps.md").read_text().count("\n") > 10
 

@@ -13,7 +13,7 @@ GOOD = "{point: [0, 0, 0], closing: [0, 1, 0], approach: [0, 0, -1], width: 0.05
 @pytest.mark.parametrize("name", sorted(BUILTIN))
 def test_built_in_parts_have_grasps_from_the_front(name):
     grasps = find_grasps(load_part(name))
-    assert any(one.approach[2] < -0.9 for one in grasps)
+    assert any(grasp.approach[2] < -0.9 for grasp in grasps)
 
 
 def test_what_is_written_is_read(part, tmp_path):

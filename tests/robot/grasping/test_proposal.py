@@ -16,21 +16,21 @@ def part_of(solid, name="solid"):
 @pytest.mark.parametrize("extents", [(0.06, 0.03, 0.02), (0.12, 0.05, 0.007)])
 def test_a_box_is_gripped_on_opposite_faces(extents):
     part = part_of(trimesh.creation.box(extents))
-    found = propose_grasps(part, 12)
-    assert len(found) >= 3
-    for one in found:
-        axis = int(np.abs(one.closing).argmax())
-        assert abs(one.closing[axis]) > 0.999
-        assert one.width == pytest.approx(extents[axis], abs=1e-6)
-        assert abs(one.point[axis]) < 1e-6
-        assert (np.abs(one.point) <= np.array(extents) / 2 + 1e-9).all()
+    result = propose_grasps(part, 12)
+    assert len(result) >= 3
+    for item in result:
+        axis = int(np.abs(item.closing).argmax())
+        assert abs(item.closing[axis]) > 0.999
+        assert item.width == pytest.approx(extents[axis], abs=1e-6)
+        assert abs(item.point[axis]) < 1e-6
+        assert (np.abs(item.point) <= np.array(extents) / 2 + 1e-9).all()
 
 
 def test_both_contacts_lie_on_the_surface_of_a_ring():
     inner, outer = 0.015, 0.03
     solid = trimesh.creation.annulus(inner, outer, 0.02, sections=64)
-    for one in propose_grasps(part_of(solid), 16):
-        contacts = one.point + np.outer((-0.5, 0.5), one.width * one.closing)
+    for grasp in propose_grasps(part_of(solid), 16):
+        contacts = grasp.point + np.outer((-0.5, 0.5), grasp.width * grasp.closing)
         radius, height = np.hypot(*contacts[:, :2].T), np.abs(contacts[:, 2])
         # Of each, its distance from the two cylinders and from the two flat sides.
         away = np.abs([radius - inner, radius - outer, height - 0.01]).min(axis=0)
@@ -42,7 +42,7 @@ def test_both_contacts_lie_on_the_surface_of_a_ring():
 def test_it_is_the_same_for_the_same_seed():
     part = part_of(trimesh.creation.box((0.06, 0.03, 0.02)))
     first, second = (propose_grasps(part, 6, seed=3) for _ in range(2))
-    assert [one.point.tolist() for one in first] == [one.point.tolist() for one in second]
+    assert [grasp.point.tolist() for grasp in first] == [grasp.point.tolist() for grasp in second]
 
 
 @pytest.mark.parametrize(

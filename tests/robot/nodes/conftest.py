@@ -37,9 +37,9 @@ def seen(tmp_path_factory):
     factory = Factory([pivconnector()], PRESETS["quickstart"].reframed(320, 240), 2)
     rendered = [factory.render(0, number) for number in (9, 10, 11)]
     folder = tmp_path_factory.mktemp("pictures")
-    for number, one in enumerate(rendered):
-        write_png(folder / f"{number}.png", one.image)
-    return Seen([one.image for one in rendered], rendered[0].scene.K, folder)
+    for number, first in enumerate(rendered):
+        write_png(folder / f"{number}.png", first.image)
+    return Seen([item.image for item in rendered], rendered[0].scene.K, folder)
 
 
 def header(second: float, frame_id: str = FRAME) -> SimpleNamespace:
@@ -99,12 +99,13 @@ def recording(seen, tmp_path_factory):
             "/camera/camera_info": "sensor_msgs/msg/CameraInfo",
         }
         ways = {
-            one: writer.add_connection(one, kind, typestore=store) for one, kind in kinds.items()
+            first: writer.add_connection(first, kind, typestore=store)
+            for first, kind in kinds.items()
         }
         for number, picture in enumerate(seen.pictures, 1):
             info = info_message(seen.K, (320, 240))
-            for topic, one in ((TOPIC, image_message(picture, number)), (None, info)):
+            for topic, left in ((TOPIC, image_message(picture, number)), (None, info)):
                 topic = topic or "/camera/camera_info"
-                content = store.serialize_cdr(native(kinds[topic], one), kinds[topic])
+                content = store.serialize_cdr(native(kinds[topic], left), kinds[topic])
                 writer.write(ways[topic], number * 10**9, content)
     return next(folder.glob("*.mcap"))

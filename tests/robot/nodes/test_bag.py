@@ -28,7 +28,7 @@ def answered(recording, tmp_path_factory):
     done = call("node", MODEL, "--bag", recording, "--out", out, "--overlay")
     assert done.exit_code == 0, done.output
     assert "3 pictures" in done.output
-    assert [one.name for one in out.parent.iterdir()] == ["poses.mcap"]
+    assert [path.name for path in out.parent.iterdir()] == ["poses.mcap"]
     store = get_typestore(Stores.ROS2_HUMBLE)
     for kind, text in VISION.items():
         store.register(get_types_from_msg(text, kind))
@@ -44,19 +44,19 @@ def test_poses_equal_those_of_predict(answered, recording):
     done = call("predict", MODEL, recording)
     assert done.exit_code == 0, done.output
     expected = [json.loads(line) for line in done.stdout.splitlines()]
-    found = [
-        (one, message.header)
+    result = [
+        (detection, message.header)
         for _, message in answered["/dope/detections"]
-        for one in message.detections
+        for detection in message.detections
     ]
-    assert len(found) == len(expected) >= 2
-    for (one, header), plain in zip(found, expected, strict=True):
-        pose, T = one.results[0].pose.pose, np.array(plain["T_cam_obj"])
+    assert len(result) == len(expected) >= 2
+    for (first, header), plain in zip(result, expected, strict=True):
+        pose, T = first.results[0].pose.pose, np.array(plain["T_cam_obj"])
         place, turn = pose.position, pose.orientation
         np.testing.assert_allclose([place.x, place.y, place.z], T[:3, 3], atol=1e-6)
         R = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
         np.testing.assert_allclose(R, T[:3, :3], atol=1e-6)
-        assert one.results[0].hypothesis.score == pytest.approx(plain["score"], abs=1e-6)
+        assert first.results[0].hypothesis.score == pytest.approx(plain["score"], abs=1e-6)
         assert header.stamp.sec == plain["time"]
 
 

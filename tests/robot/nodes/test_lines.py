@@ -25,12 +25,12 @@ def test_lines_are_the_estimators_poses(seen, four, estimator):
     done = call(MODEL, seen.folder, "--json", *four)
     assert done.exit_code == 0, done.output
     lines = [json.loads(line) for line in done.stdout.splitlines()]
-    assert [one["number"] for one in lines] == [0, 1, 2]
+    assert [row["number"] for row in lines] == [0, 1, 2]
     for line, picture in zip(lines, seen.pictures, strict=True):
-        expected = [one.T_cam_obj for one in estimator.predict(picture, seen.K)]
+        expected = [detection.T_cam_obj for detection in estimator.predict(picture, seen.K)]
         assert len(line["detections"]) == len(expected)
-        for one, T in zip(line["detections"], expected, strict=True):
-            np.testing.assert_allclose(one["T_cam_obj"], T, atol=1e-9)
+        for record, T in zip(line["detections"], expected, strict=True):
+            np.testing.assert_allclose(record["T_cam_obj"], T, atol=1e-9)
 
 
 def test_datagrams_hold_a_line_each(seen, four):
@@ -40,7 +40,7 @@ def test_datagrams_hold_a_line_each(seen, four):
         done = call(MODEL, seen.folder, "--udp", f"127.0.0.1:{ear.getsockname()[1]}", *four)
         assert done.exit_code == 0, done.output
         heard = [json.loads(ear.recv(70_000)) for _ in range(3)]
-    assert [one["number"] for one in heard] == [0, 1, 2]
+    assert [record["number"] for record in heard] == [0, 1, 2]
     assert done.stdout == ""
 
 
@@ -61,7 +61,7 @@ def test_datagrams_hold_a_line_each(seen, four):
     ],
 )
 def test_what_does_not_go_together_is_one_line(seen, words, said):
-    done = call(MODEL, *(str(one).format(pictures=seen.folder) for one in words))
+    done = call(MODEL, *(str(word).format(pictures=seen.folder) for word in words))
     assert done.exit_code == 2
     assert said in done.stderr
     assert done.stderr.count("\n") == 1

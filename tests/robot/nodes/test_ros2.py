@@ -88,7 +88,7 @@ def test_no_picture_is_lost_between_two_processes_and_a_killed_node_starts_again
     rows = [line.split("|")[1:-1] for line in done.stdout.splitlines() if line.startswith("| 50")]
     assert len(rows) == 2
     for row in rows:
-        sent, received, lost, _, answered, *_ = (float(one) for one in row)
+        sent, received, lost, _, answered, *_ = (float(item) for item in row)
         assert (sent, received, lost) == (50, 50, 0)
         assert answered > 0
     assert "ended with 143" in done.stdout

@@ -20,9 +20,9 @@ def test_what_is_shipped_names_what_there_is(estimator):
     topics.add(DIAGNOSTICS[0])
     for name in ("dope.rviz", "dope.foxglove.json"):
         content = yaml.safe_load((SHARE / name).read_text())
-        named = {one for one in words(content) if one.startswith("/")}
+        named = {word for word in words(content) if word.startswith("/")}
         assert len(named) >= 2
-        assert {one.partition(".")[0] for one in named} <= topics
+        assert {item.partition(".")[0] for item in named} <= topics
     (parameters,) = yaml.safe_load((SHARE / "dope.yaml").read_text()).values()
     WorkerSettings(**parameters["ros__parameters"])
 
@@ -42,13 +42,15 @@ def test_the_launch_file_starts_the_command_with_options_it_has(monkeypatch):
         monkeypatch.setitem(sys.modules, name, SimpleNamespace(**content))
     declared = runpy.run_path(str(SHARE / "dope_launch.py"))["generate_launch_description"]()
     assert seen[:4] == ["dopepp", "node", "<model>", "--ros2"]
-    assert {f"<{one}>" for one in declared[:-1]} == {one for one in seen if one[0] == "<"}
+    assert {f"<{item}>" for item in declared[:-1]} == {
+        element for element in seen if element[0] == "<"
+    }
     assert {one for one in seen if one.startswith("--")} <= options()
 
 
 def options():
     command = typer.main.get_command(app).commands["node"]
-    return {text for one in command.params for text in one.opts}
+    return {text for item in command.params for text in item.opts}
 
 
 def words(content):
@@ -56,7 +58,7 @@ def words(content):
     if isinstance(content, dict):
         content = [*content, *content.values()]
     if isinstance(content, list):
-        for one in content:
-            yield from words(one)
+        for item in content:
+            yield from words(item)
     elif isinstance(content, str):
         yield content

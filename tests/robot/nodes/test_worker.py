@@ -42,8 +42,8 @@ def test_poses_are_the_estimators_on_the_picture_without_distortion(
     straight = cv2.undistort(seen.pictures[0], seen.K, np.array([-0.05, 0.01, 0.001, -0.001, 0]))
     expected = estimator.predict(straight, seen.K)
     assert expected
-    for one, other in zip(answer.result.detections, expected, strict=True):
-        np.testing.assert_allclose(one.T_cam_obj, other.T_cam_obj, atol=1e-9)
+    for detection, other in zip(answer.result.detections, expected, strict=True):
+        np.testing.assert_allclose(detection.T_cam_obj, other.T_cam_obj, atol=1e-9)
     assert (answer.stamp, answer.frame_id) == (Stamp(12, 250_000_000), "camera_optical_frame")
     assert not said
     assert worker.problem == ""

@@ -395,7 +395,7 @@ def test_upright_parts_stand_and_the_camera_looks_down(up, axis):
     turning = UprightTurning(up=up, elevation_deg=(20, 70), roll_deg=30)
     rng = np.random.default_rng(1)
     rotations = np.array([turning.draw(rng) for _ in range(2000)])
-    assert all(is_rotation(one, 1e-9) for one in rotations)
+    assert all(is_rotation(rotation, 1e-9) for rotation in rotations)
     # Where the camera is, in the part's frame; its height above the horizon is the elevation.
     towards = -rotations[:, 2]
     height = np.degrees(np.arcsin(towards[:, axis]))

@@ -42,26 +42,26 @@ def test_a_part_has_the_pixels_of_the_pinhole():
     portrait=st.booleans(),
 )
 def test_what_is_chosen_shows_parts_as_networks_learn_them(near, ratio, diameter, portrait):
-    one, parts = view(near, near * ratio), [part(diameter)]
+    first, parts = view(near, near * ratio), [part(diameter)]
     if portrait:
-        one = replace(one, size=(720, 1280), K=camera_matrix(FOCAL, FOCAL, 350.0, 650.0))
+        first = replace(first, size=(720, 1280), K=camera_matrix(FOCAL, FOCAL, 350.0, 650.0))
     try:
-        one.check(parts)
+        first.check(parts)
     except UserError:
         return
-    scale = one.scale_for(parts)
+    scale = first.scale_for(parts)
     assert 0 < scale <= 1
-    smallest, largest = one.sizes_px(parts, scale)
-    assert smallest >= min(45, one.sizes_px(parts)[0]) * 0.99
+    smallest, largest = first.sizes_px(parts, scale)
+    assert smallest >= min(45, first.sizes_px(parts)[0]) * 0.99
     assert smallest < 71
     if ratio < 2.4 and scale < 1:
         assert 44.5 < smallest <= largest < 111
-    window = one.window_for(parts, scale)
+    window = first.window_for(parts, scale)
     assert all(side % 32 == 0 for side in window)
     assert min(window) >= largest or min(window) >= scale * 720
-    assert all(side < scale * whole + 32 for side, whole in zip(window, one.size, strict=True))
+    assert all(side < scale * whole + 32 for side, whole in zip(window, first.size, strict=True))
     assert (window[0] >= window[1]) != (portrait and window[0] != window[1])
-    one.check(parts, scale)
+    first.check(parts, scale)
 
 
 def test_a_given_window_limits_the_scale():
@@ -136,10 +136,10 @@ def test_it_is_said_in_words():
 
 @pytest.mark.parametrize("name", ["wide", "table", "quickstart"])
 def test_scenes_show_the_parts_at_work(name):
-    parts, one = [servoholder()], view()
-    scale = one.scale_for(parts)
-    window = one.window_for(parts, scale)
-    whole, small = one.whole(PRESETS[name], scale), one.window(PRESETS[name], scale, window)
+    parts, first = [servoholder()], view()
+    scale = first.scale_for(parts)
+    window = first.window_for(parts, scale)
+    whole, small = first.whole(PRESETS[name], scale), first.window(PRESETS[name], scale, window)
     np.testing.assert_array_equal(whole.K, K)
     assert (whole.width, whole.height) == (1280, 720)
     assert whole.sensors.blur_px[1] * scale == pytest.approx(small.sensors.blur_px[1])
@@ -164,8 +164,8 @@ def test_scenes_show_the_parts_at_work(name):
 
 def test_a_window_shows_what_the_whole_picture_has_there():
     """The window's K is that of the camera's picture, scaled and moved by whole pixels."""
-    one = view()
-    scene = Factory([servoholder()], one.window(PRESETS["wide"], 0.4, (224, 128)), 1).scene(0, 0)
+    item = view()
+    scene = Factory([servoholder()], item.window(PRESETS["wide"], 0.4, (224, 128)), 1).scene(0, 0)
     scaled = camera_matrix(0.4 * FOCAL, 0.4 * FOCAL, 0.4 * 650.5 - 0.5, 0.4 * 350.5 - 0.5)
     corner = scaled[:2, 2] - scene.K[:2, 2]
     np.testing.assert_allclose(corner, np.round(corner), atol=1e-9)

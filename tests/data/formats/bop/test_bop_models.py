@@ -86,13 +86,13 @@ def test_texture_round_trip(ycb_root, tmp_path):
 def test_parts_called_as_bops_files_keep_their_numbers(tmp_path):
     parts = [replace(servoholder(), name="obj_000012"), replace(pivconnector(), name="obj_000005")]
     write_models(tmp_path, parts)
-    found = parts_by_id(tmp_path, bop_parts(tmp_path))
-    assert {number: part.name for number, part in found.items()} == {
+    result = parts_by_id(tmp_path, bop_parts(tmp_path))
+    assert {number: part.name for number, part in result.items()} == {
         5: "obj_000005",
         12: "obj_000012",
     }
-    np.testing.assert_allclose(found[5].diameter, parts[1].diameter, rtol=1e-6)
-    assert found[5].diameter != pytest.approx(found[12].diameter, rel=1e-3)
+    np.testing.assert_allclose(result[5].diameter, parts[1].diameter, rtol=1e-6)
+    assert result[5].diameter != pytest.approx(result[12].diameter, rel=1e-3)
 
 
 @pytest.mark.parametrize("names", [("obj_5", "part"), ("obj_5", "obj_05"), ("obj_0", "obj_1")])

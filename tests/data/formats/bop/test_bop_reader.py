@@ -242,14 +242,19 @@ def test_a_list_of_targets_marks_the_most_visible_instances(scene, block, caplog
     (scene.root / "test_targets_bop19.json").write_text(json.dumps(listed))
     source = BopReader(scene.root, [block(2)], "test", targets="auto")
     assert len(source) == 1
-    assert [one.wanted for one in source.sample(0).instances] == [False, True, False, True]
+    assert [instance.wanted for instance in source.sample(0).instances] == [
+        False,
+        True,
+        False,
+        True,
+    ]
     listed[0]["inst_count"] = 7
     (scene.root / "test_targets_bop19.json").write_text(json.dumps(listed))
     assert "not counted" not in caplog.text
     BopReader(scene.root, [block(2)], "test", targets="auto")
     assert "bop/test: 3 listed instances have no annotation or no model" in caplog.text
     every = BopReader(scene.root, [block(2)], "test")
-    assert [one.wanted for one in every.sample(0).instances] == [None] * 4
+    assert [instance.wanted for instance in every.sample(0).instances] == [None] * 4
     assert len(every) == 2
     (scene.root / "test_targets_bop19.json").unlink()
     assert len(BopReader(scene.root, [block(2)], "test", targets="auto")) == 2
@@ -274,7 +279,7 @@ def test_linemod_occlusion_as_it_is_published(shared_data, caplog):
     parts = bop_parts(root)
     source = BopReader(root, parts, "test")
     rotations = np.array(
-        [one.T_cam_obj[:3, :3] for i in range(3) for one in source.sample(i).instances]
+        [item.T_cam_obj[:3, :3] for i in range(3) for item in source.sample(i).instances]
     )
     errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     assert errors.max() <= 1e-3

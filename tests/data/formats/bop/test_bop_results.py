@@ -66,9 +66,9 @@ def test_what_is_written_is_read_back(seed, count, tmp_path_factory):
     path = tmp_path_factory.mktemp("results") / "out.csv"
     write_results(path, results)
     assert path.read_text().splitlines()[0] == HEADER
-    for one, back in zip(results, read_results(path, {1, 2, 3}), strict=True):
-        np.testing.assert_allclose(back.T_cam_obj, one.T_cam_obj, rtol=0, atol=1e-12)
-        assert vars(back) | {"T_cam_obj": 0} == vars(one) | {"T_cam_obj": 0}
+    for detection, back in zip(results, read_results(path, {1, 2, 3}), strict=True):
+        np.testing.assert_allclose(back.T_cam_obj, detection.T_cam_obj, rtol=0, atol=1e-12)
+        assert vars(back) | {"T_cam_obj": 0} == vars(detection) | {"T_cam_obj": 0}
 
 
 @pytest.mark.parametrize(

@@ -268,12 +268,12 @@ def test_every_habit_is_found(tmp_path, order, unit, habits, frame, caplog):
     with caplog.at_level(logging.INFO):
         source = NddsReader(tmp_path, [BOX, CUBE])
     assert_read(wild, source)
-    found = source.finding.convention
+    result = source.finding.convention
     expected = (order, unit, "opengl" if habits.get("opengl") else "opencv", frame)
-    assert (found.quaternion, found.unit, found.camera, found.frame) == expected
+    assert (result.quaternion, result.unit, result.camera, result.frame) == expected
     assert f"quaternion {','.join(order)}, lengths in {unit}" in caplog.text
     (info,) = source.describe()
-    assert str(found) == info.identity["convention"]
+    assert str(result) == info.identity["convention"]
 
 
 @given(seed=st.integers(0, 2**32 - 1), order=st.sampled_from(["xyzw", "wxyz"]))

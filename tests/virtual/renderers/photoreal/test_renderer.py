@@ -50,13 +50,13 @@ def assert_same_labels(found: Rendered, expected: Rendered) -> None:
 def test_labels_agree_with_the_rasteriser(photoreal, preset, seed):
     parts = [make() for make in BUILTIN.values()]
     scene = Factory(parts, PRESETS[preset].resized(160, 120), seed).scene(0, seed)
-    expected, found = render(scene), photoreal(scene)
-    assert_same_labels(found, expected)
+    expected, result = render(scene), photoreal(scene)
+    assert_same_labels(result, expected)
     # The labels are not the rasteriser's by construction: each renderer casts its own.
-    assert (found.image.dtype, found.depth.dtype) == (np.uint8, np.float32)
-    assert found.instances.dtype == np.int16
+    assert (result.image.dtype, result.depth.dtype) == (np.uint8, np.float32)
+    assert result.instances.dtype == np.int16
     # The same lamps and colours, so about the same picture.
-    assert abs(found.image.astype(float).mean() - expected.image.mean()) < 12
+    assert abs(result.image.astype(float).mean() - expected.image.mean()) < 12
 
 
 @pytest.mark.parametrize(
@@ -71,13 +71,13 @@ def test_labels_agree_with_the_rasteriser(photoreal, preset, seed):
 )
 def test_every_material_renders(photoreal, material, box_part, scene_of):
     scene = scene_of(lying(box_part, 0.1, material=material))
-    found = photoreal(scene)
-    covered = found.instances == 0
+    result = photoreal(scene)
+    covered = result.instances == 0
     assert covered.sum() > 500
-    assert not np.array_equal(found.image[covered], scene.background[covered])
+    assert not np.array_equal(result.image[covered], scene.background[covered])
     away = cv2.dilate(covered.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
-    np.testing.assert_array_equal(found.image[away], scene.background[away])
-    assert_same_labels(found, render(scene))
+    np.testing.assert_array_equal(result.image[away], scene.background[away])
+    assert_same_labels(result, render(scene))
 
 
 def test_a_textured_model_shows_its_texture(photoreal, ycb_root, scene_of):
@@ -85,31 +85,31 @@ def test_a_textured_model_shows_its_texture(photoreal, ycb_root, scene_of):
     T = np.eye(4)
     T[:3, :3], T[2, 3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]], 0.5
     scene = scene_of(SceneObject(make_surface(mesh), T), lights=(Light((0.3, -0.3, 0.0)),))
-    expected, found = render(scene), photoreal(scene)
-    assert_same_labels(found, expected)
+    expected, result = render(scene), photoreal(scene)
+    assert_same_labels(result, expected)
     covered = expected.instances == 0
     for channel in range(3):
-        one, other = (picture.image[covered][:, channel] for picture in (expected, found))
-        assert np.corrcoef(one, other)[0, 1] > 0.9
+        first, other = (picture.image[covered][:, channel] for picture in (expected, result))
+        assert np.corrcoef(first, other)[0, 1] > 0.9
 
 
 def test_no_light_at_all_is_black_and_finite(photoreal, box_part, scene_of):
     dark = Ambient(above=(0.0, 0.0, 0.0), below=(0.0, 0.0, 0.0))
     scene = on_table(scene_of(lying(box_part, 0.01), lights=(), ambient=dark))
-    found = photoreal(scene)
-    inside = found.instances == 0
-    assert (np.percentile(found.image[inside], 90) == 0).all()
+    result = photoreal(scene)
+    inside = result.instances == 0
+    assert (np.percentile(result.image[inside], 90) == 0).all()
     # Without light there is nothing that an object could keep from the table.
-    np.testing.assert_array_equal(found.image[:4], scene.background[:4])
+    np.testing.assert_array_equal(result.image[:4], scene.background[:4])
 
 
 def test_the_table_is_darker_near_the_contact(photoreal, box_part, scene_of):
     scene = on_table(scene_of(lying(box_part, 0.01), lights=()))
-    found = photoreal(scene)
-    assert found.depth[0, 0] == pytest.approx(0.5, abs=1e-6)
-    row = np.flatnonzero((found.instances == 0).any(axis=1))[-1]
+    result = photoreal(scene)
+    assert result.depth[0, 0] == pytest.approx(0.5, abs=1e-6)
+    row = np.flatnonzero((result.instances == 0).any(axis=1))[-1]
     column = scene.size[0] // 2
-    below = found.image[row + 2 :, column].astype(float).mean(axis=1)
+    below = result.image[row + 2 :, column].astype(float).mean(axis=1)
     assert below[0] < 80  # of a background of 90
     assert below[0] < below[6] < below[20] + 1.0
 
@@ -118,10 +118,13 @@ def test_a_shadow_falls_away_from_its_lamp(photoreal, box_part, scene_of):
     dim = Ambient(above=(0.02, 0.02, 0.02), below=(0.02, 0.02, 0.02))
     lamp = Light((-0.4, 0.0, 0.2))
     scene = on_table(scene_of(lying(box_part, 0.03), lights=(lamp,), ambient=dim))
-    found, expected = photoreal(scene), render(scene)
-    columns = np.flatnonzero((found.instances == 0).any(axis=0))
+    result, expected = photoreal(scene), render(scene)
+    columns = np.flatnonzero((result.instances == 0).any(axis=0))
     row = scene.size[1] // 2
-    left, right = found.image[row, columns[0] - 4].mean(), found.image[row, columns[-1] + 4].mean()
+    left, right = (
+        result.image[row, columns[0] - 4].mean(),
+        result.image[row, columns[-1] + 4].mean(),
+    )
     assert right < 45 < left
     assert right == pytest.approx(expected.image[row, columns[-1] + 4].mean(), abs=15)
 
@@ -152,11 +155,11 @@ def test_pixels_that_are_not_square(photoreal, box_part, scene_of):
     K[0, 0] *= 1.3
     K[0, 1] = 5.0
     scene = replace(scene, K=K)
-    expected, found = render(scene), photoreal(scene)
-    assert_same_labels(found, expected)
+    expected, result = render(scene), photoreal(scene)
+    assert_same_labels(result, expected)
     covered = expected.instances == 0
     # The picture stands where the labels do.
-    changed = (found.image != scene.background).any(axis=2)
+    changed = (result.image != scene.background).any(axis=2)
     assert (changed & covered).sum() > 0.97 * covered.sum()
     near = cv2.dilate(covered.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     assert not (changed & ~near).any()
@@ -196,10 +199,10 @@ def test_vertex_colours_are_the_rasterisers(photoreal, scene_of):
     item = SceneObject(make_surface(mesh), T, Material((0.8, 0.8, 0.8), 1.0, 0.0))
     even = Ambient(above=(0.6,) * 3, below=(0.6,) * 3)
     scene = scene_of(item, lights=(), ambient=even)
-    expected, found = render(scene), photoreal(scene)
-    covered = (expected.instances == 0) & (found.instances == 0)
-    apart = expected.image[covered].astype(int) - found.image[covered]
+    expected, result = render(scene), photoreal(scene)
+    covered = (expected.instances == 0) & (result.instances == 0)
+    apart = expected.image[covered].astype(int) - result.image[covered]
     assert np.abs(np.median(apart, axis=0)).max() < 8
     for channel in range(3):
-        one, other = (picture.image[covered][:, channel] for picture in (expected, found))
-        assert np.corrcoef(one, other)[0, 1] > 0.95
+        first, other = (picture.image[covered][:, channel] for picture in (expected, result))
+        assert np.corrcoef(first, other)[0, 1] > 0.95

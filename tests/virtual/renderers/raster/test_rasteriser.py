@@ -203,8 +203,8 @@ def plate(surface_of):
     ids=["whole", "side by side", "half", "hidden or outside", "behind"],
 )
 def test_the_visible_share_of_every_object(scene_of, plate, places, fractions):
-    found = render(scene_of(*(at(plate, *place) for place in places), **LARGE)).visible_fractions
-    np.testing.assert_allclose(found, fractions, atol=0.005 if 0.5 in fractions else 0)
+    result = render(scene_of(*(at(plate, *place) for place in places), **LARGE)).visible_fractions
+    np.testing.assert_allclose(result, fractions, atol=0.005 if 0.5 in fractions else 0)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.25])
