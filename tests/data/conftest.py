@@ -14,8 +14,8 @@ import scipy.io
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from dopepp.data.rendered import rendered_sample
 from dopepp.data.render_job import make_job
+from dopepp.data.rendered import rendered_sample
 from dopepp.data.sample import Instance, Sample, SourceInfo
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
 from dopepp.geometry.cuboid import cuboid_keypoints
