@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
+from dopepp.data import render_preview
 from dopepp.data.render_job import make_job
 from dopepp.data.render_preview import preview_sheet, scene_tiles, write_preview
 
