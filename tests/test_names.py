@@ -6,8 +6,6 @@ import ast
 from collections import defaultdict
 from pathlib import Path
 
-import pytest
-
 import dopepp
 
 PACKAGE = Path(dopepp.__file__).parent
@@ -15,8 +13,6 @@ SOURCES = {path.relative_to(PACKAGE): path.read_text() for path in sorted(PACKAG
 TREES = {path: ast.parse(text) for path, text in SOURCES.items()}
 MAX_ONE = 20
 MAX_FMT_SKIP = 40
-
-unfinished = pytest.mark.xfail(strict=False, reason="other packages still have such names")
 
 
 def module_name(path: Path) -> str:
@@ -30,7 +26,6 @@ def collisions(places: dict[str, list[str]]) -> dict[str, list[str]]:
     return {name: paths for name, paths in public.items() if len(paths) > 1}
 
 
-@unfinished
 def test_modules_have_distinct_names() -> None:
     modules: dict[str, list[str]] = defaultdict(list)
     for path in SOURCES:
@@ -38,7 +33,6 @@ def test_modules_have_distinct_names() -> None:
     assert collisions(modules) == {}
 
 
-@unfinished
 def test_public_classes_have_distinct_names() -> None:
     classes: dict[str, list[str]] = defaultdict(list)
     for path, tree in TREES.items():
@@ -48,7 +42,6 @@ def test_public_classes_have_distinct_names() -> None:
     assert collisions(classes) == {}
 
 
-@unfinished
 def test_variables_are_rarely_called_one() -> None:
     nodes = [(path, node) for path, tree in TREES.items() for node in ast.walk(tree)]
     bound = [
@@ -60,7 +53,6 @@ def test_variables_are_rarely_called_one() -> None:
     assert len(bound) <= MAX_ONE, bound
 
 
-@unfinished
 def test_formatter_is_rarely_overridden() -> None:
     skips = {str(path): text.count("# fmt: skip") for path, text in SOURCES.items()}
     assert sum(skips.values()) <= MAX_FMT_SKIP, {path: num for path, num in skips.items() if num}
