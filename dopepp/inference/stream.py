@@ -63,8 +63,9 @@ def stream(
     """
     limited = [name for name in ("distances", "roi", "depth") if options.get(name) is not None]
     if options.get("track") and limited:
-        problem = "--track with --distance, --roi or --depth"
-        raise UserError(problem, "--track alone", "leave it out")
+        names = " and ".join(f"--{name.removesuffix('s')}" for name in limited)
+        allowed = "--track without --distance, --roi and --depth"
+        raise UserError(f"--track with {names}", allowed, f"leave out --track or {names}")
     stride = check("stride", options.get("stride", 1), int, Range(1, 1_000_000))
     least_score = check("least_score", options.get("least_score", 0.0), float, Range(0, 1))
     shapes = {part.name: make_shape(part) for part in estimator.solid_parts}

@@ -123,7 +123,9 @@ def symmetry_transforms(part: Part) -> Float[Tensor, "s 4 4"]:
 
 
 def bop_points(part: Part) -> Float[Tensor, "v 3"]:
-    """Return the points of BOP's scores: the mesh's vertices, or the ADD points without a mesh.
+    """Return the points on which BOP's scores are computed.
+
+    These are the mesh's vertices, or the ADD points if the part has no mesh.
 
     Surface samples miss the corners, which have the largest distances.
     """

@@ -217,7 +217,8 @@ def same_conv(
 
 def _weights_file(path: object) -> str:
     if not isinstance(path, str):
-        raise UserError(f"weights_path={path!r:.200}", f"a file's path or {IMAGENET}", "correct it")
+        allowed = f"a file path, or the word {IMAGENET}"
+        raise UserError(f"weights_path={path!r:.200}", allowed, "set weights_path to one of these")
     if path != IMAGENET:
         return path
     # Not imported, because only its file is needed.

@@ -107,10 +107,11 @@ class PoseNetwork(nn.Module):
 
 
 def network_cost(network: nn.Module, input_size: tuple[int, int]) -> tuple[int, float]:
-    """Return the number of parameters and of 10⁹ multiply–accumulates for one image.
+    """Return the number of parameters, and the multiply–accumulates per image in units of 10⁹.
 
-    The forward pass runs on the ``meta`` device, so it takes milliseconds and changes no
-    statistics. Convolutions and matrix products are counted, elementwise operations are not.
+    The forward pass runs on the ``meta`` device, so it takes milliseconds and leaves the batch
+    norm statistics unchanged. Convolutions and matrix products are counted; elementwise operations
+    are not.
 
     Args:
         network: Network to measure.
@@ -119,7 +120,7 @@ def network_cost(network: nn.Module, input_size: tuple[int, int]) -> tuple[int, 
     tensors = {**dict(network.named_parameters()), **dict(network.named_buffers())}
     shapes = {name: tensor.to("meta") for name, tensor in tensors.items()}
     width, height = input_size
-    # In training mode, batch norm rejects maps of one cell, as small inputs have.
+    # In training mode, batch norm rejects the 1×1 maps that small inputs produce.
     training = {module: module.training for module in network.modules()}
     network.eval()
     counter = FlopCounterMode(display=False)

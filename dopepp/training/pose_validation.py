@@ -207,7 +207,7 @@ class BeliefMaps(ValidationSheet):
         super().__init__(num_images)
 
     def tiles(self, system: PoseSystem, outputs: ValidationOutput, batch: Batch) -> Sequence[Tile]:
-        """Return each image twice: under the beliefs of corners and of the centroid."""
+        """Return each image twice: overlaid with the belief maps of corners and of the centroid."""
         images = batch.images.permute(0, 2, 3, 1).cpu().numpy()
         shape = (len(images), -1, NUM_KEYPOINTS, *outputs.belief.shape[-2:])
         beliefs = outputs.belief.reshape(shape).amax(dim=1).cpu().numpy()

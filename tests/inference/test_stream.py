@@ -69,7 +69,7 @@ def test_a_video_is_followed(estimator, clip, K):
         ({"K": np.eye(3)}, "field of view"),
         ({"K": np.eye(3), "stride": 0}, "stride=0"),
         ({"K": np.eye(3), "least_score": 2}, "least_score=2"),
-        ({"K": np.eye(3), "track": True, "roi": (0, 0, 9, 9)}, "--track alone"),
+        ({"K": np.eye(3), "track": True, "roi": (0, 0, 9, 9)}, "leave out --track or --roi"),
         ({"K": np.eye(3), "depth": "d.png"}, "--depth with 4 pictures"),
     ],
 )

@@ -47,7 +47,7 @@ FULL_WIDTH = "with width=1 and batch_norm=false"
         (EfficientNetLite, {"width": 0}, "width=0"),
         (EfficientNetLite, {"frozen": 4}, "frozen=4; allowed: 0, 8, 16 or 32"),
         (EfficientNetLite, {"frozen": False}, "frozen=False"),
-        (EfficientNetLite, {"weights_path": 3}, "weights_path=3; allowed: a file's path or image"),
+        (EfficientNetLite, {"weights_path": 3}, "weights_path=3; allowed: a file path, or the wo"),
         (EfficientNetLite, {"weights_path": "missing.pth"}, "missing.pth, which is no file"),
         (Cascade, {"stages": 0}, "stages=0; allowed: an integer from 1 to 12"),
         (Cascade, {"stages": True}, "stages=True"),

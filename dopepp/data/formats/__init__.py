@@ -129,7 +129,7 @@ def by_line(content: Mapping[str, object]) -> bytes:
 
 
 def stage(path: Path, content: bytes) -> None:
-    """Write a staged item, even if a finalizer removes the empty folder meanwhile."""
+    """Write an item to the staging folder; retry if another process removes the folder."""
     _retry(lambda: write_whole(path, content))
 
 

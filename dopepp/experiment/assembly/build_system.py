@@ -226,17 +226,24 @@ def choose_precision(asked: str, accelerator: str) -> tuple[str, str]:
     on the hardware only, not on timings, so runs are repeatable.
     """
     if asked != "auto":
-        return asked, "as asked"
+        return asked, "as requested"
     if accelerator == "cuda":
         fast = torch.cuda.is_bf16_supported(including_emulation=False)
-        return ("bf16-mixed", "this GPU has bf16") if fast else ("32-true", "this GPU has no bf16")
+        return (
+            ("bf16-mixed", "this GPU supports bf16")
+            if fast
+            else ("32-true", "this GPU has no bf16")
+        )
     if accelerator != "cpu":
-        return "32-true", f"bf16 is not probed on {accelerator}"
+        return "32-true", f"bf16 support is not checked on {accelerator}"
     useful = _BF16_FLAGS | ({_AMD_BF16_FLAG} if cpu_fact("vendor_id") == "AuthenticAMD" else set())
     fast = useful & set(cpu_fact("flags", "Features").split())
     if fast:
-        return "bf16-mixed", f"this CPU is fast in bf16 ({', '.join(sorted(fast))})"
-    return "32-true", "no fast bf16 arithmetic in this CPU: training takes up to four times as long"
+        return "bf16-mixed", f"this CPU has fast bf16 instructions ({', '.join(sorted(fast))})"
+    return (
+        "32-true",
+        "this CPU has no fast bf16 instructions: training takes up to four times as long",
+    )
 
 
 def keep_freed_memory() -> None:

@@ -84,12 +84,13 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     asked = EvaluationConfig.of(config)
     extensions.enable(asked.extensions)
     if asked.ckpt_path is None and asked.results is None:
-        allowed = "ckpt_path=… or results=… on the command line"
-        raise UserError("no ckpt_path", allowed, "add what is to be measured")
+        fix = "give a checkpoint, or a file of poses"
+        raise UserError("neither ckpt_path nor results", "ckpt_path=…, results=… or both", fix)
     paths = [path for path in (asked.baseline, asked.ckpt_path) if path is not None]
     if asked.refine is not None and not paths:
-        allowed = "refine=… of a checkpoint: a file's poses are measured as they are"
-        raise UserError(f"refine={asked.refine} without ckpt_path", allowed, "leave refine out")
+        allowed = "refine=… together with ckpt_path=… (poses from a file are not refined)"
+        fix = "leave out refine, or add ckpt_path"
+        raise UserError(f"refine={asked.refine} without ckpt_path", allowed, fix)
     device = asked.device
     if device == "auto":
         exported = any(is_export(Path(path)) for path in paths)

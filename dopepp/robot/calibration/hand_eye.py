@@ -195,8 +195,8 @@ def _covariances(
     M: Transforms, X: Transform, Y: Transform, seen: Covariances, robot: Noise
 ) -> Covariances:
     """Return the covariances of the residuals: those of the pictures plus the robot's."""
-    # A small rotation (about the origin of the camera's mount) and shift of the robot's pose move
-    # the board by this Jacobian, camera axes.
+    # Jacobian of the board's pose, in camera axes, with respect to a small rotation (about the
+    # origin of the camera's mount) and translation of the robot's pose.
     to_cam = X[:3, :3].T
     jacobian = np.zeros((len(M), 6, 6))
     jacobian[:, :3, :3] = jacobian[:, 3:, 3:] = to_cam

@@ -138,9 +138,9 @@ def make_experiment(
     write_report(folder, records, facts)
     if all(record.failure == "no plan" for record in records):
         raise UserError(
-            f"{task.grasps or task.part}: none of its grasps is reachable in {count} trials",
-            "grasps from above, for a face on which the part lies",
-            "find some with `dopepp grasp propose`, or change --rest",
+            f"{task.grasps or task.part}, whose grasps were not reachable in any of {count} trials",
+            "grasps from above that suit the face on which the part rests",
+            "generate grasps with `dopepp grasp propose`, or change --rest",
         )
     show(task, records, folder, video, rerun)
     return markdown(records, facts)

@@ -229,8 +229,8 @@ def _ros_errors(what: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # rclpy raises many types
-        allowed = "names and values that ROS 2 accepts"
-        raise UserError(f"{what}: {error!s:.300}", allowed, "correct the value") from error
+        allowed = "a running ROS 2, and names and values that it accepts"
+        raise UserError(f"{what}: {error!s:.300}", allowed, f"correct {what}") from error
 
 
 class Slot(Generic[Item]):

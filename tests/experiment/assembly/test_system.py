@@ -36,7 +36,7 @@ def test_bf16_is_taken_only_where_it_is_fast(
     monkeypatch.setattr(built, "cpu_fact", lambda *names: facts[names])
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: gpu_is_fast)
     assert choose_precision("auto", accelerator)[0] == expected
-    assert choose_precision("16-mixed", accelerator) == ("16-mixed", "as asked")
+    assert choose_precision("16-mixed", accelerator) == ("16-mixed", "as requested")
 
 
 def test_the_estimate_grows_with_the_run_and_leaves_the_network_alone(tiny):

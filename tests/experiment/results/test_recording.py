@@ -127,13 +127,13 @@ def test_a_file_that_does_not_fit_the_data(root, composed, tmp_path):
 
 
 def test_an_evaluation_needs_something_to_measure(composed, tmp_path):
-    with pytest.raises(UserError, match=r"got no ckpt_path; allowed: ckpt_path=… or results=…"):
+    with pytest.raises(UserError, match=r"got neither ckpt_path nor results; allowed: ckpt_path=…"):
         run_evaluation(composed(config="evaluate"), tmp_path)
     with pytest.raises(UserError, match=r"x\.csv, which names no data; .*data=…"):
         run_evaluation(composed("results=x.csv", config="evaluate"), tmp_path)
     with pytest.raises(UserError, match=r"x\.csv, which does not say how to render"):
         run_evaluation(composed("results=x.csv", "data=virtual", config="evaluate"), tmp_path)
-    with pytest.raises(UserError, match=r"got refine=region without ckpt_path; .*leave refine out"):
+    with pytest.raises(UserError, match=r"got refine=region without ckpt_path; .*leave out refine"):
         run_evaluation(composed("results=x.csv", "refine=region", config="evaluate"), tmp_path)
     assert not list(tmp_path.iterdir())
 

@@ -314,16 +314,16 @@ def _check_counts(
         for field in ("px_count_all", "px_count_visib")
     )
     if count < 0 or count > total:
-        node["px_count_visib"].report(f"{count:g} of {total:g} pixels")
+        node["px_count_visib"].report(f"{count:g} pixels, but px_count_all is {total:g}")
     elif fraction is not None and total > 0:
         slack = FRACTION_TOLERANCE + 1 / np.sqrt(total)
         if abs(count / total - fraction) > slack:
-            message = f"{fraction:.3g}, the pixel counts say {count / total:.3g}"
+            message = f"{fraction:.3g}, but the pixel counts give {count / total:.3g}"
             node["visib_fract"].report(message)
     if visible is not None:
         pixels = int(np.count_nonzero(visible))
         if abs(pixels - count) > PIXEL_TOLERANCE * max(pixels, count) + np.sqrt(pixels):
-            node["px_count_visib"].report(f"{count:g}, mask_visib has {pixels} pixels")
+            node["px_count_visib"].report(f"{count:g}, but mask_visib has {pixels} pixels")
 
 
 def _check_boxes(node: Node, info: Mapping[str, Any], seen: Box | None) -> Box | None:
@@ -338,5 +338,5 @@ def _check_boxes(node: Node, info: Mapping[str, Any], seen: Box | None) -> Box |
     if seen is not None and box is not None:
         distance = max(abs(a - b) for a, b in zip(seen, box, strict=True))
         if distance > BOX_EDGE_PX:
-            node["bbox_visib"].report(f"{box}, mask_visib has {seen}")
+            node["bbox_visib"].report(f"{box}, but mask_visib has {seen}")
     return seen or box

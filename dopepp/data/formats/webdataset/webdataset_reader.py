@@ -128,7 +128,7 @@ class WebdatasetReader:
         return False
 
     def describe(self) -> list[SourceInfo]:
-        """Describe the images by hashes of sizes and objects, and the fractions' origin."""
+        """Describe the data by hashes of files and objects, and the origin of the fractions."""
         digest, stated = hashlib.sha256(), True
         for number, image in self._items.tolist():
             shard = self._shards[number]
@@ -208,8 +208,10 @@ def _check_keys(shards: Sequence[ShardIndex]) -> None:
     owners: dict[str, Path] = {}
     for shard in shards:
         if twice := [key for key in shard.keys if key in owners]:
-            problem = f"{shard.path} with {len(twice)} keys of {owners[twice[0]]}, e.g. {twice[:3]}"
-            raise UserError(problem, "each key in one shard", "write or download the shard again")
+            other = owners[twice[0]]
+            problem = f"{shard.path} with {len(twice)} keys of {other}, e.g. {', '.join(twice[:3])}"
+            fix = "remove the duplicate shard, or write it again"
+            raise UserError(problem, "each key in only one shard", fix)
         owners |= dict.fromkeys(shard.keys, shard.path)
 
 

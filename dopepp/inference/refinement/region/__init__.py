@@ -239,11 +239,11 @@ def _coarse_end(coarse: Round, start: Transform, prior: Prior, reach: float) -> 
 
 
 def _necessary(rounds: Sequence[Round], reach: float) -> Sequence[Round]:
-    """Leave out rounds that search farther than necessary: tracked parts need the last one only."""
+    """Drop the rounds that search farther than necessary; a tracked part needs only the last."""
     while len(rounds) > 1 and rounds[1].farthest(reach) >= ENOUGH * reach:
         rounds = rounds[1:]
     if len(rounds) == 1 and rounds[0].farthest(reach) < reach:
-        # Colours are learned better at the end of the first pass.
+        # Run it twice: the second pass learns the colours from a better pose.
         return [*rounds, *rounds]
     return rounds
 

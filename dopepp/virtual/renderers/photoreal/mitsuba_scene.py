@@ -276,7 +276,7 @@ def pixel_rays(K: CameraMatrix, window: Box) -> Float[np.ndarray, "height width 
 def cast(
     mi: Any, world: Any, shapes: list[Any], rays: Float[np.ndarray, "height width 3"]
 ) -> tuple[Float32[np.ndarray, "height width"], Int16[np.ndarray, "height width"]]:
-    """Return depth (0 without a hit) and the index of the shape that each ray hits (−1 without).
+    """Return the depth (0 if nothing is hit) and the index of the shape of each ray (−1 if none).
 
     ``rays`` are points at depth 1 m; hits nearer than ``NEAR`` are ignored.
     """
@@ -290,7 +290,7 @@ def cast(
                 distance[index] = hit.t
                 numbers[index] = next(k for k, shape in enumerate(shapes) if shape == hit.shape)
     else:
-        # Directions of unit depth make distances depths.
+        # The directions have z = 1, so the distance along a ray is its depth.
         origins, directions = mi.Point3f(flat.T * np.float32(NEAR)), mi.Vector3f(flat.T)
         hit = world.ray_intersect_preliminary(mi.Ray3f(origins, directions), coherent=True)
         owners = mi.Int32(-1)
