@@ -296,6 +296,6 @@ import sys
 from typer.testing import CliRunner
 from dopepp.cli import app
 done = CliRunner().invoke(app, [{", ".join(map(repr, verb))}, {str(picture)!r}])
-print(done.exit_code, {{"torch", "numba", "scipy"}} & set(sys.modules), done.stderr)
+print(done.exit_code, {{"torch", "numba", "scipy.spatial"}} & set(sys.modules), done.stderr)
 """
     assert command("-c", code).out.startswith("2 set() got neither --K nor --camera")

@@ -83,7 +83,7 @@ def test_wrong_input_is_one_line(refused, folder, options, line):
 
 
 def test_a_page_that_cannot_be_served_is_one_line(refused, monkeypatch):
-    assert "region, or none" in refused("serve", MODEL, "--refine", "depth")
+    assert "allowed: region;" in refused("serve", MODEL, "--refine", "depth")
     assert "--help" in refused("serve", MODEL, "--port", "0")
     monkeypatch.setattr(errors, "find_spec", lambda name: None)
     assert "pip install 'dopepp[web]'" in refused("serve", MODEL)
