@@ -75,7 +75,7 @@ def parse_calibration(text: str, source: str) -> Calibration:
     elif text.startswith("{"):
         content = parse_json(text, source)
     else:
-        # OpenCV writes a first line and tags of its own; an echoed message ends in a line.
+        # OpenCV adds a %YAML line and its own tags; `rostopic echo` ends a message with ---.
         text = re.sub(r"\A%YAML.*\n", "", text).removesuffix("---")
         content = parse_yaml(re.sub(r"!!opencv-(nd-)?matrix\b", "", text), source)
     if not isinstance(content, Mapping):
@@ -206,7 +206,7 @@ def _size(fields: _Fields) -> Size | None:
         return None
     if width is None or height is None:
         missing = "image_height" if width else "image_width"
-        raise UserError(f"{fields.source} without {missing}", "both or none", f"add {missing}")
+        raise UserError(f"{fields.source} without {missing}", "both or neither", f"add {missing}")
     return _side(*width), _side(*height)
 
 

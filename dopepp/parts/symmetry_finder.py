@@ -173,7 +173,7 @@ class Candidates:
         self._probes = surface.spread(400, seed=2)[0]
 
     def axes(self, order: int) -> Iterator[Vector]:
-        """Yield refined axes of a prime order by ascending rough distance."""
+        """Yield refined symmetry axes of a prime order, smallest coarse distance first."""
         turns = axis_rotation(self._axes, 2 * np.pi / order)
         change = turns @ self._moments @ np.swapaxes(turns, 1, 2) - self._moments
         scale = np.linalg.norm(self._moments)

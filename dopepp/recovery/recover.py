@@ -75,7 +75,7 @@ def recover(
     names: Sequence[str] | None = None,
     **options: float,
 ) -> list[Detection]:
-    """Recover the poses of all objects on one image from its maps.
+    """Recover the poses of all objects in one image from its maps.
 
     Args:
         belief: 9·C belief maps of C objects, peaks of 1.

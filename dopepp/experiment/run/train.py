@@ -237,7 +237,7 @@ def _resume_path(
     resume = config.resume
     if resume is None:
         if config.resume_anyway:
-            raise UserError("resume_anyway=true without resume", "resume=RUN beside it", "add it")
+            raise UserError("resume_anyway=true without resume", "only with resume", "set resume")
         return None, []
     run_dir = Path(resume)
     newest = newest_checkpoint(run_dir)

@@ -54,7 +54,7 @@ class Crop:
 
     @cached_property
     def bins(self) -> Int[np.ndarray, "height width"]:
-        """Colour bins, computed on first use: rounds may be left out."""
+        """Colour bins, computed on first use, as a refinement round may be skipped."""
         return colour_bins(self.colours)
 
 

@@ -125,7 +125,7 @@ def descend(
     """Take Gauss–Newton steps on the prior and the terms from a start pose.
 
     Returns:
-        The end after at most ``steps`` steps; None if a term has no evidence.
+        The solution after at most ``steps`` steps; None if a term has no evidence.
     """
     pose, information = T_cam_obj, prior.information
     step = np.empty(6)

@@ -175,7 +175,7 @@ def read_glb(path: Path) -> RawMesh:
 
 
 def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """Return the JSON and the binary chunk; trimesh accepts files without the latter."""
+    """Return the JSON and binary chunks; both are required, unlike in trimesh."""
     magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)
     if (magic, version, kind, length) != (b"glTF", 2, b"JSON", len(data)):
         raise ValueError(f"{len(data)} bytes, not the {length} of a GLB file of version 2")
@@ -184,7 +184,7 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
     start = 20 + size + 8
     size, kind = struct.unpack_from("<I4s", data, start - 8)
     if kind != b"BIN\0" or start + size > len(data):
-        raise ValueError(f"no binary chunk, or one of less than its {size} bytes")
+        raise ValueError(f"binary chunk missing or shorter than its stated {size} bytes")
     return json.loads(data[20 : start - 8]), data[start : start + size]
 
 

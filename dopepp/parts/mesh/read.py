@@ -45,9 +45,9 @@ MANY_CAVITIES: Final = 1000
 
 
 def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
-    """Read an STL, OBJ, PLY, GLB, 3MF or OFF file in metres.
+    """Read an STL, OBJ, PLY, GLB, 3MF or OFF file, and convert it to metres.
 
-    Duplicate STL vertices are merged, flat triangles dropped, and triangles oriented consistently.
+    Duplicate STL vertices are merged, zero-area triangles dropped, and the rest oriented alike.
     Edges may be open, and triangles may intersect each other. OBJ, PLY and GLB files may have a
     texture, PLY files also colours and normals.
 

@@ -155,9 +155,9 @@ def _check_motion(T: Transforms, what: str, source: str) -> None:
     largest = Rotation.from_matrix(between).magnitude().max(initial=0.0)
     if largest < MIN_TURN:
         raise UserError(
-            f"{source}: the {what} rotates by {np.degrees(largest):.1f}° in all {len(T)} poses",
-            "rotations of 30° and more about different axes",
-            "record the poses while the robot moves between pictures",
+            f"{source}: the {what} rotates by {np.degrees(largest):.1f}° over all {len(T)} poses",
+            "rotations of at least 30° about different axes",
+            "turn the robot between pictures, and record each picture's pose",
         )
 
 

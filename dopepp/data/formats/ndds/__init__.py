@@ -97,7 +97,7 @@ def parse_object(item: Mapping[str, Any], node: Node) -> NddsObject:
     quaternion = take("quaternion_xyzw", 4)
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > _NORM_TOLERANCE:
-        node["quaternion_xyzw"].report(f"no rotation: norm {norm:.4g}", "a quaternion of norm 1")
+        node["quaternion_xyzw"].report(f"norm {norm:.4g}", "a quaternion of norm 1")
         quaternion = np.full(4, np.nan)
     corners_px, cuboid = take_corners("projected_cuboid", 2), take_corners("cuboid", 3)
     centroid = None if cuboid is None else cuboid.mean(axis=0)

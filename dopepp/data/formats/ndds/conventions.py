@@ -192,7 +192,7 @@ def find_convention(observations: Sequence[Observation], where: str) -> NddsFind
 
     Raises:
         UserError: No convention fits three quarters of the instances within 5 px, or two that give
-            different poses fit alike.
+            different poses fit equally well.
     """
     errors = {
         convention: _most([observation.error_px(convention) for observation in observations])
@@ -208,7 +208,7 @@ def find_convention(observations: Sequence[Observation], where: str) -> NddsFind
     others = [rival for rival in rivals if rival not in alike]
     rival_px = min((errors[rival] for rival in others), default=np.inf)
     if rival_px < _RATIO * errors[best] + _ROUNDING_PX:
-        raise _undecidable(where, "two conventions fit alike", [best, *others[:5]], errors)
+        raise _undecidable(where, "two conventions fit equally well", [best, *others[:5]], errors)
     undecided = tuple(rival for rival in alike if replace(rival, frame=best.frame) != best)
     return NddsFinding(best, errors[best], rival_px, undecided, len(observations))
 

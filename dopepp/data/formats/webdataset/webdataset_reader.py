@@ -267,7 +267,7 @@ def _local(path: Path) -> list[Path]:
     if shards:
         return shards
     lack = "a folder without *.tar" if path.is_dir() else "no such file or folder"
-    allowed = "a folder of shard-000000.tar, …, a shard, or a URL"
+    allowed = "a folder of shards (*.tar), a single shard, or a URL"
     raise UserError(f"shards {path}, {lack}", allowed, "correct data.root or image_sets")
 
 
