@@ -94,7 +94,7 @@ def test_grasps_that_are_not_reached_are_told(run, tmp_path):
     (tmp_path / "below.yaml").write_text(f"part: pivconnector\ngrasps: [{below}]\n")
     words = ["--poses", "exact", "-n", 2, "--grasps", tmp_path / "below.yaml", "--workers", 1]
     done = run("grasp", *words, "--out", tmp_path / "out", code=2)
-    assert "none of its grasps is reachable" in done.output
+    assert "whose grasps were not reachable in any" in done.output
 
 
 def test_without_the_extra_it_says_which(refused, tmp_path, monkeypatch):
