@@ -271,8 +271,8 @@ NDDS = {
 
     "unknown class": read(f"{OBJECT}.class", "ball", "objects[0].class: unknown object 'ball'"),
     "class of number": Case(f"{OBJECT}.class", 5, "objects[0].class: 5"),
-    "no rotation": read(f"{OBJECT}.quaternion_xyzw", times(1.1), "quaternion_xyzw: no rotation"),
-    "zero rotation": Case(f"{OBJECT}.quaternion_xyzw", times(0), "quaternion_xyzw: no rotation"),
+    "no rotation": read(f"{OBJECT}.quaternion_xyzw", times(1.1), "quaternion_xyzw: norm"),
+    "zero rotation": Case(f"{OBJECT}.quaternion_xyzw", times(0), "quaternion_xyzw: norm"),
     "short rotation": Case(f"{OBJECT}.quaternion_xyzw", [1, 0], "[0].quaternion_xyzw: [1, 0]"),
     "no location": Case(f"{OBJECT}.location", None, "objects[0].location: missing"),
     "location of words": Case(f"{OBJECT}.location", ["a", "b", "c"], "objects[0].location: ['a'"),
