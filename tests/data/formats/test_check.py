@@ -207,7 +207,7 @@ BOP = {
     "depth scale": Case(f"{CAMERA}:0.depth_scale", 0, "0.depth_scale: 0"),
     "no depth scale": read(f"{CAMERA}:0.depth_scale", None, "0.depth_scale: missing"),
     "fraction": Case(f"{INFO}:0.0.visib_fract", 1.5, "0[0].visib_fract: 1.5"),
-    "fraction and counts": read(f"{INFO}:0.1.visib_fract", 0.2, "0[1].visib_fract: 0.2, but the pixel"),
+    "fraction and counts": read(f"{INFO}:0.1.visib_fract", 0.2, "0[1].visib_fract: 0.2, but"),
     "counts": read(f"{INFO}:0.1.px_count_visib", times(1.5), "0[1].px_count_visib"),
     "visible box": read(f"{INFO}:0.1.bbox_visib", [0, 0, 20, 20], "0[1].bbox_visib:"),
     "box short": read(f"{INFO}:0.1.bbox_obj", [0], "0[1].bbox_obj: [0]"),
