@@ -195,8 +195,8 @@ def _outputs(
         drawn = np.asarray(
             cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         )
-    said = _message(message, is_error=not detections)
-    return drawn, said, rows, _button(file), belief_sheet(estimator, image, K)
+    summary = _message(message, is_error=not detections)
+    return drawn, summary, rows, _button(file), belief_sheet(estimator, image, K)
 
 
 def _camera(kind: str, inputs: Sequence[Any], width: int, height: int) -> Camera:
