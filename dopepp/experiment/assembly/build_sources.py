@@ -50,7 +50,7 @@ _TRAINING_SHARE: Final = 0.8
 
 def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModule:
     """Build training images from ``seed`` and held-out images from ``data.eval_seed``."""
-    backgrounds = find_backgrounds(data.virtual.backgrounds)
+    backgrounds = find_backgrounds(data.virtual.backgrounds, "train")
     val = held_out_source(data, parts, "val")
     if data.virtual.view is not None and isinstance(val, RenderedSource):
         val = validation_windows(data, parts)

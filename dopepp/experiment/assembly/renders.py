@@ -23,14 +23,14 @@ from dopepp.virtual.presets import Preset
 
 def training_renders(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
     """Render the training images at the size of the network's input, which saves time."""
-    factory = _factory(data, parts, seen_preset(data), seed, data.virtual.renderer)
+    factory = _factory(data, parts, seen_preset(data), seed, "train")
     source = RenderedSource(factory, data.samples_per_epoch)
     return kept(source, data, data.cache, data.network_input)
 
 
 def validation_windows(data: DataConfig, parts: Parts) -> DescribedSource:
     """Render the validation images of the user's camera in the windows that training uses."""
-    factory = _factory(data, parts, seen_preset(data), data.eval_seed, data.virtual.renderer)
+    factory = _factory(data, parts, seen_preset(data), data.eval_seed, "val")
     return RenderedSource(factory, data.num_val, "val")
 
 
@@ -45,7 +45,7 @@ def held_out_renders(
     preset, view = data.preset, data.virtual.view
     if view is not None:
         preset = view.whole(preset, data.virtual.camera_scale or 1.0)
-    factory = _factory(data, parts, preset, data.eval_seed, renderer)
+    factory = _factory(data, parts, preset, data.eval_seed, split, renderer)
     name = "virtual" if renderer == "raster" else renderer
     return kept(RenderedSource(factory, count, split, name, scale), data, cache, None)
 
@@ -116,12 +116,19 @@ def seen_preset(data: DataConfig) -> Preset:
     return preset.resized(box.width, box.height)
 
 
-def _factory(data: DataConfig, parts: Parts, preset: Preset, seed: int, renderer: str) -> Factory:
+def _factory(
+    data: DataConfig,
+    parts: Parts,
+    preset: Preset,
+    seed: int,
+    split: Split,
+    renderer: str | None = None,
+) -> Factory:
     return Factory(
         parts,
         preset,
         seed,
-        find_backgrounds(data.virtual.backgrounds),
-        renderer=renderer,
+        find_backgrounds(data.virtual.backgrounds, split),
+        renderer=renderer or data.virtual.renderer,
         negatives=build_negatives(data, parts),
     )

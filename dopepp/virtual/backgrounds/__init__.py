@@ -6,6 +6,7 @@ To add a kind, write a class with the methods of :class:`Backgrounds` and name i
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import importlib.util
 import logging
@@ -13,7 +14,7 @@ import os
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, Literal, Protocol
 
 import cv2
 import numpy as np
@@ -43,6 +44,12 @@ _LEAST_REDUCTION: Final = 2.0
 """A crop comes from the smallest halving of a photo that it still reduces by this factor, which is
 cheaper than reducing the whole photo."""
 
+PhotoSplit = Literal["train", "val", "test", "all"]
+
+FEWEST_PHOTOS: Final = 2  # of validation and of test
+_HELD_OUT: Final = 0.15  # share of the photos for validation, and for test
+_HASHED_BYTES: Final = 2**16  # beginning of a photo that decides about its split
+
 _SMALLEST_PX: Final = 30  # shorter side of the smallest halving, at least
 _KEPT_BYTES: Final = 200_000_000  # decoded photos a process keeps: about 260 of VOC2007
 
@@ -57,21 +64,21 @@ class Backgrounds(Protocol):
         """Return the kind and a fingerprint of its files, for the record of the render."""
 
 
-def find_backgrounds(choice: str | Path | None) -> Backgrounds:
+def find_backgrounds(choice: str | Path | None, split: PhotoSplit = "all") -> Backgrounds:
     """Return the backgrounds that a user selects.
 
     Args:
         choice: None or ``procedural``, the same on every machine; ``skimage`` for the photos in an
             installed scikit-image; or a folder of photos (``./skimage`` for one of that name).
+        split: Photos to draw from (:meth:`PhotoBackgrounds.part`).
 
     Raises:
         UserError: The folder is missing or contains no photo, or scikit-image is not installed.
     """
     if choice is None or choice == "procedural":
         return ProceduralBackgrounds()
-    if choice == "skimage":
-        return bundled_photos()
-    return PhotoBackgrounds(Path(choice))
+    photos = bundled_photos() if choice == "skimage" else PhotoBackgrounds(Path(choice))
+    return photos.part(split)
 
 
 class PhotoBackgrounds:
@@ -91,7 +98,7 @@ class PhotoBackgrounds:
     """
 
     def __init__(self, folder: Path, names: Sequence[str] | None = None) -> None:
-        self.folder = Path(folder)
+        self.folder, self.split = Path(folder), "all"
         photo_names = _photo_names(self.folder) if names is None else names
         self.paths = [self.folder / name for name in sorted(photo_names)]
         if not self.paths:
@@ -112,7 +119,37 @@ class PhotoBackgrounds:
         for path in self.paths:
             name = path.relative_to(self.folder).as_posix()
             digest.update(f"{name}\0{path.stat().st_size}\0".encode("utf-8", "surrogateescape"))
-        return ["photos", str(len(self.paths)), digest.hexdigest()]
+        kind = "photos" if self.split == "all" else f"{self.split} photos"
+        return [kind, str(len(self.paths)), digest.hexdigest()]
+
+    def part(self, split: PhotoSplit) -> PhotoBackgrounds:
+        """Return the photos of one split: training 70 %, validation 15 %, test 15 %.
+
+        The order of the files' hashes decides, so the splits do not depend on names or folders, and
+        copies of a photo are in the same split. If there are fewer than six different photos, all
+        splits are the whole folder (:meth:`is_divided` is False).
+        """
+        if split == "all":
+            return self
+        by_hash: dict[bytes, list[str]] = {}
+        for path in self.paths:
+            with path.open("rb") as file:
+                key = hashlib.sha256(file.read(_HASHED_BYTES)).digest()
+            by_hash.setdefault(key, []).append(path.relative_to(self.folder).as_posix())
+        groups = [by_hash[key] for key in sorted(by_hash)]
+        part = copy.copy(self)
+        if len(groups) >= 3 * FEWEST_PHOTOS:
+            held_out = max(FEWEST_PHOTOS, round(_HELD_OUT * len(groups)))
+            val, test = len(groups) - 2 * held_out, len(groups) - held_out
+            chosen = {"train": groups[:val], "val": groups[val:test], "test": groups[test:]}[split]
+            part = PhotoBackgrounds(self.folder, [name for group in chosen for name in group])
+            part.split = split
+        return part
+
+    @property
+    def is_divided(self) -> bool:
+        """Whether these are the photos of one split, which no other split has."""
+        return self.split != "all"
 
     def draw(self, rng: Generator, width: int, height: int) -> Picture:
         """Return a crop of the image's aspect ratio that covers 40 % to 100 % of a photo's side."""
