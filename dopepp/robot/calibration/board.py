@@ -153,7 +153,9 @@ class Board:
     def _find_charuco(self, grey: Grey) -> tuple[Any, Any]:
         pixels, indices, _, markers = self._detector.detectBoard(grey)
         if markers is not None and len(np.unique(markers)) < len(markers):
-            raise UserError("two boards with the same markers", "one visible board", "cover one")
+            problem = "a picture of two boards with the same markers"
+            fix = "cover or remove the second board and take the picture again"
+            raise UserError(problem, "one visible board", fix)
         return ([], []) if indices is None else (np.ravel(indices), pixels)
 
     def _find_chess(self, grey: Grey) -> tuple[Any, Any]:
@@ -191,7 +193,8 @@ def parse_board(text: str) -> Board:
     except ValueError:
         allowed = SPELLING
     if allowed:
-        raise UserError(f"board {text!r:.100}", allowed, "e.g. charuco:8x11:20:15")
+        fix = "describe the printed board, e.g. charuco:8x11:20:15"
+        raise UserError(f"board {text!r:.100}", allowed, fix)
     return board
 
 
@@ -243,8 +246,9 @@ def board_pose(sighting: Sighting, camera: Camera) -> BoardPose:
     projections = [cv2.projectPoints(points, *pose, *lens)[0][:, 0] for pose in poses]
     errors = [float(np.square(projection - pixels).sum()) for projection in projections]
     if not errors or not np.isfinite(min(errors)):
-        problem = f"{sighting.name}: a board without a pose"
-        raise UserError(problem, "a board seen from the front", "leave out this picture")
+        problem = f"{sighting.name}, whose board has no pose"
+        fix = "delete this picture, or take it again with the board facing the camera"
+        raise UserError(problem, "a board that is seen from the front", fix)
     error = min(errors)
     turn, shift = poses[errors.index(error)]
     T = make_transform(cv2.Rodrigues(turn)[0], shift.ravel())

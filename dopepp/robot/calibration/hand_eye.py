@@ -66,7 +66,8 @@ class HandEye:
 def check_mount(mount: str) -> Mount:
     """Return a valid mount, or raise :class:`UserError`."""
     if mount not in ("hand", "bench"):
-        raise UserError(f"--mount {mount}", "hand or bench", "choose the mount of the camera")
+        fix = "pass --mount hand for a camera on the robot, --mount bench for a fixed camera"
+        raise UserError(f"--mount {mount}", "hand or bench", fix)
     return cast("Mount", mount)
 
 
@@ -82,7 +83,7 @@ def calibrate_hand_eye(
         raise UserError(
             f"{len(boards)} poses with a visible board",
             f"at least {MIN_POSES}, better 15",
-            "add poses, rotated by 30° and more about different axes",
+            "record more poses, rotated by 30° or more about different axes",
         )
     M, B, seen = equations(T_base_flange, boards, mount)
     starts = [solve(M, B) for solve in (park, shah)]

@@ -111,7 +111,8 @@ def calibrate_lens(sightings: Sequence[Sighting], size: Size) -> LensCalibration
         raise UserError(
             f"{len(sightings)} pictures with the board",
             f"at least 3, better {MIN_VIEWS} or more",
-            "take further ones, tilted by 20 to 40° in all directions and out to the corners",
+            "take more pictures, with the board tilted by 20 to 40° in all directions and moved "
+            "into the corners of the picture",
         )
     views = list(sightings)
     lens = _solve(views, size)
@@ -185,7 +186,7 @@ def _solve(views: Sequence[Sighting], size: Size) -> _Solution:
     except cv2.error as reason:
         problem = f"{len(views)} views of the board that determine no camera ({reason.err})"
         allowed = "views tilted by 20 to 40° in several directions"
-        raise UserError(problem, allowed, "take further ones") from reason
+        raise UserError(problem, allowed, "take more pictures of the tilted board") from reason
     normals = np.array([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
     tilt = float(np.linalg.norm(normals[:, :2].std(axis=0)))
     distortion, deviations = np.ravel(lens)[:5], np.ravel(deviations)[:4]

@@ -137,14 +137,14 @@ def check_poses(
         ):
             if consistency(rows, seen, mount).is_right:
                 problem = f"{poses.source}: the poses fit the {which} picture"
-                fix = "shift the list by one, or add names"
-                raise UserError(problem, "the pose of every picture in its place", fix)
+                fix = "shift the list of poses by one, or add a column `name` with the pictures"
+                raise UserError(problem, "poses in the order of the pictures", fix)
     raise UserError(
         f"{poses.source}: rotations of robot and camera differ by "
         f"{np.degrees(agreement.turn):.1f}° and {1000 * agreement.shift:.0f} mm (medians of pairs)",
-        f"{np.degrees(TURN):g}° and {1000 * SHIFT:g} mm",
-        "check that every pose was recorded with its picture, after the robot had come to rest, "
-        "and is the flange's (not that of a tool that was changed in between)",
+        f"at most {np.degrees(TURN):g}° and {1000 * SHIFT:g} mm",
+        "record every pose with its picture, after the robot has come to rest, and record the "
+        "pose of the flange, not of a tool",
     )
 
 
@@ -190,7 +190,7 @@ def _format_error(
         changes.append(f"--unit {unit}")
     problem = f"{source}, whose poses contradict the pictures"
     allowed = f"poses that fit, which would be: {', and '.join(changes)}"
-    return UserError(problem, allowed, "change these options")
+    return UserError(problem, allowed, "run the command again with these options")
 
 
 def _scale_error(scale: float, unit: str, source: str) -> UserError:
@@ -198,7 +198,7 @@ def _scale_error(scale: float, unit: str, source: str) -> UserError:
     factor, right = 1 / scale, _unit_of(scale, unit)
     if right is not None:
         problem = f"{source} in {unit}, which makes the robot's motions {factor:.4g} times too long"
-        return UserError(problem, f"--unit {right}", "change the unit")
+        return UserError(problem, f"--unit {right}", f"run the command again with --unit {right}")
     return UserError(
         f"{source}: the robot's motions are {factor:.3f} times those seen by the camera",
         f"a factor from {1 / SCALE:.2f} to {SCALE:.2f}",

@@ -98,9 +98,10 @@ def read_robot_poses(path: Path) -> RobotPoses:
         is_json = suffix == ".json"
         records = _records(read_json(path, MAX_BYTES) if is_json else read_yaml(path), path)
     else:
-        raise UserError(f"robot poses {path}", "a .csv, .json or .yaml file", f"write {FORMAT}")
+        fix = f"write a file with {FORMAT}"
+        raise UserError(f"robot poses {path}", "a .csv, .json or .yaml file", fix)
     if not records:
-        raise UserError(f"{path} without a pose", FORMAT, "add the poses")
+        raise UserError(f"{path} without a pose", FORMAT, "write one record per pose")
     names = tuple(
         next((str(record[key]) for key in NAMES if record.get(key)), "") for record in records
     )
@@ -112,10 +113,11 @@ def read_robot_poses(path: Path) -> RobotPoses:
     kind = next((kind for kind, needed in ROTATIONS.items() if set(needed) <= fields), None)
     if kind is None or not {"x", "y", "z"} <= fields:
         problem = f"{path} with the columns {', '.join(sorted(fields))[:200]}"
-        raise UserError(problem, FORMAT, "rename the columns")
+        raise UserError(problem, FORMAT, "rename the columns to these names")
     numbers = _numbers(records, ("x", "y", "z", *ROTATIONS[kind]), path)
     if kind == "quaternion" and not (np.abs(numbers[:, 3:]).max(axis=1) > 1e-6).all():
-        raise UserError(f"{path}: a quaternion of zeros", "unit quaternions", "remove that pose")
+        fix = "delete the pose whose quaternion is 0, 0, 0, 0"
+        raise UserError(f"{path}: a quaternion of zeros", "unit quaternions", fix)
     return RobotPoses(names, numbers[:, :3], kind, numbers[:, 3:], str(path))
 
 
@@ -134,7 +136,7 @@ def read_points(path: Path, unit: str) -> Float[np.ndarray, "points 3"]:
 def check_unit(unit: str) -> str:
     """Return a valid unit, or raise :class:`UserError`."""
     if unit not in UNITS:
-        raise UserError(f"--unit {unit}", ", ".join(UNITS), "use an allowed unit")
+        raise UserError(f"--unit {unit}", ", ".join(UNITS), "pass the unit, e.g. --unit mm")
     return unit
 
 
@@ -145,10 +147,11 @@ def _read_csv(path: Path) -> list[Record]:
         text = content.decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         problem = f"{path}: {error!s:.200}"
-        raise UserError(problem, "a readable CSV file", "check the path") from error
+        fix = "pass the path of a CSV file in UTF-8"
+        raise UserError(problem, "a readable CSV file", fix) from error
     if len(content) > MAX_BYTES:
         problem = f"{path} of more than {MAX_BYTES / 1e6:g} MB"
-        raise UserError(problem, FORMAT, "check that this is the file of poses")
+        raise UserError(problem, FORMAT, "pass the file of the poses, which is smaller")
     separator = ";" if text.partition("\n")[0].count(";") >= 3 else ","
     rows = csv.DictReader(io.StringIO(text), delimiter=separator)
     return [{str(key).strip().lower(): value for key, value in row.items()} for row in rows]
@@ -178,7 +181,7 @@ def _numbers(
             value = np.nan
         if not np.isfinite(value):
             problem = f"{path}, pose {row}: {key}={record.get(key)!r:.50}"
-            raise UserError(problem, "a finite number", "correct or remove that pose")
+            raise UserError(problem, "a finite number", "write the number, or delete that pose")
         return value
 
     return np.array(
@@ -196,7 +199,7 @@ def _matrix(record: Record, row: int, path: Path) -> Transform:
     if not is_rigid or np.linalg.det(R) < 0:
         problem = f"{path}, pose {row}: matrix={record.get('matrix')!r:.80}"
         allowed = "4×4 numbers of a rigid transform, row by row"
-        raise UserError(problem, allowed, "correct or remove that pose")
+        raise UserError(problem, allowed, "write the 16 numbers, or delete that pose")
     return T
 
 
@@ -218,7 +221,7 @@ def match_pictures(poses: RobotPoses, pictures: Sequence[str]) -> list[tuple[int
                 f"{poses.source}: {len(missing)} poses without a picture, the first "
                 f"{missing[0]!r:.80}",
                 f"names such as {pictures[0] if pictures else '…'!r}",
-                "correct the names, or check the folder of the pictures",
+                "write the names of the pictures' files, or pass the folder with these pictures",
             )
         return [(row, indices[name]) for row, name in enumerate(poses.names)]
     if len(poses.names) != len(pictures):
@@ -249,7 +252,7 @@ def check_trust(findings: Sequence[str], force: bool) -> None:
     """Refuse a calibration with findings, unless by force."""
     if findings and not force:
         problem = f"a calibration that is not trustworthy: {'; '.join(findings)}"
-        fix = "take further measurements as advised, or write it anyway with --force"
+        fix = "measure again as advised, or add --force to write it anyway"
         raise UserError(problem, "a calibration without findings", fix)
 
 
@@ -267,7 +270,8 @@ def read_transform(path: Path, name: str) -> Transform:
         T = np.zeros(0)
     if T.shape != (4, 4) or not is_rotation(T[:3, :3], 1e-6) or not np.isfinite(T).all():
         allowed = f"{name}: {{matrix: 4×4 numbers of a rigid transform}}"
-        raise UserError(f"{path} without {name}", allowed, "use a file from `dopepp calibrate`")
+        fix = "pass a file that `dopepp calibrate` has written"
+        raise UserError(f"{path} without {name}", allowed, fix)
     return T
 
 

@@ -42,7 +42,8 @@ def find_tip(T_base_flange: Float[np.ndarray, "poses 4 4"]) -> Tip:
     poses = np.asarray(T_base_flange, np.float64)
     if len(poses) < MIN_POSES:
         allowed = f"at least {MIN_POSES} that touch one point"
-        raise UserError(f"{len(poses)} poses", allowed, "add poses")
+        fix = "record more poses in which the tip touches the point"
+        raise UserError(f"{len(poses)} poses", allowed, fix)
     system = np.concatenate([np.hstack([pose[:3, :3], -np.eye(3)]) for pose in poses])
     target = -poses[:, :3, 3].ravel()
     solution, _, _, _ = np.linalg.lstsq(system, target, rcond=1e-6)
@@ -92,11 +93,12 @@ def find_bench(touched: Float[np.ndarray, "points 3"]) -> Bench:
     """
     points = np.asarray(touched, np.float64)
     if len(points) < 3:
-        raise UserError(f"{len(points)} points", "at least 3, better 5 or more", "touch more")
+        fix = "touch more points of the bench and add them to the file"
+        raise UserError(f"{len(points)} points", "at least 3, better 5 or more", fix)
     centre = points.mean(axis=0)
     values, axes = np.linalg.svd(points - centre, full_matrices=False)[1:]
     if values[1] < 0.1 * values[0]:
-        allowed, fix = "points all over the bench", "touch some away from the line"
+        allowed, fix = "points all over the bench", "touch more points, away from the line"
         raise UserError("points along a line", allowed, fix)
     z = axes[2] if axes[2, 2] >= 0 else -axes[2]
     origin = points[0] - (points[0] - centre) @ z * z

@@ -276,4 +276,5 @@ def _read_pieces(path: Path) -> tuple[Piece, ...]:
             vertices, counts = np.asarray(content["vertices"], np.float64), content["counts"]
         return tuple(np.split(vertices, np.cumsum(counts)[:-1]))
     except (OSError, KeyError, ValueError) as error:
-        raise UserError(f"{path}: {error}", "a file written by dopepp", "delete it") from error
+        fix = "delete this file; the next run writes it again"
+        raise UserError(f"{path}: {error}", "a file written by dopepp", fix) from error

@@ -70,7 +70,8 @@ def parse_sources(text: str) -> tuple[PoseSource, ...]:
 
 def _check_choice(option: str, value: str, allowed: Iterable[str]) -> None:
     if value not in allowed:
-        raise UserError(f"{option} {value}", ", ".join(allowed), f"change {option}")
+        fix = f"pass {option} with one of these names"
+        raise UserError(f"{option} {value}", ", ".join(allowed), fix)
 
 
 def check_task(task: GraspTask, poses: str, count: int) -> GraspTask:
@@ -140,7 +141,7 @@ def make_experiment(
         raise UserError(
             f"{task.grasps or task.part}, whose grasps were not reachable in any of {count} trials",
             "grasps from above that suit the face on which the part rests",
-            "generate grasps with `dopepp grasp propose`, or change --rest",
+            "write other grasps with `dopepp grasp propose`, or pass another --rest",
         )
     show(task, records, folder, video, rerun)
     return markdown(records, facts)

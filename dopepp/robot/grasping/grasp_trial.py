@@ -170,7 +170,7 @@ class Trials:
         if self.part.name not in names:
             problem = f"--network {self.task.network}, which does not know {self.part.name}"
             allowed = f"a network of this part, not of {', '.join(names)}"
-            raise UserError(problem, allowed, "pass another network")
+            raise UserError(problem, allowed, f"pass a network trained on {self.part.name}")
         seen = self.estimator.checkpoint.seen.get(self.part.name)
         if seen is None:
             return DEFAULT_DISTANCE

@@ -223,7 +223,7 @@ def propose_grasps(part: Part, count: int, seed: int = 0) -> tuple[Grasp, ...]:
             f"part {part.name}, on which no grasp was found",
             f"opposite walls {1000 * THINNEST:g} to {1000 * (WIDEST - CLEARANCE):g} mm apart that "
             "are reachable from above",
-            "write grasps by hand, e.g. for another gripper or fixture",
+            "write a file of grasps by hand and pass it with --grasps FILE",
         )
     return tuple(grasps[:count])
 

@@ -106,7 +106,7 @@ def _draw_reachable(draw: Callable[[], FlangePair | None], count: int) -> list[F
     drawn = (draw() for _ in range(4 * count))
     pairs = [pair for pair in drawn if pair is not None][:count]
     if len(pairs) < count:
-        raise RunError("the arm does not reach the poses of its calibration")
+        raise RunError("the simulated arm reaches too few poses to calibrate its camera")
     return pairs
 
 

@@ -252,5 +252,5 @@ def open_gl(model: Any, size: tuple[int, int]) -> Any:
         raise UserError(
             f"MuJoCo pictures without OpenGL ({type(error).__name__}: {error!s:.100})",
             "a display, or EGL (libegl1 and a driver)",
-            "install EGL, or leave out --video and --renderer mujoco",
+            "install EGL (apt install libegl1), or leave out --video and --renderer mujoco",
         ) from error

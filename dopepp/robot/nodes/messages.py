@@ -88,7 +88,8 @@ class AnswerFormatter:
         self._names = {part.name: re.sub(r"\W", "_", part.name, flags=re.ASCII) for part in parts}
         if len(set(self._names.values())) < len(parts):
             problem = f"parts {', '.join(self._names)}"
-            raise UserError(problem, "names that differ in letters and digits", "rename a part")
+            fix = "rename a part and train its network again"
+            raise UserError(problem, "names that differ in letters and digits", fix)
         self._triangles = {part.name: _triangles(part) for part in parts}
 
     def topics(self) -> list[tuple[str, str]]:

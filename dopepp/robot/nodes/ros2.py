@@ -66,9 +66,10 @@ def run(worker: Worker, topic: str, name: str, params: Path | None = None) -> No
     from rclpy.signals import SignalHandlerOptions
 
     if params is not None and not params.is_file():
-        raise UserError(f"--params {params}, no such file", "a YAML file", "check the path")
+        fix = "pass the path of an existing file"
+        raise UserError(f"--params {params}, no such file", "a YAML file", fix)
     words = [] if params is None else ["--ros-args", "--params-file", str(params)]
-    with _ros_errors("--params" if params else "ROS 2"):
+    with _ros_errors("--params" if params else "ROS 2's environment"):
         rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
     node = None
     try:
@@ -230,7 +231,8 @@ def _ros_errors(what: str) -> Iterator[None]:
         yield
     except Exception as error:  # rclpy raises many types
         allowed = "a running ROS 2, and names and values that it accepts"
-        raise UserError(f"{what}: {error!s:.300}", allowed, f"correct {what}") from error
+        fix = f"change {what} as the message says"
+        raise UserError(f"{what}: {error!s:.300}", allowed, fix) from error
 
 
 class Slot(Generic[Item]):

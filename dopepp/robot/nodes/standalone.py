@@ -80,7 +80,7 @@ def _print(line: str) -> None:
         sys.stdout.write(f"{line}\n")
         sys.stdout.flush()  # a reader must not wait for a full buffer
     except BrokenPipeError as error:
-        raise RunError("the reader of the lines has ended") from error
+        raise RunError("the program that reads the lines has ended") from error
 
 
 def _parse_address(text: str) -> tuple[str, int]:
@@ -91,7 +91,7 @@ def _parse_address(text: str) -> tuple[str, int]:
             raise ValueError(text)
         addresses = socket.getaddrinfo(host, int(port), socket.AF_INET, socket.SOCK_DGRAM)
     except (ValueError, OSError) as error:
-        allowed, fix = "HOST:PORT, e.g. 192.168.0.7:5005", "use the address of the receiver"
+        allowed, fix = "HOST:PORT, e.g. 192.168.0.7:5005", "pass the address of the receiver"
         raise UserError(f"--udp {text:.100}", allowed, fix) from error
     ip, number = addresses[0][4][:2]
     return str(ip), int(number)
@@ -118,7 +118,8 @@ def process_bag(
     require("rosbags", "--bag", "bags")
     check_target(target, (SUFFIX,))
     if target.exists() and target.samefile(source):
-        raise UserError(f"--out {target}, the recording itself", "another file", "change --out")
+        fix = "pass another path, e.g. --out poses.mcap"
+        raise UserError(f"--out {target}, the recording itself", "another file", fix)
     bag = Bag(source, topic)
     with draft(target) as path, _Recorder(path, name, worker) as recorder:
         for seconds, message, info in bag.messages():

@@ -120,7 +120,8 @@ class Worker:
             UserError: The settings are not supported; the previous ones stay.
         """
         if self._tracker is not None and not settings.refine:
-            raise UserError("refine=false with --track", "refine=true", "start without --track")
+            fix = "set refine=true, or start the node without --track"
+            raise UserError("refine=false with --track", "refine=true", fix)
         self._estimator(settings.refine)
         self.settings = settings
 
@@ -196,7 +197,7 @@ class Worker:
             sizes = f"{camera.size[0]}×{camera.size[1]}, and pictures of {size[0]}×{size[1]}"
             fix = "let the driver publish the camera_info of these pictures, or calibrate the "
             fix += "camera at this size"
-            raise UserError(f"{camera.source} of {sizes}", "one size", fix)
+            raise UserError(f"{camera.source} of {sizes}", "a camera of the pictures' size", fix)
         estimator = self._estimator(self.settings.refine)
         before, start = dict(estimator.spent_ms), time.perf_counter()
         image = camera.undistorted(frame.image)
