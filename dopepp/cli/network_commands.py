@@ -44,12 +44,12 @@ def benchmark(
 ) -> None:
     """Time the steps from a picture to its poses, in milliseconds per frame."""
     with report_errors():
+        from dopepp.core.pool import num_threads
         from dopepp.drawing.pictures import read_photo
         from dopepp.experiment.assembly.renders import validation_renders
         from dopepp.geometry.camera import camera_matrix
         from dopepp.inference.benchmark import time_frames
         from dopepp.inference.estimator import PoseEstimator
-        from dopepp.inference.runtimes import num_threads
         from dopepp.parts.catalogue import with_meshes
 
         if (image is None) != (intrinsics is None):

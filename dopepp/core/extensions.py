@@ -17,9 +17,9 @@ environment variable ``DOPEPP_EXTENSIONS=mine``, which worker processes inherit.
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Iterable, Iterator
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
@@ -71,11 +71,11 @@ def advice(group: str, name: str) -> str:
 def config_folders() -> Iterator[tuple[str, Path]]:
     """Yield name and config folder of every installed package, without importing it."""
     for entry in _entries("conf"):
-        roots = [] if entry.dist is None else [Path(str(entry.dist.locate_file("")))]
-        folders = (
-            root.joinpath(*entry.value.split(".")) for root in (*roots, *map(Path, sys.path))
-        )
-        folder = next(filter(Path.is_dir, folders), None)
+        package, *folders = entry.value.split(".")
+        spec = find_spec(package)  # of a top-level package, whose code does not run
+        roots = spec.submodule_search_locations if spec is not None else None
+        paths = (Path(root, *folders) for root in roots or ())
+        folder = next(filter(Path.is_dir, paths), None)
         if folder is not None:
             yield _package(entry), folder
 

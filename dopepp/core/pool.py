@@ -70,6 +70,12 @@ def physical_cores() -> int:
     return len(siblings)
 
 
+def num_threads() -> int:
+    """Return ``OMP_NUM_THREADS`` if it is set, else the physical cores of this process."""
+    text = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
+    return int(text) if text.isdecimal() and int(text) > 0 else physical_cores()
+
+
 def cpu_fact(*names: str) -> str:
     """Return the first entry of /proc/cpuinfo with one of these names, or an empty string."""
     path = Path("/proc/cpuinfo")

@@ -222,7 +222,9 @@ def shown(value: object, most: int = 100) -> str:
 
 @cache
 def _adapter(kind: type[T]) -> TypeAdapter[T]:
-    return TypeAdapter(kind)
+    # A class of an extension may have arguments that no plain value can stand for.
+    config = None if dataclasses.is_dataclass(kind) else ConfigDict(arbitrary_types_allowed=True)
+    return TypeAdapter(kind, config=config)
 
 
 def _validated(kind: Any, value: object, name: str) -> Any:

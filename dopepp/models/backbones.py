@@ -97,7 +97,6 @@ class VGG19(_Chain):
     def __init__(
         self, width: float = 1.0, batch_norm: bool = False, weights_path: str | None = None
     ) -> None:
-        check("batch_norm", batch_norm, bool)
         super().__init__(
             (*self.plan, *self.reduction),
             width,
@@ -138,7 +137,6 @@ class DSC(_Chain):
     )
 
     def __init__(self, width: float = 1.0, batch_norm: bool = False) -> None:
-        check("batch_norm", batch_norm, bool)
 
         def make_block(inputs: int, outputs: int) -> list[nn.Module]:
             if inputs == 3:

@@ -131,7 +131,6 @@ class Cascade(Head):
         batch_norm: bool = False,
     ) -> None:
         narrow, wide = scaled_channels(128, width), scaled_channels(512, width)
-        check("batch_norm", batch_norm, bool)
 
         def make_branch(inputs: int, outputs: int, stage: int) -> Branch:
             steps = [(7, narrow)] * 5 + [(1, narrow)] if stage else [(3, narrow)] * 3 + [(1, wide)]
@@ -179,7 +178,6 @@ class MultiScale(Head):
         maps: str | None = None,
     ) -> None:
         channels = scaled_channels(128, width)
-        check("batch_norm", batch_norm, bool)
         if maps not in (None, "plain", "learned"):
             raise UserError(f"maps={maps!r}", "plain, learned or null", "choose one of them")
 

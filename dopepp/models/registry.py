@@ -3,7 +3,8 @@
 A node is a plain dict ``{"_target_": "package.module.Class", argument: value, …}``. The dotted name
 must be in the allow-list before anything is imported, and the resolved class is checked again. This
 excludes paths through other modules (``dopepp.models.network.os.system``) and re-bound names;
-Hydra's own block-list can be circumvented.
+Hydra's own block-list can be circumvented. Arguments of backbones, attention modules, heads and
+losses must have their annotated types; torch and Lightning check those of their classes themselves.
 
 To allow your own class, enable its package (:mod:`dopepp.core.extensions`), or call ``register`` of
 the registry of its kind (``BACKBONES.register("package.module.Class")``).
@@ -12,6 +13,7 @@ the registry of its kind (``BACKBONES.register("package.module.Class")``).
 from __future__ import annotations
 
 import inspect
+import typing
 from collections.abc import Iterable, Mapping
 from importlib import import_module
 from types import ModuleType
@@ -19,6 +21,7 @@ from typing import Any, Final, Generic, TypeVar
 
 from dopepp.core import extensions
 from dopepp.core.errors import UserError
+from dopepp.core.validation import check
 
 T = TypeVar("T")
 TARGET = "_target_"
@@ -99,8 +102,8 @@ class Registry(Generic[T]):
             **provided: Further arguments, which the node must not repeat.
 
         Raises:
-            UserError: The target is not allowed, an argument is unknown, missing, nested or
-                provided twice, or the class rejects a value.
+            UserError: The target is not allowed, an argument is unknown, missing, nested,
+                provided twice or of the wrong type, or the class rejects a value.
         """
         if not isinstance(node, Mapping):
             raise UserError(
@@ -112,10 +115,13 @@ class Registry(Generic[T]):
         arguments = {key: value for key, value in node.items() if key != TARGET}
         self._check_arguments(node[TARGET], target, arguments, provided)
         try:
+            hints = typing.get_type_hints(target.__init__) if self._group else {}
+            for name in arguments.keys() & hints.keys():
+                check(f"{self.kind}.{name}", arguments[name], hints[name])
             return target(**arguments, **provided)
         except UserError:
             raise
-        except (TypeError, ValueError) as error:
+        except (NameError, TypeError, ValueError) as error:
             raise UserError(
                 f"{node[TARGET]} with {arguments!r:.300}, which it refuses: {error}",
                 f"{node[TARGET]}{inspect.signature(target)}",

@@ -1,6 +1,8 @@
 """A package of a user's own: found by its entry points, used where it is enabled by name."""
 
+import shutil
 import sys
+from importlib.util import spec_from_file_location
 
 import pytest
 import yaml
@@ -19,7 +21,7 @@ from torch import nn
 from dopepp.models.backbones import Backbone
 
 class Tiny(Backbone):
-    def __init__(self, channels: int = 8) -> None:
+    def __init__(self, channels: int = 8, norm: nn.Module | None = None) -> None:
         super().__init__()
         self.layers, self.out_channels = nn.Conv2d(3, channels, 8, stride=8), channels
 
@@ -90,6 +92,37 @@ def test_a_package_that_is_not_enabled_is_not_imported(mine, call, tiny_options,
         extensions.enable(["other"])
     with pytest.raises(UserError, match="install the package absent and enable it"):
         BACKBONES.resolve("absent.Net")
+
+
+def test_arguments_of_its_classes_have_the_annotated_types(mine):
+    extensions.enable(["mine"])
+    node = {"_target_": "mine.backbones.Tiny"}
+    assert BACKBONES.build({**node, "channels": 16, "norm": None}).out_channels == 16
+    for argument in ({"channels": "16"}, {"channels": 8.5}, {"norm": "BatchNorm2d"}):
+        with pytest.raises(UserError, match=rf"backbone\.{next(iter(argument))}="):
+            BACKBONES.build({**node, **argument})
+
+
+class Finder:
+    """Finds ``mine`` in a folder off ``sys.path``, as a flat-layout editable install does."""
+
+    def __init__(self, site):
+        self.site = site
+
+    def find_spec(self, name, path=None, target=None):
+        if name != "mine":
+            return None
+        file = self.site / "mine" / "__init__.py"
+        return spec_from_file_location(name, file, submodule_search_locations=[str(file.parent)])
+
+
+def test_config_folders_of_an_editable_install(mine, tmp_path, monkeypatch):
+    shutil.move(mine / "mine", tmp_path / "checkout" / "mine")
+    assert list(extensions.config_folders()) == []
+    monkeypatch.setattr(sys, "meta_path", [*sys.meta_path, Finder(tmp_path / "checkout")])
+    folder = tmp_path / "checkout" / "mine" / "conf"
+    assert list(extensions.config_folders()) == [("mine", folder)]
+    assert "mine" not in sys.modules
 
 
 def test_renderers_and_formats_are_found_by_name(mine, tiny):

@@ -13,10 +13,11 @@ from numpy.testing import assert_allclose
 from torch import nn
 
 from dopepp.core.errors import UserError
+from dopepp.core.pool import num_threads
 from dopepp.geometry.camera import camera_matrix
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.export import EXPORTERS, check_possible
-from dopepp.inference.runtimes import Export, num_threads
+from dopepp.inference.runtimes import Export
 from dopepp.models import network as specs
 from dopepp.models.backbones import Backbone
 from dopepp.models.checkpoint import Checkpoint, load_network, write_atomic

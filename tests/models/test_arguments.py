@@ -9,6 +9,7 @@ from dopepp.models.efficientnet import EfficientNetLite
 from dopepp.models.heads import Cascade, MultiScale, SharedTrunk
 from dopepp.models.layers import find_activation
 from dopepp.models.losses import SpatialCrossEntropy
+from dopepp.models.network import BACKBONES, HEADS, LOSSES
 
 WITH_WEIGHTS = {"weights_path": "vgg19.pth"}
 FULL_WIDTH = "with width=1 and batch_norm=false"
@@ -25,9 +26,7 @@ FULL_WIDTH = "with width=1 and batch_norm=false"
         (DSC, {"width": 0}, "width=0; allowed: a number from"),
         (DSC, {"width": 100}, "width=100"),
         (DSC, {"width": "wide"}, "width='wide'"),
-        (DSC, {"batch_norm": "yes"}, "batch_norm='yes'; allowed: true or false"),
         (VGG19, {"width": -1}, "width=-1"),
-        (VGG19, {"batch_norm": "yes"}, "batch_norm"),
         (VGG19, {**WITH_WEIGHTS, "width": 0.5}, FULL_WIDTH),
         (VGG19, {**WITH_WEIGHTS, "batch_norm": True}, FULL_WIDTH),
         (VGG19, {"weights_path": 3}, FULL_WIDTH),
@@ -52,10 +51,8 @@ FULL_WIDTH = "with width=1 and batch_norm=false"
         (Cascade, {"stages": 0}, "stages=0; allowed: an integer from 1 to 12"),
         (Cascade, {"stages": True}, "stages=True"),
         (Cascade, {"width": float("nan")}, "width=nan"),
-        (Cascade, {"batch_norm": 1}, "batch_norm=1; allowed: true or false"),
         (MultiScale, {"stages": 13}, "stages=13"),
         (MultiScale, {"width": 4.1}, "width=4.1"),
-        (MultiScale, {"batch_norm": 1}, "batch_norm=1"),
         (MultiScale, {"maps": "all"}, "maps='all'; allowed: plain, learned or null"),
         (SharedTrunk, {"channels": 64.5}, "channels=64.5; allowed: an integer from 8 to 1024"),
         (SharedTrunk, {"blocks": 0}, "blocks=0; allowed: an integer from 1 to 16"),
@@ -74,3 +71,24 @@ def test_arguments_are_bounded(kind, arguments, message):
     provided[SharedTrunk] = provided[Cascade]
     with pytest.raises(UserError, match=message):
         kind(**{**provided.get(kind, {}), **arguments})
+
+
+MAPS = {"in_channels": 8, "num_objects": 1}
+
+
+@pytest.mark.parametrize(
+    ("registry", "node", "provided", "message"),
+    [
+        (BACKBONES, {"_target_": "dopepp.models.backbones.DSC", "batch_norm": "yes"}, {},
+         r"backbone\.batch_norm='yes'; allowed: true or false; fix: change backbone\.batch_norm"),
+        (HEADS, {"_target_": "dopepp.models.heads.Cascade", "batch_norm": 1}, MAPS,
+         r"head\.batch_norm=1; allowed: true or false"),
+        (HEADS, {"_target_": "dopepp.models.heads.Cascade", "stages": "six"}, MAPS,
+         r"head\.stages='six'; allowed: an integer"),
+        (LOSSES, {"_target_": "dopepp.models.losses.SpatialCrossEntropy", "sigma": None}, {},
+         r"loss\.sigma=None; allowed: a finite number"),
+    ],
+)  # fmt: skip
+def test_a_node_s_arguments_have_the_annotated_types(registry, node, provided, message):
+    with pytest.raises(UserError, match=message):
+        registry.build(node, **provided)

@@ -47,6 +47,8 @@ _log = logging.getLogger(__name__)
 _TRAINING_SHARE: Final = 0.8
 """Share of the training in a folder of images that it shares with validation or test."""
 
+_DIVIDED: Final = ("bop", "ndds", "webdataset")  # formats whose folders `share_of` divides
+
 
 def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModule:
     """Build training images from ``seed`` and held-out images from ``data.eval_seed``."""
@@ -215,7 +217,7 @@ FORMATS: Final[dict[str, Opener]] = {
 
 def share_in_words(data: DataConfig) -> str | None:
     """Return a remark if the test images are only a share of their folder, else None."""
-    if data.is_rendered("test") or data.format == "ycb_video":
+    if data.is_rendered("test") or data.format not in _DIVIDED:
         return None
     first, last = share_of(data.image_sets, "test")
     if last - first == 1:

@@ -29,11 +29,8 @@ from dopepp.models.network import network_cost
 
 _log = logging.getLogger(__name__)
 
-NUM_CHECKED: Final = 20
-"""Number of rendered pictures on which the export is compared with PyTorch."""
-
-NUM_IMAGES: Final = 100
-"""Number of scenes to calibrate on, and of further scenes to measure on."""
+NUM_CHECKED: Final = 20  # rendered pictures on which the export is compared with PyTorch
+NUM_IMAGES: Final = 100  # scenes to calibrate on, and further scenes to measure on
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,8 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -65,17 +64,15 @@ _ABSENT: Final = "not set"
 _OVERRIDE: Final = re.compile(r"(\+\+?|~)?(?P<key>[A-Za-z_][\w/.@:]*)(=.*)?", re.DOTALL)
 
 
-@dataclass(frozen=True)
-class ConfigDifference:
+class ConfigDifference(NamedTuple):
     """An option, by its dotted name, with its old and new value as text."""
 
     key: str
-    old: str
-    new: str
+    values: tuple[str, str]
 
     def __str__(self) -> str:
         """Return the difference as a line of text."""
-        return f"{self.key}: {self.old} → {self.new}"
+        return f"{self.key}: {' → '.join(self.values)}"
 
 
 def check_resume(
@@ -126,7 +123,7 @@ def config_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[C
     """Return the options in which two configs differ, except those of a single call."""
     before, after = dict(flat(old)), dict(flat(new))
     return [
-        ConfigDifference(key, *(str(options.get(key, _ABSENT)) for options in (before, after)))
+        ConfigDifference(key, (str(before.get(key, _ABSENT)), str(after.get(key, _ABSENT))))
         for key in {**before, **after}
         if before.get(key) != after.get(key) and not below(key, _THIS_CALL)
     ]
@@ -137,7 +134,7 @@ def image_differences(saved: object, present: object) -> list[ConfigDifference]:
     if not isinstance(saved, Mapping) or not isinstance(present, Mapping):
         return []  # the checkpoint was not written by train.py
     return [
-        ConfigDifference(f"{split} images", "as trained on", f"others ({'; '.join(lines)})")
+        ConfigDifference(f"{split} images", ("as trained on", f"others ({'; '.join(lines)})"))
         for split in ("train", "val")
         for lines in [differing_images(saved[split], present[split])]
         if lines

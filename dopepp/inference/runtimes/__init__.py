@@ -7,7 +7,6 @@ write a module with ``read_network(path) -> ExportedNetwork`` and a line in :dat
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -21,7 +20,6 @@ from jaxtyping import Float, UInt8
 
 from dopepp.core.errors import UserError
 from dopepp.core.json import parse_json
-from dopepp.core.pool import physical_cores
 from dopepp.core.validation import STRICT, Range, check, parse
 from dopepp.geometry.cuboid import NUM_CORNERS, NUM_KEYPOINTS
 from dopepp.models.checkpoint import KEY, Checkpoint, load_network, packed, parse_description
@@ -152,12 +150,6 @@ def placed(network: Runtime, device: torch.device) -> Runtime:
     if isinstance(network, PoseNetwork):
         network = network.for_inference().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     return network
-
-
-def num_threads() -> int:
-    """Return ``OMP_NUM_THREADS`` if it is set, else the physical cores of this process."""
-    text = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
-    return int(text) if text.isdecimal() and int(text) > 0 else physical_cores()
 
 
 def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from dopepp.core.errors import require
+from dopepp.core.pool import num_threads
 from dopepp.inference.runtimes import (
     INPUT,
     OUTPUTS,
@@ -23,7 +24,6 @@ from dopepp.inference.runtimes import (
     Pixels,
     check_shapes,
     invalid_export,
-    num_threads,
     read_bytes,
     unpack,
 )

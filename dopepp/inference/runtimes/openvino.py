@@ -14,6 +14,7 @@ from typing import Any, Final
 from lxml import etree
 
 from dopepp.core.errors import require
+from dopepp.core.pool import num_threads
 from dopepp.inference.runtimes import (
     Arrays,
     Export,
@@ -21,7 +22,6 @@ from dopepp.inference.runtimes import (
     Pixels,
     check_shapes,
     invalid_export,
-    num_threads,
     read_bytes,
     unpack,
 )

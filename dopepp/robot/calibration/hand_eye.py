@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import Transform, invert_transform, make_transform
+from dopepp.geometry.rotation import nearest_rotation
 from dopepp.robot.calibration.board import BoardPose, Transforms, displaced
 
 Mount = Literal["hand", "bench"]
@@ -232,12 +233,6 @@ def inverted(T: Transforms) -> Transforms:
     inverse[:, :3, :3] = R
     inverse[:, :3, 3] = -(R @ T[:, :3, 3:])[..., 0]
     return inverse
-
-
-def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation nearest to a matrix (Frobenius norm)."""
-    left, _, right = np.linalg.svd(matrix)
-    return np.asarray(left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right)
 
 
 def _cross(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:

@@ -15,14 +15,13 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.rotation import Vector
+from dopepp.geometry.rotation import Vector, nearest_rotation
 from dopepp.robot.calibration.board import BoardPose, Transforms
 from dopepp.robot.calibration.hand_eye import (
     HandEye,
     Mount,
     equations,
     inverted,
-    nearest_rotation,
     pairs,
     refined,
 )

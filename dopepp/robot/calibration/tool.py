@@ -11,9 +11,8 @@ from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import Transform, make_transform
-from dopepp.geometry.rotation import Vector
+from dopepp.geometry.rotation import Vector, nearest_rotation
 from dopepp.robot.calibration.board import Board
-from dopepp.robot.calibration.hand_eye import nearest_rotation
 
 MIN_POSES: Final = 4
 

@@ -169,6 +169,7 @@ def test_preset_changes_reach_the_renders(tiny):
         (("data=bop", "data.image_sets.train=none", "data.image_sets.val=none"), None),
         (("data=bop", "data/test=photoreal"), None),
         (("data=ycb_video",), None),
+        (("data=ndds", "data.format=posed"), None),
         (("data=virtual",), None),
     ],
 )  # fmt: skip
