@@ -17,6 +17,7 @@ from jaxtyping import Float
 from dopepp.core.compiled import compile_beside
 from dopepp.core.errors import UserError
 from dopepp.core.extensions import enable
+from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.inference import runtimes
@@ -33,7 +34,7 @@ from dopepp.inference.picture import (
 from dopepp.inference.pose_result import STEPS
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Part
-from dopepp.recovery.detection import Detection, RecoveryOptions, rescored
+from dopepp.recovery.detection import CANDIDATE, Detection, RecoveryOptions, rescored
 from dopepp.recovery.recover import Reason, explain, recover, rejected_refined
 
 if TYPE_CHECKING:
@@ -119,7 +120,11 @@ class PoseEstimator:
 
     def refining(self, refine: Refine, parts: Sequence[Part] | None = None) -> PoseEstimator:
         """Return an estimator with the same network that also refines; see the class."""
-        return type(self)(self.network, self.checkpoint, self.device, refine, parts, self.max_ms)
+        refining = type(self)(
+            self.network, self.checkpoint, self.device, refine, parts, self.max_ms
+        )
+        refining.recovery = self.recovery
+        return refining
 
     @property
     def parts(self) -> Sequence[Part]:
@@ -155,7 +160,7 @@ class PoseEstimator:
         roi: Region | None = None,
         cropped: bool = False,
     ) -> list[Detection]:
-        """Detect all trained parts on an image.
+        """Detect all trained parts on an image, from the score :attr:`min_score` on.
 
         The image is resized until parts have the size that they had in training
         (:mod:`dopepp.inference.picture`).
@@ -184,6 +189,24 @@ class PoseEstimator:
             UserError: The image is no RGB image, K does not belong to it, the distortion has no
                 OpenCV lens model, or the depth is not aligned or not in metres.
         """
+        candidates = self.candidates(image, K, distortion, depth, distances, roi, cropped)
+        return self.split(candidates)[0]
+
+    def candidates(
+        self,
+        image: Picture,
+        K: CameraMatrix,
+        distortion: Coefficients | None = None,
+        depth: Depth | None = None,
+        distances: Distances | None = None,
+        roi: Region | None = None,
+        cropped: bool = False,
+    ) -> list[Detection]:
+        """Return every detection, best score first; arguments and errors are those of predict.
+
+        Most candidates below :attr:`min_score` are no part. An estimator that refines leaves out
+        those of a network score below :data:`~dopepp.recovery.detection.CANDIDATE`.
+        """
         image, K, depth = prepare_image(image, K, distortion, depth, cropped)
         with self._timed("pre"):
             views = self.views(image, K, distances, roi)
@@ -192,7 +215,7 @@ class PoseEstimator:
             with self._timed("network"):
                 belief, field = self.maps(view.pixels)
             with self._timed("decode"):
-                stride, options = self.network.stride, self._recovery_options()
+                stride, options = self.network.stride, self._recovery_options(0.0)
                 detections = recover(
                     belief, field, self.cuboids, view.K, stride, self._names, **options
                 )
@@ -201,6 +224,38 @@ class PoseEstimator:
         if self.refiner is None:
             return detections
         return rescored(self.refined(detections, image, K, depth), self.recovery)
+
+    @property
+    def min_score(self) -> float:
+        """Score from which a candidate is a detection.
+
+        It is the checkpoint's threshold unless :meth:`reporting` has replaced it. Refined poses
+        have a threshold of their own if they have a score of their own.
+        """
+        is_refined = self.refiner is not None and self.recovery.scores_refined
+        return self.recovery.refined_min_score if is_refined else self.recovery.min_score
+
+    def reporting(self, min_score: float | None) -> PoseEstimator:
+        """Return an estimator with the same network and another threshold.
+
+        Args:
+            min_score: New :attr:`min_score`, in [0, 1]; None keeps the threshold.
+
+        Raises:
+            UserError: The score is out of range.
+        """
+        if min_score is None:
+            return self
+        least = check("min_score", min_score, float, Range(0, 1))
+        changed = copy.copy(self)
+        changed.recovery = replace(self.recovery, min_score=least, refined_min_score=least)
+        return changed
+
+    def split(self, candidates: Sequence[Detection]) -> tuple[list[Detection], list[float]]:
+        """Return the candidates that pass the threshold, and the scores of the others."""
+        passed = [candidate for candidate in candidates if candidate.score >= self.min_score]
+        weaker = [candidate.score for candidate in candidates if candidate.score < self.min_score]
+        return passed, weaker
 
     def refined(
         self,
@@ -261,19 +316,16 @@ class PoseEstimator:
             UserError: As for :meth:`predict`.
         """
         image, K, depth = prepare_image(image, K, None, depth, cropped)
-        stride, options = self.network.stride, self._recovery_options()
+        stride, options = self.network.stride, self._recovery_options(self.min_score)
         reasons: list[Reason] = []
         for view in self.views(image, K, distances, roi):
             belief, field = self.maps(view.pixels)
             reasons += explain(belief, field, self.cuboids, view.K, stride, self._names, **options)
-        threshold = self.recovery.refined_min_score
-        if self.refiner is None or threshold == 0:
+        if self.refiner is None:
             return reasons
-        lenient = copy.copy(self)
-        lenient.recovery = replace(self.recovery, refined_min_score=0.0)
-        detections = lenient.predict(image, K, None, depth, distances, roi, cropped)
-        rejected = [detection for detection in detections if detection.score < threshold]
-        return reasons + [rejected_refined(detection, threshold) for detection in rejected]
+        candidates = self.candidates(image, K, None, depth, distances, roi, cropped)
+        rejected = [candidate for candidate in candidates if candidate.score < self.min_score]
+        return reasons + [rejected_refined(candidate, self.min_score) for candidate in rejected]
 
     def views(
         self,
@@ -293,9 +345,10 @@ class PoseEstimator:
             belief, field = self.network.maps(pixels)
         return belief[0].float(), field[0].float()
 
-    def _recovery_options(self) -> dict[str, float]:
-        """Return the thresholds; they are lower for candidates that will be refined."""
-        return vars(self.recovery if self.refiner is None else self.recovery.of_candidates())
+    def _recovery_options(self, min_score: float) -> dict[str, float]:
+        """Return the options of the recovery; all candidates that can be refined pass."""
+        least = min_score if self.refiner is None else CANDIDATE
+        return vars(replace(self.recovery, min_score=least))
 
     @contextmanager
     def _timed(self, step: str) -> Iterator[None]:

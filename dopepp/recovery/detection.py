@@ -33,8 +33,8 @@ FEATURES: Final = ("bias", "belief", "spread", "misfit", "found")  # Of the scor
 REFINED_FEATURES: Final = ("bias", "score", "agreement", "support")  # Of a refined pose's score
 
 CANDIDATE: Final = 0.005
-"""Score from which a detection is refined if refined poses have a score of their own: refinement
-distinguishes a false detection from a part that the network was unsure of."""
+"""Score of the network from which a detection is refined: refinement distinguishes a false
+detection from a part that the network was unsure of."""
 
 DISTANCE_FACTORS: Final = (0.5, 2.0)  # Range; factors of trained networks are within a tenth of 1
 COVARIANCE_FACTORS: Final = (0.01, 100.0)  # Range; factors of trained networks are 1 to 4
@@ -157,11 +157,10 @@ class RecoveryOptions:
         defaults = {field.name: field.default for field in fields(self)}
         return replace(self, **{k: v for k, v in defaults.items() if k.startswith("refined_")})  # type: ignore[arg-type]
 
-    def of_candidates(self) -> RecoveryOptions:
-        """Return the options that keep every detection which refinement may confirm."""
-        if self.refined_weights == _NETWORK_SCORE:
-            return self
-        return replace(self, min_score=min(self.min_score, CANDIDATE))
+    @property
+    def scores_refined(self) -> bool:
+        """Whether refined poses have a score of their own."""
+        return self.refined_weights != _NETWORK_SCORE
 
 
 def make_detection(
@@ -211,15 +210,14 @@ def calibrated(
 
 
 def rescored(refined: Sequence[Detection], options: RecoveryOptions) -> list[Detection]:
-    """Return refined detections with the score of refined poses, best first, without low scores."""
-    if options.refined_weights != _NETWORK_SCORE:
+    """Return refined detections with the score of refined poses, best first."""
+    if options.scores_refined:
         weights = np.array(options.refined_weights)
         refined = [
             replace(detection, score=float(score(refined_features(detection), weights)))
             for detection in refined
         ]
-    passed = [detection for detection in refined if detection.score >= options.refined_min_score]
-    return sorted(passed, key=lambda detection: -detection.score)
+    return sorted(refined, key=lambda detection: -detection.score)
 
 
 def refined_features(detection: Detection) -> Float[np.ndarray, "features"]:

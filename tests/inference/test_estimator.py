@@ -314,3 +314,38 @@ def test_a_checkpoint_without_meshes_names_the_option(parts_path):
     with pytest.raises(UserError, match=r"no mesh of servoholder.*--part servoholder=FILE"):
         PoseEstimator.load(parts_path, refine="region")
     PoseEstimator.load(parts_path, refine="region", parts=estimator.parts)
+
+
+def test_candidates_below_the_threshold_are_not_reported(checkpoint_path):
+    estimator, picture = Oracle.load(checkpoint_path), image(640, 480)
+    places = [(-0.2, -0.1, 0.7), (0.2, -0.1, 0.8), (-0.2, 0.15, 0.9), (0.2, 0.15, 1.0)]
+    poses = [(0, make_transform(TRUE[:3, :3], np.array(place))) for place in places]
+    estimator.show((640, 480), K_VGA, poses)
+    candidates = estimator.reporting(0.0).predict(picture, K_VGA)
+    scores = [candidate.score for candidate in candidates]
+    assert sorted(set(scores), reverse=True) == scores
+    assert len(scores) == 4
+    strict = estimator.reporting(scores[1])
+    assert strict.min_score == scores[1]
+    assert [detection.score for detection in strict.predict(picture, K_VGA)] == scores[:2]
+    assert [candidate.score for candidate in strict.candidates(picture, K_VGA)] == scores
+    assert strict.split(candidates) == (candidates[:2], scores[2:])
+    rejected = [reason.best for reason in strict.explain(picture, K_VGA) if reason.kind == "score"]
+    assert sorted(rejected, reverse=True) == scores[2:]
+    assert estimator.reporting(None) is estimator
+    with pytest.raises(UserError, match=r"min_score=1.1"):
+        estimator.reporting(1.1)
+
+
+def test_a_refined_pose_has_a_threshold_of_its_own(parts_path):
+    estimator, rendered = seen(parts_path, "region", nearer=0.0)
+    estimator.recovery = replace(estimator.recovery, min_score=0.2, refined_min_score=0.6)
+    assert estimator.min_score == 0.2  # the network's score
+    estimator.recovery = replace(estimator.recovery, refined_bias=1.0)
+    assert estimator.min_score == 0.6
+    (candidate,) = estimator.candidates(rendered.image, K_VGA)
+    least = float(np.nextafter(candidate.score, 1))
+    assert estimator.reporting(least).predict(rendered.image, K_VGA) == []
+    reason = estimator.reporting(least).explain(rendered.image, K_VGA)[-1]
+    assert (reason.kind, reason.best) == ("refined", candidate.score)
+    assert estimator.reporting(0.3).refining("region").min_score == 0.3

@@ -14,7 +14,6 @@ from dopepp.geometry.camera import camera_matrix, make_transform, project, trans
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.recovery.detection import (
-    CANDIDATE,
     DISTANCE_FACTORS,
     FEATURES,
     Detection,
@@ -109,20 +108,20 @@ def test_refined_poses_keep_the_networks_score_until_another_is_fitted():
     said = [replace(detection(), score=0.2), replace(detection(), score=0.8)]
     assert [estimate.score for estimate in rescored(said, RecoveryOptions())] == [0.8, 0.2]
     options = RecoveryOptions(min_score=0.5)
-    assert options.of_candidates() is options
+    assert not options.scores_refined
     fitted = RecoveryOptions(
         min_score=0.5, refined_bias=-2.0, refined_score=1.0, refined_agreement=6.0,
         refined_support=2.0, refined_min_score=0.4,
     )  # fmt: skip
-    assert fitted.of_candidates().min_score == CANDIDATE
+    assert fitted.scores_refined
     assert fitted.unrefined() == RecoveryOptions(min_score=0.5)
     judged = [
         replace(said[0], agreement=0.9, support=0.4),
         replace(said[1], agreement=None, kept="no"),
     ]
-    (only,) = rescored(judged, fitted)
-    assert only.agreement == 0.9
-    assert only.score == pytest.approx(expit(-2 + np.log(0.2 / 0.8) + 6 * 0.9 + 2 * 0.4))
+    best, last = rescored(judged, fitted)
+    assert (best.agreement, last.agreement) == (0.9, None)
+    assert best.score == pytest.approx(expit(-2 + np.log(0.2 / 0.8) + 6 * 0.9 + 2 * 0.4))
 
 
 def test_missing_keypoints_and_worse_fits_are_seen():

@@ -247,7 +247,7 @@ def _by_object(
     images = ((source, index) for source in sources for index in range(len(source)))
     for number, (source, index) in enumerate(images):
         sample = source.sample(index, 0)
-        detections = estimator.predict(sample.image, sample.K, cropped=True)
+        detections = estimator.candidates(sample.image, sample.K, cropped=True)
         for part in parts:
             of_part = [detection for detection in detections if detection.object == part.name]
             true = [instance for instance in sample.instances if instance.label == part.name]

@@ -110,7 +110,7 @@ def found(T: np.ndarray, certainty: float, shift: float = 0.0) -> Detection:
 
 
 def estimator(*detections: Detection, refiner: object = None) -> Any:
-    return SimpleNamespace(predict=lambda image, K, **_: list(detections), refiner=refiner)
+    return SimpleNamespace(candidates=lambda image, K, **_: list(detections), refiner=refiner)
 
 
 def test_right_is_matched_once_and_within_a_tenth_of_the_diameter():
