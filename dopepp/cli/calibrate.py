@@ -156,7 +156,8 @@ def bench(
             result, names = _bench_from_board(source, board, camera, hand_eye, poses, pose_format)
         elif source.is_dir():
             problem = f"{source}, a folder, without --board"
-            raise UserError(problem, "a CSV, or pictures with --board", "add --board")
+            fix = "describe the board, e.g. --board charuco:8x11:20:15"
+            raise UserError(problem, "a CSV, or pictures with --board", fix)
         else:
             result = find_bench(read_points(source, check_unit(unit)))
             names = [f"point {number}" for number in range(1, len(result.residuals) + 1)]
@@ -218,7 +219,8 @@ def _pose_format(unit: str, angles: str, quaternion: str, direction: str) -> Pos
         ("--direction", direction, ("flange-to-base", "base-to-flange")),
     ):
         if value not in allowed:
-            raise UserError(f"{name} {value}", " or ".join(allowed), "use an allowed value")
+            fix = f"pass {' or '.join(f'{name} {choice}' for choice in allowed)}"
+            raise UserError(f"{name} {value}", " or ".join(allowed), fix)
     return PoseFormat(check_unit(unit), angles == "deg", quaternion, direction == "base-to-flange")
 
 
@@ -230,7 +232,8 @@ def _picture_names(folder: Path) -> list[str]:
     names = sorted(path.name for path in folder.glob("*") if path.suffix.lower() in suffixes)
     if not names:
         allowed = f"a folder with {', '.join(suffixes)}"
-        raise UserError(f"{folder} without pictures", allowed, "check the path of the folder")
+        fix = "pass the folder that holds the pictures"
+        raise UserError(f"{folder} without pictures", allowed, fix)
     return names
 
 
@@ -247,7 +250,8 @@ def _folder_sightings(folder: Path, board: Board) -> tuple[list[Sighting], Size]
         if size != first_size:
             problem = f"{folder / name} of {size[0]}×{size[1]} pixels among pictures of "
             problem += f"{first_size[0]}×{first_size[1]}"
-            raise UserError(problem, "pictures of one size", "remove those of another camera")
+            fix = "delete the pictures of the other size, which another camera took"
+            raise UserError(problem, "pictures of one size", fix)
         sighting = _find_board(board, picture, name, quiet=False)
         if sighting is not None:
             sightings.append(sighting)
@@ -303,7 +307,7 @@ def _check_sightings(
         raise UserError(
             f"{source}: the board is on none of {count} pictures",
             "pictures of the board that --board describes",
-            "check --board: kind, numbers of columns and rows, dictionary",
+            "compare --board with the board: kind, numbers of columns and rows, dictionary",
         )
     return sightings, size
 
@@ -333,8 +337,8 @@ def _bench_from_board(
     if on_flange != (poses is not None):
         problem = f"{hand_eye} of a camera on the {'flange' if on_flange else 'bench'}, "
         problem += "without --poses" if on_flange else "with --poses"
-        fix = "add the robot's poses" if on_flange else "leave out --poses"
-        raise UserError(problem, "--poses exactly for a camera on the flange", fix)
+        fix = "add --poses FILE with the robot's poses" if on_flange else "leave out --poses"
+        raise UserError(problem, "--poses only, and always, for a camera on the flange", fix)
     T_mount_cam = read_transform(hand_eye, "T_flange_cam" if on_flange else "T_base_cam")
     board = parse_board(spec)
     sightings, size = _folder_sightings(folder, board)

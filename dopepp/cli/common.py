@@ -58,7 +58,7 @@ Device = Annotated[str, Option(help="PyTorch device, e.g. cpu or cuda.")]
 def check_region(refine: str | None) -> None:
     """Refuse any refinement other than ``region``."""
     if refine not in (None, "region"):
-        raise UserError(f"--refine {refine}", "region", "use --refine region, or leave it out")
+        raise UserError(f"--refine {refine}", "region", "pass --refine region, or leave it out")
 
 
 @contextmanager

@@ -53,7 +53,7 @@ def benchmark(
         from dopepp.parts.catalogue import with_meshes
 
         if (image is None) != (intrinsics is None):
-            fix = "give --image FILE --K FX FY CX CY, or leave out both"
+            fix = "pass --image FILE --K FX FY CX CY, or leave out both"
             raise UserError("only one of --image and --K", "both or neither", fix)
         rows = []
         for path in models:

@@ -107,19 +107,21 @@ def _check_transport(
     if len(chosen) != 1:
         problem = " and ".join(chosen) or "no input and output"
         allowed = "one of --ros2, --bag FILE --out FILE, --json, --udp HOST:PORT"
-        raise UserError(problem, allowed, "choose how pictures come in and poses go out")
+        raise UserError(problem, allowed, "pass one of these options and leave out the others")
     transport = chosen[0]
     if transport in LINES and not words:
         sources = "a camera, a video, pictures, …"
-        raise UserError(f"{transport} without a source", sources, "name it after the model")
+        fix = "write the source after the network, e.g. 0 for the first camera"
+        raise UserError(f"{transport} without a source", sources, fix)
     if transport not in LINES and words:
         allowed = "no source: the pictures come from --topic or from the recording"
-        raise UserError(f"{transport} with the source {words[0]}", allowed, "leave it out")
+        problem, fix = f"{transport} with the source {words[0]}", f"leave out {words[0]}"
+        raise UserError(problem, allowed, fix)
     if (transport == "--bag") != (out is not None):
         problem = "--out without --bag" if out else "--bag without --out"
         raise UserError(problem, "both", "add --bag FILE" if out else "add --out poses.mcap")
     if transport != "--ros2" and params:
-        raise UserError(f"--params with {transport}", "--params with --ros2", "leave it out")
+        raise UserError(f"--params with {transport}", "--params with --ros2", "leave out --params")
     if transport in PACKAGES:
         package, extra = PACKAGES[transport]
         require(package, transport, extra)

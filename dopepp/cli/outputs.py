@@ -117,7 +117,8 @@ class OverlayFolder:
         path = self._folder / name
         if path.exists() and source.exists() and path.samefile(source):
             problem = f"--save {self._folder}, the folder of {source} itself"
-            raise UserError(problem, "a folder without the sources", "choose another folder")
+            fix = "pass another folder, e.g. --save poses"
+            raise UserError(problem, "a folder without the sources", fix)
         return path
 
 

@@ -144,7 +144,8 @@ def _check_options(
         )
     if track and (verify or depth is not None or where):
         problem = "--track with --verify, --depth, --distance or --roi"
-        raise UserError(problem, "--track without these options", "leave them out")
+        fix = "leave out --track, or these options"
+        raise UserError(problem, "--track without these options", fix)
 
 
 def _file_outputs(

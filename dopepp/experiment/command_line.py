@@ -78,8 +78,8 @@ def _refuse_used_folder(arguments: Sequence[str]) -> None:
     if Path(folder, VERSIONS_FILE).is_file() and program.is_first_process():
         raise UserError(
             f"hydra.run.dir={folder}, which holds a run",
-            "a folder without one",
-            f"choose another folder, or go on with resume={folder}",
+            "a folder without a run",
+            f"set another folder, or go on with resume={folder}",
         )
 
 
@@ -104,15 +104,19 @@ def explain(error: Exception) -> UserError:
     if match := re.search(r"Could not override '([^']+)'", text):
         key = match.group(1)
         allowed = "the options of `--cfg job`" + _nearest(key)
-        return UserError(f"override {key!r}, which names no option", allowed, "check the spelling")
+        fix = "correct the name; --cfg job prints all options"
+        return UserError(f"override {key!r}, which names no option", allowed, fix)
     choice = r"Could not find '([^']+)' Available options in '([^']+)': (.*?) Config"
     if match := re.search(choice, text):
         name, group, available = match.groups()
-        return UserError(f"{group}={name.rpartition('/')[2]}", available, "choose one of them")
+        fix = f"set {group} to one of these names"
+        return UserError(f"{group}={name.rpartition('/')[2]}", available, fix)
     if match := re.search(r"Missing mandatory value: (\S+)", text):
         key = match.group(1)
         return UserError(f"no {key}", f"{key}=… on the command line", f"add {key}=…")
-    return UserError(text, "overrides as `key=value`", "see `--help`")
+    return UserError(
+        text, "overrides as `key=value`", "correct the override; --help shows examples"
+    )
 
 
 def _nearest(key: str) -> str:

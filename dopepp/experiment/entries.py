@@ -119,7 +119,7 @@ def entry(
     except OSError as error:  # jobs handle their own errors, so this is an error of Hydra
         if error.errno not in _REFUSALS:
             raise
-        allowed, fix = "a folder that can be written", "set output_dir=…, or make it writable"
+        allowed, fix = "a folder that can be written", "set output_dir=FOLDER, or make it writable"
         problem = f"output folder {error.filename}: {error.strerror}"
         _exit(UserError(problem, allowed, fix), USERS_MISTAKE)
     except UserError as error:  # of a sweeper or launcher; jobs handle their own errors

@@ -373,5 +373,5 @@ def checked_device(device: str | torch.device) -> torch.device:
         allowed = "cpu or cuda" if torch.cuda.is_available() else "cpu (this PyTorch has no cuda)"
         reason = str(error).partition("\n")[0]
         problem = f"device {device} ({reason:.100})"
-        raise UserError(problem, allowed, "pass one of these") from error
+        raise UserError(problem, allowed, "choose a device of this machine, e.g. cpu") from error
     return chosen

@@ -174,10 +174,10 @@ def _translating(network: PoseNetwork, language: str) -> Iterator[None]:
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         parts = ", ".join(type(child).__name__ for child in network.children())
         raise UserError(
-            f"a network of {parts}, which {language} has no words for "
+            f"a network of {parts}, which {language} cannot express "
             f"({lines[0] if lines else type(error).__name__:.300})",
             f"operators that {language} supports, for images of any size",
-            "use another operator in your module, or export it as safetensors",
+            "use another operator in your module, or pass --format safetensors",
         ) from error
     finally:
         for logger, level in levels.items():
@@ -208,7 +208,8 @@ def _halve(graph: Any) -> None:
             continue
         if not np.abs(values).max() <= _FLOAT16_MAX:
             allowed = f"weights of at most {_FLOAT16_MAX:g}"
-            raise UserError(f"--precision fp16 of {tensor.name}", allowed, "choose fp32")
+            problem = f"--precision fp16 with larger weights in {tensor.name}"
+            raise UserError(problem, allowed, "pass --precision fp32")
         name, half = tensor.name, f"{tensor.name}.half"
         tensor.CopyFrom(numpy_helper.from_array(values.astype(np.float16), half))
         conversions.append(helper.make_node("Cast", [half], [name], name, to=TensorProto.FLOAT))

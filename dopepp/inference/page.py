@@ -95,7 +95,8 @@ def served(estimator: PoseEstimator, port: int | None = None) -> Iterator[str]:
             _, address, _ = page.launch(server_port=port, **LAUNCH)
         except OSError as error:
             taken = "every port from 7860 on" if port is None else f"--port {port}"
-            raise UserError(f"{taken}, which is taken", "a free port", "choose another") from error
+            fix = "end the program that uses it, or pass another port, e.g. --port 8000"
+            raise UserError(f"{taken}, which is taken", "a free port", fix) from error
         try:
             yield address
         finally:
@@ -108,7 +109,7 @@ def make_page(estimator: PoseEstimator, folder: Path) -> gr.Blocks:
     def find_poses(path: str | None, kind: str, *camera: Any) -> Outputs:
         try:
             if path is None:
-                raise UserError("no picture", "a picture's file", "drop one")
+                raise UserError("no picture", "a picture's file", "drop a picture onto the page")
             return _outputs(estimator, Path(path), kind, camera, folder)
         except UserError as error:
             message = str(error)
@@ -209,11 +210,12 @@ def _camera(kind: str, inputs: Sequence[Any], width: int, height: int) -> Camera
         return Camera(None, K, (), "the field of view")
     if kind == FILE:
         if file is None:
-            raise UserError("no camera file", "the calibration's file", "drop it")
+            fix = "drop the camera file onto the page"
+            raise UserError("no camera file", "the calibration's file", fix)
         return read_camera(file)
     for name, number in {"fx": fx, "fy": fy, "cx": cx, "cy": cy}.items():
         if number is None:
-            raise UserError(f"K without {name}", "fx, fy, cx and cy, pixels", "fill it in")
+            raise UserError(f"K without {name}", "fx, fy, cx and cy, pixels", f"enter {name}")
     return Camera(None, camera_matrix(fx, fy, cx, cy), (), "K")
 
 

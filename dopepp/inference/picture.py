@@ -126,7 +126,7 @@ def checked_depth(depth: Depth, image_size: Size) -> Depth32:
     measured = depth[depth != 0]
     if measured.size and measured.min() < 0:
         problem = f"depth with values down to {measured.min():.4g}"
-        fix = "check how the depth was decoded"
+        fix = "read the depth as unsigned numbers, and set unknown pixels to 0"
         raise UserError(problem, "metres along z, 0 where unknown", fix)
     if measured.size and np.median(measured) > FARTHEST:
         raise UserError(
@@ -213,7 +213,7 @@ def network_views(
         x, y, columns, rows = (round(number) for number in roi)
         if not (0 <= x < x + columns <= width and 0 <= y < y + rows <= height):
             allowed = f"(x, y, width, height) within the {width}×{height} image, pixels"
-            raise UserError(f"roi {tuple(roi)}", allowed, "cut it to the image")
+            raise UserError(f"roi {tuple(roi)}", allowed, "move or shrink the region")
         image = np.ascontiguousarray(image[y : y + rows, x : x + columns])
         K = crop_camera(K, x, y)
     boxes = letterboxes(checkpoint, K, image, distances)

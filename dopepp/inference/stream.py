@@ -73,7 +73,8 @@ def stream(
         lens = Lens(choose_camera(K, camera, opened), options.get("K_size"), options.get("crop"))
         if options.get("depth") is not None and opened.count != 1:
             problem = f"--depth with {opened.count or 'many'} pictures"
-            raise UserError(problem, "one picture, which it belongs to", "pass that picture alone")
+            fix = "pass only the picture that the depth belongs to"
+            raise UserError(problem, "one picture", fix)
         tracker = PoseTracker(estimator) if options.get("track") else None
         for frame in opened.frames(stride):
             result = _process(estimator, tracker, frame, lens, options)

@@ -69,7 +69,7 @@ class Viewer:
         if path is not None:
             check_target(path, (".rrd",))
         elif sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
-            fix = "--rerun FILE.rrd writes a file, to look at elsewhere"
+            fix = "pass --rerun FILE.rrd instead, and open the file on a machine with a display"
             raise UserError("--show without a display", "a desktop session", fix)
 
     def begin(self, source: FrameSource) -> None:
@@ -157,7 +157,7 @@ class Viewer:
         deadline = time.monotonic() + START_S
         while not _is_listening(port):
             if time.monotonic() > deadline:
-                raise RunError("the viewer did not start; --rerun FILE.rrd writes a file")
+                raise RunError("the viewer did not start; pass --rerun FILE.rrd to write a file")
             time.sleep(0.1)
         address = f"rerun+http://{LOCALHOST}:{port}/proxy"
         self._recording.connect_grpc(address, default_blueprint=blueprint)

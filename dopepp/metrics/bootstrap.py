@@ -192,7 +192,7 @@ def _check(mine: Numbers, baseline: Numbers, statistic: str, same_seeds: bool) -
         )
     if same_seeds and seeds[0] != seeds[1]:
         problem = f"{seeds[0].pop()} seeds against {seeds[1].pop()}"
-        raise UserError(problem, "equal numbers, to pair them", "pass same_seeds=False")
+        raise UserError(problem, "equal numbers of seeds, to pair them", "pass same_seeds=False")
     if statistic == "mean" and not all(np.isfinite(v).all() for v in [*mine, *baseline]):
         problem, fix = "a mean over numbers that are not finite", "replace misses, e.g. by 0"
         raise UserError(problem, "finite numbers", fix)

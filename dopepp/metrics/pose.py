@@ -150,7 +150,7 @@ class PoseMetrics(Metric):
         names = [part.name for part in parts]
         if not names or len(set(names)) < len(names) or MEAN in names:
             allowed = f"one or more parts of different names, none {MEAN!r}"
-            raise UserError(f"parts {names}", allowed, "rename a part")
+            raise UserError(f"parts {names}", allowed, "pass a part, or rename one of these")
         self.parts = {part.name: part for part in parts}
         self.method = method
         self.set_dtype(torch.float64)

@@ -150,7 +150,9 @@ def labelled_images(data: DataConfig, parts: Parts, seed: int, split: Split) -> 
     if data.format not in added:
         formats, advice = ", ".join((*FORMATS, *added)), extensions.advice("formats", data.format)
         problem = f"data.format={data.format}"
-        raise UserError(problem, formats, f"choose the images' format, or {advice}")
+        raise UserError(
+            problem, formats, f"set data.format to the format of the images, or {advice}"
+        )
     opener: Opener = resolve_name(added[data.format])
     return opener(data, data.root, parts, seed, split)
 
@@ -285,7 +287,7 @@ def _with_camera_of_pictures(config: RunConfig, parts: Parts) -> RunConfig:
         raise UserError(
             f"no annotated object in {source.name}, so the working distance is unknown",
             "working_distance=[near,far], metres",
-            "state the distances at which the camera is to find the parts",
+            "add the distances at which the camera sees the parts, e.g. working_distance=[0.3,0.8]",
         )
     if virtual.working_distance is None:
         _log.info(

@@ -169,7 +169,7 @@ def _start_from(network: torch.nn.Module, path: Path) -> None:
         raise UserError(
             f"init_from={path}, whose network differs from the chosen one",
             "a checkpoint of the same backbone, attention, head, width and number of objects",
-            "choose the model it was trained with",
+            "set the model's options as in the run of the checkpoint, or leave out init_from",
         ) from error
 
 
@@ -215,7 +215,7 @@ def build_trainer(config: RunConfig, run_dir: Path, trackers: Sequence[Logger] =
         raise UserError(
             f"trainer {config.plain['trainer']}, which Lightning refuses: {error}",
             "values of Lightning's Trainer that this machine can run",
-            "correct the trainer's options",
+            "change the option trainer.… that this message names, or leave it out",
         ) from error
 
 

@@ -96,7 +96,8 @@ class VirtualConfig:
         if self.camera is None or self.working_distance is None:
             missing = "camera=FILE" if self.camera is None else "working_distance=[0.3,0.8]"
             given = "working_distance" if self.camera is None else "camera"
-            raise UserError(f"{given} alone", "both, or none of the two", f"add {missing}")
+            allowed = "camera and working_distance together, or neither"
+            raise UserError(f"{given} alone", allowed, f"add {missing}")
         lens = self.camera
         K = camera_matrix(lens.fx, lens.fy, lens.cx, lens.cy)
         return View((lens.width, lens.height), K, self.working_distance)
@@ -198,7 +199,7 @@ class DataConfig:
         """
         if isinstance(data, Mapping) and "virtual" in data:
             problem = f"data.virtual={shown(data['virtual'])}"
-            raise UserError(problem, "virtual.… alone", "set virtual.…")
+            raise UserError(problem, "virtual.…", "write virtual.… instead of data.virtual.…")
         parsed = replace(parse(cls, data, "data"), virtual=VirtualConfig.of(virtual))
         _ = parsed.preset  # raises for a wrong field before anything is rendered
         return parsed
@@ -208,7 +209,7 @@ class DataConfig:
             raise UserError(
                 f"data.input_size={list(self.input_size or ())}",
                 f"[width, height], each a multiple of {_MULTIPLE}",
-                "round up; images are letterboxed into it",
+                "round width and height up; images are letterboxed into this size",
             )
 
     @property
@@ -252,8 +253,8 @@ class DataConfig:
         if chosen is None:
             raise UserError(
                 f"data.image_sets.{split}=null with data.real_fraction={self.real_fraction:g}",
-                f"data.image_sets.{split}=FOLDER, or data.real_fraction=0 for renders alone",
-                "set one of the two",
+                "an image set, or renders alone",
+                f"set data.image_sets.{split}=FOLDER, or data.real_fraction=0",
             )
         return chosen
 
@@ -273,7 +274,8 @@ def chosen_data(data: Node | None, virtual: Node | None, stored: object, source:
     given, base = data or {}, stored if isinstance(stored, dict) else {}
     whole = "name" in given  # a file of conf/data, not single options
     if not whole and not isinstance(stored, dict):
-        raise UserError(f"{source}, which names no data", "data=… on the command line", "add it")
+        allowed, fix = "data=… on the command line", "add the data, e.g. data=virtual"
+        raise UserError(f"{source}, which names no data", allowed, fix)
     base, how = {key: base[key] for key in base if key != "virtual"}, base.get("virtual")
     try:
         merged = given if whole else _changed(base, given, "data")
@@ -321,9 +323,8 @@ def _chosen_virtual(given: Mapping[str, Any], stored: object, source: str) -> Vi
     """Return the given whole node ``virtual``, or the stored node with changed options."""
     if not {"renderer", "preset"} <= set(given):  # else a file of conf/virtual
         if stored is None:
-            raise UserError(
-                f"{source}, which does not say how to render", "virtual=default", "add it"
-            )
+            problem = f"{source}, which does not say how to render"
+            raise UserError(problem, "virtual=… on the command line", "add virtual=default")
         given = _changed(stored, given, "virtual")
     return VirtualConfig.of(given)
 
@@ -331,11 +332,13 @@ def _chosen_virtual(given: Mapping[str, Any], stored: object, source: str) -> Vi
 def _changed(base: object, changes: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Replace options recursively."""
     if not isinstance(base, Mapping):
-        raise UserError(f"{where}={base!r:.100}", "a mapping", "write a whole node")
+        fix = f"choose a file of conf/{where} with {where}=NAME"
+        raise UserError(f"{where}={base!r:.100}", "a mapping", fix)
     merged = dict(base)
     for key, value in changes.items():
         if key not in base and where in _CLOSED:
-            raise UserError(f"{where}.{key}={value}", ", ".join(base), "check the option's name")
+            fix = f"write {where}. and one of these names"
+            raise UserError(f"{where}.{key}={value}", ", ".join(base), fix)
         nested = isinstance(value, Mapping) and isinstance(base.get(key), Mapping)
         merged[key] = _changed(base[key], value, f"{where}.{key}") if nested else value
     return merged

@@ -134,7 +134,7 @@ class TrainerConfig:
         if type(devices) is int and devices > 0:
             return devices
         allowed = "a positive number, a list of devices, auto or -1"
-        raise UserError(f"trainer.devices={self.devices}", allowed, "correct it")
+        raise UserError(f"trainer.devices={self.devices}", allowed, "set e.g. trainer.devices=1")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,7 +161,8 @@ class LearningRateConfig:
     def __post_init__(self) -> None:
         if self.max_lr <= self.min_lr:
             allowed = f"above lr_finder.min_lr={self.min_lr:g}"
-            raise UserError(f"lr_finder.max_lr={self.max_lr:g}", allowed, "widen the range")
+            fix = "raise lr_finder.max_lr, or lower lr_finder.min_lr"
+            raise UserError(f"lr_finder.max_lr={self.max_lr:g}", allowed, fix)
 
 
 @dataclass(frozen=True)
@@ -224,7 +225,7 @@ def _levels(
     numbers: list[float] = [n for n in levels if isinstance(n, int | float) and type(n) is not bool]
     wrong = len(numbers) < len(levels) or not all(bounds[0] <= n <= bounds[1] for n in numbers)
     if wrong or (given is not None and set(numbers) <= {usual}):
-        raise UserError(f"{option}={given!r:.100}", allowed, f"change {option}")
+        raise UserError(f"{option}={given!r:.100}", allowed, f"set {option} to such numbers")
     return tuple(sorted({float(level) for level in numbers if level != usual}))
 
 
@@ -235,7 +236,7 @@ def _quantities(given: object) -> tuple[QuantityName, ...]:
     wrong = [name for name in names if not isinstance(name, str) or name not in quantities]
     if wrong or (given is not None and not names):
         allowed = f"one or more of {', '.join(get_args(QuantityName))}"
-        raise UserError(f"by={given!r:.100}", allowed, "change by")
+        raise UserError(f"by={given!r:.100}", allowed, "set e.g. by=distance")
     return tuple(dict.fromkeys(quantities[name] for name in names))
 
 
@@ -389,7 +390,7 @@ def _parsed(kind: type[C], options: Mapping[str, Any]) -> C:
     """Parse a whole config."""
     if "plain" in options:
         raise UserError(
-            f"plain={shown(options['plain'])}", "the options of `--cfg job`", "remove it"
+            f"plain={shown(options['plain'])}", "the options of `--cfg job`", "leave out plain"
         )
     return replace(parse(kind, options), plain=options)
 

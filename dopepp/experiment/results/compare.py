@@ -138,7 +138,9 @@ def compare_paths(
         out = Path("outputs", "compare", datetime.now().strftime("%Y-%m-%d_%H-%M-%S-%f"))
     elif (out / TABLE_FILE).exists():
         raise UserError(
-            f"{out}, which holds {TABLE_FILE}", "a folder without a comparison", "choose another"
+            f"{out}, which holds {TABLE_FILE}",
+            "a folder without a comparison",
+            "pass another folder with --out",
         )
     entries = compare_runs(runs, out, baseline, num_pictures)
     if layout is not None:
@@ -161,7 +163,8 @@ def compare_runs(
     networks = group(runs)
     names = [entry.name for entry in networks]
     if baseline is not None and baseline not in names:
-        raise UserError(f"baseline {baseline!r}", ", ".join(names), "choose one of them")
+        fix = "pass --baseline with one of these names"
+        raise UserError(f"baseline {baseline!r}", ", ".join(names), fix)
     networks = ordered(networks, baseline or BASELINE)
     entries = with_refined(networks)
     page = write_comparison(entries, folder)

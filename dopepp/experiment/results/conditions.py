@@ -233,7 +233,7 @@ def check_masks(source: SampleSource) -> None:
         raise UserError(
             f"shading on {source.name}, {len(source):,} images without an instance mask",
             "images with masks: renders, label images of YCB-Video, mask_visib of BOP",
-            "choose such data, or leave out shading",
+            "evaluate on images with masks, or leave out shading",
         )
 
 

@@ -66,9 +66,11 @@ def read_json(path: Path) -> dict[str, Any]:
         record = read_strict_json(path)
     except UserError as error:
         allowed = "a file written by a run"
-        raise UserError(f"{error.got}, unreadable", allowed, "check the run folder") from error
+        fix = "run the training or the evaluation again"
+        raise UserError(f"{error.got}, unreadable", allowed, fix) from error
     if not isinstance(record, dict):
-        raise UserError(f"{path} with a {type(record).__name__}", "a JSON object", "check the file")
+        fix = "run the training or the evaluation again"
+        raise UserError(f"{path} with a {type(record).__name__}", "a JSON object", fix)
     return record
 
 

@@ -229,7 +229,7 @@ def release(checkpoint: Path, results: Path, name: str, folder: Path) -> list[Pa
         UserError: A file is of another kind, or the release is too large.
     """
     if not name.isidentifier():
-        raise UserError(f"name {name!r}", "letters, digits and _", "choose another name")
+        raise UserError(f"name {name!r}", "letters, digits and _", "pass a name such as my_part")
     trained = read(checkpoint)
     report = Report.from_record(read_json(results))
     parameters = sum(value.numel() for value in trained.state_dict.values())

@@ -108,7 +108,8 @@ class PaperTable:
         table = parse(cls, config, "table")
         if table.threshold not in _PASS_FIELDS:
             allowed = ", ".join(f"{threshold:g}" for threshold in _PASS_FIELDS)
-            raise UserError(f"table.threshold={table.threshold}", f"{allowed}, metres", "change it")
+            fix = "set table.threshold to one of these numbers"
+            raise UserError(f"table.threshold={table.threshold}", f"{allowed}, metres", fix)
         return table
 
     @classmethod
@@ -124,7 +125,7 @@ class PaperTable:
             raise UserError(
                 f"{path}, which lays out no table",
                 "an experiment with `table:`",
-                "pass conf/experiment/table….yaml",
+                "pass e.g. conf/experiment/table4_parameters.yaml",
             )
         return cls.of(table)
 

@@ -73,7 +73,7 @@ def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part
         raise UserError(
             f"test data without {', '.join(missing)}, which the checkpoint was trained on",
             ", ".join(names),
-            "point data.root or data.parts to data of these objects",
+            "set data.root or data.parts to data of these objects",
         )
     return [available[name] for name in names]
 
@@ -84,7 +84,7 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     asked = EvaluationConfig.of(config)
     extensions.enable(asked.extensions)
     if asked.ckpt_path is None and asked.results is None:
-        fix = "give a checkpoint, or a file of poses"
+        fix = "add ckpt_path=FILE for a checkpoint, or results=FILE for a file of poses"
         raise UserError("neither ckpt_path nor results", "ckpt_path=…, results=… or both", fix)
     paths = [path for path in (asked.baseline, asked.ckpt_path) if path is not None]
     if asked.refine is not None and not paths:
@@ -147,11 +147,15 @@ def _tune_only(
     """Tune the checkpoint without measuring it further."""
     if asked.protocols:
         raise UserError(
-            "tune=true with shading, scale or by", "one of the two", "tune first, then measure"
+            "tune=true with shading, scale or by",
+            "tune=true without these options",
+            "tune first, then measure the tuned checkpoint with these options",
         )
     if asked.ckpt_path is None or len(loaded) > 1:
-        allowed = "one ckpt_path, and no baseline"
-        raise UserError("tune=true", allowed, "tune one checkpoint at a time")
+        is_missing = asked.ckpt_path is None
+        problem = f"tune=true {'without ckpt_path' if is_missing else 'with a baseline'}"
+        fix = "add ckpt_path=FILE" if is_missing else "leave out baseline"
+        raise UserError(problem, "one ckpt_path, and no baseline", fix)
     if not isinstance(loaded[0].network, PoseNetwork):
         fix = "tune the checkpoint, then export the tuned one"
         raise UserError(f"tune=true of {asked.ckpt_path}, which is an export", "a checkpoint", fix)

@@ -66,7 +66,8 @@ def export(
     """
     target = _target(path, layout, precision, out)
     if runtimes.is_export(path):
-        raise UserError(f"{path}, which is an export", "a checkpoint", "export the checkpoint")
+        fix = "pass the checkpoint that it was exported from"
+        raise UserError(f"{path}, which is an export", "a checkpoint", fix)
     check_possible(layout, precision)
     network, checkpoint = load_network(path)
     cost = network_cost(network, checkpoint.input_size)
@@ -102,7 +103,8 @@ def _written(target: Path) -> Iterator[Path]:
         with draft(target) as draft_path:
             yield draft_path
     except OSError as error:
-        raise RunError(f"cannot write {target}: {error.strerror}; free or repair it") from error
+        reason = f"cannot write {target}: {error.strerror}; free space there, or pass another --out"
+        raise RunError(reason) from error
 
 
 def _target(path: Path, layout: str, precision: str, out: Path | None) -> Path:
@@ -110,7 +112,8 @@ def _target(path: Path, layout: str, precision: str, out: Path | None) -> Path:
     choices = {"format": (layout, EXPORTERS), "precision": (precision, PRECISIONS)}
     for name, (value, allowed) in choices.items():
         if value not in allowed:
-            raise UserError(f"--{name} {value}", ", ".join(allowed), "choose one of them")
+            fix = f"pass --{name} with one of these names"
+            raise UserError(f"--{name} {value}", ", ".join(allowed), fix)
     ending = EXPORTERS[layout][1]
     if out is None:
         folder = Path() if path.parent == Path(FOLDER) and not path.exists() else path.parent
@@ -119,13 +122,15 @@ def _target(path: Path, layout: str, precision: str, out: Path | None) -> Path:
     is_file = ending.startswith(".")
     if (is_file and out.suffix != ending) or (not is_file and out.suffix in (".xml", ".onnx")):
         what = f"a file NAME{ending}" if is_file else "a folder"
-        raise UserError(f"--out {out} for --format {layout}", what, "change --out")
+        fix = f"pass e.g. --out {path.stem}{ending}"
+        raise UserError(f"--out {out} for --format {layout}", what, fix)
     others = [path for path in out.glob("*") if path.suffix not in (".xml", ".bin")]
     if (is_file and out.is_dir()) or (not is_file and out.is_file()) or others:
         problem = f"--out {out}, where something else exists"
-        raise UserError(problem, "a new path, or an earlier export", "choose another path")
+        raise UserError(problem, "a new path, or an earlier export", "pass another --out")
     if out.exists() and path.exists() and out.samefile(path):
-        raise UserError(f"--out {out}, which is the checkpoint", "another path", "choose one")
+        fix = "pass another --out"
+        raise UserError(f"--out {out}, which is the checkpoint", "another path", fix)
     return out
 
 

@@ -75,7 +75,9 @@ def find_learning_rate(config: RunConfig, run_dir: Path) -> Suggestion | None:
     """
     if config.resume is not None:
         raise UserError(
-            f"resume={config.resume} with job=lr_finder", "init_from=…, or neither", "remove resume"
+            f"resume={config.resume} with job=lr_finder",
+            "init_from=CHECKPOINT, or neither",
+            "leave out resume",
         )
     seed_everything(config.seed, verbose=False)
     parts = build_parts(config.data)

@@ -93,7 +93,8 @@ def check_resume(
     path = run / CONFIG_FILE
     before = read_yaml(path) if path.is_file() else config.plain
     if not isinstance(before, Mapping):
-        raise UserError(f"{path} with a {type(before).__name__}", "a config", "check the run")
+        fix = "restore the file from a copy, or start a new run"
+        raise UserError(f"{path} with a {type(before).__name__}", "a config", fix)
     differences = config_differences(before, config.plain)
     state = [change for change in differences if change.key == _OPTIMIZER]
     if saved.spec != payload["spec"] or state:
@@ -103,8 +104,8 @@ def check_resume(
             if not state
             else f"resume={run} with another optimiser ({_listed(state)})",
             "the model, the number of objects and the optimiser of that run",
-            f"leave them as they were, or start anew with init_from={run / BEST_CHECKPOINT}"
-            " where the network is the same",
+            "set these options as in that run, or start a new run with "
+            f"init_from={run / BEST_CHECKPOINT} if the network is the same",
         )
     learnt = [change for change in differences if below(change.key, LEARNT_FROM)]
     learnt = [change for change in learnt if not below(change.key, _NOT_LEARNT_FROM)]
@@ -113,8 +114,8 @@ def check_resume(
     if learnt and not config.resume_anyway:
         raise UserError(
             f"resume={run} with other data or another loss ({_listed(learnt)})",
-            "what the run has learnt from so far",
-            "leave these as they were, or add resume_anyway=true",
+            "the data and the loss of that run",
+            "set these options as in that run, or add resume_anyway=true",
         )
     return list(dict.fromkeys([*differences, *learnt]))
 
@@ -151,13 +152,15 @@ def trusted_overrides(stored: object, source: Path) -> list[str]:
         UserError: The stored value is not a list of overrides.
     """
     if not isinstance(stored, list) or not all(isinstance(text, str) for text in stored):
-        raise UserError(f"{source} without a list of overrides", "key=value lines", "check the run")
+        fix = "restore the file from a copy, or start a new run"
+        raise UserError(f"{source} without a list of overrides", "key=value lines", fix)
     kept = []
     for text in stored:
         match = _OVERRIDE.fullmatch(text)
         if match is None:
-            value, allowed = f"{source} with {text!r:.100}", "overrides as key=value"
-            raise UserError(value, allowed, "check the run's folder")
+            problem, allowed = f"{source} with {text!r:.100}", "overrides as key=value"
+            fix = "restore the file from a copy, or start a new run"
+            raise UserError(problem, allowed, fix)
         if match["key"] in ("resume", "resume_anyway", "hydra.run.dir"):
             continue
         if "hydra" in re.split(r"[/.@:]", match["key"]):

@@ -132,7 +132,7 @@ def _train(
         raise UserError(
             f"resume={config.resume} with keep_checkpoints=false",
             "a run whose checkpoints are kept",
-            "set keep_checkpoints=true, or start anew without resume",
+            "set keep_checkpoints=true, or start a new run without resume",
         )
     seed_everything(config.seed, verbose=False)
     keep_freed_memory()
@@ -237,7 +237,8 @@ def _resume_path(
     resume = config.resume
     if resume is None:
         if config.resume_anyway:
-            raise UserError("resume_anyway=true without resume", "only with resume", "set resume")
+            fix = "add resume=FOLDER, or leave out resume_anyway"
+            raise UserError("resume_anyway=true without resume", "both, or resume alone", fix)
         return None, []
     run_dir = Path(resume)
     newest = newest_checkpoint(run_dir)
@@ -245,7 +246,7 @@ def _resume_path(
         raise UserError(
             f"resume={resume}, which has no {LAST_CHECKPOINT}",
             "the folder of an interrupted run",
-            "pass that run's folder, or start anew without resume",
+            "set resume to the folder of a run, or start a new run without resume",
         )
     if newest is None:
         display.console.print(f"no checkpoint yet in {resume}: the run starts from its beginning")

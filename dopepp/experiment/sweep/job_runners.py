@@ -198,7 +198,8 @@ def on_slurm(folder: str, cluster: str, max_num_timeout: int, sbatch: Mapping[st
             raise UserError(
                 f"hydra/launcher=submitit_slurm, which this machine or SLURM refuses: {error}",
                 "a machine with srun and sbatch, and options of sbatch that the cluster takes",
-                "correct hydra.launcher.…, or try it here with hydra.launcher.cluster=local",
+                "change the option hydra.launcher.… that this message names, or run the jobs on "
+                "this machine with hydra.launcher.cluster=local",
             ) from error
         numbers = dict(zip((handle.job_id for handle in handles), overrides, strict=True))
         for handle in submitit.helpers.as_completed(handles):

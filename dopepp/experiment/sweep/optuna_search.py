@@ -83,7 +83,7 @@ def search(
         raise UserError(
             f"search=optuna with an experiment that sweeps over {', '.join(swept)} itself",
             "an experiment of one training, such as experiment=quickstart",
-            "leave one of the two out",
+            "leave out search=optuna, or choose another experiment",
         )
     options: Any = OmegaConf.to_container(config.search, resolve=True)
     wanted = check("search.num_trials", options["num_trials"], int, Range(1, MOST))
@@ -117,7 +117,7 @@ class _Trials:
             raise UserError(
                 f"{folder} with the jobs {', '.join(sorted(foreign))} of another study",
                 f"a folder of the study {study.study_name} alone",
-                "choose another search.study=NAME, or move the folder away",
+                "set another search.study=NAME, or move the folder away",
             )
 
     def run(self, wanted: int, at_a_time: int) -> list[JobReturn]:
@@ -236,7 +236,7 @@ def _bad_entry(problem: str) -> UserError:
     return UserError(
         f"search.space with {problem}",
         "interval(low, high), int(interval(…)), tag(log, interval(…)), range(…), choice(…)",
-        "correct search.space or the command line",
+        "write the option in one of these forms, e.g. 'optimizer.lr=interval(1e-4, 1e-2)'",
     )
 
 
@@ -282,7 +282,7 @@ def alone(folder: Path, study: str) -> Iterator[None]:
             raise UserError(
                 f"search.study={study}, which another command is searching in {folder}",
                 "one command at a time",
-                "wait for it, raise its search.num_parallel, or choose another search.study",
+                "wait for its end, raise its search.num_parallel, or set another search.study=NAME",
             ) from error
         yield
 
@@ -301,7 +301,8 @@ def open_study(options: Mapping[str, Any], facts: Mapping[str, str], seed: int) 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     name = str(options["study"])
     if options["mode"] not in _DIRECTIONS:
-        raise UserError(f"search.mode={options['mode']}", "max or min", "choose one of them")
+        fix = "set search.mode=max or search.mode=min"
+        raise UserError(f"search.mode={options['mode']}", "max or min", fix)
     study = optuna.create_study(
         storage=open_storage(str(options["storage"])),
         study_name=name,
@@ -328,7 +329,7 @@ def _check_same(before: Mapping[str, str], now: Mapping[str, str], study: str) -
     raise UserError(
         f"{', '.join(shown)}{more}, while the study {study} was begun with {', '.join(was)}",
         "the command that the study was begun with",
-        "choose another search.study=NAME",
+        "repeat that command, or begin another study with search.study=NAME",
     )
 
 

@@ -85,5 +85,5 @@ def _expand(pattern: str) -> list[Path]:
         f"{pattern}, {problem}",
         f"an image, a folder of images, a pattern like 'frames/*.png', a video or a recording "
         f"({', '.join((*VIDEOS, *BAGS))}), a camera number, or an rtsp:// or http:// address",
-        "check the path",
+        "pass the path of an existing file, in quotes if it is a pattern",
     )

@@ -81,7 +81,8 @@ def list_images(path: Path) -> list[Path] | None:
     images = sort_paths(child for child in path.iterdir() if child.suffix.lower() in SUFFIXES)
     if not images:
         allowed = f"a folder with images ({', '.join(SUFFIXES)})"
-        raise UserError(f"{path} without a picture", allowed, "pass the folder of the images")
+        fix = "pass the folder that holds the images"
+        raise UserError(f"{path} without a picture", allowed, fix)
     return images
 
 
@@ -198,11 +199,10 @@ class Live(FrameSource):
         capture = self._opened(self._address)
         if not capture.isOpened():
             is_number = isinstance(self._address, int)
-            raise UserError(
-                f"{self.name}, which does not open",
-                "the number of a connected camera" if is_number else "the address of a stream",
-                "check whether another program shows it, or keeps it open",
-            )
+            allowed = "the number of a connected camera" if is_number else "the address of a stream"
+            by_number = "close other programs that use it, or try camera 0 or 1"
+            fix = by_number if is_number else "test the address with another player, e.g. ffplay"
+            raise UserError(f"{self.name}, which does not open", allowed, fix)
         self.rate = _plausible_rate(capture.get(cv2.CAP_PROP_FPS))
         reader = _NewestFrame(capture, self.name, self._clock)
         timeout, num_requests = self._timeouts[0], 0
@@ -211,7 +211,8 @@ class Live(FrameSource):
                 frame = reader.wait(timeout)
                 if frame is None:
                     since = "" if num_requests else " since it was opened"
-                    raise RunError(f"{self.name}: no picture for {timeout:g} s{since}")
+                    reason = f"{self.name}: no picture for {timeout:g} s{since}"
+                    raise RunError(f"{reason}; check its cable or network")
                 if num_requests % stride == 0:
                     yield frame
                 timeout, num_requests = self._timeouts[1], num_requests + 1
@@ -270,7 +271,8 @@ def is_url(text: str) -> bool:
         return False
     if scheme[1].lower() not in SCHEMES:
         allowed = ", ".join(f"{name}://" for name in SCHEMES)
-        raise UserError(f"address {_without_login(text)}", allowed, "use one of these, or a file")
+        fix = "write an address that begins with one of these, or pass a file"
+        raise UserError(f"address {_without_login(text)}", allowed, fix)
     return True
 
 

@@ -245,11 +245,12 @@ class Bag(FrameSource):
         problem = f"with pictures on {len(names)} topics" if names else "without pictures"
         problem = problem if topic is None else f"without pictures on {topic}"
         allowed = f"one of {', '.join(names)}" if names else f"a topic of {RAW} or {COMPRESSED}"
-        raise UserError(f"{self._path} {problem}", allowed, "name it: --topic /camera/image_raw")
+        fix = f"pass --topic {names[0]}" if names else "record a topic of pictures"
+        raise UserError(f"{self._path} {problem}", allowed, fix)
 
     def _unreadable(self, reason: str) -> UserError:
         allowed = f"a ROS recording ({', '.join(BAGS)}, or a folder with metadata.yaml)"
-        return UserError(f"{self._path}: {reason:.300}", allowed, "copy or record it again")
+        return UserError(f"{self._path}: {reason:.300}", allowed, "copy it again, or record again")
 
 
 def is_bag_folder(path: Path) -> bool:

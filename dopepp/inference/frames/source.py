@@ -81,7 +81,7 @@ def given_camera(K: CameraMatrix | None, camera: Camera | Path | str | None) -> 
         UserError: Both are given, or the camera file cannot be read.
     """
     if K is not None and camera is not None:
-        raise UserError("--K and --camera", "one of the two", "leave one of them out")
+        raise UserError("--K and --camera", "one of the two", "leave out --K or --camera")
     if K is not None:
         return Camera(None, K, (), "--K")
     return read_camera(camera) if isinstance(camera, Path | str) else camera

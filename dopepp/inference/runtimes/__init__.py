@@ -224,7 +224,7 @@ def unpack(text: str | None, path: Path) -> tuple[Checkpoint, Export]:
     """
     if text is None or len(text) > MAX_HEADER_BYTES:
         problem = "no description" if text is None else f"a description of {len(text)} characters"
-        allowed = f"one of at most {MAX_HEADER_BYTES} under {KEY!r}, as `dopepp export` writes it"
+        allowed = f"at most {MAX_HEADER_BYTES} characters under {KEY!r}, written by `dopepp export`"
         raise UserError(f"{path}: {problem}", allowed, _FIX)
     payload = parse_json(text, f"{path}, description under {KEY!r}")
     try:

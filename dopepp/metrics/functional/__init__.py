@@ -57,14 +57,16 @@ def auc(errors: Errors, max_threshold: float, method: AucMethod = "exact") -> fl
     """
     if not max_threshold > 0:
         raise UserError(
-            f"max_threshold={max_threshold}", "a positive number", "give where the curve ends"
+            f"max_threshold={max_threshold}",
+            "a positive number",
+            "pass the error at which the curve ends, e.g. 0.1",
         )
     errors = nan_is_miss(to_float64(errors))
     if method == "exact":
         values = (1 - errors / max_threshold).clamp(0, 1)
         return float(values.mean()) if len(values) else 0.0
     if method != "voc":
-        raise UserError(f"auc method {method!r}", "exact, voc", "choose one of them")
+        raise UserError(f"auc method {method!r}", "exact, voc", "pass method='exact' or 'voc'")
     hits = errors[errors <= max_threshold].sort().values
     if len(hits) == 0:
         return 0.0
@@ -90,7 +92,7 @@ def average_recall(errors: Errors, thresholds: Sequence[float]) -> float:
         UserError: There are no thresholds.
     """
     if not len(thresholds):
-        raise UserError("no thresholds", "one or more", "give those of BOP_THRESHOLDS")
+        raise UserError("no thresholds", "one or more", "pass e.g. BOP_THRESHOLDS")
     return sum(pass_rate(errors, threshold) for threshold in thresholds) / len(thresholds)
 
 

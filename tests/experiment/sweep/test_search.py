@@ -169,7 +169,7 @@ def test_a_study_is_not_mixed_with_another_configuration(call_fast):
     line = call_fast(*FAST, "search.num_trials=2", "data.batch_size=7").line
     assert "data.batch_size=7, while the study s was begun with data.batch_size=32" in line
     done = call_fast(*SEARCH, "optimizer.lr=interval(1e-6,1e-5)", "search.prune=false")
-    assert "choose another search.study=NAME" in done.line
+    assert "search.study=NAME" in done.line
 
 
 def test_a_folder_of_another_study_or_command_is_refused(call_fast, tmp_path):
