@@ -21,7 +21,7 @@ import numpy as np
 from numpy.random import Generator
 
 from dopepp.core.errors import UserError
-from dopepp.drawing.pictures import MAX_SIDE, Picture, read_picture
+from dopepp.drawing.pictures import MAX_SIDE, Picture, Size, read_picture
 from dopepp.virtual.backgrounds.procedural import ProceduralBackgrounds
 
 __all__ = ["Backgrounds", "PhotoBackgrounds", "ProceduralBackgrounds", "find_backgrounds"]
@@ -171,6 +171,45 @@ class PhotoBackgrounds:
         if rng.random() < 0.5:
             image = cv2.flip(image, 1)
         return np.asarray(cv2.convertScaleAbs(image, alpha=float(rng.uniform(0.5, 1.1))), np.uint8)
+
+    def frame(
+        self, rng: Generator, number: int, size: Size, share: float = 1.0, mirrored: bool = False
+    ) -> tuple[Picture, Path]:
+        """Return a photo that covers a frame, and its path.
+
+        Args:
+            rng: Generator of the region's position; unused for the largest region.
+            number: Index of the photo; a damaged photo is replaced by the next.
+            size: (width, height) of the frame, pixels.
+            share: Region's side over that of the largest region of the frame's aspect ratio.
+            mirrored: Whether to flip left and right.
+
+        Raises:
+            UserError: Too many photos are damaged.
+        """
+        while True:
+            path = self.paths[number % len(self.paths)]
+            number += 1
+            if path in self.bad:
+                continue
+            try:
+                photo = read_picture(path)
+            except ValueError as error:
+                self._quarantine(path, str(error))
+                continue
+            break
+        (rows, columns), (width, height) = photo.shape[:2], size
+        scale = share * min(columns / width, rows / height)
+        crop_width, crop_height = round(width * scale), round(height * scale)
+        left, top = (columns - crop_width) // 2, (rows - crop_height) // 2
+        if share < 1:
+            left = int(rng.integers(columns - crop_width + 1))
+            top = int(rng.integers(rows - crop_height + 1))
+        crop = photo[top : top + crop_height, left : left + crop_width]
+        if mirrored:
+            crop = cv2.flip(crop, 1)
+        interpolation = cv2.INTER_AREA if crop_width > width else cv2.INTER_LINEAR
+        return np.asarray(cv2.resize(crop, size, interpolation=interpolation), np.uint8), path
 
     def _photo(self, path: Path) -> list[Picture] | None:
         """Return a reduced photo and its halvings from the cache or file; None if damaged."""

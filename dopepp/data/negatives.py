@@ -1,0 +1,130 @@
+"""Sources of camera frames without the objects: pictures, scenes, and a mix of several kinds.
+
+Every sample is a whole frame without instances; its ``source`` names the kind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from dopepp.data.rendered import RenderedSource
+from dopepp.data.sample import DescribedSource, Purpose, Sample, SourceInfo, item_rng
+from dopepp.drawing.pictures import Size
+from dopepp.geometry.camera import CameraMatrix
+from dopepp.virtual.backgrounds import PhotoBackgrounds
+
+
+class PictureFrames:
+    """Whole pictures as frames of a camera.
+
+    Each picture is scaled and cropped in the middle until it covers the frame; pictures of the
+    camera itself stay as they are. If there are more frames than pictures, the second round is
+    mirrored, and further rounds show random regions.
+
+    Args:
+        pictures: Pictures of a folder or of one split of a folder.
+        num_frames: Number of frames; None for one per picture.
+        K: Camera matrix, pixels.
+        size: (width, height) of the frames, pixels.
+        seed: Seed of the pictures' order and regions.
+    """
+
+    def __init__(
+        self,
+        pictures: PhotoBackgrounds,
+        K: CameraMatrix,
+        size: Size,
+        num_frames: int | None = None,
+        name: str = "pictures",
+        seed: int = 0,
+    ) -> None:
+        self.pictures, self.K, self.size, self.name = pictures, K, size, name
+        self._length = len(pictures.paths) if num_frames is None else num_frames
+        self._seed = seed
+        self._order = item_rng(seed, Purpose.SHUFFLE, 0).permutation(len(pictures.paths))
+
+    def __len__(self) -> int:
+        return self._length
+
+    def sample(self, index: int, epoch: int = 0) -> Sample:
+        """Return frame ``index``; the epoch is ignored."""
+        if not 0 <= index < self._length:
+            raise IndexError(f"item {index} of {self._length}")
+        lap, number = divmod(index, len(self._order))
+        rng = item_rng(self._seed, Purpose.WINDOW, lap, number)
+        share = 1.0 if lap < 2 else rng.uniform(0.5, 1.0)
+        image, path = self.pictures.frame(
+            rng, int(self._order[number]), self.size, share, lap % 2 == 1
+        )
+        key = f"{path.relative_to(self.pictures.folder).as_posix()}/{lap}"
+        return Sample(image, self.K.copy(), [], None, self.name, key)
+
+    def contains(self, label: str) -> bool:
+        """Return False: the pictures show no object."""
+        return False
+
+    def describe(self) -> list[SourceInfo]:
+        """Return the identity of the pictures and the camera."""
+        identity = {
+            "pictures": self.pictures.identity(),
+            "K": self.K.tolist(),
+            "size": list(self.size),
+            "seed": self._seed,
+        }
+        return [SourceInfo(self.name, self._length, identity)]
+
+
+class UnlabelledRenders:
+    """Rendered frames whose objects must not be detected."""
+
+    def __init__(self, renders: RenderedSource) -> None:
+        self.renders, self.name = renders, renders.name
+
+    def __len__(self) -> int:
+        return len(self.renders)
+
+    def sample(self, index: int, epoch: int = 0) -> Sample:
+        """Return frame ``index`` without instances and depth."""
+        return replace(self.renders.sample(index, epoch), instances=[], depth=None)
+
+    def contains(self, label: str) -> bool:
+        """Return False: no object is labelled."""
+        return False
+
+    def describe(self) -> list[SourceInfo]:
+        """Describe the renders."""
+        return self.renders.describe()
+
+
+class FrameMix:
+    """Frames of several sources in turn; the index decides the source.
+
+    Args:
+        sources: One or more sources, each with at least ``num_frames / len(sources)`` frames,
+            rounded up.
+        num_frames: Number of frames.
+    """
+
+    def __init__(
+        self, sources: Sequence[DescribedSource], num_frames: int, name: str = "negatives"
+    ) -> None:
+        self.sources, self.name, self._length = tuple(sources), name, num_frames
+
+    def __len__(self) -> int:
+        return self._length
+
+    def sample(self, index: int, epoch: int = 0) -> Sample:
+        """Return frame ``index``."""
+        if not 0 <= index < self._length:
+            raise IndexError(f"item {index} of {self._length}")
+        item, kind = divmod(index, len(self.sources))
+        return self.sources[kind].sample(item, epoch)
+
+    def contains(self, label: str) -> bool:
+        """Tell whether any source holds this object."""
+        return any(source.contains(label) for source in self.sources)
+
+    def describe(self) -> list[SourceInfo]:
+        """Return the entries of all sources."""
+        return [info for source in self.sources for info in source.describe()]

@@ -1,0 +1,145 @@
+"""Build camera frames without the objects, which tune and test that an estimator keeps silent.
+
+The frames have the full size of the camera and are of several kinds in turn (:data:`KINDS`). The
+kind of a frame is its sample's ``source``. Frames of the validation and the test split show
+different photos.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from dopepp.core.errors import UserError
+from dopepp.data.negatives import FrameMix, PictureFrames, UnlabelledRenders
+from dopepp.data.rendered import RenderedSource, Split
+from dopepp.data.sample import DescribedSource
+from dopepp.drawing.pictures import Size
+from dopepp.experiment.assembly.build_parts import build_negatives
+from dopepp.experiment.config.data_config import DataConfig
+from dopepp.geometry.camera import crop_camera
+from dopepp.parts.lookalikes import lookalikes
+from dopepp.parts.part import Parts
+from dopepp.virtual.backgrounds import Backgrounds, PhotoBackgrounds, find_backgrounds
+from dopepp.virtual.factory import Factory
+from dopepp.virtual.presets import Preset
+from dopepp.virtual.presets.placement import DistancePlacement
+from dopepp.virtual.presets.view import View
+
+PHOTOS: Final = "photos"
+SCENES: Final = "scenes"
+LOOKALIKES: Final = "look-alikes"
+KINDS: Final = {
+    PHOTOS: "photos, whole",
+    SCENES: "renders of clutter, distractors and other parts",
+    LOOKALIKES: "renders of look-alikes of the parts before photos",
+}
+"""Kinds of frames and what they show."""
+
+FRAME: Final[Size] = (640, 480)
+"""(width, height) of the frames if there is no camera and the preset's pictures are smaller."""
+
+_MOST_DISTRACTORS: Final = 12  # in a frame, which bounds the time to render it
+_LOOKALIKES_SHOWN: Final = (1, 3)  # in a frame
+_MARGIN: Final = 0.3  # border without look-alikes, share of the frame, if there is no camera
+_NUM_POSES: Final = 64  # drawn of each part to measure the preset's distances
+
+
+def negative_frames(
+    data: DataConfig, parts: Parts, split: Split, num_images: int
+) -> DescribedSource:
+    """Build frames of a held-out split that show none of the parts.
+
+    Args:
+        data: Options of the data; its backgrounds provide the photos.
+        parts: Parts with meshes.
+        split: ``val`` to choose a threshold, ``test`` to check it.
+        num_images: Number of frames.
+
+    Raises:
+        UserError: The folder of the backgrounds has too few photos to be divided.
+    """
+    view, preset = frame_view(data, parts), data.preset
+    backgrounds = find_backgrounds(data.virtual.backgrounds, split)
+    dense = _as_dense(preset, view.size) if data.virtual.view is None else preset
+    preset = view.whole(dense, data.virtual.camera_scale or 1.0)
+    if data.virtual.view is None:
+        # Far from the middle, the short focal length distorts parts as in no picture of the preset.
+        near, far = view.distance
+        preset = replace(preset, placement=DistancePlacement(near, far, _MARGIN))
+    empty = replace(preset, targets_per_image=(0, 0))
+    sources: list[DescribedSource] = []
+    share = math.ceil(num_images / 3)
+    if isinstance(backgrounds, PhotoBackgrounds):
+        _check_divided(backgrounds)
+        photos = PictureFrames(backgrounds, view.K, view.size, share, PHOTOS, data.eval_seed)
+        sources.append(photos)
+    renders = _factory(data, parts, empty, backgrounds)
+    sources.append(UnlabelledRenders(RenderedSource(renders, num_images, split, SCENES)))
+    alone = replace(
+        preset,
+        targets_per_image=_LOOKALIKES_SHOWN,
+        distractors=replace(preset.distractors, number=(0, 0)),
+    )
+    similar = _factory(data, lookalikes(parts), alone, backgrounds)
+    sources.append(UnlabelledRenders(RenderedSource(similar, num_images, split, LOOKALIKES)))
+    return FrameMix(sources, num_images)
+
+
+def frame_view(data: DataConfig, parts: Parts) -> View:
+    """Return the camera of the frames and the distances of the parts.
+
+    It is the camera of the user or of the labelled pictures. Without one, it has the preset's focal
+    length in at least :data:`FRAME` pixels, so that parts have as many pixels as in the preset.
+    """
+    if data.virtual.view is not None:
+        return data.virtual.view
+    preset = data.preset
+    width, height = max(preset.width, FRAME[0]), max(preset.height, FRAME[1])
+    K = crop_camera(preset.K, (preset.width - width) / 2, (preset.height - height) / 2)
+    near, far = _distances(preset, parts)
+    return View((width, height), K, (max(near, 0.02), max(far, 0.02)))
+
+
+def _distances(preset: Preset, parts: Parts) -> tuple[float, float]:
+    """Return the smallest and largest depth at which a preset places the middle of parts."""
+    if preset.table is not None:
+        return preset.table.distance
+    rng, depths = np.random.default_rng(0), []
+    for part in parts:
+        for _ in range(_NUM_POSES):
+            points = part.points @ preset.turning.draw(rng).T
+            size = preset.width, preset.height
+            depth = float(preset.placement.draw(rng, preset.K, size, points)[2])
+            depths.append(depth + float(points[:, 2].min() + points[:, 2].max()) / 2)
+    return min(depths), max(depths)
+
+
+def _as_dense(preset: Preset, size: Size) -> Preset:
+    """Return a preset whose distractors are as large and as dense in larger frames."""
+    old, scale = preset.distractors, size[0] / preset.width
+    growth = size[0] * size[1] / (preset.width * preset.height)
+    low, high = (min(math.ceil(count * growth), _MOST_DISTRACTORS) for count in old.number)
+    share = old.image_share[0] / scale, old.image_share[1] / scale
+    return replace(preset, distractors=replace(old, number=(low, high), image_share=share))
+
+
+def _factory(data: DataConfig, parts: Parts, preset: Preset, backgrounds: Backgrounds) -> Factory:
+    """Return a factory of the quick renderer, whatever renders the other images."""
+    negatives = build_negatives(data, parts)
+    return Factory(parts, preset, data.eval_seed, backgrounds, negatives=negatives)
+
+
+def _check_divided(photos: PhotoBackgrounds) -> None:
+    """Refuse photos that training has seen as well."""
+    if photos.is_divided:
+        return
+    raise UserError(
+        f"virtual.backgrounds={photos.folder} with {len(photos.paths)} photos, which are too few "
+        "to keep some from training",
+        "at least 6 different photos",
+        "add photos, or leave out virtual.backgrounds to use procedural backgrounds",
+    )
