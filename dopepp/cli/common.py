@@ -40,6 +40,11 @@ Distances = Annotated[
 
 Region = Annotated[str | None, Option("--refine", help="region: refine the poses on the picture.")]
 
+Conf = Annotated[
+    float | None,
+    Option(help="Minimum score of a pose, 0 to 1 (default: the checkpoint's threshold)."),
+]
+
 MaxMs = Annotated[
     float | None, Option(help="Time limit of the refinement per picture, milliseconds.")
 ]

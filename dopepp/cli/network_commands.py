@@ -13,6 +13,7 @@ from typer import Argument, Option
 
 from dopepp.cli.common import (
     CameraFile,
+    Conf,
     Crop,
     Device,
     Distances,
@@ -151,6 +152,7 @@ def serve(
     port: Annotated[
         int | None, Option(min=1, max=65535, help="Port (default: first free from 7860).")
     ] = None,
+    conf: Conf = None,
     refine: Region = None,
     device: Device = "cpu",
 ) -> None:
@@ -168,7 +170,7 @@ def serve(
         from dopepp.inference.estimator import PoseEstimator
         from dopepp.inference.page import served
 
-        estimator = PoseEstimator.load(model, device, refine)
+        estimator = PoseEstimator.load(model, device, refine).reporting(conf)
         with suppress(Interruption), interruptible(""), served(estimator, port) as address:
             typer.echo(f"{address} (Ctrl-C ends it)")
             Event().wait()

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 from typer import Argument, Option
 
 from dopepp.cli.common import (
+    Conf,
     Device,
     Intrinsics,
     MaxMs,
@@ -20,6 +21,9 @@ from dopepp.cli.common import (
     resumable,
 )
 from dopepp.core.errors import UserError, require
+
+if TYPE_CHECKING:
+    from dopepp.inference.pose_result import PoseResult
 
 LINES: Final = ("--json", "--udp")
 
@@ -45,7 +49,7 @@ def node(
     intrinsics: Intrinsics = None,
     camera: Annotated[Path | None, Option(help="Camera file, for camera_info.")] = None,
     frame: Annotated[str | None, Option(help="Optical frame (default: the pictures').")] = None,
-    conf: Annotated[float, Option(help="Minimum score of a pose, 0 to 1.")] = 0.0,
+    conf: Conf = None,
     refine: Region = None,
     max_ms: MaxMs = None,
     track: Track = False,
@@ -91,13 +95,18 @@ def node(
             send_lines(worker, zip(sources, cameras, strict=True), udp)
         elif bag is not None and out is not None:
             answers = process_bag(worker, bag, out, topic, name)
-            counts = [
-                None if answer is None else len(answer.result.detections) for answer in answers
-            ]
+            counts = [answer and _counts(answer.result) for answer in answers]
             processed = [count for count in counts if count is not None]
+            poses, weaker = map(sum, zip((0, 0), *processed, strict=True))
             skipped = len(counts) - len(processed)
             note = f", {skipped} skipped" if skipped else ""
-            typer.echo(f"{out}: {sum(processed)} poses in {len(processed)} pictures{note}")
+            note += f"; {weaker} weaker candidates" if weaker else ""
+            typer.echo(f"{out}: {poses} poses in {len(processed)} pictures{note}")
+
+
+def _counts(result: PoseResult) -> tuple[int, int]:
+    """Return the number of poses and of weaker candidates."""
+    return len(result.detections), result.num_weaker
 
 
 def _check_transport(

@@ -15,6 +15,7 @@ from typer import Argument, Option
 
 from dopepp.cli.common import (
     CameraFile,
+    Conf,
     Crop,
     Device,
     Distances,
@@ -57,7 +58,7 @@ def predict(
     roi: Annotated[
         tuple[int, int, int, int] | None, Option(help="Region of interest: x y width height.")
     ] = None,
-    conf: Annotated[float, Option(help="Minimum score of a detection, 0 to 1.")] = 0.0,
+    conf: Conf = None,
     stride: Annotated[int, Option(help="Use every n-th frame only.")] = 1,
     track: Track = False,
     refine: Annotated[
@@ -103,7 +104,7 @@ def predict(
         from dopepp.inference.estimator import PoseEstimator
         from dopepp.parts.catalogue import with_meshes
 
-        estimator = PoseEstimator.load(model, device, max_ms=max_ms)
+        estimator = PoseEstimator.load(model, device, max_ms=max_ms).reporting(conf)
         known_parts = estimator.parts
         if verify or "region" in terms:
             known_parts = with_meshes(known_parts, parts or (), unit)
@@ -118,7 +119,6 @@ def predict(
         options: StreamOptions = {
             "stride": stride,
             "track": track,
-            "least_score": conf,
             "distances": distance,
             "roi": roi,
             "K_size": K_size,
@@ -162,6 +162,11 @@ def _file_outputs(
     return [(path, make(path)) for path, make in requests if path is not None]
 
 
+def _floor(score: float) -> float:
+    """Round a score down to three decimals."""
+    return math.floor(1000 * score) / 1000
+
+
 class _Session:
     """Processes sources and prints the results.
 
@@ -189,8 +194,9 @@ class _Session:
                 result, reason = self._search_again(result, camera)
             for record in self._records(result):
                 typer.echo(json.dumps(record, ensure_ascii=False))
-            count = len(result.detections)
-            summary = f"{count} pose{'s' * (count > 1)}" if count else "nothing found"
+            summary = result.summary
+            if result.weaker:
+                summary += f" (--conf {_floor(min(result.weaker)):g} shows them)"
             summary += f": {reason}" if reason else ""
             progress = f"{number}/{total or '…'} {Path(result.name).name}: " if total != 1 else ""
             typer.echo(f"{progress}{summary}; speed: {format_speed(result.speed)}", err=True)
@@ -208,14 +214,13 @@ class _Session:
         )
         region = (options["roi"], options["crop"] is not None)
         if options["distances"] is None:
-            detections = self._estimator.predict(image, K, None, metres, "any", *region)
-            detections = [best for best in detections if best.score >= options["least_score"]]
+            candidates = self._estimator.candidates(image, K, None, metres, "any", *region)
+            detections, weaker = self._estimator.split(candidates)
             if detections:
                 typer.echo("nothing in the training range; found at another distance", err=True)
-                return replace(result, detections=detections), ""
+                return replace(result, detections=detections, weaker=weaker), ""
         reason = self._estimator.explain(image, K, metres, options["distances"], *region)
-        least = f"no score of {options['least_score']:g}; " if options["least_score"] else ""
-        return result, least + explained(reason)
+        return result, explained(reason)
 
     def _records(self, result: PoseResult) -> list[dict[str, object]]:
         """Return the detections as plain values, with their agreement if they are verified."""

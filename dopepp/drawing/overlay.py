@@ -32,6 +32,9 @@ GREEN: Final[Colour] = (40, 220, 60)
 BLUE: Final[Colour] = (70, 165, 255)
 """The DOPE baseline (paper Fig. 14)."""
 
+WHITE: Final[Colour] = (255, 255, 255)
+"""Captions."""
+
 MIN_WIDTH_PX: Final = 640
 """Narrower images are enlarged before drawing, for readable lines and legends."""
 
@@ -165,6 +168,13 @@ def draw_text(
     box = box[:, : coverage.shape[1]]
     # Darkening keeps any colour readable on any picture.
     box[:] = np.rint(0.5 * box * (1 - coverage) + np.array(colour) * coverage)
+
+
+def draw_caption(image: Picture, text: str) -> None:
+    """Write a line of text IN PLACE in the bottom left corner; an empty text draws nothing."""
+    size = max(12, round(max(image.shape[:2]) / 50))
+    if text:
+        draw_text(image, text, (0, max(image.shape[0] - size, 0)), size, WHITE)
 
 
 def draw_tags(image: Picture, tags: Sequence[tuple[str, tuple[float, float], Colour]]) -> None:

@@ -172,16 +172,23 @@ def _outputs(
     size = (picture.shape[1], picture.shape[0])
     camera = _camera(kind, inputs, *size).for_picture(size)
     image, K = camera.undistorted(picture), camera.K
-    detections, remark = estimator.predict(image, K), ""
+    (detections, weaker), remark = estimator.split(estimator.candidates(image, K)), ""
     if not detections:
-        detections = estimator.predict(image, K, distances="any")
-        remark = ", not where training had the parts, but at another distance"
-    count = len(detections)
-    message = f"{count} pose{'s' * (count > 1)} found{remark}"
+        detections, weaker = estimator.split(estimator.candidates(image, K, distances="any"))
+        remark = " (not where training had the parts, but at another distance)"
     if not detections:
-        message = f"Nothing found: {explained(estimator.explain(image, K))}"
+        remark = f": {explained(estimator.explain(image, K))}"
     shapes = {part.name: make_shape(part) for part in estimator.parts}
-    result = PoseResult(image, K, detections, {}, path.name, shapes=shapes)
+    result = PoseResult(
+        image,
+        K,
+        detections,
+        {},
+        path.name,
+        shapes=shapes,
+        weaker=weaker,
+        min_score=estimator.min_score,
+    )
     file = Path(mkdtemp(dir=folder), f"{path.stem}.json")
     write_whole(file, json.dumps(result.records(), ensure_ascii=False, indent=1).encode())
     rows: list[list[object]] = []
@@ -196,7 +203,7 @@ def _outputs(
         drawn = np.asarray(
             cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         )
-    summary = _message(message, is_error=not detections)
+    summary = _message(f"{result.summary}{remark}", is_error=not detections)
     return drawn, summary, rows, _button(file), belief_sheet(estimator, image, K)
 
 

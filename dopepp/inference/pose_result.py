@@ -24,6 +24,7 @@ from dopepp.drawing.overlay import (
     MIN_WIDTH_PX,
     YELLOW,
     Colour,
+    draw_caption,
     draw_line,
     draw_tags,
     draw_wireframe,
@@ -105,17 +106,39 @@ class PoseResult:
     time: float | None = None  # seconds since a video's start, or since 1970; None of an image
     identities: Sequence[int] | None = None  # of the detections, if a tracker follows them
     shapes: Mapping[str, Shape] = field(default_factory=dict, repr=False)  # by part name
+    weaker: Sequence[float] = ()  # scores of the candidates below min_score, best first
+    min_score: float = 0.0  # score from which a candidate is a detection
+
+    @property
+    def num_weaker(self) -> int:
+        """Number of candidates below :attr:`min_score`."""
+        return len(self.weaker)
+
+    @property
+    def weaker_in_words(self) -> str:
+        """Number of weaker candidates with the threshold; empty without weaker candidates."""
+        return f"{self.num_weaker} weaker below {self.min_score:.2g}" if self.weaker else ""
+
+    @property
+    def summary(self) -> str:
+        """Number of poses and of weaker candidates in words."""
+        count = len(self.detections)
+        poses = f"{count} pose{'s' * (count > 1)}" if count else "nothing found"
+        return f"{poses}; {self.weaker_in_words}" if self.weaker else poses
 
     def plot(self) -> Picture:
         """Return the image with every part's silhouette, cuboid, axes, name and score.
 
-        An image below 640 pixels in width is enlarged by an integer factor.
+        A caption states the number of weaker candidates. An image below 640 pixels in width is
+        enlarged by an integer factor.
         """
         labels = [
             f"{detection.object}{'' if identity is None else f' #{identity}'} {detection.score:.2f}"
             for detection, identity in self._identified()
         ]
-        return draw_poses(self.image, self.K, self.detections, labels, self.shapes)
+        canvas = draw_poses(self.image, self.K, self.detections, labels, self.shapes)
+        draw_caption(canvas, self.weaker_in_words)
+        return canvas
 
     def save(self, path: Path | str) -> None:
         """Write :meth:`plot` as PNG or JPEG, according to the suffix.
@@ -137,14 +160,22 @@ class PoseResult:
         ]
 
     def to_json(self) -> str:
-        """Return image name, K, speed and all detections as one line of JSON."""
+        """Return image name, K, speed, weaker candidates and all detections as a line of JSON."""
         shared = {"image": self.name, "number": self.number, "time": self.time, "frame": FRAME}
         detections = [
             {key: value for key, value in row.items() if key not in shared}
             for row in self.records()
         ]
         speed = {step: round(ms, 3) for step, ms in self.speed.items()}
-        content = {**shared, "K": self.K.tolist(), "speed_ms": speed, "detections": detections}
+        content = {
+            **shared,
+            "K": self.K.tolist(),
+            "speed_ms": speed,
+            "min_score": self.min_score,
+            "num_weaker": self.num_weaker,
+            "best_weaker": max(self.weaker, default=None),
+            "detections": detections,
+        }
         return json.dumps(content, ensure_ascii=False, allow_nan=False)
 
     def to_dataframe(self) -> pd.DataFrame:

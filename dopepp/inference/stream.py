@@ -28,7 +28,7 @@ class StreamOptions(TypedDict, total=False):
 
     stride: int  # use every n-th frame only
     track: bool  # track parts from frame to frame; the estimator must refine by region
-    least_score: float  # leave out detections of lower scores, in [0, 1]
+    min_score: float | None  # threshold instead of the checkpoint's; see PoseEstimator.reporting
     distances: Distances | None  # expected depths, as in predict; not supported with `track`
     roi: Region | None  # region (x, y, width, height) in pixels; not supported with `track`
     K_size: Size | None  # (width, height) that K belongs to, if images were resized
@@ -67,7 +67,7 @@ def stream(
         allowed = "--track without --distance, --roi and --depth"
         raise UserError(f"--track with {names}", allowed, f"leave out --track or {names}")
     stride = check("stride", options.get("stride", 1), int, Range(1, 1_000_000))
-    least_score = check("least_score", options.get("least_score", 0.0), float, Range(0, 1))
+    estimator = estimator.reporting(options.get("min_score"))
     shapes = {part.name: make_shape(part) for part in estimator.solid_parts}
     for opened in open_sources([source], options.get("topic")):
         lens = Lens(choose_camera(K, camera, opened), options.get("K_size"), options.get("crop"))
@@ -77,16 +77,7 @@ def stream(
             raise UserError(problem, "one picture", fix)
         tracker = PoseTracker(estimator) if options.get("track") else None
         for frame in opened.frames(stride):
-            result = _process(estimator, tracker, frame, lens, options)
-            scores = [detection.score for detection in result.detections]
-            kept = [number for number, score in enumerate(scores) if score >= least_score]
-            ids = result.identities
-            yield replace(
-                result,
-                detections=[result.detections[number] for number in kept],
-                identities=None if ids is None else [ids[number] for number in kept],
-                shapes=shapes,
-            )
+            yield replace(_process(estimator, tracker, frame, lens, options), shapes=shapes)
 
 
 def _process(
@@ -105,10 +96,21 @@ def _process(
         path, scale = options.get("depth"), options.get("depth_scale", 0.001)
         depth = None if path is None else lens.read_depth(path, scale, K)
         distances, roi = options.get("distances"), options.get("roi")
-        detections = estimator.predict(image, K, None, depth, distances, roi, cropped)
+        candidates = estimator.candidates(image, K, None, depth, distances, roi, cropped)
+        detections, weaker = estimator.split(candidates)
     else:
-        tracks = tracker.track(image, K, cropped)
+        tracks, weaker = tracker.track(image, K, cropped), tracker.weaker
         detections = [track.detection for track in tracks]
         identities = [track.identity for track in tracks]
-    speed = spent_between(before, estimator.spent_ms)
-    return PoseResult(image, K, detections, speed, frame.name, frame.number, frame.time, identities)
+    return PoseResult(
+        image,
+        K,
+        detections,
+        spent_between(before, estimator.spent_ms),
+        frame.name,
+        frame.number,
+        frame.time,
+        identities,
+        weaker=weaker,
+        min_score=estimator.min_score,
+    )

@@ -191,7 +191,10 @@ class PoseTracker:
             fix = "load it with PoseEstimator.load(path, refine='region')"
             raise UserError(problem, "refine='region'", fix)
         self.detect_every = check("detect_every", detect_every, int, Range(1, 1_000_000))
-        self._estimator = estimator
+        self.estimator = estimator
+        """Estimator, whose threshold may change between two frames."""
+        self.weaker: list[float] = []
+        """Scores of the weaker candidates of the last frame, if the network was run on it."""
         self._cuboid_of = {part.name: part.cuboid for part in estimator.parts}
         self._diameters = {part.name: part.diameter for part in estimator.parts}
         self._states: list[_State] = []
@@ -207,12 +210,13 @@ class PoseTracker:
             cropped: As in :meth:`PoseEstimator.predict`.
 
         Returns:
-            Visible parts, sorted by identity.
+            Visible parts from the estimator's threshold on, sorted by identity.
 
         Raises:
             UserError: The image is no RGB image, or K does not belong to it.
         """
         image, K, _ = prepare_image(image, K, cropped=cropped)
+        self.weaker = []
         for state in self._states:
             self._follow(state, image, K)
         doubtful = [state for state in self._states if self._is_doubtful(state)]
@@ -223,7 +227,8 @@ class PoseTracker:
             self._detect(image, K, _region_around([s.track.detection for s in doubtful], image))
         self._frame += 1
         self._states = [state for state in self._states if state.unseen <= FORGOTTEN]
-        return [state.track for state in self._states if not state.unseen]
+        tracks = [state.track for state in self._states if not state.unseen]
+        return [track for track in tracks if track.detection.score >= self.estimator.min_score]
 
     def _is_doubtful(self, state: _State) -> bool:
         """Return whether the network has to search a part on this frame."""
@@ -238,7 +243,7 @@ class PoseTracker:
             for motion in (forecast, state.motion.predict(sudden=True)):
                 covariance = motion.pose_covariance
                 start = replace(previous, T_cam_obj=motion.T_cam_obj, covariance=covariance)
-                refined = self._estimator.refined([start], image, K)[0]
+                refined = self.estimator.refined([start], image, K)[0]
                 if refined.kept:
                     continue
                 agreement = _agreement(refined)
@@ -257,7 +262,8 @@ class PoseTracker:
 
     def _detect(self, image: Picture, K: CameraMatrix, roi: Region | None = None) -> None:
         """Run the network, and assign its detections to tracked, lost and new parts."""
-        detections = self._estimator.predict(image, K, roi=roi, cropped=True)  # checked before
+        candidates = self.estimator.candidates(image, K, roi=roi, cropped=True)  # checked before
+        detections, self.weaker = self.estimator.split(candidates)
         refined = [detection for detection in detections if not detection.kept]
         for state, detection in self._assigned(refined):
             agreement = _agreement(detection)

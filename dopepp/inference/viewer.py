@@ -95,6 +95,7 @@ class Viewer:
         log("world/camera", pinhole)
         log("world/camera/picture", rr.Image(result.image).compress(JPEG_QUALITY))
         log("world/camera/outlines", _outlines(result))
+        log("summary", rr.TextDocument(result.summary))
         for name, belief in belief_pictures(self._estimator, result).items():
             log(f"beliefs/{name}", rr.Image(belief))
         # With a tracker, a detection has the same name on every frame.
@@ -231,8 +232,9 @@ def _blueprint(distance: float) -> Any:
     space = rrb.Spatial3DView(origin="world", name="space", eye_controls=eye)
     picture = rrb.Spatial2DView(origin="world/camera", contents="world/camera/**", name="picture")
     beliefs = rrb.Spatial2DView(origin="beliefs", name="belief maps")
+    summary = rrb.TextDocumentView(origin="summary", name="summary")
     return rrb.Blueprint(
-        rrb.Horizontal(space, rrb.Vertical(picture, beliefs, row_shares=[2, 1])),
+        rrb.Horizontal(space, rrb.Vertical(picture, beliefs, summary, row_shares=[8, 4, 1])),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline="frame"),

@@ -90,7 +90,7 @@ def test_a_picture_becomes_an_overlay_and_a_file_as_predict_prints_it(page, file
     upload(page, "#picture", files / "part.png")
     page.get_by_label("camera file", exact=True).check()
     upload(page, "#camera", files / "K.txt")
-    assert said(page) == "1 pose found"
+    assert said(page) == "1 pose"
     shown = page.locator("#poses img")
     shown.wait_for()
     source = shown.get_attribute("src")
@@ -117,7 +117,7 @@ def test_a_picture_becomes_an_overlay_and_a_file_as_predict_prints_it(page, file
     [
         ("words.png", "60", "got image words.png: cannot identify the format"),
         ("part.png", "179", "got field of view=179; allowed: a number from 5 to 150 (degrees)"),
-        ("empty.png", "60", "Nothing found: pivconnector: its maps are empty"),
+        ("empty.png", "60", "nothing found: pivconnector: its maps are empty"),
     ],
 )
 def test_what_is_wrong_is_told_in_a_sentence(page, files, picture, view, line):

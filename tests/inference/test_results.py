@@ -101,6 +101,21 @@ def test_a_picture_is_saved_as_its_suffix_says(tmp_path):
         result(pose()).save(tmp_path / "a.gif")
 
 
+def test_weaker_candidates_are_counted_in_words_on_the_picture_and_in_json():
+    plain, loud = result(pose()), result(pose(), weaker=[0.3, 0.051], min_score=0.312)
+    assert (plain.summary, loud.summary) == ("1 pose", "1 pose; 2 weaker below 0.31")
+    assert result(weaker=[0.1], min_score=0.5).summary == "nothing found; 1 weaker below 0.5"
+    changed = (plain.plot() != loud.plot()).any(axis=2)
+    assert changed[-20:, :200].any()
+    assert not changed[:-20].any()
+    contents = [json.loads(item.to_json()) for item in (plain, loud)]
+    keys = ("min_score", "num_weaker", "best_weaker")
+    assert [[content[key] for key in keys] for content in contents] == [
+        [0.0, 0, None],
+        [0.312, 2, 0.3],
+    ]
+
+
 def test_json_names_frame_units_and_what_is_no_number():
     whole = json.loads(result(pose(), pose(0.1), time=0.4, number=7, identities=[3, 5]).to_json())
     assert (whole["image"], whole["number"], whole["time"], whole["frame"]) == (

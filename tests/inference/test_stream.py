@@ -48,8 +48,10 @@ def test_a_picture_gives_what_predict_gives(estimator, rendered, K, tmp_path):
     assert (result.time, result.identities) == (None, None)
     assert list(result.speed) == ["pre", "network", "decode", "refine"]
     assert min(result.speed.values()) > 0
-    (none,) = estimator.stream(tmp_path / "a.png", K, least_score=1.0)
+    (none,) = estimator.stream(tmp_path / "a.png", K, min_score=1.0)
     assert none.detections == []
+    assert (none.num_weaker, none.min_score) == (1, 1.0)
+    assert none.weaker == pytest.approx([expected.score])
 
 
 def test_a_video_is_followed(estimator, clip, K):
@@ -61,6 +63,12 @@ def test_a_video_is_followed(estimator, clip, K):
     assert [item.number for item in estimator.stream(clip, K, stride=3)] == [0, 3]
 
 
+def test_a_track_begins_with_a_pose_that_passes_the_threshold(estimator, clip, K):
+    results = list(estimator.stream(clip, K, track=True, min_score=1.0))
+    assert [result.detections for result in results] == [[]] * 4
+    assert [result.num_weaker for result in results] == [1] * 4
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -68,7 +76,7 @@ def test_a_video_is_followed(estimator, clip, K):
         ({"K": np.eye(3), "camera": "cam.yaml"}, "--K and --camera"),
         ({"K": np.eye(3)}, "field of view"),
         ({"K": np.eye(3), "stride": 0}, "stride=0"),
-        ({"K": np.eye(3), "least_score": 2}, "least_score=2"),
+        ({"K": np.eye(3), "min_score": 2}, "min_score=2"),
         ({"K": np.eye(3), "track": True, "roi": (0, 0, 9, 9)}, "leave out --track or --roi"),
         ({"K": np.eye(3), "depth": "d.png"}, "--depth with 4 pictures"),
     ],

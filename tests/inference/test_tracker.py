@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import make_transform, moved, project_keypoints, step_between
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
+from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.tracker import (
     FORGOTTEN,
     OFTEN,
@@ -38,12 +39,16 @@ class Stage:
         self.hidden, self.unknown_to_network = set(), set()
         self.looks = self.refinements = 0
         self.agreement = self.network_agreement = 0.95
+        self.min_score = 0.5
 
     def put(self, name, part, place, turn=(0.0, 0.0, 0.0)):
         pose = make_transform(rotation_vector_to_matrix(np.array(turn)), np.array(place))
         self.actors[name] = part.name, pose
 
-    def predict(self, image, K, roi=None, cropped=False):
+    def split(self, candidates):
+        return PoseEstimator.split(self, candidates)
+
+    def candidates(self, image, K, roi=None, cropped=False):
         self.looks += 1
         self.roi = roi
         return [
@@ -134,6 +139,19 @@ def test_a_lost_part_is_looked_for_and_keeps_its_identity(stage, tracker):
     assert stage.looks == 9
 
 
+def test_only_parts_from_the_threshold_on_are_tracked(stage):
+    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
+    stage.min_score = 0.95
+    tracker = PoseTracker(stage)
+    assert tracker.track(IMAGE, K) == []
+    assert tracker.weaker == [0.9]
+    stage.min_score = 0.5
+    assert len(tracker.track(IMAGE, K)) == 1
+    assert tracker.weaker == []
+    stage.min_score = 0.95
+    assert tracker.track(IMAGE, K) == []
+
+
 def test_a_part_is_forgotten(stage):
     tracker = PoseTracker(stage, detect_every=1_000_000)
     stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
@@ -177,9 +195,9 @@ def test_the_network_outvotes_a_track_that_sits_elsewhere(stage):
     tracker = PoseTracker(stage, detect_every=5)
     stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
     tracker.track(IMAGE, K)
-    true = stage.predict
+    true = stage.candidates
     turned = make_transform(np.diag([-1.0, -1.0, 1.0]), np.array([0.0, 0.0, 0.3]))
-    stage.predict = lambda *given, **options: [
+    stage.candidates = lambda *given, **options: [
         replace(option, T_cam_obj=turned) for option in true(*given, **options)
     ]
     detected = [tracker.track(IMAGE, K)[0].detected for _ in range(6)]
@@ -191,7 +209,7 @@ def test_the_network_looks_at_what_agrees_little_and_must_agree_more(stage, trac
     stage.agreement = 0.84  # not enough less than usual to be in doubt
     elsewhere = make_transform(np.eye(3), np.array([0.0, 0.03, 0.3]))
     beside = replace(stage._detection("pivconnector", elsewhere), agreement=0.8)
-    stage.predict = lambda image, K, roi=None, cropped=False: [beside]
+    stage.candidates = lambda image, K, roi=None, cropped=False: [beside]
     for _ in range(2 * OFTEN):
         (track,) = tracker.track(IMAGE, K)
     assert track.detection.T_cam_obj[1, 3] == pytest.approx(0.0, abs=1e-9)

@@ -43,7 +43,7 @@ def test_a_recording_has_everything(estimator, result, tmp_path):
     name = "pivconnector_0"
     assert logged >= {
         "/world", "/world/camera", "/world/camera/picture", "/world/camera/outlines",
-        "/beliefs/pivconnector",
+        "/beliefs/pivconnector", "/summary",
         f"/world/parts/{name}", f"/world/parts/{name}/cuboid", f"/world/meshes/{name}",
         f"/world/uncertainty/{name}",
     }  # fmt: skip

@@ -42,6 +42,9 @@ old pictures."""
 
 QUEUE_OUT: Final = 10
 WAIT_S: Final = 0.2  # seconds between two checks whether the node should stop
+CHECKPOINTS: Final = -1.0
+"""Parameter ``confidence`` for the checkpoint's threshold: ROS has no empty parameter."""
+
 RECENT: Final = 100  # number of pictures over which rates and latencies are reported
 
 logger = logging.getLogger(__name__)
@@ -106,7 +109,7 @@ class _Node:
         self._is_reliable = True
         self._subscriptions: list[Any] = []
         self._subscribe()
-        self._silent_s = 0
+        self._silent_s, self._summary = 0, ""
         self.handle.create_timer(1.0, self._tick)
 
     def _declare_parameters(self) -> None:
@@ -114,23 +117,27 @@ class _Node:
         settings = asdict(self._worker.settings)
         for name, value in settings.items():
             with _ros_errors(f"parameter {name}"):
-                self.handle.declare_parameter(name, value)
-        values = {name: self.handle.get_parameter(name).value for name in settings}
-        self._worker.update(replace(self._worker.settings, **values))
+                self.handle.declare_parameter(name, CHECKPOINTS if value is None else value)
+        self._update({name: self.handle.get_parameter(name).value for name in settings})
         self.handle.add_on_set_parameters_callback(self._change)
 
     def _change(self, parameters: Any) -> Any:
         """Apply changed parameters, all or none."""
         from rcl_interfaces.msg import SetParametersResult
 
-        settings = self._worker.settings
-        names = asdict(settings)
+        names = asdict(self._worker.settings)
         changes = {entry.name: entry.value for entry in parameters if entry.name in names}
         try:
-            self._worker.update(replace(settings, **changes))
+            self._update(changes)
         except UserError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
+
+    def _update(self, parameters: dict[str, Any]) -> None:
+        """Change the worker's settings."""
+        if parameters.get("confidence") == CHECKPOINTS:
+            parameters = parameters | {"confidence": None}
+        self._worker.update(replace(self._worker.settings, **parameters))
 
     def _advertise(self, topic: str, kind: str) -> None:
         full = topic if topic.startswith("/") else f"~/{topic}"
@@ -172,6 +179,7 @@ class _Node:
         for message in self._formatter.messages(answer, self._is_wanted):
             self._publish(message)
         self._pace.count(self._now() - answer.stamp.seconds)
+        self._summary = answer.result.summary
 
     def _tick(self) -> None:
         """Publish the diagnosis once a second, and find out why no pictures arrive."""
@@ -195,6 +203,7 @@ class _Node:
         self.slot.check()
         counts = {"received": self.slot.received, "replaced by newer": self.slot.replaced}
         values = {key: str(value) for key, value in counts.items()} | self._pace.values()
+        values["last picture"] = self._summary
         now = self._now()
         stamp = Stamp(int(now), int(1e9 * (now % 1)))
         problem = self._worker.problem

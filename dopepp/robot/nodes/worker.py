@@ -45,12 +45,13 @@ class Stamp(NamedTuple):
 class WorkerSettings:
     """Settings that may change while a node runs."""
 
-    confidence: float = 0.0  # minimum score of a pose, in [0, 1]
+    confidence: float | None = None  # minimum score of a pose; None: the checkpoint's threshold
     refine: bool = False  # whether poses are refined on the picture
     overlay: bool = False  # whether pictures with drawn poses are published
 
     def __post_init__(self) -> None:
-        check("confidence", self.confidence, float, Range(0, 1))
+        if self.confidence is not None:
+            check("confidence", self.confidence, float, Range(0, 1))
         check("refine", self.refine, bool)
         check("overlay", self.overlay, bool)
 
@@ -198,29 +199,30 @@ class Worker:
             fix = "let the driver publish the camera_info of these pictures, or calibrate the "
             fix += "camera at this size"
             raise UserError(f"{camera.source} of {sizes}", "a camera of the pictures' size", fix)
-        estimator = self._estimator(self.settings.refine)
+        estimator = self._estimator(self.settings.refine).reporting(self.settings.confidence)
         before, start = dict(estimator.spent_ms), time.perf_counter()
         image = camera.undistorted(frame.image)
         estimator.spent_ms["pre"] += 1000 * (time.perf_counter() - start)
         if self._tracker is None:
-            detections = estimator.predict(image, camera.K, cropped=cropped)
-            ids = None
+            candidates = estimator.candidates(image, camera.K, cropped=cropped)
+            (detections, weaker), ids = estimator.split(candidates), None
         else:
-            tracks = self._tracker.track(image, camera.K, cropped)
+            self._tracker.estimator = estimator
+            tracks, weaker = self._tracker.track(image, camera.K, cropped), self._tracker.weaker
             detections = [track.detection for track in tracks]
             ids = [track.identity for track in tracks]
-        least = self.settings.confidence
-        kept = [index for index, pose in enumerate(detections) if pose.score >= least]
         return PoseResult(
             image,
             camera.K,
-            [detections[index] for index in kept],
+            detections,
             spent_between(before, estimator.spent_ms),
             frame.name,
             frame.number,
             frame.time,
-            ids and [ids[index] for index in kept],
+            ids,
             self._shapes,
+            weaker,
+            estimator.min_score,
         )
 
     def _checked_frame(self, frame_id: str, info: CameraInfo | None, topic: str) -> str:

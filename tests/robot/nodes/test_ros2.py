@@ -45,6 +45,8 @@ def test_parameters_change_while_it_runs(estimator, tmp_path):
             assert result.successful == taken
         assert "a number from 0 to 1" in result.reason
         assert worker.settings == WorkerSettings(confidence=0.75)
+        node.handle.set_parameters([Parameter("confidence", value=-1.0)])
+        assert worker.settings == WorkerSettings()
         node.slot.stop()
     finally:
         rclpy.try_shutdown()
