@@ -40,7 +40,7 @@ def enable(packages: Iterable[str]) -> None:
         if package not in installed:
             allowed = ", ".join(sorted(installed)) or "installed packages with dopepp entry points"
             raise UserError(
-                f"extensions=[{package}]", allowed, f"install {package}, or leave it out"
+                f"extensions=[{package}]", allowed, f"pip install {package}, or leave it out"
             )
     names = dict.fromkeys((*_enabled(), *packages))
     if names:

@@ -69,7 +69,7 @@ def check_target(path: Path, suffixes: Sequence[str] = ()) -> None:
     if suffixes and path.suffix.lower() not in suffixes:
         problem = f"{path}, which is a folder" if path.is_dir() else f"{path} to write"
         allowed = f"a file with one of the suffixes {', '.join(suffixes)}"
-        raise UserError(problem, allowed, "change the name")
+        raise UserError(problem, allowed, f"pass e.g. {path.with_suffix(suffixes[0]).name}")
     try:
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
@@ -77,7 +77,7 @@ def check_target(path: Path, suffixes: Sequence[str] = ()) -> None:
         partial_path(path).touch()
         partial_path(path).unlink()
     except OSError as error:
-        problem, fix = f"{path}: {error.strerror}", "choose another path"
+        problem, fix = f"{path}: {error.strerror}", "pass another path, or make it writable"
         raise UserError(problem, "a file that can be written", fix) from error
 
 

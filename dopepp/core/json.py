@@ -43,15 +43,18 @@ def read_json(path: str | Path, max_bytes: int = MAX_BYTES) -> object:
     path = Path(path)
     allowed = f"a JSON file of at most {max_bytes / 1e6:.3g} MB"
     if not path.is_file():
-        raise UserError(f"{path}, no such file", allowed, "check the path, or restore the file")
+        fix = "pass the path of an existing file, or restore the file"
+        raise UserError(f"{path}, no such file", allowed, fix)
     try:
         with path.open("rb") as file:
             content = file.read(max_bytes + 1)
     except OSError as error:
-        raise UserError(f"{path}: {error.strerror}", allowed, "restore the file") from error
+        fix = "make the file readable, or copy it again"
+        raise UserError(f"{path}: {error.strerror}", allowed, fix) from error
     if len(content) > max_bytes:
         size = path.stat().st_size / 1e6
-        raise UserError(f"{path} of {size:,.3g} MB", allowed, "check what this file is")
+        fix = "pass the right file; this one is too large"
+        raise UserError(f"{path} of {size:,.3g} MB", allowed, fix)
     return parse_json(content, str(path))
 
 

@@ -16,6 +16,7 @@ import json
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import cache
 from itertools import groupby
 from typing import Annotated, Any, Final, NamedTuple, TypeVar
@@ -184,7 +185,7 @@ def check(
         mistake = next(_mistakes(limited, value, error))
         owner = "" if of is None else f" of {getattr(of, 'name', None) or type(of).__name__}"
         problem = f"{mistake.name(name)}={mistake.got if mistake.location else shown(value)}{owner}"
-        raise UserError(problem, mistake.allowed, f"change {name}") from None
+        raise UserError(problem, mistake.allowed, f"set {name} to an allowed value") from None
     return typed
 
 
@@ -237,16 +238,20 @@ def _json(value: object, name: str) -> str:
     except (TypeError, ValueError, RecursionError) as error:
         problem = f"{name}: {error}" if name else str(error)
         allowed = "null, true/false, numbers, text, and lists and mappings of them"
-        raise UserError(problem, allowed, "write plain values") from None
+        raise UserError(problem, allowed, "write only such values") from None
 
 
 def _user_error(mistake: _Mistake, root: str, fix: str) -> UserError:
     name = mistake.name(root)
     if mistake.is_unknown:
-        return UserError(f"{name}={mistake.got}", mistake.allowed, fix or "check the name")
+        fields = mistake.allowed.split(", ")
+        near = get_close_matches(str(mistake.location[-1]), fields, 1)
+        advice = f"write {near[0]}" if near else "use one of these names"
+        return UserError(f"{name}={mistake.got}", mistake.allowed, fix or advice)
     if not mistake.got:
-        return UserError(f"no {name}", f"{name}=…", fix or "add it")
-    return UserError(f"{name}={mistake.got}", mistake.allowed, fix or f"change {name}")
+        return UserError(f"no {name}", f"{name}=…", fix or f"add {name}=…")
+    advice = f"set {name} to an allowed value"
+    return UserError(f"{name}={mistake.got}", mistake.allowed, fix or advice)
 
 
 def _mistakes(kind: type[Any], value: object, error: ValidationError) -> Iterator[_Mistake]:

@@ -67,4 +67,4 @@ def _check_events(text: str) -> None:
 
 def _bad(where: Path | str, problem: str) -> UserError:
     allowed = f"YAML of at most {MAX_BYTES / 1e6:g} MB, without anchors and tags"
-    return UserError(f"{where}, {problem}", allowed, "use a file that you trust, or restore it")
+    return UserError(f"{where}, {problem}", allowed, "write plain YAML, or restore the file")

@@ -70,9 +70,11 @@ def safe_extract(archive: Path | str, folder: Path | str, most_members: int = MO
     """
     archive, folder = Path(archive), Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UserError(f"{folder}, which is in use", "a new or empty folder", "choose another")
+        fix = "pass the path of a new folder"
+        raise UserError(f"{folder}, which is in use", "a new or empty folder", fix)
     if not archive.is_file():
-        raise UserError(f"archive {archive}, no such file", "a tar file", "check the path")
+        fix = "pass the path of an existing file"
+        raise UserError(f"archive {archive}, no such file", "a tar file", fix)
     draft = partial_path(folder.absolute())
     try:
         with archive.open("rb") as file, tarfile.open(fileobj=Bounded(file), mode="r:") as tar:
@@ -92,7 +94,8 @@ def safe_extract(archive: Path | str, folder: Path | str, most_members: int = MO
     except OSError as error:
         problem = f"{archive}, which cannot be unpacked into {folder}: {error}"
         allowed = "an archive to read and a folder with room to write"
-        raise UserError(problem, allowed, "check both, and the space on the disk") from error
+        fix = "make both accessible, and free space on the disk"
+        raise UserError(problem, allowed, fix) from error
     except Exception as error:  # a damaged header makes tarfile raise any type
         raise _refused(archive, f"damaged: {error or type(error).__name__}") from error
     finally:
@@ -155,6 +158,6 @@ def _unpack(tar: tarfile.TarFile, member: tarfile.TarInfo, path: Path) -> None:
 
 
 def _refused(archive: Path, reason: str) -> UserError:
-    allowed = "a whole tar file of plain files and folders that stay inside of its own folder"
-    fix = "do not trust it; get it again from its source"
+    allowed = "a whole tar file of plain files and folders that stay inside its own folder"
+    fix = "do not trust the file; download it again from its source"
     return UserError(f"archive {archive}: {reason}", allowed, fix)

@@ -46,13 +46,14 @@ def check_dataset(root: Path) -> CheckReport:
         "BOP-WebDataset shards (*.tar), or an NDDS or FAT folder (000000.json beside 000000.png)"
     )
     if not root.is_dir():
-        raise UserError(f"{root}, which is no folder", allowed, "give the data set's folder")
+        fix = "pass the folder of the data set"
+        raise UserError(f"{root}, which is no folder", allowed, fix)
     layout = _layout_of(root)
     if layout in (None, "NDDS"):  # NDDS includes annotations of all subfolders
         _refuse_parent(root, layout)
     if layout is None:
         problem = f"{root}, a folder of no known layout"
-        raise UserError(problem, allowed, "give the data set's folder")
+        raise UserError(problem, allowed, "pass the folder of the data set")
     report = CheckReport(root, layout)
     LAYOUTS[layout][1](report)
     return report
@@ -79,5 +80,5 @@ def _refuse_parent(root: Path, layout: str | None) -> None:
     listed = [f"{name} ({kind})" for name, kind in layouts.items()]
     more = f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
     problem = f"{root}, a folder of {len(listed)} data sets: {', '.join(listed[:_LISTED])}{more}"
-    fix = f"check one of them, e.g. dopepp check {root / next(iter(layouts))}"
+    fix = f"check each on its own, e.g. dopepp check {root / next(iter(layouts))}"
     raise UserError(problem, "one data set", fix)

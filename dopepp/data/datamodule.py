@@ -131,7 +131,7 @@ class PoseDataModule(LightningDataModule):
         if missing:
             sources = ", ".join(info.name for info in self.train_source.describe())
             problem = f"no instance of {', '.join(missing)} in the training data ({sources})"
-            fix = "take the object out, or add a source that shows it (e.g. renders)"
+            fix = "leave the object out, or add a source that shows it (e.g. renders)"
             raise UserError(problem, "objects with at least one instance in a training source", fix)
 
     def seen(self, parts: Sequence[Part]) -> dict[str, Seen]:

@@ -73,7 +73,8 @@ def download(name: str, folder: Path | str, progress: Progress | None = None) ->
     """
     source = SOURCES.get(name)
     if source is None:
-        raise UserError(f"unknown data set {name!r}", ", ".join(SOURCES), "choose from this list")
+        fix = "pass a name of this list"
+        raise UserError(f"unknown data set {name!r}", ", ".join(SOURCES), fix)
     target = Path(folder) / name
     photos = target / source.photos
     if photos.is_dir():
@@ -110,7 +111,7 @@ def fetch(
             partial.replace(path)
         elif path.stat().st_size != num_bytes:
             problem = f"{path} of {path.stat().st_size} bytes"
-            raise UserError(problem, f"{num_bytes} bytes", "delete it")
+            raise UserError(problem, f"{num_bytes} bytes", "delete this file and download it again")
         else:
             _verify(path, url, sha256)
     except urllib.error.HTTPError as error:
@@ -121,7 +122,7 @@ def fetch(
         raise _failed(url, f"the connection broke: {error or type(error).__name__}") from error
     except OSError as error:
         allowed = f"a folder to write to with {num_bytes} bytes of room"
-        fix = "choose another folder, or make room; what was received stays"
+        fix = "pass another folder, or free space; the next call goes on with what was received"
         raise UserError(f"{path}, which cannot be written: {error}", allowed, fix) from error
 
 
@@ -188,10 +189,10 @@ def _verify(path: Path, url: str, sha256: str) -> None:
 
 
 def _failed(url: str, reason: str) -> UserError:
-    fix = "check the network and run the same command again: it goes on where it stopped"
+    fix = "check the network and run the command again; it goes on where it stopped"
     return UserError(f"{url}: {reason}", "a server that can be reached and has the file", fix)
 
 
 def _other_file(url: str, problem: str, expected: str) -> UserError:
-    fix = "try again; if it stays so, the file on the server has changed"
+    fix = "run the command again; if this error remains, the file on the server has changed"
     return UserError(f"{url}: {problem}", expected, fix)

@@ -75,7 +75,8 @@ class HybridSource:
         self._sources = (real, virtual, synthetic)
         present = tuple(source is not None for source in self._sources)
         if not any(present):
-            raise UserError("a hybrid mix without any source", "at least one", "give data.root")
+            problem, fix = "a hybrid mix without any source", "set data.root=FOLDER"
+            raise UserError(problem, "at least one source", fix)
         shares = _shares(present, real_fraction, synthetic_fraction)
         if real is not None and shares[REAL] != real_fraction:
             _log.warning("there are no virtual images: the real share is 1, not %g", real_fraction)

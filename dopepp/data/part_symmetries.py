@@ -101,7 +101,8 @@ def _read_infos(choice: str) -> dict[str, bop_models.ModelInfo]:
     path = Path(choice)
     if not path.is_file():
         allowed = f"null, {NONE}, {AUTO} or a models_info.json"
-        raise UserError(f"data.symmetries={choice}, no such file", allowed, "check the path")
+        fix = "set data.symmetries to one of these words or to the path of a file"
+        raise UserError(f"data.symmetries={choice}, no such file", allowed, fix)
     records = read_json(path)
     if isinstance(records, dict) and "diameter" in records:
         records = {"1": records}  # one entry alone

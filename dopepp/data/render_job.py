@@ -128,7 +128,8 @@ def make_job(
 def _find_writer(layout: str) -> Callable[[Path, Sequence[Part]], Writer]:
     """Import and return the class of a layout's writer."""
     if layout not in WRITERS:
-        raise UserError(f"format {layout!r}", ", ".join(WRITERS), "choose one of them")
+        fix = "pass --format with one of these names"
+        raise UserError(f"format {layout!r}", ", ".join(WRITERS), fix)
     module, name = WRITERS[layout]
     writer: Callable[[Path, Sequence[Part]], Writer] = getattr(import_module(module), name)
     return writer
@@ -149,12 +150,12 @@ def _in_camera(
     if path is None or distance is None:
         missing = "--camera FILE" if path is None else "--working-distance 0.3,0.8"
         given = "--working-distance" if path is None else "--camera"
-        raise UserError(f"{given} alone", "both, or none of the two", f"add {missing}")
+        raise UserError(f"{given} alone", "both options, or neither", f"add {missing}")
     try:
         nearest, farthest = (float(end) for end in distance.strip("[]").split(","))
     except ValueError as error:
         allowed = "NEAREST,FARTHEST in metres, e.g. 0.3,0.8"
-        fix = "change --working-distance"
+        fix = "pass e.g. --working-distance 0.3,0.8"
         raise UserError(f"--working-distance {distance:.100}", allowed, fix) from error
     view = View(*read_lens(path), (nearest, farthest), str(path))
     view.check(parts)
@@ -166,7 +167,7 @@ def _in_camera(
 def _sides(size: str) -> tuple[int, int]:
     match = re.fullmatch(r"([0-9]{1,6})[x,]([0-9]{1,6})", size)
     if match is None:
-        raise UserError(f"--size {size}", "WIDTHxHEIGHT in pixels, e.g. 640x480", "change --size")
+        raise UserError(f"--size {size}", "WIDTHxHEIGHT in pixels", "pass e.g. --size 640x480")
     return int(match[1]), int(match[2])
 
 
@@ -181,13 +182,15 @@ def _nested(changes: Sequence[str]) -> dict[str, Any]:
         except (yaml.YAMLError, ValueError, RecursionError) as error:
             sign, value = "", error
         if not sign or not all((*groups, field)):
-            allowed, fix = "FIELD.FIELD=VALUE, the value in YAML", "write lighting.num_lights=[1,3]"
+            allowed = "FIELD.FIELD=VALUE, the value in YAML"
+            fix = "write e.g. --set lighting.num_lights=[1,3]"
             raise UserError(f"--set {change:.200}", allowed, fix)
         node: Any = tree
         for group in groups:
             node = node.setdefault(group, {}) if isinstance(node, dict) else None
         if not isinstance(node, dict) or field in node:
-            raise UserError(f"--set {change} after another --set of {path}", "one each", "drop one")
+            problem = f"--set {change} after another --set of {path}"
+            raise UserError(problem, "one --set for each field", "leave out all but one")
         node[field] = value
     return tree
 
@@ -232,7 +235,9 @@ def begin(root: Path, record: Mapping[str, Any]) -> None:
         if error.errno in NO_SPACE:
             raise stopped(error, root) from error
         raise UserError(
-            f"folder {root}: {error.strerror}", "a folder that can be written", "choose another"
+            f"folder {root}: {error.strerror}",
+            "a folder that can be written",
+            "pass another --out",
         ) from error
 
 
@@ -245,13 +250,13 @@ def _claim(root: Path, record: Mapping[str, Any]) -> None:
         if foreign:
             problem = f"folder {root}, which holds {foreign[0]!r} and no {RECORD_FILE}"
             allowed = "an empty folder, or one that a render job began"
-            raise UserError(problem, allowed, "choose another folder")
+            raise UserError(problem, allowed, "pass another --out")
         write_whole(path, (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())
     # This also follows writing, as two jobs may begin simultaneously.
     differences = list(_differences(read_json(path, _MAX_RECORD_BYTES), record, ""))
     if differences:
         problem = f"{path} of another job: {', '.join(differences[:_MAX_DIFFERENCES])}"
-        fix = "repeat those settings with that version of dopepp, or choose another folder"
+        fix = "repeat those settings with that version of dopepp, or pass another --out"
         raise UserError(problem, "the settings that the folder was begun with", fix)
 
 

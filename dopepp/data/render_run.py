@@ -101,9 +101,11 @@ def _engine(engine: str, workers: int | None, ray_address: str | None) -> OpenPo
     """Return the function that opens the pool, after checking the options."""
     workers = available_cores() if workers is None else workers
     if not 1 <= workers <= MAX_WORKERS:
-        raise UserError(f"--workers {workers}", f"1 to {MAX_WORKERS}", "change --workers")
+        fix = "pass an allowed number, or leave out --workers"
+        raise UserError(f"--workers {workers}", f"1 to {MAX_WORKERS}", fix)
     if engine not in ENGINES:
-        raise UserError(f"--engine {engine}", ", ".join(ENGINES), "choose one of them")
+        fix = "pass --engine with one of these names"
+        raise UserError(f"--engine {engine}", ", ".join(ENGINES), fix)
     if engine == "ray":
         return lambda content: ClusterPool(content, ray_address, workers)
     if ray_address is not None:
@@ -203,7 +205,7 @@ class RenderTasks:
             if not is_begun(self._root):
                 problem = f"{self._root} without {RECORD_FILE}, as one of the workers sees it"
                 allowed = "a folder that every machine of the cluster sees under the same path"
-                raise UserError(problem, allowed, "choose --out on a shared file system")
+                raise UserError(problem, allowed, "pass an --out on a shared file system")
             self._opened = self._job.factory, self._job.writer(self._root)
         return self._opened
 
@@ -234,7 +236,7 @@ def render_dataset(
         StoppedError: The disk is full, or a worker has died.
     """
     if not 1 <= num_items <= MAX_ITEMS:
-        raise UserError(f"-n {num_items}", f"1 to {MAX_ITEMS:,} images", "change -n")
+        raise UserError(f"-n {num_items}", f"1 to {MAX_ITEMS:,} images", "pass e.g. -n 1000")
     root, shard = root.resolve(), shard or Shard()
     if not is_begun(root):
         # This fails before anything is written if the preset cannot show the part.

@@ -51,7 +51,7 @@ class RenderedSource:
         scale: float = 1.0,
     ) -> None:
         if not 0 < scale < math.inf:
-            raise ValueError(f"scale must be positive and finite, problem {scale}")
+            raise ValueError(f"scale must be positive and finite, got {scale}")
         self.factory, self.split, self.name, self.scale = factory, split, name, scale
         self._num_items = num_items
 
@@ -170,7 +170,8 @@ class CachedSource:
                 size = f"{self.num_bytes / 1e9:.1f} GB"
                 problem = f"data.cache=memory for {len(source)} images of {source.name}: {size}"
                 allowed = f"at most half of this machine's {available / 1e9:.1f} GB"
-                fix = "set data.cache=none or disk, a smaller input size or fewer samples per epoch"
+                fix = "set data.cache=none or disk, or lower data.input_size or "
+                fix += "data.samples_per_epoch"
                 raise UserError(problem, allowed, fix)
             self._slots = _in_memory(slot, len(source))
             self._checksums = _in_memory(np.dtype("u8"), len(source))

@@ -125,9 +125,11 @@ def read_content(path: Path) -> bytes:
     try:
         return _content(path)
     except (OSError, ValueError) as error:
-        reason, allowed, fix = str(error), f"at most {MAX_BYTES / 1e6:.0f} MB", "reduce it"
+        reason, allowed = str(error), f"at most {MAX_BYTES / 1e6:.0f} MB"
+        fix = "save the picture with fewer pixels"
         if isinstance(error, OSError):
-            reason, allowed, fix = str(error.strerror), "a readable file", "restore it"
+            reason, allowed = str(error.strerror), "a readable file"
+            fix = "copy the file there, or make it readable"
         raise UserError(f"image {path}: {reason}", allowed, fix) from error
 
 
@@ -148,7 +150,8 @@ def read_image(path: Path) -> NDArray[Any]:
         ) from error
     if _is_deep_colour(content):
         # Pillow would silently drop the lower half of the bits.
-        raise UserError(f"image {path} of 16-bit colours", "8 bits a channel", "convert it")
+        fix = f"convert it: magick {path.name} -depth 8 picture.png"
+        raise UserError(f"image {path} of 16-bit colours", "8 bits a channel", fix)
     if image.mode.startswith("I"):
         return np.asarray(image, np.uint16)
     if image.mode not in ("L", "RGB", "RGBA"):
@@ -166,7 +169,8 @@ def read_rgb(path: Path) -> Picture:
     """
     image = read_image(path)
     if image.dtype != np.uint8:
-        raise UserError(f"image {path} of type {image.dtype}", "8 bits a channel", "convert it")
+        fix = f"convert it: magick {path.name} -depth 8 picture.png"
+        raise UserError(f"image {path} of type {image.dtype}", "8 bits a channel", fix)
     if image.ndim == 2:
         image = np.repeat(image[..., None], 3, axis=2)
     return np.ascontiguousarray(image[..., :3])
@@ -200,7 +204,7 @@ def read_photo(path: Path) -> Picture:
     if is_deep and picture[..., :3].max() < DARKEST:
         raise UserError(
             f"image {path} of 16 bits, the brightest of which is {picture[..., :3].max()} of 255",
-            "16 bits that are used, not 10 or 12 of a sensor's",
+            "values that use all 16 bits, not 10 or 12 of them",
             f"stretch it: magick {path.name} -auto-level -depth 8 picture.png",
         )
     return np.ascontiguousarray(picture[..., :3])
@@ -308,7 +312,7 @@ class VideoFile(AbstractContextManager["VideoFile"]):
         until = round((time - self._start) * self._rate) + 1
         until = min(until, self._written + max(1, round(LONGEST_GAP_S * self._rate)))
         if self._written < until and shutil.disk_usage(self.path.parent).free < LEAST_FREE:
-            raise RunError(f"no space left for {self.path}: free some")
+            raise RunError(f"no space left for {self.path}; delete files on this disk")
         frame = cv2.cvtColor(even, cv2.COLOR_RGB2BGR)
         while self._written < until:
             self._writer.write(frame)

@@ -79,7 +79,7 @@ def _refuse_used_folder(arguments: Sequence[str]) -> None:
         raise UserError(
             f"hydra.run.dir={folder}, which holds a run",
             "a folder without a run",
-            f"set another folder, or go on with resume={folder}",
+            f"set another folder, or continue with resume={folder}",
         )
 
 

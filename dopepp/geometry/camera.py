@@ -188,7 +188,7 @@ def pinhole_matrix(K: CameraMatrix, source: str) -> CameraMatrix:
         raise UserError(
             f"K {K!r:.200} of {source}",
             "a 3×3 pinhole matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels",
-            "pass the camera's own K",
+            "pass the K of the camera's calibration",
         )
     return camera_matrix(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
 

@@ -92,10 +92,12 @@ class Camera:
         if K_size is not None:
             stated = f"--K-size {K_size[0]} {K_size[1]}"
             if min(K_size) < 1:
-                raise UserError(stated, "width and height above 0", "correct it")
+                fix = "pass the size of the calibrated picture, e.g. --K-size 1920 1080"
+                raise UserError(stated, "width and height above 0", fix)
             if self.size is not None and K_size != self.size:
                 allowed = f"the file's own size, {_by(self.size)}"
-                raise UserError(f"{stated} with {self.source}", allowed, "correct it")
+                fix = f"leave out --K-size, or pass --K-size {self.size[0]} {self.size[1]}"
+                raise UserError(f"{stated} with {self.source}", allowed, fix)
         calibrated = K_size or self.size
         if calibrated is not None:
             check_camera(self.K, calibrated, self.source, WHOLE)
@@ -137,7 +139,7 @@ def _camera(calibration: Calibration, source: str) -> Camera:
     K = pinhole_matrix(calibration.K, source)
     if min(K[0, 0], K[1, 1]) <= 0:
         problem = f"{source}: fx={K[0, 0]:g}, fy={K[1, 1]:g}"
-        fix = "calibrate the camera"
+        fix = "calibrate the camera, e.g. with `dopepp calibrate camera`"
         raise UserError(problem, "focal lengths above 0 pixels", fix)
     if len(calibration.distortion) not in COEFFICIENTS:
         problem = f"{source}: {len(calibration.distortion)} distortion coefficients"
@@ -158,7 +160,7 @@ def _text(path: Path) -> str:
     except (OSError, ValueError) as error:  # ValueError also for a null character in its name
         problem = f"camera file {path!s:.200}: {getattr(error, 'strerror', None) or error}"
         allowed = f"a UTF-8 camera file of at most {MAX_BYTES / 1e3:g} kB: {FORMATS}"
-        raise UserError(problem, allowed, "pass the camera's file") from error
+        raise UserError(problem, allowed, "pass a camera file of this form") from error
 
 
 def _cut(K: CameraMatrix, calibrated: Size | None, size: Size, crop: Crop) -> CameraMatrix:
@@ -167,11 +169,13 @@ def _cut(K: CameraMatrix, calibrated: Size | None, size: Size, crop: Crop) -> Ca
     stated = "--crop " + " ".join(map(str, crop))
     if (width, height) != size:
         problem = f"{stated} with a picture of {_by(size)}"
-        raise UserError(problem, "x y followed by the picture's width and height", "correct it")
+        fix = f"pass --crop {x} {y} {size[0]} {size[1]}"
+        raise UserError(problem, "x y followed by the picture's width and height", fix)
     beyond = calibrated is not None and (x + width > calibrated[0] or y + height > calibrated[1])
     if min(x, y) < 0 or beyond:
         inside = f"inside the calibrated picture{f' of {_by(calibrated)}' if calibrated else ''}"
-        raise UserError(stated, f"x y width height {inside}", "correct it")
+        fix = "pass the position of the crop in the calibrated picture"
+        raise UserError(stated, f"x y width height {inside}", fix)
     return crop_camera(K, x, y)
 
 

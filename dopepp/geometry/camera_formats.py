@@ -79,7 +79,7 @@ def parse_calibration(text: str, source: str) -> Calibration:
         text = re.sub(r"\A%YAML.*\n", "", text).removesuffix("---")
         content = parse_yaml(re.sub(r"!!opencv-(nd-)?matrix\b", "", text), source)
     if not isinstance(content, Mapping):
-        raise UserError(f"{source} without any fields", FORMATS, "pass the camera's file")
+        raise UserError(f"{source} without any fields", FORMATS, "pass a file of this form")
     return calibration_of_fields(content, source)
 
 
@@ -96,7 +96,8 @@ def _colmap(lines: Sequence[Sequence[str]], source: str) -> Calibration:
     values = _floats(rest)
     if values is None or len(values) != 2 + _COLMAP_MODELS[model]:
         allowed = f"WIDTH HEIGHT and {_COLMAP_MODELS[model]} numbers behind {model}"
-        raise UserError(f"{source}: {' '.join(rest)!r:.100}", allowed, "export it again")
+        fix = "export the cameras from COLMAP again"
+        raise UserError(f"{source}: {' '.join(rest)!r:.100}", allowed, fix)
     width, height, fx, *values = values
     has_one_focal_length = "OPENCV" not in model and model != "PINHOLE"
     fy, cx, cy, *lens = [fx, *values] if has_one_focal_length else values
@@ -111,14 +112,16 @@ def _xml(text: str, source: str) -> dict[object, object]:
     """Return the fields of OpenCV's XML; without a document type, entities cannot expand."""
     allowed = "OpenCV's XML (opencv_storage), without DOCTYPE"
     if "<!DOCTYPE" in text:
-        raise UserError(f"{source} with DOCTYPE", allowed, "write the file again")
+        fix = "write the file with cv2.FileStorage"
+        raise UserError(f"{source} with DOCTYPE", allowed, fix)
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
         problem = f"{source}, unreadable: {error!s:.200}"
-        raise UserError(problem, allowed, "write the file again") from error
+        raise UserError(problem, allowed, "write the file with cv2.FileStorage") from error
     if root.tag != "opencv_storage":
-        raise UserError(f"{source}: <{root.tag:.50}>", allowed, "write it with cv2.FileStorage")
+        fix = "write the file with cv2.FileStorage"
+        raise UserError(f"{source}: <{root.tag:.50}>", allowed, fix)
     return {node.tag: {part.tag: _words(part) for part in node} or _words(node) for node in root}
 
 
@@ -146,7 +149,7 @@ def calibration_of_fields(content: Mapping[Any, object], source: str) -> Calibra
     elif all(four):
         K = camera_matrix(*(_number(*field) for field in four if field))
     else:
-        fix = "pass the camera's file, of one camera"
+        fix = "pass a file of this form, of one camera"
         raise UserError(f"{source} without camera_matrix (it has {fields})", FORMATS, fix)
     lens = fields.find(
         "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distortion", "D"
@@ -174,7 +177,8 @@ class _Fields:
             inner = camera.get("intrinsic_settings") if isinstance(camera, Mapping) else None
             if not isinstance(camera, Mapping) or not isinstance(inner, Mapping):
                 problem = f"{source}: camera_settings of {len(cameras)} cameras"
-                raise UserError(problem, "one camera with intrinsic_settings", "keep one of them")
+                fix = "delete the other cameras from a copy of the file"
+                raise UserError(problem, "one camera with intrinsic_settings", fix)
             size = camera.get("captured_image_size")
             content = {**inner, **(size if isinstance(size, Mapping) else {})}
         named = {name[:40]: value for name, value in content.items() if isinstance(name, str)}
@@ -199,7 +203,8 @@ def _size(fields: _Fields) -> Size | None:
     if both is not None:
         name, sides = both[0], _numbers(*both)
         if len(sides) != 2:
-            raise UserError(f"{name} of {len(sides)} numbers", "width and height", "correct it")
+            fix = f"write {name}: [width, height]"
+            raise UserError(f"{name} of {len(sides)} numbers", "width and height", fix)
         return _side(name, sides[0]), _side(name, sides[1])
     width, height = (fields.find(f"image_{side}", side) for side in ("width", "height"))
     if width is None and height is None:

@@ -60,7 +60,7 @@ class CBAM(Attention):
     def __init__(self, channels: int, reduction: int = 16, kernel_size: int = 3) -> None:
         super().__init__()
         if check("kernel_size", kernel_size, int, Range(1, 31)) % 2 == 0:
-            raise UserError(f"kernel_size={kernel_size}", "an odd number", "use 3 (the paper's)")
+            raise UserError(f"kernel_size={kernel_size}", "an odd number", "set kernel_size=3")
         self.mlp = _bottleneck(channels, reduction)
         self.spatial = nn.Conv2d(2, 1, kernel_size, padding=kernel_size // 2, bias=False)
         initialise(self)

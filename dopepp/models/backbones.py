@@ -107,7 +107,8 @@ class VGG19(_Chain):
         if width != 1 or batch_norm or not isinstance(weights_path, str):
             values = f"weights_path={weights_path!r:.200}, width={width:g}, batch_norm={batch_norm}"
             allowed = "the path of a file, with width=1 and batch_norm=false"
-            raise UserError(values, allowed, "omit weights_path, or change the other two")
+            fix = "leave out weights_path, or set width=1 and batch_norm=false"
+            raise UserError(values, allowed, fix)
         weights = read_mapping(Path(weights_path), "a torchvision state_dict of vgg19 (.pth)")
         convolutions = (layer for layer in self.modules() if isinstance(layer, nn.Conv2d))
         # torchvision numbers all layers: a convolution counts with its ReLU, a pooling alone.

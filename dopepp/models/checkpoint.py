@@ -53,7 +53,7 @@ _FOLDER_KEYS: Final = ("root", "cache_dir", "backgrounds")
 """Keys of a data configuration that name folders of the training machine."""
 
 _WHAT: Final = "a checkpoint (.ckpt) written by train.py"
-_FIX: Final = "write the file with train.py"
+_FIX: Final = "use a checkpoint that training wrote"
 
 
 @dataclass(eq=False)
@@ -170,7 +170,9 @@ def parse_description(payload: object) -> Checkpoint:
         UserError: A field is missing, of the wrong type or out of range.
     """
     if not isinstance(payload, dict):
-        raise UserError(f"a {type(payload).__name__} under {KEY!r}", "a mapping", "train again")
+        raise UserError(
+            f"a {type(payload).__name__} under {KEY!r}", "a mapping", "train the network again"
+        )
     _check_plain(payload)
     version = payload.get("format_version")
     if type(version) is not int or version != FORMAT_VERSION:
@@ -237,7 +239,7 @@ def _check_weights(checkpoint: Checkpoint, size: int) -> None:
     if odd or stored > size:
         first = odd[0] if odd else "their size"
         problem = f"weights that do not fit the spec's network, first {first}"
-        fix = f"{_FIX}, or use the spec it was trained with"
+        fix = f"{_FIX}, unchanged"
         raise UserError(problem, f"the {len(expected)} tensors of that network", fix)
 
 
@@ -276,7 +278,9 @@ def find(path: Path) -> Path:
     released = released_paths()
     if path.name not in released:
         names = ", ".join(f"{FOLDER}/{name}" for name in released) or "none"
-        raise UserError(f"checkpoint {path}", f"a file, or one of {names}", "correct the name")
+        raise UserError(
+            f"checkpoint {path}", f"a file, or one of {names}", "write one of these names"
+        )
     return released[path.name]
 
 
@@ -285,7 +289,9 @@ def _read_released(path: Path) -> tuple[dict[str, Any], int]:
     tensors, metadata = read_safetensors(path)
     if KEY not in metadata:
         allowed = "a file of `dopepp release` or `dopepp export`"
-        raise UserError(f"{path} without a description under {KEY!r}", allowed, "get it again")
+        raise UserError(
+            f"{path} without a description under {KEY!r}", allowed, "download the file again"
+        )
     payload = parse_json(metadata[KEY], f"{path}, description under {KEY!r}")
     for name, value in tensors.items():
         tensors[name] = value.float() if value.is_floating_point() else value

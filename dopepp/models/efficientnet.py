@@ -82,7 +82,7 @@ class EfficientNetLite(Backbone):
         inside = scaled_channels(check("channels", channels, int, CHANNELS), width)
         top_down = check("top_down", top_down, tuple[int, int], BLOCKS_OR_NONE)
         if isinstance(frozen, bool) or frozen not in (0, *self.strides):
-            raise UserError(f"frozen={frozen!r:.100}", "0, 8, 16 or 32", "choose one of them")
+            raise UserError(f"frozen={frozen!r:.100}", "0, 8, 16 or 32", "set e.g. frozen=8")
         before, self.down = 32, nn.ModuleList()
         for number, stages in enumerate(self.plan):
             blocks: list[nn.Module] = [] if number else [same_conv(3, before, 3, stride=2)]

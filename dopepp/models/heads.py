@@ -179,7 +179,7 @@ class MultiScale(Head):
     ) -> None:
         channels = scaled_channels(128, width)
         if maps not in (None, "plain", "learned"):
-            raise UserError(f"maps={maps!r}", "plain, learned or null", "choose one of them")
+            raise UserError(f"maps={maps!r}", "plain, learned or null", "set e.g. maps=learned")
 
         def make_branch(inputs: int, outputs: int, stage: int) -> Branch:
             return MultiScaleBranch(inputs, channels, outputs, batch_norm, maps)

@@ -167,7 +167,8 @@ def _check_keys(spec: object) -> None:
     if not isinstance(spec, Mapping) or set(spec) != set(SPEC_KEYS):
         keys = sorted(map(str, spec)) if isinstance(spec, Mapping) else repr(spec)[:200]
         allowed = f"exactly {', '.join(SPEC_KEYS)}"
-        raise UserError(f"a model spec with {keys!s:.200}", allowed, "add or remove keys")
+        fix = "write exactly these keys, or use a checkpoint written by train.py"
+        raise UserError(f"a model spec with {keys!s:.200}", allowed, fix)
 
 
 def architecture(spec: Mapping[str, Any]) -> dict[str, Any]:

@@ -90,7 +90,7 @@ class Registry(Generic[T]):
             raise UserError(
                 f"{self.kind} {TARGET} {dotted!r:.200}",
                 ", ".join(self.targets) or "nothing",
-                f"choose one of them, or {advice}",
+                f"choose one of these names, or {advice}",
             )
         return self._load(dotted)
 
@@ -125,7 +125,7 @@ class Registry(Generic[T]):
             raise UserError(
                 f"{node[TARGET]} with {arguments!r:.300}, which it refuses: {error}",
                 f"{node[TARGET]}{inspect.signature(target)}",
-                f"correct the arguments of this {self.kind}",
+                f"pass the {self.kind} arguments that this signature accepts",
             ) from error
 
     def _load(self, dotted: str) -> type[T]:
@@ -174,12 +174,12 @@ class Registry(Generic[T]):
             unknown = key not in free and (not open_ended or key in provided)
             if not isinstance(key, str) or key.startswith("_") or unknown:
                 problem = f"argument {key!r:.100} of {dotted}"
-                raise UserError(problem, allowed, "remove or rename it")
+                raise UserError(problem, allowed, f"remove {key!r:.100}, or use one of these names")
             _check_plain(value, f"{dotted}, argument {key}")
         empty = inspect.Parameter.empty
         needed = [name for name in free if named[name].default is empty]
         if missing := ", ".join(name for name in needed if name not in arguments):
-            raise UserError(f"{dotted} without {missing}", allowed, f"give {missing}")
+            raise UserError(f"{dotted} without {missing}", allowed, f"add {missing}")
 
 
 def _check_plain(value: object, where: str) -> None:
@@ -188,7 +188,8 @@ def _check_plain(value: object, where: str) -> None:
         for key, item in value.items():
             if not isinstance(key, str) or key.startswith("_"):
                 problem = f"key {key!r:.100} in {where}"
-                raise UserError(problem, "plain values", "nested targets are not built")
+                fix = "write only plain values; nested targets are not built"
+                raise UserError(problem, "plain values", fix)
             _check_plain(item, where)
     elif isinstance(value, (list, tuple)):
         for item in value:

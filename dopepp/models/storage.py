@@ -140,10 +140,11 @@ def read_mapping(path: Path, what: str) -> dict[Any, Any]:
     except Exception as error:  # a damaged or hostile file may raise any exception
         reason = " ".join(str(error).split("\n")[0].split()) or type(error).__name__
         problem = f"{path}, which torch refuses to load ({reason[:200]})"
-        fix = "get the file again; load only files that you trust"
+        fix = "download the file again; load only files that you trust"
         raise UserError(problem, what, fix) from error
     if not isinstance(content, dict):
-        raise UserError(f"{path} with a {type(content).__name__} in it", what, "pass another file")
+        fix = "pass a file of this kind"
+        raise UserError(f"{path} with a {type(content).__name__} in it", what, fix)
     return content
 
 
@@ -164,7 +165,7 @@ def check_container(path: Path, what: str) -> int:
             size = sum(member.file_size for member in archive.infolist())
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
         problem = f"{path}, which is not a torch file or was cut short"
-        raise UserError(problem, what, "copy or write it again") from error
+        raise UserError(problem, what, "copy the file again, or write it again") from error
     limit = min(MAX_BYTES, path.stat().st_size)
     if size > limit:
         allowed = f"{what} of at most {limit} bytes"
@@ -175,7 +176,7 @@ def check_container(path: Path, what: str) -> int:
 
 def _check_file(path: Path, what: str) -> None:
     if not path.is_file():
-        raise UserError(f"{path}, which is no file", what, "correct the path")
+        raise UserError(f"{path}, which is no file", what, "pass the path of an existing file")
 
 
 def _check_archive(path: Path) -> None:
@@ -307,7 +308,7 @@ def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         reason = getattr(error, "strerror", None) or getattr(error, "got", None) or str(error)
         allowed = f"a whole safetensors file of at most {MAX_SAFETENSORS_BYTES >> 20} MiB"
         problem = f"{path}: {' '.join(reason[:300].split())}"
-        raise UserError(problem, allowed, "get the file again from its source") from error
+        raise UserError(problem, allowed, "download the file again from its source") from error
     return tensors, metadata
 
 

@@ -110,7 +110,8 @@ def load_part(path_or_name: str | Path, unit: str | None = None) -> Part:
     path = Path(path_or_name)
     if path.suffix.lower() not in READERS:
         allowed = f"{', '.join(BUILTIN)}, or a path to {'/'.join(READERS)}"
-        raise UserError(f"unknown part {text!r}", allowed, "check the spelling")
+        fix = "write a built-in name of this list, or pass a mesh file"
+        raise UserError(f"unknown part {text!r}", allowed, fix)
     mesh, file_unit = read_in_unit(path, unit)
     part = replace(make_part(path.stem, mesh, unit=file_unit), unit=file_unit)
     _log.log(logging.INFO if is_plausible(part) else logging.WARNING, "%s", part_in_words(part))
@@ -146,7 +147,7 @@ def with_meshes(
                 f"--part {text}, which is not in the checkpoint",
                 ", ".join(names),
             )
-            raise UserError(problem, allowed, "name the part: --part NAME=FILE")
+            raise UserError(problem, allowed, "write which part the file is of: --part NAME=FILE")
         chosen[name] = path
     return [_with_mesh(part, chosen.get(part.name), unit) for part in parts]
 

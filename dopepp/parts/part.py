@@ -295,7 +295,8 @@ def _renderable(mesh: Mesh, name: str) -> tuple[Mesh, float]:
     try:
         vertices, faces, values, moved = decimate(mesh.vertices, mesh.faces, values)
     except ValueError as error:
-        allowed, fix = f"up to {MAX_FACES} triangles", "reduce its triangles"
+        allowed = f"up to {MAX_FACES} triangles"
+        fix = "reduce the triangles in the CAD program or Blender (Decimate)"
         raise UserError(f"part {name!r}: {error}", allowed, fix) from error
     counts = f"{len(mesh.faces)} triangles decimated to {len(faces)}"
     logger.warning("part %r: %s; vertices moved by up to %.2g mm", name, counts, 1000 * moved)
@@ -314,7 +315,9 @@ def _check_diameter(diameter: float, name: str, unit: str) -> None:
     raise UserError(
         f"part {name!r} with a diameter of {diameter:.4g} m, its file read with unit={unit}",
         "a diameter of 5 mm – 5 m",
-        f"state the file's unit: unit={likely[0]}" if likely else "check the file's size",
+        f"state the file's unit: unit={likely[0]}"
+        if likely
+        else "export the part at its real size",
     )
 
 

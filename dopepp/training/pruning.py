@@ -127,4 +127,4 @@ def open_storage(location: str) -> BaseStorage:
     except (OSError, ImportError, RuntimeError, SQLAlchemyError, StorageInternalError) as error:
         problem = f"search.storage={location}, which cannot be opened: {error}"
         allowed = "an existing or new file of an Optuna study, or a database URL"
-        raise UserError(problem, allowed, "choose another search.storage") from error
+        raise UserError(problem, allowed, "set search.storage to such a file or URL") from error

@@ -163,7 +163,7 @@ def newest_checkpoint(run_dir: Path) -> tuple[Path, Checkpoint] | None:
     if damaged:
         problem = f"{run_dir}, whose checkpoints are all damaged ({', '.join(damaged)})"
         allowed = f"a run with at least one whole file among {LAST}, {PREVIOUS} and {BEST}"
-        fix = "restore one of them from a backup, or start anew without resume"
+        fix = "restore one of these files from a backup, or start a new run without resume"
         raise UserError(problem, allowed, fix)
     return None
 
@@ -196,13 +196,13 @@ def check_room(run_dir: Path, weight_bytes: int) -> None:
         free = shutil.disk_usage(folder).free
     except OSError as error:
         problem = f"{folder}, which cannot be written: {error.strerror or error}"
-        fix = "set output_dir=…, or make it writable"
+        fix = "set output_dir=FOLDER, or make the folder writable"
         raise UserError(problem, "a folder that can be written, for checkpoints", fix) from error
     needed = _NUM_FILES * _WEIGHTS_PER_FILE * weight_bytes
     needed -= sum(path.stat().st_size for path in folder.glob("*.ckpt"))
     if free < needed:
         allowed = f"at least {needed / 1e6:,.1f} MB, for {_NUM_FILES} checkpoints"
-        fix = "free some space, or set output_dir=…"
+        fix = "free space, or set output_dir=FOLDER on another disk"
         raise UserError(f"{free / 1e6:,.1f} MB free in {folder}", allowed, fix)
 
 
@@ -226,7 +226,7 @@ def _read_whole(path: Path) -> tuple[Checkpoint, int]:
     missing = sorted(_NEEDED - content.keys())
     if bad is not None or missing:
         problem = f"{path}, damaged in {bad}" if bad else f"{path}, without {', '.join(missing)}"
-        raise UserError(problem, "a checkpoint as training wrote it", "take another one")
+        raise UserError(problem, "a checkpoint as training wrote it", "use another checkpoint")
     return checkpoint, int(content["global_step"])
 
 

@@ -226,7 +226,8 @@ def check_state(checkpoint: Mapping[str, Any]) -> None:
     for name, text in (("state_dict", "weights"), ("optimizer_states", "optimiser's state")):
         if not all_finite(_tensors(checkpoint.get(name))):
             when = f"after step {checkpoint.get('global_step')}"
-            raise RunError(f"the {text} not finite {when}: nothing was saved, the run ends")
+            verb = "are" if text == "weights" else "is"
+            raise RunError(f"the {text} {verb} not finite {when}: nothing was saved, the run ends")
 
 
 def _tensors(value: object) -> Iterator[Tensor]:

@@ -53,7 +53,7 @@ class SymmetryOptions(Checked):
         if self.border_deg > 0 and not self.canonical:
             problem = f"symmetry.border_deg={self.border_deg} with symmetry.canonical=false"
             fix = "set symmetry=none, or symmetry.canonical=true"
-            raise UserError(problem, "0 where there are no sectors and so no borders", fix)
+            raise UserError(problem, "symmetry.border_deg=0 without sectors", fix)
 
 
 def draw_maps(

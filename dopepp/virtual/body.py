@@ -61,7 +61,7 @@ def make_body(part: Part, *, is_target: bool) -> Body:
     """
     if part.mesh is None:
         allowed = "parts that were read from a mesh file or built in"
-        fix = "give the part's mesh file; a checkpoint's objects table holds no mesh"
+        fix = "pass the part's mesh file; this checkpoint holds no mesh"
         raise UserError(f"part {part.name} without a mesh", allowed, fix)
     return Body(make_surface(part.mesh), part if is_target else None)
 

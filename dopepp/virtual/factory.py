@@ -69,9 +69,10 @@ class Factory:
         names = [part.name for part in parts]
         if not parts or len(set(names)) != len(names):
             allowed = "at least one part, each with its own name"
-            raise UserError(f"parts {names} to render", allowed, "name the parts differently")
+            fix = "name a part, and rename those that share a name: NAME=FILE"
+            raise UserError(f"parts {names} to render", allowed, fix)
         if seed < 0:
-            raise UserError(f"seed {seed}", "an integer >= 0", "choose another seed")
+            raise UserError(f"seed {seed}", "an integer >= 0", "set a seed such as 0")
         self.parts, self.preset, self.seed = tuple(parts), preset, seed
         self.negatives = _all_negatives(parts, negatives)
         self.backgrounds = ProceduralBackgrounds() if backgrounds is None else backgrounds
@@ -122,16 +123,16 @@ class Factory:
             if plane.offset >= 0:
                 problem = f"scale {scale:g} of a scene whose parts reach higher than the camera"
                 allowed = "a scale at which the camera is above the table"
-                raise UserError(problem, allowed, "choose a larger scale")
+                raise UserError(problem, allowed, "set a larger scale")
             background = picture.seen(K, size, T_cam_table)
         if targets and not any(item.is_target for item in composition.objects):
             part = targets[0].part
             assert part is not None
             raise UserError(
-                f"part {part.name} of diameter {part.diameter:.3g} m, which found no place in any "
-                f"draw of preset {preset.name}",
+                f"part {part.name} of diameter {part.diameter:.3g} m, which fitted into no "
+                f"scene of preset {preset.name}",
                 "a part that the preset's distances and field of view can show",
-                "check the mesh's unit, or replace the preset's distances or field of view",
+                "set the unit of the mesh file, or the preset's distances or field of view",
             )
         objects = [
             replace(item, T_cam_obj=_moved(item.T_cam_obj, shift)) for item in composition.objects
@@ -182,7 +183,7 @@ def _all_negatives(parts: Sequence[Part], given: Sequence[Part]) -> tuple[Part, 
             raise UserError(
                 f"negative {part.name}, which is one of the targets {', '.join(sorted(names))}",
                 "parts whose names and meshes differ from those of the targets",
-                "remove it from the negatives",
+                f"leave {part.name} out of the negatives",
             )
     names |= {part.name for part in given}
     hashes |= {part.mesh_hash for part in given}

@@ -95,7 +95,7 @@ def test_an_argument_becomes_typed(value, kind, limits, typed):
 @pytest.mark.parametrize(
     ("value", "kind", "limits", "message"),
     [
-        (1, bool, None, "got name=1; allowed: true or false; fix: change name"),
+        (1, bool, None, "got name=1; allowed: true or false; fix: set name to an allowed value"),
         (True, int, Range(1, 9), "got name=True; allowed: an integer from 1 to 9;"),
         (1.0, int, Range(1, 10**6), "got name=1.0; allowed: an integer from 1 to 1000000;"),
         ("1", float, Range(0, 1, "share"), "got name='1'; allowed: a number from 0 to 1 (share);"),

@@ -135,7 +135,10 @@ def test_a_server_that_goes_on_elsewhere_is_refused(server, tmp_path):
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        ("other", f"a file with SHA-256 [0-9a-f]{{64}}; allowed: {SHA256}; fix: try again"),
+        (
+            "other",
+            f"a file with SHA-256 [0-9a-f]{{64}}; allowed: {SHA256}; fix: run the command again",
+        ),
         ("longer", "3000001 bytes; allowed: 3000000 bytes"),
         ("endless", "more than 3000000 bytes; allowed: 3000000 bytes"),
         ("gone", "the server answers 404 Not Found"),

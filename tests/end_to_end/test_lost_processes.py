@@ -58,7 +58,7 @@ def test_the_others_end_when_a_process_is_killed(killed, start, tiny, tmp_path):
     said = (tmp_path / "err").read_text()
     line = said.rstrip("\n").rpartition("\n")[2]
     assert f"process {victim} ({killed} on this machine)" in line
-    assert line.endswith(f"the run ends; go on with resume={saved[0].parents[1]}")
+    assert line.endswith(f"the run ends; continue with resume={saved[0].parents[1]}")
     assert "Traceback" not in said
     load_network(saved[0])
 

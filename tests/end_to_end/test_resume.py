@@ -69,10 +69,10 @@ def test_an_interrupted_run_ends_as_a_whole_one(call, find_run, tiny, tmp_path, 
     run = find_run(tmp_path / "cut")
     # After the first epoch there was a new best one, and a checkpoint to go on from.
     saved = "saved up to step 2 in checkpoints/last.ckpt"
-    assert done.last_line == f"interrupted; {saved}; go on with resume={run}"
+    assert done.last_line == f"interrupted; {saved}; continue with resume={run}"
     assert not (run / "metrics.json").exists()
     readme = (run / "README.md").read_text()
-    assert readme.startswith(f"# dopepp on virtual: interrupted\n\n{saved}; go on with")
+    assert readme.startswith(f"# dopepp on virtual: interrupted\n\n{saved}; continue with")
     assert f"python train.py resume={run}  # go on" in readme
 
     call("train.py", f"resume={run}", code=0)

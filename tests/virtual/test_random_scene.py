@@ -137,5 +137,5 @@ def test_a_camera_stays_above_the_table(sized_box):
     preset = preset_of("table", {"table": low, "min_visible_fraction": 0.1})
     factory = Factory([sized_box("high", 8.0)], preset, 0)
     factory.scene(0, 0)
-    with pytest.raises(UserError, match=r"scale 0\.25 of a scene .*choose a larger scale"):
+    with pytest.raises(UserError, match=r"scale 0\.25 of a scene .*set a larger scale"):
         factory.scene(0, 0, 0.25)

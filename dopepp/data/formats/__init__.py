@@ -83,11 +83,11 @@ def share(num_items: int, part_of: tuple[float, float], name: str) -> slice:
     """
     first, last = part_of
     if not 0 <= first < last <= 1:
-        raise ValueError(f"part_of must be ascending in [0, 1], problem {part_of}")
+        raise ValueError(f"part_of must be ascending in [0, 1], got {part_of}")
     chosen = slice(round(first * num_items), round(last * num_items))
     if chosen.start == chosen.stop:
         problem = f"{name}: no image in the share {first:.3g} – {last:.3g} of {num_items} images"
-        fix = "give every split a folder of its own"
+        fix = "set data.image_sets to a separate folder for each split"
         raise UserError(problem, "a folder with more images", fix)
     return chosen
 
@@ -118,7 +118,8 @@ def read_object(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
     """Read a JSON object that a writer extends; empty without a file."""
     content = read_json(path, max_bytes) if path.exists() else {}
     if not isinstance(content, dict):
-        raise UserError(f"{path}, no JSON object", "what this writer wrote", "restore or remove it")
+        fix = "restore the file from a copy, or choose another folder"
+        raise UserError(f"{path}, no JSON object", "the file that this writer wrote", fix)
     return content
 
 

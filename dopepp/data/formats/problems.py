@@ -40,7 +40,7 @@ class Problems:
 
     def report(self, path: Path | str, where: str, message: str, allowed: str = "") -> None:
         """Raise a problem; ``allowed`` is empty if ``message`` implies it."""
-        fix = "correct the file or get it again; `dopepp check` lists all problems of a data set"
+        fix = "correct the file, or copy it again; `dopepp check` lists all problems of a data set"
         parts = str(path), where.lstrip("."), message
         raise UserError(": ".join(filter(None, parts)), allowed, fix)
 

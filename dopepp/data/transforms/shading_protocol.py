@@ -59,7 +59,7 @@ def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> lis
         index: Index of the image in the test set.
     """
     if not all(0 <= share <= 1 for share in shares):
-        raise ValueError(f"shares must be in [0, 1], problem {list(shares)}")
+        raise ValueError(f"shares must be in [0, 1], got {list(shares)}")
     shape = sample.image.shape[:2]
     silhouettes = [silhouette(instance, shape) for instance in sample.instances]
     crops = BackgroundCrops(sample.image, silhouettes)

@@ -215,7 +215,7 @@ def _read_result(run: Run) -> None:
     if name is None:
         run.failure = f"unfinished: it left no {METRICS_FILE}"
         if (run.folder / LAST_CHECKPOINT).is_file():
-            run.failure += f"; go on with resume={run.folder}"
+            run.failure += f"; continue with resume={run.folder}"
         return
     record = read_json(run.folder / name)
     try:

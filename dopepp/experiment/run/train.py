@@ -199,7 +199,7 @@ def _fit(
         if not trainer.is_global_zero and not isinstance(error, ProcessDiedError):
             raise SystemExit(1) from error  # the first process reports the common reason
         kept = (run_dir / LAST_CHECKPOINT).is_file()
-        advice = f"go on with resume={run_dir}" if kept else "no checkpoint was saved yet"
+        advice = f"continue with resume={run_dir}" if kept else "no checkpoint was saved yet"
         raise RunError(f"{error}; {advice}") from error
 
 
@@ -259,7 +259,7 @@ def _advice(run_dir: Path) -> str:
     """Return what an interrupted run has saved, and how to resume it."""
     step = saved_step(run_dir / LAST_CHECKPOINT)
     saved = f"saved up to step {step} in {LAST_CHECKPOINT}" if step else "nothing saved yet"
-    return f"{saved}; go on with resume={run_dir}"
+    return f"{saved}; continue with resume={run_dir}"
 
 
 def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Trainer) -> Report:

@@ -102,7 +102,7 @@ def read_3mf(path: Path) -> RawMesh:
     unit = str(mesh.unit).removesuffix("s")  # trimesh calls the default unit "millimeters"
     if unit not in UNITS_3MF:
         problem, allowed = f"mesh {path} in the unit {unit!r}", ", ".join(UNITS_3MF)
-        raise UserError(problem, allowed, "export it in millimetres")
+        raise UserError(problem, allowed, "export the mesh in millimetres")
     return mesh._replace(unit=UNITS_3MF[unit])
 
 

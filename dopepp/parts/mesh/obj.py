@@ -149,7 +149,7 @@ def _colour_maps(path: Path) -> dict[str | None, str | None]:
     """Return the file name of each MTL material's colour map, or None."""
     if (size := path.stat().st_size) > MAX_MATERIAL_BYTES:
         allowed = f"up to {MAX_MATERIAL_BYTES / 1e6:.0f} MB"
-        fix = "keep only the materials that the mesh uses"
+        fix = "delete the materials that the mesh does not use"
         raise UserError(f"material file {path} of {size / 1e6:.0f} MB", allowed, fix)
     maps: dict[str | None, str | None] = {}
     material: str | None = None
@@ -188,8 +188,9 @@ def companion_path(mesh_path: Path, name: str, statement: str) -> Path:
     path = (folder / written.as_posix()).resolve()
     problem = f"{mesh_path} whose {statement} {name!r}"
     if written.anchor or not path.is_relative_to(folder):
-        fix = "copy the file beside the mesh and write its plain name"
-        raise UserError(f"{problem} lies outside of its folder", "files in it or below it", fix)
+        fix = "copy the file into the mesh's folder and write its plain name"
+        allowed = "a file in the mesh's folder or below"
+        raise UserError(f"{problem} lies outside of its folder", allowed, fix)
     if not path.is_file():
         fix = "put the file there, or delete the line for a part without texture"
         raise UserError(f"{problem} does not exist", "a file in the mesh's folder", fix)
@@ -206,7 +207,8 @@ def read_texture(path: Path) -> Picture:
         return read_picture(path)
     except ValueError as error:
         allowed = f"a whole {', '.join(FORMATS)} image of at most {MAX_SIDE}×{MAX_SIDE} pixels"
-        raise UserError(f"texture {path}: {error}", allowed, "replace the image") from error
+        fix = "save the texture again in this form"
+        raise UserError(f"texture {path}: {error}", allowed, fix) from error
 
 
 def read_off(path: Path) -> RawMesh:

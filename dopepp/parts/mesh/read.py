@@ -68,17 +68,20 @@ def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
     """Like :func:`read_mesh`; also return the unit of the file."""
     path = Path(path)
     if unit is not None and unit not in UNITS:
-        raise UserError(f"unit={unit!r} for {path}", ", ".join(UNITS), "state the file's unit")
+        fix = "set the unit in which the file was exported, e.g. unit=mm"
+        raise UserError(f"unit={unit!r} for {path}", ", ".join(UNITS), fix)
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         suffixes = ", ".join(READERS)
-        raise UserError(f"mesh {path}", f"files ending in {suffixes}", "export one of these")
+        fix = "export the mesh as one of these, e.g. as STL"
+        raise UserError(f"mesh {path}", f"files ending in {suffixes}", fix)
     try:
         is_file = path.is_file()
     except OSError:  # e.g. a name that is too long
         is_file = False
     if not is_file:
-        raise UserError(f"mesh {path}, no such file", "a mesh file", "check the path")
+        fix = "pass the path of an existing file"
+        raise UserError(f"mesh {path}, no such file", "a mesh file", fix)
     if (size := path.stat().st_size) > MAX_BYTES:
         fix = "reduce its triangles, or write it as a binary file"
         raise _damaged(path, f"{size / 1e6:.0f} MB", fix)

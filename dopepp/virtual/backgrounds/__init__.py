@@ -103,7 +103,7 @@ class PhotoBackgrounds:
         self.paths = [self.folder / name for name in sorted(photo_names)]
         if not self.paths:
             allowed = f"a folder with {', '.join(PHOTO_SUFFIXES)} files"
-            fix = "correct the path, or leave it out to use procedural backgrounds"
+            fix = "pass a folder of photos, or leave it out to use procedural backgrounds"
             raise UserError(f"no photo in the background folder {folder}", allowed, fix)
         self.bad: dict[Path, str] = {}
         self._photos: OrderedDict[Path, list[Picture]] = OrderedDict()
@@ -240,7 +240,7 @@ class PhotoBackgrounds:
             raise UserError(
                 f"{len(self.bad)} damaged of {len(self.paths)} background photos ({listed})",
                 f"whole photos of at most {MAX_SIDE} pixels a side; {most} damaged ones of these",
-                "remove or replace them",
+                "delete these files, or copy them again",
             )
         text = "background photo %s left out: %s (%d damaged of at most %d)"
         logger.warning(text, path, damage, len(self.bad), most)
@@ -257,7 +257,7 @@ def bundled_photos() -> PhotoBackgrounds:
     names = [name for name in BUNDLED if folder and (folder / name).is_file()]
     if folder is None or not names:
         problem = "backgrounds=skimage without scikit-image and its photos"
-        fix = "pip install scikit-image, or give a folder of photos"
+        fix = "pip install scikit-image, or pass a folder of photos"
         raise UserError(problem, "an installed scikit-image", fix)
     return PhotoBackgrounds(folder, names)
 

@@ -186,7 +186,8 @@ def written_out(name: str, changes: object = None) -> tuple[str, object]:
     if path.suffix != ".yaml":
         if name not in _NAMES:
             allowed = f"{', '.join(_NAMES)}, or a FILE.yaml"
-            raise UserError(f"preset {name!r}", allowed, "choose one of them")
+            fix = "set the preset to one of these names, or to the path of a file"
+            raise UserError(f"preset {name!r}", allowed, fix)
         return name, changes or {}
     fields: Any = read_yaml(path)
     base = fields.pop("base", None) if isinstance(fields, dict) else None

@@ -128,7 +128,7 @@ class _Placement(Checked):
         if low > high:
             first, last = self._ends
             problem = f"{first}={low} and {last}={high} of {type(self).__name__}"
-            raise UserError(problem, f"{first} <= {last}", "change the placement's range")
+            raise UserError(problem, f"{first} <= {last}", f"lower {first}, or raise {last}")
 
     def redraw(self, rng: Generator, position: Vector) -> Vector | None:
         """Return another position for an object that the frame does not show well, or None.
@@ -163,7 +163,7 @@ class OffsetPlacement(_Placement):
             raise UserError(
                 f"distance={self.distance} and axial={self.axial} of OffsetPlacement",
                 "axial < distance, in metres",
-                "move the box of positions in front of the camera",
+                "raise distance, or lower axial, so that all positions are in front of the camera",
             )
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:

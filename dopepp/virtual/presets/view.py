@@ -60,7 +60,7 @@ class View:
         check_camera(self.K, self.size, self.source)
         allowed = "[nearest, farthest] in metres, from 0.02 to 100"
         if len(self.distance) != 2 or not all(0.02 <= end <= 100 for end in self.distance):
-            fix = "give the range of distances between camera and part"
+            fix = "set the range of distances between camera and part, e.g. [0.3,0.8]"
             raise UserError(f"working_distance={list(self.distance)}", allowed, fix)
         if self.distance[0] > self.distance[1]:
             fix = "write working_distance=[{1:g},{0:g}]".format(*self.distance)
@@ -87,7 +87,7 @@ class View:
                 f"working_distance from {self.distance[0]:g} m, where {_named(parts, max)} has "
                 f"{largest:.0f} pixels in pictures of {width}×{height}",
                 "parts that fit into the picture in any orientation",
-                f"start at {nearest:g} m",
+                f"start working_distance at {nearest:g}",
             )
         if scale * smallest < FEWEST_PX:
             farthest = math.floor(1000 * self.distance[1] * scale * smallest / FEWEST_PX) / 1000
@@ -95,7 +95,7 @@ class View:
                 f"working_distance to {self.distance[1]:g} m, where {_named(parts, min)} has "
                 f"{scale * smallest:.0f} pixels in the camera's picture scaled by {scale:g}",
                 f"at least {FEWEST_PX:g} pixels",
-                f"end at {farthest:g} m, or use a longer lens or larger pictures",
+                f"end working_distance at {farthest:g}, or use a longer lens or larger pictures",
             )
 
     def scale_for(self, parts: Sequence[Part], window: Size | None = None) -> float:
@@ -184,7 +184,7 @@ def read_lens(path: str | Path) -> tuple[Size, CameraMatrix]:
         raise UserError(
             f"{camera.source}, which does not state the size of its pictures",
             "a camera file with width and height",
-            "add them, e.g. image_width and image_height as ROS writes them",
+            "add the size in pixels to the file, e.g. image_width: 640 and image_height: 480",
         )
     if camera.distortion:
         _log.info("%s: its distortion is not rendered; undistort for prediction", camera.source)

@@ -34,7 +34,7 @@ def find_renderer(name: str) -> Renderer:
         RENDERERS if name in RENDERERS else {**extensions.components("renderers"), **RENDERERS}
     )
     if name not in modules:
-        fix = f"choose one of them, or {extensions.advice('renderers', name)}"
+        fix = f"choose one of these names, or {extensions.advice('renderers', name)}"
         raise UserError(f"renderer {name!r}", ", ".join(modules), fix)
     render: Renderer = import_module(modules[name]).render
     return render

@@ -196,7 +196,7 @@ def test_an_evaluation_is_what_its_checkpoint_was_trained_as(tmp_path, report_of
         (METRICS_FILE, "{}", "metrics.json is not of this version"),
         (METRICS_FILE, '{"name": 1, "objects": []}', "not of this version"),
         (COST_FILE, "{}", "cost.json is not of this version"),
-        ("checkpoints/last.ckpt", "", "it left no metrics.json; go on with resume="),
+        ("checkpoints/last.ckpt", "", "it left no metrics.json; continue with resume="),
     ],
 )
 def test_a_damaged_or_unfinished_run_is_a_row_with_the_reason(

@@ -76,7 +76,7 @@ def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Pa
     infos = read_models(Path(root))
     if not infos:
         problem = f"{root}, which has no {INFO_FILE} in {', '.join(MODEL_FOLDERS)}"
-        fix = "check data.root, or unpack the data set's models into it"
+        fix = "set data.root to this folder, or unpack the data set's models into it"
         raise UserError(problem, "the root folder of a BOP data set", fix)
     by_name = {info.name: info for info in infos.values()}
     wanted = list(objects or by_name)
@@ -87,7 +87,7 @@ def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Pa
     for name in wanted:
         if name not in by_name:
             problem, allowed = f"data.objects with {name!r}", ", ".join(by_name)
-            raise UserError(problem, allowed, "choose from this list")
+            raise UserError(problem, allowed, "set data.objects to names of this list")
     return [part_of(by_name[name]) for name in wanted]
 
 
@@ -106,7 +106,7 @@ def parts_by_id(root: Path, parts: Sequence[Part]) -> dict[int, Part]:
             raise UserError(
                 f"part {part.name!r} for the data set {root}",
                 ", ".join(names) or f"obj_NNNNNN, as there is no {MODEL_FOLDERS[0]}/{INFO_FILE}",
-                f'choose from these, or write "name": "{part.name}" into {INFO_FILE}',
+                f'choose a part of this list, or write "name": "{part.name}" into {INFO_FILE}',
             )
         numbered[number] = part
     return numbered
@@ -141,8 +141,8 @@ def part_of(info: ModelInfo) -> Part:
     try:
         part = make_part(info.name, mesh, unit="mm", **symmetries)
     except UserError as error:  # a wrong size may mean a wrong unit; BOP has only one
-        allowed = f"{error.allowed}, from a file in millimetres as all of BOP's"
-        fix = "correct the model, or convert its file to millimetres"
+        allowed = f"{error.allowed}, from a file in millimetres as BOP requires"
+        fix = "download the model again, or convert its file to millimetres"
         raise UserError(f"{info.path}: {error.got}", allowed, fix) from error
     if abs(info.diameter - part.diameter) > _DIAMETER_TOLERANCE * part.diameter:
         stated = f"{INFO_FILE} states a diameter of {info.diameter:.6g} m"
@@ -267,7 +267,7 @@ def write_models(root: Path, parts: Sequence[Part]) -> None:
     for part in parts:
         if part.mesh is None:
             allowed = "parts that were read from a mesh file"
-            fix = "give the part's mesh file"
+            fix = "pass the part's mesh file"
             raise UserError(f"part {part.name} without a mesh", allowed, fix)
     folder, names = root / MODEL_FOLDERS[0], [part.name for part in parts]
     numbers = model_numbers(names)
@@ -277,7 +277,7 @@ def write_models(root: Path, parts: Sequence[Part]) -> None:
     if path.exists():
         if path.read_bytes() != content:
             problem, allowed = f"{path}, written for other parts", f"a folder for {names}"
-            raise UserError(problem, allowed, "choose an empty folder")
+            raise UserError(problem, allowed, "pass an empty folder")
         return
     for part in parts:
         model = folder / f"obj_{numbers[part.name]:06d}.ply"

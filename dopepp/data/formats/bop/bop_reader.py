@@ -128,7 +128,7 @@ class BopReader:
         if not present:
             problem = f"no image under {self.root / self.split} ({num_wanted:,} listed)"
             allowed = "at least one listed image in rgb/ or gray/"
-            raise UserError(problem, allowed, "unpack the data set fully")
+            raise UserError(problem, allowed, "unpack all archives of the data set there")
         if len(present) < num_wanted:
             absent = f"{num_wanted - len(present):,} of {num_wanted:,}"
             _log.warning("%s: %s listed images are absent", self.name, absent)
@@ -266,8 +266,8 @@ def _scene_folders(root: Path, split: str) -> list[Path]:
         raise UserError(
             f"{root / split}, which is no folder",
             f"one of {splits}" if splits else "a BOP data set's folder with its splits",
-            "correct data.root or data.image_sets; without labelled images to learn from, "
-            "data=bop_renders learns renders of the models",
+            "set data.root or data.image_sets to this folder; without labelled images, train on "
+            "renders of the models with data=bop_renders",
         )
     folders = [p for p in (root / split).iterdir() if bop.is_number(p.name) and p.is_dir()]
     if not folders:

@@ -109,7 +109,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Yield the lines with poses and their numbers."""
     allowed = f"a CSV file of {','.join(FIELDS)}"
     if not path.is_file():
-        raise _bad(f"{path}, no such file", allowed, "check the path")
+        raise _bad(f"{path}, no such file", allowed, "pass the path of an existing file")
     number = 0
     with path.open("rb") as file:
         while content := file.readline(_MAX_LINE_BYTES + 1):
@@ -193,11 +193,11 @@ def _check_unit(path: Path, table: Table) -> None:
             f"{path}: line {table[middle, 0]:.0f}: t of length {distances[middle]:.4g}, half of "
             f"all lines have {'less' if distances[middle] < low else 'more'}",
             f"millimetres: a median of {low:g} – {high:g}",
-            "multiply t by 1000 if it is in metres; otherwise correct its unit",
+            "write t in millimetres: multiply it by 1000 if it is in metres",
         )
 
 
 def _bad(
-    problem: str, allowed: str, fix: str = "correct the line or write the file again"
+    problem: str, allowed: str, fix: str = "correct the line, or write the file again"
 ) -> UserError:
     return UserError(problem, allowed, fix)

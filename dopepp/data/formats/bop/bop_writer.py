@@ -64,7 +64,7 @@ class BopFolder:
         if (self.root / self.split).exists() and not (self.root / info).exists():
             problem = f"{self.root}, which has {self.split}/ and no {info}"
             allowed = "an empty folder, or one that this layout was begun in"
-            raise UserError(problem, allowed, "choose another folder")
+            raise UserError(problem, allowed, "pass another folder")
         write_models(self.root, self._parts)
 
     @cached_property

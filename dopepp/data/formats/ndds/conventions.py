@@ -264,5 +264,5 @@ def _undecidable(
     return UserError(
         f"{where}: {why}; reprojection error: {figures}",
         f"one convention with at most {MAX_ERROR_PX:g} px and a third of any other's error",
-        "check that the parts are the meshes (and units) the data set was made with, and its K",
+        "pass the meshes and units that the data set was made with, and compare its K",
     )

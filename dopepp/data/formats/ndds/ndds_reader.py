@@ -74,7 +74,8 @@ class NddsReader:
         unknown = sorted(set(self._classes.values()) - set(self._parts))
         if unknown:
             allowed = f"parts of {sorted(self._parts)}"
-            raise UserError(f"classes of the parts {unknown}", allowed, "correct it")
+            fix = "map each class to the name of a part"
+            raise UserError(f"classes of the parts {unknown}", allowed, fix)
         self._settings = ndds.NddsSettings(self.folder)
         items = _find(self.folder)
         self.items = items[share(len(items), part_of, self.name)]
@@ -100,8 +101,8 @@ class NddsReader:
             listed = ", ".join(f"{name} ({number})" for name, number in others.most_common(8))
             names = f"{', '.join(self._parts)}; other classes: {listed or 'none'}"
             problem = f"{self.folder}: no instance with projected_cuboid of the parts {names}"
-            fix = "name the parts as the classes, or give classes={class: part}"
-            raise UserError(problem, "at least one, whose class is a part's name", fix)
+            fix = "name the parts like the classes, or set classes={class: part}"
+            raise UserError(problem, "at least one instance whose class is a part's name", fix)
         # Hidden objects may be behind the camera, where projections are meaningless.
         return conventions.find_convention(seen or hidden, str(self.folder))
 
@@ -214,7 +215,7 @@ def _find(folder: Path) -> list[Path]:
         counts = f"({len(lonely)} JSON files without an image)"
         allowed = "an NDDS or FAT folder with pairs such as 000000.json and 000000.png or .jpg"
         problem = f"{folder} without one annotated image {counts}"
-        raise UserError(problem, allowed, "give the folder of the data set")
+        raise UserError(problem, allowed, "pass the folder of the data set")
     if lonely:
         message = "%s: %s annotations have no image and are left out; first: %s"
         _log.warning(message, folder, f"{len(lonely):,}", lonely[0])

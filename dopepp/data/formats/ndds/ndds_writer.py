@@ -96,7 +96,7 @@ class NddsWriter:
             write_whole(path, settings)
             return
         allowed = "an empty folder, or one begun with the same parts"
-        raise UserError(problem, allowed, "name another")
+        raise UserError(problem, allowed, "pass another folder")
 
     def write(self, index: int, sample: Sample) -> None:
         """Write an item's images and then its annotation, which marks the item as complete."""

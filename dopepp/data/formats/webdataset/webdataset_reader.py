@@ -210,7 +210,7 @@ def _check_keys(shards: Sequence[ShardIndex]) -> None:
         if twice := [key for key in shard.keys if key in owners]:
             other = owners[twice[0]]
             problem = f"{shard.path} with {len(twice)} keys of {other}, e.g. {', '.join(twice[:3])}"
-            fix = "remove the duplicate shard, or write it again"
+            fix = "delete the repeated shard, or write it again"
             raise UserError(problem, "each key in only one shard", fix)
         owners |= dict.fromkeys(shard.keys, shard.path)
 
@@ -238,7 +238,8 @@ def find_shards(root: Path, shards: str, download_dir: Path | None = None) -> li
             paths.append(_fetched(text, scheme[1].lower(), download_dir))
     if len(set(paths)) < len(paths):
         twice = next(path for path in paths if paths.count(path) > 1)
-        raise UserError(f"shard {twice} twice", "each shard once", "correct data.image_sets")
+        fix = "name every shard once in data.image_sets"
+        raise UserError(f"shard {twice} twice", "each shard once", fix)
     return paths
 
 
@@ -255,9 +256,10 @@ def _expanded(text: str) -> list[str]:
                 return expanded
     except ValueError as error:
         problem, allowed = f"shards {text!r:.100}: {error}", "braces as in shard-{00..09}.tar"
-        raise UserError(problem, allowed, "close the brace") from error
+        raise UserError(problem, allowed, "write the braces in this form") from error
     allowed = f"at most {MAX_SHARDS:,} shards"
-    raise UserError(f"shards {text!r:.100}", allowed, "correct the range")
+    fix = "shorten the range of numbers, or name a folder of shards"
+    raise UserError(f"shards {text!r:.100}", allowed, fix)
 
 
 def _local(path: Path) -> list[Path]:
@@ -268,18 +270,20 @@ def _local(path: Path) -> list[Path]:
         return shards
     lack = "a folder without *.tar" if path.is_dir() else "no such file or folder"
     allowed = "a folder of shards (*.tar), a single shard, or a URL"
-    raise UserError(f"shards {path}, {lack}", allowed, "correct data.root or image_sets")
+    fix = "set data.root and data.image_sets to existing shards"
+    raise UserError(f"shards {path}, {lack}", allowed, fix)
 
 
 def _fetched(url: str, scheme: str, folder: Path | None) -> Path:
     problem = f"shards {url!r:.100}"
     if scheme == "pipe":  # an untrusted config must not run commands
         allowed = "files, folders and URLs of shards"
-        raise UserError(f"{problem}, a command to run", allowed, "download the shards")
+        fix = "download the shards and pass their folder"
+        raise UserError(f"{problem}, a command to run", allowed, fix)
     if folder is None:
         allowed = "local shards, or a folder to download them into"
         raise UserError(
-            f"{problem}, which are not on this machine", allowed, "set data.download_dir"
+            f"{problem}, which are not on this machine", allowed, "set data.download_dir=FOLDER"
         )
     name = PurePosixPath(urlsplit(url).path).name
     if not name.endswith(".tar"):
@@ -297,7 +301,8 @@ def _download(url: str, scheme: str, path: Path) -> None:
 
     if scheme not in gopen_schemes:
         schemes = ", ".join(sorted(gopen_schemes.keys() - {"__default__", "pipe"}))
-        raise UserError(f"shards {url!r:.100}", f"URLs of {schemes}", "correct the URL")
+        fix = "download the shards and pass their folder"
+        raise UserError(f"shards {url!r:.100}", f"URLs of {schemes}", fix)
     path.parent.mkdir(parents=True, exist_ok=True)
     draft, size = partial_path(path), 0
     try:
@@ -307,12 +312,13 @@ def _download(url: str, scheme: str, path: Path) -> None:
                 if size > MAX_SHARD_BYTES:
                     allowed = f"shards of at most {MAX_SHARD_BYTES / 1e9:.0f} GB"
                     problem = f"{url} of over {size / 1e9:.0f} GB"
-                    raise UserError(problem, allowed, "download it by hand")
+                    raise UserError(problem, allowed, "divide this shard into smaller ones")
                 file.write(piece)
         draft.replace(path)
     except OSError as error:
         problem = f"shard {url}, which cannot be fetched into {path.parent}: {error!s:.200}"
         allowed = "a URL that can be read and enough space"
-        raise UserError(problem, allowed, "check the URL and the connection") from error
+        fix = "open the URL in a browser to test it, and free space"
+        raise UserError(problem, allowed, fix) from error
     finally:
         draft.unlink(missing_ok=True)

@@ -44,13 +44,14 @@ def read_image_set(root: Path, image_set: str, subset: Subset) -> list[str]:
     path = root / "image_sets" / f"{image_set}.txt"
     if not path.is_file():
         lists = sorted(p.stem for p in path.parent.glob("*.txt") if p.stem != "classes")
-        raise UserError(f"image set {image_set!r}", f"one of {lists}", f"correct it or add {path}")
+        fix = f"set data.image_sets to one of these, or add {path}"
+        raise UserError(f"image set {image_set!r}", f"one of {lists}", fix)
     frames = []
     for line in path.read_text().split():
         scene, _, number = line.partition("/")
         if not number.isdigit() or not (scene.isdigit() or scene == "data_syn"):
             allowed = "SSSS/NNNNNN or data_syn/NNNNNN"
-            raise UserError(f"{path}: line {line!r}", allowed, "correct it")
+            raise UserError(f"{path}: line {line!r}", allowed, "write this line as a frame")
         if (scene == "data_syn") == (subset == "synthetic"):
             frames.append(number if subset == "synthetic" else line)
     return frames

@@ -78,7 +78,8 @@ class YcbVideoReader:
         unknown = [part.name for part in parts if part.name not in classes]
         if unknown:
             allowed = f"those of classes.txt: {classes}"
-            raise UserError(f"objects {unknown}", allowed, "correct them")
+            fix = "set data.objects to names of this list"
+            raise UserError(f"objects {unknown}", allowed, fix)
         self._parts = {classes.index(part.name) + 1: part for part in parts}
         if image_set is not None:
             frames = ycb_video.read_image_set(self.root, image_set, subset)
@@ -92,7 +93,7 @@ class YcbVideoReader:
         absent = [frame for frame in listed if not is_there[frame]]
         if len(absent) == len(listed):
             problem = f"no frame of {where} under {folder} ({len(absent):,} listed)"
-            fix = "unpack the data set fully, or choose another image set"
+            fix = "unpack all archives of the data set there, or set another image set"
             raise UserError(problem, "at least one listed frame on disk", fix)
         if absent:
             counts = f"{len(absent):,} of {len(listed):,}"

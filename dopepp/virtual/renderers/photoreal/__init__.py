@@ -68,7 +68,7 @@ def mitsuba() -> Any:
     pid = _start()
     if pid != os.getpid():
         raise UserError(
-            f"a process forked from one ({pid}) that has rendered with Mitsuba",
+            f"a process forked from process {pid}, which has rendered with Mitsuba",
             "workers that were spawned, or forked before the first image",
             "start workers with multiprocessing.get_context('spawn')",
         )
@@ -84,7 +84,8 @@ def num_threads() -> int:
     setting = os.environ.get(THREADS_SETTING)
     if setting is not None:
         if not setting.isdecimal() or int(setting) < 1:
-            raise UserError(f"{THREADS_SETTING}={setting!r}", "a number of at least 1", "change it")
+            fix = f"set {THREADS_SETTING}=1, or unset it"
+            raise UserError(f"{THREADS_SETTING}={setting!r}", "a number of at least 1", fix)
         return int(setting)
     return 1 if multiprocessing.parent_process() is not None else available_cores()
 
@@ -110,7 +111,8 @@ def _chosen_library() -> Path | None:
     """Return the libLLVM to use; None for the scalar variant."""
     variant = os.environ.get(VARIANT_SETTING)
     if variant not in (None, *VARIANTS):
-        raise UserError(f"{VARIANT_SETTING}={variant!r}", ", ".join(VARIANTS), "change or unset it")
+        fix = f"set {VARIANT_SETTING} to one of these names, or unset it"
+        raise UserError(f"{VARIANT_SETTING}={variant!r}", ", ".join(VARIANTS), fix)
     if variant == "scalar_rgb":
         return None
     libraries = candidates()
