@@ -263,6 +263,7 @@ def make_part(
     Raises:
         UserError: The name is empty or too long, the diameter is outside 5 mm – 5 m, or the mesh
             cannot be decimated.
+        ValueError: Neither a mesh nor points are given.
     """
     check_name(name)
     outline = points if mesh is None else mesh.vertices

@@ -80,6 +80,7 @@ def share(num_items: int, part_of: tuple[float, float], name: str) -> slice:
 
     Raises:
         UserError: The share has no item.
+        ValueError: The fractions do not ascend within [0, 1].
     """
     first, last = part_of
     if not 0 <= first < last <= 1:

@@ -57,6 +57,9 @@ def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> lis
             other.
         seed: Seed of the patches.
         index: Index of the image in the test set.
+
+    Raises:
+        ValueError: A share is outside [0, 1].
     """
     if not all(0 <= share <= 1 for share in shares):
         raise ValueError(f"shares must be in [0, 1], got {list(shares)}")

@@ -239,6 +239,9 @@ def fitted_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
 
     Without a camera, only renders of the models of a BOP data set are fitted, to the camera of its
     pictures. The chosen values are logged and stored in the config.
+
+    Raises:
+        UserError: A part is larger than ``data.input_size``, or the working distance is unknown.
     """
     config = _with_camera_of_pictures(config, parts)
     data, virtual = config.data, config.data.virtual

@@ -162,7 +162,10 @@ def match(
         max_distance: Largest distance of a match (inclusive), metres.
 
     Returns:
-        Index of each prediction's instance, −1 without one.
+        Index of each prediction's instance; −1 if it matches none.
+
+    Raises:
+        ValueError: The numbers of scores and rows differ.
     """
     scores, distances = to_float64(scores), to_float64(distances)
     if distances.shape[0] != len(scores) or distances.ndim != 2:

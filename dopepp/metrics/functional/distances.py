@@ -153,6 +153,9 @@ def rotation_error_deg(
     """Return the angle between two orientations, degrees in [0, 180].
 
     ``symmetries`` are those of :func:`mssd`; the smallest angle to any R_gt·S counts.
+
+    Raises:
+        ValueError: An array has another shape.
     """
     R_est, R_gt = to_float64(R_est), to_float64(R_gt)
     if R_est.shape != R_gt.shape or R_est.shape[1:] != (3, 3):
@@ -199,6 +202,9 @@ def mahalanobis(
 
     Returns:
         Distances; infinite if a covariance is not finite or singular.
+
+    Raises:
+        ValueError: An array has another shape.
     """
     R_est, t_est, R_gt, t_gt, _ = _checked(R_est, t_est, R_gt, t_gt, points=torch.zeros(1, 3))
     covariance = to_float64(covariance)

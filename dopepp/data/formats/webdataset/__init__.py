@@ -113,8 +113,12 @@ def index_shard(path: Path) -> ShardIndex:
 def members(path: Path, problems: Problems = STRICT) -> Iterator[TarMember]:
     """Yield the files of a shard, without folders and WebDataset's ``__meta__``.
 
-    A compressed, truncated or damaged archive is reported. So is a member that is no plain file,
-    leads out of the archive, has no extension, is repeated or is too large; it is skipped.
+    A compressed, truncated or damaged archive is reported to ``problems``. So is a member that is
+    no plain file, leads out of the archive, has no extension, is repeated or is too large; it is
+    skipped.
+
+    Raises:
+        UserError: There is a problem, and ``problems`` is :data:`STRICT`.
     """
     node = Node(problems, path, "archive")
     try:
