@@ -88,7 +88,7 @@ class LostWorkerError(RuntimeError):
 
 
 class PickledFunction:
-    """A pickled function. It is unpickled with the first item, to which failures then belong.
+    """A pickled function, which is unpickled when its first item arrives.
 
     Calls return a pickled pair (value, error).
     """

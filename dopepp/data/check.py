@@ -66,7 +66,7 @@ def _layout_of(root: Path) -> str | None:
 def _refuse_parent(root: Path, layout: str | None) -> None:
     """Reject a folder that holds data sets and is no data set itself.
 
-    FAT's scene folders form one data set; folders of render jobs are data sets each.
+    FAT's scene folders form one data set, but each folder of a render job is its own data set.
     """
     if (root / RECORD_FILE).is_file() or any(root.glob("*.json")):
         return

@@ -151,7 +151,7 @@ class PoseDataModule(LightningDataModule):
         return {name: widest(sizes) for name, sizes in views.items() if sizes}
 
     def summary(self) -> list[tuple[str, SourceInfo]]:
-        """Return (split, source) for the start-up print."""
+        """Return the sources with their splits, for the start-up print."""
         splits = self._splits().items()
         return [(split, info) for split, source in splits for info in source.describe()]
 

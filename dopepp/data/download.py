@@ -78,7 +78,7 @@ def download(name: str, folder: Path | str, progress: Progress | None = None) ->
     target = Path(folder) / name
     photos = target / source.photos
     if photos.is_dir():
-        logger.info("%s is there already", photos)
+        logger.info("%s is already there", photos)
         return photos
     logger.info("%s: %.0f MB from %s; %s", name, source.num_bytes / 1e6, source.url, source.licence)
     archive = Path(folder) / PurePosixPath(urlsplit(source.url).path).name
@@ -122,7 +122,7 @@ def fetch(
         raise _failed(url, f"the connection broke: {error or type(error).__name__}") from error
     except OSError as error:
         allowed = f"a folder to write to with {num_bytes} bytes of room"
-        fix = "pass another folder, or free space; the next call goes on with what was received"
+        fix = "pass another folder, or free space; the next call continues with what was received"
         raise UserError(f"{path}, which cannot be written: {error}", allowed, fix) from error
 
 
@@ -144,7 +144,7 @@ def _receive(url: str, partial: Path, num_bytes: int, progress: Progress | None)
         resumed = response.status == http.client.PARTIAL_CONTENT
         start = response.headers.get("Content-Range", "")
         if resumed and not start.startswith(f"bytes {size}-"):
-            raise _failed(url, f"the server goes on at {start!r} instead of byte {size}")
+            raise _failed(url, f"the server continues at {start!r} instead of byte {size}")
         size = size if resumed else 0
         # The length is None where the server does not state it.
         if response.length is not None and size + response.length != num_bytes:
@@ -189,7 +189,7 @@ def _verify(path: Path, url: str, sha256: str) -> None:
 
 
 def _failed(url: str, reason: str) -> UserError:
-    fix = "check the network and run the command again; it goes on where it stopped"
+    fix = "check the network and run the command again; it continues where it stopped"
     return UserError(f"{url}: {reason}", "a server that can be reached and has the file", fix)
 
 

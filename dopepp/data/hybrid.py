@@ -124,7 +124,7 @@ class HybridSource:
         return roles, ranks
 
     def contains(self, label: str) -> bool:
-        """Tell whether any source with a share holds this object."""
+        """Return whether any source with a share holds this object."""
         return any(
             count > 0 and source is not None and source.contains(label)
             for source, count in zip(self._sources, self.counts, strict=True)
@@ -147,7 +147,7 @@ class WindowedSource:
     """Windows of another source's scaled images that contain the centre of an object.
 
     A network that trains on windows of renders thus gets windows of photographs. Each epoch draws
-    object and window anew, uniformly among the windows that contain the object's centre, or among
+    object and window again, uniformly among the windows that contain the object's centre, or among
     all windows without an object. Smaller pictures are padded, as for prediction.
 
     Args:
@@ -181,7 +181,7 @@ class WindowedSource:
         return pad_sample(window, self._window)
 
     def contains(self, label: str) -> bool:
-        """Tell whether the whole images hold this object."""
+        """Return whether the whole images hold this object."""
         return self._source.contains(label)
 
     def describe(self) -> list[SourceInfo]:

@@ -216,7 +216,7 @@ _MAX_DIFFERENCES: Final = 3  # as many as one line can hold
 
 
 def is_begun(root: Path) -> bool:
-    """Tell whether a job has claimed the folder."""
+    """Return whether a job has claimed the folder."""
     return (root / RECORD_FILE).is_file()
 
 

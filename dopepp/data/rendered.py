@@ -67,7 +67,7 @@ class RenderedSource:
         return rendered_sample(rendered, self.name, f"{self.split}/{epoch}/{index}")
 
     def contains(self, label: str) -> bool:
-        """Tell whether the factory renders this object."""
+        """Return whether the factory renders this object."""
         return any(part.name == label for part in self.factory.parts)
 
     def describe(self) -> list[SourceInfo]:
@@ -196,7 +196,7 @@ class CachedSource:
         return self._load(index)
 
     def contains(self, label: str) -> bool:
-        """Tell whether the cached source holds this object."""
+        """Return whether the cached source holds this object."""
         return self._source.contains(label)
 
     def describe(self) -> list[SourceInfo]:

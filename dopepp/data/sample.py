@@ -105,7 +105,7 @@ class DescribedSource(SampleSource, Protocol):
         """Return an entry for each elementary source."""
 
     def contains(self, label: str) -> bool:
-        """Tell whether any item of any epoch can hold an instance of this object."""
+        """Return whether any item of any epoch can hold an instance of this object."""
 
 
 def silhouette(instance: Instance, shape: Shape) -> Mask:

@@ -123,7 +123,7 @@ def draw_line(
     colour: tuple[int, ...],
     thickness: int,
 ) -> None:
-    """Draw an anti-aliased segment IN PLACE; equal ends make a dot, ends not finite nothing."""
+    """Draw an anti-aliased segment IN PLACE, a dot if the ends are equal, nothing if not finite."""
     clipped = _clip(start, end, canvas.shape[1], canvas.shape[0], margin=2 * thickness)
     if clipped is None:
         return

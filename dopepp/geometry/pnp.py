@@ -262,7 +262,7 @@ class _Starts:
         self._steps: list[Float[np.ndarray, "s 6"]] = []
 
     def without(self, left_out: int) -> Float[np.ndarray, "s 6"]:
-        """Return SQPnP's poses (rotation vector, translation) without so many points, or NaN."""
+        """Return SQPnP's poses (rotation vector, translation) for all omissions, or NaN."""
         while len(self._steps) <= left_out:
             kept = _kept(len(self.rays), len(self._steps))
             steps = np.full((len(kept), 6), np.nan)
@@ -283,7 +283,7 @@ class _Starts:
 
 @cache
 def _kept(count: int, left_out: int) -> list[NDArray[np.intp]]:
-    """Return all selections of the rows that leave out so many of them."""
+    """Return all selections of the rows that omit ``left_out`` of them."""
     return [np.array(rows) for rows in combinations(range(count), count - left_out)][::-1]
 
 

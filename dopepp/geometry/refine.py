@@ -186,7 +186,7 @@ def normal_equations(
 
 @compiled()
 def solve_damped(hessian: Array, gradient: Array, damping: float, step: Array) -> None:
-    """Solve (H + damping) step = −gradient by Cholesky, H scaled to a unit diagonal."""
+    """Write the solution of (H + damping) step = −gradient, with H scaled to a unit diagonal."""
     solve_inside(hessian, gradient, damping, step, np.empty((7, 6)))
 
 

@@ -42,7 +42,7 @@ class Timing:
 
 
 def time_frames(estimator: PoseEstimator, pictures: Pictures, num_frames: int) -> Timing:
-    """Time an estimator that was just loaded on images in turn."""
+    """Time a freshly loaded estimator on images, which are used in turn."""
     rows, num_found = [], []
     for picture, K in islice(cycle(pictures), 1 + WARM_UP + num_frames):
         before, start = estimator.spent_ms.copy(), time.perf_counter()

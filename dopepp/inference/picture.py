@@ -161,7 +161,7 @@ def read_depth_image(path: Path, scale: float) -> Depth32:
 
 
 def undistorted_depth(depth: Depth32, K: CameraMatrix, distortion: Coefficients) -> Depth32:
-    """Undistort depth by the nearest pixel: a mean of two depths is on no surface."""
+    """Undistort depth by its nearest pixel, because a mean of two depths lies on no surface."""
     size = depth.shape[::-1]
     maps = cv2.initUndistortRectifyMap(K, distortion, np.eye(3), K, size, cv2.CV_32FC1)
     return np.asarray(cv2.remap(depth, *maps, cv2.INTER_NEAREST), np.float32)
@@ -236,9 +236,9 @@ def letterboxes(
 ) -> list[Letterbox]:
     """Return the sizes of an image that the network is run on, the smallest first.
 
-    By default these show parts at the distances of training, and the whole image in the size of
-    training images, which shows parts that fill it. Both are the same for the camera of training. A
-    checkpoint without distances has the second size only.
+    By default, one group of sizes shows parts at the distances of training, and one size is that of
+    training images, for parts that fill the image. Both are equal for the camera of training. A
+    checkpoint without distances has only the size of training images.
     """
     size = image.shape[1], image.shape[0]
     learned = Letterbox.fit(size, checkpoint.input_size)
@@ -295,7 +295,7 @@ def _depths(
 
 
 def _scales(seen: Seen, reach: float, depths: tuple[float, float]) -> Sequence[float]:
-    """Return the fewest scales of an image that show a part in sizes of training at all depths.
+    """Return the smallest set of scales at which a part has a trained size at all depths.
 
     Each scale shows the part in the middle size at the middle depth of its range.
     """

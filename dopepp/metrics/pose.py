@@ -100,7 +100,7 @@ def assign(
         instances: Instances of the object.
 
     Returns:
-        Index of each detection's instance, −1 without one.
+        Index of each detection's instance; −1 if it matches none.
     """
     # An infinite pose would warn (infinity times zero); as NaN throughout, it matches nothing.
     estimates = [np.asarray(d.T_cam_obj, np.float64) for d in detections]
@@ -226,7 +226,7 @@ class PoseMetrics(Metric):
     def errors(self, name: str, measure: InstanceError = "add") -> Float[np.ndarray, "instances"]:
         """Return an error of every instance of a part, infinite for a miss.
 
-        All ranks must call this method, as ``compute``.
+        All ranks must call this method, like ``compute``.
         """
         self.compute()
         return np.asarray(getattr(self._gathered[name].errors, measure).numpy())
@@ -234,7 +234,7 @@ class PoseMetrics(Metric):
     def references(self, seed: int = 0) -> dict[str, dict[str, PoseRow]]:
         """Return the rows of each reference on the same instances, by object or :data:`MEAN`.
 
-        All ranks must call this method, as ``compute``.
+        All ranks must call this method, like ``compute``.
         """
         self.compute()
         table: dict[str, dict[str, PoseRow]] = {reference: {} for reference in REFERENCES}
@@ -249,7 +249,7 @@ class PoseMetrics(Metric):
     def instances(self, name: str) -> Gathered:
         """Return the evaluated instances of a part, in the order of :meth:`errors`.
 
-        All ranks must call this method, as ``compute``.
+        All ranks must call this method, like ``compute``.
         """
         self.compute()
         return self._gathered[name]

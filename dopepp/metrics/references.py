@@ -107,7 +107,7 @@ def _row(part: Part, name: str, Q: Tensor, few_points: Tensor, points: Tensor) -
 def _other_poses(
     rotations: Float[np.ndarray, "n 3 3"], rng: np.random.Generator
 ) -> Float[np.ndarray, "draws 3 3"]:
-    """Guess another pose of the test set for each: all ordered pairs, or a random subset."""
+    """Return the errors of guessing another pose of the test set: all pairs, or a random subset."""
     n = len(rotations)
     # Pair k of the n·(n − 1) ordered pairs: the true pose, and the guessed pose's offset from it.
     true, step = np.divmod(rng.permutation(n * (n - 1))[:_NUM_DRAWS], max(n - 1, 1))

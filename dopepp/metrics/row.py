@@ -144,7 +144,7 @@ class PoseRow:
         object: The part's name, or ``mean``.
         method: What produced the poses: the estimator, or a reference row's name.
         num_instances: Number of evaluated ground-truth instances.
-        add_01d: Share of instances with ADD below a tenth of the diameter; others alike.
+        add_01d: Share of instances with ADD below a tenth of the diameter.
         add_or_s_01d: Like ``add_01d``, with ADD-S for a part with symmetries.
         ar_mssd: BOP's average recall of MSSD.
         ar_mspd: BOP's average recall of MSPD; None if an image's camera is unknown.
@@ -254,7 +254,7 @@ def _p90(error: str) -> Formula:
 
 
 def _near(errors: PoseErrors) -> float | None:
-    """Return the share within 5 cm and, up to symmetry, 5°."""
+    """Return the share of poses within 5 cm and, up to symmetry, within 5°."""
     if errors.translation is None:
         return None
     near = (errors.translation < 0.05) & (errors.rotation_s_deg < 5)

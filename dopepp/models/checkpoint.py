@@ -268,7 +268,7 @@ def released_paths() -> dict[str, Path]:
 
 
 def find(path: Path) -> Path:
-    """Return the file of a path or of ``pretrained/NAME``.
+    """Return the file that a path or ``pretrained/NAME`` refers to.
 
     Raises:
         UserError: No released checkpoint has this name.

@@ -21,7 +21,7 @@ from dopepp.models.heads import Beliefs, Fields, Stage
 
 
 class MapLoss(nn.Module, ABC):
-    """A loss summed over the stages; the network must have the belief ``activation`` named here."""
+    """A loss summed over the stages; the network must use its belief ``activation``."""
 
     activation: ClassVar[str]
 

@@ -67,7 +67,7 @@ class Seen(NamedTuple):
         """Validate the four numbers of a file.
 
         Raises:
-            UserError: They are not four numbers, or out of range.
+            UserError: The values are not four numbers, or a number is out of range.
         """
         if not isinstance(values, list | tuple) or len(values) != len(cls._fields):
             fix = "write the file with train.py"

@@ -75,7 +75,7 @@ class FiniteSteps(Callback):
         return {"skipped": self.skipped}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on counting."""
+        """Continue counting."""
         self.skipped = int(state_dict["skipped"])
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -202,7 +202,7 @@ class EmptyMaps(Callback):
         return {"empty": self._num_empty, "warned": self._warned, "first_loss": self._first_loss}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on counting."""
+        """Continue counting."""
         self._num_empty, self._warned = int(state_dict["empty"]), bool(state_dict["warned"])
         self._first_loss = float(state_dict["first_loss"])
 

@@ -63,7 +63,7 @@ class LastCheckpoint(Checkpoint):
         self._saved: tuple[int, float | None] = (0, None)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the states of the random generators, in a validation those at its start."""
+        """Return the states of the random generators; in a validation, those at its start."""
         return {"random": self._random or _capture()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -248,7 +248,9 @@ def _forget_later_best(trainer: Trainer) -> None:
     step = files.saved_step(Path(best.best_model_path))
     if step is None or step > trainer.global_step:
         _log.info(
-            "%s is newer than step %d: chosen anew", best.best_model_path, trainer.global_step
+            "%s is newer than step %d: the best checkpoint is chosen again",
+            best.best_model_path,
+            trainer.global_step,
         )
         best.best_k_models, best.best_model_score = {}, None
         best.kth_value = ModelCheckpoint(monitor=best.monitor, mode=best.mode).kth_value

@@ -109,7 +109,7 @@ class GuardedLogger(Logger):
             return call()
         except Exception as error:  # networks, disks and services raise any exception
             self._failed = True
-            _log.warning("a logger failed and is off for the rest of the run: %r", error)
+            _log.warning("a logger failed and is disabled for the rest of the run: %r", error)
             return None
 
     def _forward(self, call: Callable[[Logger], T]) -> T | None:

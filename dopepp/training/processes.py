@@ -34,7 +34,7 @@ class ProcessDiedError(RunError):
 
 
 class Watch(threading.Thread):
-    """Watches the children of this process, rank 1 first, and its parent if part of the run."""
+    """Watches this process's children, rank 1 first, and its parent if that belongs to the run."""
 
     def __init__(self, children: Sequence[subprocess.Popen[Any]], parent: int | None) -> None:
         super().__init__(daemon=True, name="process-watch")

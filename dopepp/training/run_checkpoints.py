@@ -75,7 +75,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
     ) -> None:
-        """Write the file atomically, or keep the checkpoint in memory and warn.
+        """Write the file atomically; if that fails, keep the checkpoint in memory and warn.
 
         Args:
             checkpoint: Content of the file.
@@ -87,7 +87,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         self._waiting[target] = (checkpoint, (storage_options or {}).get("previous"))
         error = self._write_waiting()
         if error is not None:
-            _log.warning("%s; trying again at the next saving", _failure(self.waiting[0], error))
+            _log.warning("%s; the next save tries again", _failure(self.waiting[0], error))
 
     def finish(self) -> None:
         """Write the waiting files.
@@ -120,7 +120,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         target = Path(os.fspath(path))
         folder = target.parent.resolve()
         if self._folder is not None and not folder.is_relative_to(self._folder.resolve()):
-            _log.warning("%s is not of this run and stays", target)
+            _log.warning("%s does not belong to this run and is kept", target)
             return
         if target.is_file():
             target.unlink()
@@ -158,7 +158,7 @@ def newest_checkpoint(run_dir: Path) -> tuple[Path, Checkpoint] | None:
             _log.warning("left out: %s", error.got)
             continue
         if damaged:
-            _log.warning("going on from %s, step %d", path.name, step)
+            _log.warning("continuing from %s, step %d", path.name, step)
         return path, checkpoint
     if damaged:
         problem = f"{run_dir}, whose checkpoints are all damaged ({', '.join(damaged)})"

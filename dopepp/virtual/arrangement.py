@@ -45,7 +45,7 @@ class Composition:
         self.clear()
 
     def clear(self) -> None:
-        """Take every object out again."""
+        """Remove all objects."""
         self.objects: list[SceneObject] = []
         self._preview = Preview(self.K, self.size, self.preset.min_visible_fraction)
 
@@ -142,8 +142,8 @@ class Preview:
 def arrange_floating(composition: Composition, targets: Sequence[Body], usual: Body) -> float:
     """Place targets and distractors, and return the targets' mean depth, metres.
 
-    There are no targets if the first finds no place; ``usual`` is the body to take the depth from
-    where there is no target.
+    If the first target does not fit, no target is placed. Without targets, the depth is drawn for
+    the body ``usual``.
     """
     for body in targets:
         material = composition.draw_material(body)

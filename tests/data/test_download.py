@@ -110,7 +110,7 @@ def test_redirections_within_http_are_followed(server, tmp_path):
 
 def test_a_broken_connection_is_resumed(server, tmp_path):
     path, half = tmp_path / "f", len(CONTENT) // 2
-    with pytest.raises(UserError, match=rf"broke after {half} of 3000000 bytes; .*goes on"):
+    with pytest.raises(UserError, match=rf"broke after {half} of 3000000 bytes; .*it continues"):
         fetch(url(server, "cut"), path, len(CONTENT), SHA256)
     assert names(tmp_path) == ["f.partial"]
     fetch(url(server, "good"), path, len(CONTENT), SHA256)
@@ -128,7 +128,7 @@ def test_any_partial_file_ends_well(server, tmp_path, there):
 
 def test_a_server_that_goes_on_elsewhere_is_refused(server, tmp_path):
     (tmp_path / "f.partial").write_bytes(CONTENT[:1000])
-    with pytest.raises(UserError, match=r"goes on at 'bytes 0-.* instead of byte 1000"):
+    with pytest.raises(UserError, match=r"continues at 'bytes 0-.* instead of byte 1000"):
         fetch(url(server, "wrong-range"), tmp_path / "f", len(CONTENT), SHA256)
 
 

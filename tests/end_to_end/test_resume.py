@@ -153,7 +153,7 @@ def test_resume_takes_the_newest_whole_checkpoint(how, run, call, caplog):
     assert done.code == 0, done.err
     assert f"left out: {folder}/last.ckpt" in caplog.text
     assert f"left out: {folder}/previous.ckpt" in caplog.text
-    assert "going on from best.ckpt, step 2" in caplog.text
+    assert "continuing from best.ckpt, step 2" in caplog.text
     assert (folder / "last.ckpt.damaged").exists()
     assert steps(run) == [0, 1, 2, 3]
     assert last(run)["global_step"] == 4

@@ -34,7 +34,7 @@ def test_a_killed_search_goes_on_and_prunes(start, call, tiny, tmp_path):
 
     assert [trial.state.name for trial in trials()] == ["RUNNING"]
     done = call("train.py", *arguments, code=0)
-    assert "goes on with trials 0" in done.out
+    assert "continues with trials 0" in done.out
     states = [trial.state.name for trial in trials()]
     assert len(states) == 5
     assert set(states) == {"COMPLETE", "PRUNED"}

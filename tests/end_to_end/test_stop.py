@@ -100,7 +100,7 @@ def test_a_job_that_slurm_requeues_goes_on_in_its_folder(
     assert (tmp_path / "asked").read_text() == "requeue 77\n"
     monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
     call(*command, code=0)
-    assert "job 77 was requeued: going on in" in caplog.text
+    assert "job 77 was requeued: continuing in" in caplog.text
     assert steps(find_run(tmp_path / "outputs")) == ["0", "1"]
 
 

@@ -60,7 +60,7 @@ def test_nothing_outside_of_the_run_is_removed(tmp_path, caplog):
     for path in (run / "checkpoints" / ".." / ".." / "other.ckpt", other, run / "link/other.ckpt"):
         io.remove_checkpoint(path)
     assert other.read_bytes() == b"mine"
-    assert caplog.text.count("is not of this run and stays") == 3
+    assert caplog.text.count("does not belong to this run and is kept") == 3
     io.remove_checkpoint(run / "checkpoints")  # a folder is no checkpoint
     io.remove_checkpoint(run / "checkpoints" / "old.ckpt")
     assert list((run / "checkpoints").iterdir()) == []

@@ -31,7 +31,7 @@ DEPTH_MODES: Final = ("I;16", "I;16B", "I", "L")
 """Pillow's pixel types of BOP's depth images: whole numbers."""
 
 DEPTH_SCALES_MM: Final = (0.1, 1.0)
-"""Millimetres a unit of written depth images, which then reach 6.5 m or 65 m."""
+"""Millimetres per unit of written depth images, which then reach 6.5 m or 65 m."""
 
 _MAX_UNITS: Final = 65_535
 
@@ -101,7 +101,7 @@ def decode_depth(content: bytes, where: str, depth_scale: float, shape: Shape) -
     Args:
         content: The image file.
         where: Name of the image in messages.
-        depth_scale: Millimetres a unit; NaN if not stated.
+        depth_scale: Millimetres per unit; NaN if not stated.
         shape: (height, width) of the colour image.
 
     Raises:
@@ -111,7 +111,7 @@ def decode_depth(content: bytes, where: str, depth_scale: float, shape: Shape) -
     units = one_channel_of(node, shape, content, DEPTH_MODES)
     assert units is not None
     if np.isnan(depth_scale):
-        node["image"].report("no depth_scale", "depth_scale (mm a unit) beside the image's cam_K")
+        node["image"].report("no depth_scale", "depth_scale (mm per unit) beside the image's cam_K")
     return (units.astype(np.float64) * (depth_scale / 1000)).astype(np.float32)
 
 

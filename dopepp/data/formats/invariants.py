@@ -59,7 +59,7 @@ class Box(NamedTuple):
         return max(left, top, other.right - self.right, other.bottom - self.bottom)
 
     def is_inside(self, shape: Shape) -> bool:
-        """Tell whether an image of (height, width) contains the box."""
+        """Return whether an image of (height, width) contains the box."""
         height, width = shape
         return min(self.left, self.top) >= 0 and self.right < width and self.bottom < height
 

@@ -61,7 +61,7 @@ class BackgroundCrops:
         return None
 
     def search(self, size: Size, rng: Generator) -> Picture | None:
-        """Return any crop of (height, width) with contrast, else any of two colours, or None."""
+        """Return a crop of (height, width) with contrast, else with two colours, else None."""
         free = self._is_free(size)
         if not free.any():
             return None
@@ -88,7 +88,7 @@ class BackgroundCrops:
             height, width = max(MIN_PATCH_PX, height // 2), max(MIN_PATCH_PX, width // 2)
 
     def _is_free(self, size: Size) -> Bool[np.ndarray, "rows columns"]:
-        """Tell for each window, by its top left corner, whether it is free of objects."""
+        """Return for each window, by its top left corner, whether it is free of objects."""
         return np.asarray(_windows(self._integral, size) == 0)
 
     @cached_property
@@ -115,7 +115,7 @@ def _windows(integral: np.ndarray, size: Size) -> np.ndarray:
 
 
 def has_contrast(crop: Picture, min_contrast: float) -> bool:
-    """Tell whether a crop is more than a solid colour."""
+    """Return whether a crop is more than a solid colour."""
     return float(crop.reshape(-1, 3).std(axis=0).max()) >= min_contrast
 
 

@@ -249,7 +249,7 @@ def choose_precision(asked: str, accelerator: str) -> tuple[str, str]:
 def keep_freed_memory() -> None:
     """Let glibc reuse large blocks instead of returning them to the system after each operation.
 
-    By default every large tensor is mapped anew, and page faults slow training on a CPU down
+    By default every large tensor is mapped again, and page faults slow training on a CPU down
     (``benchmarks/train_step.py``).
     """
     if sys.platform == "linux" and hasattr(ctypes.CDLL(None), "mallopt"):

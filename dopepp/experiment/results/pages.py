@@ -40,7 +40,7 @@ PRUNED: Final = "stopped by the search"
 FILES: Final = {
     "checkpoints/best_tuned.ckpt": "the same as `best.ckpt`, tuned; the one to use",
     "checkpoints/best.ckpt": "the weights with the best validation",
-    "checkpoints/last.ckpt": "where `resume=` goes on",
+    "checkpoints/last.ckpt": "where `resume=` continues",
     "checkpoints/previous.ckpt": "the one before, should that be damaged",
     "metrics.json": "the measurement on the test set, every instance's error included",
     "metrics.csv": "losses, rates and validation over the steps",

@@ -188,7 +188,7 @@ def begun_run(command: Sequence[str]) -> Path | None:
     if note is None or restarts == "0" or not note.is_file():
         return None
     run_dir = Path(note.read_text().strip())
-    _log.info("job %s was requeued: going on in %s", job_id(), run_dir)
+    _log.info("job %s was requeued: continuing in %s", job_id(), run_dir)
     return run_dir
 
 

@@ -127,7 +127,7 @@ class _Trials:
         left = self._running()
         if left:
             names = ", ".join(str(trial.number) for trial in left)
-            display.console.print(f"study {self._study.study_name} goes on with trials {names}")
+            display.console.print(f"study {self._study.study_name} continues with trials {names}")
         for trials in _consecutive(left, at_a_time):
             returns += self._launch(trials)
         ended = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)

@@ -76,7 +76,7 @@ class Diagnosis:
 
 
 def part_size(case: Case) -> Diagnosis:
-    """Check whether the parts have a plausible size, and the mesh the size of training."""
+    """Check whether the parts' sizes are plausible and the meshes have the trained size."""
     sizes = []
     for part, given in zip(case.estimator.parts, case.parts, strict=True):
         learned = np.ptp(part.cuboid, axis=0)
@@ -94,7 +94,7 @@ def part_size(case: Case) -> Diagnosis:
 
 
 def exposure(case: Case) -> Diagnosis:
-    """Check whether the image is dark, or white at the part."""
+    """Check whether the image is dark, or overexposed at the part."""
     brightest, white, near = highlights(case.image), clipped(case.image), 0.0
     sentence = f"highlights of {brightest:.0f} of 255, {white:.0%} white without detail"
     if case.found is not None:
@@ -108,7 +108,7 @@ def exposure(case: Case) -> Diagnosis:
 
 
 def sharpness(case: Case) -> Diagnosis:
-    """Check whether edges are sharp in the size that the network is run on."""
+    """Check whether edges are sharp at the size on which the network runs."""
     width = edge_width(case.around())
     if width is None:
         return Diagnosis("sharpness", "too few edges to tell")
@@ -143,7 +143,7 @@ def camera(case: Case) -> Diagnosis:
 
 
 def size(case: Case) -> Diagnosis:
-    """Check whether the part has a distance and a size of training."""
+    """Check whether the part's distance and size lie within the training range."""
     name, seen = case.part.name, case.seen
     if seen is None:
         return Diagnosis("size", f"the checkpoint does not know in which sizes {name} was trained")
@@ -217,9 +217,10 @@ def diagnose(case: Case) -> list[Diagnosis]:
 
 
 def _lens_ratio(case: Case) -> float | None:
-    """Return the ratio of K's focal length to that of training.
+    """Return the ratio of K's focal length to that of training, if it explains a wrong distance.
 
-    None unless that places a part of usual size on the image outside the distances of training.
+    None if the part's distance lies within the training range, if its size on the image does not,
+    or if the focal lengths hardly differ.
     """
     if case.seen is None or case.distances is not None or case.found is None:
         return None

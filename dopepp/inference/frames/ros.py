@@ -121,7 +121,7 @@ class CameraInfo:
             rectified: Whether the images are undistorted, so that P describes them.
 
         Raises:
-            UserError: The camera is not calibrated, or no pinhole camera.
+            UserError: The camera is not calibrated, or is not a pinhole camera.
         """
         if not any(self.K):
             raise UserError(

@@ -124,7 +124,7 @@ class ExportedNetwork(ABC):
 
 
 def is_export(path: Path) -> bool:
-    """Return whether a path is an exported network, which runs on the CPU, or a checkpoint."""
+    """Return whether a path is an exported network rather than a checkpoint."""
     return path.is_dir() or path.suffix in SUFFIXES
 
 

@@ -104,7 +104,7 @@ def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
 
 
 def ycb_part(root: str | Path, name: str) -> Part:
-    """Return the part of the files ``points.xyz`` and ``textured.obj`` of a YCB-Video model.
+    """Read a part from the files ``points.xyz`` and ``textured.obj`` of a YCB-Video model.
 
     Both files are in metres. Without a ``textured.obj`` the part has no mesh, and the ADD points
     determine its cuboid and diameter.

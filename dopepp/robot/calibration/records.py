@@ -210,7 +210,8 @@ def match_pictures(poses: RobotPoses, pictures: Sequence[str]) -> list[tuple[int
         Pairs of indices (pose, picture).
 
     Raises:
-        UserError: A picture is missing, or without names, the numbers of poses and pictures differ.
+        UserError: A named picture is missing, or there are no names and the numbers of poses and
+            pictures differ.
     """
     if any(poses.names):
         indices = {name: index for index, name in enumerate(pictures)}
@@ -234,7 +235,7 @@ def match_pictures(poses: RobotPoses, pictures: Sequence[str]) -> list[tuple[int
 def write_calibration(
     path: Path, kind: str, values: Mapping[str, Any], findings: Sequence[str], force: bool
 ) -> None:
-    """Write a trusted calibration, or by ``force`` a doubtful one, which is marked.
+    """Write a trusted calibration, or with ``force`` a doubtful calibration, marked as such.
 
     Raises:
         UserError: There are findings and ``force`` is false, or the file cannot be written.

@@ -121,8 +121,8 @@ def find_bench(touched: Float[np.ndarray, "points 3"]) -> Bench:
 def bench_of_board(T_base_board: Sequence[Transform], board: Board) -> Bench:
     """Return the bench under a board that lies on it.
 
-    z points out of the board. Origin and x are the board's. A residual is the distance along z of
-    the board's centre in a picture from the mean.
+    z points out of the board. Origin and x are the board's. A residual is the distance along z
+    between the board's centre according to a picture and the mean of all pictures.
 
     Args:
         T_base_board: The board's pose from every picture.

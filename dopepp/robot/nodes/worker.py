@@ -118,7 +118,7 @@ class Worker:
         """Change the settings.
 
         Raises:
-            UserError: The settings are not supported; the previous ones stay.
+            UserError: The settings are not supported; the previous settings stay.
         """
         if self._tracker is not None and not settings.refine:
             fix = "set refine=true, or start the node without --track"
@@ -232,8 +232,10 @@ class Worker:
         pictures = f"pictures on {topic} are in frame {frame_id!r:.80}"
         fix = "name the camera's optical frame: --frame camera_optical_frame"
         if OPTICAL not in frame_id:
-            problem = f"{pictures}, which is not named as an optical one; poses have x right, "
-            self._warn("frame", f"{problem}y down and z forward in it; {fix}")
+            problem = (
+                f"{pictures}, which is not named as an optical one; a pose's frame has x right, "
+            )
+            self._warn("frame", f"{problem}y down and z forward; {fix}")
         elif info is not None and info.frame_id not in ("", frame_id):
             problem = f"{pictures}, their camera_info in {info.frame_id!r:.80}; the pictures' frame"
             self._warn("frame", f"{problem} is used; {fix}")
@@ -250,7 +252,7 @@ class Worker:
             self._warn(
                 "back",
                 f"stamps on {topic} went back by {back:.3f} s: a restarted recording or "
-                "simulation, or two cameras on one topic? Parts are detected anew",
+                "simulation, or two cameras on one topic? Parts are detected again",
             )
             if self._tracker is not None:
                 self._tracker = PoseTracker(self._estimator(True))

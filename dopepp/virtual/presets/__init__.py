@@ -52,7 +52,7 @@ class Preset(Checked):
         turning: Distribution of the targets' orientation; like the placement, unused on a table.
         table: The supporting plane; None for floating objects.
         targets_per_image: Number of targets, each a random part; further targets that do not fit
-            are left out. Images without targets teach and test silence.
+            are left out. On images without targets, a network learns to detect nothing.
         min_visible_fraction: Smallest visible fraction of every target.
         centroid_inside: Whether the image must contain every target's cuboid centre.
         window: (width, height) of the rendered part of the picture, around a random point; None

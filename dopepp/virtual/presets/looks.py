@@ -34,8 +34,8 @@ class Materials(Checked):
     Attributes:
         albedo: Linear albedo of the brightest channel, the same range for greys and colours.
         coloured_share: Share of untextured surfaces that have a colour; the others are grey.
-        roughness: Of dielectrics.
-        specular: Their reflectance at normal incidence.
+        roughness: Roughness of dielectrics.
+        specular: Reflectance of dielectrics at normal incidence.
         texture_gain: Factor on the colours of coloured surfaces.
         texture_tint: Largest relative deviation of a channel from that factor, because scans are
             taken with another camera.
@@ -147,7 +147,7 @@ _RGB_FROM_XYZ: Final = np.array(
 
 @dataclass(frozen=True)
 class Lighting(Checked):
-    """Ranges of light; intensities are what a white surface facing the light reflects, 1 clips.
+    """Ranges of light; an intensity is what a white surface facing the light reflects, 1 is white.
 
     Attributes:
         num_lights: Number of point lights; the first, the key light, casts the sharpest shadows.

@@ -134,7 +134,7 @@ class _Placement(Checked):
         """Return another position for an object that the frame does not show well, or None.
 
         Coordinates that a placement keeps retain their distribution, however many positions are
-        rejected. None also draws the orientation anew.
+        rejected. None also draws the orientation again.
         """
         return None
 

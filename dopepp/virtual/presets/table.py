@@ -129,7 +129,7 @@ def plane_of(T_cam_table: Transform) -> Plane:
 
 
 def inverse_depth_row(plane: Plane, K: CameraMatrix) -> Vector:
-    """Return the row vector whose product with a homogeneous pixel is the plane's 1/depth, 1/m.
+    """Return the row vector that maps a homogeneous pixel to the plane's inverse depth, 1/m.
 
     A ray r (with z = 1) meets the plane at depth offset/(normal · r).
     """

@@ -132,7 +132,7 @@ class View:
         )
 
     def whole(self, preset: Preset, scale: float) -> Preset:
-        """Return a preset's scenes in whole pictures, with the same blur once scaled."""
+        """Return a preset's scenes in whole pictures, with more blur to be equal when scaled."""
         sensors = preset.sensors.resized(min(1 / scale, _MOST_BLUR))
         return replace(self.window(preset, 1.0, None), sensors=sensors)
 

@@ -47,7 +47,7 @@ class Texture:
 
 
 def make_texture(image: Picture, uv: Float[np.ndarray, "vertices 2"], faces: Faces) -> Texture:
-    """Build the pyramid of an image that a mesh uses."""
+    """Build the image pyramid of a mesh's texture."""
     shapes = [image.shape[:2]]
     while max(shapes[-1]) > 1:
         shapes.append((max(shapes[-1][0] // 2, 1), max(shapes[-1][1] // 2, 1)))

@@ -186,7 +186,7 @@ BOP = {
     "duplicate key": Case(
         GT, instead(b'"1": [', b'"1": [], "1": ['), "scene_gt.json: JSON: key '1' twice"
     ),
-    "no image's number": Case(f"{GT}:x", [], "scene_gt.json: 'x': no image's number"),
+    "not an image number": Case(f"{GT}:x", [], "scene_gt.json: 'x': not an image number"),
     "rotation scaled": Case(f"{GT}:0.0.cam_R_m2c", times(1.01), "0[0].cam_R_m2c: no rotation"),
     "rotation mirrored": Case(f"{GT}:0.0.cam_R_m2c", times(-1), "0[0].cam_R_m2c: no rotation"),
     "rotation short": Case(f"{GT}:0.0.cam_R_m2c", [1.0] * 8, "0[0].cam_R_m2c: [1.0"),
@@ -490,7 +490,7 @@ def test_an_empty_folder_of_depth_is_none(copy_of, boxes):
 def test_a_scene_that_no_reader_finds_is_a_defect(copy_of):
     root = copy_of("BOP")
     (root / SCENE).rename(root / "train_pbr" / "kitchen")
-    assert_found(root, "train_pbr/kitchen: name: no scene's number")
+    assert_found(root, "train_pbr/kitchen: name: not a scene number")
 
 
 @pytest.mark.parametrize("stated", [b"[]", b"[null, null]"])

@@ -112,7 +112,7 @@ def test_interrupted_trials_run_again_under_their_numbers(call_fast, tmp_path, m
     drawn = trials(tmp_path)[0].params
     code, out, _ = call_fast(*FAST, "search.num_trials=3")
     assert code == 130
-    assert "goes on with trials 0" in out
+    assert "continues with trials 0" in out
     assert call_fast(*FAST, "search.num_trials=3")[0] == 0
     result = trials(tmp_path)
     assert [trial.state for trial in result] == [TrialState.COMPLETE] * 3

@@ -80,7 +80,7 @@ class BopPoses:
 def read_cameras(
     records: Sequence[object], nodes: Nodes
 ) -> tuple[Float[np.ndarray, "images 3 3"], Float[np.ndarray, " images"]]:
-    """Return each image's K in pixels and ``depth_scale`` in mm a unit (NaN if not stated)."""
+    """Return each image's K in pixels and ``depth_scale`` in mm per unit (NaN if not stated)."""
     node = partial(nodes, "camera")
     K = _column(records, "cam_K", 9, node).reshape(-1, 3, 3)
     scales = _stated_column(records, "depth_scale", node)
@@ -180,7 +180,7 @@ def _orthogonality(matrices: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " 
 
 
 def is_number(text: str) -> bool:
-    """Tell whether a key or a name is the number of an image, an object or a scene."""
+    """Return whether a key or a name is the number of an image, an object or a scene."""
     return text.isascii() and text.isdecimal() and len(text) < 10
 
 
@@ -211,7 +211,7 @@ def _by_image(node: Node) -> dict[int, Any]:
     by_image: dict[int, Any] = {}
     for key, record in (node.load(allowed, MAX_SCENE_BYTES) or {}).items():
         if not is_number(key):
-            node[f"{key!r:.40}"].report("no image's number", allowed)
+            node[f"{key!r:.40}"].report("not an image number", allowed)
         elif int(key) in by_image:
             node[f"{key!r:.40}"].report(f"image {int(key)} twice", "each once")
         else:
@@ -232,7 +232,7 @@ def image_files(
         number = int(path.stem)
         if number in files:
             problem = f"image {number} twice, also as {files[number].name}"
-            problems.report(path, "file", problem, "one file an image")
+            problems.report(path, "file", problem, "one file per image")
         else:
             files[number] = path
     return files
@@ -245,7 +245,7 @@ class BopScene:
     Attributes:
         files: Image files relative to the folder; empty for an image that is not on disk.
         depth_files: Depth images likewise.
-        depth_scales: Millimetres a unit of the depth images; NaN where not stated.
+        depth_scales: Millimetres per unit of the depth images; NaN where not stated.
         first: Image i has the objects ``first[i] … first[i + 1] − 1``.
         gt_ids: Each object's index in its image's list, which names its masks.
         num_other: Number of objects that have a model and are not wanted.

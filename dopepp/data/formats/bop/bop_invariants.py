@@ -72,7 +72,7 @@ def check_bop(report: CheckReport) -> None:
     models = load_models(report, (report.root, *report.root.resolve().parents[:2]))
     for folder in scene_folders(report.root):
         if folder != report.root and not bop.is_number(folder.name):
-            report.report(folder, "name", "no scene's number", "000000, 000001, …")
+            report.report(folder, "name", "not a scene number", "000000, 000001, …")
         _SceneCheck(report, folder, models).check()
 
 
@@ -92,7 +92,7 @@ class _SceneCheck:
         for folder in {path.parent for path in files.values()}:
             for path in sorted(folder.glob("[!.]*")):
                 if path.suffix.lower() in kind[1] and not bop.is_number(path.stem):
-                    self._report.report(path, "file", "no image's number")
+                    self._report.report(path, "file", "not an image number")
         return files
 
     def check(self) -> None:
@@ -301,7 +301,7 @@ def _check_camera(
     node = nodes("camera", 0)
     K: CameraMatrix = bop.read_cameras([camera], nodes)[0][0]
     if has_depth and "depth_scale" not in mapping(camera):
-        node["depth_scale"].report("missing", "millimetres a unit of the depth")
+        node["depth_scale"].report("missing", "millimetres per unit of the depth")
     return plausible_camera(node["cam_K"], K, shape)
 
 

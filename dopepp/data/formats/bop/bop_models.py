@@ -178,7 +178,7 @@ def parse_models(path: Path, records: object, problems: Problems = STRICT) -> di
     names: set[str] = set()
     for key, record in mapping(records).items():
         if not is_number(key) or int(key) in infos:
-            node[f"{key!r:.40}"].report("no object's number, or one twice", _ALLOWED)
+            node[f"{key!r:.40}"].report("not an object number, or a repeated one", _ALLOWED)
             continue
         info = _info(node[key], path.parent / f"obj_{int(key):06d}.ply", record)
         if info.name in names:

@@ -229,7 +229,7 @@ class BopReader:
         return first.size, first.K, (floor(100 * min(depths)) / 100, ceil(100 * max(depths)) / 100)
 
     def contains(self, label: str) -> bool:
-        """Tell whether any image shows this object."""
+        """Return whether any image shows this object."""
         return bool(self._num_instances.get(label))
 
     def describe(self) -> list[SourceInfo]:

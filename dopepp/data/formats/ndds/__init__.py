@@ -192,7 +192,7 @@ class NddsSettings:
             allowed = (
                 f"fx, fy, cx, cy there or, of one camera or one named {side!r}, in {path.name}"
             )
-            node.report(f"{len(cameras)} cameras' to take", allowed)
+            node.report(f"{len(cameras)} cameras that match", allowed)
         return np.full((3, 3), np.nan)
 
     def fixed_transform(self, annotation: Path, label: str) -> NDArray[np.float64] | None:
@@ -301,5 +301,5 @@ def label_values(
 
 
 def has_object_ids(record: Mapping[str, Any]) -> bool:
-    """Tell whether an annotation states that ``.seg.png`` labels objects, not classes."""
+    """Return whether an annotation states that ``.seg.png`` labels objects, not classes."""
     return stated(record, "segmentation") == "segmentation_id"

@@ -224,11 +224,11 @@ def check_observation(observation: Observation, convention: PoseConvention) -> T
     T_cam_obj, node = observation.T_cam_obj(convention), item.node
     if T_cam_obj is None:
         problem = f"no fixed_model_transform of {item.label} in the object settings"
-        node["class"].report(problem, f"one as for the others ({convention})")
+        node["class"].report(problem, f"the class's matrix, because poses are {convention}")
     assert T_cam_obj is not None
     if T_cam_obj[2, 3] <= 0:
         problem = f"an object behind the camera (z = {T_cam_obj[2, 3]:.3g} m)"
-        node["location"].report(problem, f"one before it ({convention})")
+        node["location"].report(problem, f"an object in front of it ({convention})")
     predicted = observation.predicted_px(convention)
     # Projections of hidden objects, and of objects partly behind the camera, are meaningless.
     if predicted is None or not np.isfinite(predicted).all() or item.visibility == 0:
@@ -241,7 +241,7 @@ def check_observation(observation: Observation, convention: PoseConvention) -> T
 
 
 def _same_poses(observations: Sequence[Observation], a: PoseConvention, b: PoseConvention) -> bool:
-    """Tell whether two conventions give most instances the same pose."""
+    """Return whether two conventions give most instances the same pose."""
     distances = []
     for observation in observations:
         T_a, T_b, part = observation.T_cam_obj(a), observation.T_cam_obj(b), observation.part

@@ -158,7 +158,7 @@ class NddsReader:
         return path.relative_to(self.folder).as_posix().removesuffix(".json")
 
     def _is_out_of_view(self, observation: Observation) -> bool:
-        """Tell whether an object is behind the camera and invisible according to the file."""
+        """Return whether an object is behind the camera and invisible according to the file."""
         T_cam_obj = observation.T_cam_obj(self.finding.convention)
         behind = T_cam_obj is not None and T_cam_obj[2, 3] <= 0
         visibility = observation.item.visibility
@@ -178,7 +178,7 @@ class NddsReader:
         return Instance(part.name, T_cam_obj, keypoints, float(fraction))
 
     def contains(self, label: str) -> bool:
-        """Tell whether any item shows this object, reading annotations until one does."""
+        """Return whether any item shows this object, reading annotations until one does."""
         return label in self._parts and any(
             self._part(name) is self._parts[label]
             for path in self.items
@@ -186,7 +186,7 @@ class NddsReader:
         )
 
     def describe(self) -> list[SourceInfo]:
-        """Describe the items, objects and convention; count the instances of a small data set."""
+        """Describe items, objects and convention; count instances if the data set is small."""
         identity: dict[str, object] = {
             "items": hashlib.sha256("\n".join(map(self._key, self.items)).encode()).hexdigest(),
             "objects": {part.name: part.mesh_hash for part in self._parts.values()},

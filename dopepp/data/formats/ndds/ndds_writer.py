@@ -139,7 +139,7 @@ class NddsWriter:
 
 
 def object_settings(parts: Sequence[Part]) -> dict[str, Any]:
-    """Return ``_object_settings.json``: the classes, their ids from 1 and boxes (x, y, z, cm)."""
+    """Return the content of ``_object_settings.json``: classes, ids from 1 and box sizes in cm."""
     return {
         "exported_object_classes": [part.name for part in parts],
         "exported_objects": [
@@ -155,7 +155,7 @@ def object_settings(parts: Sequence[Part]) -> dict[str, Any]:
 
 
 def camera_settings(camera: dict[str, Any]) -> dict[str, Any]:
-    """Return ``_camera_settings.json`` for the camera of an annotation's ``camera_data``."""
+    """Return the content of ``_camera_settings.json`` for an annotation's ``camera_data``."""
     width, height, values = (camera[name] for name in CAMERA_FIELDS)
     return {
         "camera_settings": [

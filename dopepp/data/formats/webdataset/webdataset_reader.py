@@ -119,7 +119,7 @@ class WebdatasetReader:
         return [int(number) for number in np.flatnonzero(wanted)]
 
     def contains(self, label: str) -> bool:
-        """Tell whether any image shows this object, reading ground truth until one does."""
+        """Return whether any image shows this object, reading ground truth until one does."""
         wanted = {number for number, part in self._parts.items() if part.name == label}
         for number, image in self._items.tolist() if wanted else ():
             poses = _records(self._shards[number], image).poses()

@@ -133,7 +133,7 @@ def _load(path: Path, node: Node) -> dict[str, NDArray[Any]] | None:
 
 
 def _is_complete(content: bytes) -> bool:
-    """Tell whether the last MAT-5 element (type, length, data) ends where the file ends."""
+    """Return whether the last MAT-5 element (type, length, data) ends where the file ends."""
     # SciPy accepts a file that is truncated between or inside other variables.
     start = _HEADER_BYTES
     order = "<" if content[126:128] == b"IM" else ">"

@@ -87,7 +87,7 @@ class _FrameCheck:
             if points.shape[1] != 3 or not np.isfinite(points).all():
                 raise ValueError(f"shape {points.shape}, or not finite")
         except (ValueError, UserWarning) as error:
-            self._report.report(path, "points", f"{error}", "three finite numbers a line")
+            self._report.report(path, "points", f"{error}", "three finite numbers per line")
             return None
         return points, largest_distance(points)
 

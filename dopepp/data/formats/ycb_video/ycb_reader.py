@@ -141,14 +141,14 @@ class YcbVideoReader:
         return np.asarray(np.rint(blend), np.uint8)
 
     def contains(self, label: str) -> bool:
-        """Tell whether any frame shows this object, reading frames until one does."""
+        """Return whether any frame shows this object, reading frames until one does."""
         wanted = {index for index, part in self._parts.items() if part.name == label}
         return bool(wanted) and any(
             not wanted.isdisjoint(self._meta(frame).poses) for frame in self.frames
         )
 
     def describe(self) -> list[SourceInfo]:
-        """Describe the frames and objects; count the instances of a small list."""
+        """Describe the frames and objects; count instances if the list of frames is short."""
         identity: dict[str, object] = {
             "frames": hashlib.sha256("\n".join(self.frames).encode()).hexdigest(),
             "objects": {part.name: part.mesh_hash for part in self._parts.values()},

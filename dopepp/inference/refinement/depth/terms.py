@@ -154,7 +154,7 @@ def _add_planes(
     H: Array,
     g: Array,
 ) -> float:
-    """Add the terms of all pixels that the part covers; return the sum of their weights.
+    """Add the point-to-plane terms of all covered pixels to H and g; return their total weight.
 
     A rotation ω and a shift τ of the part move a point at ``arm`` from its origin by ω × arm + τ.
     """

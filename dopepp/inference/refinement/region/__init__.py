@@ -146,7 +146,7 @@ class RegionRefiner:
         weights: Weights = FOUND,
         more: Sequence[Term] = (),
     ) -> list[Round]:
-        """Return the rounds around a pose.
+        """Return the rounds of optimisation around a pose, from coarse to fine.
 
         Raises:
             UndecidedError: The part is not in view.

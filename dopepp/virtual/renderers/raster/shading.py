@@ -99,7 +99,7 @@ def _set_albedo(
 
 @compiled(fastmath=True)
 def _blend_colours(face: Array, share: Array, faces: Array, colours: Array, albedo: Array) -> None:
-    """Set the albedo to the vertices' colours, linear RGB, as far as each is away."""
+    """Set the albedo to the interpolated colours of the triangle's corners, linear RGB."""
     for p in range(face.shape[0]):
         # A triangle seen from behind is its number's bitwise complement.
         corners = faces[face[p] if face[p] >= 0 else ~face[p]]

@@ -140,7 +140,7 @@ def test_objects_without_a_name_are_called_after_their_file(tmp_path):
             ({"symmetries_continuous": [{"axis": [0, 0, 1]}]}, "3 finite numbers"),
             ([], r"1: \[\]; .*diameter and symmetries"),
         ]),
-        ({"1": {}, "01": {}}, "'01': no object's number, or one twice"),
+        ({"1": {}, "01": {}}, "'01': not an object number, or a repeated one"),
         ({"1": {"name": "a"}, "2": {"name": "a"}}, r"2\.name: 'a' twice"),
         ({"a": {}}, "objects by number"),
         ([], "objects by number"),

@@ -303,7 +303,7 @@ def test_what_contradicts_an_image_is_named(scene, block):
 
     content = (scene.folder / "rgb" / "000003.png").read_bytes()
     (scene.folder / "rgb" / "000003.jpg").write_bytes(content)
-    refused(r"rgb/000003.*: image 3 twice, also as 000003.*one file an image")
+    refused(r"rgb/000003.*: image 3 twice, also as 000003.*one file per image")
     (scene.folder / "rgb" / "000003.png").unlink()
     scene.json("scene_camera", {"3": {"cam_K": K}, "11": {"cam_K": K}})
     scene.image("depth/000003.png", np.zeros((48, 64), np.uint16))
