@@ -127,19 +127,19 @@ class GuardedLogger(Logger):
         return self._forward(lambda inner: inner.version)
 
     def log_hyperparams(self, params: dict[str, Any] | Namespace, *args: Any, **kw: Any) -> None:
-        """Forward."""
+        """Forward to the logger."""
         self._forward(lambda inner: inner.log_hyperparams(params, *args, **kw))
 
     def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
-        """Forward."""
+        """Forward to the logger."""
         self._forward(lambda inner: inner.log_metrics(metrics, step))
 
     def save(self) -> None:
-        """Forward."""
+        """Forward to the logger."""
         self._forward(lambda inner: inner.save())
 
     def finalize(self, status: str) -> None:
-        """Forward."""
+        """Forward to the logger."""
         self._forward(lambda inner: inner.finalize(status))
 
     def log_picture(self, name: str, image: Picture, step: int | None = None) -> None:

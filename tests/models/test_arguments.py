@@ -80,7 +80,7 @@ MAPS = {"in_channels": 8, "num_objects": 1}
     ("registry", "node", "provided", "message"),
     [
         (BACKBONES, {"_target_": "dopepp.models.backbones.DSC", "batch_norm": "yes"}, {},
-         r"backbone\.batch_norm='yes'; allowed: true or false; fix: change backbone\.batch_norm"),
+         r"backbone\.batch_norm='yes'; allowed: true or false; fix: set backbone\.batch_norm"),
         (HEADS, {"_target_": "dopepp.models.heads.Cascade", "batch_norm": 1}, MAPS,
          r"head\.batch_norm=1; allowed: true or false"),
         (HEADS, {"_target_": "dopepp.models.heads.Cascade", "stages": "six"}, MAPS,

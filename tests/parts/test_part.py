@@ -50,7 +50,7 @@ def test_hash_tells_meshes_apart():
         (1000, "m", r"'holder' with a diameter of 104\.8 m, .* unit=m; .*5 mm – 5 m; .*unit=mm"),
         (0.001, "mm", r"diameter of 0\.0001048 m, .* unit=mm; .* fix: .*unit=m$"),
         (0.01, "mm", r"diameter of 0\.001048 m, .* fix: .*unit=cm"),
-        (0.0, "mm", r"diameter of 0 m, .* fix: check the file's size"),
+        (0.0, "mm", r"diameter of 0 m, .* fix: export the part at its real size"),
     ],
 )
 def test_an_unlikely_size_names_the_unit_and_suggests_one(scale, unit, message):

@@ -127,7 +127,7 @@ def _train_source(
 
 
 def _real_frames(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
-    """Open the labelled training images, in windows if the user's camera is given."""
+    """Open the labelled training images, cut into windows if the user's camera is given."""
     frames, view = labelled_images(data, parts, seed, "train"), data.virtual.view
     if view is None:
         return kept(frames, data, data.cache, data.network_input)

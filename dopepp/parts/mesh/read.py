@@ -137,9 +137,9 @@ def _read_points(path: Path) -> Points:
             warnings.simplefilter("error")  # numpy only warns of an empty file
             points = np.loadtxt(path, ndmin=2)
     except (OSError, ValueError, UserWarning) as error:
-        raise UserError(f"{path}: {error}", allowed, "replace the file") from error
+        raise UserError(f"{path}: {error}", allowed, "unpack the model again") from error
     if points.shape[1] != 3 or not np.isfinite(points).all():
-        raise UserError(f"{path} of shape {points.shape}", allowed, "replace the file")
+        raise UserError(f"{path} of shape {points.shape}", allowed, "unpack the model again")
     return np.asarray(points, np.float64)
 
 

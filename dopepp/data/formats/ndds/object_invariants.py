@@ -307,7 +307,7 @@ def _finite(values: Float[np.ndarray, "..."] | None) -> Float[np.ndarray, "..."]
 def _quarter_turn_distance(rotation: RotationMatrix) -> float:
     """Return the angle to the nearest matrix that permutes and flips axes.
 
-    The frames that tools give to one object differ by such matrices.
+    Different tools assign frames to the same object that differ by such matrices.
     """
     nearest = np.where(np.abs(rotation) == np.abs(rotation).max(axis=0), np.sign(rotation), 0.0)
     if abs(np.linalg.det(nearest)) != 1:
