@@ -333,7 +333,7 @@ def _half(name: str, value: Tensor) -> Tensor:
 
 
 def _portable(value: Any, key: str = "") -> Any:
-    """Return a payload with null in place of local folders and with names of files only."""
+    """Return a payload without folders, and with the names of files instead of their paths."""
     if isinstance(value, Mapping):
         return {name: _portable(item, name) for name, item in value.items()}
     if isinstance(value, list):

@@ -63,7 +63,7 @@ class BopFolder:
         info = f"{MODEL_FOLDERS[0]}/{INFO_FILE}"
         if (self.root / self.split).exists() and not (self.root / info).exists():
             problem = f"{self.root}, which has {self.split}/ and no {info}"
-            allowed = "an empty folder, or one that this layout was begun in"
+            allowed = "an empty folder, or a data set that this command began"
             raise UserError(problem, allowed, "pass another folder")
         write_models(self.root, self._parts)
 
