@@ -138,7 +138,9 @@ def read(path: Path) -> Checkpoint:
         size = check_container(path, _WHAT)
         content = read_mapping(path, _WHAT)
     if KEY not in content:
-        raise UserError(f"{path} without {KEY!r} entry", _WHAT, "pass a file written by train.py")
+        raise UserError(
+            f"{path} without {KEY!r} entry", _WHAT, "pass a checkpoint that training wrote"
+        )
     try:
         checkpoint = parse_description(content[KEY])
         weights = content.get("state_dict")

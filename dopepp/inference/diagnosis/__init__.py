@@ -128,7 +128,7 @@ def camera(case: Case) -> Diagnosis:
     sentence = f"K sees {across:.0f}° × {down:.0f}°"
     if case.found is None:
         return Diagnosis("camera", sentence)
-    fix = "check K: its size (--K-size), what was cut out (--crop), its calibration"
+    fix = "check K: its picture size (--K-size), the crop (--crop), the calibration"
     detection, name = case.found, case.part.name
     lens = focal_factor(case.part.cuboid, detection.peaks, detection.T_cam_obj, case.K)
     if lens and lens.gain > GAIN and lens.deviation < CERTAIN and not _near(lens.factor, FOCAL):
@@ -136,9 +136,9 @@ def camera(case: Case) -> Diagnosis:
         return Diagnosis("camera", f"{sentence}, but {other}", fix)
     ratio = _lens_ratio(case)
     if ratio is not None:
-        other = f"{name} looks as large as in training, and is {ratio:.2g} times as far away by K"
-        fix = f"right if the lens is {ratio:.2g} times as long as training's; else {fix}"
-        return Diagnosis("camera", f"{sentence}, and {other}", fix)
+        other = f"{name} has a trained size and, by K, {ratio:.2g} times the trained distance"
+        fix = f"none if the focal length is {ratio:.2g} times that of training; otherwise {fix}"
+        return Diagnosis("camera", f"{sentence}; {other}", fix)
     return Diagnosis("camera", sentence)
 
 
@@ -150,14 +150,14 @@ def size(case: Case) -> Diagnosis:
     near, far = case.distances or seen[2:]
     usual = f"{near:.2g} – {far:.2g} m"
     if case.found is None:
-        return Diagnosis("size", f"{name} is looked for at {usual}, and nearer and farther")
+        return Diagnosis("size", f"{name} was searched at {usual}, and nearer and farther")
     z = float(case.found.T_cam_obj[2, 3])
     sentence = f"{name} is {case.length_px:.0f} pixels long at {z:.3g} m"
     if case.elsewhere is None:
-        return Diagnosis("size", f"{sentence}; it is looked for at {usual}")
-    fix = f"bring it to {usual}, or look there: --distance {0.9 * z:.2g} {1.1 * z:.2g}"
+        return Diagnosis("size", f"{sentence}; it is searched at {usual}")
+    fix = f"move it to {usual}, or search there: --distance {0.9 * z:.2g} {1.1 * z:.2g}"
     if not _near(z / math.sqrt(near * far), 5):
-        fix += "; such a factor may also be the unit of the part's mesh or of a distance"
+        fix += "; the cause may also be a wrong unit of the part's mesh or of a distance"
     return Diagnosis("size", f"{sentence}, and nothing is found at {usual}", fix)
 
 
@@ -169,7 +169,7 @@ def visibility(case: Case) -> Diagnosis:
         sentence = f"{count} of 9 keypoints of {name}, score {score:.2g}"
         if score >= LEAST_SCORE:
             return Diagnosis("visibility", sentence)
-        problem = f"what looks most like {name} hardly does: {sentence}"
+        problem = f"the best candidate hardly looks like {name}: {sentence}"
         return Diagnosis("visibility", problem, ABSENT)
     beliefs = case.strongest_beliefs()
     centre, count = float(beliefs[CENTROID]), int((beliefs > PARTLY).sum())
@@ -178,8 +178,8 @@ def visibility(case: Case) -> Diagnosis:
         return Diagnosis("visibility", f"nothing like {name} is seen, {belief}", ABSENT)
     return Diagnosis(
         "visibility",
-        f"{name} is seen in part: its centre with a belief of {centre:.2g} and {count} of 9 "
-        "keypoints, which make no pose that can be trusted",
+        f"{name} is only partly visible: a belief of {centre:.2g} in its centre and {count} of 9 "
+        "keypoints, which determine no reliable pose",
         "uncover it, and keep all of it within the picture, not nearer than in training",
     )
 
@@ -187,7 +187,7 @@ def visibility(case: Case) -> Diagnosis:
 def pose(case: Case) -> Diagnosis:
     """Check whether keypoints and outline agree with the pose."""
     if case.found is None:
-        return Diagnosis("pose", "none to look at")
+        return Diagnosis("pose", "no pose to check")
     detection, refined, name = case.found, case.refined, case.part.name
     share = detection.reprojection_error_px / case.length_px
     sentence = f"{name}'s keypoints are {detection.reprojection_error_px:.1f} pixels off it"
@@ -195,10 +195,10 @@ def pose(case: Case) -> Diagnosis:
         fix = "check K and the mesh; if both are right, train longer or with more such pictures"
         return Diagnosis("pose", f"{sentence}, {share:.0%} of its length", fix)
     if refined is None:
-        return Diagnosis("pose", f"{sentence}; without a mesh its outline is not looked at")
+        return Diagnosis("pose", f"{sentence}; without a mesh its outline is not checked")
     if refined.agreement is None:
-        fix = "another background or light; check that the mesh is this part's (--part)"
-        sentence += f", its outline tells nothing: {refined.kept}"
+        fix = "change the background or the light; check that the mesh is this part's (--part)"
+        sentence += f", its outline does not determine a pose: {refined.kept}"
         return Diagnosis("pose", sentence, fix if case.estimator.refiner is not None else "")
     sentence += f", {refined.agreement:.0%} of its outline agrees"
     fix = "uncover the part; check that the mesh is this part's (--part)"

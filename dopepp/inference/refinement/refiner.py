@@ -77,7 +77,7 @@ class Refiner:
         terms = (refine,) if isinstance(refine, str) else tuple(refine)
         if not terms or not set(terms) <= set(TERMS):
             allowed = f"{', '.join(TERMS)}, several of them, or none"
-            raise UserError(f"refine={refine!r}", allowed, "choose among them")
+            raise UserError(f"refine={refine!r}", allowed, "use only these words")
         self._refiners = {part.name: PartRefiner(part, terms) for part in parts}
         self._cuboids = {part.name: part.cuboid for part in parts}
 

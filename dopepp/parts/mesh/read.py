@@ -120,9 +120,12 @@ def ycb_part(root: str | Path, name: str) -> Part:
     names = sorted(path.parent.name for path in models.glob("*/points.xyz"))
     if not names:
         problem, allowed = f"{root}, which has no models/NAME/points.xyz", "the root of YCB-Video"
-        raise UserError(problem, allowed, "check data.root, or unpack YCB_Video_Models into models")
+        raise UserError(
+            problem, allowed, "set data.root to this folder, or unpack YCB_Video_Models"
+        )
     if name not in names:
-        raise UserError(f"unknown object {name!r}", ", ".join(names), f"choose one of {models}")
+        fix = "set data.objects to names of this list"
+        raise UserError(f"unknown object {name!r}", ", ".join(names), fix)
     points_path, mesh_path = models / name / "points.xyz", models / name / "textured.obj"
     mesh = read_mesh(mesh_path, unit="m") if mesh_path.exists() else None
     return make_part(name, mesh, _read_points(points_path), unit="m")

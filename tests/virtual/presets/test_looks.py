@@ -136,5 +136,5 @@ def test_only_what_has_colours_is_stained(sheet, box_surface):
     ],
 )
 def test_wrong_ranges_are_refused(make):
-    with pytest.raises(UserError, match=r"allowed: .*fix: (change|move)"):
+    with pytest.raises(UserError, match=r"allowed: .*fix: (set|lower|raise)"):
         make()
