@@ -1,7 +1,7 @@
 """The accumulator of pose errors for validation, evaluation and other methods' poses.
 
-Its state are the poses themselves, so that all errors of an object are computed in one batch and a
-new measure needs no new state.
+Its state consists of the poses themselves, so that all errors of an object are computed in one
+batch and a new measure needs no new state.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""The robot's side: what ties a camera to an arm."""
+"""Robots: calibration of a camera on an arm, nodes that publish poses, and simulated grasps."""

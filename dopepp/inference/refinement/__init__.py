@@ -1,1 +1,1 @@
-"""What makes a recovered pose precise."""
+"""Refinement of recovered poses on the image and on a depth image."""
