@@ -88,7 +88,9 @@ def test_a_package_that_is_not_enabled_is_not_imported(mine, call, tiny_options,
     done = call("train.py", *tiny_options, "model/backbone=tiny", output, code=2)
     assert "extensions=[mine]" in done.line
     assert "mine" not in sys.modules
-    with pytest.raises(UserError, match=r"extensions=\[other\]; allowed: mine; fix: pip install other"):
+    with pytest.raises(
+        UserError, match=r"extensions=\[other\]; allowed: mine; fix: pip install other"
+    ):
         extensions.enable(["other"])
     with pytest.raises(UserError, match="install the package absent and enable it"):
         BACKBONES.resolve("absent.Net")

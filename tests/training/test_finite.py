@@ -205,7 +205,9 @@ def test_weights_that_are_not_finite_are_never_saved(run, tmp_path):
     """They break in the second step; at once that ends the run, or a checkpoint that is due."""
     with pytest.raises(RunError, match=r"not finite in step 2 \(the weights are not finite\)"):
         run({1: "weights"}, save_every=100)
-    with pytest.raises(RunError, match=r"^the weights are not finite after step 2: nothing was saved"):
+    with pytest.raises(
+        RunError, match=r"^the weights are not finite after step 2: nothing was saved"
+    ):
         run({1: "weights"})
     assert [path.name for path in tmp_path.glob("*.ckpt")] == ["last.ckpt"]
     saved = torch.load(tmp_path / "last.ckpt", weights_only=True)

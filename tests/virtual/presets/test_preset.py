@@ -315,7 +315,10 @@ def test_groups_come_and_go():
     ("changes", "message"),
     [
         ({"colour": 1}, "colour=1; allowed: name, width"),
-        ({"materials": {"metal": 1}}, "materials.metal=1; allowed: albedo, .*; fix: write metal_share"),
+        (
+            {"materials": {"metal": 1}},
+            "materials.metal=1; allowed: albedo, .*; fix: write metal_share",
+        ),
         ({"materials": 3}, "materials=3; allowed: a mapping"),
         ({"materials": {"metal_share": "0.2"}}, "materials.metal_share='0.2'"),
         ({"materials": {"metal_share": None}}, "materials.metal_share=None"),

@@ -73,11 +73,13 @@ def test_a_given_window_limits_the_scale():
 
 def test_what_is_advised_will_do():
     parts = [part(0.1)]
-    large = r"from 0.1 m, where bracket \(100 mm across\) has 931 pixels .*1280×720.*start working_distance at 0\.13$"
+    large = r"from 0.1 m, where bracket \(100 mm across\) has 931 pixels .*1280×720.*"
+    large += r"start working_distance at 0\.13$"
     with pytest.raises(UserError, match=large):
         view(0.1).check(parts)
     view(0.13).check(parts)
-    small = r"to 9 m, where bracket .* has 10 pixels .*at least 25 pixels.*end working_distance at 3\.724,"
+    small = r"to 9 m, where bracket .* has 10 pixels .*at least 25 pixels.*"
+    small += r"end working_distance at 3\.724,"
     with pytest.raises(UserError, match=small):
         view(0.4, 9).check(parts)
     assert FEWEST_PX <= view(0.4, 3.724).sizes_px(parts)[0] < FEWEST_PX + 0.1
