@@ -13,6 +13,7 @@ setup(
             "pretrained/*",
             "robot/grasping/data/*",
             "robot/nodes/share/*",
+            "virtual/backgrounds/photos/*",
         ],
         "dopepp.conf": ["**/*.yaml"],
     },

@@ -156,7 +156,9 @@ def test_pickling_leaves_the_decoded_photos_behind(tmp_path):
 
 def test_memory_for_photos_is_bounded(tmp_path, monkeypatch):
     write_photos(tmp_path, 9, 100)
-    monkeypatch.setattr("dopepp.virtual.backgrounds._KEPT_BYTES", 3 * (100 * 120 + 50 * 60) * 3)
+    monkeypatch.setattr(
+        "dopepp.virtual.backgrounds.photo_backgrounds._KEPT_BYTES", 3 * (100 * 120 + 50 * 60) * 3
+    )
     backgrounds = PhotoBackgrounds(tmp_path)
     for seed in range(50):
         draw(backgrounds, seed)

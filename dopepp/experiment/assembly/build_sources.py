@@ -30,6 +30,7 @@ from dopepp.data.transforms.augment import Photometric
 from dopepp.data.transforms.jitter import CameraJitter
 from dopepp.data.transforms.masking import RandomMask
 from dopepp.experiment.assembly.build_system import build_optional
+from dopepp.experiment.assembly.photos import training_backgrounds
 from dopepp.experiment.assembly.renders import (
     held_out_renders,
     kept,
@@ -40,7 +41,7 @@ from dopepp.experiment.config.data_config import DataConfig, LensConfig
 from dopepp.experiment.config.run_config import RunConfig
 from dopepp.geometry.camera import Letterbox
 from dopepp.parts.part import Parts
-from dopepp.virtual.backgrounds import Backgrounds, find_backgrounds
+from dopepp.virtual.backgrounds import Backgrounds
 
 _log = logging.getLogger(__name__)
 
@@ -52,7 +53,7 @@ _DIVIDED: Final = ("bop", "ndds", "webdataset")  # formats whose folders `share_
 
 def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModule:
     """Build training images from ``seed`` and held-out images from ``data.eval_seed``."""
-    backgrounds = find_backgrounds(data.virtual.backgrounds, "train")
+    backgrounds = training_backgrounds(data)
     val = held_out_source(data, parts, "val")
     if data.virtual.view is not None and isinstance(val, RenderedSource):
         val = validation_windows(data, parts)
@@ -113,7 +114,7 @@ def _train_source(
         )
     if data.root is not None and data.synthetic_fraction > 0 and data.real_fraction < 1:
         synthetic = synthetic_companions(data, parts, seed, backgrounds)
-    virtual = None if data.real_fraction == 1 else training_renders(data, parts, seed)
+    virtual = None if data.real_fraction == 1 else training_renders(data, parts, seed, backgrounds)
     return HybridSource(
         real,
         virtual,

@@ -9,21 +9,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
-from dopepp.core.errors import UserError
 from dopepp.data.negatives import FrameMix, PictureFrames, UnlabelledRenders
-from dopepp.data.rendered import RenderedSource, Split
+from dopepp.data.rendered import RenderedSource
 from dopepp.data.sample import DescribedSource
 from dopepp.drawing.pictures import Size
 from dopepp.experiment.assembly.build_parts import build_negatives
+from dopepp.experiment.assembly.photos import held_out_photos, own_photos
 from dopepp.experiment.config.data_config import DataConfig
 from dopepp.geometry.camera import crop_camera
 from dopepp.parts.lookalikes import lookalikes
 from dopepp.parts.part import Parts
-from dopepp.virtual.backgrounds import Backgrounds, PhotoBackgrounds, find_backgrounds
+from dopepp.virtual.backgrounds import PhotoBackgrounds, find_backgrounds
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import Preset
 from dopepp.virtual.presets.placement import DistancePlacement
@@ -32,10 +32,12 @@ from dopepp.virtual.presets.view import View
 PHOTOS: Final = "photos"
 SCENES: Final = "scenes"
 LOOKALIKES: Final = "look-alikes"
+OWN: Final = "own pictures"
 KINDS: Final = {
     PHOTOS: "photos, whole",
     SCENES: "renders of clutter, distractors and other parts",
     LOOKALIKES: "renders of look-alikes of the parts before photos",
+    OWN: "the user's own pictures without the parts",
 }
 """Kinds of frames and what they show."""
 
@@ -49,7 +51,7 @@ _NUM_POSES: Final = 64  # drawn of each part to measure the preset's distances
 
 
 def negative_frames(
-    data: DataConfig, parts: Parts, split: Split, num_images: int
+    data: DataConfig, parts: Parts, split: Literal["val", "test"], num_images: int
 ) -> DescribedSource:
     """Build frames of a held-out split that show none of the parts.
 
@@ -60,32 +62,43 @@ def negative_frames(
         num_images: Number of frames.
 
     Raises:
-        UserError: The folder of the backgrounds has too few photos to be divided.
+        UserError: A folder of photos has too few of them to be divided.
     """
     view, preset = frame_view(data, parts), data.preset
-    backgrounds = find_backgrounds(data.virtual.backgrounds, split)
+    photos, own = held_out_photos(data, split), own_photos(data, split)
     dense = _as_dense(preset, view.size) if data.virtual.view is None else preset
     preset = view.whole(dense, data.virtual.camera_scale or 1.0)
     if data.virtual.view is None:
         # Far from the middle, the short focal length distorts parts as in no picture of the preset.
         near, far = view.distance
         preset = replace(preset, placement=DistancePlacement(near, far, _MARGIN))
+    share = math.ceil(num_images / (3 if own is None else 4))
+
+    def whole(pictures: PhotoBackgrounds, kind: str) -> PictureFrames:
+        return PictureFrames(pictures, view.K, view.size, share, kind, data.eval_seed)
+
+    def rendered(factory: Factory, kind: str) -> UnlabelledRenders:
+        return UnlabelledRenders(RenderedSource(factory, share, split, kind))
+
     empty = replace(preset, targets_per_image=(0, 0))
-    sources: list[DescribedSource] = []
-    share = math.ceil(num_images / 3)
-    if isinstance(backgrounds, PhotoBackgrounds):
-        _check_divided(backgrounds)
-        photos = PictureFrames(backgrounds, view.K, view.size, share, PHOTOS, data.eval_seed)
-        sources.append(photos)
-    renders = _factory(data, parts, empty, backgrounds)
-    sources.append(UnlabelledRenders(RenderedSource(renders, num_images, split, SCENES)))
-    alone = replace(
+    bare = replace(
         preset,
         targets_per_image=_LOOKALIKES_SHOWN,
         distractors=replace(preset.distractors, number=(0, 0)),
+        clutter=(0, 0),
+        background_contrast=(1.0, 1.0),
     )
-    similar = _factory(data, lookalikes(parts), alone, backgrounds)
-    sources.append(UnlabelledRenders(RenderedSource(similar, num_images, split, LOOKALIKES)))
+    behind = find_backgrounds(data.virtual.backgrounds, split)
+    # The quick renderer, whatever renders the other images.
+    scenes = Factory(parts, empty, data.eval_seed, behind, negatives=build_negatives(data, parts))
+    similar = Factory(lookalikes(parts), bare, data.eval_seed, photos)
+    sources: list[DescribedSource] = [
+        whole(photos, PHOTOS),
+        rendered(scenes, SCENES),
+        rendered(similar, LOOKALIKES),
+    ]
+    if own is not None:
+        sources.append(whole(own, OWN))
     return FrameMix(sources, num_images)
 
 
@@ -125,21 +138,3 @@ def _as_dense(preset: Preset, size: Size) -> Preset:
     low, high = (min(math.ceil(count * growth), _MOST_DISTRACTORS) for count in old.number)
     share = old.image_share[0] / scale, old.image_share[1] / scale
     return replace(preset, distractors=replace(old, number=(low, high), image_share=share))
-
-
-def _factory(data: DataConfig, parts: Parts, preset: Preset, backgrounds: Backgrounds) -> Factory:
-    """Return a factory of the quick renderer, whatever renders the other images."""
-    negatives = build_negatives(data, parts)
-    return Factory(parts, preset, data.eval_seed, backgrounds, negatives=negatives)
-
-
-def _check_divided(photos: PhotoBackgrounds) -> None:
-    """Refuse photos that training has seen as well."""
-    if photos.is_divided:
-        return
-    raise UserError(
-        f"virtual.backgrounds={photos.folder} with {len(photos.paths)} photos, which are too few "
-        "to keep some from training",
-        "at least 6 different photos",
-        "add photos, or leave out virtual.backgrounds to use procedural backgrounds",
-    )

@@ -16,21 +16,24 @@ from dopepp.geometry.camera import Letterbox
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.catalogue import with_meshes
 from dopepp.parts.part import Parts
-from dopepp.virtual.backgrounds import find_backgrounds
+from dopepp.virtual.backgrounds import Backgrounds, find_backgrounds
 from dopepp.virtual.factory import Factory, code_hash
 from dopepp.virtual.presets import Preset
 
 
-def training_renders(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
+def training_renders(
+    data: DataConfig, parts: Parts, seed: int, backgrounds: Backgrounds
+) -> DescribedSource:
     """Render the training images at the size of the network's input, which saves time."""
-    factory = _factory(data, parts, seen_preset(data), seed, "train")
+    factory = _factory(data, parts, seen_preset(data), seed, backgrounds)
     source = RenderedSource(factory, data.samples_per_epoch)
     return kept(source, data, data.cache, data.network_input)
 
 
 def validation_windows(data: DataConfig, parts: Parts) -> DescribedSource:
     """Render the validation images of the user's camera in the windows that training uses."""
-    factory = _factory(data, parts, seen_preset(data), data.eval_seed, "val")
+    backgrounds = find_backgrounds(data.virtual.backgrounds, "val")
+    factory = _factory(data, parts, seen_preset(data), data.eval_seed, backgrounds)
     return RenderedSource(factory, data.num_val, "val")
 
 
@@ -45,7 +48,8 @@ def held_out_renders(
     preset, view = data.preset, data.virtual.view
     if view is not None:
         preset = view.whole(preset, data.virtual.camera_scale or 1.0)
-    factory = _factory(data, parts, preset, data.eval_seed, split, renderer)
+    backgrounds = find_backgrounds(data.virtual.backgrounds, split)
+    factory = _factory(data, parts, preset, data.eval_seed, backgrounds, renderer)
     name = "virtual" if renderer == "raster" else renderer
     return kept(RenderedSource(factory, count, split, name, scale), data, cache, None)
 
@@ -121,14 +125,14 @@ def _factory(
     parts: Parts,
     preset: Preset,
     seed: int,
-    split: Split,
+    backgrounds: Backgrounds,
     renderer: str | None = None,
 ) -> Factory:
     return Factory(
         parts,
         preset,
         seed,
-        find_backgrounds(data.virtual.backgrounds, split),
+        backgrounds,
         renderer=renderer or data.virtual.renderer,
         negatives=build_negatives(data, parts),
     )

@@ -57,6 +57,8 @@ class VirtualConfig:
             a ``data.root``, else ``paper``.
         scene: Changed fields of the preset (:class:`~dopepp.virtual.presets.Preset`).
         backgrounds: Folder of photos, or ``skimage`` for its photos; None uses procedural pictures.
+        negative_photos: Folder of the user's own pictures without the parts. Like ``backgrounds``,
+            it is divided between training, tuning and test.
         negatives: Parts to show that must not be detected: built-in names or mesh files. Models of
             a BOP data set that are not in ``data.objects`` are always shown.
         renderer: ``raster`` or ``photoreal``.
@@ -69,6 +71,7 @@ class VirtualConfig:
     preset: str | None = None
     scene: Mapping[str, Any] | None = None
     backgrounds: str | None = None
+    negative_photos: str | None = None
     negatives: tuple[str, ...] = ()
     renderer: str = "raster"
     camera: LensConfig | None = None

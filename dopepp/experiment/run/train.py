@@ -31,6 +31,7 @@ from dopepp.experiment.assembly.build_system import (
     estimate_training_s,
     keep_freed_memory,
 )
+from dopepp.experiment.assembly.photos import held_out_photos
 from dopepp.experiment.config.run_config import RunConfig, TrainerConfig
 from dopepp.experiment.results import display, pages
 from dopepp.experiment.results.conditions import check_masks
@@ -141,6 +142,8 @@ def _train(
     )  # only the first process reports
     parts = build_parts(config.data)
     config = fitted_to_camera(config, parts)
+    if config.tune:
+        held_out_photos(config.data, "val")  # reports too few photos before the training
     datamodule = build_datamodule(config.data, parts, config.seed)
     datamodule.check_objects()
     if config.protocols.shading:

@@ -6,29 +6,25 @@ To add a kind, write a class with the methods of :class:`Backgrounds` and name i
 
 from __future__ import annotations
 
-import copy
-import hashlib
 import importlib.util
-import logging
-import os
-from collections import OrderedDict
-from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final, Literal, Protocol
+from typing import Final, Literal, Protocol
 
-import cv2
-import numpy as np
 from numpy.random import Generator
 
 from dopepp.core.errors import UserError
-from dopepp.drawing.pictures import MAX_SIDE, Picture, Size, read_picture
+from dopepp.drawing.pictures import Picture
+from dopepp.virtual.backgrounds.photo_backgrounds import PhotoBackgrounds, PhotoSplit
 from dopepp.virtual.backgrounds.procedural import ProceduralBackgrounds
 
-__all__ = ["Backgrounds", "PhotoBackgrounds", "ProceduralBackgrounds", "find_backgrounds"]
-
-logger = logging.getLogger(__name__)
-
-PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
+__all__ = [
+    "Backgrounds",
+    "MixedBackgrounds",
+    "PhotoBackgrounds",
+    "ProceduralBackgrounds",
+    "find_backgrounds",
+    "shipped_photos",
+]
 
 BUNDLED: Final = (
     "astronaut.png", "brick.png", "camera.png", "chelsea.png", "coffee.png", "coins.png",
@@ -36,22 +32,7 @@ BUNDLED: Final = (
 )  # fmt: skip
 """Photos in scikit-image's wheel; its other pictures are drawings, scans and microscopy."""
 
-_LONGEST_PHOTO_PX: Final = 1000
-"""Longest side of cached photos: enough for a sharp 640×480 crop. JPEG decodes at 1/2, 1/4 or 1/8,
-so 1000 lets a photo of 4000 pixels decode at a quarter."""
-
-_LEAST_REDUCTION: Final = 2.0
-"""A crop comes from the smallest halving of a photo that it still reduces by this factor, which is
-cheaper than reducing the whole photo."""
-
-PhotoSplit = Literal["train", "val", "test", "all"]
-
-FEWEST_PHOTOS: Final = 2  # of validation and of test
-_HELD_OUT: Final = 0.15  # share of the photos for validation, and for test
-_HASHED_BYTES: Final = 2**16  # beginning of a photo that decides about its split
-
-_SMALLEST_PX: Final = 30  # shorter side of the smallest halving, at least
-_KEPT_BYTES: Final = 200_000_000  # decoded photos a process keeps: about 260 of VOC2007
+_SHIPPED: Final = Path(__file__).parent / "photos"
 
 
 class Backgrounds(Protocol):
@@ -81,169 +62,25 @@ def find_backgrounds(choice: str | Path | None, split: PhotoSplit = "all") -> Ba
     return photos.part(split)
 
 
-class PhotoBackgrounds:
-    """Random crops of photos, mirrored and dimmed at random.
+class MixedBackgrounds:
+    """Backgrounds of which a share comes from other backgrounds."""
 
-    A damaged photo is logged and replaced by the next draw, so an image stays a pure function of
-    the generator and the files.
-
-    Args:
-        folder: Folder to search recursively for :data:`PHOTO_SUFFIXES`, without hidden files and
-            links to folders. Photos are sorted by relative path.
-        names: Relative paths of the photos, instead of a search.
-
-    Raises:
-        UserError: The folder contains no photo; or, while drawing, more than 10 photos or more than
-            1 % of all photos are damaged.
-    """
-
-    def __init__(self, folder: Path, names: Sequence[str] | None = None) -> None:
-        self.folder, self.split = Path(folder), "all"
-        photo_names = _photo_names(self.folder) if names is None else names
-        self.paths = [self.folder / name for name in sorted(photo_names)]
-        if not self.paths:
-            allowed = f"a folder with {', '.join(PHOTO_SUFFIXES)} files"
-            fix = "pass a folder of photos, or leave it out to use procedural backgrounds"
-            raise UserError(f"no photo in the background folder {folder}", allowed, fix)
-        self.bad: dict[Path, str] = {}
-        self._photos: OrderedDict[Path, list[Picture]] = OrderedDict()
-        self._kept_bytes = 0
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Pickle without the decoded photos."""
-        return self.__dict__ | {"_photos": OrderedDict(), "_kept_bytes": 0}
+    def __init__(self, usual: Backgrounds, other: Backgrounds, share: float) -> None:
+        self.usual, self.other, self.share = usual, other, share
 
     def identity(self) -> list[str]:
-        """Return the kind, and a hash of the photos' relative paths and sizes."""
-        digest = hashlib.sha256()
-        for path in self.paths:
-            name = path.relative_to(self.folder).as_posix()
-            digest.update(f"{name}\0{path.stat().st_size}\0".encode("utf-8", "surrogateescape"))
-        kind = "photos" if self.split == "all" else f"{self.split} photos"
-        return [kind, str(len(self.paths)), digest.hexdigest()]
-
-    def part(self, split: PhotoSplit) -> PhotoBackgrounds:
-        """Return the photos of one split: training 70 %, validation 15 %, test 15 %.
-
-        The order of the files' hashes decides, so the splits do not depend on names or folders, and
-        copies of a photo are in the same split. If there are fewer than six different photos, all
-        splits are the whole folder (:meth:`is_divided` is False).
-        """
-        if split == "all":
-            return self
-        by_hash: dict[bytes, list[str]] = {}
-        for path in self.paths:
-            with path.open("rb") as file:
-                key = hashlib.sha256(file.read(_HASHED_BYTES)).digest()
-            by_hash.setdefault(key, []).append(path.relative_to(self.folder).as_posix())
-        groups = [by_hash[key] for key in sorted(by_hash)]
-        part = copy.copy(self)
-        if len(groups) >= 3 * FEWEST_PHOTOS:
-            held_out = max(FEWEST_PHOTOS, round(_HELD_OUT * len(groups)))
-            val, test = len(groups) - 2 * held_out, len(groups) - held_out
-            chosen = {"train": groups[:val], "val": groups[val:test], "test": groups[test:]}[split]
-            part = PhotoBackgrounds(self.folder, [name for group in chosen for name in group])
-            part.split = split
-        return part
-
-    @property
-    def is_divided(self) -> bool:
-        """Whether these are the photos of one split, which no other split has."""
-        return self.split != "all"
+        """Return the identities of both, and the share."""
+        return [*self.usual.identity(), f"mixed {self.share:g}", *self.other.identity()]
 
     def draw(self, rng: Generator, width: int, height: int) -> Picture:
-        """Return a crop of the image's aspect ratio that covers 40 % to 100 % of a photo's side."""
-        sizes = None
-        while sizes is None:
-            sizes = self._photo(self.paths[int(rng.integers(len(self.paths)))])
-        rows, columns = sizes[0].shape[:2]
-        share = rng.uniform(0.4, 1.0)
-        reduction = share * min(columns / width, rows / height)
-        photo = sizes[int(np.clip(np.log2(reduction / _LEAST_REDUCTION), 0, len(sizes) - 1))]
-        rows, columns = photo.shape[:2]
-        scale = share * min(columns / width, rows / height)
-        crop_width, crop_height = max(int(width * scale), 1), max(int(height * scale), 1)
-        left = int(rng.integers(columns - crop_width + 1))
-        top = int(rng.integers(rows - crop_height + 1))
-        crop = photo[top : top + crop_height, left : left + crop_width]
-        interpolation = cv2.INTER_AREA if crop_width > width else cv2.INTER_LINEAR
-        image = cv2.resize(crop, (width, height), interpolation=interpolation)
-        if rng.random() < 0.5:
-            image = cv2.flip(image, 1)
-        return np.asarray(cv2.convertScaleAbs(image, alpha=float(rng.uniform(0.5, 1.1))), np.uint8)
+        """Return a background of one of the two."""
+        chosen = self.other if rng.random() < self.share else self.usual
+        return chosen.draw(rng, width, height)
 
-    def frame(
-        self, rng: Generator, number: int, size: Size, share: float = 1.0, mirrored: bool = False
-    ) -> tuple[Picture, Path]:
-        """Return a photo that covers a frame, and its path.
 
-        Args:
-            rng: Generator of the region's position; unused for the largest region.
-            number: Index of the photo; a damaged photo is replaced by the next.
-            size: (width, height) of the frame, pixels.
-            share: Region's side over that of the largest region of the frame's aspect ratio.
-            mirrored: Whether to flip left and right.
-
-        Raises:
-            UserError: Too many photos are damaged.
-        """
-        while True:
-            path = self.paths[number % len(self.paths)]
-            number += 1
-            if path in self.bad:
-                continue
-            try:
-                photo = read_picture(path)
-            except ValueError as error:
-                self._quarantine(path, str(error))
-                continue
-            break
-        (rows, columns), (width, height) = photo.shape[:2], size
-        scale = share * min(columns / width, rows / height)
-        crop_width, crop_height = round(width * scale), round(height * scale)
-        left, top = (columns - crop_width) // 2, (rows - crop_height) // 2
-        if share < 1:
-            left = int(rng.integers(columns - crop_width + 1))
-            top = int(rng.integers(rows - crop_height + 1))
-        crop = photo[top : top + crop_height, left : left + crop_width]
-        if mirrored:
-            crop = cv2.flip(crop, 1)
-        interpolation = cv2.INTER_AREA if crop_width > width else cv2.INTER_LINEAR
-        return np.asarray(cv2.resize(crop, size, interpolation=interpolation), np.uint8), path
-
-    def _photo(self, path: Path) -> list[Picture] | None:
-        """Return a reduced photo and its halvings from the cache or file; None if damaged."""
-        if path in self._photos:
-            self._photos.move_to_end(path)
-            return self._photos[path]
-        if path in self.bad:
-            return None
-        try:
-            photo = read_picture(path, _LONGEST_PHOTO_PX)
-        except ValueError as error:
-            self._quarantine(path, str(error))
-            return None
-        sizes = _halvings(photo)
-        self._photos[path] = sizes
-        self._kept_bytes += sum(size.nbytes for size in sizes)
-        while self._kept_bytes > _KEPT_BYTES and len(self._photos) > 1:
-            oldest = self._photos.popitem(last=False)[1]
-            self._kept_bytes -= sum(size.nbytes for size in oldest)
-        return sizes
-
-    def _quarantine(self, path: Path, damage: str) -> None:
-        """Record a damaged photo; raise a UserError if there are too many."""
-        self.bad[path] = damage
-        most = min(10, int(0.01 * len(self.paths)))
-        if len(self.bad) > most:
-            listed = "; ".join(f"{bad}: {reason}" for bad, reason in self.bad.items())
-            raise UserError(
-                f"{len(self.bad)} damaged of {len(self.paths)} background photos ({listed})",
-                f"whole photos of at most {MAX_SIDE} pixels a side; {most} damaged ones of these",
-                "delete these files, or copy them again",
-            )
-        text = "background photo %s left out: %s (%d damaged of at most %d)"
-        logger.warning(text, path, damage, len(self.bad), most)
+def shipped_photos(split: Literal["val", "test"]) -> PhotoBackgrounds:
+    """Return half of the photos in this package, which no training uses."""
+    return PhotoBackgrounds(_SHIPPED).part(split, held_out=0.5)
 
 
 def bundled_photos() -> PhotoBackgrounds:
@@ -260,29 +97,3 @@ def bundled_photos() -> PhotoBackgrounds:
         fix = "pip install scikit-image, or pass a folder of photos"
         raise UserError(problem, "an installed scikit-image", fix)
     return PhotoBackgrounds(folder, names)
-
-
-def _halvings(photo: Picture) -> list[Picture]:
-    """Return a photo and its successive halvings."""
-    sizes = [photo]
-    while min(sizes[-1].shape[:2]) >= 2 * _SMALLEST_PX:
-        half = cv2.resize(sizes[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        sizes.append(np.asarray(half, np.uint8))
-    return sizes
-
-
-def _photo_names(folder: Path) -> Iterator[str]:
-    """Yield the relative paths of a folder's photos."""
-    if not folder.is_dir():
-        return
-    pending = [""]
-    while pending:
-        prefix = pending.pop()
-        with os.scandir(folder / prefix) as entries:
-            for entry in entries:
-                if entry.name.startswith("."):  # such as a Mac's ._photo.jpg
-                    continue
-                if entry.is_dir(follow_symlinks=False):
-                    pending.append(f"{prefix}{entry.name}/")
-                elif entry.name.lower().endswith(PHOTO_SUFFIXES) and entry.is_file():
-                    yield f"{prefix}{entry.name}"

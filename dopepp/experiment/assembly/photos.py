@@ -1,0 +1,83 @@
+"""Divide the user's photos: backgrounds for training, other photos to tune and test silence.
+
+Photos stand behind rendered parts in training. A network learns to ignore them, so its threshold is
+tuned and tested on photos that training has not used.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Final, Literal
+
+from dopepp.core.errors import UserError
+from dopepp.experiment.config.data_config import DataConfig
+from dopepp.virtual.backgrounds import (
+    Backgrounds,
+    MixedBackgrounds,
+    PhotoBackgrounds,
+    find_backgrounds,
+    shipped_photos,
+)
+from dopepp.virtual.backgrounds.photo_backgrounds import FEWEST_PHOTOS, PhotoSplit
+
+_log = logging.getLogger(__name__)
+
+_OWN_SHARE: Final = 0.25  # of the training backgrounds that are the user's own pictures
+_NEEDED: Final = f"at least {3 * FEWEST_PHOTOS} different photos"
+
+
+def training_backgrounds(data: DataConfig) -> Backgrounds:
+    """Return the backgrounds of training: the training share of the user's photos.
+
+    Raises:
+        UserError: A folder has no photo, or there are too few negative photos.
+    """
+    backgrounds = find_backgrounds(data.virtual.backgrounds, "train")
+    if isinstance(backgrounds, PhotoBackgrounds) and not backgrounds.is_divided:
+        _log.warning(
+            "virtual.backgrounds=%s has fewer than %d different photos: training, validation and "
+            "test use all of them, and tune=true is not possible",
+            data.virtual.backgrounds,
+            3 * FEWEST_PHOTOS,
+        )
+    own = own_photos(data, "train")
+    return backgrounds if own is None else MixedBackgrounds(backgrounds, own, _OWN_SHARE)
+
+
+def held_out_photos(data: DataConfig, split: Literal["val", "test"]) -> PhotoBackgrounds:
+    """Return photos that training does not use; those of the package if backgrounds are drawn.
+
+    Raises:
+        UserError: The folder of the backgrounds has too few photos to be divided.
+    """
+    photos = find_backgrounds(data.virtual.backgrounds, split)
+    if not isinstance(photos, PhotoBackgrounds):
+        return shipped_photos(split)
+    if photos.is_divided:
+        return photos
+    raise UserError(
+        f"tuning with virtual.backgrounds={data.virtual.backgrounds}, whose {len(photos.paths)} "
+        "photos are too few to keep some from training",
+        _NEEDED,
+        "add photos, leave out virtual.backgrounds (procedural backgrounds), or set tune=false",
+    )
+
+
+def own_photos(data: DataConfig, split: PhotoSplit) -> PhotoBackgrounds | None:
+    """Return a split of the user's own pictures without the parts, or None without a folder.
+
+    Raises:
+        UserError: There are too few pictures to be divided.
+    """
+    folder = data.virtual.negative_photos
+    if folder is None:
+        return None
+    photos = PhotoBackgrounds(Path(folder)).part(split)
+    if photos.is_divided:
+        return photos
+    raise UserError(
+        f"virtual.negative_photos={folder} with {len(photos.paths)} pictures",
+        _NEEDED,
+        "take more pictures of the workplace without the part",
+    )
