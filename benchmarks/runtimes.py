@@ -40,7 +40,7 @@ def main() -> None:
     limit(asked.isa)
     import torch
 
-    from dopepp.inference.runtimes import num_threads
+    from dopepp.core.pool import num_threads
 
     torch.set_num_threads(num_threads())
     print(f"{num_threads()} threads, ATen {torch.backends.cpu.get_cpu_capability()}")

@@ -188,7 +188,7 @@ def measure(isa: str, folder: Path, seconds: float, only: str) -> None:
     limit(None if isa == "native" else isa)
     import torch
 
-    from dopepp.inference.runtimes import num_threads
+    from dopepp.core.pool import num_threads
 
     torch.set_num_threads(num_threads())
     print(
