@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 
 from dopepp.parts.mesh import Faces, SurfaceTree, Vertices, half_sphere
 from dopepp.parts.part import Mesh, Part, make_part
@@ -39,34 +40,35 @@ def lookalikes(parts: Sequence[Part]) -> list[Part]:
 
 
 def mirror_distance(mesh: Mesh) -> float:
-    """Return how far the best reflection moves a surface away from itself.
+    """Return how far a surface is from its mirror image.
+
+    Reflections at planes through the centroid and the reflection at the centroid itself are
+    searched; a part with another improper symmetry counts as chiral.
 
     Returns:
-        Mean distance of the reflected surface from the surface, diameters of its bounding sphere.
-        All planes through the centroid of the surface are searched.
+        Smallest mean distance of the reflected surface from the surface, diameters of its bounding
+        sphere.
     """
     surface = SurfaceTree(mesh.vertices, mesh.faces)
     centre = surface.areas @ surface.triangles.mean(axis=1) / surface.areas.sum()
     probes = surface.spread(120, seed=0)[0] - centre
     diameter = 2 * float(np.linalg.norm(probes, axis=1).max())
 
-    def distances(normals: Vertices) -> Vertices:
-        """Return the mean distance for each plane's normal."""
-        along = probes @ normals.T
-        moved = probes - 2 * along.T[:, :, None] * normals[:, None]
-        return np.asarray(surface.distances(moved + centre, neighbours=1).mean(axis=1))
+    def distances(reflected: Float[np.ndarray, "ways probes 3"]) -> Float[np.ndarray, " ways"]:
+        return np.asarray(surface.distances(reflected + centre, neighbours=1).mean(axis=1))
 
     rng = np.random.default_rng(0)
     normals, reach = half_sphere(600), 0.06
     best, least = normals[0], np.inf
     for _ in range(6):
-        errors = distances(normals)
+        along = probes @ normals.T
+        errors = distances(probes - 2 * along.T[:, :, None] * normals[:, None])
         if errors.min() < least:
             best, least = normals[errors.argmin()], float(errors.min())
         normals = best + reach * rng.normal(size=(40, 3))
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         reach /= 3
-    return least / diameter
+    return min(least, float(distances(-probes[None])[0])) / diameter
 
 
 def _meshes(mesh: Mesh) -> Iterator[tuple[str, Mesh]]:

@@ -39,7 +39,10 @@ KINDS: Final = {
     LOOKALIKES: "renders of look-alikes of the parts before photos",
     OWN: "the user's own pictures without the parts",
 }
-"""Kinds of frames and what they show."""
+"""Kinds of frames and what they show, in the order of the frames.
+
+No threshold can silence a network on look-alikes without losing the part; whether refinement or
+verification rejects them is worth a separate row in a table."""
 
 FRAME: Final[Size] = (640, 480)
 """(width, height) of the frames if there is no camera and the preset's pictures are smaller."""

@@ -167,15 +167,15 @@ class LearningRateConfig:
 
 @dataclass(frozen=True)
 class FalsePositiveTarget:
-    """Permitted rate of false positives on images without objects.
+    """Permitted rate of false positives on camera frames without objects.
 
     Attributes:
-        num_empty: Number of images without objects to choose the threshold, and as many to check
-            it.
-        false_positive_rate: Permitted share of these images with a detection; 1 sets no threshold.
+        num_empty: Number of frames without objects to choose the threshold, and as many to check
+            it (:mod:`dopepp.experiment.assembly.negative_frames`).
+        false_positive_rate: Permitted share of these frames with a detection; 1 sets no threshold.
     """
 
-    num_empty: Count = 500
+    num_empty: Count = 60
     false_positive_rate: Share = 0.005
 
 

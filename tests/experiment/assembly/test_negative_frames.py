@@ -1,12 +1,23 @@
 """Frames without the part: their size, kinds and photos."""
 
+import logging
+
 import cv2
 import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.assembly.build_parts import build_parts
-from dopepp.experiment.assembly.negative_frames import LOOKALIKES, PHOTOS, SCENES, negative_frames
+from dopepp.experiment.assembly.build_sources import build_datamodule
+from dopepp.experiment.assembly.negative_frames import (
+    LOOKALIKES,
+    OWN,
+    PHOTOS,
+    SCENES,
+    negative_frames,
+)
+from dopepp.experiment.assembly.photos import held_out_photos, training_backgrounds
+from dopepp.experiment.run.resume import describe_images, differing_images
 
 
 @pytest.fixture
@@ -41,6 +52,63 @@ def test_frames_of_a_preset_are_large_and_of_each_kind_in_turn(tiny, photos):
     assert all((a.image != b.image).any() for a, b in zip(samples, others, strict=True))
 
 
+def test_frames_of_a_camera_are_its_own(tiny):
+    lens = "{width: 800, height: 600, fx: 700.0, fy: 700.0, cx: 402.0, cy: 297.0}"
+    distance = "virtual.working_distance=[0.3,0.5]"
+    config = tiny("virtual.preset=wide", f"virtual.camera={lens}", distance)
+    source = frames(config, "val", 3)
+    view = config.data.virtual.view
+    for index in range(3):
+        sample = source.sample(index)
+        assert sample.size == view.size
+        np.testing.assert_array_equal(sample.K, view.K)
+
+
+def test_drawn_backgrounds_are_tuned_and_tested_on_the_packages_photos(tiny):
+    data = tiny().data
+    val, test = (held_out_photos(data, split) for split in ("val", "test"))
+    assert (len(val.paths), len(test.paths)) == (12, 12)
+    assert not set(val.paths) & set(test.paths)
+    assert training_backgrounds(data).identity() == ["procedural"]
+
+
+def test_own_pictures_are_learned_tuned_on_and_tested(tiny, photos):
+    config = tiny(f"virtual.negative_photos={photos}")
+    keys = {}
+    for split in ("val", "test"):
+        source = frames(config, split, 8)
+        assert [source.sample(index).source for index in range(4)] == [
+            PHOTOS, SCENES, LOOKALIKES, OWN,
+        ]  # fmt: skip
+        keys[split] = {source.sample(index).key.partition("/")[0] for index in (3, 7)}
+    assert len(keys["val"] | keys["test"]) == 4
+    identity = training_backgrounds(config.data).identity()
+    assert identity[0] == "procedural"
+    assert identity[2:4] == ["train photos", "8"]
+    for number in range(7):
+        (photos / f"{number}.png").unlink()
+    with pytest.raises(UserError, match=r"negative_photos=.* with 5 pictures; .*at least 6"):
+        training_backgrounds(config.data)
+
+
+def test_other_photos_are_other_data_for_a_resumed_run(tiny, photos):
+    config = tiny(f"virtual.backgrounds={photos}")
+
+    def described(split):
+        module = build_datamodule(config.data, build_parts(config.data), 0)
+        return describe_images(getattr(module, f"{split}_source")), module.fingerprint()
+
+    before = {split: described(split) for split in ("train", "val", "test")}
+    again = {split: described(split) for split in ("train", "val", "test")}
+    assert again == before
+    (photos / "0.png").unlink()
+    for split in ("train", "val", "test"):
+        images, fingerprint = described(split)
+        assert fingerprint != before[split][1]
+        if split == "train":
+            assert differing_images(before[split][0], images)
+
+
 def test_too_few_photos_are_refused(tiny, photos):
     for number in range(6, 12):
         (photos / f"{number}.png").unlink()
@@ -48,3 +116,13 @@ def test_too_few_photos_are_refused(tiny, photos):
     (photos / "0.png").unlink()
     with pytest.raises(UserError, match=r"5 photos are too few .*at least 6 different"):
         frames(tiny(f"virtual.backgrounds={photos}"), "val")
+
+
+def test_training_on_a_folder_that_cannot_be_divided_is_said(tiny, photos, caplog):
+    for number in range(5, 12):
+        (photos / f"{number}.png").unlink()
+    with caplog.at_level(logging.WARNING):
+        backgrounds = training_backgrounds(tiny(f"virtual.backgrounds={photos}").data)
+    assert backgrounds.identity()[:2] == ["photos", "5"]
+    (message,) = [record.getMessage() for record in caplog.records]
+    assert "fewer than 6 different photos" in message

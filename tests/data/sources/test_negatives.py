@@ -1,0 +1,87 @@
+"""Sources of frames without objects."""
+
+import cv2
+import numpy as np
+import pytest
+
+from dopepp.core.errors import UserError
+from dopepp.data.negatives import FrameMix, PictureFrames
+from dopepp.geometry.camera import camera_matrix
+from dopepp.virtual.backgrounds import PhotoBackgrounds
+
+K = camera_matrix(100.0, 100.0, 31.5, 23.5)
+SIZE = 64, 48
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Pictures of the camera's own size, which fast compression leaves as they are."""
+    rng = np.random.default_rng(0)
+    for number in range(4):
+        noise = rng.integers(0, 256, (SIZE[1], SIZE[0], 3), np.uint8)
+        assert cv2.imwrite(str(tmp_path / f"{number}.png"), noise)
+    return tmp_path
+
+
+def test_pictures_of_the_camera_stay_as_they_are(folder):
+    source = PictureFrames(PhotoBackgrounds(folder), K, SIZE, name="desk")
+    assert len(source) == 4
+    samples = [source.sample(index) for index in range(4)]
+    assert sorted(sample.key for sample in samples) == [f"{number}.png/0" for number in range(4)]
+    for sample in samples:
+        picture = cv2.imread(str(folder / sample.key.rpartition("/")[0]))[..., ::-1]
+        np.testing.assert_array_equal(sample.image, picture)
+        np.testing.assert_array_equal(sample.K, K)
+        assert (sample.source, sample.instances, sample.depth) == ("desk", [], None)
+    assert not source.contains("anything")
+    with pytest.raises(IndexError):
+        source.sample(4)
+
+
+def test_later_rounds_are_mirrored_and_then_regions(folder):
+    source = PictureFrames(PhotoBackgrounds(folder), K, SIZE, num_frames=12)
+    for index in range(4):
+        whole, mirrored, region = (source.sample(index + 4 * lap) for lap in range(3))
+        np.testing.assert_array_equal(mirrored.image, whole.image[:, ::-1])
+        assert region.image.shape == whole.image.shape
+        assert (region.image != whole.image).any()
+        np.testing.assert_array_equal(source.sample(index + 8).image, region.image)
+
+
+def test_a_larger_picture_covers_the_frame_from_its_middle(tmp_path):
+    # Brightness grows along x and y, so that the corners state their place.
+    y, x = np.mgrid[0:480, 0:800]
+    picture = np.stack([x / 4, y / 4, 0 * x], axis=2).astype(np.uint8)
+    assert cv2.imwrite(str(tmp_path / "wide.png"), picture[..., ::-1])
+    image = PictureFrames(PhotoBackgrounds(tmp_path), K, SIZE).sample(0).image.astype(float)
+    # The frame's aspect ratio is 4:3, of 480 rows these are 640 columns from column 80 on.
+    np.testing.assert_allclose(image[0, 0, :2], (20, 0), atol=2)
+    np.testing.assert_allclose(image[-1, -1, :2], (180, 120), atol=2)
+
+
+def test_a_damaged_picture_is_replaced_and_too_many_are_an_error(tmp_path):
+    rng = np.random.default_rng(0)
+    for number in range(120):
+        noise = rng.integers(0, 256, (12, 16, 3), np.uint8)
+        assert cv2.imwrite(str(tmp_path / f"{number:03}.png"), noise)
+    (tmp_path / "050.png").write_bytes(b"no picture")
+    source = PictureFrames(PhotoBackgrounds(tmp_path), K, (16, 12))
+    keys = [source.sample(index).key for index in range(120)]
+    assert "050.png/0" not in keys
+    assert len(set(keys)) == 119
+    (tmp_path / "051.png").write_bytes(b"no picture")
+    source = PictureFrames(PhotoBackgrounds(tmp_path), K, (16, 12))
+    with pytest.raises(UserError, match="2 damaged of 120"):
+        [source.sample(index) for index in range(120)]
+
+
+def test_the_index_decides_the_kind(folder):
+    photos = PhotoBackgrounds(folder)
+    sources = [PictureFrames(photos, K, SIZE, name=name) for name in "abc"]
+    mix = FrameMix(sources, 10)
+    assert "".join(mix.sample(index).source for index in range(len(mix))) == "abcabcabca"
+    np.testing.assert_array_equal(mix.sample(4).image, sources[1].sample(1).image)
+    with pytest.raises(IndexError):
+        mix.sample(10)
+    assert [info.name for info in mix.describe()] == ["a", "b", "c"]
+    assert not mix.contains("anything")
