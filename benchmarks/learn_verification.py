@@ -1,0 +1,273 @@
+"""Learn the verification of poses from refined poses of procedural parts.
+
+    python benchmarks/learn_verification.py samples.npz --parts 60 --scenes 40 [--photos DIR]
+    python benchmarks/learn_verification.py samples.npz --fit
+
+The first command renders random parts among clutter, occluders and look-alikes, refines poses that
+start near and far from the true one, and stores their evidence and whether they are right. Run it
+with other ``--seed`` values in parallel and pass all files to ``--fit``, which learns the model,
+prints its quality on parts that it has not seen, and writes ``verification.json``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from sklearn.metrics import average_precision_score, brier_score_loss, log_loss
+
+from dopepp.geometry.camera import Transform, make_transform, moved
+from dopepp.geometry.rotation import random_rotation
+from dopepp.inference.refinement import verification
+from dopepp.inference.refinement.outline import make_outline_mesh
+from dopepp.inference.refinement.refiner import LOOSER
+from dopepp.inference.refinement.region import RegionRefiner
+from dopepp.inference.refinement.solver import Prior
+from dopepp.inference.refinement.verification import EVIDENCE, Model, Verifier
+from dopepp.metrics.functional import add, add_s
+from dopepp.parts.part import Mesh, Part, make_part
+from dopepp.virtual.backgrounds import find_backgrounds
+from dopepp.virtual.factory import Factory
+from dopepp.virtual.presets import preset_of
+
+SIZE, FOCAL = (320, 240), 300.0
+SMALLEST_PX, LARGEST_PX = 40.0, 190.0
+UNITS, WEIGHT_DECAY, STEPS = 16, 3e-4, 3000
+HELD_OUT = 5  # every fifth part judges the model
+
+
+def random_part(rng: np.random.Generator, name: str) -> Part:
+    """Return a part of two to seven primitives that overlap or touch."""
+    pieces = [_primitive(rng, 1.0)]
+    for _ in range(int(rng.integers(1, 7))):
+        piece = _primitive(rng, rng.uniform(0.15, 0.6))
+        base = pieces[int(rng.integers(len(pieces)))]
+        point = base.bounds[0] + rng.uniform(0, 1, 3) * np.ptp(base.bounds, axis=0)
+        axis = int(rng.integers(3))
+        point[axis] = base.bounds[int(rng.integers(2))][axis]
+        piece.apply_translation(point)
+        pieces.append(piece)
+    colours = rng.integers(20, 236, (len(pieces), 3)) if rng.random() < 0.3 else None
+    mesh = trimesh.util.concatenate(pieces)
+    vertices = np.asarray(mesh.vertices, np.float64)
+    vertices *= rng.uniform(0.03, 0.2) / np.ptp(vertices, axis=0).max()
+    vertices -= (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    painted = None
+    if colours is not None:
+        painted = np.repeat(colours, [len(p.vertices) for p in pieces], axis=0).astype(np.uint8)
+    return make_part(name, Mesh(vertices, mesh.faces.astype(np.int32), colours=painted))
+
+
+def _primitive(rng: np.random.Generator, size: float) -> trimesh.Trimesh:
+    sides = size * rng.uniform(0.12, 1.0, 3)
+    kind = rng.integers(6)
+    if kind <= 1:
+        piece = trimesh.creation.box(sides)
+    elif kind == 2:
+        sections = int(rng.choice([3, 6, 8, 32]))
+        piece = trimesh.creation.cylinder(sides[0] / 2, sides[1], sections=sections)
+    elif kind == 3:
+        piece = trimesh.creation.annulus(sides[0] * rng.uniform(0.2, 0.4), sides[0] / 2, sides[1])
+    elif kind == 4:
+        piece = trimesh.creation.cone(sides[0] / 2, sides[1], sections=int(rng.choice([4, 32])))
+    else:
+        piece = trimesh.creation.icosphere(2, sides[0] / 2)
+    if rng.random() < 0.3:
+        turned = random_rotation(rng)
+    else:
+        turned = np.eye(3)[rng.permutation(3)]
+        turned *= np.linalg.det(turned)
+    piece.apply_transform(make_transform(turned, np.zeros(3)))
+    return piece
+
+
+def look_alike(rng: np.random.Generator, part: Part) -> Part:
+    """Return a part of other shape: mirrored, stretched, or without a share of its triangles."""
+    assert part.mesh is not None
+    vertices, faces = part.mesh.vertices.copy(), part.mesh.faces
+    kind, axis = rng.integers(3), int(rng.integers(3))
+    if kind == 0:
+        vertices[:, axis] *= -1
+        faces = faces[:, ::-1]
+    elif kind == 1:
+        vertices[:, axis] *= rng.choice([0.7, 1.3, 1.45])
+    else:
+        centre = vertices[faces].mean(axis=1)[:, axis]
+        low, high = centre.min(), centre.max()
+        faces = faces[centre < low + rng.uniform(0.5, 0.75) * (high - low)]
+    return make_part(
+        "other", Mesh(vertices, np.ascontiguousarray(faces), colours=part.mesh.colours)
+    )
+
+
+def starts(
+    rng: np.random.Generator, T: Transform, part: Part, K: np.ndarray
+) -> Iterator[tuple[Transform, np.ndarray]]:
+    """Yield start poses and their stated covariances, as a network would give them."""
+    depth = T[2, 3]
+    for turn_deg, across, along in (
+        (3.0, 0.01, 0.01), (6.0, 0.03, 0.03), (9.0, 0.04, 0.05), (15.0, 0.05, 0.08),
+        (30.0, 0.05, 0.05), (180.0, 0.02, 0.08), (180.0, 0.6, 0.1), (180.0, 2.0, 0.3),
+    ):  # fmt: skip
+        turn = rng.normal(size=3)
+        turn *= math.radians(turn_deg) * rng.uniform(0.2, 1.0) / np.linalg.norm(turn)
+        # The ray of sight is near z in these pictures.
+        shift = np.array([*(across * part.diameter * rng.normal(size=2)), along * depth])
+        shift[2] *= rng.normal() if along < 0.3 else rng.uniform(-1.0, 1.0)
+        start = moved(T, np.concatenate([turn, shift]))
+        if across >= 1.0:  # anywhere on the picture
+            pixel = rng.uniform(0.15, 0.85, 2) * SIZE
+            start[:2, 3] = (pixel - K[:2, 2]) / FOCAL * start[2, 3]
+        stated = rng.uniform(0.5, 2.0) * np.array([math.radians(7.0), 0.03, 0.04])
+        deviations = np.repeat([stated[0], stated[1] * part.diameter, stated[2] * depth], [3, 2, 1])
+        yield start, np.diag(deviations**2)
+
+
+def samples(number: int, num_scenes: int, seed: int, photos: str | None) -> Iterator[np.ndarray]:
+    """Yield evidence, label and part number of the refined poses of one part."""
+    rng = np.random.default_rng([seed, number])
+    part = random_part(rng, f"part{number}")
+    assert part.mesh is not None
+    diameter = part.diameter
+    nearest, farthest = (diameter * FOCAL / px for px in (LARGEST_PX, SMALLEST_PX))
+    preset = preset_of(
+        "wide",
+        {
+            "width": SIZE[0], "height": SIZE[1],
+            "intrinsics_px": [FOCAL, FOCAL, SIZE[0] / 2 - 0.5, SIZE[1] / 2 - 0.5],
+            "turning": {"kind": "free"},
+            "placement": {"kind": "distance", "nearest": nearest, "farthest": farthest},
+            "min_visible_fraction": 0.35, "clutter": [0, 60], "background_contrast": [0.5, 1.8],
+            "distractors": {"number": [0, 6], "lookalike_share": 0.4},
+            "materials": {"metal_share": 0.15, "coloured_share": 0.6},
+            "sensors": {"blur_px": [0.2, 1.2], "read_noise": [0.3, 3.0], "jpeg_quality": [60, 95]},
+        },
+        "scene",
+    )  # fmt: skip
+    other = look_alike(rng, part)
+    backgrounds = find_backgrounds(photos, "train")
+    true, false = (
+        Factory([shown], preset, seed, backgrounds, negatives=[unlike])
+        for shown, unlike in ((part, other), (other, part))
+    )
+    mesh = make_outline_mesh(part.mesh.vertices, part.mesh.faces)
+    refiner, verifier = RegionRefiner(part.mesh.vertices, part.mesh.faces), Verifier(mesh, diameter)
+    points = torch.from_numpy(part.points)
+    for index in range(num_scenes):
+        shows_part = index % 4 > 0
+        rendered = (true if shows_part else false).render(0, 1000 * number + index)
+        scene, image = rendered.scene, rendered.image
+        T = scene.objects[scene.targets[0]].T_cam_obj
+        for start, covariance in starts(rng, T, part, scene.K):
+            refined = refiner.refine(image, scene.K, start, LOOSER**2 * covariance, starts=list)
+            given = Prior(start, np.linalg.inv(covariance))
+            stated = covariance if refined.covariance is None else refined.covariance
+            end = refined.T_cam_obj
+            evidence = verifier.evidence(
+                image, scene.K, end, stated, given.squared_distance(end) ** 0.5,
+                refined.agreement, refined.support,
+            )  # fmt: skip
+            if evidence is None:
+                continue
+            poses = [torch.from_numpy(np.ascontiguousarray(P[None])) for P in (end, T)]
+            R_t = [piece for P in poses for piece in (P[:, :3, :3], P[:, :3, 3])]
+            far, near = float(add(*R_t, points)) / diameter, float(add_s(*R_t, points)) / diameter
+            # A pose that looks the same is right: ADD-S tells what ADD of a near-symmetry does not.
+            is_right = shows_part and (far < 0.1 or near < 0.015)
+            yield np.array([*evidence, is_right, number, far, near])
+
+
+def fit(inputs: np.ndarray, labels: np.ndarray, seed: int = 0) -> Model:
+    """Learn the model by maximum likelihood."""
+    torch.manual_seed(seed)
+    mean, scale = inputs.mean(axis=0), inputs.std(axis=0) + 1e-6
+    x = torch.from_numpy(np.clip((inputs - mean) / scale, -4, 4)).float()
+    y = torch.from_numpy(labels).float()
+    network = torch.nn.Sequential(
+        torch.nn.Linear(x.shape[1], UNITS), torch.nn.Tanh(), torch.nn.Linear(UNITS, 1)
+    )
+    optimizer = torch.optim.AdamW(network.parameters(), 1e-2, weight_decay=WEIGHT_DECAY)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, STEPS)
+    for _ in range(STEPS):
+        chosen = torch.randint(len(x), (1024,))
+        loss = torch.nn.functional.binary_cross_entropy_with_logits(
+            network(x[chosen])[:, 0], y[chosen]
+        )
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    hidden, output = network[0], network[2]
+    arrays = (hidden.weight.T, hidden.bias, output.weight[0], output.bias[0])
+    return Model(mean, scale, *(array.detach().double().numpy() for array in arrays))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("samples", type=Path, nargs="+")
+    parser.add_argument("--parts", type=int, default=60)
+    parser.add_argument("--scenes", type=int, default=40)
+    parser.add_argument("--first", type=int, default=0, help="number of the first part")
+    parser.add_argument("--photos", help="folder of background photos; default: procedural")
+    parser.add_argument("--seed", type=int, default=7)
+    parser.add_argument("--fit", action="store_true")
+    options = parser.parse_args()
+    if not options.fit:
+        rows: list[np.ndarray] = []
+        for number in range(options.first, options.first + options.parts):
+            rows += samples(number, options.scenes, options.seed, options.photos)
+            print(
+                number,
+                len(rows),
+                f"{np.mean([row[len(EVIDENCE)] for row in rows]):.2f} right",
+                flush=True,
+            )
+            np.savez(options.samples[0], rows=np.array(rows))
+        return
+    table = np.concatenate([np.load(path)["rows"] for path in options.samples])
+    count = len(EVIDENCE)
+    inputs, labels, parts = table[:, :count], table[:, count], table[:, count + 1].astype(int)
+    held = parts % HELD_OUT == 0
+    model = fit(inputs[~held], labels[~held])
+    report(model, inputs[held], labels[held])
+    final = fit(inputs, labels)
+    values = {
+        "command": " ".join(
+            ["python benchmarks/learn_verification.py", *map(str, options.samples), "--fit"]
+        ),
+        "evidence": EVIDENCE,
+        **{name: np.round(value, 5).tolist() for name, value in final._asdict().items()},
+    }
+    path = Path(verification.__file__).with_name("verification.json")
+    path.write_text(json.dumps(values, indent=1) + "\n", "utf-8")
+    print(f"written: {path}")
+
+
+def report(model: Model, inputs: np.ndarray, labels: np.ndarray) -> None:
+    """Print the quality on parts that were not learned, and what each feature is worth alone."""
+    probability = 1 / (1 + np.exp(-model.log_odds(inputs)))
+    print(f"{len(labels)} poses, {labels.mean():.1%} right")
+    print(
+        f"AP {average_precision_score(labels, probability):.4f}, "
+        f"log loss {log_loss(labels, probability):.4f}, "
+        f"Brier {brier_score_loss(labels, probability):.4f}"
+    )
+    for low in np.arange(0, 1, 0.1):
+        bin_ = (probability >= low) & (probability < low + 0.1)
+        if bin_.any():
+            print(
+                f"  stated {probability[bin_].mean():.2f}, observed {labels[bin_].mean():.2f} ({bin_.sum()})"
+            )
+    for name, column in zip(EVIDENCE, inputs.T, strict=True):
+        both = [average_precision_score(labels, sign * column) for sign in (1, -1)]
+        print(f"  {name:16s} alone: AP {max(both):.3f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,374 @@
+"""Verification: the probability that a pose is right, from the image at that pose.
+
+A pose is right if ADD(-S) is below a tenth of the part's diameter. The features describe how well
+the part, drawn at the pose, explains the image: its outline, its creases, its colours and its
+shading. None of them depends on a network, so that one small model serves all parts. It was learned
+from refined poses of procedural parts (``benchmarks/learn_verification.py``), and its numbers are
+the file ``verification.json``.
+
+To add a feature, name it in :data:`EVIDENCE`, compute it in :meth:`Verifier.evidence`, and learn
+the model again.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import cache
+from importlib.resources import files
+from typing import Any, Final, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, Int, UInt8
+
+from dopepp.core.compiled import Array, compiled
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import CameraMatrix, Transform
+from dopepp.inference.refinement.colour import SMALLEST_PX, crop_around, log_odds
+from dopepp.inference.refinement.outline import (
+    Contour,
+    OutlineMesh,
+    PosedMesh,
+    find_contour,
+    posed,
+)
+from dopepp.inference.refinement.solver import PoseMatrix, UndecidedError
+
+EVIDENCE: Final = (
+    "outline",  # mean response of the image's edges along the outline, in [0, 1]
+    "outline_gain",  # the same minus that of outlines beside it: busy surroundings have edges too
+    "outline_weakest",  # mean response of the second weakest eighth of the outline
+    "crease",  # mean response along visible creases
+    "crease_gain",  # the same minus that of creases beside them
+    "creases",  # number of crease points relative to that of outline points, at most 1
+    "contrast",  # difference of the colours on both sides of the outline, in [0, 1]
+    "inside",  # mean log odds of the colours inside the outline
+    "outside",  # mean log odds of the colours around it
+    "shading",  # share of the variance inside that a linear model of the normals explains
+    "residual",  # logarithm of the unexplained deviation inside over that of the surroundings
+    "agreement",  # of the refinement; 0 without
+    "support",  # of the refinement; 0 without
+    "moved",  # Mahalanobis distance from the network's pose
+    "spread",  # logarithm of the stated deviation of the part's points over a tenth of the diameter
+    "size",  # logarithm of the extent on the image over 100 pixels
+)
+"""Evidence about a pose, in this order."""
+
+LONGEST_PX: Final = 120  # approximate length of the part on the crop
+SPACING: Final = 80.0  # points along an extent
+NOISE: Final = 8.0  # gradient, grey levels per pixel, at which an edge has half its response
+SHARP: Final = math.cos(math.radians(25.0))  # of the angle between normals at a crease
+BESIDE: Final = 0.12  # distance of the outlines beside, share of the extent
+BESIDE_PX: Final = 2.5  # distance from the outline at which colours are compared
+RING: Final = 0.2  # width of the surroundings, share of the extent
+MOST_PIXELS: Final = 1500  # that the model of shading is fitted to
+SECTORS: Final = 8
+FEWEST_POINTS: Final = 12  # of the outline on the image
+
+
+class Model(NamedTuple):
+    """A network of one hidden layer, and how its inputs are normalised."""
+
+    mean: Float[np.ndarray, "evidence"]
+    scale: Float[np.ndarray, "evidence"]
+    hidden: Float[np.ndarray, "evidence units"]
+    hidden_bias: Float[np.ndarray, "units"]
+    output: Float[np.ndarray, "units"]
+    bias: Float[np.ndarray, ""]
+
+    def log_odds(self, evidence: Float[np.ndarray, "*n evidence"]) -> Float[np.ndarray, "*n"]:
+        """Return the logarithm of the odds that each pose is right."""
+        inputs = np.clip((evidence - self.mean) / self.scale, -4.0, 4.0)
+        return np.asarray(
+            np.tanh(inputs @ self.hidden + self.hidden_bias) @ self.output + self.bias
+        )
+
+
+@cache
+def learned_model() -> Model:
+    """Return the model in the package."""
+    path = files("dopepp.inference.refinement").joinpath("verification.json")
+    values: dict[str, Any] = json.loads(path.read_text("utf-8"))
+    if tuple(values["evidence"]) != EVIDENCE:
+        raise ValueError(f"{path} was learned from other evidence: run {values['command']}")
+    arrays = [np.array(values[name]) for name in Model._fields]
+    return Model(*arrays)
+
+
+class Verifier:
+    """Verifies poses of one part.
+
+    Args:
+        mesh: Mesh of the part.
+        diameter: Diameter of the part, metres.
+    """
+
+    def __init__(self, mesh: OutlineMesh, diameter: float) -> None:
+        self._mesh, self._diameter = mesh, diameter
+        normals = mesh.planes[:, :3]
+        self._normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        first, second = mesh.sides.T
+        cosines = (self._normals[first] * self._normals[second]).sum(axis=1)
+        sharp = (second >= 0) & (cosines < SHARP) & (mesh.opposed == 0)
+        self._creases, self._sides = mesh.edges[sharp], mesh.sides[sharp]
+        spread = mesh.vertices - mesh.vertices.mean(axis=0)
+        self._moment = spread.T @ spread / len(spread)
+
+    def log_odds(
+        self,
+        image: Picture,
+        K: CameraMatrix,
+        T_cam_obj: Transform,
+        covariance: PoseMatrix,
+        moved: float,
+        agreement: float | None,
+        support: float | None,
+    ) -> float:
+        """Return the logarithm of the odds that a pose is right; −inf if it is not on the image."""
+        evidence = self.evidence(image, K, T_cam_obj, covariance, moved, agreement, support)
+        return -math.inf if evidence is None else float(learned_model().log_odds(evidence))
+
+    def evidence(
+        self,
+        image: Picture,
+        K: CameraMatrix,
+        T_cam_obj: Transform,
+        covariance: PoseMatrix,
+        moved: float,
+        agreement: float | None,
+        support: float | None,
+    ) -> Float[np.ndarray, "evidence"] | None:
+        """Return the :data:`EVIDENCE` about a pose; None if too little of the part is on the image.
+
+        Args:
+            image: RGB.
+            K: Camera matrix, pixels.
+            T_cam_obj: Pose, metres.
+            covariance: Its covariance.
+            moved: Mahalanobis distance from the pose before refinement.
+            agreement: Agreement of the refinement, if any.
+            support: Support of the refinement, if any.
+        """
+        at = posed(self._mesh, T_cam_obj, K)
+        if at is None:
+            return None
+        corners = np.array([at.pixels.min(axis=0), at.pixels.max(axis=0)])
+        try:
+            crop = crop_around(image, K, corners, LONGEST_PX)
+        except UndecidedError:
+            return None
+        at = posed(self._mesh, T_cam_obj, crop.K)
+        assert at is not None
+        ids = self._drawn(at, crop.size)
+        mask = (ids >= 0).astype(np.uint8)
+        spacing = max(1.5, 3.0 * crop.extent / SPACING)
+        contour = find_contour(self._mesh, at, mask, spacing)
+        odds = log_odds(crop.bins, mask, 1.5, RING * crop.extent, 1)
+        if len(contour) < FEWEST_POINTS or odds is None or mask.sum() < SMALLEST_PX**2:
+            return None
+        gradients = _gradients(crop.colours)
+        outline = _lines(contour)
+        along, beside = _responses(gradients, outline, BESIDE * crop.extent)
+        creases = _walk_creases(self._creases, self._sides, at.pixels, ids, spacing)
+        crease, crease_beside = _responses(gradients, creases, BESIDE * crop.extent)
+        ring = cv2.dilate(mask, None, iterations=round(RING * crop.extent)) - mask
+        within = mask.astype(bool)
+        explained, residual = self._shading(crop.colours, ids, ring, T_cam_obj)
+        return np.array(
+            [
+                along.mean(),
+                along.mean() - beside,
+                _weakest(along, outline),
+                crease.mean() if len(crease) else 0.0,
+                crease.mean() - crease_beside if len(crease) else 0.0,
+                min(1.0, len(crease) / len(along)),
+                _contrast(crop.colours, outline),
+                odds[within].mean(),
+                odds[ring.astype(bool)].mean(),
+                explained,
+                residual,
+                agreement or 0.0,
+                support or 0.0,
+                min(moved, 20.0),
+                self._spread(covariance, T_cam_obj),
+                math.log(crop.extent / crop.scale / 100.0),
+            ]
+        )
+
+    def _drawn(self, at: PosedMesh, size: tuple[int, int]) -> Int[np.ndarray, "height width"]:
+        """Return the triangle at each pixel, −1 for none."""
+        width, height = size
+        ids = np.full((height, width), -1, np.int32)
+        inverse_depth = 1.0 / (at.arms[:, 2] + at.T_cam_obj[2, 3])
+        nearest = np.zeros((height, width), np.float32)
+        _draw(at.pixels, inverse_depth, self._mesh.faces, ids, nearest)
+        return ids
+
+    def _shading(
+        self,
+        colours: Picture,
+        ids: Int[np.ndarray, "height width"],
+        ring: UInt8[np.ndarray, "height width"],
+        T_cam_obj: Transform,
+    ) -> tuple[float, float]:
+        """Fit the colours inside by their normals; return explained share and log residual."""
+        inside = np.flatnonzero(ids >= 0)
+        inside = inside[:: math.ceil(len(inside) / MOST_PIXELS)]
+        normals = self._normals[ids.ravel()[inside]] @ T_cam_obj[:3, :3].T
+        rows = np.column_stack([np.ones(len(normals)), normals])
+        seen = colours.reshape(-1, 3)[inside].astype(np.float64)
+        normal_matrix = rows.T @ rows + 1e-3 * len(rows) * np.diag([0.0, 1.0, 1.0, 1.0])
+        rest = seen - rows @ np.linalg.solve(normal_matrix, rows.T @ seen)
+        around = colours.reshape(-1, 3)[np.flatnonzero(ring)]
+        total, unexplained = seen.var(axis=0).sum(), (rest**2).mean(axis=0).sum()
+        surroundings = float(around.var(axis=0).sum()) if len(around) else 0.0
+        residual = 0.5 * math.log((unexplained + NOISE**2) / (surroundings + NOISE**2))
+        return float(1 - unexplained / (total + NOISE**2)), residual
+
+    def _spread(self, covariance: PoseMatrix, T_cam_obj: Transform) -> float:
+        """Return the logarithm of the stated deviation of points over a tenth of the diameter."""
+        R = T_cam_obj[:3, :3]
+        moment = R @ self._moment @ R.T
+        arms = np.trace(moment) * np.eye(3) - moment  # mean of |ω × p|² as a form of ω
+        variance = np.trace(covariance[3:, 3:]) + float((arms * covariance[:3, :3]).sum())
+        deviation = math.sqrt(max(variance, 1e-18)) / (0.1 * self._diameter)
+        return math.log(min(max(deviation, 1e-3), 1e3))
+
+
+def _lines(contour: Contour) -> Float[np.ndarray, "points 4"]:
+    """Return pixels and normals of a contour as one array."""
+    return np.column_stack([contour.pixels, contour.normals])
+
+
+def _gradients(colours: Picture) -> Float32[np.ndarray, "height width 2"]:
+    """Return the gradient of the channel that changes most, grey levels per pixel."""
+    soft = cv2.GaussianBlur(colours, (3, 3), 0.8)
+    gx = cv2.Scharr(soft, cv2.CV_32F, 1, 0, scale=1 / 32)
+    gy = cv2.Scharr(soft, cv2.CV_32F, 0, 1, scale=1 / 32)
+    gradients = np.empty((*colours.shape[:2], 2), np.float32)
+    _strongest(gx, gy, gradients)
+    return gradients
+
+
+def _responses(
+    gradients: Float32[np.ndarray, "height width 2"],
+    lines: Float[np.ndarray, "points 4"],
+    distance: float,
+) -> tuple[Float[np.ndarray, "points"], float]:
+    """Return the response at each point of lines, and the mean of lines shifted by a distance."""
+    angles = np.arange(8) * math.pi / 4
+    shifts = distance * np.column_stack([np.cos(angles), np.sin(angles)])
+    here, beside = np.zeros(len(lines)), np.zeros(len(lines))
+    for number, shift in enumerate(np.vstack([np.zeros(2), shifts])):
+        _respond(gradients, lines, shift, beside if number else here)
+    return here, float(beside.mean() / len(shifts)) if len(lines) else 0.0
+
+
+def _weakest(along: Float[np.ndarray, "points"], outline: Float[np.ndarray, "points 4"]) -> float:
+    """Return the mean response of the second weakest of eight sectors around the outline."""
+    away = outline[:, :2] - outline[:, :2].mean(axis=0)
+    sector = ((np.arctan2(away[:, 1], away[:, 0]) / (2 * math.pi) + 0.5) * SECTORS).astype(int)
+    sector = np.minimum(sector, SECTORS - 1)
+    counts = np.bincount(sector, minlength=SECTORS)
+    means = np.bincount(sector, along, SECTORS)[counts > 0] / counts[counts > 0]
+    return float(np.sort(means)[min(1, len(means) - 1)])
+
+
+def _contrast(colours: Picture, outline: Float[np.ndarray, "points 4"]) -> float:
+    """Return the mean difference of colours across an outline, relative to noise, in [0, 1]."""
+    height, width = colours.shape[:2]
+    sides = []
+    for side in (-BESIDE_PX, BESIDE_PX):
+        at = np.rint(outline[:, :2] + side * outline[:, 2:]).astype(int)
+        columns, rows = np.clip(at[:, 0], 0, width - 1), np.clip(at[:, 1], 0, height - 1)
+        sides.append(colours[rows, columns].astype(np.float64))
+    difference = np.abs(sides[0] - sides[1]).max(axis=1)
+    return float((difference / (difference + 2 * NOISE)).mean())
+
+
+@compiled()
+def _draw(pixels: Array, inverse_depth: Array, faces: Array, ids: Array, nearest: Array) -> None:
+    """Write the nearest triangle at each pixel's centre."""
+    height, width = ids.shape
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        ax, ay, bx, by = pixels[a, 0], pixels[a, 1], pixels[b, 0], pixels[b, 1]
+        cx, cy = pixels[c, 0], pixels[c, 1]
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        if abs(area) < 1e-9:
+            continue
+        first = int(max(0.0, math.ceil(min(ay, by, cy))))
+        last = int(min(height - 1.0, math.floor(max(ay, by, cy))))
+        left = int(max(0.0, math.ceil(min(ax, bx, cx))))
+        right = int(min(width - 1.0, math.floor(max(ax, bx, cx))))
+        za, zb, zc = inverse_depth[a], inverse_depth[b], inverse_depth[c]
+        for v in range(first, last + 1):
+            for u in range(left, right + 1):
+                wa = ((bx - u) * (cy - v) - (by - v) * (cx - u)) / area
+                wb = ((cx - u) * (ay - v) - (cy - v) * (ax - u)) / area
+                wc = 1.0 - wa - wb
+                if wa < -1e-9 or wb < -1e-9 or wc < -1e-9:
+                    continue
+                near = wa * za + wb * zb + wc * zc
+                if near > nearest[v, u]:
+                    nearest[v, u] = near
+                    ids[v, u] = f
+
+
+@compiled()
+def _walk_creases(edges: Array, sides: Array, pixels: Array, ids: Array, spacing: float) -> Array:
+    """Return pixel and normal of points along visible creases, ``spacing`` pixels apart."""
+    height, width = ids.shape
+    rows, count, left = np.empty((512, 4)), 0, 0.5 * spacing
+    for e in range(len(edges)):
+        x, y = pixels[edges[e, 0], 0], pixels[edges[e, 0], 1]
+        dx, dy = pixels[edges[e, 1], 0] - x, pixels[edges[e, 1], 1] - y
+        length = math.hypot(dx, dy)
+        while left < length and count < len(rows):
+            share = left / length
+            left += spacing
+            u, v = x + share * dx, y + share * dy
+            # Both triangles are drawn beside a crease; an outline has one of them only.
+            first = second = False
+            for row in range(int(v) - 1, int(v) + 3):
+                for column in range(int(u) - 1, int(u) + 3):
+                    if 0 <= row < height and 0 <= column < width:
+                        first = first or ids[row, column] == sides[e, 0]
+                        second = second or ids[row, column] == sides[e, 1]
+            if first and second:
+                rows[count, 0], rows[count, 1] = u, v
+                rows[count, 2], rows[count, 3] = -dy / length, dx / length
+                count += 1
+        left = max(left - length, 0.0)
+    return rows[:count]
+
+
+@compiled()
+def _strongest(gx: Array, gy: Array, gradients: Array) -> None:
+    """Write the gradient of the channel with the longest gradient."""
+    for v in range(gx.shape[0]):
+        for u in range(gx.shape[1]):
+            longest = -1.0
+            for c in range(3):
+                x, y = gx[v, u, c], gy[v, u, c]
+                if x * x + y * y > longest:
+                    longest = x * x + y * y
+                    gradients[v, u, 0], gradients[v, u, 1] = x, y
+
+
+@compiled()
+def _respond(gradients: Array, lines: Array, shift: Array, responses: Array) -> None:
+    """Add the response at each shifted point: 1 for a strong gradient along the point's normal."""
+    height, width = gradients.shape[:2]
+    for i in range(len(lines)):
+        x, y = lines[i, 0] + shift[0], lines[i, 1] + shift[1]
+        most = 0.0
+        for k in range(3):
+            u = round(x + (k - 1.0) * lines[i, 2])
+            v = round(y + (k - 1.0) * lines[i, 3])
+            if 0 <= u < width and 0 <= v < height:
+                gx, gy = gradients[v, u, 0], gradients[v, u, 1]
+                along = abs(gx * lines[i, 2] + gy * lines[i, 3])
+                most = max(most, along / (math.hypot(gx, gy) + NOISE))
+        responses[i] += most
