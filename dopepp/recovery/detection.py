@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dopepp.core.compiled import Array, compiled
+from dopepp.core.errors import UserError
 from dopepp.core.validation import STRICT, Range, parse
 from dopepp.geometry.camera import CameraMatrix, Transform, project, project_keypoints, transform
 from dopepp.geometry.cuboid import NUM_CORNERS, Cuboid
@@ -30,24 +31,27 @@ from dopepp.geometry.pnp import PnPResult
 from dopepp.recovery.association import KeypointGroup
 
 FEATURES: Final = ("bias", "belief", "spread", "misfit", "found")  # Of the score, in this order
-REFINED_FEATURES: Final = ("bias", "score", "agreement", "support")  # Of a refined pose's score
+REFINED_FEATURES: Final = ("bias", "score", "verification")  # Of a refined pose's score
 
 CANDIDATE: Final = 0.005
-"""Score of the network from which a detection is refined: refinement distinguishes a false
+"""Score of the network from which a detection is refined: verification distinguishes a false
 detection from a part that the network was unsure of."""
 
 DISTANCE_FACTORS: Final = (0.5, 2.0)  # Range; factors of trained networks are within a tenth of 1
-COVARIANCE_FACTORS: Final = (0.01, 100.0)  # Range; factors of trained networks are 1 to 4
+COVARIANCE_FACTORS: Final = (0.5, 4.0)  # Range; factors of trained networks are 0.8 to 3
 PASSING: Final = 0.1  # ADD over the diameter below which a pose is right
 
-_TENTH_BEYOND: Final = 10.645  # Squared Mahalanobis distance in 6D that a tenth exceeds
+# Squared Mahalanobis distances in 6D that three quarters and a tenth exceed.
+_QUARTER: Final = 3.455
+_TENTH_BEYOND: Final = 10.645
+_WRONG_RANGE: Final = math.log(1e6)  # Of the logarithms of wrong poses' squared distances
 _CERTAIN: Final = 1e-3  # Beliefs within this distance of 0 or 1 are treated alike
 _EXPONENTS: Final = 4.0  # Logarithms are clipped beyond this, so that outliers do not dominate
 _TYPICAL_MISFIT: Final = 0.01  # Average reprojection error over the size in the image
 _RIDGE: Final = 0.1  # Weight of the squared weights, in detections, which keeps them finite
 _STEPS: Final = 50  # Maximum number of Newton steps
 _MEAN_BELIEF: Final = tuple(float(name == "belief") for name in FEATURES)
-_NETWORK_SCORE: Final = tuple(float(name == "score") for name in REFINED_FEATURES)
+_VERIFIED: Final = 1e-4  # As _CERTAIN, for the probability of a verified pose
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,9 @@ class Detection:
             [0, 1]; None without refinement.
         support: Share of the refined outline that has agreeing evidence, in [0, 1]; an occluded
             outline has none. None without refinement.
+        probability: Probability that ADD(-S) is below a tenth of the diameter, from the image at
+            the refined pose (:mod:`dopepp.inference.refinement.verification`); None without
+            refinement or without a mesh.
     """
 
     object: str
@@ -85,6 +92,7 @@ class Detection:
     kept: str = ""
     agreement: float | None = None
     support: float | None = None
+    probability: float | None = None
 
 
 _Belief = Annotated[float, Range(1e-6, 1.0)]
@@ -109,7 +117,7 @@ class RecoveryOptions:
             the defaults, the score is the mean belief.
         refined_min_score: Refined detections below this score are dropped.
         refined_bias: First weight of the score of refined poses, set by ``evaluate.py tune=true
-            refine=region``; with the defaults, the network's score is kept.
+            refine=region``; with the defaults, the score is the probability of the verification.
     """
 
     __pydantic_config__ = STRICT
@@ -127,11 +135,10 @@ class RecoveryOptions:
     score_spread: _Weight = 0.0
     score_misfit: _Weight = 0.0
     score_found: _Weight = 0.0
-    refined_min_score: _Score = 0.0
+    refined_min_score: _Score = 0.5
     refined_bias: _Weight = 0.0
-    refined_score: _Weight = 1.0
-    refined_agreement: _Weight = 0.0
-    refined_support: _Weight = 0.0
+    refined_score: _Weight = 0.0
+    refined_verification: _Weight = 1.0
 
     @classmethod
     def of(cls, options: Mapping[str, float]) -> RecoveryOptions:
@@ -156,11 +163,6 @@ class RecoveryOptions:
         """Return the options with the default score of refined poses."""
         defaults = {field.name: field.default for field in fields(self)}
         return replace(self, **{k: v for k, v in defaults.items() if k.startswith("refined_")})  # type: ignore[arg-type]
-
-    @property
-    def scores_refined(self) -> bool:
-        """Whether refined poses have a score of their own."""
-        return self.refined_weights != _NETWORK_SCORE
 
 
 def make_detection(
@@ -210,20 +212,25 @@ def calibrated(
 
 
 def rescored(refined: Sequence[Detection], options: RecoveryOptions) -> list[Detection]:
-    """Return refined detections with the score of refined poses, best first."""
-    if options.scores_refined:
-        weights = np.array(options.refined_weights)
-        refined = [
-            replace(detection, score=float(score(refined_features(detection), weights)))
-            for detection in refined
-        ]
-    return sorted(refined, key=lambda detection: -detection.score)
+    """Return refined detections with the score of refined poses, best first.
+
+    Detections that were not verified keep the network's score.
+    """
+    weights = np.array(options.refined_weights)
+    judged = [
+        detection
+        if detection.probability is None
+        else replace(detection, score=float(score(refined_features(detection), weights)))
+        for detection in refined
+    ]
+    return sorted(judged, key=lambda detection: -detection.score)
 
 
 def refined_features(detection: Detection) -> Float[np.ndarray, "features"]:
-    """Return the features of a refined detection that still has the network's score."""
-    evidence = detection.agreement or 0.0, detection.support or 0.0
-    return np.array([1.0, np.log(_odds(detection.score)), *evidence])
+    """Return the features of a verified detection that still has the network's score."""
+    assert detection.probability is not None
+    verified = _odds(detection.probability, _VERIFIED)
+    return np.array([1.0, *np.log([_odds(detection.score), verified])])
 
 
 def detection_features(
@@ -243,8 +250,8 @@ def detection_features(
     return np.array([1.0, *np.clip(logarithms, -2 * _EXPONENTS, 2 * _EXPONENTS), missing])
 
 
-def _odds(probability: float) -> float:
-    bounded = float(np.clip(probability, _CERTAIN, 1 - _CERTAIN))
+def _odds(probability: float, certain: float = _CERTAIN) -> float:
+    bounded = float(np.clip(probability, certain, 1 - certain))
     return bounded / (1 - bounded)
 
 
@@ -266,28 +273,57 @@ def fit_distance_factor(
 
 
 def fit_covariance_factor(squared_distances: Float[np.ndarray, "n"]) -> float:
-    """Return the factor on covariances that matches the 90 % quantile of the pose errors.
+    """Return the factor on covariances that matches the errors of the right poses.
 
-    The tails are heavier than those of a Gaussian, and refinement, whose prior this is, must reach
-    the true pose.
+    The squared distances are a mixture of right poses, a multiple of χ² with six degrees of
+    freedom, and of wrong poses, whose logarithms are uniform. Expectation-maximisation separates
+    them. The factor matches the 90 % quantile of the right poses, because their tails are heavier
+    than those of a Gaussian, and refinement, whose prior this is, must reach the true pose.
 
     Args:
         squared_distances: Squared Mahalanobis distances of true poses, with a factor of 1.
+
+    Raises:
+        UserError: The factor is outside :data:`COVARIANCE_FACTORS`.
     """
-    if not len(squared_distances):
+    squared = np.asarray(squared_distances, np.float64)
+    squared = squared[np.isfinite(squared) & (squared > 0)]
+    if not len(squared):
         return 1.0
-    factor = float(np.quantile(squared_distances, 0.9)) / _TENTH_BEYOND
-    return float(np.clip(factor, *COVARIANCE_FACTORS))
+    factor, share = float(np.quantile(squared, 0.25)) / _QUARTER, 0.5
+    for _ in range(_STEPS):
+        ratio = squared / factor
+        # Densities of the logarithm: s·χ²₆(s), and that of the wrong poses.
+        right = share * ratio**3 * np.exp(-ratio / 2) / 16
+        certainty = right / (right + (1 - share) / _WRONG_RANGE)
+        share = float(np.clip(certainty.mean(), 0.01, 0.99))
+        factor = float((certainty * squared).sum() / (6 * max(certainty.sum(), 1e-9)))
+    order = np.argsort(squared)
+    passed = np.cumsum(certainty[order]) / certainty.sum()
+    factor = float(squared[order[np.searchsorted(passed, 0.9)]]) / _TENTH_BEYOND
+    low, high = COVARIANCE_FACTORS
+    if not low <= factor <= high:
+        lean = "sure" if factor > high else "unsure"
+        raise UserError(
+            f"covariances of which the right poses need {factor:.3g} times as much",
+            f"a factor from {low:g} to {high:g}",
+            f"train longer: the network is far too {lean}; or state the part's symmetries "
+            "(data.symmetries=auto) if its poses look alike",
+        )
+    return factor
 
 
 def fit_weights(
-    features: Float[np.ndarray, "n features"], correct: Bool[np.ndarray, "n"]
+    features: Float[np.ndarray, "n features"],
+    correct: Bool[np.ndarray, "n"],
+    usual: Float[np.ndarray, "features"] | None = None,
 ) -> Float[np.ndarray, "features"]:
     """Fit the score's weights by maximum likelihood (Newton's method) with a ridge penalty.
 
     Args:
         features: Features of the detections.
         correct: Whether each pose is right; a detection without an instance is not.
+        usual: Weights that few detections hardly change (default: 0).
 
     Raises:
         ValueError: All or no detections are right.
@@ -295,12 +331,13 @@ def fit_weights(
     correct = np.asarray(correct, bool)
     if not correct.any() or correct.all():
         raise ValueError("a score needs right and wrong detections to learn from")
-    weights = np.zeros(features.shape[1])
+    usual = np.zeros(features.shape[1]) if usual is None else usual
+    weights = usual.copy()
     ridge = _RIDGE * np.eye(len(weights))
     ridge[0, 0] = 0.0  # the share of right detections is well determined
     for _ in range(_STEPS):
         predicted = score(features, weights)
-        gradient = features.T @ (correct - predicted) - ridge @ weights
+        gradient = features.T @ (correct - predicted) - ridge @ (weights - usual)
         hessian = (features * (predicted * (1 - predicted))[:, None]).T @ features + ridge
         step = np.linalg.lstsq(hessian, gradient, rcond=None)[0]
         weights = weights + step * min(1.0, _EXPONENTS / max(float(np.abs(step).max()), 1e-12))

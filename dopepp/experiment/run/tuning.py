@@ -1,9 +1,14 @@
-"""Tune the distance factor, the score and the threshold of a checkpoint on validation images.
+"""Tune the factors, the scores and the thresholds of a checkpoint on validation images.
 
-The factor is the median ratio of true to estimated distances. The weights of the score are fitted
-to "ADD below a tenth of the diameter". The threshold is the lowest one that satisfies the permitted
-rate of false positives on images without the objects. Test images check the result, which is
-written to a new checkpoint.
+- Distance: the median ratio of true to estimated distances.
+- Covariance: matches the errors of the right poses among the matched ones.
+- Scores: the probability of "ADD(-S) below a tenth of the diameter". That of refined poses is a
+  recalibration of the verification.
+- Thresholds: the lowest ones that satisfy the permitted rate of false positives on pictures without
+  the objects.
+
+Factors and scores that rank the validation poses worse than those of the checkpoint are not taken.
+Test images check the result, which is written to a new checkpoint.
 """
 
 from __future__ import annotations
@@ -11,7 +16,7 @@ from __future__ import annotations
 import copy
 import hashlib
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import compress
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -24,13 +29,19 @@ from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample, SampleSource
 from dopepp.data.transforms.shading_protocol import shade
 from dopepp.experiment.assembly.build_sources import held_out_source
-from dopepp.experiment.assembly.renders import empty_renders
+from dopepp.experiment.assembly.renders import empty_renders as negative_frames
 from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.config.run_config import FalsePositiveTarget
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.runtimes import Runtime
-from dopepp.metrics.functional import add, add_s, expected_calibration_error, mahalanobis
+from dopepp.metrics.functional import (
+    add,
+    add_s,
+    average_precision,
+    expected_calibration_error,
+    mahalanobis,
+)
 from dopepp.metrics.pose import assign, counted
 from dopepp.metrics.row import symmetry_transforms
 from dopepp.models.checkpoint import Checkpoint
@@ -39,7 +50,6 @@ from dopepp.models.network import Images
 from dopepp.models.storage import write_atomic
 from dopepp.parts.part import Part, Parts
 from dopepp.recovery.detection import (
-    CANDIDATE,
     FEATURES,
     PASSING,
     REFINED_FEATURES,
@@ -53,12 +63,20 @@ from dopepp.recovery.detection import (
     score,
 )
 
+LEAST_REFINED_SCORE: Final = 0.5
+"""Lowest threshold of refined poses: a pose that is more likely wrong than right is not reported,
+however quiet the pictures without the objects are."""
+
+SAME: Final = 0.005  # average precision that fitted options may lose
+
 HIDDEN: Final = 0.4
 """Share of each object that is covered in additional validation images for the score of refined
 poses. It adds detections of low belief whose refined pose may still be correct."""
 
 MOST_BYTES: Final = 2**30
 """Limit of the cache: 1,400 pictures of 400×400 pixels with the maps of one part."""
+
+_WEIGHTS: Final = ("score_", "refined_")
 
 Made = TypeVar("Made")
 
@@ -80,71 +98,148 @@ class Scored:
         np.maximum.at(best, self.image, scores)
         return best
 
+    def average_precision(self, scores: Float[np.ndarray, "n"]) -> float:
+        """Return the average precision of the correct poses."""
+        ranked = torch.from_numpy(scores), torch.from_numpy(self.correct)
+        return average_precision(*ranked, self.num_instances)
+
 
 @dataclass(frozen=True)
 class Figures:
-    """Quality of scores and threshold; ``recall`` counts correct poses above the threshold."""
+    """Quality of scores and threshold; recall and precision are those of the reported poses."""
 
     calibration_error: float
     false_positive_rate: float
     recall: float
+    precision: float
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """Tuned recovery options, and their effect on test images with and without objects."""
+    """Tuned recovery options, and their effect on test images with and without objects.
+
+    ``kept`` says which options of the checkpoint were better than the fitted ones.
+    """
 
     options: dict[str, float]
     before: Figures
     after: Figures
     num_images: tuple[int, int]
+    kept: str = ""
 
 
 def tune(
     estimator: PoseEstimator, data: DataConfig, parts: Parts, target: FalsePositiveTarget
 ) -> Tuning:
-    """Choose factors, weights and threshold on validation images and measure them on test images.
+    """Choose factors, weights and thresholds on validation images and measure them on test images.
 
     For an estimator that refines, the network is tuned first, then the refined poses.
 
     Raises:
-        UserError: There are no detections, or all of them are correct or wrong.
+        UserError: There are no detections, all of them are correct or wrong, or the covariances
+            are far from the errors.
     """
-    old, refiner, memory = estimator.recovery, estimator.refiner, Memory()
+    old, memory = estimator.recovery, Memory()
     estimator = memory.behind(estimator)
-    validation = memory.of(held_out_source(data, parts, "val"))
-    test = memory.of(held_out_source(data, parts, "test"))
     count, rate = target.num_empty, target.false_positive_rate
-    empty = memory.of(empty_renders(data, parts, "val", count))
-    empty_test = memory.of(empty_renders(data, parts, "test", count))
+    sources = _Sources(
+        validation=memory.of(held_out_source(data, parts, "val")),
+        test=memory.of(held_out_source(data, parts, "test")),
+        empty=memory.of(negative_frames(data, parts, "val", count)),
+        empty_test=memory.of(negative_frames(data, parts, "test", count)),
+    )
+    before = _measured(estimator, parts, sources, old)
+    new, kept = _chosen_factors(estimator, parts, sources, old)
+    new = _tuned_score(_without_refinement(estimator), parts, sources, rate, new)
+    if _verifies(estimator, parts):
+        new = _tuned_score(estimator, parts, sources, rate, new)
+    after = _measured(estimator, parts, sources, new)
+    options = {
+        field.name: getattr(new, field.name)
+        for field in fields(RecoveryOptions)
+        if field.name.endswith(("_factor", "min_score")) or field.name.startswith(_WEIGHTS)
+    }
+    return Tuning(options, before, after, (len(sources.test), count), kept)
 
-    def scored(options: RecoveryOptions, *sources: SampleSource) -> Scored:
+
+@dataclass(frozen=True)
+class _Sources:
+    """Images to tune and to measure on, with and without objects."""
+
+    validation: SampleSource
+    test: SampleSource
+    empty: SampleSource
+    empty_test: SampleSource
+
+
+def _chosen_factors(
+    estimator: PoseEstimator, parts: Parts, sources: _Sources, old: RecoveryOptions
+) -> tuple[RecoveryOptions, str]:
+    """Return the options with the fitted factors, or with the old ones and why.
+
+    The factors are those of network poses. They are judged by the poses that the estimator reports,
+    because a wrong covariance misleads the refinement.
+    """
+    without = replace(_audible(old), distance_factor=1.0, covariance_factor=1.0)
+    plain = _without_refinement(estimator)
+    plain.recovery = without
+    factors = fit_factors(matched_poses(plain, parts, sources.validation))
+    precision: dict[str, float] = {}
+    for name, options in (("new", replace(without, **factors)), ("old", _audible(old))):  # type: ignore[arg-type]
         estimator.recovery = options
-        return score_images(estimator, parts, *sources)
+        shown = score_images(estimator, parts, sources.validation)
+        precision[name] = shown.average_precision(shown.scores)
+    if precision["new"] >= precision["old"] - SAME:
+        return replace(old, **factors), ""  # type: ignore[arg-type]
+    fitted = ", ".join(f"{name}={value:.3g}" for name, value in factors.items())
+    kept = "AP {old:.3f} on validation images with the old factors, {new:.3f} with ".format(
+        **precision
+    )
+    return old, kept + fitted
 
-    estimator.refiner = None
-    # All detections count here, regardless of their score.
-    heard = replace(old, min_score=0.0, covariance_factor=1.0)
-    before = _figures(scored(heard, test), scored(heard, empty_test), old.min_score)
-    estimator.recovery = replace(heard, distance_factor=1.0)
-    factors = fit_factors(matched_poses(estimator, parts, validation))
-    heard = replace(heard, distance_factor=factors["distance_factor"])
-    chosen = choose(scored(heard, validation), scored(heard, empty), rate)
-    new = replace(old, **factors, **chosen)  # type: ignore[arg-type]
-    threshold = new.min_score
-    heard = replace(new, min_score=0.0)
-    if refiner is not None:
-        estimator.refiner = refiner
-        # The features need the score of the network, not the score of an earlier tuning.
-        candidate = min(new.min_score, CANDIDATE)
-        heard = replace(new.unrefined(), min_score=candidate)
-        shown = scored(heard, validation, Hidden(validation))
-        refined = choose(shown, scored(heard, empty), rate, refined=True)
-        chosen |= refined
-        threshold = refined.pop("refined_min_score")
-        heard = replace(new, **refined)  # type: ignore[arg-type]
-    after = _figures(scored(heard, test), scored(heard, empty_test), threshold)
-    return Tuning(factors | chosen, before, after, (len(test), count))
+
+def _tuned_score(
+    estimator: PoseEstimator, parts: Parts, sources: _Sources, rate: float, options: RecoveryOptions
+) -> RecoveryOptions:
+    """Return the options with the weights and the threshold of the estimator's poses."""
+    refined, shown = estimator.refiner is not None, [sources.validation]
+    estimator.recovery = _audible(options)
+    if refined:
+        # The features need the score of the network, and the verification as it was learned.
+        estimator.recovery = _audible(options.unrefined())
+        shown.append(Hidden(sources.validation))
+    with_objects = score_images(estimator, parts, *shown)
+    without = score_images(estimator, parts, sources.empty)
+    chosen = choose(with_objects, without, rate, refined=refined)
+    return replace(options, **chosen)  # type: ignore[arg-type]
+
+
+def _audible(options: RecoveryOptions) -> RecoveryOptions:
+    """Return options under which every detection counts, regardless of its score."""
+    return replace(options, min_score=0.0, refined_min_score=0.0)
+
+
+def _verifies(estimator: PoseEstimator, parts: Parts) -> bool:
+    """Return whether the estimator refines, and knows the meshes to verify the refined poses."""
+    return estimator.refiner is not None and all(part.mesh is not None for part in parts)
+
+
+def _measured(
+    estimator: PoseEstimator, parts: Parts, sources: _Sources, options: RecoveryOptions
+) -> Figures:
+    """Return the figures of options on test images."""
+    estimator.recovery = _audible(options)
+    shown, empty = (
+        score_images(estimator, parts, source) for source in (sources.test, sources.empty_test)
+    )
+    verified = _verifies(estimator, parts)
+    return _figures(shown, empty, options.refined_min_score if verified else options.min_score)
+
+
+def _without_refinement(estimator: PoseEstimator) -> PoseEstimator:
+    plain = copy.copy(estimator)
+    plain.refiner = None
+    return plain
 
 
 def fit_factors(
@@ -175,12 +270,17 @@ def choose(
 ) -> dict[str, float]:
     """Choose weights and threshold from detections in images with and without objects.
 
+    Few refined poses change the verification little, and poses that are all correct not at all.
+
     Raises:
         UserError: There are no detections, or all of them are correct or wrong.
     """
     features = np.concatenate([shown.features, empty.features])
     correct = np.concatenate([shown.correct, empty.correct])
-    if not correct.any() or correct.all():
+    usual = np.array(RecoveryOptions().refined_weights) if refined else None
+    if refined and (not correct.any() or correct.all()):
+        weights = np.array(RecoveryOptions().refined_weights)
+    elif not correct.any() or correct.all():
         what = "right" if correct.any() else "wrong"
         raise UserError(
             f"{len(correct)} validation detections, all of them {what}"
@@ -189,20 +289,22 @@ def choose(
             "right and wrong ones to learn from",
             "train longer, or raise data.num_val and num_empty",
         )
-    weights = fit_weights(features, correct)
+    else:
+        weights = fit_weights(features, correct, usual)
     loudest = np.sort(empty.loudest(score(empty.features, weights)))[::-1]
     allowed = int(false_positive_rate * empty.num_images)
     # A score equal to the threshold passes, so it lies just above the first rejected score.
     threshold = float(np.nextafter(loudest[allowed], 1.0)) if allowed < len(loudest) else 0.0
     names = ["min_score", *(f"score_{feature}" for feature in FEATURES)]
     if refined:
+        threshold = max(threshold, LEAST_REFINED_SCORE) if false_positive_rate < 1 else 0.0
         names = [f"refined_{name}" for name in ("min_score", *REFINED_FEATURES)]
     return dict(zip(names, [threshold, *map(float, weights)], strict=True))
 
 
 def score_images(estimator: PoseEstimator, parts: Parts, *sources: SampleSource) -> Scored:
     """Run an estimator over sources and judge every detection."""
-    refined = estimator.refiner is not None
+    refined = _verifies(estimator, parts)
     names = REFINED_FEATURES if refined else FEATURES
     rows: list[tuple[np.ndarray, float, bool, int]] = []
     num_instances = 0
@@ -302,8 +404,10 @@ def _figures(test: Scored, empty: Scored, threshold: float) -> Figures:
     scores, correct = torch.from_numpy(test.scores), torch.from_numpy(test.correct)
     error = expected_calibration_error(scores, correct)
     loud = empty.loudest(np.where(empty.scores >= threshold, 1.0, 0.0))
-    right = test.correct & (test.scores >= threshold)
-    return Figures(error, float(loud.mean()), float(right.sum()) / max(test.num_instances, 1))
+    reported = test.scores >= threshold
+    right = float((test.correct & reported).sum())
+    recall, precision = right / max(test.num_instances, 1), right / max(int(reported.sum()), 1)
+    return Figures(error, float(loud.mean()), recall, precision)
 
 
 class Memory:

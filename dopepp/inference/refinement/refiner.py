@@ -40,11 +40,13 @@ from dopepp.inference.refinement.part_surface import FEWEST_POINTS, Points, surf
 from dopepp.inference.refinement.region import RegionRefiner, Starts, refinement
 from dopepp.inference.refinement.solver import (
     PoseMatrix,
+    Prior,
     Refinement,
     Solution,
     UndecidedError,
     make_prior,
 )
+from dopepp.inference.refinement.verification import Verifier
 from dopepp.parts.part import Part
 
 if TYPE_CHECKING:
@@ -84,27 +86,36 @@ class Refiner:
     def __call__(
         self, detection: Detection, image: Picture, K: CameraMatrix, depth: Depth | None
     ) -> Detection:
-        """Return the refined detection, or the given one with the reason why it was kept."""
-        cuboid, T_cam_obj = self._cuboids[detection.object], detection.T_cam_obj
-        refine, covariance = self._refiners[detection.object].refine, detection.covariance
-        if detection.agreement is not None:  # set by refinement only: the part is tracked
-            refined = refine(image, K, T_cam_obj, covariance, depth, followed=True)
+        """Return the refined detection, or the given one with the reason why it was kept.
+
+        It has the probability that its pose is right, if the part has a mesh.
+        """
+        refiner, cuboid = self._refiners[detection.object], self._cuboids[detection.object]
+        T_cam_obj, covariance = detection.T_cam_obj, detection.covariance
+        is_tracked = detection.agreement is not None  # set by refinement only
+        if is_tracked:
+            refined = refiner.refine(image, K, T_cam_obj, covariance, depth, followed=True)
         else:
             # A tracker knows how far a part may have moved; a network's covariance may be wrong.
             starts = partial(poses_of_four, cuboid, detection.peaks, K)
-            covariance = LOOSER**2 * covariance
-            refined = refine(image, K, T_cam_obj, covariance, depth, starts=starts)
+            loose = LOOSER**2 * covariance
+            refined = refiner.refine(image, K, T_cam_obj, loose, depth, starts=starts)
         if refined.covariance is None:
-            return replace(detection, kept=refined.reason, agreement=None, support=None)
-        return replace(
-            detection,
-            T_cam_obj=refined.T_cam_obj,
-            keypoints=project_keypoints(cuboid, refined.T_cam_obj, K),
-            covariance=refined.covariance,
-            kept="",
-            agreement=refined.agreement,
-            support=refined.support,
-        )
+            end = replace(detection, kept=refined.reason, agreement=None, support=None)
+        else:
+            end = replace(
+                detection,
+                T_cam_obj=refined.T_cam_obj,
+                keypoints=project_keypoints(cuboid, refined.T_cam_obj, K),
+                covariance=refined.covariance,
+                kept="",
+                agreement=refined.agreement,
+                support=refined.support,
+            )
+        if is_tracked or refiner.verifier is None:  # a tracked part keeps its probability
+            return end
+        moved = Prior(T_cam_obj, np.linalg.inv(covariance)).squared_distance(end.T_cam_obj) ** 0.5
+        return replace(end, probability=refiner.verifier.probability(end, image, K, moved))
 
 
 class PartRefiner:
@@ -120,6 +131,11 @@ class PartRefiner:
 
     def __init__(self, part: Part, terms: Sequence[str]) -> None:
         self._region: RegionRefiner | None = None
+        self.verifier: Verifier | None = None
+        """Verifies refined poses; None without a mesh."""
+        if part.mesh is not None:
+            region = RegionRefiner(part.mesh.vertices, part.mesh.faces)
+            self.verifier = Verifier(region.mesh, part.diameter)
         if "region" in terms:
             if part.mesh is None:
                 raise UserError(
@@ -128,7 +144,7 @@ class PartRefiner:
                     f"add --part {part.name}=FILE and its --unit (parts=… in Python), "
                     "or train again",
                 )
-            self._region = RegionRefiner(part.mesh.vertices, part.mesh.faces)
+            self._region = region
         self._uses_depth, self._diameter = "depth" in terms, part.diameter
         has_surface = self._uses_depth and len(part.points) >= FEWEST_POINTS
         self._surface = surface_points(part.points) if has_surface else None

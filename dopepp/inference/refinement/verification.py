@@ -16,7 +16,7 @@ import json
 import math
 from functools import cache
 from importlib.resources import files
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -34,6 +34,9 @@ from dopepp.inference.refinement.outline import (
     posed,
 )
 from dopepp.inference.refinement.solver import PoseMatrix, UndecidedError
+
+if TYPE_CHECKING:
+    from dopepp.recovery.detection import Detection
 
 EVIDENCE: Final = (
     "outline",  # mean response of the image's edges along the outline, in [0, 1]
@@ -115,19 +118,20 @@ class Verifier:
         spread = mesh.vertices - mesh.vertices.mean(axis=0)
         self._moment = spread.T @ spread / len(spread)
 
-    def log_odds(
-        self,
-        image: Picture,
-        K: CameraMatrix,
-        T_cam_obj: Transform,
-        covariance: PoseMatrix,
-        moved: float,
-        agreement: float | None,
-        support: float | None,
+    def probability(
+        self, detection: Detection, image: Picture, K: CameraMatrix, moved: float
     ) -> float:
-        """Return the logarithm of the odds that a pose is right; −inf if it is not on the image."""
-        evidence = self.evidence(image, K, T_cam_obj, covariance, moved, agreement, support)
-        return -math.inf if evidence is None else float(learned_model().log_odds(evidence))
+        """Return the probability that a detection's pose is right; 0 if it is not on the image.
+
+        ``moved`` is the Mahalanobis distance of the pose from that before refinement.
+        """
+        evidence = self.evidence(
+            image, K, detection.T_cam_obj, detection.covariance, moved,
+            detection.agreement, detection.support,
+        )  # fmt: skip
+        if evidence is None:
+            return 0.0
+        return float(1 / (1 + np.exp(-learned_model().log_odds(evidence))))
 
     def evidence(
         self,

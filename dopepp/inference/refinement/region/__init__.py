@@ -90,8 +90,8 @@ class RegionRefiner:
     """
 
     def __init__(self, vertices: Vertices, faces: Faces) -> None:
-        self._mesh = make_outline_mesh(vertices, faces)
-        self._diameter = largest_distance(self._mesh.vertices)
+        self.mesh = make_outline_mesh(vertices, faces)
+        self._diameter = largest_distance(self.mesh.vertices)
 
     def refine(
         self,
@@ -152,14 +152,14 @@ class RegionRefiner:
             UndecidedError: The part is not in view.
         """
         K = np.asarray(K, np.float64)
-        at = posed(self._mesh, pose, K)
+        at = posed(self.mesh, pose, K)
         if at is None:
             raise UndecidedError("the part reaches behind the camera")
         corners = np.stack([at.pixels.min(axis=0), at.pixels.max(axis=0)])
         stages = (COARSE, MIDDLE, FINE)
         crops = [crop_around(image, K, corners, stage.longest_px) for stage in stages]
         return [
-            Round(self._mesh, crop, stage, weights, more)
+            Round(self.mesh, crop, stage, weights, more)
             for crop, stage in zip(crops, stages, strict=True)
         ]
 
