@@ -15,6 +15,7 @@ import argparse
 import json
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -43,9 +44,10 @@ HELD_OUT = 5  # every fifth part judges the model
 
 
 def random_part(rng: np.random.Generator, name: str) -> Part:
-    """Return a part of two to seven primitives that overlap or touch."""
-    pieces = [_primitive(rng, 1.0)]
-    for _ in range(int(rng.integers(1, 7))):
+    """Return a part of primitives that overlap or touch, on a lump for one part in three."""
+    is_lump = rng.random() < 0.35
+    pieces = [_lump(rng) if is_lump else _primitive(rng, 1.0)]
+    for _ in range(int(rng.integers(0, 4) if is_lump else rng.integers(1, 7))):
         piece = _primitive(rng, rng.uniform(0.15, 0.6))
         base = pieces[int(rng.integers(len(pieces)))]
         point = base.bounds[0] + rng.uniform(0, 1, 3) * np.ptp(base.bounds, axis=0)
@@ -62,6 +64,19 @@ def random_part(rng: np.random.Generator, name: str) -> Part:
     if colours is not None:
         painted = np.repeat(colours, [len(p.vertices) for p in pieces], axis=0).astype(np.uint8)
     return make_part(name, Mesh(vertices, mesh.faces.astype(np.int32), colours=painted))
+
+
+def _lump(rng: np.random.Generator) -> trimesh.Trimesh:
+    """Return a bumpy body like a scanned or sculpted object."""
+    lump = trimesh.creation.icosphere(4, 0.5)
+    points = lump.vertices * rng.uniform(0.35, 1.0, 3)
+    for _ in range(int(rng.integers(3, 12))):
+        wave, frequency = rng.normal(size=3), rng.uniform(3.0, 30.0)
+        height = rng.uniform(0.01, 0.25) / math.sqrt(frequency)
+        phase = frequency * (points @ wave / np.linalg.norm(wave)) + rng.uniform(0, 2 * math.pi)
+        points = points * (1 + height * np.sin(phase))[:, None]
+    lump.vertices = points
+    return lump
 
 
 def _primitive(rng: np.random.Generator, size: float) -> trimesh.Trimesh:
@@ -146,15 +161,23 @@ def samples(number: int, num_scenes: int, seed: int, photos: str | None) -> Iter
             "min_visible_fraction": 0.35, "clutter": [0, 60], "background_contrast": [0.5, 1.8],
             "distractors": {"number": [0, 6], "lookalike_share": 0.4},
             "materials": {"metal_share": 0.15, "coloured_share": 0.6},
-            "sensors": {"blur_px": [0.2, 1.2], "read_noise": [0.3, 3.0], "jpeg_quality": [60, 95]},
+            "sensors": {
+                "blur_probability": 0.6, "blur_px": [0.2, 2.2],
+                "motion_probability": 0.3, "motion_px": [1.0, 6.0],
+                "read_noise": [0.3, 4.0], "shot_noise": [0.5, 5.0],
+                "jpeg_probability": 0.4, "jpeg_quality": [50, 95],
+            },
         },
         "scene",
     )  # fmt: skip
     other = look_alike(rng, part)
+    # The print and the camera matrix differ from their files.
+    printed = replace(part.mesh, vertices=part.mesh.vertices * rng.normal(1.0, 0.008))
+    shown_part = make_part(part.name, printed)
     backgrounds = find_backgrounds(photos, "train")
     true, false = (
         Factory([shown], preset, seed, backgrounds, negatives=[unlike])
-        for shown, unlike in ((part, other), (other, part))
+        for shown, unlike in ((shown_part, other), (other, shown_part))
     )
     mesh = make_outline_mesh(part.mesh.vertices, part.mesh.faces)
     refiner, verifier = RegionRefiner(part.mesh.vertices, part.mesh.faces), Verifier(mesh, diameter)

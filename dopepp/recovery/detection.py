@@ -33,6 +33,8 @@ from dopepp.recovery.association import KeypointGroup
 FEATURES: Final = ("bias", "belief", "spread", "misfit", "found")  # Of the score, in this order
 REFINED_FEATURES: Final = ("bias", "score", "verification")  # Of a refined pose's score
 
+_FORMER_FEATURES: Final = frozenset({"refined_agreement", "refined_support"})
+
 CANDIDATE: Final = 0.005
 """Score of the network from which a detection is refined: verification distinguishes a false
 detection from a part that the network was unsure of."""
@@ -144,9 +146,13 @@ class RecoveryOptions:
     def of(cls, options: Mapping[str, float]) -> RecoveryOptions:
         """Check the options of a config, a checkpoint or a caller.
 
+        Scores of refined poses that were fitted to other features are left out: tune again.
+
         Raises:
             UserError: A name is unknown, or a value is out of its range.
         """
+        if not _FORMER_FEATURES.isdisjoint(options):
+            options = {k: v for k, v in options.items() if not k.startswith("refined_")}
         return parse(cls, options, "recovery")
 
     @property
