@@ -10,6 +10,7 @@ setup(
         "dopepp": [
             "py.typed",
             "experiment/results/templates/*",
+            "inference/refinement/verification.json",
             "pretrained/*",
             "robot/grasping/data/*",
             "robot/nodes/share/*",

@@ -229,11 +229,11 @@ class PoseEstimator:
     def min_score(self) -> float:
         """Score from which a candidate is a detection.
 
-        It is the checkpoint's threshold unless :meth:`reporting` has replaced it. Refined poses
-        have a threshold of their own if they have a score of their own.
+        It is the checkpoint's threshold unless :meth:`reporting` has replaced it. Verified poses
+        have a threshold of their own.
         """
-        is_refined = self.refiner is not None and self.recovery.scores_refined
-        return self.recovery.refined_min_score if is_refined else self.recovery.min_score
+        is_verified = self.refiner is not None and self.refiner.verifies
+        return self.recovery.refined_min_score if is_verified else self.recovery.min_score
 
     def reporting(self, min_score: float | None) -> PoseEstimator:
         """Return an estimator with the same network and another threshold.

@@ -51,6 +51,7 @@ _CERTAIN: Final = 1e-3  # Beliefs within this distance of 0 or 1 are treated ali
 _EXPONENTS: Final = 4.0  # Logarithms are clipped beyond this, so that outliers do not dominate
 _TYPICAL_MISFIT: Final = 0.01  # Average reprojection error over the size in the image
 _RIDGE: Final = 0.1  # Weight of the squared weights, in detections, which keeps them finite
+_USUAL_RIDGE: Final = 1.0  # The same for weights that are known beforehand
 _STEPS: Final = 50  # Maximum number of Newton steps
 _MEAN_BELIEF: Final = tuple(float(name == "belief") for name in FEATURES)
 _VERIFIED: Final = 1e-4  # As _CERTAIN, for the probability of a verified pose
@@ -337,10 +338,13 @@ def fit_weights(
     correct = np.asarray(correct, bool)
     if not correct.any() or correct.all():
         raise ValueError("a score needs right and wrong detections to learn from")
-    usual = np.zeros(features.shape[1]) if usual is None else usual
+    if usual is None:
+        usual = np.zeros(features.shape[1])
+        ridge = _RIDGE * np.eye(len(usual))
+        ridge[0, 0] = 0.0  # the share of right detections is well determined
+    else:
+        ridge = _USUAL_RIDGE * np.eye(len(usual))
     weights = usual.copy()
-    ridge = _RIDGE * np.eye(len(weights))
-    ridge[0, 0] = 0.0  # the share of right detections is well determined
     for _ in range(_STEPS):
         predicted = score(features, weights)
         gradient = features.T @ (correct - predicted) - ridge @ (weights - usual)

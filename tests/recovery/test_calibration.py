@@ -10,6 +10,7 @@ from scipy.optimize import minimize
 from scipy.special import expit
 from scipy.stats import chi2
 
+from dopepp.core.errors import UserError
 from dopepp.geometry.camera import camera_matrix, make_transform, project, transform
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.rotation import rotation_vector_to_matrix
@@ -99,29 +100,59 @@ def test_the_covariance_grows_and_the_score_does_not():
 def test_the_covariance_factor_is_that_of_chi_squared():
     drawn = 3.0 * chi2(6).rvs(20_000, random_state=0)
     assert fit_covariance_factor(drawn) == pytest.approx(3.0, rel=0.05)
-    drawn[:500] = 1e9  # wrong detections
-    assert 3.0 < fit_covariance_factor(drawn) < 3.5
     assert fit_covariance_factor(drawn[:0]) == 1.0
 
 
-def test_refined_poses_keep_the_networks_score_until_another_is_fitted():
-    said = [replace(detection(), score=0.2), replace(detection(), score=0.8)]
-    assert [estimate.score for estimate in rescored(said, RecoveryOptions())] == [0.8, 0.2]
-    options = RecoveryOptions(min_score=0.5)
-    assert not options.scores_refined
-    fitted = RecoveryOptions(
-        min_score=0.5, refined_bias=-2.0, refined_score=1.0, refined_agreement=6.0,
-        refined_support=2.0, refined_min_score=0.4,
-    )  # fmt: skip
-    assert fitted.scores_refined
-    assert fitted.unrefined() == RecoveryOptions(min_score=0.5)
+@pytest.mark.parametrize("share", [0.1, 0.4])
+def test_wrong_poses_do_not_raise_the_covariance_factor(share):
+    rng = np.random.default_rng(0)
+    drawn = 2.0 * chi2(6).rvs(400, random_state=0)
+    wrong = rng.random(400) < share
+    drawn[wrong] = 10 ** rng.uniform(1.5, 6.0, wrong.sum())
+    assert np.quantile(drawn, 0.9) / chi2(6).ppf(0.9) > 3.0
+    assert fit_covariance_factor(drawn) == pytest.approx(2.0, rel=0.25)
+
+
+@pytest.mark.parametrize(("factor", "lean"), [(30.0, "too sure"), (0.05, "too unsure")])
+def test_a_covariance_factor_beyond_all_experience_is_refused(factor, lean):
+    with pytest.raises(UserError, match=lean):
+        fit_covariance_factor(factor * chi2(6).rvs(500, random_state=0))
+
+
+def test_a_refined_pose_has_the_probability_of_its_verification():
     judged = [
-        replace(said[0], agreement=0.9, support=0.4),
-        replace(said[1], agreement=None, kept="no"),
+        replace(detection(), score=0.9, probability=0.2),
+        replace(detection(), score=0.3, probability=0.8),
+        replace(detection(), score=0.5),  # not verified
     ]
-    best, last = rescored(judged, fitted)
-    assert (best.agreement, last.agreement) == (0.9, None)
-    assert best.score == pytest.approx(expit(-2 + np.log(0.2 / 0.8) + 6 * 0.9 + 2 * 0.4))
+    scores = [estimate.score for estimate in rescored(judged, RecoveryOptions())]
+    assert scores == pytest.approx([0.8, 0.5, 0.2])
+    fitted = RecoveryOptions(
+        min_score=0.5, refined_bias=-2.0, refined_score=1.0, refined_verification=0.5
+    )
+    assert fitted.unrefined() == RecoveryOptions(min_score=0.5)
+    best = max(rescored(judged, fitted), key=lambda estimate: estimate.score)
+    assert best.score == 0.5
+    recalibrated = rescored(judged[:1], fitted)[0].score
+    assert recalibrated == pytest.approx(expit(-2 + np.log(0.9 / 0.1) + 0.5 * np.log(0.2 / 0.8)))
+
+
+def test_scores_fitted_to_other_features_are_left_out():
+    former = {"min_score": 0.3, "refined_min_score": 0.6, "refined_agreement": 2.0}
+    assert RecoveryOptions.of(former) == RecoveryOptions(min_score=0.3)
+    with pytest.raises(UserError, match="refined_colour"):
+        RecoveryOptions.of({"refined_colour": 1.0})
+
+
+def test_few_refined_poses_hardly_change_the_weights():
+    rng, usual = np.random.default_rng(0), np.array([0.0, 0.0, 1.0])
+    features = np.column_stack([np.ones(4), rng.normal(size=(4, 2))])
+    few = fit_weights(features, np.array([True, False, True, False]), usual)
+    assert few[1] == pytest.approx(0.0, abs=1.5)
+    many = np.column_stack([np.ones(5000), rng.normal(size=(5000, 2))])
+    truth = np.array([-1.0, 0.5, 2.0])
+    fitted = fit_weights(many, rng.random(5000) < score(many, truth), usual)
+    np.testing.assert_allclose(fitted, truth, atol=0.2)
 
 
 def test_missing_keypoints_and_worse_fits_are_seen():

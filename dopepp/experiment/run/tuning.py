@@ -151,7 +151,7 @@ def tune(
     before = _measured(estimator, parts, sources, old)
     new, kept = _chosen_factors(estimator, parts, sources, old)
     new = _tuned_score(_without_refinement(estimator), parts, sources, rate, new)
-    if _verifies(estimator, parts):
+    if estimator.refiner is not None and estimator.refiner.verifies:
         new = _tuned_score(estimator, parts, sources, rate, new)
     after = _measured(estimator, parts, sources, new)
     options = {
@@ -219,11 +219,6 @@ def _audible(options: RecoveryOptions) -> RecoveryOptions:
     return replace(options, min_score=0.0, refined_min_score=0.0)
 
 
-def _verifies(estimator: PoseEstimator, parts: Parts) -> bool:
-    """Return whether the estimator refines, and knows the meshes to verify the refined poses."""
-    return estimator.refiner is not None and all(part.mesh is not None for part in parts)
-
-
 def _measured(
     estimator: PoseEstimator, parts: Parts, sources: _Sources, options: RecoveryOptions
 ) -> Figures:
@@ -232,8 +227,8 @@ def _measured(
     shown, empty = (
         score_images(estimator, parts, source) for source in (sources.test, sources.empty_test)
     )
-    verified = _verifies(estimator, parts)
-    return _figures(shown, empty, options.refined_min_score if verified else options.min_score)
+    estimator.recovery = options
+    return _figures(shown, empty, estimator.min_score)
 
 
 def _without_refinement(estimator: PoseEstimator) -> PoseEstimator:
@@ -304,7 +299,7 @@ def choose(
 
 def score_images(estimator: PoseEstimator, parts: Parts, *sources: SampleSource) -> Scored:
     """Run an estimator over sources and judge every detection."""
-    refined = _verifies(estimator, parts)
+    refined = estimator.refiner is not None and estimator.refiner.verifies
     names = REFINED_FEATURES if refined else FEATURES
     rows: list[tuple[np.ndarray, float, bool, int]] = []
     num_instances = 0

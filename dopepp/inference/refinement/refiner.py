@@ -82,13 +82,15 @@ class Refiner:
             raise UserError(f"refine={refine!r}", allowed, "use only these words")
         self._refiners = {part.name: PartRefiner(part, terms) for part in parts}
         self._cuboids = {part.name: part.cuboid for part in parts}
+        self.verifies = all(part.mesh is not None for part in parts)
+        """Whether refined poses are verified, which needs a mesh of every part."""
 
     def __call__(
         self, detection: Detection, image: Picture, K: CameraMatrix, depth: Depth | None
     ) -> Detection:
         """Return the refined detection, or the given one with the reason why it was kept.
 
-        It has the probability that its pose is right, if the part has a mesh.
+        It has the probability that its pose is right if all parts have a mesh.
         """
         refiner, cuboid = self._refiners[detection.object], self._cuboids[detection.object]
         T_cam_obj, covariance = detection.T_cam_obj, detection.covariance
@@ -112,8 +114,9 @@ class Refiner:
                 agreement=refined.agreement,
                 support=refined.support,
             )
-        if is_tracked or refiner.verifier is None:  # a tracked part keeps its probability
+        if is_tracked or not self.verifies:  # a tracked part keeps its probability
             return end
+        assert refiner.verifier is not None
         moved = Prior(T_cam_obj, np.linalg.inv(covariance)).squared_distance(end.T_cam_obj) ** 0.5
         return replace(end, probability=refiner.verifier.probability(end, image, K, moved))
 

@@ -206,7 +206,8 @@ class Verifier:
         ids = np.full((height, width), -1, np.int32)
         inverse_depth = 1.0 / (at.arms[:, 2] + at.T_cam_obj[2, 3])
         nearest = np.zeros((height, width), np.float32)
-        _draw(at.pixels, inverse_depth, self._mesh.faces, ids, nearest)
+        shown = at.front if self._mesh.is_closed else np.ones_like(at.front)
+        _draw(at.pixels, inverse_depth, self._mesh.faces, shown, ids, nearest)
         return ids
 
     def _shading(
@@ -224,9 +225,8 @@ class Verifier:
         seen = colours.reshape(-1, 3)[inside].astype(np.float64)
         normal_matrix = rows.T @ rows + 1e-3 * len(rows) * np.diag([0.0, 1.0, 1.0, 1.0])
         rest = seen - rows @ np.linalg.solve(normal_matrix, rows.T @ seen)
-        around = colours.reshape(-1, 3)[np.flatnonzero(ring)]
-        total, unexplained = seen.var(axis=0).sum(), (rest**2).mean(axis=0).sum()
-        surroundings = float(around.var(axis=0).sum()) if len(around) else 0.0
+        total, unexplained = seen.var(axis=0).sum(), (rest**2).sum() / len(rest)
+        surroundings = float((cv2.meanStdDev(colours, mask=ring)[1] ** 2).sum())
         residual = 0.5 * math.log((unexplained + NOISE**2) / (surroundings + NOISE**2))
         return float(1 - unexplained / (total + NOISE**2)), residual
 
@@ -292,10 +292,14 @@ def _contrast(colours: Picture, outline: Float[np.ndarray, "points 4"]) -> float
 
 
 @compiled()
-def _draw(pixels: Array, inverse_depth: Array, faces: Array, ids: Array, nearest: Array) -> None:
-    """Write the nearest triangle at each pixel's centre."""
+def _draw(
+    pixels: Array, inverse_depth: Array, faces: Array, shown: Array, ids: Array, nearest: Array
+) -> None:
+    """Write the nearest shown triangle at each pixel's centre."""
     height, width = ids.shape
     for f in range(len(faces)):
+        if not shown[f]:
+            continue
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         ax, ay, bx, by = pixels[a, 0], pixels[a, 1], pixels[b, 0], pixels[b, 1]
         cx, cy = pixels[c, 0], pixels[c, 1]
@@ -306,11 +310,15 @@ def _draw(pixels: Array, inverse_depth: Array, faces: Array, ids: Array, nearest
         last = int(min(height - 1.0, math.floor(max(ay, by, cy))))
         left = int(max(0.0, math.ceil(min(ax, bx, cx))))
         right = int(min(width - 1.0, math.floor(max(ax, bx, cx))))
+        # Weights of the corners are linear over the image.
+        per_area = 1.0 / area
+        a_u, a_v = (by - cy) * per_area, (cx - bx) * per_area
+        b_u, b_v = (cy - ay) * per_area, (ax - cx) * per_area
         za, zb, zc = inverse_depth[a], inverse_depth[b], inverse_depth[c]
         for v in range(first, last + 1):
             for u in range(left, right + 1):
-                wa = ((bx - u) * (cy - v) - (by - v) * (cx - u)) / area
-                wb = ((cx - u) * (ay - v) - (cy - v) * (ax - u)) / area
+                wa = a_u * (u - cx) + a_v * (v - cy)
+                wb = b_u * (u - cx) + b_v * (v - cy)
                 wc = 1.0 - wa - wb
                 if wa < -1e-9 or wb < -1e-9 or wc < -1e-9:
                     continue

@@ -13,6 +13,7 @@ from dopepp.data.sample import Instance, Sample
 from dopepp.experiment.config.run_config import FalsePositiveTarget
 from dopepp.experiment.run.tuning import (
     HIDDEN,
+    LEAST_REFINED_SCORE,
     Hidden,
     Scored,
     choose,
@@ -97,6 +98,7 @@ class Images:
 
 PART = load_part("pivconnector")
 POSE = make_transform(np.eye(3), np.array([0.0, 0.0, 0.5]))
+VERIFIES = SimpleNamespace(verifies=True)
 
 
 def found(T: np.ndarray, certainty: float, shift: float = 0.0) -> Detection:
@@ -149,7 +151,7 @@ def test_the_factors_of_a_network_that_is_too_near_and_too_sure():
     flip = np.diag([-1.0, -1.0, 1.0, 1.0])
     pairs = []
     for number in range(2000):
-        step = 2.0 * deviation * rng.normal(size=6)
+        step = 1.5 * deviation * rng.normal(size=6)
         turn = rotation_vector_to_matrix(step[:3])
         T = make_transform(turn @ POSE[:3, :3], 0.9 * (POSE[:3, 3] + step[3:]))
         item = replace(found(T, 0.9), covariance=np.diag(deviation**2))
@@ -157,19 +159,32 @@ def test_the_factors_of_a_network_that_is_too_near_and_too_sure():
         pairs.append((item, np.array(equivalents[:: -1 if number % 3 == 0 else 1])))
     factors = fit_factors(pairs)
     assert factors["distance_factor"] == pytest.approx(1 / 0.9, rel=0.01)
-    assert factors["covariance_factor"] == pytest.approx(4.0, rel=0.1)
+    assert factors["covariance_factor"] == pytest.approx(2.25, rel=0.1)
     assert fit_factors([]) == {"distance_factor": 1.0, "covariance_factor": 1.0}
 
 
-def test_refined_poses_are_scored_by_their_agreement():
-    sure = replace(found(POSE, 0.3), agreement=0.9, support=0.6)
-    result = score_images(estimator(sure, refiner=True), [PART], Images(POSE))
-    expected = [1.0, np.log(0.3 / 0.7), 0.9, 0.6]
+def test_refined_poses_are_scored_by_their_verification():
+    sure = replace(found(POSE, 0.3), probability=0.9)
+    result = score_images(estimator(sure, refiner=VERIFIES), [PART], Images(POSE))
+    expected = [1.0, np.log(0.3 / 0.7), np.log(0.9 / 0.1)]
     np.testing.assert_allclose(result.features, [expected, expected])
-    kept = score_images(estimator(found(POSE, 0.3), refiner=True), [PART], Images(POSE))
-    assert kept.features[0, 2:].tolist() == [0.0, 0.0]
-    nothing = score_images(estimator(refiner=True), [PART], Images(POSE))
-    assert nothing.features.shape == (0, 4)
+    nothing = score_images(estimator(refiner=VERIFIES), [PART], Images(POSE))
+    assert nothing.features.shape == (0, 3)
+    unverified = estimator(sure, refiner=SimpleNamespace(verifies=False))
+    assert score_images(unverified, [PART], Images(POSE)).features.shape == (2, len(FEATURES))
+
+
+def test_refined_poses_below_even_odds_are_not_reported():
+    rng = np.random.default_rng(0)
+    features = np.column_stack([np.ones(200), rng.normal(size=(200, 2))])
+    correct = rng.random(200) < score(features, np.array([0.0, 0.0, 1.0]))
+    shown = Scored(features, rng.random(200), correct, np.arange(200), 200, 200)
+    nothing = replace(NOTHING, features=np.zeros((0, 3)))
+    assert choose(shown, nothing, refined=True)["refined_min_score"] == LEAST_REFINED_SCORE
+    assert choose(shown, nothing, 1.0, refined=True)["refined_min_score"] == 0.0
+    # Poses that are all right do not say how to weigh the features.
+    same = choose(replace(shown, correct=np.ones(200, bool)), nothing, refined=True)
+    assert [same[f"refined_{name}"] for name in ("bias", "score", "verification")] == [0, 0, 1]
 
 
 def test_scores_of_refined_poses_learn_from_hidden_parts_too():
