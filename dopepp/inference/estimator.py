@@ -275,7 +275,8 @@ class PoseEstimator:
         with self._timed("refine"):
             for detection in detections:
                 if self.max_ms is not None and 1000 * (time.perf_counter() - start) > self.max_ms:
-                    refined.append(replace(detection, kept=f"max_ms={self.max_ms:g} was spent"))
+                    given = replace(detection, kept=f"max_ms={self.max_ms:g} was spent")
+                    refined.append(self.refiner.verified(given, image, K))
                 else:
                     refined.append(self.refiner(detection, image, K, depth))
         return refined

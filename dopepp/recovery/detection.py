@@ -81,7 +81,7 @@ class Detection:
             outline has none. None without refinement.
         probability: Probability that ADD(-S) is below a tenth of the diameter, from the image at
             the refined pose (:mod:`dopepp.inference.refinement.verification`); None without
-            refinement or without a mesh.
+            refinement by region.
     """
 
     object: str

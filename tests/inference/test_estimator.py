@@ -269,7 +269,7 @@ def error(pose):
 def test_refines_with_depth_where_it_is_given(parts_path):
     estimator, rendered = seen(parts_path, "depth")
     detection = estimator.predict(rendered.image, K_VGA, depth=rendered.depth)[0]
-    alone = estimator.predict(rendered.image, K_VGA)[0]
+    alone = estimator.candidates(rendered.image, K_VGA)[0]
     assert error(detection.T_cam_obj) < 0.002 < 0.009 < error(alone.T_cam_obj)
     assert (detection.kept, alone.kept) == ("", "no depth image was given")
     assert_array_equal(
@@ -294,7 +294,10 @@ def test_refines_on_the_picture(parts_path):
     assert_array_equal(
         refined.keypoints, project_keypoints(estimator.cuboids[0], refined.T_cam_obj, K_VGA)
     )
-    alone = estimator.predict(np.full_like(rendered.image, 90), K_VGA)[0]
+    blank = np.full_like(rendered.image, 90)
+    assert estimator.predict(blank, K_VGA) == []
+    alone = estimator.candidates(blank, K_VGA)[0]
+    assert alone.probability == pytest.approx(0.0, abs=0.05)
     assert alone.kept
     assert alone.agreement is None
     assert_allclose(alone.T_cam_obj, TRUE, atol=1e-5)  # the network's
@@ -340,9 +343,10 @@ def test_candidates_below_the_threshold_are_not_reported(checkpoint_path):
 def test_a_refined_pose_has_a_threshold_of_its_own(parts_path):
     estimator, rendered = seen(parts_path, "region", nearer=0.0)
     estimator.recovery = replace(estimator.recovery, min_score=0.2, refined_min_score=0.6)
-    assert estimator.min_score == 0.2  # the network's score
-    estimator.recovery = replace(estimator.recovery, refined_bias=1.0)
     assert estimator.min_score == 0.6
+    unrefined, _ = seen(parts_path, None, nearer=0.0)
+    unrefined.recovery = estimator.recovery
+    assert unrefined.min_score == 0.2
     (candidate,) = estimator.candidates(rendered.image, K_VGA)
     least = float(np.nextafter(candidate.score, 1))
     assert estimator.reporting(least).predict(rendered.image, K_VGA) == []

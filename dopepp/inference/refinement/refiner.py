@@ -82,16 +82,13 @@ class Refiner:
             raise UserError(f"refine={refine!r}", allowed, "use only these words")
         self._refiners = {part.name: PartRefiner(part, terms) for part in parts}
         self._cuboids = {part.name: part.cuboid for part in parts}
-        self.verifies = all(part.mesh is not None for part in parts)
-        """Whether refined poses are verified, which needs a mesh of every part."""
+        self.verifies = "region" in terms
+        """Whether refined poses are verified, from the same evidence as the term ``region``."""
 
     def __call__(
         self, detection: Detection, image: Picture, K: CameraMatrix, depth: Depth | None
     ) -> Detection:
-        """Return the refined detection, or the given one with the reason why it was kept.
-
-        It has the probability that its pose is right if all parts have a mesh.
-        """
+        """Return the refined and verified detection; one that is not refined says why."""
         refiner, cuboid = self._refiners[detection.object], self._cuboids[detection.object]
         T_cam_obj, covariance = detection.T_cam_obj, detection.covariance
         is_tracked = detection.agreement is not None  # set by refinement only
@@ -114,11 +111,23 @@ class Refiner:
                 agreement=refined.agreement,
                 support=refined.support,
             )
-        if is_tracked or not self.verifies:  # a tracked part keeps its probability
+        if is_tracked:  # a tracked part keeps its probability
             return end
-        assert refiner.verifier is not None
         moved = Prior(T_cam_obj, np.linalg.inv(covariance)).squared_distance(end.T_cam_obj) ** 0.5
-        return replace(end, probability=refiner.verifier.probability(end, image, K, moved))
+        return self.verified(end, image, K, moved)
+
+    def verified(
+        self, detection: Detection, image: Picture, K: CameraMatrix, moved: float = 0.0
+    ) -> Detection:
+        """Return a detection with the probability that its pose is right, if poses are verified.
+
+        ``moved`` is the Mahalanobis distance that refinement has moved the pose.
+        """
+        verifier = self._refiners[detection.object].verifier
+        if verifier is None:
+            return detection
+        probability = verifier.probability(detection, image, K, moved)
+        return replace(detection, probability=probability)
 
 
 class PartRefiner:
@@ -135,10 +144,7 @@ class PartRefiner:
     def __init__(self, part: Part, terms: Sequence[str]) -> None:
         self._region: RegionRefiner | None = None
         self.verifier: Verifier | None = None
-        """Verifies refined poses; None without a mesh."""
-        if part.mesh is not None:
-            region = RegionRefiner(part.mesh.vertices, part.mesh.faces)
-            self.verifier = Verifier(region.mesh, part.diameter)
+        """Verifies poses refined on the image; None without the term ``region``."""
         if "region" in terms:
             if part.mesh is None:
                 raise UserError(
@@ -147,7 +153,8 @@ class PartRefiner:
                     f"add --part {part.name}=FILE and its --unit (parts=… in Python), "
                     "or train again",
                 )
-            self._region = region
+            self._region = RegionRefiner(part.mesh.vertices, part.mesh.faces)
+            self.verifier = Verifier(self._region.mesh, part.diameter)
         self._uses_depth, self._diameter = "depth" in terms, part.diameter
         has_surface = self._uses_depth and len(part.points) >= FEWEST_POINTS
         self._surface = surface_points(part.points) if has_surface else None

@@ -50,8 +50,6 @@ EVIDENCE: Final = (
     "outside",  # mean log odds of the colours around it
     "shading",  # share of the variance inside that a linear model of the normals explains
     "residual",  # logarithm of the unexplained deviation inside over that of the surroundings
-    "agreement",  # of the refinement; 0 without
-    "support",  # of the refinement; 0 without
     "moved",  # Mahalanobis distance from the network's pose
     "spread",  # logarithm of the stated deviation of the part's points over a tenth of the diameter
     "size",  # logarithm of the extent on the image over 100 pixels
@@ -125,10 +123,8 @@ class Verifier:
 
         ``moved`` is the Mahalanobis distance of the pose from that before refinement.
         """
-        evidence = self.evidence(
-            image, K, detection.T_cam_obj, detection.covariance, moved,
-            detection.agreement, detection.support,
-        )  # fmt: skip
+        T_cam_obj, covariance = detection.T_cam_obj, detection.covariance
+        evidence = self.evidence(image, K, T_cam_obj, covariance, moved)
         if evidence is None:
             return 0.0
         return float(1 / (1 + np.exp(-learned_model().log_odds(evidence))))
@@ -140,8 +136,6 @@ class Verifier:
         T_cam_obj: Transform,
         covariance: PoseMatrix,
         moved: float,
-        agreement: float | None,
-        support: float | None,
     ) -> Float[np.ndarray, "evidence"] | None:
         """Return the :data:`EVIDENCE` about a pose; None if too little of the part is on the image.
 
@@ -151,8 +145,6 @@ class Verifier:
             T_cam_obj: Pose, metres.
             covariance: Its covariance.
             moved: Mahalanobis distance from the pose before refinement.
-            agreement: Agreement of the refinement, if any.
-            support: Support of the refinement, if any.
         """
         at = posed(self._mesh, T_cam_obj, K)
         if at is None:
@@ -192,8 +184,6 @@ class Verifier:
                 odds[ring.astype(bool)].mean(),
                 explained,
                 residual,
-                agreement or 0.0,
-                support or 0.0,
                 min(moved, 20.0),
                 self._spread(covariance, T_cam_obj),
                 math.log(crop.extent / crop.scale / 100.0),

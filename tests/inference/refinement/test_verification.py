@@ -59,7 +59,7 @@ def evidence(image: np.ndarray, K: np.ndarray, T: Transform, part: Part = PART) 
     """Return the evidence about a pose by name."""
     assert part.mesh is not None
     verifier = Verifier(make_outline_mesh(part.mesh.vertices, part.mesh.faces), part.diameter)
-    values = verifier.evidence(image, K, T, COVARIANCE, 1.0, 0.9, 0.8)
+    values = verifier.evidence(image, K, T, COVARIANCE, 1.0)
     assert values is not None
     assert np.isfinite(values).all()
     return dict(zip(EVIDENCE, values, strict=True))
@@ -87,7 +87,6 @@ def test_a_flat_silhouette_has_an_outline_and_no_creases():
     assert values["crease"] < 0.3
     assert values["creases"] > 0.2  # the box has visible creases, where the picture shows nothing
     assert values["residual"] == pytest.approx(0.0, abs=0.01)  # no deviation on either side
-    assert values["agreement"], values["support"] == (0.9, 0.8)
 
 
 def test_the_extent_is_that_of_the_projected_box():
@@ -119,7 +118,7 @@ def test_the_right_pose_has_more_evidence_than_a_wrong_pose(rendered, step):
     for name in ("outline", "outline_gain", "outline_weakest"):
         assert right[name] > wrong[name] + 0.1
     odds = [learned_model().log_odds(np.array(list(each.values()))) for each in (right, wrong)]
-    assert odds[0] > odds[1] + 2.0
+    assert odds[0] > odds[1] + 1.0
 
 
 def test_a_refined_detection_has_its_probability(rendered):
