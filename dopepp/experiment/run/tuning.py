@@ -29,7 +29,7 @@ from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample, SampleSource
 from dopepp.data.transforms.shading_protocol import shade
 from dopepp.experiment.assembly.build_sources import held_out_source
-from dopepp.experiment.assembly.renders import empty_renders as negative_frames
+from dopepp.experiment.assembly.negative_frames import negative_frames
 from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.config.run_config import FalsePositiveTarget
 from dopepp.geometry.cuboid import CENTROID
