@@ -297,7 +297,7 @@ def test_refines_on_the_picture(parts_path):
     blank = np.full_like(rendered.image, 90)
     assert estimator.predict(blank, K_VGA) == []
     alone = estimator.candidates(blank, K_VGA)[0]
-    assert alone.probability == pytest.approx(0.0, abs=0.05)
+    assert alone.probability < 0.1
     assert alone.kept
     assert alone.agreement is None
     assert_allclose(alone.T_cam_obj, TRUE, atol=1e-5)  # the network's
