@@ -29,7 +29,7 @@ from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample, SampleSource
 from dopepp.data.transforms.shading_protocol import shade
 from dopepp.experiment.assembly.build_sources import held_out_source
-from dopepp.experiment.assembly.negative_frames import negative_frames
+from dopepp.experiment.assembly.negative_frames import LOOKALIKES, negative_frames
 from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.config.run_config import FalsePositiveTarget
 from dopepp.geometry.cuboid import CENTROID
@@ -89,8 +89,17 @@ class Scored:
     scores: Float[np.ndarray, "n"]
     correct: Bool[np.ndarray, "n"]
     image: np.ndarray
-    num_images: int
+    kinds: Sequence[str]  # of each image, by source
     num_instances: int
+
+    @property
+    def num_images(self) -> int:
+        """Number of images."""
+        return len(self.kinds)
+
+    def shows_lookalikes(self) -> Bool[np.ndarray, "images"]:
+        """Return which images show look-alikes of the objects."""
+        return np.array([kind == LOOKALIKES for kind in self.kinds], bool)
 
     def loudest(self, scores: Float[np.ndarray, "n"]) -> Float[np.ndarray, "images"]:
         """Return the best score in every image; 0 without a detection."""
@@ -106,10 +115,15 @@ class Scored:
 
 @dataclass(frozen=True)
 class Figures:
-    """Quality of scores and threshold; recall and precision are those of the reported poses."""
+    """Quality of scores and threshold; recall and precision are those of the reported poses.
+
+    The rates are shares of the images without objects, and of those with look-alikes, on which
+    something is reported.
+    """
 
     calibration_error: float
     false_positive_rate: float
+    lookalike_rate: float
     recall: float
     precision: float
 
@@ -265,6 +279,9 @@ def choose(
 ) -> dict[str, float]:
     """Choose weights and threshold from detections in images with and without objects.
 
+    Look-alikes teach the weights, but do not raise the threshold: it would have to exclude most
+    poses of the objects.
+
     Few refined poses change the verification little, and poses that are all correct not at all.
 
     Raises:
@@ -286,8 +303,9 @@ def choose(
         )
     else:
         weights = fit_weights(features, correct, usual)
-    loudest = np.sort(empty.loudest(score(empty.features, weights)))[::-1]
-    allowed = int(false_positive_rate * empty.num_images)
+    loudest = empty.loudest(score(empty.features, weights))[~empty.shows_lookalikes()]
+    loudest = np.sort(loudest)[::-1]
+    allowed = int(false_positive_rate * len(loudest))
     # A score equal to the threshold passes, so it lies just above the first rejected score.
     threshold = float(np.nextafter(loudest[allowed], 1.0)) if allowed < len(loudest) else 0.0
     names = ["min_score", *(f"score_{feature}" for feature in FEATURES)]
@@ -302,8 +320,9 @@ def score_images(estimator: PoseEstimator, parts: Parts, *sources: SampleSource)
     refined = estimator.refiner is not None and estimator.refiner.verifies
     names = REFINED_FEATURES if refined else FEATURES
     rows: list[tuple[np.ndarray, float, bool, int]] = []
-    num_instances = 0
+    num_instances, kinds = 0, {}
     for number, sample, part, detections, true in _by_object(estimator, parts, *sources):
+        kinds[number] = sample.source
         num_instances += sum(map(counted, true))
         right, judged = _judge(part, detections, true)
         for detection, is_right in zip(compress(detections, judged), right[judged], strict=True):
@@ -318,7 +337,7 @@ def score_images(estimator: PoseEstimator, parts: Parts, *sources: SampleSource)
         np.array(scores, np.float64),
         np.array(correct, bool),
         np.array(images, np.int64),
-        sum(map(len, sources)),
+        list(kinds.values()),
         num_instances,
     )
 
@@ -402,7 +421,11 @@ def _figures(test: Scored, empty: Scored, threshold: float) -> Figures:
     reported = test.scores >= threshold
     right = float((test.correct & reported).sum())
     recall, precision = right / max(test.num_instances, 1), right / max(int(reported.sum()), 1)
-    return Figures(error, float(loud.mean()), recall, precision)
+    alike = empty.shows_lookalikes()
+    elsewhere, lookalike = (
+        float(loud[shown].sum()) / max(shown.sum(), 1) for shown in (~alike, alike)
+    )
+    return Figures(error, elsewhere, lookalike, recall, precision)
 
 
 class Memory:

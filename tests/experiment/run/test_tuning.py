@@ -33,7 +33,12 @@ from dopepp.recovery.detection import FEATURES, Detection, score
 
 K = camera_matrix(300, 300, 64, 64)
 NOTHING = Scored(
-    np.zeros((0, len(FEATURES))), np.zeros(0), np.zeros(0, bool), np.zeros(0, int), 100, 0
+    np.zeros((0, len(FEATURES))),
+    np.zeros(0),
+    np.zeros(0, bool),
+    np.zeros(0, int),
+    ["photos"] * 100,
+    0,
 )
 
 
@@ -44,7 +49,7 @@ def scored(seed: int, count: int, right: bool = True) -> Scored:
     truth = score(features, np.array([0.0, 2.0, -1.0, -0.5, 0.0]))
     correct = (rng.random(count) < truth) & right
     image = rng.permutation(count)
-    return Scored(features, rng.random(count), correct, image, count, count)
+    return Scored(features, rng.random(count), correct, image, ["photos"] * count, count)
 
 
 def test_chosen_scores_are_calibrated_and_silent_on_other_images():
@@ -174,11 +179,21 @@ def test_refined_poses_are_scored_by_their_verification():
     assert score_images(unverified, [PART], Images(POSE)).features.shape == (2, len(FEATURES))
 
 
+def test_look_alikes_do_not_raise_the_threshold():
+    shown, empty = scored(8, 500), scored(9, 100, right=False)
+    alike = replace(empty, kinds=["look-alikes" if k % 2 else "photos" for k in range(100)])
+    options = choose(shown, alike, 0.0)
+    weights = np.array([options[f"score_{name}"] for name in FEATURES])
+    loudest = empty.loudest(score(empty.features, weights))
+    assert np.nextafter(loudest[::2].max(), 1.0) == options["min_score"]
+    assert alike.shows_lookalikes().sum() == 50
+
+
 def test_refined_poses_below_even_odds_are_not_reported():
     rng = np.random.default_rng(0)
     features = np.column_stack([np.ones(200), rng.normal(size=(200, 2))])
     correct = rng.random(200) < score(features, np.array([0.0, 0.0, 1.0]))
-    shown = Scored(features, rng.random(200), correct, np.arange(200), 200, 200)
+    shown = Scored(features, rng.random(200), correct, np.arange(200), ["photos"] * 200, 200)
     nothing = replace(NOTHING, features=np.zeros((0, 3)))
     assert choose(shown, nothing, refined=True)["refined_min_score"] == LEAST_REFINED_SCORE
     assert choose(shown, nothing, 1.0, refined=True)["refined_min_score"] == 0.0
