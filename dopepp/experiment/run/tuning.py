@@ -63,9 +63,9 @@ from dopepp.recovery.detection import (
     score,
 )
 
-LEAST_REFINED_SCORE: Final = 0.5
-"""Lowest threshold of refined poses: a pose that is more likely wrong than right is not reported,
-however quiet the pictures without the objects are."""
+LEAST_REFINED_SCORE: Final = 0.3
+"""Lowest threshold of refined poses: a pose that is far more likely wrong than right is not
+reported, however quiet the pictures without the objects are."""
 
 SAME: Final = 0.005  # average precision that fitted options may lose
 
