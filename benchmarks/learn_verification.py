@@ -30,7 +30,7 @@ from dopepp.inference.refinement.outline import make_outline_mesh
 from dopepp.inference.refinement.refiner import LOOSER
 from dopepp.inference.refinement.region import RegionRefiner
 from dopepp.inference.refinement.solver import Prior
-from dopepp.inference.refinement.verification import EVIDENCE, Model, Verifier
+from dopepp.inference.refinement.verification import EVIDENCE, VerificationModel, Verifier
 from dopepp.metrics.functional import add, add_s
 from dopepp.parts.part import Mesh, Part, make_part
 from dopepp.virtual.backgrounds import find_backgrounds
@@ -225,7 +225,7 @@ def errors(
     return float(add(*R_t, points)) / diameter, float(add_s(*R_t, points)) / diameter
 
 
-def fit(inputs: np.ndarray, labels: np.ndarray, seed: int = 0) -> Model:
+def fit(inputs: np.ndarray, labels: np.ndarray, seed: int = 0) -> VerificationModel:
     """Learn the model by maximum likelihood; it is monotone in what is evidence for or against.
 
     Real pictures have weaker creases and less regular shading than renders, so both are weakened
@@ -266,7 +266,7 @@ def fit(inputs: np.ndarray, labels: np.ndarray, seed: int = 0) -> Model:
     learned = (
         array.detach().double().numpy() for array in (weights()[0], shifts, weights()[1], bias)
     )
-    return Model(mean, scale, *learned)
+    return VerificationModel(mean, scale, *learned)
 
 
 def main() -> None:
@@ -315,7 +315,7 @@ def main() -> None:
     print(f"written: {path}")
 
 
-def report(model: Model, inputs: np.ndarray, labels: np.ndarray) -> None:
+def report(model: VerificationModel, inputs: np.ndarray, labels: np.ndarray) -> None:
     """Print the quality on parts that were not learned, and what each feature is worth alone."""
     probability = 1 / (1 + np.exp(-model.log_odds(inputs)))
     print(f"{len(labels)} poses, {labels.mean():.1%} right")

@@ -68,7 +68,7 @@ SECTORS: Final = 8
 FEWEST_POINTS: Final = 12  # of the outline on the image
 
 
-class Model(NamedTuple):
+class VerificationModel(NamedTuple):
     """A network of one hidden layer, and how its inputs are normalised."""
 
     mean: Float[np.ndarray, "evidence"]
@@ -87,14 +87,14 @@ class Model(NamedTuple):
 
 
 @cache
-def learned_model() -> Model:
+def learned_model() -> VerificationModel:
     """Return the model in the package."""
     path = files("dopepp.inference.refinement").joinpath("verification.json")
     values: dict[str, Any] = json.loads(path.read_text("utf-8"))
     if tuple(values["evidence"]) != EVIDENCE:
         raise ValueError(f"{path} was learned from other evidence: run {values['command']}")
-    arrays = [np.array(values[name]) for name in Model._fields]
-    return Model(*arrays)
+    arrays = [np.array(values[name]) for name in VerificationModel._fields]
+    return VerificationModel(*arrays)
 
 
 class Verifier:
