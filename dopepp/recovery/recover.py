@@ -211,7 +211,7 @@ def _rejected(
     best, text, points = float(np.nan_to_num(group.score[CENTROID])), result.reason, group.position
     if detection is not None:
         kind, best, points = "score", detection.score, detection.keypoints
-        text = f"score {best:.3f} below {options.min_score:g}"
+        text = f"score {best:.3f} below {options.min_score:.3g}"
     points = points[np.isfinite(points).all(1)]
     extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
     if len(points) >= 2 and extent < LEAST_CELLS * stride:
@@ -224,7 +224,7 @@ def _rejected(
 
 def rejected_refined(detection: Detection, least: float) -> Reason:
     """Return why a refined detection was dropped."""
-    text = f"once refined, score {detection.score:.3f} below {least:g}"
+    text = f"once refined, score {detection.score:.3f} below {least:.3g}"
     text += f" ({detection.kept})" if detection.kept else ""
     return Reason(detection.object, "refined", detection.score, text)
 
