@@ -47,7 +47,7 @@ def check_dataset(root: Path) -> CheckReport:
     )
     if not root.is_dir():
         fix = "pass the folder of the data set"
-        raise UserError(f"{root}, which is no folder", allowed, fix)
+        raise UserError(f"{root}, which is not a folder", allowed, fix)
     layout = _layout_of(root)
     if layout in (None, "NDDS"):  # NDDS includes annotations of all subfolders
         _refuse_parent(root, layout)

@@ -1,8 +1,8 @@
 """Parsers of camera files: named fields (ROS, OpenCV, BOP, NDDS), COLMAP and plain numbers.
 
 The content determines the format, not the suffix. Every function returns a :class:`Calibration`,
-whose lens the caller checks. Files may come from anybody, so none is passed to ``cv2.FileStorage``,
-which is C++.
+whose lens the caller checks. Files are not trusted, so none is passed to the C++ parser
+``cv2.FileStorage``.
 
 To support another format of named fields, add its names to :func:`calibration_of_fields`; for any
 other format, add a function and call it in :func:`parse_calibration`.
@@ -95,7 +95,7 @@ def _colmap(lines: Sequence[Sequence[str]], source: str) -> Calibration:
         raise UserError(f"{source}: camera model {model:.40}", allowed, _UNDISTORT)
     values = _floats(rest)
     if values is None or len(values) != 2 + _COLMAP_MODELS[model]:
-        allowed = f"WIDTH HEIGHT and {_COLMAP_MODELS[model]} numbers behind {model}"
+        allowed = f"WIDTH HEIGHT and {_COLMAP_MODELS[model]} numbers after {model}"
         fix = "export the cameras from COLMAP again"
         raise UserError(f"{source}: {' '.join(rest)!r:.100}", allowed, fix)
     width, height, fx, *values = values

@@ -205,7 +205,7 @@ def network_views(
         roi: Region to process (default: the whole image).
 
     Raises:
-        UserError: The region leaves the image, or the distances are no range of metres.
+        UserError: The region extends beyond the image, or the distances are not a range of metres.
     """
     x, y = 0, 0
     if roi is not None:

@@ -231,7 +231,7 @@ class PoseTracker:
         return [track for track in tracks if track.detection.score >= self.estimator.min_score]
 
     def _is_doubtful(self, state: _State) -> bool:
-        """Return whether the network has to search a part on this frame."""
+        """Return whether the network has to search for a part on this frame."""
         unsure = _agreement(state.track.detection) < SURE and self._frame % OFTEN == 0
         return bool(unsure or state.unseen or state.doubts or state.disagreements)
 

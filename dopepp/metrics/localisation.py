@@ -34,7 +34,7 @@ from dopepp.metrics.row import bop_points, symmetry_transforms
 from dopepp.parts.part import Part
 
 Draw = Callable[[Part, Transform, CameraMatrix, Size], DepthMap]
-"""Renders the depth of a single part, metres, 0 beside the part."""
+"""Renders the depth of a single part, metres, 0 outside the part."""
 
 _STRICT: Final = 0.1  # Threshold of ADD(-S), diameters
 

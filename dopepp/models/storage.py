@@ -176,7 +176,7 @@ def check_container(path: Path, what: str) -> int:
 
 def _check_file(path: Path, what: str) -> None:
     if not path.is_file():
-        raise UserError(f"{path}, which is no file", what, "pass the path of an existing file")
+        raise UserError(f"{path}, which is not a file", what, "pass the path of an existing file")
 
 
 def _check_archive(path: Path) -> None:

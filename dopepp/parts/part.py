@@ -1,6 +1,6 @@
 """A part: a rigid object with its mesh, size, cuboid and symmetries, all in metres.
 
-A record is the plain mapping of a part in a file. Files may come from anybody, so
+A record is the plain mapping of a part in a file. Files are not trusted, so
 :meth:`Part.from_record` checks every field.
 """
 

@@ -148,8 +148,8 @@ class Footprint:
 
     Attributes:
         bottom: Height of the underside above the lowest point, metres; the minimum of a cell and
-            its eight neighbours, to cover the space between centres; infinite beside the object.
-        top: Height of the upper side above the lowest point, metres; −infinite beside the object.
+            its eight neighbours, to cover the space between centres; infinite outside the object.
+        top: Height of the upper side above the lowest point, metres; −infinite outside the object.
         corner: x and y of the first cell's centre relative to the object's origin, in cells.
     """
 
@@ -228,7 +228,7 @@ class HeightMap:
 def _greatest(
     x: Column, y: Column, values: Column, surface: Surface, faces: Faces, corner: Cell, shape: Shape
 ) -> Float32[np.ndarray, "rows columns"]:
-    """Return 1 + the greatest value at every cell's centre, 0 beside the object."""
+    """Return 1 + the greatest value at every cell's centre, 0 outside the object."""
     # The rasteriser keeps the greatest 1/z and interpolates it linearly over the image. A vertex at
     # column x and row y with z = 1/(1 + value) therefore maps any linear value in [0, 1].
     z = 1.0 / (1.0 + values)

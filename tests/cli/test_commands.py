@@ -192,7 +192,7 @@ def test_a_wrong_render_option_is_one_line_and_code_2(refused, arguments, messag
         (["render", "--out", "x", "-n", "5"], "Missing argument"),
         (["render", "servoholder", "-n", "5"], "Missing option '--out'"),
         (["rendr"], "No such command 'rendr'"),
-        (["check", "/nowhere"], "got /nowhere, which is no folder"),
+        (["check", "/nowhere"], "got /nowhere, which is not a folder"),
         (["download", "coco"], "got unknown data set 'coco'; allowed: voc2007"),
     ],
 )

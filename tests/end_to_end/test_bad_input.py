@@ -87,7 +87,7 @@ def absent(path: Path, good: Path) -> None:
     [
         (hostile_pickle, "ckpt_path", "which torch refuses to load"),
         (hostile_pickle, "init_from", "which torch refuses to load"),
-        (absent, "baseline", "which is no file"),
+        (absent, "baseline", "which is not a file"),
     ],
 )
 def test_a_file_that_is_no_checkpoint(write, place, expected, trained, call, train, tmp_path):

@@ -221,7 +221,7 @@ BAD = {
     "fisheye in OpenCV": (OPENCV_2.replace("model: 0", "model: 1"), "fisheye_model=1"),
     "fisheye in COLMAP": (COLMAP.format("FOV 640 480 600 600 320 240 1"), "camera model FOV"),
     "two cameras": (COLMAP.format("PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1"), "2 cameras ("),
-    "too few": (COLMAP.format("PINHOLE 640 480 600 320 240"), "4 numbers behind PINHOLE"),
+    "too few": (COLMAP.format("PINHOLE 640 480 600 320 240"), "4 numbers after PINHOLE"),
     "stereo": ("M1: [1, 0, 1, 0, 1, 1, 0, 0, 1]\nM2: [1]", "without camera_matrix (it has M1, M2)"),
     "two messages": (ECHOED + ECHOED, "single document"),
     "no height": (ROS.replace("image_height: 480", ""), "without image_height"),

@@ -139,7 +139,7 @@ def test_a_file_that_is_no_torch_file_or_was_cut_short(saved, content):
     with pytest.raises(UserError, match="not a torch file or was cut short"):
         read(saved)
     saved.unlink()
-    with pytest.raises(UserError, match=r"which is no file; allowed: a checkpoint \(\.ckpt\)"):
+    with pytest.raises(UserError, match=r"which is not a file; allowed: a checkpoint \(\.ckpt\)"):
         read(saved)
 
 

@@ -34,7 +34,7 @@ class BackgroundCrops:
     """Draws crops of an image that show no object.
 
     Args:
-        image: RGB, without padding, which is no background.
+        image: RGB, without padding, as padding is not background.
         silhouettes: Pixels of each object, which no crop contains.
     """
 

@@ -225,7 +225,7 @@ def _levels(
     numbers: list[float] = [n for n in levels if isinstance(n, int | float) and type(n) is not bool]
     wrong = len(numbers) < len(levels) or not all(bounds[0] <= n <= bounds[1] for n in numbers)
     if wrong or (given is not None and set(numbers) <= {usual}):
-        raise UserError(f"{option}={given!r:.100}", allowed, f"set {option} to such numbers")
+        raise UserError(f"{option}={given!r:.100}", allowed, f"set {option} to a list of these")
     return tuple(sorted({float(level) for level in numbers if level != usual}))
 
 

@@ -296,7 +296,7 @@ def open_study(options: Mapping[str, Any], facts: Mapping[str, str], seed: int) 
         seed: Seed of the sampler; resumed studies use a different state.
 
     Raises:
-        UserError: The study was created with other facts, or its storage cannot be opened.
+        UserError: The study was created with other options, or its storage cannot be opened.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     name = str(options["study"])

@@ -178,7 +178,7 @@ class Bag(FrameSource):
                 continue
             try:
                 image = decode_image(message)
-            except Exception as error:  # anything, as anybody may have written the message
+            except Exception as error:  # any error, as messages are not trusted
                 raise self._unreadable(f"picture {number} of {self.topic}: {error}") from error
             yield CameraFrame(image, self.name, number, seconds)
 

@@ -111,7 +111,7 @@ class ExportedNetwork(ABC):
         """
         try:
             belief, field = self.run(images.contiguous().numpy())
-        except Exception as error:  # any error of the runtime, as anybody may have written the file
+        except Exception as error:  # any error of the runtime, as the file is not trusted
             raise invalid_export(self.path, error) from error
         count, _, height, width = images.shape
         cells = height // self.stride, width // self.stride
@@ -215,7 +215,7 @@ def unpack(text: str | None, path: Path) -> tuple[Checkpoint, Export]:
     """Read the description in a file's metadata without building anything.
 
     Args:
-        text: Description, which anybody may have written; None if the file has none.
+        text: Description, not trusted; None if the file has none.
         path: File, for messages.
 
     Raises:

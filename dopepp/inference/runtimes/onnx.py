@@ -45,7 +45,7 @@ _ERRORS_ONLY: Final = 3
 
 
 def read_network(path: Path) -> OnnxNetwork:
-    """Read a file that anybody may have written; :func:`check_model` states what is rejected."""
+    """Read an ONNX export. The file is not trusted; :func:`check_model` lists what is rejected."""
     for package in ("onnx", "onnxruntime"):
         require(package, str(path), "onnx")
     import onnx

@@ -55,7 +55,7 @@ def load_openvino(choice: str) -> Any:
 
 
 def read_network(path: Path) -> OpenVinoNetwork:
-    """Read a folder that anybody may have written, or the XML in it.
+    """Read an OpenVINO export, given as a folder or as its XML file. The files are not trusted.
 
     Raises:
         UserError: A file is missing, damaged or too large, the XML has content that ``dopepp

@@ -300,7 +300,7 @@ def vsd(
     them only, or if the two distances from the camera differ by at least the tolerance.
 
     Args:
-        depth_est: Rendered depth at the estimated pose, metres along z, 0 beside the object.
+        depth_est: Rendered depth at the estimated pose, metres along z, 0 outside the object.
         depth_gt: Rendered depth at the true pose, metres.
         depth: Depth of the depth camera, metres, 0 without a measurement (surfaces are visible).
         K: Camera matrix, pixels.

@@ -136,7 +136,9 @@ def check_poses(
         ):
             if consistency(rows, seen, mount).is_right:
                 problem = f"{poses.source}: the poses fit the {which} picture"
-                fix = "shift the list of poses by one, or add a column `name` with the pictures"
+                fix = (
+                    "shift the list of poses by one, or name each pose's picture in a column `name`"
+                )
                 raise UserError(problem, "poses in the order of the pictures", fix)
     raise UserError(
         f"{poses.source}: rotations of robot and camera differ by "

@@ -322,7 +322,7 @@ class Pace:
 
 
 def native(kind: str, fields: Fields) -> Any:
-    """Return the ROS 2 message of plain values. Missing fields are 0 or empty."""
+    """Return a ROS 2 message with these values. Missing fields are 0 or empty."""
     return _fill(type_of(kind)(), fields)
 
 

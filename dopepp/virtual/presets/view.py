@@ -48,7 +48,7 @@ class View:
         source: Origin of the camera, for messages.
 
     Raises:
-        UserError: K does not fit the picture size, or the distances are no range.
+        UserError: K does not fit the picture size, or the distances are not a range.
     """
 
     size: Size

@@ -73,7 +73,7 @@ def test_a_full_disk_leaves_the_old_file_and_nothing_else(monkeypatch, tmp_path)
         ({"layout": "openvino", "out": Path("a.xml")}, "allowed: a folder"),
         ({"layout": "openvino", "out": Path("full")}, "where something else exists"),
         ({"path": Path("a.onnx")}, "which is an export; allowed: a checkpoint"),
-        ({"path": Path("none.ckpt")}, "which is no file"),
+        ({"path": Path("none.ckpt")}, "which is not a file"),
     ],
 )
 def test_wrong_options(options, message, tmp_path, monkeypatch):

@@ -264,7 +264,7 @@ def _scene_folders(root: Path, split: str) -> list[Path]:
     if not (root / split).is_dir():
         splits = sorted({path.parent.parent.name for path in root.glob("*/*/scene_camera.json")})
         raise UserError(
-            f"{root / split}, which is no folder",
+            f"{root / split}, which is not a folder",
             f"one of {splits}" if splits else "a BOP data set's folder with its splits",
             "set data.root or data.image_sets to this folder; without labelled images, train on "
             "renders of the models with data=bop_renders",

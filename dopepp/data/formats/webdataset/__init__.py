@@ -181,7 +181,7 @@ def _refusal(info: tarfile.TarInfo, archive_size: int) -> str:
         return f"of {info.size / 1e6:,.0f} MB"
     if info.offset_data + info.size > archive_size:
         return "within which the archive is cut short"
-    return "" if key and dot else "which is no KEY.EXTENSION"
+    return "" if key and dot else "which is not KEY.EXTENSION"
 
 
 def field_of(extension: str) -> str | None:

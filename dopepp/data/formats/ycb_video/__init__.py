@@ -28,7 +28,7 @@ def read_classes(root: Path) -> list[str]:
     """Return the names in ``image_sets/classes.txt``; a class index is the line number from 1."""
     path = root / "image_sets" / "classes.txt"
     for is_there, lack in (
-        (root.is_dir(), "is no folder"),
+        (root.is_dir(), "is not a folder"),
         ((root / "data").is_dir(), "has no data/"),
         (path.is_file(), "has no image_sets/classes.txt"),
     ):

@@ -141,7 +141,7 @@ def draw_alone(
     """Draw an object alone at a box's pixel centres, also beyond the image.
 
     Returns:
-        Inverse depth (1/m, 0 beside the object) and triangles (undefined beside the object).
+        Inverse depth (1/m, 0 outside the object) and triangles (undefined outside the object).
     """
     left, top, right, bottom = box
     canvas = np.zeros((max(bottom - top, 0), max(right - left, 0), 1), np.float32)

@@ -314,7 +314,9 @@ def test_what_contradicts_an_image_is_named(scene, block):
 
 
 def test_wrong_folders_are_named(scene, tmp_path, block):
-    with pytest.raises(UserError, match=r"train_pbr, which is no folder; allowed: one of \['test"):
+    with pytest.raises(
+        UserError, match=r"train_pbr, which is not a folder; allowed: one of \['test"
+    ):
         BopReader(scene.root, [block(2)], "train_pbr")
     (tmp_path / "empty" / "test").mkdir(parents=True)
     with pytest.raises(UserError, match="which has no scene"):

@@ -151,7 +151,7 @@ def test_hostile_members_are_refused(tmp_path, write_shard):
     refused("two members for its image", [*good, ("000000_000000.rgb.png", b"x")])
     refused("000000_000000 without rgb", good[:-1])
     refused("000000_000000 without camera", good[1:])
-    refused("no KEY.EXTENSION", [*good, ("README", b"x")])
+    refused("which is not KEY.EXTENSION", [*good, ("README", b"x")])
 
 
 def test_truncated_damaged_and_oversized_archives_are_refused(tmp_path, write_shard):

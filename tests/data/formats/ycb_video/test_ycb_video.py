@@ -126,7 +126,7 @@ def test_hull_areas_against_trimesh_and_shapes():
 
 
 def test_root_that_is_missing_or_wrong(tmp_path, ycb_tree, box):
-    with pytest.raises(UserError, match=r"which is no folder.*set data\.root"):
+    with pytest.raises(UserError, match=r"which is not a folder.*set data\.root"):
         YcbVideoReader(tmp_path / "nowhere", [box], "train")
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match=r"empty, which has no data/.*a YCB-Video folder"):
