@@ -159,9 +159,7 @@ def measure(
             (network, estimator), (BLUE, YELLOW), errors, strict=True
         ):
             detections = method.predict(image, K)
-            for detection, number in zip(
-                detections, assign(part.cuboid[CENTROID], detections, shown), strict=True
-            ):
+            for detection, number in zip(detections, assign(part, detections, shown), strict=True):
                 kept += bool(detection.kept)
                 frames.append(
                     Wireframe(

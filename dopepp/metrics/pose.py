@@ -22,13 +22,15 @@ from dopepp.core.errors import UserError
 from dopepp.drawing.curves import accuracy_figure
 from dopepp.geometry.camera import CameraMatrix, Transform, transform
 from dopepp.geometry.cuboid import CENTROID
-from dopepp.geometry.rotation import Vector
 from dopepp.metrics.functional import average_precision, match
 from dopepp.metrics.references import REFERENCES, reference_rows
 from dopepp.metrics.row import PoseErrors, PoseRow, mean_row, summarise
 from dopepp.parts.part import Part
 
 MEAN: Final = "mean"
+
+MAX_MATCHING_RADIUS: Final = 0.1
+"""Largest matching radius of any part, metres."""
 
 MIN_VISIBLE_FRACTION: Final = 0.1
 """Smallest visible share of the silhouette of an evaluated instance."""
@@ -86,16 +88,24 @@ class TruePose(Protocol):
         """Whether a list of targets names the instance; None without a list."""
 
 
+def matching_radius(part: Part) -> float:
+    """Return the largest distance between the centres of a detection and its instance, metres.
+
+    The radius is half of the part's diameter, and at most :data:`MAX_MATCHING_RADIUS`.
+    """
+    return min(MAX_MATCHING_RADIUS, float(part.diameter) / 2)
+
+
 def assign(
-    centre: Vector, detections: Sequence[PredictedPose], instances: Sequence[TruePose]
+    part: Part, detections: Sequence[PredictedPose], instances: Sequence[TruePose]
 ) -> Int[np.ndarray, "detections"]:
     """Match the detections of one object in one image with its instances.
 
-    The positions of the cuboid's centre are matched (:func:`~dopepp.metrics.functional.match`),
-    first with evaluated instances, then with hidden ones.
+    The positions of the cuboid's centre are matched (:func:`~dopepp.metrics.functional.match`)
+    within :func:`matching_radius`, first with evaluated instances, then with hidden ones.
 
     Args:
-        centre: Centre of the object's cuboid, object frame, metres.
+        part: The object.
         detections: Detections of the object.
         instances: Instances of the object.
 
@@ -104,6 +114,7 @@ def assign(
     """
     # An infinite pose would warn (infinity times zero); as NaN throughout, it matches nothing.
     estimates = [np.asarray(d.T_cam_obj, np.float64) for d in detections]
+    centre, radius = part.cuboid[CENTROID], matching_radius(part)
     predicted = [transform(np.where(np.isfinite(T), T, np.nan), centre) for T in estimates]
     true = [transform(np.asarray(i.T_cam_obj, np.float64), centre) for i in instances]
     offsets = np.reshape(predicted, (-1, 1, 3)) - np.reshape(true, (1, -1, 3))
@@ -113,7 +124,7 @@ def assign(
     assigned = np.full(len(detections), -1)
     for group in (counts, ~counts):
         left, numbers = np.flatnonzero(assigned < 0), np.flatnonzero(group)
-        matches = match(scores[left], distances[left][:, numbers]).numpy()
+        matches = match(scores[left], distances[left][:, numbers], radius).numpy()
         hit = matches >= 0
         assigned[left[hit]] = numbers[matches[hit]]
     return assigned
@@ -190,7 +201,7 @@ class PoseMetrics(Metric):
         for index, part in enumerate(self.parts.values()):
             candidates = [d for d in detections if d.object == part.name]
             true = [i for i in instances if i.label == part.name]
-            assigned = assign(part.cuboid[CENTROID], candidates, true)
+            assigned = assign(part, candidates, true)
             table = np.full((len(true), _WIDTH), np.nan)
             table[:, 0], table[:, _CAMERA] = index, camera
             for row, instance in zip(table, true, strict=True):
@@ -297,6 +308,7 @@ class Gathered:
             row = summarise(self.part.name, method, errors)
             matched = int(errors.add.isfinite().sum())
             row.miss_rate = 1 - matched / len(errors.add)
+            row.matching_radius = matching_radius(self.part)
             row.precision = matched / max(matched + num_false, 1)
             row.average_precision = self._average_precision(0.1 * self.part.diameter)
         row.false_positives = num_false

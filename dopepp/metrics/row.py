@@ -150,6 +150,7 @@ class PoseRow:
         ar_mspd: BOP's average recall of MSPD; None if an image's camera is unknown.
         median_deviations: Median ratio of the true errors to the stated standard deviations, 1 if
             they are calibrated; None without covariances.
+        matching_radius: Largest distance of a match (:func:`~dopepp.metrics.pose.matching_radius`).
         miss_rate: Share of instances without a matched prediction.
         average_precision: AP over the scores, correct with ADD below a tenth of the diameter.
         precision: TP / (TP + FP); 0 without predictions.
@@ -173,6 +174,7 @@ class PoseRow:
     p90_rotation_deg: float | None = None
     p90_translation: float | None = None
     median_deviations: float | None = None
+    matching_radius: float | None = None
     miss_rate: float | None = None
     precision: float | None = None
     false_positives: int | None = None
@@ -291,6 +293,7 @@ COLUMNS: Final[tuple[Column, ...]] = (
     Column("p90_rotation_deg", "rotation 90 % °", 1, 1, "median", _p90("rotation_deg")),
     Column("p90_translation", "translation 90 % mm", 1000, 1, "median", _p90("translation")),
     Column("median_deviations", "error / stated", 1, 1, "median", _median("deviations")),
+    Column("matching_radius", "matching radius mm", 1000, 1, "detection"),
     Column("miss_rate", "missed %", 100, 1, "detection"),
     Column("average_precision", "AP[ADD-0.1d] %", 100, 1, "detection"),
     Column("precision", "precision %", 100, 1, "detection"),

@@ -95,6 +95,7 @@ def test_rows_agree_with_the_functions():
     row = metric.compute()["box"]
     assert row == replace(
         PoseRow("box", "estimate", 30, precision=1.0, miss_rate=0.0, false_positives=0),
+        matching_radius=0.06,
         add_01d=pass_rate(errors, 0.012),
         add_005d=pass_rate(errors, 0.006),
         add_002d=pass_rate(errors, 0.0024),
@@ -133,8 +134,8 @@ def test_rows_agree_with_the_functions():
     [
         # Of two the better score counts; the other is a false positive.
         ([(0.2, pose(0)), (0.9, pose(0.03))], [(0, 1)], (1, 1, 0.5, 0), [0.03]),
-        # Farther than ten centimetres, or no pose at all: a miss and a false positive.
-        ([(0.9, pose(0.11))], [(0, 1)], (1, 1, 0, 1), [math.inf]),
+        # Farther than half the diameter, or no pose at all: a miss and a false positive.
+        ([(0.9, pose(0.061))], [(0, 1)], (1, 1, 0, 1), [math.inf]),
         *(
             ([(0.9, np.full((4, 4), bad))], [(0, 1)], (1, 1, 0, 1), [math.inf])
             for bad in (math.nan, math.inf)
@@ -155,6 +156,15 @@ def test_what_stands_for_an_instance(found, truths, counts, errors):
     assert (row.num_instances, row.false_positives, row.precision, row.miss_rate) == counts
     assert metric.errors("box") == pytest.approx(errors)
     assert not any(isinstance(v, float) and math.isnan(v) for v in asdict(row).values())
+
+
+@pytest.mark.parametrize(("diameter", "radius"), [(0.038, 0.019), (0.2, 0.1), (1.5, 0.1)])
+def test_a_detection_matches_within_half_a_diameter_and_ten_centimetres(diameter, radius):
+    metric = PoseMetrics([replace(part("box"), diameter=diameter)])
+    for offset in (0.999 * radius, 1.001 * radius):
+        metric.update([Detection("box", 1, pose(offset))], [truth("box", pose())])
+    row = metric.compute()["box"]
+    assert (row.matching_radius, row.miss_rate) == (radius, 0.5)
 
 
 def test_the_distance_is_taken_between_centres_not_origins():
@@ -193,7 +203,7 @@ def test_all_missed_gives_zero_and_nothing_at_all_is_not_available():
     zeros = ("add_01d", "add_005d", "add_002d", "pass_5cm", "pass_10cm", "auc_10cm", "add_s_01d",
              "auc_s_10cm", "precision", "average_precision", "mssd_01d", "ar_mssd",
              "add_or_s_01d", "auc_or_s_10cm", "pass_5cm_5deg")  # fmt: skip
-    expected = PoseRow("box", "estimate", 3, miss_rate=1.0, false_positives=0)
+    expected = PoseRow("box", "estimate", 3, matching_radius=0.06, miss_rate=1.0, false_positives=0)
     assert row == replace(expected, **dict.fromkeys(zeros, 0.0))
 
 

@@ -69,32 +69,34 @@ def test_pass_rate_is_strict_and_misses_count():
 
 
 def test_match_breaks_ties_by_order_and_includes_the_limit():
-    assert match(torch.ones(2), torch.full((2, 2), 0.1, dtype=torch.float64)).tolist() == [0, 1]
-    assert match(torch.ones(1), torch.tensor([[0.1000001]])).tolist() == [-1]
-    assert match(torch.ones(1), torch.tensor([[0.02, 0.02]])).tolist() == [0]
+    limit = torch.full((2, 2), 0.1, dtype=torch.float64)
+    assert match(torch.ones(2), limit, 0.1).tolist() == [0, 1]
+    assert match(torch.ones(1), torch.tensor([[0.1000001]]), 0.1).tolist() == [-1]
+    assert match(torch.ones(1), torch.tensor([[0.02, 0.02]]), 0.1).tolist() == [0]
 
 
 def test_match_of_nothing_and_of_nan():
-    assert match(torch.empty(0), torch.empty(0, 3)).tolist() == []
-    assert match(torch.ones(2), torch.empty(2, 0)).tolist() == [-1, -1]
+    assert match(torch.empty(0), torch.empty(0, 3), 0.1).tolist() == []
+    assert match(torch.ones(2), torch.empty(2, 0), 0.1).tolist() == [-1, -1]
     nan = torch.tensor([[math.nan, 0.02], [0.01, math.nan]])
-    assert match(torch.tensor([math.nan, 0.1]), nan).tolist() == [1, 0]
+    assert match(torch.tensor([math.nan, 0.1]), nan, 0.1).tolist() == [1, 0]
     with pytest.raises(ValueError, match="2 scores need as many rows"):
-        match(torch.ones(2), torch.zeros(3, 1))
+        match(torch.ones(2), torch.zeros(3, 1), 0.1)
 
 
 @given(st.integers(0, 6), st.integers(0, 6), st.integers(0, 10_000))
 @settings(max_examples=60)
 def test_match_equals_a_plain_loop(p, g, seed):
     rng = np.random.default_rng(seed)
-    scores, distances = rng.random(p), rng.uniform(0, 0.2, (p, g))
+    scores, distances, radius = rng.random(p), rng.uniform(0, 0.2, (p, g)), rng.uniform(0, 0.2)
     expected, taken = [-1] * p, set()
     for i in sorted(range(p), key=lambda i: -scores[i]):
         near = sorted((distances[i, j], j) for j in range(g) if j not in taken)
-        if near and near[0][0] <= 0.1:
+        if near and near[0][0] <= radius:
             expected[i] = near[0][1]
             taken.add(near[0][1])
-    assert match(torch.from_numpy(scores), torch.from_numpy(distances)).tolist() == expected
+    result = match(torch.from_numpy(scores), torch.from_numpy(distances), radius)
+    assert result.tolist() == expected
 
 
 @settings(max_examples=60)

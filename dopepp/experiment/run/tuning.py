@@ -32,7 +32,6 @@ from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.assembly.negative_frames import LOOKALIKES, negative_frames
 from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.config.run_config import FalsePositiveTarget
-from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.runtimes import Runtime
 from dopepp.metrics.functional import (
@@ -349,7 +348,7 @@ def matched_poses(
     matches = []
     for _, _, part, detections, instances in _by_object(estimator, parts, source):
         group = symmetry_transforms(part).numpy()
-        numbers = assign(part.cuboid[CENTROID], detections, instances)
+        numbers = assign(part, detections, instances)
         for detection, number in zip(detections, numbers, strict=True):
             if number >= 0 and counted(instances[number]):
                 matches.append((detection, instances[number].T_cam_obj @ group))
@@ -400,7 +399,7 @@ def _judge(
 
     As in every evaluation, detections of heavily occluded instances are not judged.
     """
-    numbers = assign(part.cuboid[CENTROID], detections, true)
+    numbers = assign(part, detections, true)
     counts = np.array([number < 0 or counted(true[number]) for number in numbers], bool)
     matched = np.flatnonzero(counts & (numbers >= 0)).tolist()
     right = np.zeros(len(detections), bool)

@@ -140,17 +140,12 @@ def expected_calibration_error(
     return float((confidence - accuracy).abs().sum() / len(scores))
 
 
-MATCH_DISTANCE: Final = 0.1
-"""Largest distance between the centres of a prediction and of its instance, metres."""
-
 _RECALLS: Final = torch.from_numpy(np.linspace(0.0, 1.0, 101))
 """Recall levels of COCO's tool, with its rounding."""
 
 
 def match(
-    scores: Float[Tensor, "p"],
-    distances: Float[Tensor, "p g"],
-    max_distance: float = MATCH_DISTANCE,
+    scores: Float[Tensor, "p"], distances: Float[Tensor, "p g"], max_distance: float
 ) -> Int[Tensor, "p"]:
     """Match predictions with instances one-to-one, greedily by descending score.
 
