@@ -7,7 +7,7 @@ Figures are :class:`matplotlib.figure.Figure` objects without pyplot's global st
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -169,6 +169,16 @@ def rates_figure(
             axes.minorticks_off()
     for axes in grid.flat[len(panels) :]:
         axes.set_axis_off()
+    return figure
+
+
+def coverage_figure(curves: Mapping[str, RateCurve]) -> Figure:
+    """Draw the observed over the nominal coverage of covariance regions, beside the diagonal."""
+    percent = {name: replace(curve, x=100 * curve.x) for name, curve in curves.items()}
+    figure = rates_figure({"coverage of the covariances": percent}, "nominal (%)", columns=1)
+    axes = figure.axes[0]
+    axes.plot([0, 100], [0, 100], "--", color="0.5", zorder=0)
+    axes.set_ylabel("observed, and 95 % interval (%)")
     return figure
 
 

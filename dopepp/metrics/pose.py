@@ -11,7 +11,7 @@ from typing import Any, Final, Literal, Protocol
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -155,6 +155,7 @@ class PoseMetrics(Metric):
 
     poses: list[Tensor]
     false_positives: list[Tensor]
+    num_images: Tensor
 
     def __init__(self, parts: Sequence[Part], method: str = "estimate", **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -169,6 +170,7 @@ class PoseMetrics(Metric):
         self.add_state("poses", default=[], dist_reduce_fx="cat")
         # Object index and score of every false positive.
         self.add_state("false_positives", default=[], dist_reduce_fx="cat")
+        self.add_state("num_images", default=torch.tensor(0), dist_reduce_fx="sum")
         self._gathered: dict[str, Gathered] = {}
 
     def update(
@@ -198,6 +200,7 @@ class PoseMetrics(Metric):
                     "score it with a PoseMetrics that knows this part",
                 )
         camera = _camera(K, width)
+        self.num_images += 1
         for index, part in enumerate(self.parts.values()):
             candidates = [d for d in detections if d.object == part.name]
             true = [i for i in instances if i.label == part.name]
@@ -226,10 +229,11 @@ class PoseMetrics(Metric):
         Without evaluated instances, all measures of an object but its counts are None.
         """
         poses, false_positives = _table(self.poses, _WIDTH), _table(self.false_positives, 2)
-        rows = {}
+        rows, num_images = {}, int(self.num_images)
         for index, (name, part) in enumerate(self.parts.items()):
             false = false_positives[false_positives[:, 0] == index, 1]
-            self._gathered[name] = Gathered(part, poses[poses[:, 0] == index], false)
+            table = poses[poses[:, 0] == index]
+            self._gathered[name] = Gathered(part, table, false, num_images)
             rows[name] = self._gathered[name].row(self.method)
         rows[MEAN] = mean_row(list(rows.values()), self.method)
         return rows
@@ -283,6 +287,7 @@ class Gathered:
         scores: Score of each instance's prediction; NaN for a miss.
         errors: Errors of each instance.
         false_positives: Scores of the false positives.
+        num_images: Number of images, with or without the object.
     """
 
     def __init__(
@@ -290,8 +295,9 @@ class Gathered:
         part: Part,
         table: Float[Tensor, "n 81"],
         false_positives: Float[Tensor, "false_positives"],
+        num_images: int,
     ) -> None:
-        self.part, self.false_positives = part, false_positives
+        self.part, self.false_positives, self.num_images = part, false_positives, num_images
         T_est, self.T_gt = (table[:, columns].reshape(-1, 4, 4) for columns in (_T_EST, _T_GT))
         self.visible_fractions, self.scores = table[:, _VISIBLE], table[:, _SCORE]
         camera = table[:, _CAMERA]
@@ -309,14 +315,19 @@ class Gathered:
             matched = int(errors.add.isfinite().sum())
             row.miss_rate = 1 - matched / len(errors.add)
             row.matching_radius = matching_radius(self.part)
-            row.precision = matched / max(matched + num_false, 1)
-            row.average_precision = self._average_precision(0.1 * self.part.diameter)
-        row.false_positives = num_false
+            if matched + num_false:
+                row.precision = int(self._right.sum()) / (matched + num_false)
+            row.average_precision = self._average_precision()
+        row.false_per_frame = num_false / max(self.num_images, 1)
         return row
 
-    def _average_precision(self, threshold: float) -> float:
-        """Return AP with ADD below a threshold."""
-        hits = self.errors.add < threshold
+    @property
+    def _right(self) -> Bool[Tensor, "n"]:
+        """Return which instances have a pose with ADD(-S) below a tenth of the diameter."""
+        return self.errors.add_or_s < 0.1 * self.part.diameter
+
+    def _average_precision(self) -> float:
+        hits = self._right
         misses = ~hits & self.errors.add.isfinite()
         # Among equal scores, wrong predictions come first: AP must not depend on images or ranks.
         scores = torch.cat([self.false_positives, self.scores[misses], self.scores[hits]])

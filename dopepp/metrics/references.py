@@ -97,7 +97,7 @@ def _row(part: Part, name: str, Q: Tensor, few_points: Tensor, points: Tensor) -
         rotation_deg=rotation_error_deg(Q, identity),
         rotation_s_deg=rotation_error_deg(Q[subset], identity[subset], group),
         translation=None,
-        deviations=None,
+        mahalanobis=None,
         diameter=part.diameter,
         num_symmetries=len(group),
     )

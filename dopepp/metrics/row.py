@@ -25,6 +25,7 @@ from dopepp.metrics.functional import (
     add_s,
     auc,
     average_recall,
+    coverage,
     mahalanobis,
     mspd,
     mssd,
@@ -56,8 +57,8 @@ class PoseErrors:
         rotation_deg: Angle between the orientations, degrees.
         rotation_s_deg: Smallest such angle over the part's symmetries, degrees.
         translation: Distance between the object frame's origins, metres; None for guesses.
-        deviations: Mahalanobis distance by the stated covariance, divided by its median under
-            correct covariances; infinite without a covariance, None for guesses.
+        mahalanobis: Mahalanobis distance by the stated covariance; infinite without a covariance,
+            None for guesses.
         diameter: Diameter of the part, metres.
         num_symmetries: Number of symmetry transforms, including the identity.
     """
@@ -69,7 +70,7 @@ class PoseErrors:
     rotation_deg: Errors
     rotation_s_deg: Errors
     translation: Errors | None
-    deviations: Errors | None
+    mahalanobis: Errors | None
     diameter: float
     num_symmetries: int = 1
 
@@ -106,7 +107,7 @@ class PoseErrors:
             rotation_deg=rotation_error_deg(poses[0], poses[2]),
             rotation_s_deg=rotation_error_deg(poses[0], poses[2], group),
             translation=translation_error(poses[1], poses[3]),
-            deviations=mahalanobis(*poses, covariance, group) / _USUAL_MAHALANOBIS,
+            mahalanobis=mahalanobis(*poses, covariance, group),
             diameter=part.diameter,
             num_symmetries=len(group),
         )
@@ -148,13 +149,16 @@ class PoseRow:
         add_or_s_01d: Like ``add_01d``, with ADD-S for a part with symmetries.
         ar_mssd: BOP's average recall of MSSD.
         ar_mspd: BOP's average recall of MSPD; None if an image's camera is unknown.
+        mspd_5px: Share of instances with MSPD below 5 pixels of an image 640 wide; None likewise.
         median_deviations: Median ratio of the true errors to the stated standard deviations, 1 if
             they are calibrated; None without covariances.
+        coverage: Share of matched poses within their 90 % covariance region; None likewise.
         matching_radius: Largest distance of a match (:func:`~dopepp.metrics.pose.matching_radius`).
         miss_rate: Share of instances without a matched prediction.
-        average_precision: AP over the scores, correct with ADD below a tenth of the diameter.
-        precision: TP / (TP + FP); 0 without predictions.
-        false_positives: Number of predictions without an instance.
+        precision: Share of the reported poses with ADD(-S) below a tenth of the diameter; None if
+            nothing is reported.
+        false_per_frame: Detections without an instance, per image.
+        average_precision: AP over the scores, correct with ADD(-S) below a tenth of the diameter.
         num_symmetries: As in :class:`PoseErrors`.
     """
 
@@ -174,14 +178,16 @@ class PoseRow:
     p90_rotation_deg: float | None = None
     p90_translation: float | None = None
     median_deviations: float | None = None
+    coverage: float | None = None
     matching_radius: float | None = None
     miss_rate: float | None = None
     precision: float | None = None
-    false_positives: int | None = None
+    false_per_frame: float | None = None
     average_precision: float | None = None
     mssd_01d: float | None = None
     ar_mssd: float | None = None
     ar_mspd: float | None = None
+    mspd_5px: float | None = None
     median_rotation_s_deg: float | None = None
     add_or_s_01d: float | None = None
     auc_or_s_10cm: float | None = None
@@ -271,6 +277,15 @@ def _ar_mspd(errors: PoseErrors) -> float | None:
     return None if errors.mspd is None else average_recall(errors.mspd, BOP_MSPD_THRESHOLDS)
 
 
+def _mspd_5px(errors: PoseErrors) -> float | None:
+    return None if errors.mspd is None else pass_rate(errors.mspd, 5)
+
+
+def _median_deviations(errors: PoseErrors) -> float | None:
+    median = _median("mahalanobis")(errors)
+    return None if median is None else median / _USUAL_MAHALANOBIS
+
+
 COLUMNS: Final[tuple[Column, ...]] = (
     Column("num_instances", "instances"),
     Column("add_01d", "ADD-0.1d %", 100, 1, "ADD", _below("add", 0.1)),
@@ -288,20 +303,25 @@ COLUMNS: Final[tuple[Column, ...]] = (
     Column("median_rotation_s_deg", "rotation-S °", 1, 1, "symmetry", _median("rotation_s_deg")),
     Column("ar_mssd", "AR_MSSD %", 100, 1, "BOP", _ar_mssd),
     Column("ar_mspd", "AR_MSPD %", 100, 1, "BOP", _ar_mspd),
+    Column("mspd_5px", "MSPD<5px %", 100, 1, "BOP", _mspd_5px),
     Column("median_rotation_deg", "rotation °", 1, 1, "median", _median("rotation_deg")),
     Column("median_translation", "translation mm", 1000, 1, "median", _median("translation")),
     Column("p90_rotation_deg", "rotation 90 % °", 1, 1, "median", _p90("rotation_deg")),
     Column("p90_translation", "translation 90 % mm", 1000, 1, "median", _p90("translation")),
-    Column("median_deviations", "error / stated", 1, 1, "median", _median("deviations")),
+    Column("median_deviations", "error / stated", 1, 1, "covariance", _median_deviations),
+    Column(
+        "coverage", "coverage[90 %] %", 100, 1, "covariance", _of_finite("mahalanobis", coverage)
+    ),
     Column("matching_radius", "matching radius mm", 1000, 1, "detection"),
     Column("miss_rate", "missed %", 100, 1, "detection"),
-    Column("average_precision", "AP[ADD-0.1d] %", 100, 1, "detection"),
     Column("precision", "precision %", 100, 1, "detection"),
-    Column("false_positives", "false pos.", group="detection"),
+    Column("false_per_frame", "false per frame", 1, 3, "detection"),
+    Column("average_precision", "AP[ADD(-S)-0.1d] %", 100, 1, "detection"),
 )
 """Measures of a table, in order."""
 
-_TOTALS: Final = ("num_instances", "false_positives")
+_TOTALS: Final = ("num_instances", "false_per_frame")
+"""Measures whose mean row holds the sum over objects."""
 
 
 def shown_columns(row: PoseRow, all_measures: bool = False) -> list[Column]:
@@ -319,15 +339,15 @@ def summarise(name: str, method: str, errors: PoseErrors) -> PoseRow:
 def mean_row(rows: Sequence[PoseRow], method: str) -> PoseRow:
     """Average each measure over the objects that have it and at least one instance.
 
-    Counts are totals over all objects.
+    Numbers of instances and of false detections are totals over all objects.
     """
     mean = PoseRow(object="mean", method=method, num_instances=0)
     mean.num_symmetries = max((row.num_symmetries for row in rows), default=1)
     for column in COLUMNS:
-        counted = column.field in _TOTALS
-        values = [getattr(row, column.field) for row in rows if counted or row.num_instances]
-        available = torch.tensor([v for v in values if v is not None], dtype=torch.float64)
-        if len(available):
-            value = int(available.sum()) if counted else float(available.mean())
-            setattr(mean, column.field, value)
+        is_total = column.field in _TOTALS
+        values = [getattr(row, column.field) for row in rows if is_total or row.num_instances]
+        available = [value for value in values if value is not None]
+        if available:
+            total = sum(available)
+            setattr(mean, column.field, total if is_total else total / len(available))
     return mean

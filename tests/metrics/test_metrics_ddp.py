@@ -86,7 +86,7 @@ def test_two_processes_give_the_numbers_of_one(start, tmp_path):
         assert process.returncode == 0, error
     box = expected["rows"]["box"]
     assert box["num_instances"] == NUM_IMAGES
-    assert box["false_positives"] == 4  # images 1, 5, 7 and 11
+    assert box["false_per_frame"] == 4 / NUM_IMAGES  # images 1, 5, 7 and 11
     for measure in ("ar_mssd", "ar_mspd", "average_precision", "mssd_01d"):
         assert 0 < box[measure] < 1
     results = [json.loads((tmp_path / f"{rank}.json").read_text()) for rank in range(2)]

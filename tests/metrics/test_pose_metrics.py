@@ -14,6 +14,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance
@@ -56,12 +57,15 @@ def test_errors_are_compared_with_what_estimates_state_of_themselves():
         result = result @ flip if number % 2 else result
         metric.update([Detection("box", 1, result, np.diag(deviation**2))], [truth("box", T)])
     assert metric.compute()["box"].median_deviations == pytest.approx(3, rel=0.05)
+    inside = chi2.cdf(chi2.ppf(0.9, 6) / 9, 6)
+    assert metric.compute()["box"].coverage == pytest.approx(inside, abs=0.02)
     assert metric.compute()[MEAN].median_deviations == pytest.approx(3, rel=0.05)
     metric.update([], [truth("box", pose())])  # a miss states nothing
     assert metric.compute()["box"].median_deviations == pytest.approx(3, rel=0.05)
     file = PoseMetrics([part("box")])
     file.update([Detection("box", 1, pose(0.01))], [truth("box", pose())])
-    assert file.compute()["box"].median_deviations is None
+    row = file.compute()["box"]
+    assert (row.median_deviations, row.coverage) == (None, None)
 
 
 def test_rows_agree_with_the_functions():
@@ -94,7 +98,9 @@ def test_rows_agree_with_the_functions():
     relative = Rotation.from_matrix(split[0]) * Rotation.from_matrix(split[2]).inv()
     row = metric.compute()["box"]
     assert row == replace(
-        PoseRow("box", "estimate", 30, precision=1.0, miss_rate=0.0, false_positives=0),
+        PoseRow("box", "estimate", 30, miss_rate=0.0, false_per_frame=0.0),
+        precision=pass_rate(errors_s, 0.012),
+        mspd_5px=pass_rate(pixels, 5),
         matching_radius=0.06,
         add_01d=pass_rate(errors, 0.012),
         add_005d=pass_rate(errors, 0.006),
@@ -132,8 +138,10 @@ def test_rows_agree_with_the_functions():
 @pytest.mark.parametrize(
     ("found", "truths", "counts", "errors"),
     [
-        # Of two the better score counts; the other is a false positive.
-        ([(0.2, pose(0)), (0.9, pose(0.03))], [(0, 1)], (1, 1, 0.5, 0), [0.03]),
+        # Of two the better score counts; the other is a false positive. Precision counts poses
+        # within 12 mm.
+        ([(0.2, pose(0)), (0.9, pose(0.03))], [(0, 1)], (1, 1, 0, 0), [0.03]),
+        ([(0.9, pose(0)), (0.2, pose(0.03))], [(0, 1)], (1, 1, 0.5, 0), [0]),
         # Farther than half the diameter, or no pose at all: a miss and a false positive.
         ([(0.9, pose(0.061))], [(0, 1)], (1, 1, 0, 1), [math.inf]),
         *(
@@ -141,7 +149,7 @@ def test_rows_agree_with_the_functions():
             for bad in (math.nan, math.inf)
         ),
         # An instance hardly visible neither counts nor makes a false positive …
-        ([(0.9, pose(0.3))], [(0, 0.1), (0.3, 0.0999)], (1, 0, 0, 1), [math.inf]),
+        ([(0.9, pose(0.3))], [(0, 0.1), (0.3, 0.0999)], (1, 0, None, 1), [math.inf]),
         # … and a second detection there has no instance left to explain it.
         ([(s, pose(0.3)) for s in (0.9, 0.8)], [(0, 0.1), (0.3, 0.0999)], (1, 1, 0, 1), [math.inf]),
         # An instance that counts is matched before a hidden one.
@@ -153,7 +161,7 @@ def test_what_stands_for_an_instance(found, truths, counts, errors):
     instances = [truth("box", pose(x), visible) for x, visible in truths]
     metric.update([Detection("box", score, T) for score, T in found], instances)
     row = metric.compute()["box"]
-    assert (row.num_instances, row.false_positives, row.precision, row.miss_rate) == counts
+    assert (row.num_instances, row.false_per_frame, row.precision, row.miss_rate) == counts
     assert metric.errors("box") == pytest.approx(errors)
     assert not any(isinstance(v, float) and math.isnan(v) for v in asdict(row).values())
 
@@ -182,7 +190,7 @@ def test_objects_do_not_match_each_other():
         metric.update([Detection("c", 1, pose())], [])
     metric.update([Detection("a", 0.9, pose())], [truth("b", pose()), truth("other", pose())])
     rows = metric.compute()
-    assert (rows["a"].num_instances, rows["a"].false_positives) == (0, 1)
+    assert (rows["a"].num_instances, rows["a"].false_per_frame) == (0, 1)
     assert (rows["b"].num_instances, rows["b"].miss_rate) == (1, 1)
 
 
@@ -196,14 +204,14 @@ def test_parts_must_have_names_of_their_own(names):
 def test_all_missed_gives_zero_and_nothing_at_all_is_not_available():
     metric = PoseMetrics([part("box")])
     for row in metric.compute().values():
-        assert row == PoseRow(row.object, "estimate", num_instances=0, false_positives=0)
+        assert row == PoseRow(row.object, "estimate", num_instances=0, false_per_frame=0)
     for _ in range(3):
         metric.update([], [truth("box", pose())])
     row = metric.compute()["box"]
     zeros = ("add_01d", "add_005d", "add_002d", "pass_5cm", "pass_10cm", "auc_10cm", "add_s_01d",
-             "auc_s_10cm", "precision", "average_precision", "mssd_01d", "ar_mssd",
+             "auc_s_10cm", "average_precision", "mssd_01d", "ar_mssd",
              "add_or_s_01d", "auc_or_s_10cm", "pass_5cm_5deg")  # fmt: skip
-    expected = PoseRow("box", "estimate", 3, matching_radius=0.06, miss_rate=1.0, false_positives=0)
+    expected = PoseRow("box", "estimate", 3, matching_radius=0.06, miss_rate=1.0, false_per_frame=0)
     assert row == replace(expected, **dict.fromkeys(zeros, 0.0))
 
 
@@ -219,7 +227,7 @@ def test_an_object_without_ground_truth_stays_out_of_the_mean():
     assert cells["ADD-0.1d %"] == "n/a"
     assert rows[MEAN].add_01d == 0.5
     assert rows[MEAN].median_rotation_deg == 0.0  # only a was matched
-    assert (rows[MEAN].num_instances, rows[MEAN].false_positives) == (2, 1)
+    assert (rows[MEAN].num_instances, rows[MEAN].false_per_frame) == (2, 1)
     assert json.loads(json.dumps(asdict(rows["c"]), allow_nan=False))["add_01d"] is None
 
 
@@ -292,6 +300,21 @@ def test_average_precision_by_hand(images, expected):
         result = [] if error is MISSED else [Detection("box", score, pose(shift))]
         metric.update(result, [] if error is STRAY else [truth("box", pose())])
     assert metric.compute()["box"].average_precision == pytest.approx(expected)
+
+
+def test_precision_and_false_detections_count_in_frames():
+    """Of ten images: six right, one wrong, a duplicate and two of an image without the part."""
+    turned = np.diag([-1.0, -1.0, 1.0, 1.0])
+    box = replace(part("box"), symmetries_discrete=turned[None])
+    metric = PoseMetrics([box])
+    for number in range(10):
+        result = [] if number > 6 else [Detection("box", 0.9, pose() @ turned)]
+        truths = [truth("box", pose(0.03 if number == 6 else 0))] if number < 9 else []
+        metric.update(result, truths)
+    metric.update([Detection("box", s, pose()) for s in (0.5, 0.4)], [])
+    row = metric.compute()["box"]
+    assert (row.precision, row.false_per_frame) == (pytest.approx(6 / 9), pytest.approx(2 / 11))
+    assert row.add_or_s_01d == pytest.approx(6 / 9)
 
 
 def test_a_duplicate_lowers_average_precision_and_an_ignored_pose_does_not():

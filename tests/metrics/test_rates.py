@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import binomtest
+from scipy.stats import binomtest, chi2
 
 from dopepp.core.errors import UserError
 from dopepp.metrics.functional import (
@@ -16,9 +16,11 @@ from dopepp.metrics.functional import (
     auc,
     average_precision,
     average_recall,
+    coverage,
     expected_calibration_error,
     match,
     pass_rate,
+    region_levels,
     wilson_interval,
 )
 
@@ -182,3 +184,23 @@ def test_calibration_error_at_the_ends_and_of_mistakes():
             expected_calibration_error(scores, torch.ones(1, dtype=torch.bool))
     with pytest.raises(ValueError, match="bins"):
         expected_calibration_error(torch.ones(2), torch.ones(1, dtype=torch.bool))
+
+
+@settings(max_examples=60)
+@given(st.lists(st.floats(0, 40) | st.sampled_from([1e3, 1e200]), max_size=30))
+def test_levels_of_regions_are_those_of_chi_squared(distances):
+    expected = chi2.cdf(np.square(distances), 6)
+    levels = region_levels(torch.tensor(distances, dtype=torch.float64))
+    np.testing.assert_allclose(levels, expected, rtol=1e-12, atol=1e-14)
+
+
+def test_coverage_of_right_and_of_too_small_covariances():
+    rng = np.random.default_rng(0)
+    distances = torch.from_numpy(np.linalg.norm(rng.normal(size=(20_000, 6)), axis=1))
+    for level in (0.1, 0.5, 0.9, 0.99):
+        assert coverage(distances, level) == pytest.approx(level, abs=0.01)
+        # Deviations that are half of the true ones: twice the distance.
+        expected = chi2.cdf(chi2.ppf(level, 6) / 4, 6)
+        assert coverage(2 * distances, level) == pytest.approx(expected, abs=0.01)
+    assert coverage(torch.tensor([0.0, math.inf, math.nan, math.inf])) == 0.25
+    assert coverage(torch.zeros(0)) == 0.0

@@ -84,7 +84,7 @@ def test_rows_depend_on_the_seed_only():
     assert rows != reference_rows(plate(), T, seed=4)
     for row in rows.values():  # what a guess without score and place does not have
         assert row.median_translation is None
-        assert (row.miss_rate, row.precision, row.false_positives) == (None, None, None)
+        assert (row.miss_rate, row.precision, row.false_per_frame) == (None, None, None)
 
 
 def test_without_instances_and_with_a_single_one():

@@ -21,10 +21,18 @@ from dopepp.core.files import write_csv, write_png
 from dopepp.drawing.curves import figure_image, rates_figure
 from dopepp.experiment.config.run_config import QuantityName
 from dopepp.experiment.results import display
-from dopepp.experiment.results.frame import PassRate, Row, Value, interval, pivot, rate_curves
+from dopepp.experiment.results.frame import (
+    PassRate,
+    Row,
+    Value,
+    interval,
+    pivot,
+    radius_note,
+    rate_curves,
+)
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID
-from dopepp.metrics.pose import MEAN, Gathered, PoseMetrics
+from dopepp.metrics.pose import MEAN, Gathered, PoseMetrics, matching_radius
 
 _log = logging.getLogger(__name__)
 
@@ -196,6 +204,8 @@ def record_breakdown(
 
     rows = pivot(values, ["condition"], cells)
     display.show_table(f"by {quantity}: rates with 95 % intervals", rows)
+    parts = list(metrics.values())[-1].parts
+    display.console.print(radius_note({n: matching_radius(part) for n, part in parts.items()}))
     path = run_dir / f"by_{quantity}"
     write_csv(path.with_suffix(".csv"), pivot(values, ["condition", "method"], recorded))
     panels = {

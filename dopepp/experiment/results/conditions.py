@@ -35,6 +35,7 @@ from dopepp.experiment.results.frame import (
     heading,
     markdown,
     pivot,
+    radius_note,
     rate_curves,
     row_values,
     shown_rows,
@@ -56,7 +57,15 @@ _log = logging.getLogger(__name__)
 MAX_EXAMPLES: Final = 4
 """Maximum number of images on the sheet of examples; each appears once per level."""
 
-_FIELDS: Final = ("auc_10cm", "median_rotation_deg", "miss_rate")
+_FIELDS: Final = (
+    "auc_10cm",
+    "median_rotation_deg",
+    "miss_rate",
+    "precision",
+    "false_per_frame",
+    "average_precision",
+    "coverage",
+)
 """Measures to report in addition to the pass rates."""
 
 _LABELS: Final = ("method", "object")
@@ -188,6 +197,11 @@ def record_condition(
     notes = [level.note for level in levels if level.note]
     for line in notes:
         _log.warning("%s", line)
+    radii = {row.object: row.matching_radius for row in rows if row.matching_radius}
+    radii.pop(MEAN, None)
+    if radii:
+        notes.append(radius_note(radii))
+        display.console.print(notes[-1])
     path = run_dir / f"{condition.name}.md"
     write_csv(path.with_suffix(".csv"), pivot(values, (*_LABELS, "condition"), recorded))
     sections = [f"## {title}\n\n{markdown(table)}" for title, table in tables.items()]

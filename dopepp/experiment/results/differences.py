@@ -26,6 +26,7 @@ from dopepp.experiment.results.frame import (
     make_frame,
     means,
     pivot,
+    radius_note,
     row_values,
     values_of,
 )
@@ -39,6 +40,7 @@ REFINED_NOTE: Final = (
 
 _HEADLINE: Final = frozenset({
     "", "add_01d", "pass_5cm", "pass_10cm", "auc_10cm", "median_rotation_deg", "miss_rate",
+    "precision", "false_per_frame", "average_precision", "coverage",
     f"{DELTA}add_01d", f"{DELTA}auc_10cm", f"{DELTA}median_rotation_deg", *COST_FORMS,
 })  # fmt: skip
 """Measures of the compact table; the full table shows all measures and all Δ."""
@@ -219,6 +221,8 @@ def notes(entries: Sequence[Entry], table: pd.DataFrame) -> list[str]:
     """Return sentences that explain the table: baseline, intervals, noise and narrowed networks."""
     sentences: list[str] = []
     measured = [entry for entry in entries if entry.reports]
+    if measured and (radii := measured[0].reports[0].matching_radii):
+        sentences.append(radius_note(radii))
     networks = [entry for entry in measured if not entry.refine]
     if len(measured) > 1:
         sentences += _baseline_notes(measured[0], networks[1:] or measured[1:], noise(table))

@@ -14,7 +14,7 @@ from rich.text import Text
 from rich.tree import Tree
 
 from dopepp.data.sample import SourceInfo
-from dopepp.experiment.results.frame import header_of
+from dopepp.experiment.results.frame import FIELDS, header_of
 from dopepp.experiment.results.report import Report
 from dopepp.metrics.row import shown_columns
 
@@ -59,7 +59,8 @@ def show_report(report: Report, all_measures: bool = False) -> None:
     for name, (row, *references) in report.tables.items():
         if row.num_instances == 0:
             absent = "n/a, no ground truth in the test set"
-            console.print(f"{name}: {absent}; {row.false_positives} false positives")
+            false = FIELDS["false_per_frame"].text(row)
+            console.print(f"{name}: {absent}; {false} false detections per frame")
             continue
         table = Table("", title=f"{name}: {report.num_images} test images")
         for method_row in (row, *references):

@@ -23,7 +23,7 @@ from torch import Tensor
 from dopepp.drawing.curves import RateCurve
 from dopepp.experiment.config.data_config import DataConfig
 from dopepp.metrics.bootstrap import fewest_differing
-from dopepp.metrics.functional import wilson_interval
+from dopepp.metrics.functional import coverage, wilson_interval
 from dopepp.metrics.pose import MEAN, Gathered
 from dopepp.metrics.row import COLUMNS, NOT_AVAILABLE, Column, PoseRow, symmetry_transforms
 from dopepp.parts.part import Parts
@@ -39,6 +39,9 @@ COST_FORMS: Final = {"parameters": ",.0f", "GMACs": ".3f", "ms/frame": ".1f"}
 
 FIELDS: Final = {column.field: column for column in COLUMNS}
 """Columns of the pose measures by their field of ``PoseRow``."""
+
+NOMINAL: Final = np.linspace(0.05, 0.95, 19)
+"""Levels of the covariance regions whose coverage is measured."""
 
 WITHIN: Final = "within noise"
 BEYOND: Final = "beyond noise"
@@ -234,6 +237,12 @@ def markdown(rows: Sequence[Mapping[str, str]]) -> str:
     )
 
 
+def radius_note(radii: Mapping[str, float]) -> str:
+    """Return a sentence about the matching radius (metres) of each object."""
+    listed = ", ".join(f"{name} {1000 * radius:.0f} mm" for name, radius in radii.items())
+    return f"Matching radius, half a diameter and at most 10 cm: {listed}."
+
+
 def rate_curves(rates: Iterable[Value], per_unit: float = 1.0) -> dict[str, RateCurve]:
     """Return the curve of a rate over the conditions (times ``per_unit``) of each method."""
     points: dict[str, list[tuple[float, ...]]] = {}
@@ -242,6 +251,20 @@ def rate_curves(rates: Iterable[Value], per_unit: float = 1.0) -> dict[str, Rate
         points.setdefault(rate.method, []).extend([point] if rate.ends else [])
     arrays = {method: np.array(rows).reshape(-1, 4).T for method, rows in points.items()}
     return {method: RateCurve(*columns) for method, columns in arrays.items()}
+
+
+def coverage_curve(instances: Gathered) -> RateCurve | None:
+    """Return the observed coverage of an object's covariance regions over the nominal coverage.
+
+    Matched poses with a covariance count; None if there are none.
+    """
+    distances = instances.errors.mahalanobis
+    stated = None if distances is None else distances[distances.isfinite()]
+    if stated is None or not len(stated):
+        return None
+    rates = np.array([coverage(stated, level) for level in NOMINAL])
+    ends = np.array([interval(rate, len(stated)) for rate in rates])
+    return RateCurve(NOMINAL, rates, *ends.T)
 
 
 def shown_rows(rows: Mapping[str, PoseRow]) -> dict[str, PoseRow]:

@@ -47,6 +47,7 @@ FILES: Final = {
     "config.yaml": "every option, resolved",
     "versions.json": "command, commit, packages, hardware, seed and fingerprint of the data",
     "overlay.png": "test images: truth in green, prediction in yellow",
+    "coverage.png": "how often the truth lies within the stated covariance region, over its level",
     "auc.png": "share of test instances below each error (numbers in `auc.csv`)",
     "val_overlay.png": "validation images of the last epoch",
     "val_belief.png": "their belief maps: strongest corner and centroid",
@@ -85,7 +86,12 @@ _CARD_FIELDS: Final = (
     "auc_10cm",
     "median_rotation_deg",
     "median_translation",
+    "matching_radius",
     "miss_rate",
+    "precision",
+    "false_per_frame",
+    "average_precision",
+    "coverage",
 )
 
 

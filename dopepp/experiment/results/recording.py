@@ -11,7 +11,7 @@ import numpy as np
 from dopepp.core.files import write_png
 from dopepp.data.formats.bop.bop_results import UNKNOWN_TIME, BopResult, results_name, write_results
 from dopepp.data.sample import SampleSource
-from dopepp.drawing.curves import save_accuracy_curves
+from dopepp.drawing.curves import RateCurve, coverage_figure, figure_image, save_accuracy_curves
 from dopepp.drawing.sheet import contact_sheet
 from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.assembly.renders import scaled_test_renders
@@ -21,7 +21,7 @@ from dopepp.experiment.results import conditions, display
 from dopepp.experiment.results.breakdown import record_breakdown
 from dopepp.experiment.results.compare import compare_reports
 from dopepp.experiment.results.folder import METRICS_FILE, write_json
-from dopepp.experiment.results.frame import reported_rates
+from dopepp.experiment.results.frame import coverage_curve, reported_rates
 from dopepp.experiment.results.measurement import (
     EstimatorMethod,
     FileMethod,
@@ -35,6 +35,7 @@ from dopepp.experiment.results.measurement import (
 from dopepp.experiment.results.report import Report
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.refinement.refiner import Refine
+from dopepp.metrics.pose import PoseMetrics
 from dopepp.parts.part import Parts
 from dopepp.recovery.recover import summary
 
@@ -110,10 +111,14 @@ def measure_and_record(
     refines = refine is not None and bool(estimators)
     main = reports[-2 if refines else -1]
     main.details.update(details or {})
+    _record_coverage(run_dir, measured)
     if refines:
         main.refined = reports[-1]
-        share = main.details["made_worse"] = made_worse(main, main.refined)
-        display.console.print(f"refinement made {share:.1%} of the instances worse by over 1 mm")
+        shares = main.details["made_worse"] = made_worse(
+            measured.metrics[main.name], measured.metrics[main.refined.name]
+        )
+        in_words = ", ".join(f"{share:.1%} in {error}" for error, share in shares.items())
+        display.console.print(f"refinement made instances worse by over 1 mm: {in_words}")
     write_json(run_dir / METRICS_FILE, main.to_record())
     if bop_csv:
         _write_results(run_dir, measured.poses, data, numbers)
@@ -138,6 +143,11 @@ def measure_and_record(
 def of_networks(reports: list[Report], num_files: int) -> list[Report]:
     """Return the reports of the estimators, or of the files if there is no estimator."""
     return reports[: len(reports) - num_files] or reports
+
+
+def main_report(reports: Sequence[Report]) -> Report:
+    """Return the report that holds that of its refined poses, or the last one if there is none."""
+    return next((report for report in reports if report.refined is not None), reports[-1])
 
 
 def with_refining(
@@ -167,11 +177,36 @@ def refining(estimator: PoseEstimator, refine: Refine | None, parts: Parts) -> P
     return estimator.refining(refine, own_parts)
 
 
-def made_worse(network: Report, refined: Report) -> float:
-    """Return the share of instances whose ADD grew by more than 1 mm through refinement."""
-    pairs = [(network.errors[name], errors) for name, errors in refined.errors.items()]
-    worse = np.concatenate([after > before + 0.001 for before, after in pairs])
-    return float(worse.mean()) if len(worse) else 0.0
+def made_worse(network: PoseMetrics, refined: PoseMetrics) -> dict[str, float]:
+    """Return the shares of instances whose ADD and translation error grew by more than 1 mm.
+
+    An instance that only the network detects counts as worse.
+    """
+    shares = {}
+    for error in ("add", "translation"):
+        before, after = (
+            np.concatenate([method.errors(name, error) for name in refined.parts])
+            for method in (network, refined)
+        )
+        worse = after > before + 0.001
+        shares[error] = float(worse.mean()) if len(worse) else 0.0
+    return shares
+
+
+def _record_coverage(run_dir: Path, measured: Measured) -> None:
+    """Draw the coverage of every method and object, and add it to the reports."""
+    curves: dict[str, RateCurve] = {}
+    for report in measured.reports:
+        metrics = measured.metrics[report.name]
+        by_part = {name: coverage_curve(metrics.instances(name)) for name in metrics.parts}
+        stated = {name: curve for name, curve in by_part.items() if curve is not None}
+        curves |= {f"{report.name} {name}": curve for name, curve in stated.items()}
+        report.details["coverage_curve"] = {
+            name: {"nominal": curve.x.round(2).tolist(), "observed": curve.rate.tolist()}
+            for name, curve in stated.items()
+        }
+    if curves:
+        write_png(run_dir / "coverage.png", figure_image(coverage_figure(curves)))
 
 
 def _draw(run_dir: Path, measured: Measured, num_images: int) -> None:

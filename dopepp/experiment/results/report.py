@@ -84,11 +84,18 @@ class Report:
 
     @property
     def tables(self) -> dict[str, list[PoseRow]]:
-        """Row and reference rows of every object, and of the mean if there are several."""
+        """Rows of every object, and of the mean if there are several: own, refined, references."""
+        refined = [] if self.refined is None else [self.refined.rows]
         return {
-            name: [row, *(rows[name] for rows in self.references.values())]
+            name: [row, *(rows[name] for rows in (*refined, *self.references.values()))]
             for name, row in shown_rows(self.rows).items()
         }
+
+    @property
+    def matching_radii(self) -> dict[str, float]:
+        """Matching radius of every object with instances, metres."""
+        radii = {name: row.matching_radius for name, row in self.rows.items() if name != MEAN}
+        return {name: radius for name, radius in radii.items() if radius is not None}
 
     def to_record(self) -> dict[str, Any]:
         """Return the content of ``metrics.json``."""

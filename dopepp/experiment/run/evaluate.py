@@ -20,7 +20,12 @@ from dopepp.experiment.config.run_config import EvaluationConfig, FalsePositiveT
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import write_config, write_environment, write_json
 from dopepp.experiment.results.pages import write_run_readme
-from dopepp.experiment.results.recording import measure_and_record, of_networks, refining
+from dopepp.experiment.results.recording import (
+    main_report,
+    measure_and_record,
+    of_networks,
+    refining,
+)
 from dopepp.experiment.results.report import Report
 from dopepp.experiment.run.resume import warn_of_other_images
 from dopepp.experiment.run.tuning import Tuning, tune, write_tuned
@@ -133,7 +138,8 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
         protocols=asked.protocols,
         refine=asked.refine,
     )
-    write_run_readme(run_dir, f"Evaluation of {measured}", of_networks(reports, len(files))[-1])
+    described = main_report(of_networks(reports, len(files)))
+    write_run_readme(run_dir, f"Evaluation of {measured}", described)
     return reports
 
 

@@ -113,6 +113,26 @@ def wilson_interval(passed: int, num: int, confidence: float = 0.95) -> tuple[fl
     return low, 1.0 if passed == num else centre + half
 
 
+def region_levels(distances: Errors) -> Errors:
+    """Return the level of the covariance region on whose border each true pose lies, in [0, 1].
+
+    The squared Mahalanobis distance x of a true pose from its estimate follows χ² with six degrees
+    of freedom if the covariance is right. The level is that distribution's value at x,
+    1 − exp(−x/2)·(1 + x/2 + x²/8).
+
+    Args:
+        distances: Mahalanobis distances (:func:`mahalanobis`); infinite or NaN for a miss.
+    """
+    half = nan_is_miss(to_float64(distances)).square() / 2
+    return torch.where(half.isfinite(), 1 - (-half).exp() * (1 + half + half.square() / 2), 1.0)
+
+
+def coverage(distances: Errors, level: float = 0.9) -> float:
+    """Return the share of true poses within the covariance region of a level; 0.0 without poses."""
+    levels = region_levels(distances)
+    return float((levels <= level).double().mean()) if len(levels) else 0.0
+
+
 def expected_calibration_error(
     scores: Float[Tensor, "p"], correct: Bool[Tensor, "p"], bins: int = 10
 ) -> float:

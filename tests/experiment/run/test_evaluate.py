@@ -1,14 +1,16 @@
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from dopepp.experiment.results.folder import METRICS_FILE, read_json
 from dopepp.experiment.results.recording import made_worse
-from dopepp.experiment.results.report import Cost, Report
 from dopepp.experiment.run.evaluate import run_evaluation
+from dopepp.metrics.pose import PoseMetrics
 from dopepp.models.checkpoint import read, write_atomic
+from dopepp.parts.catalogue import pivconnector
 
 
 def test_refined_poses_are_measured_beside_the_networks(composed, tmp_path):
@@ -21,17 +23,34 @@ def test_refined_poses_are_measured_beside_the_networks(composed, tmp_path):
     assert np.median(after[result]) < np.median(before[result]) / 3
     written = read_json(tmp_path / METRICS_FILE)
     assert (written["name"], written["refined"]) == ("dopepp_fast", refined.to_record())
-    assert written["made_worse"] == made_worse(network, refined)
+    assert written["made_worse"]["add"] == np.mean(after > before + 0.001)
+    page = (tmp_path / "README.md").read_text()
+    assert "| pivconnector | dopepp_fast | dopepp_fast + region |" in page
+    share = 100 * written["made_worse"]["translation"]
+    assert f"{share:.1f} % in translation" in page
+    curve = written["refined"]["coverage_curve"]["pivconnector"]
+    assert curve["observed"][curve["nominal"].index(0.9)] == refined.mean.coverage
+    assert (tmp_path / "coverage.png").is_file()
     assert (tmp_path / "compare.csv").is_file()
 
 
 def test_worse_is_by_more_than_a_millimetre():
-    def report(*errors):
-        return Report("x", {}, {}, {"a": np.array(errors), "b": np.array([0.01])}, Cost(), 1)
+    part = pivconnector()
 
-    network = report(0.002, 0.002, 0.002, np.inf)
-    refined = report(0.0029, 0.0031, 0.0001, np.inf)
-    assert made_worse(network, refined) == pytest.approx(1 / 5)
+    def measured(*offsets):
+        """Return the metrics of poses that are off along z; NaN misses the instance."""
+        metrics = PoseMetrics([part])
+        for offset in offsets:
+            T, estimate = np.eye(4), np.eye(4)
+            T[2, 3], estimate[2, 3] = 0.3, 0.3 + offset
+            pose = SimpleNamespace(object=part.name, score=1, T_cam_obj=estimate, covariance=None)
+            truth = SimpleNamespace(label=part.name, T_cam_obj=T, visible_fraction=1, wanted=None)
+            metrics.update([] if np.isnan(offset) else [pose], [truth])
+        return metrics
+
+    network = measured(0.002, 0.002, 0.002, np.nan, 0.002)
+    refined = measured(0.0029, 0.0031, 0.0001, np.nan, np.nan)
+    assert made_worse(network, refined) == pytest.approx({"add": 2 / 5, "translation": 2 / 5})
 
 
 def test_silent_images_are_counted_by_reason(composed, tmp_path, capsys):
