@@ -107,6 +107,11 @@ def doctor(
     refine: Region = None,
     parts: Meshes = None,
     unit: Unit = None,
+    centres: Annotated[
+        list[str] | None,
+        Option("--at", help="u,v: pixel of a part's centre; once for every part on the picture."),
+    ] = None,
+    empty: Annotated[bool, Option("--empty", help="The picture shows none of the parts.")] = False,
     device: Device = "cpu",
 ) -> None:
     """Diagnose a picture, its camera and its part, one finding with its remedy per line.
@@ -121,6 +126,9 @@ def doctor(
 
     with report_errors():
         check_region(refine)
+        shown_at = None if not centres and not empty else [_pixel(text) for text in centres or ()]
+        if centres and empty:
+            raise UserError("--at with --empty", "one of the two", "leave one of them out")
         K = None if intrinsics is None else camera_matrix(*intrinsics)
         lens = Lens(choose_camera(K, camera, Images([image])), K_size, crop)
         picture = read_photo(image)
@@ -133,7 +141,12 @@ def doctor(
         estimator = estimator if refine is None else estimator.refining(refine, solid_parts)
         try:
             case = Case(
-                estimator, *lens.undistort(picture), solid_parts, distance, crop is not None
+                estimator,
+                *lens.undistort(picture),
+                solid_parts,
+                distance,
+                crop is not None,
+                shown_at,
             )
         except UserError as error:
             problem = f"{error.got}; allowed: {error.allowed}"
@@ -145,6 +158,16 @@ def doctor(
         typer.echo(f"{'!!' if finding.fix else 'ok'} {finding}")
     if findings and findings[0].fix:
         raise typer.Exit(1)
+
+
+def _pixel(text: str) -> tuple[float, float]:
+    """Read a pixel ``u,v``."""
+    try:
+        u, v = map(float, text.split(","))
+    except ValueError:
+        got, fix = f"--at {text}", "give column and row of the part's centre: --at 412,230"
+        raise UserError(got, "u,v in pixels", fix) from None
+    return u, v
 
 
 def serve(

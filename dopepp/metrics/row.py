@@ -310,13 +310,13 @@ COLUMNS: Final[tuple[Column, ...]] = (
     Column("p90_translation", "translation 90 % mm", 1000, 1, "median", _p90("translation")),
     Column("median_deviations", "error / stated", 1, 1, "covariance", _median_deviations),
     Column(
-        "coverage", "coverage[90 %] %", 100, 1, "covariance", _of_finite("mahalanobis", coverage)
+        "coverage", "coverage[0.9] %", 100, 1, "covariance", _of_finite("mahalanobis", coverage)
     ),
     Column("matching_radius", "matching radius mm", 1000, 1, "detection"),
     Column("miss_rate", "missed %", 100, 1, "detection"),
     Column("precision", "precision %", 100, 1, "detection"),
-    Column("false_per_frame", "false per frame", 1, 3, "detection"),
-    Column("average_precision", "AP[ADD(-S)-0.1d] %", 100, 1, "detection"),
+    Column("false_per_frame", "false/frame", 1, 3, "detection"),
+    Column("average_precision", "AP %", 100, 1, "detection"),
 )
 """Measures of a table, in order."""
 

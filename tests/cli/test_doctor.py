@@ -38,7 +38,16 @@ def test_a_good_picture_is_well(run, folder):
     lines = done.stdout.splitlines()
     assert [line.split(":")[0] for line in lines] == [
         f"ok {subject}"
-        for subject in ("part", "exposure", "sharpness", "camera", "size", "visibility", "pose")
+        for subject in (
+            "part",
+            "exposure",
+            "sharpness",
+            "camera",
+            "size",
+            "visibility",
+            "silence",
+            "pose",
+        )
     ]
     assert "pivconnector measures 105 × 52 × 7.0 mm" in lines[0]
     assert "of its outline agrees" in lines[-1]
@@ -48,6 +57,11 @@ def test_a_good_picture_is_well(run, folder):
     ("options", "line"),
     [
         (["plain.png", "--camera", "K.txt"], "!! visibility: nothing like pivconnector is seen"),
+        (
+            ["good.png", "--camera", "K.txt", "--at", "5,5"],
+            "!! silence: confident elsewhere, beside",
+        ),
+        (["good.png", "--camera", "K.txt", "--empty"], "!! silence: confident elsewhere, on a pic"),
         (["good.png", "--K", "220", "220", "127.5", "127.5"], "!! camera: K with fx=220"),
         (
             ["good.png", "--camera", "K.txt", "--part", "piv.stl", "--unit", "cm"],
@@ -70,6 +84,8 @@ def test_what_is_wrong_comes_first(run, folder, options, line):
     ("options", "line"),
     [
         (["good.png"], "neither --K nor --camera"),
+        (["good.png", "--camera", "K.txt", "--at", "5"], "--at 5; allowed: u,v in pixels"),
+        (["good.png", "--camera", "K.txt", "--at", "5,5", "--empty"], "--at with --empty"),
         (["K.txt", "--camera", "K.txt"], "cannot identify the format"),
         (["good.png", "--camera", "K.txt", "--refine", "magic"], "--refine magic; allowed: region"),
         (["good.png", "--camera", "K.txt", "--distance", "2", "1"], "distances=(2.0, 1.0)"),

@@ -1,5 +1,6 @@
 """What a diagnosis names first on rendered pictures whose fault is known."""
 
+import re
 from collections import Counter
 from dataclasses import replace
 
@@ -9,6 +10,7 @@ import pytest
 
 from dopepp import PoseEstimator
 from dopepp.geometry.camera import project_keypoints
+from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.diagnosis import CHECKS, Case, diagnose
 from dopepp.inference.diagnosis.case import clipped, edge_width, highlights
 from dopepp.models.checkpoint import load_network
@@ -105,6 +107,32 @@ def test_a_part_out_of_the_picture_or_covered_is_missed(estimator, factory, empt
         covered[first(estimator, image, K)] += 1
     assert missing["visibility"] >= 3, missing
     assert covered["visibility"] + covered["pose"] >= 3, covered
+
+
+def test_detections_beside_the_part_and_on_pictures_without_it_are_named(estimator, factory, empty):
+    rendered = factory.render(0, 0)
+    T, K = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj, rendered.scene.K
+    u, v = project_keypoints(PART.cuboid, T, K)[CENTROID]
+    half = PART.diameter / 2 * K[0, 0] / T[2, 3]
+
+    def silence(image, *centres):
+        findings = diagnose(Case(estimator, image, K, estimator.parts, centres=centres))
+        (finding,) = [each for each in findings if each.subject == "silence"]
+        return finding
+
+    assert not silence(rendered.image, (u + 0.8 * half, v)).fix
+    assert not silence(rendered.image, (0.0, 0.0), (u, v)).fix
+    beside = silence(rendered.image, (u + 1.3 * half, v))
+    assert "confident elsewhere, beside every part: 1 of 1 detections above" in beside.sentence
+    named = re.search(r"at \((\d+), (\d+)\)", beside.sentence)
+    assert list(map(float, named.groups())) == pytest.approx([u, v], abs=3)
+    assert "virtual.negative_photos" in beside.fix
+    assert "on a picture without the part" in silence(rendered.image).sentence
+    without = empty.render(0, 0)
+    findings = diagnose(
+        Case(estimator, without.image, without.scene.K, estimator.parts, centres=())
+    )
+    assert [(each.subject, each.fix) for each in findings] == [("part", ""), ("silence", "")]
 
 
 def test_a_part_that_is_larger_than_the_picture_is_missed(estimator, factory):

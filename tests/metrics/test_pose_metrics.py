@@ -309,7 +309,7 @@ def test_precision_and_false_detections_count_in_frames():
     metric = PoseMetrics([box])
     for number in range(10):
         result = [] if number > 6 else [Detection("box", 0.9, pose() @ turned)]
-        truths = [truth("box", pose(0.03 if number == 6 else 0))] if number < 9 else []
+        truths = [truth("box", pose(0.058 if number == 6 else 0))] if number < 9 else []
         metric.update(result, truths)
     metric.update([Detection("box", s, pose()) for s in (0.5, 0.4)], [])
     row = metric.compute()["box"]

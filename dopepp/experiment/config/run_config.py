@@ -355,6 +355,8 @@ class EvaluationConfig(MeasurementConfig):
         ckpt_path: Checkpoint to measure.
         baseline: Second checkpoint, which comes first in tables.
         results: BOP challenge CSV with the poses of another method.
+        negatives: Folder of pictures that show none of the parts.
+        camera: Camera file of these pictures; None for the camera of the data.
         method: Name of that method; None derives it from the file name.
         data: Data to measure on: a whole node, or changes to the data of the checkpoint; see
             :func:`~dopepp.experiment.config.data_config.chosen_data`.
@@ -368,6 +370,8 @@ class EvaluationConfig(MeasurementConfig):
     ckpt_path: str | None
     baseline: str | None
     results: str | None
+    negatives: str | None = None
+    camera: str | None = None
     method: Any = None
     data: Mapping[str, Any] | None = None
     virtual: Mapping[str, Any] | None = None

@@ -74,7 +74,14 @@ _PANEL_PX: Final = 768
 """Width of a panel if there are no curves."""
 _GAP_PX: Final = 12
 """Space between tiles."""
-_TOO_WIDE: Final = ("Δ rotation °", "rotation-S °", "parameters", "GMACs")
+_TOO_WIDE: Final = (
+    "ADD<5cm %",
+    "ADD<10cm %",
+    "Δ rotation °",
+    "rotation-S °",
+    "parameters",
+    "GMACs",
+)
 """Columns that are omitted in the terminal."""
 
 

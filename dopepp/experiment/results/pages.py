@@ -22,6 +22,7 @@ from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.experiment import program
 from dopepp.experiment.config.run_config import RunConfig
+from dopepp.experiment.results.false_alarms import alarm_rows
 from dopepp.experiment.results.folder import BEST_CHECKPOINT, VERSIONS_FILE, read_json
 from dopepp.experiment.results.frame import markdown, shown_rows
 from dopepp.experiment.results.report import Report
@@ -46,6 +47,7 @@ FILES: Final = {
     "metrics.csv": "losses, rates and validation over the steps",
     "config.yaml": "every option, resolved",
     "versions.json": "command, commit, packages, hardware, seed and fingerprint of the data",
+    "without_part.png": "the loudest pictures without the part, with the best candidate's score",
     "overlay.png": "test images: truth in green, prediction in yellow",
     "coverage.png": "how often the truth lies within the stated covariance region, over its level",
     "auc.png": "share of test instances below each error (numbers in `auc.csv`)",
@@ -187,6 +189,7 @@ def write_run_readme(
             commands=[program.line(words) for words in calls if words],
             report=report,
             result_table=_result_table,
+            alarms=markdown(rows) if report and (rows := alarm_rows(report)) else "",
             pictures={name: FILES[name] for name in _PICTURES if (folder / name).is_file()},
             next_commands=next_commands,
             is_trial=is_trial,

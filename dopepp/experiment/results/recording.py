@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from dopepp.experiment.config.run_config import Protocols
 from dopepp.experiment.results import conditions, display
 from dopepp.experiment.results.breakdown import record_breakdown
 from dopepp.experiment.results.compare import compare_reports
+from dopepp.experiment.results.false_alarms import KEY, TITLE, count_false_alarms
 from dopepp.experiment.results.folder import METRICS_FILE, write_json
 from dopepp.experiment.results.frame import coverage_curve, reported_rates
 from dopepp.experiment.results.measurement import (
@@ -53,6 +55,7 @@ def measure_and_record(
     all_measures: bool = False,
     protocols: Protocols | None = None,
     refine: Refine | None = None,
+    without_parts: SampleSource | None = None,
 ) -> list[Report]:
     """Measure methods on a test set; print and write tables, curves and pictures.
 
@@ -71,6 +74,7 @@ def measure_and_record(
         all_measures: Whether to print symmetric measures of objects without symmetries.
         protocols: Further protocols to measure.
         refine: Refinement with which every estimator is measured in addition.
+        without_parts: Pictures without the parts, on which detections are counted.
 
     Returns:
         A report per estimator, then per file.
@@ -112,6 +116,8 @@ def measure_and_record(
     main = reports[-2 if refines else -1]
     main.details.update(details or {})
     _record_coverage(run_dir, measured)
+    if without_parts is not None:
+        _record_false_alarms(run_dir, methods, reports, without_parts)
     if refines:
         main.refined = reports[-1]
         shares = main.details["made_worse"] = made_worse(
@@ -207,6 +213,19 @@ def _record_coverage(run_dir: Path, measured: Measured) -> None:
         }
     if curves:
         write_png(run_dir / "coverage.png", figure_image(coverage_figure(curves)))
+
+
+def _record_false_alarms(
+    run_dir: Path, methods: Mapping[str, Method], reports: Sequence[Report], frames: SampleSource
+) -> None:
+    """Measure the estimators on pictures without their parts, and add the counts to the reports."""
+    of_methods = {n: m.estimator for n, m in methods.items() if isinstance(m, EstimatorMethod)}
+    alarms, tiles = count_false_alarms(of_methods, frames)
+    for report in reports:
+        report.details[KEY] = asdict(alarms[report.name])
+    display.show_table(TITLE, [alarm.row(name) for name, alarm in alarms.items()])
+    if tiles:
+        write_png(run_dir / "without_part.png", contact_sheet(tiles, columns=3))
 
 
 def _draw(run_dir: Path, measured: Measured, num_images: int) -> None:

@@ -18,6 +18,7 @@ from dopepp.experiment.assembly.build_sources import share_in_words
 from dopepp.experiment.config.data_config import DataConfig, chosen_data, trained_on
 from dopepp.experiment.config.run_config import EvaluationConfig, FalsePositiveTarget
 from dopepp.experiment.results import display
+from dopepp.experiment.results.false_alarms import frames_without_parts
 from dopepp.experiment.results.folder import write_config, write_environment, write_json
 from dopepp.experiment.results.pages import write_run_readme
 from dopepp.experiment.results.recording import (
@@ -88,14 +89,8 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     program.quiet_lightning()
     asked = EvaluationConfig.of(config)
     extensions.enable(asked.extensions)
-    if asked.ckpt_path is None and asked.results is None:
-        fix = "add ckpt_path=FILE for a checkpoint, or results=FILE for a file of poses"
-        raise UserError("neither ckpt_path nor results", "ckpt_path=…, results=… or both", fix)
+    _check_combination(asked)
     paths = [path for path in (asked.baseline, asked.ckpt_path) if path is not None]
-    if asked.refine is not None and not paths:
-        allowed = "refine=… together with ckpt_path=… (poses from a file are not refined)"
-        fix = "leave out refine, or add ckpt_path"
-        raise UserError(f"refine={asked.refine} without ckpt_path", allowed, fix)
     device = asked.device
     if device == "auto":
         exported = any(is_export(Path(path)) for path in paths)
@@ -126,6 +121,10 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     for number, name in enumerate(names[:-1]):
         if name in names[number + 1 :]:
             names[number] += " (baseline)" if number == 0 else " (checkpoint)"
+    without_parts = None
+    if asked.negatives is not None:
+        camera = None if asked.camera is None else Path(asked.camera)
+        without_parts = frames_without_parts(Path(asked.negatives), camera, data, parts)
     reports = measure_and_record(
         dict(zip(names, loaded, strict=False)),
         parts,
@@ -137,10 +136,32 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
         all_measures=asked.all_measures,
         protocols=asked.protocols,
         refine=asked.refine,
+        without_parts=without_parts,
     )
     described = main_report(of_networks(reports, len(files)))
     write_run_readme(run_dir, f"Evaluation of {measured}", described)
     return reports
+
+
+def _check_combination(asked: EvaluationConfig) -> None:
+    """Refuse options that exclude or need each other."""
+    has_network = asked.ckpt_path is not None or asked.baseline is not None
+    if asked.ckpt_path is None and asked.results is None:
+        fix = "add ckpt_path=FILE for a checkpoint, or results=FILE for a file of poses"
+        raise UserError("neither ckpt_path nor results", "ckpt_path=…, results=… or both", fix)
+    if asked.refine is not None and not has_network:
+        allowed = "refine=… together with ckpt_path=… (poses from a file are not refined)"
+        fix = "leave out refine, or add ckpt_path"
+        raise UserError(f"refine={asked.refine} without ckpt_path", allowed, fix)
+    if asked.camera is not None and asked.negatives is None:
+        fix = "add negatives, or leave out camera: test images have the camera of their data"
+        raise UserError(f"camera={asked.camera} without negatives", "both", fix)
+    if asked.negatives is not None and not has_network:
+        fix = "add ckpt_path, or leave out negatives: a file has no poses in these pictures"
+        raise UserError(f"negatives={asked.negatives} without ckpt_path", "both", fix)
+    if asked.tune and (asked.protocols or asked.negatives is not None):
+        got, fix = "tune=true with shading, scale, by or negatives", "tune first, then measure"
+        raise UserError(got, "one of the two", fix)
 
 
 def _tune_only(

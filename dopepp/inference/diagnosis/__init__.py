@@ -63,11 +63,17 @@ ABSENT: Final = (
 )
 
 
+TUNE: Final = (
+    "tune with pictures that do not show the part: python evaluate.py ckpt_path=MODEL tune=true "
+    "virtual.negative_photos=FOLDER"
+)
+
+
 @dataclass(frozen=True)
 class Diagnosis:
     """Result of a check."""
 
-    subject: str  # part, exposure, sharpness, camera, size, visibility or pose
+    subject: str  # part, exposure, sharpness, camera, size, visibility, silence or pose
     sentence: str  # observation
     fix: str = ""  # remedy; empty if all is well
 
@@ -184,6 +190,20 @@ def visibility(case: Case) -> Diagnosis:
     )
 
 
+def silence(case: Case) -> Diagnosis:
+    """Check whether detections lie where the user names no part."""
+    if case.centres is None:
+        return Diagnosis("silence", "not checked: where the parts are is unknown")
+    if not case.stray:
+        return Diagnosis("silence", "nothing is reported beside the parts")
+    best, threshold = case.stray[0], case.estimator.min_score
+    u, v = best.keypoints[CENTROID]
+    where = "beside every part" if case.centres else "on a picture without the part"
+    counts = f"{len(case.stray)} of {len(case.reported)} detections above {threshold:.2g}"
+    loudest = f"the best has the score {best.score:.2g}, at ({u:.0f}, {v:.0f})"
+    return Diagnosis("silence", f"confident elsewhere, {where}: {counts}; {loudest}", TUNE)
+
+
 def pose(case: Case) -> Diagnosis:
     """Check whether keypoints and outline agree with the pose."""
     if case.found is None:
@@ -207,13 +227,26 @@ def pose(case: Case) -> Diagnosis:
 
 Check = Callable[[Case], Diagnosis]
 
-CHECKS: Final[Sequence[Check]] = (part_size, exposure, sharpness, camera, size, visibility, pose)
+CHECKS: Final[Sequence[Check]] = (
+    part_size,
+    exposure,
+    sharpness,
+    camera,
+    size,
+    visibility,
+    silence,
+    pose,
+)
 """Checks, in the order of causes."""
+
+EMPTY_CHECKS: Final[Sequence[Check]] = (part_size, silence)
+"""Checks of an image without the parts, where every detection is false."""
 
 
 def diagnose(case: Case) -> list[Diagnosis]:
     """Return the result of every check, in the order of causes."""
-    return [check(case) for check in CHECKS]
+    is_empty = case.centres is not None and not case.centres
+    return [check(case) for check in (EMPTY_CHECKS if is_empty else CHECKS)]
 
 
 def _lens_ratio(case: Case) -> float | None:

@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32
 
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix, Letterbox, focal_length
-from dopepp.geometry.cuboid import NUM_KEYPOINTS
+from dopepp.geometry.cuboid import CENTROID, NUM_KEYPOINTS
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.picture import letterboxes
 from dopepp.parts.part import Part
@@ -46,6 +46,8 @@ class Case:
         parts: The estimator's parts, with meshes where available.
         distances: Nearest and farthest depth, metres (default: those of training).
         cropped: As in :meth:`PoseEstimator.predict`.
+        centres: Pixel of each shown part's centre; empty if the image shows none of the parts, None
+            if unknown.
     """
 
     def __init__(
@@ -56,14 +58,33 @@ class Case:
         parts: Sequence[Part],
         distances: tuple[float, float] | None = None,
         cropped: bool = False,
+        centres: Sequence[tuple[float, float]] | None = None,
     ) -> None:
         self.estimator, self.image, self.K = estimator, image, K
         self.parts, self.distances, self.cropped = parts, distances, cropped
+        self.centres = centres
 
     @cached_property
+    def reported(self) -> list[Detection]:
+        """Detections at the expected distances, best score first."""
+        return self._detections(self.distances)
+
+    @property
     def expected(self) -> Detection | None:
         """Best detection at the expected distances."""
-        return self._best(self.distances)
+        return self.reported[0] if self.reported else None
+
+    @cached_property
+    def stray(self) -> list[Detection]:
+        """Detections farther than half of their length on the image from every known centre."""
+        return [
+            detection
+            for detection in self.reported
+            if not any(
+                math.dist(detection.keypoints[CENTROID], centre) <= self._length_px(detection) / 2
+                for centre in self.centres or ()
+            )
+        ]
 
     @cached_property
     def elsewhere(self) -> Detection | None:
@@ -73,7 +94,8 @@ class Case:
             return None
         usual = widest(seen)[2:]
         near, far = zip(usual, self.distances or usual, strict=True)
-        detection = self._best((min(near) / NEARER, max(far) * FARTHER))
+        detections = self._detections((min(near) / NEARER, max(far) * FARTHER))
+        detection = detections[0] if detections else None
         belief, keypoints = BELIEVED
         if detection is None or not np.isfinite(detection.keypoints).all():
             return None
@@ -100,7 +122,7 @@ class Case:
     def length_px(self) -> float:
         """Diameter of the detected part on the image, pixels."""
         assert self.found is not None
-        return self.part.diameter * focal_length(self.K) / float(self.found.T_cam_obj[2, 3])
+        return self._length_px(self.found)
 
     @cached_property
     def box(self) -> Letterbox:
@@ -143,11 +165,12 @@ class Case:
             strongest = np.maximum(strongest, belief[channels].flatten(1).amax(1).cpu().numpy())
         return strongest
 
-    def _best(self, distances: tuple[float, float] | None) -> Detection | None:
-        detections = self.estimator.predict(
-            self.image, self.K, distances=distances, cropped=self.cropped
-        )
-        return detections[0] if detections else None
+    def _detections(self, distances: tuple[float, float] | None) -> list[Detection]:
+        return self.estimator.predict(self.image, self.K, distances=distances, cropped=self.cropped)
+
+    def _length_px(self, detection: Detection) -> float:
+        (part,) = (part for part in self.estimator.parts if part.name == detection.object)
+        return part.diameter * focal_length(self.K) / float(detection.T_cam_obj[2, 3])
 
 
 def num_keypoints(detection: Detection) -> int:

@@ -2,9 +2,11 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
+from dopepp.core.errors import UserError
 from dopepp.experiment.results.folder import METRICS_FILE, read_json
 from dopepp.experiment.results.recording import made_worse
 from dopepp.experiment.run.evaluate import run_evaluation
@@ -62,3 +64,30 @@ def test_silent_images_are_counted_by_reason(composed, tmp_path, capsys):
     (line,) = [row for row in capsys.readouterr().out.splitlines() if "images silent:" in row]
     assert line.startswith("dopepp_fast: 3 of 3 images silent: ")
     assert "below the threshold (best score" in line
+
+
+def test_pictures_without_the_part_are_counted(composed, tmp_path, capsys):
+    folder = tmp_path / "desk"
+    folder.mkdir()
+    noise = np.random.default_rng(0).integers(0, 256, (96, 128, 3), np.uint8)
+    assert cv2.imwrite(str(folder / "noise.png"), noise)
+    options = ("ckpt_path=pretrained/pivconnector", "+data.num_test=1", f"negatives={folder}")
+    (report,) = run_evaluation(composed(*options, config="evaluate"), tmp_path / "run")
+    counts = read_json(tmp_path / "run" / METRICS_FILE)["without_part"]
+    assert counts == report.details["without_part"]
+    assert (counts["num_pictures"], counts["per_picture"]) == (1, 0)
+    assert "Pictures without the part" in capsys.readouterr().out
+    assert "## Pictures without the part\n\n| method |" in (tmp_path / "run/README.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["ckpt_path=x", "camera=y"], "camera=y without negatives"),
+        (["results=x", "negatives=y"], "negatives=y without ckpt_path"),
+        (["ckpt_path=x", "tune=true", "negatives=y"], "tune=true with shading, scale, by or neg"),
+    ],
+)
+def test_options_that_need_each_other(options, message, composed, tmp_path):
+    with pytest.raises(UserError, match=message):
+        run_evaluation(composed(*options, config="evaluate"), tmp_path)

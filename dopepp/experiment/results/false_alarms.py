@@ -1,0 +1,154 @@
+"""Count what estimators report on pictures that show none of their parts.
+
+The pictures are a user's own. They are taken with the camera of the test data, or with a camera
+that the user names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from dopepp.data.negatives import PictureFrames
+from dopepp.data.sample import Sample, SampleSource
+from dopepp.drawing.overlay import YELLOW, Wireframe, overlay
+from dopepp.drawing.pictures import read_picture
+from dopepp.drawing.sheet import Tile
+from dopepp.experiment.assembly.negative_frames import frame_view
+from dopepp.experiment.config.data_config import DataConfig
+from dopepp.experiment.results.frame import Row
+from dopepp.experiment.results.report import Report
+from dopepp.geometry.camera_file import Camera, read_camera
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.metrics.row import NOT_AVAILABLE
+from dopepp.parts.part import Parts
+from dopepp.virtual.backgrounds import PhotoBackgrounds
+
+TITLE: Final = "Pictures without the part"
+KEY: Final = "without_part"
+"""Key of a report's details."""
+
+NUM_LOUDEST: Final = 6
+"""Number of loudest pictures to name and to draw."""
+
+
+@dataclass(frozen=True)
+class FalseAlarms:
+    """What an estimator reports on pictures without its parts.
+
+    Attributes:
+        num_pictures: Number of pictures.
+        per_picture: Reported detections per picture.
+        threshold: Score from which a detection is reported.
+        loudest: Best score of the loudest pictures by name, loudest first. Scores below the
+            threshold count as well.
+    """
+
+    num_pictures: int
+    per_picture: float
+    threshold: float
+    loudest: dict[str, float]
+
+    def row(self, method: str) -> Row:
+        """Return a table row."""
+        best = next(iter(self.loudest.values()), None)
+        return {
+            "method": method,
+            "pictures": f"{self.num_pictures:,}",
+            "detections per picture": f"{self.per_picture:.3f}",
+            "threshold": f"{self.threshold:.3g}",
+            "loudest score": NOT_AVAILABLE if best is None else f"{best:.3g}",
+            "loudest pictures": ", ".join(self.loudest),
+        }
+
+
+@dataclass
+class UndistortedFrames:
+    """Pictures of a camera, without its lens distortion."""
+
+    frames: PictureFrames
+    camera: Camera
+    name: str = TITLE
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def sample(self, index: int, epoch: int = 0) -> Sample:
+        """Return a picture without instances, with its path as key."""
+        sample = self.frames.sample(index, epoch)
+        key = sample.key.rpartition("/")[0]
+        return replace(sample, image=self.camera.undistorted(sample.image), key=key)
+
+
+def frames_without_parts(
+    folder: Path, camera: Path | None, data: DataConfig, parts: Parts
+) -> UndistortedFrames:
+    """Open a folder of pictures that show none of the parts.
+
+    Args:
+        folder: Folder of photos, searched recursively.
+        camera: Camera file; None for the camera of the data. Pictures of another size are scaled
+            and cropped to the camera's.
+        data: Test data.
+        parts: Parts of the estimators.
+
+    Raises:
+        UserError: The folder has no photos, or the camera file cannot be read.
+    """
+    pictures = PhotoBackgrounds(folder)
+    if camera is None:
+        view = frame_view(data, parts)
+        lens = Camera(view.size, view.K, (), "the camera of the test data")
+    else:
+        lens = read_camera(camera)
+    size = lens.size
+    if size is None:
+        height, width = read_picture(pictures.paths[0]).shape[:2]
+        size = (width, height)
+    return UndistortedFrames(PictureFrames(pictures, lens.K, size), lens)
+
+
+def count_false_alarms(
+    estimators: Mapping[str, PoseEstimator], frames: SampleSource
+) -> tuple[dict[str, FalseAlarms], list[Tile]]:
+    """Run estimators on pictures without their parts.
+
+    Returns:
+        The counts by estimator, and tiles of the last estimator's loudest pictures with their
+        best candidate.
+    """
+    alarms, tiles = {}, []
+    for name, estimator in estimators.items():
+        num_reported = 0
+        loud: list[tuple[float, int]] = []
+        for index in range(len(frames)):
+            sample = frames.sample(index)
+            candidates = estimator.candidates(sample.image, sample.K, cropped=True)
+            num_reported += len(estimator.split(candidates)[0])
+            loud += [(candidates[0].score, index)] if candidates else []
+        loud.sort(key=lambda pair: (-pair[0], pair[1]))
+        samples = {score_index: frames.sample(score_index[1]) for score_index in loud[:NUM_LOUDEST]}
+        alarms[name] = FalseAlarms(
+            len(frames),
+            num_reported / len(frames),
+            estimator.min_score,
+            {sample.key: score for (score, _), sample in samples.items()},
+        )
+        tiles = [_tile(estimator, sample) for sample in samples.values()]
+    return alarms, tiles
+
+
+def _tile(estimator: PoseEstimator, sample: Sample) -> Tile:
+    best = estimator.candidates(sample.image, sample.K, cropped=True)[0]
+    label = f"{best.object} {best.score:.3g}"
+    return Tile(overlay(sample.image, [Wireframe(best.keypoints, YELLOW, label)]), sample.key)
+
+
+def alarm_rows(report: Report) -> list[Row]:
+    """Return the table of a method and its refined poses; empty without such pictures."""
+    reports = [report] if report.refined is None else [report, report.refined]
+    return [
+        FalseAlarms(**each.details[KEY]).row(each.name) for each in reports if KEY in each.details
+    ]

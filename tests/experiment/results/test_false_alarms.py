@@ -1,0 +1,101 @@
+"""Detections on pictures without the part: counted by hand, and the camera of the pictures."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from dopepp.core.errors import UserError
+from dopepp.experiment.assembly.build_parts import build_parts
+from dopepp.experiment.results.false_alarms import (
+    KEY,
+    NUM_LOUDEST,
+    FalseAlarms,
+    alarm_rows,
+    count_false_alarms,
+    frames_without_parts,
+)
+from dopepp.experiment.results.report import Cost, Report
+
+CAMERA = """image_width: 64
+image_height: 48
+camera_matrix: {rows: 3, cols: 3, data: [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [-0.3, 0, 0, 0, 0]}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Nine pictures whose grey level is 20 times their number."""
+    (tmp_path / "photos").mkdir()
+    for number in range(9):
+        picture = np.full((48, 64, 3), 20 * number, np.uint8)
+        assert cv2.imwrite(str(tmp_path / "photos" / f"{number}.png"), picture)
+    (tmp_path / "camera.yaml").write_text(CAMERA)
+    return tmp_path
+
+
+class Estimator:
+    """Gives picture k candidates of the scores k/10 and k/20, from picture 1 on."""
+
+    min_score = 0.39
+
+    def candidates(self, image, K, cropped):
+        grey = int(image[24, 32, 0])
+        scores = [grey / 200, grey / 400] if grey else []
+        keypoints = np.full((9, 2), 20.0)
+        return [SimpleNamespace(object="bolt", score=s, keypoints=keypoints) for s in scores]
+
+    def split(self, candidates):
+        return [each for each in candidates if each.score >= self.min_score], []
+
+
+def test_detections_are_counted_from_the_threshold_on(folder, tiny):
+    camera = folder / "camera.yaml"
+    frames = frames_without_parts(folder / "photos", camera, tiny().data, [])
+    estimators: Any = {"dopepp": Estimator()}
+    alarms, tiles = count_false_alarms(estimators, frames)
+    # The better candidates of pictures 4 to 8 and the weaker of picture 8 reach 0.39.
+    assert alarms["dopepp"].per_picture == pytest.approx(6 / 9)
+    loudest = {f"{number}.png": number / 10 for number in range(8, 8 - NUM_LOUDEST, -1)}
+    assert alarms["dopepp"].loudest == pytest.approx(loudest)
+    assert list(alarms["dopepp"].loudest) == list(loudest)
+    assert [tile.caption for tile in tiles] == list(loudest)
+
+
+def test_pictures_have_the_named_camera_or_that_of_the_data(folder, tiny):
+    data = tiny().data
+    grid = np.zeros((48, 64, 3), np.uint8)
+    grid[::8], grid[:, ::8] = 255, 255
+    assert cv2.imwrite(str(folder / "photos" / "0.png"), grid)
+    named = frames_without_parts(folder / "photos", folder / "camera.yaml", data, [])
+    samples = [named.sample(index) for index in range(len(named))]
+    (sample,) = [sample for sample in samples if sample.key == "0.png"]
+    lens = np.array([-0.3, 0, 0, 0, 0])
+    np.testing.assert_array_equal(sample.image, cv2.undistort(grid, sample.K, lens))
+    assert (sample.K[0, 0], sample.size, sample.instances) == (60, (64, 48), [])
+    own = frames_without_parts(folder / "photos", None, data, build_parts(data)).sample(0)
+    assert own.size[0] / own.K[0, 0] >= data.preset.width / data.preset.K[0, 0]
+    (folder / "K.txt").write_text("60 0 31.5\n0 60 23.5\n0 0 1\n")
+    assert frames_without_parts(folder / "photos", folder / "K.txt", data, []).sample(0).size == (
+        64,
+        48,
+    )
+    with pytest.raises(UserError, match="no photo"):
+        frames_without_parts(folder / "empty", None, data, [])
+
+
+def test_a_readme_has_a_row_for_the_network_and_the_refined_poses():
+    counts = FalseAlarms(20, 0.05, 0.9, {"a.png": 0.95})
+    report, refined = (Report(name, {}, {}, {}, Cost(), 1) for name in ("x", "x + region"))
+    report.refined = refined
+    assert alarm_rows(report) == []
+    report.details[KEY], refined.details[KEY] = vars(counts), vars(FalseAlarms(20, 0, 0.9, {}))
+    rows = [list(row.values()) for row in alarm_rows(report)]
+    assert rows == [
+        ["x", "20", "0.050", "0.9", "0.95", "a.png"],
+        ["x + region", "20", "0.000", "0.9", "n/a", ""],
+    ]
