@@ -356,7 +356,7 @@ class EvaluationConfig(MeasurementConfig):
         baseline: Second checkpoint, which comes first in tables.
         results: BOP challenge CSV with the poses of another method.
         negatives: Folder of pictures that show none of the parts.
-        camera: Camera file of these pictures; None for the camera of the data.
+        negatives_camera: Camera file of these pictures; None for the camera of the data.
         method: Name of that method; None derives it from the file name.
         data: Data to measure on: a whole node, or changes to the data of the checkpoint; see
             :func:`~dopepp.experiment.config.data_config.chosen_data`.
@@ -371,7 +371,7 @@ class EvaluationConfig(MeasurementConfig):
     baseline: str | None
     results: str | None
     negatives: str | None = None
-    camera: str | None = None
+    negatives_camera: str | None = None
     method: Any = None
     data: Mapping[str, Any] | None = None
     virtual: Mapping[str, Any] | None = None

@@ -123,7 +123,7 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
             names[number] += " (baseline)" if number == 0 else " (checkpoint)"
     without_parts = None
     if asked.negatives is not None:
-        camera = None if asked.camera is None else Path(asked.camera)
+        camera = None if asked.negatives_camera is None else Path(asked.negatives_camera)
         without_parts = frames_without_parts(Path(asked.negatives), camera, data, parts)
     reports = measure_and_record(
         dict(zip(names, loaded, strict=False)),
@@ -153,9 +153,9 @@ def _check_combination(asked: EvaluationConfig) -> None:
         allowed = "refine=… together with ckpt_path=… (poses from a file are not refined)"
         fix = "leave out refine, or add ckpt_path"
         raise UserError(f"refine={asked.refine} without ckpt_path", allowed, fix)
-    if asked.camera is not None and asked.negatives is None:
-        fix = "add negatives, or leave out camera: test images have the camera of their data"
-        raise UserError(f"camera={asked.camera} without negatives", "both", fix)
+    if asked.negatives_camera is not None and asked.negatives is None:
+        fix = "add negatives=FOLDER, or leave out negatives_camera"
+        raise UserError(f"negatives_camera={asked.negatives_camera} without negatives", "both", fix)
     if asked.negatives is not None and not has_network:
         fix = "add ckpt_path, or leave out negatives: a file has no poses in these pictures"
         raise UserError(f"negatives={asked.negatives} without ckpt_path", "both", fix)

@@ -83,7 +83,7 @@ def test_pictures_without_the_part_are_counted(composed, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["ckpt_path=x", "camera=y"], "camera=y without negatives"),
+        (["ckpt_path=x", "negatives_camera=y"], "negatives_camera=y without negatives"),
         (["results=x", "negatives=y"], "negatives=y without ckpt_path"),
         (["ckpt_path=x", "tune=true", "negatives=y"], "tune=true with shading, scale, by or neg"),
     ],
