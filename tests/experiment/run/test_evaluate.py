@@ -33,7 +33,7 @@ def test_refined_poses_are_measured_beside_the_networks(composed, tmp_path):
     curve = written["refined"]["coverage_curve"]["pivconnector"]
     assert curve["observed"][curve["nominal"].index(0.9)] == refined.mean.coverage
     assert (tmp_path / "coverage.png").is_file()
-    assert (tmp_path / "compare.csv").is_file()
+    assert "Matching radius, half a diameter" in (tmp_path / "compare.md").read_text()
 
 
 def test_worse_is_by_more_than_a_millimetre():
