@@ -65,14 +65,6 @@ def scaled_test_renders(data: DataConfig, parts: Parts, scale: float) -> Describ
     return held_out_renders(data, parts, "test", scale)
 
 
-def empty_renders(data: DataConfig, parts: Parts, split: Split, num_images: int) -> DescribedSource:
-    """Render the scenes of a held-out split without the objects."""
-    scene = {**(data.virtual.scene or {}), "targets_per_image": [0, 0]}
-    virtual = replace(data.virtual, scene=scene)
-    empty = replace(data, virtual=virtual, num_val=num_images, num_test=num_images)
-    return held_out_renders(empty, parts, split)
-
-
 def validation_renders(
     checkpoint: Checkpoint, path: Path, count: int, size: Size | None = None
 ) -> DescribedSource:

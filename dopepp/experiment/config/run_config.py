@@ -175,7 +175,7 @@ class FalsePositiveTarget:
         false_positive_rate: Permitted share of these frames with a detection; 1 sets no threshold.
     """
 
-    num_empty: Count = 60
+    num_empty: Count = 90
     false_positive_rate: Share = 0.005
 
 

@@ -84,5 +84,5 @@ def test_values_are_typed_and_the_plain_config_stays(composed):
     assert config.trainer.lightning["limit_val_batches"] == 2
     assert config.protocols.shading == (0.4,)
     assert type(config.recovery["max_peaks"]) is int
-    assert (config.num_empty, config.stored_data()["virtual"]) == (60, plain["virtual"])
+    assert (config.num_empty, config.stored_data()["virtual"]) == (90, plain["virtual"])
     assert (config.ema, config.logger, config.search) == (0.5, None, None)
