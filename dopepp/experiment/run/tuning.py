@@ -386,7 +386,8 @@ class Hidden:
 
 def write_tuned(checkpoint: Checkpoint, path: Path, options: Mapping[str, float]) -> Path:
     """Write a checkpoint with changed recovery options next to the original; return its path."""
-    tuned = replace(checkpoint, recovery={**checkpoint.recovery, **options})
+    recovery = replace(RecoveryOptions.of(checkpoint.recovery), **options)  # type: ignore[arg-type]
+    tuned = replace(checkpoint, recovery=vars(recovery))
     target = path.with_name(f"{path.stem}_tuned.ckpt")
     write_atomic(tuned.to_file(), target)
     return target

@@ -229,12 +229,13 @@ def test_a_symmetric_part_is_right_at_any_of_its_poses():
 @pytest.mark.parametrize("name", ["best.ckpt", "best.safetensors"])
 def test_the_tuned_checkpoint_stands_beside_the_old_one(tiny_spec, tmp_path, name):
     weights = build_network(tiny_spec).state_dict()
-    old = Checkpoint(tiny_spec, weights, [PART], (128, 96), 8, 1.0, {"max_angle_deg": 30.0})
-    path = write_tuned(
-        old, tmp_path / name, {"min_score": 0.5, "score_bias": -1.5, "distance_factor": 0.95}
-    )
+    former = {"max_angle_deg": 30.0, "refined_agreement": 2.0}  # of an older tuning
+    old = Checkpoint(tiny_spec, weights, [PART], (128, 96), 8, 1.0, former)
+    chosen = {"min_score": 0.5, "score_bias": -1.5, "distance_factor": 0.95}
+    path = write_tuned(old, tmp_path / name, {**chosen, "refined_min_score": 0.7})
     assert path == tmp_path / "best_tuned.ckpt"
     tuned = PoseEstimator.load(path)
     assert (tuned.recovery.max_angle_deg, tuned.recovery.min_score) == (30.0, 0.5)
     assert tuned.recovery.distance_factor == 0.95
     assert tuned.recovery.score_weights == (-1.5, 1.0, 0.0, 0.0, 0.0)
+    assert tuned.recovery.refined_min_score == 0.7
