@@ -217,7 +217,7 @@ class _Session:
             candidates = self._estimator.candidates(image, K, None, metres, "any", *region)
             detections, weaker = self._estimator.split(candidates)
             if detections:
-                typer.echo("nothing in the training range; found at another distance", err=True)
+                typer.echo("nothing at the trained sizes; found in a search at all sizes", err=True)
                 return replace(result, detections=detections, weaker=weaker), ""
         reason = self._estimator.explain(image, K, metres, options["distances"], *region)
         return result, explained(reason)

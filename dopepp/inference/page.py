@@ -175,7 +175,7 @@ def _outputs(
     (detections, weaker), remark = estimator.split(estimator.candidates(image, K)), ""
     if not detections:
         detections, weaker = estimator.split(estimator.candidates(image, K, distances="any"))
-        remark = " (not where training had the parts, but at another distance)"
+        remark = " (not at the trained sizes, but in a search at all sizes)"
     if not detections:
         remark = f": {explained(estimator.explain(image, K))}"
     shapes = {part.name: make_shape(part) for part in estimator.parts}

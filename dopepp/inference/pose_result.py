@@ -206,6 +206,7 @@ def record(detection: Detection) -> dict[str, Any]:
     return {
         "object": detection.object,
         "score": detection.score,
+        "probability": detection.probability,
         "frame": FRAME,
         "T_cam_obj": detection.T_cam_obj.tolist(),
         "covariance": _finite(detection.covariance.tolist()),
