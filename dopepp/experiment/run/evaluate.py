@@ -56,13 +56,15 @@ def _show(tuning: Tuning, path: Path) -> None:
     """Print the effect of tuning on test images, the options and the path of the checkpoint."""
     shown, empty = tuning.num_images
     title = f"tuned; measured on {shown} test images and {empty} without objects"
-    table = Table("", "before", "after", title=title)
+    table = Table("", "network before", "after", title=title)
     for name, before in vars(tuning.before).items():
         after = getattr(tuning.after, name)
         table.add_row(name.replace("_", " ") + " %", f"{100 * before:.1f}", f"{100 * after:.1f}")
     display.console.print(table)
     for name, value in tuning.options.items():
         display.console.print(f"recovery.{name}: {value:.4g}")
+    if tuning.kept:
+        display.console.print(f"old factors kept: {tuning.kept}")
     display.console.print(f"tuned checkpoint {path}")
 
 

@@ -26,8 +26,8 @@ import torch
 from jaxtyping import Bool, Float
 
 from dopepp.core.errors import UserError
+from dopepp.data.rendered import Split
 from dopepp.data.sample import Instance, Sample, SampleSource
-from dopepp.data.transforms.shading_protocol import shade
 from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.assembly.negative_frames import LOOKALIKES, negative_frames
 from dopepp.experiment.config.data_config import DataConfig
@@ -68,9 +68,7 @@ reported, however quiet the pictures without the objects are."""
 
 SAME: Final = 0.005  # average precision that fitted options may lose
 
-HIDDEN: Final = 0.4
-"""Share of each object that is covered in additional validation images for the score of refined
-poses. It adds detections of low belief whose refined pose may still be correct."""
+SPLITS: Final[tuple[Split, Split]] = ("val", "test")
 
 MOST_BYTES: Final = 2**30
 """Limit of the cache: 1,400 pictures of 400×400 pixels with the maps of one part."""
@@ -131,7 +129,7 @@ class Figures:
 class Tuning:
     """Tuned recovery options, and their effect on test images with and without objects.
 
-    ``kept`` says which options of the checkpoint were better than the fitted ones.
+    ``before`` is the network alone, as it was. ``kept`` says why the old factors were kept.
     """
 
     options: dict[str, float]
@@ -155,76 +153,58 @@ def tune(
     old, memory = estimator.recovery, Memory()
     estimator = memory.behind(estimator)
     count, rate = target.num_empty, target.false_positive_rate
-    sources = _Sources(
-        validation=memory.of(held_out_source(data, parts, "val")),
-        test=memory.of(held_out_source(data, parts, "test")),
-        empty=memory.of(negative_frames(data, parts, "val", count)),
-        empty_test=memory.of(negative_frames(data, parts, "test", count)),
-    )
-    before = _measured(estimator, parts, sources, old)
-    new, kept = _chosen_factors(estimator, parts, sources, old)
-    new = _tuned_score(_without_refinement(estimator), parts, sources, rate, new)
+    validation, test = (memory.of(held_out_source(data, parts, split)) for split in SPLITS)
+    empty, empty_test = (memory.of(negative_frames(data, parts, split, count)) for split in SPLITS)
+    plain = _without_refinement(estimator)
+    before = _measured(plain, parts, test, empty_test, old)
+    new, shown, kept = _chosen_factors(estimator, parts, validation, empty, rate, old)
     if estimator.refiner is not None and estimator.refiner.verifies:
-        new = _tuned_score(estimator, parts, sources, rate, new)
-    after = _measured(estimator, parts, sources, new)
+        estimator.recovery = _audible(new)
+        without = score_images(estimator, parts, empty)
+        new = replace(new, **choose(shown, without, rate, refined=True))  # type: ignore[arg-type]
+    after = _measured(estimator, parts, test, empty_test, new)
     options = {
         field.name: getattr(new, field.name)
         for field in fields(RecoveryOptions)
         if field.name.endswith(("_factor", "min_score")) or field.name.startswith(_WEIGHTS)
     }
-    return Tuning(options, before, after, (len(sources.test), count), kept)
-
-
-@dataclass(frozen=True)
-class _Sources:
-    """Images to tune and to measure on, with and without objects."""
-
-    validation: SampleSource
-    test: SampleSource
-    empty: SampleSource
-    empty_test: SampleSource
+    return Tuning(options, before, after, (len(test), count), kept)
 
 
 def _chosen_factors(
-    estimator: PoseEstimator, parts: Parts, sources: _Sources, old: RecoveryOptions
-) -> tuple[RecoveryOptions, str]:
-    """Return the options with the fitted factors, or with the old ones and why.
+    estimator: PoseEstimator,
+    parts: Parts,
+    validation: SampleSource,
+    empty: SampleSource,
+    rate: float,
+    old: RecoveryOptions,
+) -> tuple[RecoveryOptions, Scored, str]:
+    """Choose between the fitted factors and the old ones, each with the network's score for them.
 
     The factors are those of network poses. They are judged by the poses that the estimator reports,
     because a wrong covariance misleads the refinement.
+
+    Returns:
+        Options, their detections on the validation images, and why the old factors were kept.
     """
-    without = replace(_audible(old), distance_factor=1.0, covariance_factor=1.0)
     plain = _without_refinement(estimator)
-    plain.recovery = without
-    factors = fit_factors(matched_poses(plain, parts, sources.validation))
-    precision: dict[str, float] = {}
-    for name, options in (("new", replace(without, **factors)), ("old", _audible(old))):  # type: ignore[arg-type]
-        estimator.recovery = options
-        shown = score_images(estimator, parts, sources.validation)
-        precision[name] = shown.average_precision(shown.scores)
-    if precision["new"] >= precision["old"] - SAME:
-        return replace(old, **factors), ""  # type: ignore[arg-type]
-    fitted = ", ".join(f"{name}={value:.3g}" for name, value in factors.items())
-    kept = "AP {old:.3f} on validation images with the old factors, {new:.3f} with ".format(
-        **precision
-    )
-    return old, kept + fitted
-
-
-def _tuned_score(
-    estimator: PoseEstimator, parts: Parts, sources: _Sources, rate: float, options: RecoveryOptions
-) -> RecoveryOptions:
-    """Return the options with the weights and the threshold of the estimator's poses."""
-    refined, shown = estimator.refiner is not None, [sources.validation]
-    estimator.recovery = _audible(options)
-    if refined:
-        # The features need the score of the network, and the verification as it was learned.
-        estimator.recovery = _audible(options.unrefined())
-        shown.append(Hidden(sources.validation))
-    with_objects = score_images(estimator, parts, *shown)
-    without = score_images(estimator, parts, sources.empty)
-    chosen = choose(with_objects, without, rate, refined=refined)
-    return replace(options, **chosen)  # type: ignore[arg-type]
+    plain.recovery = replace(_audible(old), distance_factor=1.0, covariance_factor=1.0)
+    factors = fit_factors(matched_poses(plain, parts, validation))
+    results: list[tuple[RecoveryOptions, Scored, float]] = []
+    for base in (replace(old, **factors), old):  # type: ignore[arg-type]
+        plain.recovery = _audible(base)
+        with_objects, without = (score_images(plain, parts, it) for it in (validation, empty))
+        # The verification as it was learned is what the score of refined poses is fitted to.
+        options = replace(base.unrefined(), **choose(with_objects, without, rate))  # type: ignore[arg-type]
+        estimator.recovery = _audible(options)
+        shown = score_images(estimator, parts, validation)
+        results.append((options, shown, shown.average_precision(shown.scores)))
+    (new, shown_new, fitted), (same, shown_same, former) = results
+    if fitted >= former - SAME:
+        return new, shown_new, ""
+    named = ", ".join(f"{name}={value:.3g}" for name, value in factors.items())
+    kept = f"AP {former:.3f} on validation images with the old factors, {fitted:.3f} with {named}"
+    return same, shown_same, kept
 
 
 def _audible(options: RecoveryOptions) -> RecoveryOptions:
@@ -233,15 +213,17 @@ def _audible(options: RecoveryOptions) -> RecoveryOptions:
 
 
 def _measured(
-    estimator: PoseEstimator, parts: Parts, sources: _Sources, options: RecoveryOptions
+    estimator: PoseEstimator,
+    parts: Parts,
+    test: SampleSource,
+    empty: SampleSource,
+    options: RecoveryOptions,
 ) -> Figures:
     """Return the figures of options on test images."""
     estimator.recovery = _audible(options)
-    shown, empty = (
-        score_images(estimator, parts, source) for source in (sources.test, sources.empty_test)
-    )
+    shown, without = (score_images(estimator, parts, source) for source in (test, empty))
     estimator.recovery = options
-    return _figures(shown, empty, estimator.min_score)
+    return _figures(shown, without, estimator.min_score)
 
 
 def _without_refinement(estimator: PoseEstimator) -> PoseEstimator:
@@ -367,21 +349,6 @@ def _by_object(
             of_part = [detection for detection in detections if detection.object == part.name]
             true = [instance for instance in sample.instances if instance.label == part.name]
             yield number, sample, part, of_part, true
-
-
-class Hidden:
-    """Source whose masked objects are covered by the share :data:`HIDDEN`."""
-
-    def __init__(self, source: SampleSource) -> None:
-        self._source, self.name = source, f"{source.name}, hidden"
-
-    def __len__(self) -> int:
-        """Return the number of images."""
-        return len(self._source)
-
-    def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Return the covered image."""
-        return shade(self._source.sample(index, epoch), [HIDDEN], 0, index)[0].sample
 
 
 def write_tuned(checkpoint: Checkpoint, path: Path, options: Mapping[str, float]) -> Path:

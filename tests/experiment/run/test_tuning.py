@@ -12,9 +12,7 @@ from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample
 from dopepp.experiment.config.run_config import FalsePositiveTarget
 from dopepp.experiment.run.tuning import (
-    HIDDEN,
     LEAST_REFINED_SCORE,
-    Hidden,
     Scored,
     choose,
     fit_factors,
@@ -202,16 +200,8 @@ def test_refined_poses_below_even_odds_are_not_reported():
     assert [same[f"refined_{name}"] for name in ("bias", "score", "verification")] == [0, 0, 1]
 
 
-def test_scores_of_refined_poses_learn_from_hidden_parts_too():
+def test_several_sources_are_judged_as_one():
     images = Images(POSE)
-    mask = np.zeros((128, 128), bool)
-    mask[40:90, 30:100] = True
-    images.samples[0].image[:] = np.random.default_rng(0).integers(0, 256, (128, 128, 3), np.uint8)
-    images.samples[0].instances[0].mask = mask
-    (shown,) = Hidden(images).sample(0, 0).instances
-    assert shown.mask.sum() == pytest.approx((1 - HIDDEN) * mask.sum(), abs=1)
-    assert np.array_equal(shown.T_cam_obj, POSE)
-    assert not Hidden(images).sample(1, 0).instances
     both = score_images(estimator(found(POSE, 0.9)), [PART], images, Images(POSE))
     assert (both.num_images, both.num_instances) == (4, 2)
     assert both.image.tolist() == [0, 1, 2, 3]
