@@ -19,14 +19,14 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import compress
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
 from dopepp.core.errors import UserError
-from dopepp.data.rendered import Split
+
 from dopepp.data.sample import Instance, Sample, SampleSource
 from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.assembly.negative_frames import LOOKALIKES, negative_frames
@@ -68,7 +68,7 @@ reported, however quiet the pictures without the objects are."""
 
 SAME: Final = 0.005  # average precision that fitted options may lose
 
-SPLITS: Final[tuple[Split, Split]] = ("val", "test")
+HELD_OUT: Final[tuple[Literal["val"], Literal["test"]]] = ("val", "test")
 
 MOST_BYTES: Final = 2**30
 """Limit of the cache: 1,400 pictures of 400×400 pixels with the maps of one part."""
@@ -153,8 +153,10 @@ def tune(
     old, memory = estimator.recovery, Memory()
     estimator = memory.behind(estimator)
     count, rate = target.num_empty, target.false_positive_rate
-    validation, test = (memory.of(held_out_source(data, parts, split)) for split in SPLITS)
-    empty, empty_test = (memory.of(negative_frames(data, parts, split, count)) for split in SPLITS)
+    validation, test = (memory.of(held_out_source(data, parts, split)) for split in HELD_OUT)
+    empty, empty_test = (
+        memory.of(negative_frames(data, parts, split, count)) for split in HELD_OUT
+    )
     plain = _without_refinement(estimator)
     before = _measured(plain, parts, test, empty_test, old)
     new, shown, kept = _chosen_factors(estimator, parts, validation, empty, rate, old)
