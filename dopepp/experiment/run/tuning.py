@@ -26,7 +26,6 @@ import torch
 from jaxtyping import Bool, Float
 
 from dopepp.core.errors import UserError
-
 from dopepp.data.sample import Instance, Sample, SampleSource
 from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.assembly.negative_frames import LOOKALIKES, negative_frames
