@@ -237,7 +237,7 @@ def begin(root: Path, record: Mapping[str, Any]) -> None:
         raise UserError(
             f"folder {root}: {error.strerror}",
             "a folder that can be written",
-            "pass another --out",
+            "pass another folder with --out",
         ) from error
 
 
@@ -250,13 +250,13 @@ def _claim(root: Path, record: Mapping[str, Any]) -> None:
         if foreign:
             problem = f"folder {root}, which holds {foreign[0]!r} and no {RECORD_FILE}"
             allowed = "an empty folder, or one that a render job began"
-            raise UserError(problem, allowed, "pass another --out")
+            raise UserError(problem, allowed, "pass a new folder with --out")
         write_whole(path, (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())
     # This also follows writing, as two jobs may begin simultaneously.
     differences = list(_differences(read_json(path, _MAX_RECORD_BYTES), record, ""))
     if differences:
         problem = f"{path} of another job: {', '.join(differences[:_MAX_DIFFERENCES])}"
-        fix = "repeat those settings with that version of dopepp, or pass another --out"
+        fix = "repeat those settings with that version of dopepp, or pass a new folder with --out"
         raise UserError(problem, "the settings that the folder was begun with", fix)
 
 

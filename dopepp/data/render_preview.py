@@ -53,7 +53,9 @@ def write_preview(job: Job, out: Path) -> Path:
         write_png(path, sheet)
     except OSError as error:
         raise UserError(
-            f"sheet {path}: {error.strerror}", "a folder that can be written", "pass another --out"
+            f"sheet {path}: {error.strerror}",
+            "a folder that can be written",
+            "pass another folder with --out",
         ) from error
     return path
 

@@ -160,7 +160,7 @@ class PoseEstimator:
         roi: Region | None = None,
         cropped: bool = False,
     ) -> list[Detection]:
-        """Detect all trained parts on an image, from the score :attr:`min_score` on.
+        """Detect all trained parts on an image whose score is at least :attr:`min_score`.
 
         The image is resized until parts have the size that they had in training
         (:mod:`dopepp.inference.picture`).
@@ -204,8 +204,8 @@ class PoseEstimator:
     ) -> list[Detection]:
         """Return every detection, best score first; arguments and errors are those of predict.
 
-        Most candidates below :attr:`min_score` are no part. An estimator that refines leaves out
-        those of a network score below :data:`~dopepp.recovery.detection.CANDIDATE`.
+        Most candidates below :attr:`min_score` are false detections. An estimator that refines
+        leaves out those with a network score below :data:`~dopepp.recovery.detection.CANDIDATE`.
         """
         image, K, depth = prepare_image(image, K, distortion, depth, cropped)
         with self._timed("pre"):
@@ -227,7 +227,7 @@ class PoseEstimator:
 
     @property
     def min_score(self) -> float:
-        """Score from which a candidate is a detection.
+        """Minimum score of a detection.
 
         It is the checkpoint's threshold unless :meth:`reporting` has replaced it. Verified poses
         have a threshold of their own.

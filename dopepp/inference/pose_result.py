@@ -107,7 +107,7 @@ class PoseResult:
     identities: Sequence[int] | None = None  # of the detections, if a tracker follows them
     shapes: Mapping[str, Shape] = field(default_factory=dict, repr=False)  # by part name
     weaker: Sequence[float] = ()  # scores of the candidates below min_score, best first
-    min_score: float = 0.0  # score from which a candidate is a detection
+    min_score: float = 0.0  # minimum score of a detection
 
     @property
     def num_weaker(self) -> int:

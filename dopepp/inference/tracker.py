@@ -210,7 +210,7 @@ class PoseTracker:
             cropped: As in :meth:`PoseEstimator.predict`.
 
         Returns:
-            Visible parts from the estimator's threshold on, sorted by identity.
+            Visible parts with scores of at least the estimator's threshold, sorted by identity.
 
         Raises:
             UserError: The image is no RGB image, or K does not belong to it.

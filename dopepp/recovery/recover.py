@@ -256,4 +256,4 @@ def summary(silent: Sequence[Reason], num_images: int) -> str:
         values = [reason.best for reason in silent if reason.kind == kind]
         if values:
             groups.append(f"{len(values)} {words.format(best=max(values))}")
-    return f"{len(silent)} of {num_images} images silent: {', '.join(groups)}"
+    return f"{len(silent)} of {num_images} images without detections: {', '.join(groups)}"

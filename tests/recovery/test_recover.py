@@ -208,7 +208,7 @@ def test_the_best_candidate_of_each_object_and_many_images_in_a_line():
     ).split("; ")
     assert (explained(reasons), explained([])) == (line, "")
     assert summary([*reasons[1:3], reasons[-1]], 300) == (
-        "3 of 300 images silent: 1 with empty maps (best belief 0), "
+        "3 of 300 images without detections: 1 with empty maps (best belief 0), "
         "2 below the threshold (best score 0.2)"
     )
 

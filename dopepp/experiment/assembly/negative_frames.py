@@ -1,4 +1,4 @@
-"""Build camera frames without the objects, which tune and test that an estimator keeps silent.
+"""Build camera frames without the objects, which tune and test the detection threshold.
 
 The frames have the full size of the camera and are of several kinds in turn (:data:`KINDS`). The
 kind of a frame is its sample's ``source``. Frames of the validation and the test split show
@@ -36,13 +36,13 @@ OWN: Final = "own pictures"
 KINDS: Final = {
     PHOTOS: "photos, whole",
     SCENES: "renders of clutter, distractors and other parts",
-    LOOKALIKES: "renders of look-alikes of the parts before photos",
+    LOOKALIKES: "renders of look-alikes of the parts in front of photos",
     OWN: "the user's own pictures without the parts",
 }
 """Kinds of frames and what they show, in the order of the frames.
 
-No threshold can silence a network on look-alikes without losing the part; whether refinement or
-verification rejects them is worth a separate row in a table."""
+No threshold rejects look-alikes without missing the part as well, so a table shows them in a
+separate row: refinement or verification may reject them."""
 
 FRAME: Final[Size] = (640, 480)
 """(width, height) of the frames if there is no camera and the preset's pictures are smaller."""

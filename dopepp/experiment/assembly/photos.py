@@ -1,4 +1,4 @@
-"""Divide the user's photos: backgrounds for training, other photos to tune and test silence.
+"""Divide the user's photos: backgrounds for training, other photos for the detection threshold.
 
 Photos stand behind rendered parts in training. A network learns to ignore them, so its threshold is
 tuned and tested on photos that training has not used.

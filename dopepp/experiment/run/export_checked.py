@@ -103,8 +103,8 @@ def _written(target: Path) -> Iterator[Path]:
         with draft(target) as draft_path:
             yield draft_path
     except OSError as error:
-        reason = f"cannot write {target}: {error.strerror}; free space there, or pass another --out"
-        raise RunError(reason) from error
+        fix = "free space there, or pass a path on another disk with --out"
+        raise RunError(f"cannot write {target}: {error.strerror}; {fix}") from error
 
 
 def _target(path: Path, layout: str, precision: str, out: Path | None) -> Path:
@@ -127,9 +127,9 @@ def _target(path: Path, layout: str, precision: str, out: Path | None) -> Path:
     others = [path for path in out.glob("*") if path.suffix not in (".xml", ".bin")]
     if (is_file and out.is_dir()) or (not is_file and out.is_file()) or others:
         problem = f"--out {out}, where something else exists"
-        raise UserError(problem, "a new path, or an earlier export", "pass another --out")
+        raise UserError(problem, "a new path, or an earlier export", "pass a new path with --out")
     if out.exists() and path.exists() and out.samefile(path):
-        fix = "pass another --out"
+        fix = "pass another path with --out"
         raise UserError(f"--out {out}, which is the checkpoint", "another path", fix)
     return out
 

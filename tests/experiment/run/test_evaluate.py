@@ -61,8 +61,10 @@ def test_silent_images_are_counted_by_reason(composed, tmp_path, capsys):
     write_atomic(strict.to_file(), tmp_path / "strict.ckpt")
     options = (f"ckpt_path={tmp_path / 'strict.ckpt'}", "+data.num_test=3")
     run_evaluation(composed(*options, config="evaluate"), tmp_path / "run")
-    (line,) = [row for row in capsys.readouterr().out.splitlines() if "images silent:" in row]
-    assert line.startswith("dopepp_fast: 3 of 3 images silent: ")
+    (line,) = [
+        row for row in capsys.readouterr().out.splitlines() if "images without detections:" in row
+    ]
+    assert line.startswith("dopepp_fast: 3 of 3 images without detections: ")
     assert "below the threshold (best score" in line
 
 
