@@ -8,7 +8,7 @@ entry to ``conf/callbacks``.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -139,10 +139,10 @@ class PoseSystem(LightningModule):
         return ValidationOutput(loss, self.network.activate(logits.float()), field.float())
 
     def recover(self, output: ValidationOutput, batch: Batch) -> list[list[Detection]]:
-        """Recover the poses on every image of a validation batch."""
+        """Recover all candidates on every image of a validation batch, also weak ones."""
         cameras, names = batch.K.cpu().numpy(), [part.name for part in self.parts]
         maps = (output.belief, output.field, self.cuboids, cameras, self.geometry.stride)
-        return recover_batch(*maps, names, **vars(self.recovery))
+        return recover_batch(*maps, names, **vars(replace(self.recovery, min_score=0.0)))
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """Build the optimiser and its schedule over all steps of the run."""

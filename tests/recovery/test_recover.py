@@ -92,7 +92,7 @@ def test_best_score_comes_first_and_stays_within_one(make_scene, box, pose):
     belief, field = scene.maps()
     belief[:, :, :26] *= 0.5
     belief[:, :, 26:] *= 1.7  # an identity activation does not bound beliefs
-    first, second = recover(belief, field, scene.cuboids, scene.K)
+    first, second = recover(belief, field, scene.cuboids, scene.K, min_score=0.0)
     assert first.T_cam_obj[0, 3] > 0 > second.T_cam_obj[0, 3]
     assert 1 >= first.score > second.score >= 0
     assert len(recover(belief, field, scene.cuboids, scene.K, min_score=0.7)) == 1

@@ -172,7 +172,8 @@ class FalsePositiveTarget:
     Attributes:
         num_empty: Number of frames without objects to choose the threshold, and as many to check
             it (:mod:`dopepp.experiment.assembly.negative_frames`).
-        false_positive_rate: Permitted share of these frames with a detection; 1 sets no threshold.
+        false_positive_rate: Permitted share of these frames with a detection; with 1 every
+            candidate is reported.
     """
 
     num_empty: Count = 90

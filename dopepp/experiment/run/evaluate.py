@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -35,6 +36,8 @@ from dopepp.inference.runtimes import is_export
 from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part, Parts
 
+_log = logging.getLogger(__name__)
+
 
 def tune_and_record(
     estimator: PoseEstimator,
@@ -45,6 +48,9 @@ def tune_and_record(
     target: FalsePositiveTarget,
 ) -> Path:
     """Tune a checkpoint, write it next to the original and print the changes; return its path."""
+    if target.false_positive_rate == 1:
+        fix = "0.005 keeps the network silent on images without the part"
+        _log.warning("false_positive_rate=1: every candidate is reported; %s", fix)
     tuning = tune(estimator, data, parts, target)
     tuned = write_tuned(estimator.checkpoint, path, tuning.options)
     write_json(run_dir / "tuning.json", asdict(tuning))

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
+from dopepp.experiment.config.run_config import FalsePositiveTarget
 from dopepp.experiment.results.folder import METRICS_FILE, read_json
 from dopepp.experiment.results.recording import made_worse
-from dopepp.experiment.run.evaluate import run_evaluation
+from dopepp.experiment.run.evaluate import run_evaluation, tune_and_record
 from dopepp.metrics.pose import PoseMetrics
 from dopepp.models.checkpoint import read, write_atomic
 from dopepp.parts.catalogue import pivconnector
@@ -93,3 +94,16 @@ def test_pictures_without_the_part_are_counted(composed, tmp_path, capsys):
 def test_options_that_need_each_other(options, message, composed, tmp_path):
     with pytest.raises(UserError, match=message):
         run_evaluation(composed(*options, config="evaluate"), tmp_path)
+
+
+@pytest.mark.parametrize(("rate", "lines"), [(0.005, []), (1.0, ["every candidate is reported"])])
+def test_a_tuning_without_a_threshold_is_warned_of(monkeypatch, tmp_path, caplog, rate, lines):
+    def stop(*_):
+        raise InterruptedError
+
+    monkeypatch.setattr("dopepp.experiment.run.evaluate.tune", stop)
+    target = FalsePositiveTarget(10, rate)
+    with pytest.raises(InterruptedError):
+        tune_and_record(SimpleNamespace(), tmp_path, [], SimpleNamespace(), tmp_path, target)
+    assert len(caplog.messages) == len(lines)
+    assert all(line in message for line, message in zip(lines, caplog.messages, strict=True))
