@@ -124,7 +124,7 @@ def measure_and_record(
             measured.metrics[main.name], measured.metrics[main.refined.name]
         )
         in_words = ", ".join(f"{share:.1%} in {error}" for error, share in shares.items())
-        display.console.print(f"refinement made instances worse by over 1 mm: {in_words}")
+        display.console.print(f"refined poses worse than the network's by over 1 mm: {in_words}")
     write_json(run_dir / METRICS_FILE, main.to_record())
     if bop_csv:
         _write_results(run_dir, measured.poses, data, numbers)
@@ -184,9 +184,12 @@ def refining(estimator: PoseEstimator, refine: Refine | None, parts: Parts) -> P
 
 
 def made_worse(network: PoseMetrics, refined: PoseMetrics) -> dict[str, float]:
-    """Return the shares of instances whose ADD and translation error grew by more than 1 mm.
+    """Return the shares of refined poses that exceed the network's error by more than 1 mm.
 
-    An instance that only the network detects counts as worse.
+    Parts that refinement loses do not count; the recall shows them.
+
+    Returns:
+        Shares by error: ``add`` and ``translation``.
     """
     shares = {}
     for error in ("add", "translation"):
@@ -194,7 +197,7 @@ def made_worse(network: PoseMetrics, refined: PoseMetrics) -> dict[str, float]:
             np.concatenate([method.errors(name, error) for name in refined.parts])
             for method in (network, refined)
         )
-        worse = after > before + 0.001
+        worse = (after > before + 0.001)[np.isfinite(after)]
         shares[error] = float(worse.mean()) if len(worse) else 0.0
     return shares
 
