@@ -195,7 +195,7 @@ def silence(case: Case) -> Diagnosis:
     if case.centres is None:
         return Diagnosis("silence", "not checked: where the parts are is unknown")
     if not case.stray:
-        return Diagnosis("silence", "nothing is reported beside the parts")
+        return Diagnosis("silence", "nothing is reported where no part is")
     best, threshold = case.stray[0], case.estimator.min_score
     u, v = best.keypoints[CENTROID]
     where = "beside every part" if case.centres else "on a picture without the part"
