@@ -116,7 +116,10 @@ class Term(Protocol):
     """Evidence about a pose."""
 
     def __call__(self, pose: Transform, prior: NormalEquations, /) -> NormalEquations | None:
-        """Linearise the evidence at a pose, given the prior of the step; None without evidence."""
+        """Linearise the evidence at a pose; None without evidence.
+
+        ``prior`` is the prior of the step with the terms before this one.
+        """
 
 
 def descend(
@@ -130,10 +133,10 @@ def descend(
     pose, information = T_cam_obj, prior.information
     step = np.empty(6)
     for _ in range(steps):
-        before = prior.information, prior.information @ prior.offset(pose)
-        information, gradient = before
+        information = prior.information
+        gradient = information @ prior.offset(pose)
         for term in terms:
-            equations = term(pose, before)
+            equations = term(pose, (information, gradient))
             if equations is None:
                 return None
             information, gradient = information + equations[0], gradient + equations[1]

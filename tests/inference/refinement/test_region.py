@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy import ndimage
+from scipy.optimize import lsq_linear
 
 from dopepp.geometry.camera import camera_matrix, make_transform, moved, project, transform
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
@@ -27,7 +28,8 @@ from dopepp.inference.refinement.outline import (
 from dopepp.inference.refinement.refiner import NUM_QUADRUPLES, poses_of_four
 from dopepp.inference.refinement.region import FINE, FOLLOWED, FOUND, SURE, RegionRefiner
 from dopepp.inference.refinement.region.round import Round
-from dopepp.inference.refinement.region.shifts import OFFSET_PX, Shifts, find_shifts, region_terms
+from dopepp.inference.refinement.region.shared_errors import OFFSET_PX, SCALE_ERROR, region_terms
+from dopepp.inference.refinement.region.shifts import Shifts, find_shifts
 from dopepp.inference.refinement.solver import Prior, descend
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.part import Part
@@ -74,9 +76,12 @@ def started(seed: int, T: np.ndarray = TRUE) -> np.ndarray:
 
 
 def off(T: np.ndarray, true: np.ndarray = TRUE) -> tuple[float, float]:
-    """Return degrees and millimetres."""
+    """Return degrees, and millimetres without what an error of the scale explains."""
     turn = float(rotation_angle(T[:3, :3] @ true[:3, :3].T))
-    return math.degrees(turn), 1000 * float(np.linalg.norm(T[:3, 3] - true[:3, 3]))
+    distance, shift = np.linalg.norm(true[:3, 3]), T[:3, 3] - true[:3, 3]
+    ray = true[:3, 3] / distance
+    along = np.clip(shift @ ray, -SCALE_ERROR * distance, SCALE_ERROR * distance)
+    return math.degrees(turn), 1000 * float(np.linalg.norm(shift - along * ray))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -160,18 +165,46 @@ def test_derivative_against_finite_differences(part: Part) -> None:
 
 
 def test_terms_take_the_common_offset_out() -> None:
-    # Against the seven unknowns solved at once.
+    # Against the seven unknowns solved at once. At the camera's centre, scale moves no point.
     rng = np.random.default_rng(3)
     rows, mean = rng.normal(size=(60, 6)) * 100, rng.normal(size=60) * 1e-3 + 1.3
     shifts = Shifts(mean, np.full(60, 2.0))
     prior = np.eye(6), np.zeros(6)
-    H, g = region_terms(rows, shifts, prior, spacing=8.0, extent=1.0)
+    H, g = region_terms(rows, shifts, prior, spacing=8.0, extent=1.0, position=np.zeros(3))
     step = np.linalg.solve(H + prior[0], g)
     assert np.abs(rows @ step).max() < 0.2, "an offset of all points moves no pose"
     all_rows = np.column_stack([rows, np.ones(60)])
     ridge = np.diag([*np.ones(6), 1 / OFFSET_PX**2])
     whole = np.linalg.solve(2 * all_rows.T @ all_rows + ridge, 2 * all_rows.T @ mean)
     assert_allclose(step, whole[:6], atol=2e-5)
+
+
+@pytest.mark.parametrize("enlarged", [0.0, 0.004, -0.009, 0.02, -0.05])
+def test_an_error_of_the_scale_is_bounded(enlarged: float) -> None:
+    # Against the eight unknowns solved at once: pose, offset and bounded scale.
+    rng = np.random.default_rng(4)
+    position, weights = np.array([0.1, -0.05, 0.5]), np.full(60, 2.0**0.5)
+    rows = rng.normal(size=(60, 6)) * 100
+    by_scale = -rows[:, 3:] @ position
+    shifts = Shifts(rows @ (1e-3 * rng.normal(size=6)) + enlarged * by_scale, np.full(60, 2.0))
+    factor = np.linalg.cholesky(50 * np.eye(6) + 20 * np.ones((6, 6))).T
+    offset = 1e-3 * rng.normal(size=6)  # from the pose to the prior's mean
+    prior = factor.T @ factor, factor.T @ factor @ offset
+    H, g = region_terms(rows, shifts, prior, spacing=8.0, extent=1.0, position=position)
+
+    design = np.zeros((67, 8))
+    design[:60] = weights[:, None] * np.column_stack([rows, np.ones(60), by_scale])
+    design[60, 6], design[61:, :6] = 1 / OFFSET_PX, factor
+    target = [*weights * shifts.mean, 0.0, *factor @ offset]
+    limits = np.array([*np.full(7, np.inf), SCALE_ERROR])
+    expected = lsq_linear(design, target, (-limits, limits), tol=1e-14).x
+    assert_allclose(np.linalg.solve(H + prior[0], g + prior[1]), expected[:6], atol=2e-6)
+    assert (abs(expected[7]) < 0.99 * SCALE_ERROR) == (abs(enlarged) < SCALE_ERROR)
+    # The covariance contains the error of the scale, which is uniformly distributed.
+    without_error = np.linalg.inv(design[:61, :7].T @ design[:61, :7])[:6, :6]
+    nearer = np.array([0, 0, 0, *position])
+    stated = without_error + SCALE_ERROR**2 / 3 * np.outer(nearer, nearer)
+    assert_allclose(np.linalg.inv(H), stated, rtol=1e-3, atol=1e-9)
 
 
 def straight_edge() -> tuple[Contour, np.ndarray]:
@@ -290,6 +323,23 @@ def test_two_colours_are_solved(part: Part, seed: int) -> None:
     assert np.linalg.eigvalsh(refined.covariance).min() > 0
     assert np.linalg.det(refined.covariance) < np.prod(DEVIATIONS**2)
     assert refined.agreement > 0.9
+
+
+def test_distance_is_kept_where_the_scale_may_be_wrong(part: Part) -> None:
+    wrong_camera = K * np.array([[1.006], [1.006], [1.0]])
+    wrong_camera[:2, 2] = K[:2, 2]
+    refiner = RegionRefiner(part.mesh.vertices, part.mesh.faces)
+    for log_distance, kept in ((0.0, 0.002), (0.06, 0.02)):
+        turned = np.array([0.05, -0.06, 0.05, *log_distance * TRUE[:3, 3]])
+        given = moved(TRUE, turned)
+        refined = refiner.refine(picture(part), wrong_camera, given, np.diag(DEVIATIONS**2))
+        degrees, _ = off(refined.T_cam_obj)
+        assert degrees < 0.5
+        ratio = np.linalg.norm(refined.T_cam_obj[:3, 3]) / np.linalg.norm(TRUE[:3, 3])
+        assert abs(ratio - 1) < kept
+        along = TRUE[:3, 3] / np.linalg.norm(TRUE[:3, 3])
+        deviation = np.sqrt(along @ refined.covariance[3:, 3:] @ along)
+        assert deviation > 0.4 * SCALE_ERROR * TRUE[2, 3]
 
 
 def test_part_behind_an_occluder_and_over_the_border(refiner: RegionRefiner) -> None:

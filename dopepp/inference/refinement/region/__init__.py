@@ -8,9 +8,10 @@ the descent is repeated from other starts with a weaker prior, and the end that 
 returned. This is for poses whose covariance may be wrong, as a network's of an occluded part. If
 the image does not determine the pose, the given pose is kept.
 
-Errors of neighbouring points are correlated, and all points may share an offset: with independent
-errors, a blurred edge would overrule the network's distance. The idea of regions is that of PWP3D
-and RBOT, probabilistic lines are those of SRT3D (Stoiber et al. 2022).
+Errors of neighbouring points are correlated, and all points share errors of offset and scale
+(:mod:`~dopepp.inference.refinement.region.shared_errors`): with independent errors, a blurred edge
+or a print that is off by a percent would overrule the network's distance. The idea of regions is
+that of PWP3D and RBOT, probabilistic lines are those of SRT3D (Stoiber et al. 2022).
 """
 
 from __future__ import annotations
@@ -134,7 +135,8 @@ class RegionRefiner:
         visible = depth.visible(start.T_cam_obj)
         rounds = self._rounds(image, K, start.T_cam_obj, more=[depth.term(visible)])
         reach = _search_distance(rounds[0], Prior(start.T_cam_obj, start.information))
-        end = _descend(_necessary(rounds, reach), start.T_cam_obj, depth.prior, reach)
+        # Depth weighs more the nearer a pose is, so that the descent takes all rounds to converge.
+        end = _descend(rounds, start.T_cam_obj, depth.prior, reach)
         information = depth.information(end.T_cam_obj, visible)
         return end, rounds[-1].check(end, depth.prior, reach, information)
 

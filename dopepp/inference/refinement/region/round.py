@@ -22,15 +22,12 @@ from dopepp.inference.refinement.outline import (
     outline_rows,
     posed,
 )
-from dopepp.inference.refinement.region.shifts import (
-    FOLLOWED,
+from dopepp.inference.refinement.region.shared_errors import (
     INDEPENDENT_PX,
     LEAST_INFORMATION,
-    Shifts,
-    Weights,
-    find_shifts,
     region_terms,
 )
+from dopepp.inference.refinement.region.shifts import FOLLOWED, Shifts, Weights, find_shifts
 from dopepp.inference.refinement.solver import (
     NormalEquations,
     PoseMatrix,
@@ -150,9 +147,11 @@ class Round:
                 return None
             rows = outline_rows(contour, pose, self.crop.K)
             shifts = self._shifts(contour, reach)
-            return region_terms(rows, shifts, prior, self._spacing, self.crop.extent)
+            spacing, extent, position = self._spacing, self.crop.extent, pose[:3, 3].copy()
+            return region_terms(rows, shifts, prior, spacing, extent, position)
 
-        end = descend(start, prior, [outline, *self._more], self.stage.steps)
+        # The outline is the last: whether its distance counts depends on that of the other terms.
+        end = descend(start, prior, [*self._more, outline], self.stage.steps)
         if end is None:
             raise UndecidedError("the part's outline left the picture")
         return end

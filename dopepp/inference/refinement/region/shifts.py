@@ -1,4 +1,4 @@
-"""Shifts of the outline along its normals, and the terms of the pose that follow from them.
+"""Shifts of the outline along its normals.
 
 Along a normal, pixels have the part's colours up to the shift d at which the part ends, and those
 of its surroundings beyond. The sum of the pixels' log odds up to d is therefore the logarithm of
@@ -19,9 +19,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.geometry.refine import solve_damped
 from dopepp.inference.refinement.outline import Contour
-from dopepp.inference.refinement.solver import DAMPING, NormalEquations
 
 LEAST_CHANGE: Final = 3.0  # grey levels of noise: smaller changes are no edges
 
@@ -29,19 +27,6 @@ CHANCE: Final = 1.2
 """Largest ratio of the variance of a uniform distribution to that measured on pure noise."""
 
 LEAST_DEVIATION: Final = 0.3  # pixels; lower bound for the position of an edge at one point
-
-INDEPENDENT_PX: Final = 4.0  # length of the outline within which errors are equal
-LEAST_INFORMATION: Final = 1e-3  # pixels⁻²; less counts as none
-
-REWEIGHTINGS: Final = 2
-
-GATE: Final = 2.0  # standard deviations at which a point has a quarter of its weight
-
-ALIKE: Final = 0.5
-"""Length of the outline within which errors above a pixel are equal, share of the extent."""
-
-OFFSET_PX: Final = 1.5
-"""Standard deviation of the offset that all points share: blur, a halo, an error of the mesh."""
 
 
 class Weights(NamedTuple):
@@ -91,143 +76,6 @@ def find_shifts(
     shifts = np.empty((len(contour), 2))
     _shifts(odds, contour.pixels, contour.normals, changes, strength, step, count, *weights, shifts)
     return Shifts(shifts[:, 0], shifts[:, 1])
-
-
-def region_terms(
-    rows: Float[np.ndarray, "points 6"],
-    shifts: Shifts,
-    prior: NormalEquations,
-    spacing: float,
-    extent: float,
-) -> NormalEquations:
-    """Return the terms of an outline whose points share an unknown offset.
-
-    The offset is a seventh unknown with a prior. Points are reweighted by their residuals after a
-    common step: the spread of the residuals is added to each point's variance, and outliers get a
-    small weight (Geman–McClure).
-
-    Args:
-        rows: Derivatives of the points' motion.
-        shifts: Shifts of the points.
-        prior: Prior of the step.
-        spacing: Distance between points, pixels.
-        extent: Extent of the part, pixels.
-    """
-    H, g = np.zeros((7, 7)), np.zeros(7)
-    independent, alike = min(1.0, spacing / INDEPENDENT_PX), ALIKE * extent / spacing
-    _terms(rows, shifts.mean, shifts.information, *prior, independent, alike, H, g)
-    # The Schur complement eliminates the offset.
-    last = H[:6, 6] / (H[6, 6] + 1.0 / OFFSET_PX**2)
-    return H[:6, :6] - np.outer(last, H[:6, 6]), g[:6] - last * g[6]
-
-
-@compiled()
-def _terms(
-    rows: Array,
-    means: Array,
-    information: Array,
-    prior_H: Array,
-    prior_g: Array,
-    independent: float,
-    alike: float,
-    H: Array,
-    g: Array,
-) -> None:
-    """Write the reweighted terms of (rotation, shift, offset).
-
-    ``independent`` is the number of measurements that a point represents if errors are small,
-    ``alike`` the number of points that share an error otherwise.
-    """
-    squares, valid, weights = np.empty(len(rows)), np.empty(len(rows)), np.empty(len(rows))
-    num_valid = 0
-    for i in range(len(rows)):
-        weights[i] = 0.0
-        if information[i] > LEAST_INFORMATION:
-            weights[i] = information[i] * independent
-            num_valid += 1
-    if not num_valid:
-        return
-    matrix, gradient, step = np.empty((6, 6)), np.empty(6), np.empty(6)
-    for _ in range(REWEIGHTINGS):
-        _add(rows, means, weights, H, g)
-        pivot = H[6, 6] + 1.0 / OFFSET_PX**2
-        for c in range(6):
-            last = H[6, c] / pivot
-            gradient[c] = last * g[6] - g[c] - prior_g[c]
-            for d in range(6):
-                matrix[c, d] = H[c, d] + prior_H[c, d] - last * H[6, d]
-        solve_damped(matrix, gradient, DAMPING, step)
-        drawn = 0.0
-        for c in range(6):
-            drawn += H[6, c] / pivot * step[c]
-        offset, k = g[6] / pivot - drawn, 0
-        for i in range(len(rows)):
-            residual = means[i] - offset
-            for c in range(6):
-                residual -= rows[i, c] * step[c]
-            squares[i] = residual * residual
-            if information[i] > LEAST_INFORMATION:
-                valid[k] = squares[i]
-                k += 1
-        # The median of a squared normal variable is 0.455 of its variance.
-        spread = _median(valid[:num_valid]) / 0.455
-        # Below a pixel it is noise; above it is a shadow, a highlight or an error of the mesh.
-        share = min(independent, 1.0 / max(alike * min(1.0, spread), 1.0))
-        for i in range(len(rows)):
-            if information[i] > LEAST_INFORMATION:
-                variance = 1.0 / information[i] + spread
-                weights[i] = share / variance / (1.0 + squares[i] / (GATE**2 * variance)) ** 2
-    _add(rows, means, weights, H, g)
-
-
-@compiled()
-def _median(values: Array) -> float:
-    """Return the median by quickselect, which reorders the values."""
-    half = len(values) // 2
-    low, high = 0, len(values) - 1
-    while low < high:
-        pivot, i, j = values[half], low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while pivot < values[j]:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if j < half:
-            low = i
-        if half < i:
-            high = j
-    if len(values) % 2:
-        return float(values[half])
-    below = values[0]
-    for i in range(half):
-        below = max(below, values[i])
-    return float((below + values[half]) / 2)
-
-
-@compiled()
-def _add(rows: Array, means: Array, weights: Array, H: Array, g: Array) -> None:
-    """Write the normal equations; the derivative by the offset is 1."""
-    row = np.ones(7)
-    for c in range(7):
-        g[c] = 0.0
-        for d in range(7):
-            H[c, d] = 0.0
-    for i in range(len(rows)):
-        if weights[i] == 0.0:
-            continue
-        for c in range(6):
-            row[c] = rows[i, c]
-        for c in range(7):
-            g[c] += weights[i] * row[c] * means[i]
-            for d in range(c + 1):
-                H[c, d] += weights[i] * row[c] * row[d]
-    for c in range(7):
-        for d in range(c):
-            H[d, c] = H[c, d]
 
 
 @compiled()
