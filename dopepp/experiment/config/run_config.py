@@ -177,7 +177,7 @@ class FalsePositiveTarget:
     """
 
     num_empty: Count = 90
-    false_positive_rate: Share = 0.005
+    false_positive_rate: Share = 0.02
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import logging
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import compress
@@ -65,6 +66,7 @@ LEAST_REFINED_SCORE: Final = 0.3
 """Lowest threshold of refined poses: a pose that is far more likely wrong than right is not
 reported, however quiet the pictures without the objects are."""
 
+MOST_LOST: Final = 0.05  # share of the correct refined poses that silence may cost
 SAME: Final = 0.005  # average precision that fitted options may lose
 
 HELD_OUT: Final[tuple[Literal["val"], Literal["test"]]] = ("val", "test")
@@ -73,6 +75,8 @@ MOST_BYTES: Final = 2**30
 """Limit of the cache: 1,400 pictures of 400×400 pixels with the maps of one part."""
 
 _WEIGHTS: Final = ("score_", "refined_")
+
+_log = logging.getLogger(__name__)
 
 Made = TypeVar("Made")
 
@@ -292,9 +296,29 @@ def choose(
     threshold = float(np.nextafter(loudest[allowed], 1.0)) if allowed < len(loudest) else 0.0
     names = ["min_score", *(f"score_{feature}" for feature in FEATURES)]
     if refined:
-        threshold = max(threshold, LEAST_REFINED_SCORE) if false_positive_rate < 1 else 0.0
+        threshold = _refined_threshold(threshold, shown, weights) if allowed < len(loudest) else 0.0
         names = [f"refined_{name}" for name in ("min_score", *REFINED_FEATURES)]
     return dict(zip(names, [threshold, *map(float, weights)], strict=True))
+
+
+def _refined_threshold(
+    silent: float, shown: Scored, weights: Float[np.ndarray, "features"]
+) -> float:
+    """Return the threshold of refined poses.
+
+    It is the one that is silent on frames without the objects, within :data:`LEAST_REFINED_SCORE`
+    and the score that all but the share :data:`MOST_LOST` of the correct poses have. A single frame
+    that deceives the verification must not cost most poses.
+    """
+    correct = score(shown.features, weights)[shown.correct]
+    most = float(np.quantile(correct, MOST_LOST)) if len(correct) else 1.0
+    if silent > most:
+        text = (
+            "frames without the objects deceive scores up to %.2f; the threshold is %.2f, because "
+        )
+        text += "a higher one would lose over %.0f %% of the correct poses"
+        _log.warning(text, silent, max(most, LEAST_REFINED_SCORE), 100 * MOST_LOST)
+    return max(min(silent, most), LEAST_REFINED_SCORE)
 
 
 def score_images(estimator: PoseEstimator, parts: Parts, *sources: SampleSource) -> Scored:

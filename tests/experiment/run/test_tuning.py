@@ -13,6 +13,7 @@ from dopepp.data.sample import Instance, Sample
 from dopepp.experiment.config.run_config import FalsePositiveTarget
 from dopepp.experiment.run.tuning import (
     LEAST_REFINED_SCORE,
+    MOST_LOST,
     Scored,
     choose,
     fit_factors,
@@ -27,7 +28,7 @@ from dopepp.metrics.functional import expected_calibration_error
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.network import build_network
 from dopepp.parts import load_part
-from dopepp.recovery.detection import FEATURES, Detection, score
+from dopepp.recovery.detection import FEATURES, REFINED_FEATURES, Detection, score
 
 K = camera_matrix(300, 300, 64, 64)
 NOTHING = Scored(
@@ -187,14 +188,23 @@ def test_look_alikes_do_not_raise_the_threshold():
     assert alike.shows_lookalikes().sum() == 50
 
 
-def test_refined_poses_below_even_odds_are_not_reported():
+def test_refined_poses_far_below_even_odds_are_not_reported(caplog):
     rng = np.random.default_rng(0)
     features = np.column_stack([np.ones(200), rng.normal(size=(200, 2))])
     correct = rng.random(200) < score(features, np.array([0.0, 0.0, 1.0]))
     shown = Scored(features, rng.random(200), correct, np.arange(200), ["photos"] * 200, 200)
     nothing = replace(NOTHING, features=np.zeros((0, 3)))
     assert choose(shown, nothing, refined=True)["refined_min_score"] == LEAST_REFINED_SCORE
-    assert choose(shown, nothing, 1.0, refined=True)["refined_min_score"] == 0.0
+    loud = replace(nothing, features=np.array([[1.0, 0.0, 20.0]]), correct=np.zeros(1, bool))
+    loud = replace(loud, scores=np.zeros(1), image=np.zeros(1, int))
+    assert choose(shown, loud, 1.0, refined=True)["refined_min_score"] == 0.0
+    # One deceptive frame costs a twentieth of the correct poses, not all of them.
+    options = choose(shown, loud, 0.0, refined=True)
+    weights = np.array([options[f"refined_{name}"] for name in REFINED_FEATURES])
+    lost = score(shown.features, weights)[correct] < options["refined_min_score"]
+    assert options["refined_min_score"] < 0.9
+    assert lost.mean() == pytest.approx(MOST_LOST, abs=0.02)
+    assert "deceive" in caplog.text
     # Poses that are all right do not say how to weigh the features.
     same = choose(replace(shown, correct=np.ones(200, bool)), nothing, refined=True)
     assert [same[f"refined_{name}"] for name in ("bias", "score", "verification")] == [0, 0, 1]
