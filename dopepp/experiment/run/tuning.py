@@ -66,7 +66,7 @@ LEAST_REFINED_SCORE: Final = 0.2
 """Lowest threshold of refined poses: a pose that is far more likely wrong than right is not
 reported, however quiet the pictures without the objects are."""
 
-MOST_LOST: Final = 0.02  # share of the correct refined poses that silence may cost
+MOST_LOST: Final = 0.01  # share of the correct refined poses that silence may cost
 SAME: Final = 0.005  # average precision that fitted options may lose
 
 HELD_OUT: Final[tuple[Literal["val"], Literal["test"]]] = ("val", "test")

@@ -198,7 +198,7 @@ def test_refined_poses_far_below_even_odds_are_not_reported(caplog):
     loud = replace(nothing, features=np.array([[1.0, 0.0, 20.0]]), correct=np.zeros(1, bool))
     loud = replace(loud, scores=np.zeros(1), image=np.zeros(1, int))
     assert choose(shown, loud, 1.0, refined=True)["refined_min_score"] == 0.0
-    # One deceptive frame costs a fiftieth of the correct poses, not all of them.
+    # One deceptive frame costs a hundredth of the correct poses, not all of them.
     options = choose(shown, loud, 0.0, refined=True)
     weights = np.array([options[f"refined_{name}"] for name in REFINED_FEATURES])
     lost = score(shown.features, weights)[correct] < options["refined_min_score"]
