@@ -62,7 +62,7 @@ from dopepp.recovery.detection import (
     score,
 )
 
-LEAST_REFINED_SCORE: Final = 0.2
+LEAST_REFINED_SCORE: Final = 0.1
 """Lowest threshold of refined poses: a pose that is far more likely wrong than right is not
 reported, however quiet the pictures without the objects are."""
 
