@@ -47,6 +47,7 @@ from dopepp.experiment.results.measurement import (
     accumulators,
     image_id,
     measure,
+    reported,
 )
 from dopepp.experiment.results.report import Report
 from dopepp.metrics.pose import MEAN, MIN_VISIBLE_FRACTION, PoseMetrics
@@ -286,8 +287,9 @@ def measure_shading(
             shares_reached = [np.nan if share is None else share for share in variant.reached]
             reached[variant.share] += compress(shares_reached, counts)
             for name, method in methods.items():
-                poses, _ = method.detect(variant.sample, image_id(sample, index))
+                candidates, _ = method.detect(variant.sample, image_id(sample, index))
                 accumulator = metrics[variant.share][name]
+                poses = reported(method, candidates)
                 accumulator.update(poses, sample.instances, sample.K, sample.size[0])
         num_shown = len(tiles) // (len(shares) + 1)
         if num_shown < min(num_examples, MAX_EXAMPLES) and any(counts):

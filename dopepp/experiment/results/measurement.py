@@ -11,7 +11,7 @@ import re
 import statistics
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Final, Protocol
 
@@ -34,6 +34,7 @@ from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.runtimes import ExportedNetwork
 from dopepp.metrics.localisation import BopScores, Draw, Localisation
 from dopepp.metrics.pose import PoseMetrics, PredictedPose
+from dopepp.metrics.row import PoseRow
 from dopepp.models.network import build_network, network_cost
 from dopepp.parts.part import Part, Parts
 from dopepp.recovery.recover import Reason, furthest
@@ -66,15 +67,22 @@ class Method(Protocol):
 
     Attributes:
         parts: Objects to score, as defined by the test set.
+        min_score: Score from which a candidate is reported.
     """
 
     parts: Parts
+    min_score: float
 
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
-        """Return the poses in an image and the seconds it took, or None if unknown."""
+        """Return all candidates in an image and the seconds it took, or None if unknown."""
 
     def cost(self, seconds: Sequence[float]) -> Cost:
         """Return the cost of the method, given the known times of all images in order."""
+
+
+def reported(method: Method, candidates: Sequence[ScoredPose]) -> list[ScoredPose]:
+    """Return the candidates that a method reports."""
+    return [candidate for candidate in candidates if candidate.score >= method.min_score]
 
 
 class EstimatorMethod:
@@ -82,18 +90,18 @@ class EstimatorMethod:
 
     def __init__(self, estimator: PoseEstimator, parts: Parts) -> None:
         names = {part.name for part in estimator.parts}
-        self.estimator = estimator
+        self.estimator, self.min_score = estimator, estimator.min_score
         self.parts: Parts = [part for part in parts if part.name in names]
         self._names = {part.name for part in self.parts}
 
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
-        """Run the estimator and return the detections of measured objects."""
+        """Run the estimator and return the candidates of measured objects."""
         start = time.perf_counter()
-        detections = self.estimator.predict(
+        candidates = self.estimator.candidates(
             sample.image, sample.K, depth=sample.depth, cropped=True
         )
         seconds = time.perf_counter() - start
-        return [detection for detection in detections if detection.object in self._names], seconds
+        return [candidate for candidate in candidates if candidate.object in self._names], seconds
 
     def silence(self, sample: Sample) -> Reason | None:
         """Return why the best candidate in an image without detections was rejected, if any."""
@@ -128,13 +136,15 @@ class FilePose:
 class FileMethod:
     """Poses of another program, read from a BOP challenge CSV.
 
-    Poses of objects that are not measured are ignored.
+    Poses of objects that are not measured are ignored. All others are reported.
 
     Args:
         path: CSV file.
         parts: Objects to score.
         numbers: BOP number of every object by name.
     """
+
+    min_score = 0.0
 
     def __init__(self, path: Path, parts: Parts, numbers: Mapping[str, int]) -> None:
         self._path = path
@@ -224,7 +234,8 @@ class Measured:
     Attributes:
         reports: One report per method.
         tiles: Pictures of the first images.
-        poses: Poses of each method with their image and the seconds per image, or None if unknown.
+        poses: Candidates of each method with their image and the seconds per image, or None if
+            unknown.
         metrics: Accumulator of each method.
         silent: Indices of images with instances in which a method detected nothing.
         bop: BOP scores of each method, if requested and the images have targets.
@@ -247,8 +258,9 @@ def measure(
 ) -> Measured:
     """Run methods over the same images at their native size.
 
-    Pictures show the ground truth in green, predictions of the last method in yellow and those of
-    the other methods in blue (paper Fig. 14).
+    AP, BOP scores and files of poses are over all candidates, as scores rank them; every other
+    measure is over the reported poses. Pictures show the ground truth in green, predictions of the
+    last method in yellow and those of the other methods in blue (paper Fig. 14).
 
     Args:
         methods: Methods by name, the baseline first.
@@ -256,7 +268,7 @@ def measure(
         num_pictures: Number of images to draw.
         bop: Whether to compute BOP scores.
     """
-    metrics = accumulators(methods)
+    metrics, ranked = accumulators(methods), accumulators(methods)
     seconds: dict[str, list[float]] = {name: [] for name in methods}
     measured = Measured([], [], {name: [] for name in methods}, metrics, {n: [] for n in methods})
     draw = depth_drawer()
@@ -270,14 +282,16 @@ def measure(
         image = image_id(sample, index)
         wireframes = [Wireframe(instance.keypoints, GREEN, "true") for instance in sample.instances]
         for number, (name, method) in enumerate(methods.items()):
-            poses, taken = method.detect(sample, image)
+            candidates, taken = method.detect(sample, image)
+            poses, truths = reported(method, candidates), sample.instances
             seconds[name] += [] if taken is None else [taken]
-            metrics[name].update(poses, sample.instances, sample.K, sample.size[0])
+            metrics[name].update(poses, truths, sample.K, sample.size[0])
+            ranked[name].update(candidates, truths, sample.K, sample.size[0])
             if bop:
-                localised[name].update(poses, sample.instances, sample.K, sample.size, sample.depth)
-            if sample.instances and not poses:
+                localised[name].update(candidates, truths, sample.K, sample.size, sample.depth)
+            if truths and not poses:
                 measured.silent[name].append(index)
-            measured.poses[name] += [(image, pose, taken) for pose in poses]
+            measured.poses[name] += [(image, candidate, taken) for candidate in candidates]
             colour = BLUE if number < len(methods) - 1 else YELLOW
             wireframes += [Wireframe(pose.keypoints, colour, name) for pose in poses]
         if len(measured.tiles) < num_pictures:
@@ -287,7 +301,7 @@ def measure(
     measured.reports = [
         Report(
             name,
-            metrics[name].compute(),
+            _with_precision(metrics[name].compute(), ranked[name].compute()),
             metrics[name].references(),
             {part.name: metrics[name].errors(part.name) for part in method.parts},
             method.cost(seconds[name]),
@@ -302,6 +316,16 @@ def measure(
         for name, method in methods.items()
     ]
     return measured
+
+
+def _with_precision(
+    rows: Mapping[str, PoseRow], ranked: Mapping[str, PoseRow]
+) -> dict[str, PoseRow]:
+    """Return the rows of reported poses with the AP of all candidates."""
+    return {
+        name: replace(row, average_precision=ranked[name].average_precision)
+        for name, row in rows.items()
+    }
 
 
 def depth_drawer() -> Draw:

@@ -38,6 +38,8 @@ COLOUR = 255
 class Finder:
     """Gives the true pose, a bit beside it, of the instances that it sees."""
 
+    min_score = 0.0
+
     def __init__(self, part: Part, offset: float, sees: Callable[[Sample, Instance], bool]) -> None:
         self.parts: Sequence[Part] = [part]
         self.offset, self.sees = offset, sees
@@ -103,6 +105,31 @@ def check_pictures(folder: Path, condition: Condition, columns: int) -> None:
     sheet = cv2.imread(str(folder / f"{condition.name}_examples.png"))
     assert sheet.shape[1] > columns * 320
     assert cv2.imread(str(folder / f"{condition.name}.png")).std() > 0
+
+
+class Doubtful(Finder):
+    """Reports poses half a metre beside the discs, and has the true poses as weaker candidates."""
+
+    min_score = 0.5
+
+    def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[FilePose], float | None]:
+        ((pose,), _) = super().detect(sample, image)
+        beside = pose.T_cam_obj.copy()
+        beside[0, 3] += 0.5
+        return [replace(pose, score=0.9, T_cam_obj=beside), replace(pose, score=0.4)], None
+
+
+def test_all_candidates_count_for_ap_and_reported_poses_for_everything_else():
+    part = METHODS["dope"].parts[0]
+    method = Doubtful(part, 0.0, lambda *_: True)
+    measured = measure({"doubtful": method}, [Discs().sample(0)], 0)
+    for row in measured.reports[0].rows.values():
+        assert (row.precision, row.miss_rate, row.false_per_frame) == (0, 1, 1)
+        assert row.average_precision == pytest.approx(0.5)  # right at rank two, of one instance
+    method.min_score = 0.4
+    (report,) = measure({"doubtful": method}, [Discs().sample(0)], 0).reports
+    assert (report.rows["disc"].precision, report.rows["disc"].add_01d) == (0.5, 1)
+    assert [pose.score for _, pose, _ in measured.poses["doubtful"]] == [0.9, 0.4]
 
 
 def test_every_method_is_measured_at_every_share(tmp_path):
