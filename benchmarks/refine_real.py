@@ -43,7 +43,6 @@ from dopepp.geometry.camera import (
     project_keypoints,
     transform,
 )
-from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.refinement.refiner import Refiner
@@ -137,7 +136,7 @@ class NetworkStarts:
                 Instance(part.name, T, project_keypoints(part.cuboid, T, frame.K)) for T in poses
             ]
             of_part = [detection for detection in detections if detection.object == part.name]
-            indices = assign(part.cuboid[CENTROID], of_part, true)
+            indices = assign(part, of_part, true)
             for detection, index in zip(of_part, indices, strict=True):
                 if index >= 0:
                     yield number, poses[index], detection
