@@ -109,7 +109,7 @@ def doctor(
     unit: Unit = None,
     centres: Annotated[
         list[str] | None,
-        Option("--at", help="u,v: pixel of a part's centre; once for every part on the picture."),
+        Option("--at", help="u,v: pixel of a part's centre; repeat for every part in the picture."),
     ] = None,
     empty: Annotated[bool, Option("--empty", help="The picture shows none of the parts.")] = False,
     device: Device = "cpu",
@@ -128,7 +128,7 @@ def doctor(
         check_region(refine)
         shown_at = None if not centres and not empty else [_pixel(text) for text in centres or ()]
         if centres and empty:
-            raise UserError("--at with --empty", "one of the two", "leave one of them out")
+            raise UserError("--at with --empty", "one of the two", "leave out --at or --empty")
         K = None if intrinsics is None else camera_matrix(*intrinsics)
         lens = Lens(choose_camera(K, camera, Images([image])), K_size, crop)
         picture = read_photo(image)
@@ -165,7 +165,7 @@ def _pixel(text: str) -> tuple[float, float]:
     try:
         u, v = map(float, text.split(","))
     except ValueError:
-        got, fix = f"--at {text}", "give column and row of the part's centre: --at 412,230"
+        got, fix = f"--at {text}", "pass column and row of the part's centre, e.g. --at 412,230"
         raise UserError(got, "u,v in pixels", fix) from None
     return u, v
 

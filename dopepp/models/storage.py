@@ -169,7 +169,7 @@ def check_container(path: Path, what: str) -> int:
     limit = min(MAX_BYTES, path.stat().st_size)
     if size > limit:
         allowed = f"{what} of at most {limit} bytes"
-        fix = "load only files that you trust"
+        fix = "get the file again from a source that you trust"
         raise UserError(f"{path}, which unpacks to {size} bytes", allowed, fix)
     return size
 

@@ -117,13 +117,13 @@ def test_detections_beside_the_part_and_on_pictures_without_it_are_named(estimat
 
     def silence(image, *centres):
         findings = diagnose(Case(estimator, image, K, estimator.parts, centres=centres))
-        (finding,) = [each for each in findings if each.subject == "silence"]
+        (finding,) = [each for each in findings if each.subject == "elsewhere"]
         return finding
 
     assert not silence(rendered.image, (u + 0.8 * half, v)).fix
     assert not silence(rendered.image, (0.0, 0.0), (u, v)).fix
     beside = silence(rendered.image, (u + 1.3 * half, v))
-    assert "confident elsewhere, beside every part: 1 of 1 detections above" in beside.sentence
+    assert "1 of 1 detections above 0.5 are away from every part" in beside.sentence
     named = re.search(r"at \((\d+), (\d+)\)", beside.sentence)
     assert list(map(float, named.groups())) == pytest.approx([u, v], abs=3)
     assert "virtual.negative_photos" in beside.fix
@@ -132,7 +132,7 @@ def test_detections_beside_the_part_and_on_pictures_without_it_are_named(estimat
     findings = diagnose(
         Case(estimator, without.image, without.scene.K, estimator.parts, centres=())
     )
-    assert [(each.subject, each.fix) for each in findings] == [("part", ""), ("silence", "")]
+    assert [(each.subject, each.fix) for each in findings] == [("part", ""), ("elsewhere", "")]
 
 
 def test_a_part_that_is_larger_than_the_picture_is_missed(estimator, factory):

@@ -31,7 +31,7 @@ KEY: Final = "without_part"
 """Key of a report's details."""
 
 NUM_LOUDEST: Final = 6
-"""Number of loudest pictures to name and to draw."""
+"""Number of pictures with the highest scores to name and to draw."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,9 @@ class FalseAlarms:
     Attributes:
         num_pictures: Number of pictures.
         per_picture: Reported detections per picture.
-        threshold: Score from which a detection is reported.
-        loudest: Best score of the loudest pictures by name, loudest first. Scores below the
-            threshold count as well.
+        threshold: Minimum score of a reported detection.
+        loudest: Highest score of a candidate by picture, for the pictures with the highest scores,
+            in descending order. Scores below the threshold count as well.
     """
 
     num_pictures: int
@@ -59,8 +59,8 @@ class FalseAlarms:
             "pictures": f"{self.num_pictures:,}",
             "detections per picture": f"{self.per_picture:.3f}",
             "threshold": f"{self.threshold:.3g}",
-            "loudest score": NOT_AVAILABLE if best is None else f"{best:.3g}",
-            "loudest pictures": ", ".join(self.loudest),
+            "highest score": NOT_AVAILABLE if best is None else f"{best:.3g}",
+            "highest-scoring pictures": ", ".join(self.loudest),
         }
 
 
@@ -116,8 +116,8 @@ def count_false_alarms(
     """Run estimators on pictures without their parts.
 
     Returns:
-        The counts by estimator, and tiles of the last estimator's loudest pictures with their
-        best candidate.
+        The counts by estimator, and tiles of the last estimator's pictures with the highest
+        scores, with their best candidate.
     """
     alarms, tiles = {}, []
     for name, estimator in estimators.items():

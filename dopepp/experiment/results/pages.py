@@ -47,7 +47,7 @@ FILES: Final = {
     "metrics.csv": "losses, rates and validation over the steps",
     "config.yaml": "every option, resolved",
     "versions.json": "command, commit, packages, hardware, seed and fingerprint of the data",
-    "without_part.png": "the loudest pictures without the part, with the best candidate's score",
+    "without_part.png": "highest-scoring pictures without the part, with the best candidates",
     "overlay.png": "test images: truth in green, prediction in yellow",
     "coverage.png": "how often the truth lies within the stated covariance region, over its level",
     "auc.png": "share of test instances below each error (numbers in `auc.csv`)",

@@ -73,7 +73,7 @@ TUNE: Final = (
 class Diagnosis:
     """Result of a check."""
 
-    subject: str  # part, exposure, sharpness, camera, size, visibility, silence or pose
+    subject: str  # part, exposure, sharpness, camera, size, visibility, elsewhere or pose
     sentence: str  # observation
     fix: str = ""  # remedy; empty if all is well
 
@@ -190,18 +190,22 @@ def visibility(case: Case) -> Diagnosis:
     )
 
 
-def silence(case: Case) -> Diagnosis:
-    """Check whether detections lie where the user names no part."""
+def elsewhere(case: Case) -> Diagnosis:
+    """Check for detections away from the parts that the user has pointed out."""
     if case.centres is None:
-        return Diagnosis("silence", "not checked: where the parts are is unknown")
+        return Diagnosis(
+            "elsewhere", "not checked, because neither --at nor --empty states where the parts are"
+        )
     if not case.stray:
-        return Diagnosis("silence", "nothing is reported where no part is")
+        return Diagnosis("elsewhere", "no detections away from the parts")
     best, threshold = case.stray[0], case.estimator.min_score
     u, v = best.keypoints[CENTROID]
-    where = "beside every part" if case.centres else "on a picture without the part"
-    counts = f"{len(case.stray)} of {len(case.reported)} detections above {threshold:.2g}"
-    loudest = f"the best has the score {best.score:.2g}, at ({u:.0f}, {v:.0f})"
-    return Diagnosis("silence", f"confident elsewhere, {where}: {counts}; {loudest}", TUNE)
+    where = "away from every part" if case.centres else "on a picture without the part"
+    counts = (
+        f"{len(case.stray)} of {len(case.reported)} detections above {threshold:.2g} are {where}"
+    )
+    best_stray = f"the best has the score {best.score:.2g}, at ({u:.0f}, {v:.0f})"
+    return Diagnosis("elsewhere", f"{counts}; {best_stray}", TUNE)
 
 
 def pose(case: Case) -> Diagnosis:
@@ -234,12 +238,12 @@ CHECKS: Final[Sequence[Check]] = (
     camera,
     size,
     visibility,
-    silence,
+    elsewhere,
     pose,
 )
 """Checks, in the order of causes."""
 
-EMPTY_CHECKS: Final[Sequence[Check]] = (part_size, silence)
+EMPTY_CHECKS: Final[Sequence[Check]] = (part_size, elsewhere)
 """Checks of an image without the parts, where every detection is false."""
 
 
