@@ -49,6 +49,11 @@ MaxMs = Annotated[
     float | None, Option(help="Time limit of the refinement per picture, milliseconds.")
 ]
 
+ScaleError = Annotated[
+    float | None,
+    Option(help="Largest relative error of part size or focal length (default: 0.01)."),
+]
+
 Track = Annotated[bool, Option("--track", help="Track the parts from frame to frame.")]
 
 Meshes = Annotated[

@@ -16,6 +16,7 @@ from dopepp.cli.common import (
     MaxMs,
     Model,
     Region,
+    ScaleError,
     Track,
     check_region,
     resumable,
@@ -52,6 +53,7 @@ def node(
     conf: Conf = None,
     refine: Region = None,
     max_ms: MaxMs = None,
+    scale_error: ScaleError = None,
     track: Track = False,
     overlay: Annotated[bool, Option("--overlay", help="Publish drawn poses.")] = False,
     device: Device = "cpu",
@@ -80,7 +82,9 @@ def node(
         sources = open_sources(words, topic) if transport in LINES else []
         cameras = [fixed_camera or choose_camera(None, None, opened) for opened in sources]
         refinement = "region" if track or refine else None
-        estimator = PoseEstimator.load(model, device, refinement, max_ms=max_ms)
+        estimator = PoseEstimator.load(
+            model, device, refinement, max_ms=max_ms, scale_error=scale_error
+        )
         settings = WorkerSettings(conf, refinement is not None, overlay)
         worker = Worker(estimator, settings, fixed_camera, frame, track)
         if transport == "--ros2":

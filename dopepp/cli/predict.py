@@ -24,6 +24,7 @@ from dopepp.cli.common import (
     MaxMs,
     Meshes,
     Model,
+    ScaleError,
     Track,
     Unit,
     resumable,
@@ -65,6 +66,7 @@ def predict(
         str | None, Option(help="region, depth (with --depth), or region,depth.")
     ] = None,
     max_ms: MaxMs = None,
+    scale_error: ScaleError = None,
     depth: Annotated[Path | None, Option(help="Aligned 16-bit PNG, 0 = unknown.")] = None,
     depth_scale: Annotated[float, Option(help="Metres per unit of --depth.")] = 0.001,
     verify: Annotated[
@@ -104,7 +106,8 @@ def predict(
         from dopepp.inference.estimator import PoseEstimator
         from dopepp.parts.catalogue import with_meshes
 
-        estimator = PoseEstimator.load(model, device, max_ms=max_ms).reporting(conf)
+        estimator = PoseEstimator.load(model, device, max_ms=max_ms, scale_error=scale_error)
+        estimator = estimator.reporting(conf)
         known_parts = estimator.parts
         if verify or "region" in terms:
             known_parts = with_meshes(known_parts, parts or (), unit)

@@ -61,6 +61,9 @@ class PoseEstimator:
         parts: The checkpoint's parts with other meshes, or with meshes that it lacks.
         max_ms: Time limit for the refinement of an image, milliseconds. Detections beyond the limit
             keep the network's pose; the best scores are refined first.
+        scale_error: Largest relative error of the parts' size or of the focal length (default:
+            0.01). While network and image differ by less, the distance stays the network's. A
+            small value suits a calibrated camera and a measured part.
 
     Raises:
         UserError: The refinement is unknown, or a part has no mesh.
@@ -74,14 +77,16 @@ class PoseEstimator:
         refine: Refine | None = None,
         parts: Sequence[Part] | None = None,
         max_ms: float | None = None,
+        scale_error: float | None = None,
     ) -> None:
         self.checkpoint = checkpoint
         self.refine, self.refiner = refine, None
         if refine is not None:  # its solvers take as long to import as everything else but torch
             from dopepp.inference.refinement.refiner import Refiner
 
-            self.refiner = Refiner(refine, parts or checkpoint.parts)
-        self.max_ms = max_ms
+            known = {} if scale_error is None else {"scale_error": scale_error}
+            self.refiner = Refiner(refine, parts or checkpoint.parts, **known)
+        self.max_ms, self.scale_error = max_ms, scale_error
         for function in ("rehearse_pose", "rehearse_refinement"):
             compile_beside(f"dopepp.inference.refinement.refiner:{function}")
         self.device = checked_device(device)
@@ -103,6 +108,7 @@ class PoseEstimator:
         refine: Refine | None = None,
         parts: Sequence[Part] | None = None,
         max_ms: float | None = None,
+        scale_error: float | None = None,
         extensions: Sequence[str] = (),
     ) -> PoseEstimator:
         """Load a checkpoint, or a network that ``dopepp export`` wrote; see the class for options.
@@ -116,12 +122,12 @@ class PoseEstimator:
         """
         enable(extensions)
         chosen = checked_device(device)
-        return cls(*runtimes.load(Path(path), chosen), chosen, refine, parts, max_ms)
+        return cls(*runtimes.load(Path(path), chosen), chosen, refine, parts, max_ms, scale_error)
 
     def refining(self, refine: Refine, parts: Sequence[Part] | None = None) -> PoseEstimator:
         """Return an estimator with the same network that also refines; see the class."""
         refining = type(self)(
-            self.network, self.checkpoint, self.device, refine, parts, self.max_ms
+            self.network, self.checkpoint, self.device, refine, parts, self.max_ms, self.scale_error
         )
         refining.recovery = self.recovery
         return refining

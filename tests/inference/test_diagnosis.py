@@ -76,7 +76,7 @@ def test_what_spoils_a_picture_is_named_first(estimator, factory, fault, subject
     for index in range(6):
         rendered = factory.render(0, index)
         firsts[first(estimator, *fault(rendered.image, rendered.scene.K))] += 1
-    assert firsts[subject] >= 5, firsts
+    assert firsts[subject] >= 4, firsts
 
 
 def test_a_part_that_is_too_small_is_named_with_its_distance(estimator, factory):

@@ -308,6 +308,13 @@ def test_refines_no_longer_than_it_may(parts_path):
     assert estimator.predict(rendered.image, K_VGA)[0].kept == "max_ms=0 was spent"
 
 
+def test_the_scale_error_is_a_share(parts_path):
+    estimator = PoseEstimator.load(parts_path, refine="region", scale_error=0.002)
+    assert estimator.refining("region").scale_error == 0.002
+    with pytest.raises(UserError, match="scale_error"):
+        PoseEstimator.load(parts_path, refine="region", scale_error=2.0)
+
+
 def test_a_checkpoint_without_meshes_names_the_option(parts_path):
     estimator, _ = seen(parts_path, None)
     bare = replace(

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.errors import UserError
+from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import (
     CameraMatrix,
@@ -38,6 +39,7 @@ from dopepp.inference.picture import Depth
 from dopepp.inference.refinement.depth import DepthEvidence
 from dopepp.inference.refinement.part_surface import FEWEST_POINTS, Points, surface_points
 from dopepp.inference.refinement.region import RegionRefiner, Starts, refinement
+from dopepp.inference.refinement.region.shared_errors import SCALE_ERROR
 from dopepp.inference.refinement.solver import (
     PoseMatrix,
     Prior,
@@ -70,17 +72,21 @@ class Refiner:
     Args:
         refine: One or several of :data:`TERMS`.
         parts: Parts, with meshes for the term ``region``.
+        scale_error: Largest relative error of the parts' size or of the focal length, 0 to 0.1.
 
     Raises:
         UserError: There is no such term, or a part has no mesh.
     """
 
-    def __init__(self, refine: Refine, parts: Sequence[Part]) -> None:
+    def __init__(
+        self, refine: Refine, parts: Sequence[Part], scale_error: float = SCALE_ERROR
+    ) -> None:
+        scale_error = check("scale_error", scale_error, float, Range(0.0, 0.1))
         terms = (refine,) if isinstance(refine, str) else tuple(refine)
         if not terms or not set(terms) <= set(TERMS):
             allowed = f"{', '.join(TERMS)}, several of them, or none"
             raise UserError(f"refine={refine!r}", allowed, "use only these words")
-        self._refiners = {part.name: PartRefiner(part, terms) for part in parts}
+        self._refiners = {part.name: PartRefiner(part, terms, scale_error) for part in parts}
         self._cuboids = {part.name: part.cuboid for part in parts}
         self.verifies = "region" in terms
         """Whether refined poses are verified, from the same evidence as the term ``region``."""
@@ -136,12 +142,13 @@ class PartRefiner:
     Args:
         part: Part.
         terms: Evidence, some of :data:`TERMS`.
+        scale_error: As of :class:`Refiner`.
 
     Raises:
         UserError: The term ``region`` requires a mesh, and the part has none.
     """
 
-    def __init__(self, part: Part, terms: Sequence[str]) -> None:
+    def __init__(self, part: Part, terms: Sequence[str], scale_error: float = SCALE_ERROR) -> None:
         self._region: RegionRefiner | None = None
         self.verifier: Verifier | None = None
         """Verifies poses refined on the image; None without the term ``region``."""
@@ -153,7 +160,7 @@ class PartRefiner:
                     f"add --part {part.name}=FILE and its --unit (parts=… in Python), "
                     "or train again",
                 )
-            self._region = RegionRefiner(part.mesh.vertices, part.mesh.faces)
+            self._region = RegionRefiner(part.mesh.vertices, part.mesh.faces, scale_error)
             self.verifier = Verifier(self._region.mesh, part.diameter)
         self._uses_depth, self._diameter = "depth" in terms, part.diameter
         has_surface = self._uses_depth and len(part.points) >= FEWEST_POINTS

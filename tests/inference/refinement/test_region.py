@@ -342,6 +342,17 @@ def test_distance_is_kept_where_the_scale_may_be_wrong(part: Part) -> None:
         assert deviation > 0.4 * SCALE_ERROR * TRUE[2, 3]
 
 
+@pytest.mark.parametrize(("scale_error", "ratio"), [(0.0, 1.0), (0.01, 1.008)])
+def test_a_part_of_known_size_has_the_distance_of_its_outline(
+    part: Part, scale_error: float, ratio: float
+) -> None:
+    refiner = RegionRefiner(part.mesh.vertices, part.mesh.faces, scale_error)
+    given = moved(TRUE, np.array([0.03, -0.03, 0.03, *0.008 * TRUE[:3, 3]]))
+    refined = refiner.refine(picture(part), K, given, np.diag(DEVIATIONS**2))
+    distances = [np.linalg.norm(T[:3, 3]) for T in (refined.T_cam_obj, TRUE)]
+    assert distances[0] / distances[1] == pytest.approx(ratio, abs=0.003)
+
+
 def test_part_behind_an_occluder_and_over_the_border(refiner: RegionRefiner) -> None:
     image = picture(pivconnector())
     image[150:240, 190:250] = (30, 160, 40)

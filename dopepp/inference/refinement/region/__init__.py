@@ -29,6 +29,7 @@ from dopepp.inference.refinement.colour import EDGE_PX, crop_around
 from dopepp.inference.refinement.depth import DepthEvidence
 from dopepp.inference.refinement.outline import make_outline_mesh, outline_rows, posed
 from dopepp.inference.refinement.region.round import OutlineAgreement, RegionStage, Round
+from dopepp.inference.refinement.region.shared_errors import SCALE_ERROR
 from dopepp.inference.refinement.region.shifts import FOLLOWED, FOUND, Weights
 from dopepp.inference.refinement.solver import (
     PoseMatrix,
@@ -85,12 +86,14 @@ class RegionRefiner:
     Args:
         vertices: Positions, metres.
         faces: Triangles; large meshes are simplified.
+        scale_error: Largest relative error of the part's size or of the focal length.
 
     Raises:
         ValueError: The triangles have no area.
     """
 
-    def __init__(self, vertices: Vertices, faces: Faces) -> None:
+    def __init__(self, vertices: Vertices, faces: Faces, scale_error: float = SCALE_ERROR) -> None:
+        self._scale_error = scale_error
         self.mesh = make_outline_mesh(vertices, faces)
         self._diameter = largest_distance(self.mesh.vertices)
 
@@ -161,7 +164,7 @@ class RegionRefiner:
         stages = (COARSE, MIDDLE, FINE)
         crops = [crop_around(image, K, corners, stage.longest_px) for stage in stages]
         return [
-            Round(self.mesh, crop, stage, weights, more)
+            Round(self.mesh, crop, stage, weights, more, self._scale_error)
             for crop, stage in zip(crops, stages, strict=True)
         ]
 

@@ -25,6 +25,7 @@ from dopepp.inference.refinement.outline import (
 from dopepp.inference.refinement.region.shared_errors import (
     INDEPENDENT_PX,
     LEAST_INFORMATION,
+    SCALE_ERROR,
     region_terms,
 )
 from dopepp.inference.refinement.region.shifts import FOLLOWED, Shifts, Weights, find_shifts
@@ -91,6 +92,7 @@ class Round:
         stage: Resolution and search distance.
         weights: Weights of colours and edges.
         more: Terms in addition to the outline.
+        scale_error: Largest relative error of the outline's scale.
     """
 
     def __init__(
@@ -100,7 +102,9 @@ class Round:
         stage: RegionStage,
         weights: Weights,
         more: Sequence[Term] = (),
+        scale_error: float = SCALE_ERROR,
     ) -> None:
+        self._scale_error = scale_error
         self.crop, self.stage, self._weights = crop, stage, weights
         self._mesh, self._more, self._is_followed = mesh, more, weights == FOLLOWED
         self._spacing = max(1.5, 3.0 * crop.extent / stage.points)
@@ -148,7 +152,7 @@ class Round:
             rows = outline_rows(contour, pose, self.crop.K)
             shifts = self._shifts(contour, reach)
             spacing, extent, position = self._spacing, self.crop.extent, pose[:3, 3].copy()
-            return region_terms(rows, shifts, prior, spacing, extent, position)
+            return region_terms(rows, shifts, prior, spacing, extent, position, self._scale_error)
 
         # The outline is the last: whether its distance counts depends on that of the other terms.
         end = descend(start, prior, [*self._more, outline], self.stage.steps)

@@ -40,7 +40,7 @@ OFFSET_PX: Final = 1.5
 """Standard deviation of the offset that all points share: blur, a halo, an error of the mesh."""
 
 SCALE_ERROR: Final = 0.01
-"""Largest relative error of the part's size or of the focal length."""
+"""Default of the largest relative error of the part's size or of the focal length."""
 
 
 def region_terms(
@@ -50,6 +50,7 @@ def region_terms(
     spacing: float,
     extent: float,
     position: Vector,
+    scale_error: float = SCALE_ERROR,
 ) -> NormalEquations:
     """Return the terms of an outline, with offset and scale eliminated.
 
@@ -63,6 +64,7 @@ def region_terms(
         spacing: Distance between points, pixels.
         extent: Extent of the part, pixels.
         position: Object's origin, camera frame, metres.
+        scale_error: Largest relative error of the scale.
     """
     H, g = np.zeros((7, 7)), np.zeros(7)
     independent, alike = min(1.0, spacing / INDEPENDENT_PX), ALIKE * extent / spacing
@@ -70,7 +72,7 @@ def region_terms(
     # The Schur complement eliminates the offset.
     last = H[:6, 6] / (H[6, 6] + 1.0 / OFFSET_PX**2)
     H, g = H[:6, :6] - np.outer(last, H[:6, 6]), g[:6] - last * g[6]
-    _eliminate_scale(H, g, *prior, position, SCALE_ERROR)
+    _eliminate_scale(H, g, *prior, position, max(scale_error, 1e-9))
     return H, g
 
 
