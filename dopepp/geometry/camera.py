@@ -140,7 +140,7 @@ class Letterbox:
 
     @classmethod
     def scaled(cls, image_size: tuple[int, int], scale: float) -> Letterbox:
-        """Resize an image (width, height) by a factor."""
+        """Return the letterbox that scales an image of size (width, height) by a factor."""
         width, height = (max(1, round(side * scale)) for side in image_size)
         return cls(width, height, width / image_size[0], height / image_size[1])
 

@@ -89,7 +89,7 @@ class TruePose(Protocol):
 
 
 def matching_radius(part: Part) -> float:
-    """Return the largest distance between the centres of a detection and its instance, metres.
+    """Return the distance within which the centres of a detection and an instance match, metres.
 
     The radius is half of the part's diameter, and at most :data:`MAX_MATCHING_RADIUS`.
     """

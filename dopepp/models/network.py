@@ -174,7 +174,7 @@ def _check_keys(spec: object) -> None:
 def architecture(spec: Mapping[str, Any]) -> dict[str, Any]:
     """Return a deep copy of a spec without ``weights_path``.
 
-    Readers of a checkpoint must not open a file of the machine that trained it.
+    Loading a checkpoint must not need a file that exists only on the machine where it was trained.
     """
     plain: dict[str, Any] = copy.deepcopy(dict(spec))
     if isinstance(plain.get("backbone"), dict):

@@ -313,12 +313,12 @@ def fit_covariance_factor(squared_distances: Float[np.ndarray, "n"]) -> float:
     factor = float(squared[order[np.searchsorted(passed, 0.9)]]) / _TENTH_BEYOND
     low, high = COVARIANCE_FACTORS
     if not low <= factor <= high:
-        lean = "sure" if factor > high else "unsure"
+        lean = "confident" if factor > high else "cautious"
         raise UserError(
-            f"covariances of which the right poses need {factor:.3g} times as much",
+            f"covariances that must be multiplied by {factor:.3g} to match the poses' errors",
             f"a factor from {low:g} to {high:g}",
-            f"train longer: the network is far too {lean}; or state the part's symmetries "
-            "(data.symmetries=auto) if its poses look alike",
+            f"train longer, because the network is far too {lean}; or, if the part looks the same "
+            "in several orientations, state its symmetries with data.symmetries=auto",
         )
     return factor
 

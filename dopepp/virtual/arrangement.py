@@ -183,7 +183,7 @@ def _poses(composition: Composition, body: Body) -> Iterator[Transform]:
 
 
 def _place_distractor(composition: Composition, reference: float) -> None:
-    """Draw a distractor until it neither pierces nor hides a target, at most eight times."""
+    """Add a distractor that neither pierces nor hides a target; give up after eight trials."""
     rng, ranges = composition.rng, composition.preset.distractors
     for _ in range(8):
         depth = reference * rng.uniform(*ranges.depth)

@@ -69,7 +69,7 @@ class Factory:
         names = [part.name for part in parts]
         if not parts or len(set(names)) != len(names):
             allowed = "at least one part, each with its own name"
-            fix = "name a part, and rename those that share a name: NAME=FILE"
+            fix = "pass at least one part, and write NAME=FILE for parts that would share a name"
             raise UserError(f"parts {names} to render", allowed, fix)
         if seed < 0:
             raise UserError(f"seed {seed}", "an integer >= 0", "set a seed such as 0")

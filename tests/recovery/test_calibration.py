@@ -113,7 +113,7 @@ def test_wrong_poses_do_not_raise_the_covariance_factor(share):
     assert fit_covariance_factor(drawn) == pytest.approx(2.0, rel=0.25)
 
 
-@pytest.mark.parametrize(("factor", "lean"), [(30.0, "too sure"), (0.05, "too unsure")])
+@pytest.mark.parametrize(("factor", "lean"), [(30.0, "too confident"), (0.05, "too cautious")])
 def test_a_covariance_factor_beyond_all_experience_is_refused(factor, lean):
     with pytest.raises(UserError, match=lean):
         fit_covariance_factor(factor * chi2(6).rvs(500, random_state=0))

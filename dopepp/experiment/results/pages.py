@@ -238,7 +238,8 @@ def release(checkpoint: Path, results: Path, name: str, folder: Path) -> list[Pa
         UserError: A file is of another kind, or the release is too large.
     """
     if not name.isidentifier():
-        raise UserError(f"name {name!r}", "letters, digits and _", "pass a name such as my_part")
+        allowed = "letters, digits and _, not starting with a digit"
+        raise UserError(f"release name {name!r}", allowed, "choose a name such as my_part")
     trained = read(checkpoint)
     report = Report.from_record(read_json(results))
     parameters = sum(value.numel() for value in trained.state_dict.values())

@@ -241,7 +241,7 @@ def _bad_entry(problem: str) -> UserError:
 
 
 def examples(space: Space) -> list[list[str]]:
-    """Return overrides that contain every choice once, to check that they compose."""
+    """Return lists of overrides that together cover every choice, to check that they compose."""
     first = {key: _ends(choices)[0] for key, choices in space.varied.items()}
     tried = [first]
     for key, distribution in space.varied.items():

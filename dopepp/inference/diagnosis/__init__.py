@@ -205,7 +205,7 @@ def elsewhere(case: Case) -> Diagnosis:
         f"{len(case.stray)} of {len(case.reported)} detections above {threshold:.2g} are {where}"
     )
     best_stray = f"the best has the score {best.score:.2g}, at ({u:.0f}, {v:.0f})"
-    return Diagnosis("elsewhere", f"{counts}; {best_stray}", TUNE)
+    return Diagnosis("elsewhere", f"confident elsewhere: {counts}; {best_stray}", TUNE)
 
 
 def pose(case: Case) -> Diagnosis:

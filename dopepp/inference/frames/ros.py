@@ -55,17 +55,19 @@ def decode_image(message: Any) -> Picture:
     """Return the RGB image of a message.
 
     Raises:
-        ValueError: The message contradicts itself, or its image is too large.
+        ValueError: The encoding is not supported, or the image's size is inconsistent or too large.
     """
     if hasattr(message, "format"):
         picture = whole_picture(bytes(message.data), ("JPEG", "PNG"))
         return np.ascontiguousarray(np.asarray(picture.convert("RGB")))
     if message.encoding not in ENCODINGS:
-        raise ValueError(f"encoding {message.encoding!r:.40}, none of {', '.join(ENCODINGS)}")
+        supported = ", ".join(ENCODINGS)
+        raise ValueError(f"unsupported encoding {message.encoding!r:.40}; supported: {supported}")
     pixel_bytes, code = ENCODINGS[message.encoding]
     height, width, step = message.height, message.width, message.step
     if not 0 < height * width <= MAX_PIXELS or step < pixel_bytes * width:
-        raise ValueError(f"{width}×{height} pixels in rows of {step} bytes")
+        size = f"{width}×{height} pixels in rows of {step} bytes"
+        raise ValueError(f"image of {size}: empty, too large, or rows too short")
     data = np.frombuffer(message.data, np.uint8)
     rows = data[: height * step].reshape(height, step)[:, : pixel_bytes * width]
     pixels = np.ascontiguousarray(rows.reshape(height, width, pixel_bytes))

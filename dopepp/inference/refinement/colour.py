@@ -186,7 +186,7 @@ def _count(
 
 @compiled()
 def _tables(counts: Array, tables: Array) -> None:
-    """Write the log odds of every tile and colour; ``counts`` are blurred in place."""
+    """Write the log odds of part against surroundings per tile and colour; blurs ``counts``."""
     tiles = counts.shape[1]
     total, near = np.empty((2, STEPS**3), np.float32), np.empty((2, STEPS**3), np.float32)
     for side in range(2):

@@ -55,15 +55,15 @@ class OutlineMesh:
 def make_outline_mesh(
     vertices: Vertices, faces: Faces, max_faces: int = MAX_LIGHT_FACES
 ) -> OutlineMesh:
-    """Prepare a mesh; it is simplified to at most ``max_faces`` triangles.
+    """Prepare a mesh for drawing its outline, simplified to at most ``max_faces`` triangles.
 
     Raises:
-        ValueError: The triangles have no area.
+        ValueError: All triangles have zero area.
     """
     vertices, faces = weld(np.asarray(vertices, np.float64), np.asarray(faces, np.int64))
     faces = faces[face_areas(vertices, faces) > 0]
     if not len(faces):
-        raise ValueError("no triangle with an area")
+        raise ValueError("all triangles have zero area")
     if len(faces) > max_faces:
         vertices, faces, *_ = decimate(vertices, faces, None, max_faces)
         faces = faces[face_areas(vertices, faces) > 0]

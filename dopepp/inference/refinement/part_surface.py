@@ -65,7 +65,8 @@ def surface_points(points: Points) -> SurfacePoints:
         ValueError: There are fewer than :data:`FEWEST_POINTS`.
     """
     if len(points) < FEWEST_POINTS:
-        raise ValueError(f"{len(points)} points are no surface, {FEWEST_POINTS} are needed")
+        few = f"{len(points)} points are too few for a surface"
+        raise ValueError(f"{few}; at least {FEWEST_POINTS} are needed")
     points = np.asarray(points, np.float64)
     if len(points) > MOST_POINTS:
         points = points[np.linspace(0, len(points) - 1, MOST_POINTS).astype(int)]

@@ -192,7 +192,7 @@ def companion_path(mesh_path: Path, name: str, statement: str) -> Path:
         allowed = "a file in the mesh's folder or below"
         raise UserError(f"{problem} lies outside of its folder", allowed, fix)
     if not path.is_file():
-        fix = "put the file there, or delete the line for a part without texture"
+        fix = f"copy the file to {path}, or delete the {statement} line if the part has no texture"
         raise UserError(f"{problem} does not exist", "a file in the mesh's folder", fix)
     return path
 

@@ -187,7 +187,10 @@ def refined(
 
 
 def _residuals(M: Transforms, B: Transforms, X: Transform, Y: Transform) -> Residuals:
-    """Return rotation (about the board's origin) and translation errors, camera axes."""
+    """Return each view's rotation error (about the board's origin) and translation error.
+
+    Both are in camera axes.
+    """
     expected = invert_transform(X) @ inverted(M) @ Y
     turn = Rotation.from_matrix(B[:, :3, :3] @ expected[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
     return np.concatenate([turn, B[:, :3, 3] - expected[:, :3, 3]], axis=1)

@@ -436,7 +436,7 @@ def test_large_pictures_are_read_smaller(refiner: RegionRefiner) -> None:
 
 
 def test_faces_without_area_are_refused() -> None:
-    with pytest.raises(ValueError, match="no triangle"):
+    with pytest.raises(ValueError, match="zero area"):
         RegionRefiner(np.zeros((3, 3)), np.array([[0, 1, 2]]))
 
 

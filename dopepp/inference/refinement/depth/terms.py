@@ -119,7 +119,7 @@ def outline_terms(
 
 
 def _to_surface(overlay: SurfaceOverlay, past: Int[np.ndarray, "past"], supported: Mask) -> Pulls:
-    """Pull points with depth behind them to the nearest pixel of the surface."""
+    """Return the pulls of points in front of the measured depth to the nearest supported pixel."""
     if not len(past) or not supported.any():
         return np.empty((0, 3)), np.empty((0, 2))
     _, labels = nearest_zero((~supported).astype(np.uint8))

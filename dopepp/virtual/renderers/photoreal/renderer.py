@@ -75,10 +75,10 @@ _FLOAT3: Final = 3  # OIDN_FORMAT_FLOAT3
 
 
 def render(scene: Scene) -> Rendered:
-    """Render a scene; one without objects is its background.
+    """Render a scene; without objects, return its background.
 
     Raises:
-        UserError: Mitsuba cannot run in this process (see the package).
+        UserError: Mitsuba cannot run in this process (see the docstring of this package).
     """
     image, depth, instances = backdrop(scene)
     fractions = visible_fractions(scene)
