@@ -57,8 +57,14 @@ def test_a_good_picture_is_well(run, folder):
     ("options", "line"),
     [
         (["plain.png", "--camera", "K.txt"], "!! visibility: nothing like pivconnector is seen"),
-        (["good.png", "--camera", "K.txt", "--at", "5,5"], "!! elsewhere: 1 of 1 detections above"),
-        (["good.png", "--camera", "K.txt", "--empty"], "!! elsewhere: 1 of 1 detections above"),
+        (
+            ["good.png", "--camera", "K.txt", "--at", "5,5"],
+            "!! elsewhere: confident elsewhere: 1 of 1 detections above",
+        ),
+        (
+            ["good.png", "--camera", "K.txt", "--empty"],
+            "!! elsewhere: confident elsewhere: 1 of 1 detections above",
+        ),
         (["good.png", "--K", "220", "220", "127.5", "127.5"], "!! camera: K with fx=220"),
         (
             ["good.png", "--camera", "K.txt", "--part", "piv.stl", "--unit", "cm"],

@@ -123,7 +123,10 @@ def test_detections_beside_the_part_and_on_pictures_without_it_are_named(estimat
     assert not elsewhere(rendered.image, (u + 0.8 * half, v)).fix
     assert not elsewhere(rendered.image, (0.0, 0.0), (u, v)).fix
     beside = elsewhere(rendered.image, (u + 1.3 * half, v))
-    assert re.match(r"1 of 1 detections above [\d.]+ are away from every part", beside.sentence)
+    assert re.match(
+        r"confident elsewhere: 1 of 1 detections above [\d.]+ are away from every part",
+        beside.sentence,
+    )
     named = re.search(r"at \((\d+), (\d+)\)", beside.sentence)
     assert list(map(float, named.groups())) == pytest.approx([u, v], abs=3)
     assert "virtual.negative_photos" in beside.fix
