@@ -84,8 +84,8 @@ class PoseEstimator:
         if refine is not None:  # its solvers take as long to import as everything else but torch
             from dopepp.inference.refinement.refiner import Refiner
 
-            known = {} if scale_error is None else {"scale_error": scale_error}
-            self.refiner = Refiner(refine, parts or checkpoint.parts, **known)
+            limits = {} if scale_error is None else {"scale_error": scale_error}
+            self.refiner = Refiner(refine, parts or checkpoint.parts, **limits)
         self.max_ms, self.scale_error = max_ms, scale_error
         for function in ("rehearse_pose", "rehearse_refinement"):
             compile_beside(f"dopepp.inference.refinement.refiner:{function}")

@@ -68,14 +68,14 @@ def negative_frames(
         UserError: A folder of photos has too few of them to be divided.
     """
     view, preset = frame_view(data, parts), data.preset
-    photos, own = held_out_photos(data, split), own_photos(data, split)
+    photos, user_photos = held_out_photos(data, split), own_photos(data, split)
     dense = _as_dense(preset, view.size) if data.virtual.view is None else preset
     preset = view.whole(dense, data.virtual.camera_scale or 1.0)
     if data.virtual.view is None:
         # Far from the middle, the short focal length distorts parts as in no picture of the preset.
         near, far = view.distance
         preset = replace(preset, placement=DistancePlacement(near, far, _MARGIN))
-    share = math.ceil(num_images / (3 if own is None else 4))
+    share = math.ceil(num_images / (3 if user_photos is None else 4))
 
     def whole(pictures: PhotoBackgrounds, kind: str) -> PictureFrames:
         return PictureFrames(pictures, view.K, view.size, share, kind, data.eval_seed)
@@ -100,8 +100,8 @@ def negative_frames(
         rendered(scenes, SCENES),
         rendered(similar, LOOKALIKES),
     ]
-    if own is not None:
-        sources.append(whole(own, OWN))
+    if user_photos is not None:
+        sources.append(whole(user_photos, OWN))
     return FrameMix(sources, num_images)
 
 

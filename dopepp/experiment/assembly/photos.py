@@ -41,8 +41,12 @@ def training_backgrounds(data: DataConfig) -> Backgrounds:
             data.virtual.backgrounds,
             3 * FEWEST_PHOTOS,
         )
-    own = own_photos(data, "train")
-    return backgrounds if own is None else MixedBackgrounds(backgrounds, own, _OWN_SHARE)
+    user_photos = own_photos(data, "train")
+    return (
+        backgrounds
+        if user_photos is None
+        else MixedBackgrounds(backgrounds, user_photos, _OWN_SHARE)
+    )
 
 
 def held_out_photos(data: DataConfig, split: Literal["val", "test"]) -> PhotoBackgrounds:
