@@ -97,6 +97,43 @@ def learned_model() -> VerificationModel:
     return VerificationModel(*arrays)
 
 
+class SharpEdges:
+    """Creases of a mesh, and which of them a camera sees.
+
+    Args:
+        mesh: Mesh of the part.
+    """
+
+    def __init__(self, mesh: OutlineMesh) -> None:
+        self._mesh = mesh
+        normals = mesh.planes[:, :3]
+        self.normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        """Unit normal of each triangle."""
+        first, second = mesh.sides.T
+        cosines = (self.normals[first] * self.normals[second]).sum(axis=1)
+        sharp = (second >= 0) & (cosines < SHARP) & (mesh.opposed == 0)
+        self._creases, self._sides = mesh.edges[sharp], mesh.sides[sharp]
+
+    def drawn(self, at: PosedMesh, size: tuple[int, int]) -> Int[np.ndarray, "height width"]:
+        """Return the triangle at each pixel, −1 for none."""
+        width, height = size
+        ids = np.full((height, width), -1, np.int32)
+        inverse_depth = 1.0 / (at.arms[:, 2] + at.T_cam_obj[2, 3])
+        nearest = np.zeros((height, width), np.float32)
+        shown = at.front if self._mesh.is_closed else np.ones_like(at.front)
+        _draw(at.pixels, inverse_depth, self._mesh.faces, shown, ids, nearest)
+        return ids
+
+    def visible(
+        self, at: PosedMesh, ids: Int[np.ndarray, "height width"], spacing: float
+    ) -> Float[np.ndarray, "points 4"]:
+        """Return pixel and normal of points on visible creases, ``spacing`` pixels apart.
+
+        ``ids`` are the triangles that :meth:`drawn` returns.
+        """
+        return np.asarray(_walk_creases(self._creases, self._sides, at.pixels, ids, spacing))
+
+
 class Verifier:
     """Verifies poses of one part.
 
@@ -107,12 +144,8 @@ class Verifier:
 
     def __init__(self, mesh: OutlineMesh, diameter: float) -> None:
         self._mesh, self._diameter = mesh, diameter
-        normals = mesh.planes[:, :3]
-        self._normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-        first, second = mesh.sides.T
-        cosines = (self._normals[first] * self._normals[second]).sum(axis=1)
-        sharp = (second >= 0) & (cosines < SHARP) & (mesh.opposed == 0)
-        self._creases, self._sides = mesh.edges[sharp], mesh.sides[sharp]
+        self._edges = SharpEdges(mesh)
+        self._normals = self._edges.normals
         spread = mesh.vertices - mesh.vertices.mean(axis=0)
         self._moment = spread.T @ spread / len(spread)
 
@@ -156,7 +189,7 @@ class Verifier:
             return None
         at = posed(self._mesh, T_cam_obj, crop.K)
         assert at is not None
-        ids = self._drawn(at, crop.size)
+        ids = self._edges.drawn(at, crop.size)
         mask = (ids >= 0).astype(np.uint8)
         spacing = max(1.5, 3.0 * crop.extent / SPACING)
         contour = find_contour(self._mesh, at, mask, spacing)
@@ -166,7 +199,7 @@ class Verifier:
         gradients = _gradients(crop.colours)
         outline = _lines(contour)
         along, beside = _responses(gradients, outline, BESIDE * crop.extent)
-        creases = _walk_creases(self._creases, self._sides, at.pixels, ids, spacing)
+        creases = self._edges.visible(at, ids, spacing)
         crease, crease_beside = _responses(gradients, creases, BESIDE * crop.extent)
         ring = cv2.dilate(mask, None, iterations=round(RING * crop.extent)) - mask
         within = mask.astype(bool)
@@ -189,16 +222,6 @@ class Verifier:
                 math.log(crop.extent / crop.scale / 100.0),
             ]
         )
-
-    def _drawn(self, at: PosedMesh, size: tuple[int, int]) -> Int[np.ndarray, "height width"]:
-        """Return the triangle at each pixel, −1 for none."""
-        width, height = size
-        ids = np.full((height, width), -1, np.int32)
-        inverse_depth = 1.0 / (at.arms[:, 2] + at.T_cam_obj[2, 3])
-        nearest = np.zeros((height, width), np.float32)
-        shown = at.front if self._mesh.is_closed else np.ones_like(at.front)
-        _draw(at.pixels, inverse_depth, self._mesh.faces, shown, ids, nearest)
-        return ids
 
     def _shading(
         self,
