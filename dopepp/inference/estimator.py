@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, Literal, Unpack
 
 import numpy as np
 import torch
@@ -80,25 +80,29 @@ class PoseEstimator:
         scale_error: float | None = None,
     ) -> None:
         self.checkpoint = checkpoint
-        self.refine, self.refiner = refine, None
-        if refine is not None:  # its solvers take as long to import as everything else but torch
-            from dopepp.inference.refinement.refiner import Refiner
-
-            limits = {} if scale_error is None else {"scale_error": scale_error}
-            self.refiner = Refiner(refine, parts or checkpoint.parts, **limits)
         self.max_ms, self.scale_error = max_ms, scale_error
-        for function in ("rehearse_pose", "rehearse_refinement"):
-            compile_beside(f"dopepp.inference.refinement.refiner:{function}")
+        self._refine_by(refine, parts or checkpoint.parts)
         self.device = checked_device(device)
-        self.solid_parts = tuple(parts or checkpoint.parts)
-        """Parts with the meshes that were passed."""
-        self.spent_ms = dict.fromkeys(STEPS, 0.0)
-        """Total milliseconds by step of :data:`~dopepp.inference.pose_result.STEPS`."""
         self.network = runtimes.placed(network, self.device)
         self.cuboids = np.stack([part.cuboid for part in checkpoint.parts])
         self._names = [part.name for part in checkpoint.parts]
         self._cuboid_of = dict(zip(self._names, self.cuboids, strict=True))
         self.recovery = RecoveryOptions.of({"sigma": checkpoint.sigma, **checkpoint.recovery})
+
+    def _refine_by(self, refine: Refine | None, parts: Sequence[Part]) -> None:
+        """Set the refinement, and reset the spent time."""
+        self.refine, self.refiner = refine, None
+        if refine is not None:  # its solvers take as long to import as everything else but torch
+            from dopepp.inference.refinement.refiner import Refiner
+
+            limits = {} if self.scale_error is None else {"scale_error": self.scale_error}
+            self.refiner = Refiner(refine, parts, **limits)
+        for function in ("rehearse_pose", "rehearse_refinement"):
+            compile_beside(f"dopepp.inference.refinement.refiner:{function}")
+        self.solid_parts = tuple(parts)
+        """Parts with the meshes that were passed."""
+        self.spent_ms = dict.fromkeys(STEPS, 0.0)
+        """Total milliseconds by step of :data:`~dopepp.inference.pose_result.STEPS`."""
 
     @classmethod
     def load(
@@ -124,29 +128,78 @@ class PoseEstimator:
         chosen = checked_device(device)
         return cls(*runtimes.load(Path(path), chosen), chosen, refine, parts, max_ms, scale_error)
 
-    def refining(self, refine: Refine, parts: Sequence[Part] | None = None) -> PoseEstimator:
-        """Return an estimator with the same network that also refines; see the class."""
-        refining = type(self)(
-            self.network, self.checkpoint, self.device, refine, parts, self.max_ms, self.scale_error
+    @staticmethod
+    def from_mesh(
+        mesh: str | Path,
+        unit: str | None = None,
+        working_distance: tuple[float, float] | None = None,
+        tilt_deg: float = 180.0,
+        name: str | None = None,
+        symmetries: Literal["auto"] | None = "auto",
+        refine: Refine = "region",
+        max_ms: float | None = None,
+        scale_error: float | None = None,
+    ) -> PoseEstimator:
+        """Make an estimator of one part from its mesh alone, without training.
+
+        Args:
+            mesh: Mesh file, or name of a built-in part.
+            unit: Unit of the file: mm, cm, m or inch (default: that of its format, otherwise mm).
+            working_distance: Nearest and farthest depth of the part, metres; required.
+            tilt_deg: Largest angle between the part's z axis and the direction to the camera.
+            name: Name of the part (default: that of the file).
+            symmetries: ``auto`` finds them on the mesh; None: the part has none.
+            refine: As of the class, with ``region``, which verifies the poses.
+            max_ms: As of the class.
+            scale_error: As of the class.
+
+        Raises:
+            UserError: The mesh or an option is invalid, or the working distance is missing.
+        """
+        from dopepp.inference.template_estimator import (
+            TemplateEstimator,
+            checked_distances,
+            load_solid_part,
         )
-        refining.recovery = self.recovery
+        from dopepp.inference.templates import (  # type: ignore[import-not-found,unused-ignore]
+            TemplateDetector,
+        )
+
+        distances = checked_distances(working_distance)
+        tilt = check("tilt_deg", tilt_deg, float, Range(0, 180, "degrees"))
+        part = load_solid_part(mesh, unit, name, symmetries)
+        detector = TemplateDetector(part, distances, tilt)
+        return TemplateEstimator(detector, distances, refine, max_ms, scale_error)
+
+    def refining(self, refine: Refine | None, parts: Sequence[Part] | None = None) -> PoseEstimator:
+        """Return an estimator with the same network and another refinement; see the class."""
+        refining = copy.copy(self)
+        refining._refine_by(refine, parts or self.parts)
         return refining
 
     @property
     def parts(self) -> Sequence[Part]:
-        """Parts that the network detects, in the order of its outputs."""
+        """Detected parts, in the order of the network's outputs."""
         return self.checkpoint.parts
+
+    @property
+    def has_network(self) -> bool:
+        """Whether a network detects the parts, rather than templates of their meshes."""
+        return True
+
+    def depth_range(self, name: str) -> tuple[float, float] | None:
+        """Return the depths at which a part is searched by default, metres; None if unknown."""
+        seen = self.checkpoint.seen.get(name)
+        return None if seen is None else (seen.nearest, seen.farthest)
 
     def __repr__(self) -> str:
         """Describe network, parts with their distances in training, and thresholds."""
-        runtime, name = type(self.network).__name__, self.checkpoint.data.get("name", "network")
-        size = "{}×{} pixels".format(*self.checkpoint.input_size)
-        description = f"{name} as {runtime}, {size}, {self.device}, refine={self.refine}"
-        lines = [f"PoseEstimator({description})"]
+        lines = [f"PoseEstimator({self._detector}, {self.device}, refine={self.refine})"]
         for part in self.parts:
             size = " × ".join(f"{1000 * side:.0f}" for side in np.ptp(part.cuboid, axis=0))
-            seen = self.checkpoint.seen.get(part.name)
-            where = f", learned at {seen.nearest:.2g} – {seen.farthest:.2g} m" if seen else ""
+            depths = self.depth_range(part.name)
+            verb = "learned" if self.has_network else "searched"
+            where = f", {verb} at {depths[0]:.2g} – {depths[1]:.2g} m" if depths else ""
             lines.append(f"{part.name}: {size} mm{where}")
         limits = self.recovery
         lines.append(
@@ -155,6 +208,13 @@ class PoseEstimator:
             f"refined score {limits.refined_min_score:.3g}"
         )
         return "\n  ".join(lines)
+
+    @property
+    def _detector(self) -> str:
+        """Name, runtime and input size of the network."""
+        runtime, name = type(self.network).__name__, self.checkpoint.data.get("name", "network")
+        width, height = self.checkpoint.input_size
+        return f"{name} as {runtime}, {width}×{height} pixels"
 
     def predict(
         self,
@@ -214,6 +274,15 @@ class PoseEstimator:
         leaves out those with a network score below :data:`~dopepp.recovery.detection.CANDIDATE`.
         """
         image, K, depth = prepare_image(image, K, distortion, depth, cropped)
+        detections = self._start_detections(image, K, distances, roi)
+        if self.refiner is None:
+            return detections
+        return self._rescored(self.refined(detections, image, K, depth))
+
+    def _start_detections(
+        self, image: Picture, K: CameraMatrix, distances: Distances | None, roi: Region | None
+    ) -> list[Detection]:
+        """Return the detections before refinement, best score first."""
         with self._timed("pre"):
             views = self.views(image, K, distances, roi)
         scales: list[list[Detection]] = []
@@ -226,10 +295,11 @@ class PoseEstimator:
                     belief, field, self.cuboids, view.K, stride, self._names, **options
                 )
             scales.append([view.to_image(it, self._cuboid_of[it.object], K) for it in detections])
-        detections = merge_scales(scales)
-        if self.refiner is None:
-            return detections
-        return rescored(self.refined(detections, image, K, depth), self.recovery)
+        return merge_scales(scales)
+
+    def _rescored(self, refined: Sequence[Detection]) -> list[Detection]:
+        """Return refined detections with the score of refined poses, best first."""
+        return rescored(refined, self.recovery)
 
     @property
     def min_score(self) -> float:
@@ -323,16 +393,23 @@ class PoseEstimator:
             UserError: As for :meth:`predict`.
         """
         image, K, depth = prepare_image(image, K, None, depth, cropped)
-        stride, options = self.network.stride, self._recovery_options(self.min_score)
-        reasons: list[Reason] = []
-        for view in self.views(image, K, distances, roi):
-            belief, field = self.maps(view.pixels)
-            reasons += explain(belief, field, self.cuboids, view.K, stride, self._names, **options)
+        reasons = self._missing(image, K, distances, roi)
         if self.refiner is None:
             return reasons
         candidates = self.candidates(image, K, None, depth, distances, roi, cropped)
         rejected = [candidate for candidate in candidates if candidate.score < self.min_score]
         return reasons + [rejected_refined(candidate, self.min_score) for candidate in rejected]
+
+    def _missing(
+        self, image: Picture, K: CameraMatrix, distances: Distances | None, roi: Region | None
+    ) -> list[Reason]:
+        """Return why there are no more start detections."""
+        stride, options = self.network.stride, self._recovery_options(self.min_score)
+        reasons: list[Reason] = []
+        for view in self.views(image, K, distances, roi):
+            belief, field = self.maps(view.pixels)
+            reasons += explain(belief, field, self.cuboids, view.K, stride, self._names, **options)
+        return reasons
 
     def views(
         self,

@@ -130,11 +130,8 @@ class Worker:
         """Return the estimator with or without refinement. Both share the network."""
         if refine not in self._estimators:
             base = self._estimators[not refine]
-            self._estimators[refine] = (
-                base.refining("region", base.solid_parts)
-                if refine
-                else PoseEstimator(base.network, base.checkpoint, base.device)
-            )
+            term = "region" if refine else None
+            self._estimators[refine] = base.refining(term, base.solid_parts)
         return self._estimators[refine]
 
     def take(self, message: Any, info: Any | None, topic: str) -> Answer | None:

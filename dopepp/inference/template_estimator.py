@@ -1,0 +1,174 @@
+"""Estimator whose start poses come from templates of a mesh, so that it needs no training.
+
+Everything after the start poses is that of a network's estimator: refinement, verification, score.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal, NoReturn, Protocol
+
+import torch
+
+from dopepp.core.errors import UserError
+from dopepp.core.validation import Span, check
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import CameraMatrix
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.picture import Distances, NetworkView, Region, merge_scales
+from dopepp.inference.refinement.refiner import Refine
+from dopepp.models.checkpoint import Checkpoint
+from dopepp.parts.catalogue import load_part
+from dopepp.parts.part import Part, check_name
+from dopepp.parts.symmetry_finder import find_symmetries
+from dopepp.recovery.detection import Detection, RecoveryOptions
+from dopepp.recovery.recover import Reason
+
+
+class Detector(Protocol):
+    """Detects a part without a network; one instance may have several start poses."""
+
+    part: Part
+
+    def detect(
+        self,
+        image: Picture,
+        K: CameraMatrix,
+        distances: tuple[float, float] | None = None,
+        roi: Region | None = None,
+    ) -> list[Detection]:
+        """Return start poses, best score first, on an image without distortion."""
+
+
+class TemplateEstimator(PoseEstimator):
+    """Estimates the poses of one part from its mesh alone.
+
+    Args:
+        detector: Detector of the part.
+        distances: Nearest and farthest depth of the part, metres.
+        refine: As of :class:`PoseEstimator`, with ``region``.
+        max_ms: As of :class:`PoseEstimator`.
+        scale_error: As of :class:`PoseEstimator`.
+
+    Raises:
+        UserError: The refinement is unknown or does not include ``region``.
+    """
+
+    def __init__(
+        self,
+        detector: Detector,
+        distances: tuple[float, float],
+        refine: Refine = "region",
+        max_ms: float | None = None,
+        scale_error: float | None = None,
+    ) -> None:
+        self.detector, self.distances = detector, distances
+        self.max_ms, self.scale_error = max_ms, scale_error
+        self.device, self.recovery = torch.device("cpu"), RecoveryOptions()
+        self._refine_by(refine, self.parts)
+
+    def _refine_by(self, refine: Refine | None, parts: Sequence[Part]) -> None:
+        terms = (refine,) if isinstance(refine, str) else refine or ()
+        if "region" not in terms:
+            fix = "leave out the refinement, or use region or region and depth"
+            raise UserError(f"templates with refine={refine}", "a refinement with region", fix)
+        super()._refine_by(refine, parts)
+
+    @property
+    def parts(self) -> Sequence[Part]:
+        """The part."""
+        return (self.detector.part,)
+
+    @property
+    def has_network(self) -> bool:
+        """False."""
+        return False
+
+    def depth_range(self, name: str) -> tuple[float, float] | None:
+        """Return the working distance, metres."""
+        return self.distances
+
+    @property
+    def _detector(self) -> str:
+        return f"{self.detector.part.name} by templates"
+
+    def _start_detections(
+        self, image: Picture, K: CameraMatrix, distances: Distances | None, roi: Region | None
+    ) -> list[Detection]:
+        with self._timed("decode"):
+            return self.detector.detect(image, K, self._range(distances), roi)
+
+    def _rescored(self, refined: Sequence[Detection]) -> list[Detection]:
+        """Return the best refined detection of each instance, best first."""
+        return merge_scales([[detection] for detection in super()._rescored(refined)])
+
+    def _missing(
+        self, image: Picture, K: CameraMatrix, distances: Distances | None, roi: Region | None
+    ) -> list[Reason]:
+        if self.detector.detect(image, K, self._range(distances), roi):
+            return []
+        near, far = self._range(distances)
+        text = f"no view of it fits the image at {near:.2g} – {far:.2g} m"
+        return [Reason(self.detector.part.name, "empty", 0.0, text)]
+
+    def _range(self, distances: Distances | None) -> tuple[float, float]:
+        """Return depths to search; templates are searched at the working distance by default."""
+        return self.distances if distances is None or distances == "any" else distances
+
+    @property
+    def network(self) -> NoReturn:  # type: ignore[override]
+        """Raise, because there is no network."""
+        raise _networks_only("a network")
+
+    @property
+    def checkpoint(self) -> Checkpoint:  # type: ignore[override]
+        """Raise, because there is no checkpoint."""
+        raise _networks_only("a checkpoint")
+
+    def views(
+        self,
+        image: Picture,
+        K: CameraMatrix,
+        distances: Distances | None = None,
+        roi: Region | None = None,
+    ) -> list[NetworkView]:
+        """Raise, because there is no network."""
+        raise _networks_only("inputs of a network")
+
+    def maps(self, image: Picture) -> NoReturn:
+        """Raise, because there is no network."""
+        raise _networks_only("belief maps")
+
+
+def checked_distances(distances: object) -> tuple[float, float]:
+    """Return the working distance of templates.
+
+    Raises:
+        UserError: The distance is missing, or is not a range of metres.
+    """
+    if distances is None:
+        raise UserError(
+            "a mesh without a working distance",
+            "nearest and farthest distance of the part from the camera, metres",
+            "state it: --working-distance 0.3,0.5 (working_distance=(0.3, 0.5) in Python)",
+        )
+    return check("working_distance", distances, tuple[float, float], Span(0.001, 1000.0, "metres"))
+
+
+def load_solid_part(
+    mesh: str | Path, unit: str | None, name: str | None, symmetries: Literal["auto"] | None
+) -> Part:
+    """Load a part for templates; see :meth:`PoseEstimator.from_mesh`."""
+    part = load_part(mesh, unit)
+    part = part if name is None else replace(part, name=check_name(name))
+    if symmetries is None or part.mesh is None:
+        return part
+    discrete, continuous = find_symmetries(part.mesh)
+    return replace(part, symmetries_discrete=discrete, symmetries_continuous=continuous)
+
+
+def _networks_only(noun: str) -> UserError:
+    fix = "train the part (python train.py experiment=my_part), and pass the checkpoint"
+    return UserError(f"{noun} of templates", "a trained network", fix)
