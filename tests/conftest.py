@@ -7,7 +7,8 @@ import runpy
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import Any, ClassVar, NamedTuple
 
 import pytest
 from hypothesis import settings
@@ -173,3 +174,47 @@ def two_nodes():
     cluster.wait_for_nodes()
     yield cluster
     cluster.shutdown()
+
+
+@pytest.fixture
+def near_truth(monkeypatch):
+    """Replace the templates by a detector that answers with poses near the given ones.
+
+    Its ``truth`` lists the poses; each has two starts, and the first also a false one.
+    """
+    import numpy as np
+
+    from dopepp.geometry.camera import project_keypoints
+    from dopepp.geometry.rotation import rotation_vector_to_matrix
+    from dopepp.recovery.detection import Detection
+
+    class NearTruth:
+        truth: ClassVar[list[np.ndarray]] = []
+
+        def __init__(self, part, working_distance, tilt_deg=180.0):
+            self.part, self.working_distance, self.tilt_deg = part, working_distance, tilt_deg
+            self.asked = []
+
+        def detect(self, image, K, distances=None, roi=None):
+            self.asked.append((distances, roi))
+            starts = []
+            for T_true in self.truth:
+                for score, turn in ((0.8, [0.03, 0, 0.02]), (0.7, [0, -0.03, 0.02])):
+                    T = T_true.copy()
+                    T[:3, :3] = rotation_vector_to_matrix(np.array(turn)) @ T[:3, :3]
+                    starts.append(self.detection(T, K, score))
+            for T in self.truth[:1]:
+                shift = np.eye(4)
+                shift[:3, 3] = 0.05
+                starts.append(self.detection(shift @ T, K, 0.5))
+            return starts
+
+        def detection(self, T, K, score):
+            points, peaks = project_keypoints(self.part.cuboid, T, K), np.full((9, 2), np.nan)
+            covariance = np.diag([0.03**2] * 3 + [0.001**2] * 3)
+            return Detection(self.part.name, score, score, T, points, peaks, 0.0, covariance)
+
+    templates = ModuleType("dopepp.inference.templates")
+    templates.TemplateDetector = NearTruth
+    monkeypatch.setitem(sys.modules, templates.__name__, templates)
+    return NearTruth

@@ -5,14 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 from typer import Argument, Option
 
 from dopepp.core.errors import RESUME, Interruption, RunError, UserError, interruptible
 
-Model = Annotated[Path, Argument(help="Checkpoint (best.ckpt of a run) or released network.")]
+if TYPE_CHECKING:
+    from dopepp.inference.estimator import PoseEstimator
+
+MODEL_HELP: Final = (
+    "Checkpoint (best.ckpt of a run), released network, or mesh file of an untrained part."
+)
+
+Model = Annotated[Path, Argument(help=MODEL_HELP)]
 
 Intrinsics = Annotated[
     tuple[float, float, float, float] | None,
@@ -62,7 +69,72 @@ Meshes = Annotated[
 
 Unit = Annotated[str | None, Option(help="Unit of the mesh files: mm, cm, m or inch.")]
 
+WorkingDistance = Annotated[
+    str | None, Option(help="NEAR,FAR: distances of a part given by its mesh, metres.")
+]
+
+Tilt = Annotated[
+    float | None,
+    Option(help="Largest angle of that part's z axis to the camera, degrees (default: 180)."),
+]
+
 Device = Annotated[str, Option(help="PyTorch device, e.g. cpu or cuda.")]
+
+
+def load_estimator(
+    model: Path,
+    device: str,
+    unit: str | None,
+    working_distance: str | None,
+    tilt: float | None,
+    parts: list[str] | None = None,
+    max_ms: float | None = None,
+    scale_error: float | None = None,
+) -> PoseEstimator:
+    """Load a checkpoint, or make an estimator of a mesh, which always refines by region.
+
+    Raises:
+        UserError: The model is invalid, or an option does not belong to its kind.
+    """
+    from dopepp.inference.estimator import PoseEstimator
+    from dopepp.parts.catalogue import BUILTIN
+    from dopepp.parts.mesh.read import READERS
+
+    is_mesh = model.suffix.lower() in READERS or (str(model) in BUILTIN and not model.exists())
+    excluded = (
+        {"--part": parts, f"--device {device}": device != "cpu"}
+        if is_mesh
+        else {
+            "--working-distance": working_distance is not None,
+            "--tilt": tilt is not None,
+            "--unit": unit is not None and not parts,
+        }
+    )
+    for option, is_given in excluded.items():
+        if is_given:
+            kind, other = ("mesh", "checkpoint") if is_mesh else ("checkpoint", "mesh")
+            problem = f"{option} with the {kind} {model}"
+            raise UserError(problem, f"{option} with a {other}", f"leave out {option}")
+    if not is_mesh:
+        return PoseEstimator.load(model, device, max_ms=max_ms, scale_error=scale_error)
+    return PoseEstimator.from_mesh(
+        model,
+        unit,
+        None if working_distance is None else _distances(working_distance),
+        180.0 if tilt is None else tilt,
+        max_ms=max_ms,
+        scale_error=scale_error,
+    )
+
+
+def _distances(text: str) -> tuple[float, float]:
+    """Read a range ``NEAR,FAR``."""
+    try:
+        near, far = map(float, text.split(","))
+    except ValueError:
+        got, fix = f"--working-distance {text}", "write e.g. --working-distance 0.3,0.5"
+        raise UserError(got, "NEAR,FAR in metres", fix) from None
+    return near, far
 
 
 def check_region(refine: str | None) -> None:

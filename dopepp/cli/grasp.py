@@ -37,8 +37,8 @@ def grasp(
     poses: Annotated[
         str,
         Option(
-            help="Sources of poses, separated by commas: network, exact, random, true-matrices "
-            "or curve (exact poses with increasing errors)."
+            help="Sources of poses, separated by commas: network, templates (of the mesh), exact, "
+            "random, true-matrices or curve (exact poses with increasing errors)."
         ),
     ] = "network",
     no_refine: Annotated[bool, Option("--no-refine", help="Use unrefined poses.")] = False,

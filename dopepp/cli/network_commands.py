@@ -12,6 +12,7 @@ import typer
 from typer import Argument, Option
 
 from dopepp.cli.common import (
+    MODEL_HELP,
     CameraFile,
     Conf,
     Crop,
@@ -22,8 +23,11 @@ from dopepp.cli.common import (
     Meshes,
     Model,
     Region,
+    Tilt,
     Unit,
+    WorkingDistance,
     check_region,
+    load_estimator,
     report_errors,
 )
 from dopepp.core.errors import UserError
@@ -36,11 +40,14 @@ SIZE: Final = (640, 480)  # their width and height
 
 
 def benchmark(
-    models: Annotated[list[Path], Argument(help="Checkpoints and exported files.")],
+    models: Annotated[list[Path], Argument(help="Checkpoints, exported files and meshes.")],
     image: Annotated[Path | None, Option(help="Picture (default: renders).")] = None,
     intrinsics: Intrinsics = None,
     refine: Region = None,
     frames: Annotated[int, Option("-n", min=1, max=100_000, help="Frames.")] = 50,
+    unit: Unit = None,
+    working_distance: WorkingDistance = None,
+    tilt: Tilt = None,
     device: Device = "cpu",
 ) -> None:
     """Time the steps from a picture to its poses, in milliseconds per frame."""
@@ -50,7 +57,6 @@ def benchmark(
         from dopepp.experiment.assembly.renders import validation_renders
         from dopepp.geometry.camera import camera_matrix
         from dopepp.inference.benchmark import time_frames
-        from dopepp.inference.estimator import PoseEstimator
         from dopepp.parts.catalogue import with_meshes
 
         if (image is None) != (intrinsics is None):
@@ -58,9 +64,12 @@ def benchmark(
             raise UserError("only one of --image and --K", "both or neither", fix)
         rows = []
         for path in models:
-            estimator = PoseEstimator.load(path, device)
+            estimator = load_estimator(path, device, unit, working_distance, tilt)
             if image is not None and intrinsics is not None:
                 pictures = [(read_photo(image), camera_matrix(*intrinsics))]
+            elif not estimator.has_network:
+                fix = "pass a picture and its camera: --image FILE --K FX FY CX CY"
+                raise UserError(f"{path} without --image", "a picture to time a mesh on", fix)
             else:
                 source = validation_renders(estimator.checkpoint, path, NUM_SCENES, SIZE)
                 samples = map(source.sample, range(NUM_SCENES))
@@ -98,7 +107,7 @@ def _print_table(rows: list[dict[str, str]]) -> None:
 
 def doctor(
     image: Annotated[Path, Argument(help="Picture (PNG, JPEG or TIFF).")],
-    model: Annotated[Path, Option(help="Checkpoint (best.ckpt of a run) or released network.")],
+    model: Annotated[Path, Option(help=MODEL_HELP)],
     intrinsics: Intrinsics = None,
     camera: CameraFile = None,
     K_size: KSize = None,
@@ -107,6 +116,8 @@ def doctor(
     refine: Region = None,
     parts: Meshes = None,
     unit: Unit = None,
+    working_distance: WorkingDistance = None,
+    tilt: Tilt = None,
     centres: Annotated[
         list[str] | None,
         Option("--at", help="u,v: pixel of a part's centre; repeat for every part in the picture."),
@@ -133,10 +144,9 @@ def doctor(
         lens = Lens(choose_camera(K, camera, Images([image])), K_size, crop)
         picture = read_photo(image)
         from dopepp.inference.diagnosis import Case, Diagnosis, diagnose
-        from dopepp.inference.estimator import PoseEstimator
         from dopepp.parts.catalogue import with_meshes
 
-        estimator = PoseEstimator.load(model, device)
+        estimator = load_estimator(model, device, unit, working_distance, tilt, parts)
         solid_parts = with_meshes(estimator.parts, parts, unit) if parts else estimator.parts
         estimator = estimator if refine is None else estimator.refining(refine, solid_parts)
         try:
@@ -177,6 +187,9 @@ def serve(
     ] = None,
     conf: Conf = None,
     refine: Region = None,
+    unit: Unit = None,
+    working_distance: WorkingDistance = None,
+    tilt: Tilt = None,
     device: Device = "cpu",
 ) -> None:
     """Open a local web page that estimates poses on uploaded pictures.
@@ -190,10 +203,11 @@ def serve(
     with report_errors():
         require("gradio", "dopepp serve", "web")
         check_region(refine)
-        from dopepp.inference.estimator import PoseEstimator
         from dopepp.inference.page import served
 
-        estimator = PoseEstimator.load(model, device, refine).reporting(conf)
+        estimator = load_estimator(model, device, unit, working_distance, tilt)
+        estimator = estimator if refine is None else estimator.refining(refine)
+        estimator = estimator.reporting(conf)
         with suppress(Interruption), interruptible(""), served(estimator, port) as address:
             typer.echo(f"{address} (Ctrl-C ends it)")
             Event().wait()

@@ -17,8 +17,12 @@ from dopepp.cli.common import (
     Model,
     Region,
     ScaleError,
+    Tilt,
     Track,
+    Unit,
+    WorkingDistance,
     check_region,
+    load_estimator,
     resumable,
 )
 from dopepp.core.errors import UserError, require
@@ -56,6 +60,9 @@ def node(
     scale_error: ScaleError = None,
     track: Track = False,
     overlay: Annotated[bool, Option("--overlay", help="Publish drawn poses.")] = False,
+    unit: Unit = None,
+    working_distance: WorkingDistance = None,
+    tilt: Tilt = None,
     device: Device = "cpu",
 ) -> None:
     """Publish the poses in every picture of a camera, until Ctrl-C.
@@ -75,17 +82,17 @@ def node(
         K = None if intrinsics is None else camera_matrix(*intrinsics)
         fixed_camera = given_camera(K, camera)
 
-        from dopepp.inference.estimator import PoseEstimator
         from dopepp.inference.frames import open_sources
         from dopepp.robot.nodes.worker import Worker, WorkerSettings
 
         sources = open_sources(words, topic) if transport in LINES else []
         cameras = [fixed_camera or choose_camera(None, None, opened) for opened in sources]
-        refinement = "region" if track or refine else None
-        estimator = PoseEstimator.load(
-            model, device, refinement, max_ms=max_ms, scale_error=scale_error
+        estimator = load_estimator(
+            model, device, unit, working_distance, tilt, max_ms=max_ms, scale_error=scale_error
         )
-        settings = WorkerSettings(conf, refinement is not None, overlay)
+        if track or refine:
+            estimator = estimator.refining("region")
+        settings = WorkerSettings(conf, estimator.refiner is not None, overlay)
         worker = Worker(estimator, settings, fixed_camera, frame, track)
         if transport == "--ros2":
             from dopepp.robot.nodes.ros2 import run

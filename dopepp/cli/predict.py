@@ -25,8 +25,11 @@ from dopepp.cli.common import (
     Meshes,
     Model,
     ScaleError,
+    Tilt,
     Track,
     Unit,
+    WorkingDistance,
+    load_estimator,
     resumable,
 )
 from dopepp.core.errors import UserError
@@ -74,6 +77,8 @@ def predict(
     ] = False,
     parts: Meshes = None,
     unit: Unit = None,
+    working_distance: WorkingDistance = None,
+    tilt: Tilt = None,
     device: Device = "cpu",
     save: Annotated[Path | None, Option(help="Folder for drawn pictures and videos.")] = None,
     json_file: Annotated[
@@ -103,11 +108,11 @@ def predict(
         K = None if intrinsics is None else camera_matrix(*intrinsics)
         cameras = [choose_camera(K, camera, opened) for opened in sources]
 
-        from dopepp.inference.estimator import PoseEstimator
         from dopepp.parts.catalogue import with_meshes
 
-        estimator = PoseEstimator.load(model, device, max_ms=max_ms, scale_error=scale_error)
-        estimator = estimator.reporting(conf)
+        estimator = load_estimator(
+            model, device, unit, working_distance, tilt, parts, max_ms, scale_error
+        ).reporting(conf)
         known_parts = estimator.parts
         if verify or "region" in terms:
             known_parts = with_meshes(known_parts, parts or (), unit)
@@ -207,6 +212,8 @@ class _Session:
 
     def _search_again(self, result: PoseResult, camera: Camera) -> tuple[PoseResult, str]:
         """Search at all distances after an empty result; return the reason if that fails too."""
+        if not self._estimator.has_network:
+            return result, "no pose at these distances passes the verification"
         from dopepp.inference.frames.source import Lens
         from dopepp.recovery.recover import explained
 

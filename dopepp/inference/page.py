@@ -127,7 +127,7 @@ def make_page(estimator: PoseEstimator, folder: Path) -> gr.Blocks:
                 picture = gr.File(label=formats, height=160, elem_id="picture")
                 camera = _camera_inputs()
                 button = gr.Button("Find poses", variant="primary")
-                maps = _image("Belief maps", "maps")
+                maps = _image("Belief maps", "maps", estimator.has_network)
             with gr.Column(scale=2, min_width=480):
                 greeting = _message("Drop a picture, say what took it, and find the poses.")
                 message = gr.HTML(greeting, padding=False)
@@ -139,10 +139,17 @@ def make_page(estimator: PoseEstimator, folder: Path) -> gr.Blocks:
     return page
 
 
-def _image(label: str, name: str) -> gr.Image:
+def _image(label: str, name: str, is_visible: bool = True) -> gr.Image:
     """Return an image output without Gradio's button that publishes the image."""
     buttons: Any = ["download", "fullscreen"]
-    return gr.Image(label=label, elem_id=name, interactive=False, format="png", buttons=buttons)
+    return gr.Image(
+        label=label,
+        elem_id=name,
+        interactive=False,
+        format="png",
+        buttons=buttons,
+        visible=is_visible,
+    )
 
 
 def _camera_inputs() -> list[Any]:
@@ -173,10 +180,10 @@ def _outputs(
     camera = _camera(kind, inputs, *size).for_picture(size)
     image, K = camera.undistorted(picture), camera.K
     (detections, weaker), remark = estimator.split(estimator.candidates(image, K)), ""
-    if not detections:
+    if not detections and estimator.has_network:
         detections, weaker = estimator.split(estimator.candidates(image, K, distances="any"))
         remark = " (not at the trained sizes, but in a search at all sizes)"
-    if not detections:
+    if not detections and estimator.has_network:
         remark = f": {explained(estimator.explain(image, K))}"
     shapes = {part.name: make_shape(part) for part in estimator.parts}
     result = PoseResult(
@@ -204,7 +211,8 @@ def _outputs(
             cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         )
     summary = _message(f"{result.summary}{remark}", is_error=not detections)
-    return drawn, summary, rows, _button(file), belief_sheet(estimator, image, K)
+    maps = belief_sheet(estimator, image, K) if estimator.has_network else None
+    return drawn, summary, rows, _button(file), maps
 
 
 def _camera(kind: str, inputs: Sequence[Any], width: int, height: int) -> Camera:

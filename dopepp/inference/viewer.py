@@ -195,10 +195,12 @@ class Viewer:
 
 
 def belief_pictures(estimator: PoseEstimator, result: PoseResult) -> Mapping[str, Picture]:
-    """Return the strongest belief of each part's keypoints as colours.
+    """Return the strongest belief of each part's keypoints as colours; none without a network.
 
     The network is run again, on the largest of its image sizes.
     """
+    if not estimator.has_network:
+        return {}
     view = estimator.views(result.image, result.K)[-1]
     beliefs = estimator.maps(view.pixels)[0].cpu().numpy()
     by_part = beliefs.reshape(len(estimator.parts), CENTROID + 1, *beliefs.shape[1:])

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from types import ModuleType
-from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -13,58 +10,17 @@ import pytest
 
 from dopepp import PoseEstimator
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import project_keypoints
-from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
+from dopepp.geometry.rotation import rotation_angle
 from dopepp.inference.tracker import PoseTracker
 from dopepp.parts.catalogue import pivconnector
-from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import explained
 from dopepp.virtual import PRESETS, Factory
 
 NEAR, FAR = 0.08, 0.2
 
 
-class NearTruth:
-    """Returns two starts beside each given pose, and a false one."""
-
-    truth: ClassVar[list[np.ndarray]] = []
-
-    def __init__(self, part, working_distance, tilt_deg=180.0):
-        self.part, self.working_distance, self.tilt_deg = part, working_distance, tilt_deg
-        self.asked = []
-
-    def detect(self, image, K, distances=None, roi=None):
-        self.asked.append((distances, roi))
-        starts = []
-        for T_true in self.truth:
-            for number, turn in enumerate(([0.03, 0, 0.02], [0, -0.03, 0.02])):
-                T = T_true.copy()
-                T[:3, :3] = rotation_vector_to_matrix(np.array(turn)) @ T[:3, :3]
-                starts.append(self._detection(T, K, 0.8 - 0.1 * number))
-        if starts:
-            T = self.truth[0].copy()
-            T[:3, 3] += [0.05, 0.05, 0.05]
-            starts.append(self._detection(T, K, 0.5))
-        return starts
-
-    def _detection(self, T, K, score):
-        points = project_keypoints(self.part.cuboid, T, K)
-        covariance = np.diag([0.03**2] * 3 + [0.001**2] * 3)
-        peaks = np.full((9, 2), np.nan)
-        return Detection(self.part.name, score, score, T, points, peaks, 0.0, covariance)
-
-
 @pytest.fixture
-def detector(monkeypatch):
-    templates = ModuleType("dopepp.inference.templates")
-    templates.TemplateDetector = NearTruth
-    monkeypatch.setitem(sys.modules, templates.__name__, templates)
-    monkeypatch.setattr(NearTruth, "truth", [])
-    return NearTruth
-
-
-@pytest.fixture
-def estimator(detector):
+def estimator(near_truth):
     return PoseEstimator.from_mesh("pivconnector", working_distance=(NEAR, FAR))
 
 
@@ -78,9 +34,9 @@ def true_pose(rendered):
     return rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj
 
 
-def test_starts_are_refined_verified_and_merged_by_instance(detector, estimator, rendered):
+def test_starts_are_refined_verified_and_merged_by_instance(near_truth, estimator, rendered):
     image, K, truth = rendered.image, rendered.scene.K, true_pose(rendered)
-    detector.truth = [truth]
+    near_truth.truth = [truth]
     (detection,) = estimator.predict(image, K, roi=(0, 0, 300, 300))
     assert estimator.detector.asked == [((NEAR, FAR), (0, 0, 300, 300))]
     turn = rotation_angle(detection.T_cam_obj[:3, :3].T @ truth[:3, :3])
@@ -99,19 +55,19 @@ def test_the_given_distances_replace_the_working_distance(estimator, rendered):
     assert estimator.detector.asked == [((0.2, 0.3), None), ((NEAR, FAR), None)]
 
 
-def test_an_empty_image_is_explained(detector, estimator, rendered):
+def test_an_empty_image_is_explained(near_truth, estimator, rendered):
     image, K = rendered.image, rendered.scene.K
     assert estimator.predict(image, K) == []
     text = "pivconnector: no view of it fits the image at 0.08 – 0.2 m"
     assert explained(estimator.explain(image, K)) == text
     T = true_pose(rendered).copy()
     T[:3, 3] += [0.03, 0.03, 0.05]  # beside the part
-    detector.truth = [T]
+    near_truth.truth = [T]
     assert "once refined, score" in explained(estimator.reporting(1.0).explain(image, K))
 
 
-def test_it_tracks_and_streams_as_a_network_does(detector, estimator, rendered, tmp_path):
-    detector.truth = [true_pose(rendered)]
+def test_it_tracks_and_streams_as_a_network_does(near_truth, estimator, rendered, tmp_path):
+    near_truth.truth = [true_pose(rendered)]
     tracker, identities = PoseTracker(estimator), set()
     for _ in range(3):
         (track,) = tracker.track(rendered.image, rendered.scene.K)
@@ -130,7 +86,7 @@ def test_repr_states_part_distances_and_thresholds(estimator):
     assert "pivconnector: 105 × 52 × 7 mm, searched at 0.08 – 0.2 m" in text
 
 
-def test_options_reach_the_part_and_the_detector(detector, tmp_path):
+def test_options_reach_the_part_and_the_detector(near_truth, tmp_path):
     path = tmp_path / "box.off"
     corners = [f"{x} {y} {z}" for x in (0, 40) for y in (0, 30) for z in (0, 20)]
     quads = ["0 1 3 2", "4 6 7 5", "0 4 5 1", "2 3 7 6", "0 2 6 4", "1 5 7 3"]
@@ -157,7 +113,7 @@ def test_options_reach_the_part_and_the_detector(detector, tmp_path):
         ({"name": ""}, "part name"),
     ],
 )
-def test_wrong_options_are_refused(detector, tmp_path, options, words):
+def test_wrong_options_are_refused(near_truth, tmp_path, options, words):
     path = tmp_path / "part.stl"
     path.write_text("")
     mesh = path if "unit" in options else "pivconnector"

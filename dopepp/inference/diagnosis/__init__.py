@@ -94,7 +94,9 @@ def part_size(case: Case) -> Diagnosis:
                 mesh = f"its mesh {size_in_words(extents)}, {ratio:.3g} times that"
                 return Diagnosis("part", f"{sizes[-1]}, and {mesh}", _unit_fix(ratio))
         if not is_plausible(part):
-            fix = "train again with the unit of the mesh's file: data.unit=mm, cm, m or inch"
+            fix = "pass the unit of the mesh's file: --unit mm, cm, m or inch"
+            if case.estimator.has_network:
+                fix = "train again with the unit of the mesh's file: data.unit=mm, cm, m or inch"
             return Diagnosis("part", f"{sizes[-1]}, which is unlikely", fix)
     return Diagnosis("part", "; ".join(sizes))
 
@@ -120,7 +122,8 @@ def sharpness(case: Case) -> Diagnosis:
         return Diagnosis("sharpness", "too few edges to tell")
     size = f"{case.box.width}×{case.box.height}"
     width_image = width / case.box.scale_x
-    sentence = f"edges {width_image:.1f} pixels wide, {width:.1f} in the network's {size}"
+    owner = "network's" if case.estimator.has_network else "templates'"
+    sentence = f"edges {width_image:.1f} pixels wide, {width:.1f} in the {owner} {size}"
     if width <= BLURRED:
         return Diagnosis("sharpness", sentence)
     fix = "focus on the part; if it or the camera moves, use a shorter exposure"
@@ -150,10 +153,10 @@ def camera(case: Case) -> Diagnosis:
 
 def size(case: Case) -> Diagnosis:
     """Check whether the part's distance and size lie within the training range."""
-    name, seen = case.part.name, case.seen
-    if seen is None:
+    name, depths = case.part.name, case.estimator.depth_range(case.part.name)
+    if depths is None:
         return Diagnosis("size", f"the checkpoint does not know in which sizes {name} was trained")
-    near, far = case.distances or seen[2:]
+    near, far = case.distances or depths
     usual = f"{near:.2g} – {far:.2g} m"
     if case.found is None:
         return Diagnosis("size", f"{name} was searched at {usual}, and nearer and farther")
@@ -170,6 +173,13 @@ def size(case: Case) -> Diagnosis:
 def visibility(case: Case) -> Diagnosis:
     """Check how much of the part the network sees, and what its maps lack."""
     name = case.part.name
+    if not case.estimator.has_network:
+        if case.found is not None:
+            return Diagnosis("visibility", f"{name} is seen, score {case.found.score:.2g}")
+        problem = f"no pose of {name} passes the verification"
+        fix = "check that all of it is on the picture and uncovered; add light from the side, or "
+        fix += "train it (experiment=my_part): a network sees more in clutter"
+        return Diagnosis("visibility", problem, fix)
     if case.found is not None:
         count, score = num_keypoints(case.found), case.found.score
         sentence = f"{count} of 9 keypoints of {name}, score {score:.2g}"
@@ -205,7 +215,8 @@ def elsewhere(case: Case) -> Diagnosis:
         f"{len(case.stray)} of {len(case.reported)} detections above {threshold:.2g} are {where}"
     )
     best_stray = f"the best has the score {best.score:.2g}, at ({u:.0f}, {v:.0f})"
-    return Diagnosis("elsewhere", f"confident elsewhere: {counts}; {best_stray}", TUNE)
+    fix = TUNE if case.estimator.has_network else "raise the threshold: --conf, or train the part"
+    return Diagnosis("elsewhere", f"confident elsewhere: {counts}; {best_stray}", fix)
 
 
 def pose(case: Case) -> Diagnosis:
@@ -215,6 +226,8 @@ def pose(case: Case) -> Diagnosis:
     detection, refined, name = case.found, case.refined, case.part.name
     share = detection.reprojection_error_px / case.length_px
     sentence = f"{name}'s keypoints are {detection.reprojection_error_px:.1f} pixels off it"
+    if not case.estimator.has_network:
+        sentence = f"{name} is {case.length_px:.0f} pixels long"
     if share > OFF:
         fix = "check K and the mesh; if both are right, train longer or with more such pictures"
         return Diagnosis("pose", f"{sentence}, {share:.0%} of its length", fix)

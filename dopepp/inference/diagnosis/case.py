@@ -17,7 +17,7 @@ from dopepp.geometry.cuboid import CENTROID, NUM_KEYPOINTS
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.picture import letterboxes
 from dopepp.parts.part import Part
-from dopepp.parts.size import Seen, widest
+from dopepp.parts.size import Seen
 from dopepp.recovery.detection import Detection
 
 NEARER, FARTHER = 2.0, 4.0  # factors on the expected distances for a further search
@@ -89,13 +89,16 @@ class Case:
     @cached_property
     def elsewhere(self) -> Detection | None:
         """Best detection at other distances, or None if there is one at the expected distances."""
-        seen = list(self.estimator.checkpoint.seen.values())
-        if self.expected is not None or not seen:
+        ranges = [self.estimator.depth_range(part.name) for part in self.estimator.parts]
+        depths = [limits for limits in ranges if limits is not None]
+        if self.expected is not None or not depths:
             return None
-        usual = widest(seen)[2:]
+        usual = min(near for near, _ in depths), max(far for _, far in depths)
         near, far = zip(usual, self.distances or usual, strict=True)
         detections = self._detections((min(near) / NEARER, max(far) * FARTHER))
         detection = detections[0] if detections else None
+        if not self.estimator.has_network:
+            return detection
         belief, keypoints = BELIEVED
         if detection is None or not np.isfinite(detection.keypoints).all():
             return None
@@ -116,6 +119,8 @@ class Case:
     @property
     def seen(self) -> Seen | None:
         """Sizes and distances of the part in training, if known."""
+        if not self.estimator.has_network:
+            return None
         return self.estimator.checkpoint.seen.get(self.part.name)
 
     @property
@@ -126,7 +131,9 @@ class Case:
 
     @cached_property
     def box(self) -> Letterbox:
-        """Image size in which the network sees the detected part best."""
+        """Image size in which the network sees the detected part best; templates use all pixels."""
+        if not self.estimator.has_network:
+            return Letterbox.scaled(self.image.shape[1::-1], 1.0)
         boxes = letterboxes(self.estimator.checkpoint, self.K, self.image, self.distances)
         if self.found is None or self.seen is None:
             return boxes[-1]

@@ -48,6 +48,7 @@ PAPER: Final = ((49, 47), (46, 46), (47, 43), (46, 45))
 
 SOURCES: Final[dict[str, tuple[PoseSource, ...]]] = {
     "network": (PoseSource(),),
+    "templates": (PoseSource("templates"),),
     "exact": (PoseSource("exact"),),
     "random": (PoseSource("random"),),
     "true-matrices": (PoseSource(matrices="true"),),
@@ -88,8 +89,8 @@ def check_task(task: GraspTask, poses: str, count: int) -> GraspTask:
     sources = parse_sources(poses)
     needs_network = any(source.kind == "network" for source in sources)
     if needs_network and task.network is None:
-        allowed = "a checkpoint of the part, or exact or random poses"
-        fix = "pass --network CHECKPOINT, or --poses exact"
+        allowed = "a checkpoint of the part, or poses by templates, exact or random"
+        fix = "pass --network CHECKPOINT, or --poses templates"
         raise UserError(f"part {task.part} without a network", allowed, fix)
     part = load_part(task.part, task.unit)
     find_grasps(part, task.grasps)

@@ -47,6 +47,10 @@ DEFAULT_DISTANCE: Final = (0.18, 0.22)  # distances of the camera without a trai
 TILT: Final = np.radians(17.0)
 """Largest rotation of the camera about its x and y axes from straight down, radians."""
 
+DISTANCE_MARGIN: Final = 1.2  # factor on these distances, for parts away from the tray's centre
+FLAT_TILT_DEG: Final = 60.0
+"""Tilt that templates cover for parts that lie flat: that of the camera and of the perspective."""
+
 SETTLE_S: Final = {"single": 0.2, "distractors": 0.4, "heap": 1.5}
 MAX_OBSTACLES: Final = 8  # number of parts in the planner's model
 RECOGNISED: Final = 0.1  # largest ADD of a recognised part, as a share of its diameter
@@ -56,7 +60,7 @@ RECOGNISED: Final = 0.1  # largest ADD of a recognised part, as a share of its d
 class PoseSource:
     """Source of the poses by which parts are grasped."""
 
-    kind: str = "network"  # `network`, `exact` (the simulation's) or `random`
+    kind: str = "network"  # `network`, `templates`, `exact` (the simulation's) or `random`
     matrices: str = "calibrated"  # `calibrated` or `true` camera matrices for the network's poses
     # Errors of exact poses in a random direction and about a random axis, millimetres and degrees.
     error: tuple[float, float] = (0.0, 0.0)
@@ -67,7 +71,7 @@ class PoseSource:
         if any(self.error):
             return f"{EXACT}, off by {self.error[0]:g} mm and {self.error[1]:g}°"
         true = ", true matrices" if self.matrices == "true" else ""
-        return {"network": "network", "exact": EXACT, "random": "random poses"}[self.kind] + true
+        return {"exact": EXACT, "random": "random poses"}.get(self.kind, self.kind) + true
 
 
 @dataclass(frozen=True)
@@ -164,6 +168,17 @@ class Trials:
         refine = "region" if self.task.refine else None
         return PoseEstimator.load(self.task.network, refine=refine)
 
+    @cached_property
+    def templates(self) -> PoseEstimator:
+        """Estimator of the part's mesh, for the distances at which the camera stands."""
+        from dopepp.inference.estimator import PoseEstimator
+
+        near, far = self.distance
+        distances = near / DISTANCE_MARGIN, far * DISTANCE_MARGIN
+        lies_flat = self.task.rest == "front" and self.task.layout != "heap"
+        tilt_deg = FLAT_TILT_DEG if lies_flat else 180.0
+        return PoseEstimator.from_mesh(self.task.part, self.task.unit, distances, tilt_deg)
+
     def _trained_distance(self) -> tuple[float, float]:
         """Return distances inside the network's training range, metres."""
         names = [part.name for part in self.estimator.parts]
@@ -171,10 +186,10 @@ class Trials:
             problem = f"--network {self.task.network}, which does not know {self.part.name}"
             allowed = f"a network of this part, not of {', '.join(names)}"
             raise UserError(problem, allowed, f"pass a network trained on {self.part.name}")
-        seen = self.estimator.checkpoint.seen.get(self.part.name)
-        if seen is None:
+        depths = self.estimator.depth_range(self.part.name)
+        if depths is None:
             return DEFAULT_DISTANCE
-        near, far = seen.nearest, seen.farthest
+        near, far = depths
         return near + 0.4 * (far - near), near + 0.75 * (far - near)
 
     def _robot(self, block: int) -> tuple[TrueRobot, CalibratedRobot]:
@@ -241,7 +256,8 @@ class Trials:
             T_flange_cam = scene.calibrated.knowledge.T_flange_cam
             T_base_cam = self.arm.flange(scene.joints) @ T_flange_cam
         lens = scene.calibrated.camera
-        detections = self.estimator.predict(scene.picture, lens.K, lens.coefficients)
+        estimator = self.templates if source.kind == "templates" else self.estimator
+        detections = estimator.predict(scene.picture, lens.K, lens.coefficients)
         parts = [detection for detection in detections if detection.object == self.part.name]
         # Keep the parts with at least half the best score.
         poses = [

@@ -1,0 +1,136 @@
+"""Commands with a mesh in place of a checkpoint."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from dopepp.parts.catalogue import pivconnector
+from dopepp.virtual import PRESETS, Factory
+
+RELEASED = "pretrained/pivconnector"
+RANGE = ("--working-distance", "0.08,0.2")
+
+
+@pytest.fixture(scope="module")
+def rendered():
+    return Factory([pivconnector()], PRESETS["quickstart"].reframed(640, 480), 2).render(0, 9)
+
+
+@pytest.fixture(scope="module")
+def folder(rendered, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("mesh")
+    cv2.imwrite(str(folder / "part.png"), rendered.image[..., ::-1])
+    cv2.imwrite(str(folder / "empty.png"), np.full((480, 640, 3), 90, np.uint8))
+    np.savetxt(folder / "K.txt", rendered.scene.K)
+    mesh = pivconnector().mesh
+    trimesh.Trimesh(1000 * mesh.vertices, mesh.faces).export(folder / "piv.stl")
+    return folder
+
+
+@pytest.fixture
+def truth(near_truth, rendered, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    near_truth.truth = [rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj]
+    return near_truth.truth[0]
+
+
+MESH = ("piv.stl", "part.png", "--camera", "K.txt", "--unit", "mm", *RANGE)
+
+
+def test_predict_draws_and_writes_the_pose_of_a_mesh(run, truth, tmp_path):
+    files = ("--save", tmp_path / "out", "--json", tmp_path / "p.json", "--csv", tmp_path / "p.csv")
+    done = run("predict", *MESH, *files, "--verify")
+    (line,) = map(json.loads, done.stdout.splitlines())
+    assert line["object"] == "piv"
+    assert np.abs(np.array(line["T_cam_obj"]) - truth).max() < 0.01
+    assert line["score"] == pytest.approx(line["probability"], abs=1e-3)
+    assert line["agreement"] > 0.5
+    assert len(list((tmp_path / "out").iterdir())) == 1
+    assert json.loads((tmp_path / "p.json").read_text())
+    assert (tmp_path / "p.csv").read_text().count("\n") == 2
+
+
+def test_predict_is_silent_on_an_empty_picture_and_searches_once(run, near_truth, truth):
+    near_truth.truth = []
+    done = run("predict", "pivconnector", "empty.png", "--camera", "K.txt", *RANGE, "--refine",
+               "region")  # fmt: skip
+    assert done.stdout == ""
+    assert "nothing found: no pose at these distances passes the verification;" in done.stderr
+
+
+def test_node_doctor_and_benchmark_take_a_mesh(run, truth, rendered):
+    line = run("node", *MESH, "--json").stdout.splitlines()[0]
+    assert "piv" in line
+    words = ("part.png", "--model", "piv.stl", "--camera", "K.txt", "--unit", "mm", *RANGE)
+    lines = run("doctor", *words).stdout.splitlines()
+    assert all(line.startswith("ok ") for line in lines), lines
+    assert "piv is seen, score" in lines[5]
+    four = ("--K", *rendered.scene.K[[0, 1, 0, 1], [0, 1, 2, 2]])
+    table = run(
+        "benchmark", "piv.stl", "--unit", "mm", *RANGE, "--image", "part.png", *four, "-n", 1
+    )
+    assert "piv.stl" in table.stdout
+
+
+def test_doctor_says_that_no_pose_is_verified(run, near_truth, truth):
+    near_truth.truth = []
+    words = ("part.png", "--model", "pivconnector", "--camera", "K.txt", *RANGE)
+    first = run("doctor", *words, code=1).stdout.splitlines()[0]
+    assert first.startswith("!! visibility: no pose of pivconnector passes the verification; fix: ")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("piv.stl",), "got a mesh without a working distance"),
+        (("piv.stl", "--working-distance", "0.3"), "got --working-distance 0.3; allowed: NEAR,FAR"),
+        (("piv.stl", "--working-distance", "0.5,0.3"), "working_distance=(0.5, 0.3)"),
+        (("piv.stl", *RANGE, "--tilt", "200"), "tilt_deg=200"),
+        (("piv.stl", *RANGE, "--unit", "feet"), "unit='feet'"),
+        (("piv.stl", *RANGE, "--device", "cuda"), "got --device cuda with the mesh piv.stl"),
+        (("none.stl", *RANGE), "none.stl, no such file"),
+        ((RELEASED, *RANGE), f"got --working-distance with the checkpoint {RELEASED}"),
+        ((RELEASED, "--tilt", "40"), f"got --tilt with the checkpoint {RELEASED}"),
+        ((RELEASED, "--unit", "mm"), f"got --unit with the checkpoint {RELEASED}"),
+    ],
+)
+@pytest.mark.parametrize("command", ["predict", "node", "doctor", "benchmark"])
+def test_wrong_options_are_one_line(refused, truth, rendered, command, words, message):
+    model, *options = words
+    four = ("--K", *rendered.scene.K[[0, 1, 0, 1], [0, 1, 2, 2]])
+    commands = {
+        "predict": (model, "part.png", *four),
+        "node": (model, "part.png", *four, "--json"),
+        "doctor": ("part.png", "--model", model, *four),
+        "benchmark": (model, "--image", "part.png", *four),
+    }
+    assert message in refused(command, *commands[command], *options)
+
+
+def test_options_of_one_command_alone(refused, truth):
+    line = refused("predict", *MESH, "--part", "piv.stl")
+    assert "got --part with the mesh piv.stl" in line
+    assert "piv.stl without --image" in refused("benchmark", "piv.stl", *RANGE)
+    K = ("--camera", "K.txt")
+    line = refused(
+        "predict", "piv.stl", "part.png", *K, *RANGE, "--depth", "d.png", "--refine", "depth"
+    )
+    assert "templates with refine=('depth',)" in line
+
+
+def test_the_page_shows_poses_without_maps(truth, folder, rendered):
+    pytest.importorskip("gradio", reason="without the extra web")
+    from dopepp import PoseEstimator
+    from dopepp.inference.page import _outputs
+
+    estimator = PoseEstimator.from_mesh("piv.stl", "mm", (0.08, 0.2))
+    K = rendered.scene.K
+    numbers = (None, K[0, 0], K[1, 1], K[0, 2], K[1, 2], None)
+    drawn, message, rows, _, maps = _outputs(estimator, folder / "part.png", "K", numbers, folder)
+    assert drawn.shape == (480, 640, 3)
+    assert [row[0] for row in rows] == ["piv"]
+    assert maps is None
+    assert "1 pose" in message
