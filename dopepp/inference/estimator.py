@@ -161,9 +161,7 @@ class PoseEstimator:
             checked_distances,
             load_solid_part,
         )
-        from dopepp.inference.templates import (  # type: ignore[import-not-found,unused-ignore]
-            TemplateDetector,
-        )
+        from dopepp.inference.templates import TemplateDetector
 
         distances = checked_distances(working_distance)
         tilt = check("tilt_deg", tilt_deg, float, Range(0, 180, "degrees"))

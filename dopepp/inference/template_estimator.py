@@ -8,16 +8,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, NoReturn, Protocol
+from typing import Final, Literal, NoReturn, Protocol
 
 import torch
 
 from dopepp.core.errors import UserError
 from dopepp.core.validation import Span, check
 from dopepp.drawing.pictures import Picture
-from dopepp.geometry.camera import CameraMatrix
+from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.picture import Distances, NetworkView, Region, merge_scales
+from dopepp.inference.picture import Depth, Distances, NetworkView, Region, merge_scales
 from dopepp.inference.refinement.refiner import Refine
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.catalogue import load_part
@@ -26,11 +26,21 @@ from dopepp.parts.symmetry_finder import find_symmetries
 from dopepp.recovery.detection import Detection, RecoveryOptions
 from dopepp.recovery.recover import Reason
 
+NUM_REPEATED: Final = 10  # refined poses that are refined again
+
+REPEATS: Final = 2
+
+SCALE_ERROR: Final = 0.001
+"""Relative error of size and focal length: a template's distance is too rough to be kept."""
+
 
 class Detector(Protocol):
     """Detects a part without a network; one instance may have several start poses."""
 
     part: Part
+
+    def start(self, T_cam_obj: Transform, score: float, K: CameraMatrix) -> Detection:
+        """Return a start pose."""
 
     def detect(
         self,
@@ -65,7 +75,8 @@ class TemplateEstimator(PoseEstimator):
         scale_error: float | None = None,
     ) -> None:
         self.detector, self.distances = detector, distances
-        self.max_ms, self.scale_error = max_ms, scale_error
+        self.max_ms = max_ms
+        self.scale_error = SCALE_ERROR if scale_error is None else scale_error
         self.device, self.recovery = torch.device("cpu"), RecoveryOptions()
         self._refine_by(refine, self.parts)
 
@@ -99,6 +110,30 @@ class TemplateEstimator(PoseEstimator):
     ) -> list[Detection]:
         with self._timed("decode"):
             return self.detector.detect(image, K, self._range(distances), roi)
+
+    def refined(
+        self,
+        detections: Sequence[Detection],
+        image: Picture,
+        K: CameraMatrix,
+        depth: Depth | None = None,
+    ) -> list[Detection]:
+        """Refine detections; the most probable ends of start poses are refined again from there.
+
+        A start pose is off by so much that a single refinement may stop too early.
+        """
+        refined = super().refined(detections, image, K, depth)
+        for _ in range(REPEATS if all(it.agreement is None for it in detections) else 0):
+            refined.sort(key=lambda detection: -(detection.probability or 0.0))
+            starts = [
+                self.detector.start(it.T_cam_obj, it.score, K) for it in refined[:NUM_REPEATED]
+            ]
+            again = super().refined(starts, image, K, depth)
+            refined[:NUM_REPEATED] = [
+                max(pair, key=lambda it: it.probability or 0.0)
+                for pair in zip(again, refined[:NUM_REPEATED], strict=True)
+            ]
+        return refined
 
     def _rescored(self, refined: Sequence[Detection]) -> list[Detection]:
         """Return the best refined detection of each instance, best first."""

@@ -100,6 +100,8 @@ class Refiner:
         is_tracked = detection.agreement is not None  # set by refinement only
         if is_tracked:
             refined = refiner.refine(image, K, T_cam_obj, covariance, depth, followed=True)
+        elif not np.isfinite(detection.peaks).any():  # a template's, one of several starts
+            refined = refiner.refine(image, K, T_cam_obj, covariance, depth)
         else:
             # A tracker knows how far a part may have moved; a network's covariance may be wrong.
             starts = partial(poses_of_four, cuboid, detection.peaks, K)

@@ -1,0 +1,243 @@
+"""Detection of a part by templates of its mesh; needs no training.
+
+1. :mod:`~dopepp.inference.templates.views` draws the part from 600 directions.
+2. :mod:`~dopepp.inference.templates.matching` compares all drawings, turned in the image plane and
+   resized to the working distances, with the image's edges at every fourth pixel.
+3. :mod:`~dopepp.inference.templates.ranking` moves the best matches and ranks them.
+
+The result are start poses. Refinement and verification choose among them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from dopepp.core.errors import UserError
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import (
+    CameraMatrix,
+    Transform,
+    crop_camera,
+    focal_length,
+    project_keypoints,
+)
+from dopepp.geometry.rotation import rotation_vector_to_matrix
+from dopepp.geometry.symmetry import symmetry_group
+from dopepp.inference.picture import MAX_PIXELS, Region
+from dopepp.inference.refinement.outline import make_outline_mesh
+from dopepp.inference.templates.matching import STRIDE, Matches, match
+from dopepp.inference.templates.ranking import describe, learned_ranking
+from dopepp.inference.templates.responses import edge_responses
+from dopepp.inference.templates.views import make_templates, view_rotations
+from dopepp.parts.part import Part
+from dopepp.recovery.detection import Detection
+
+COARSE_PX: Final = 80.0  # diameter of the part on the image that all places are compared on
+FINE_PX: Final = 140.0  # largest diameter on the image that the best matches are ranked on
+SMALLEST_PX: Final = 12.0  # least diameter that templates can detect
+SCALE_STEP: Final = 1.13  # ratio of neighbouring distances
+OCTAVE: Final = 2.0  # ratio of diameters that are ranked on one image
+COARSE_SPREAD: Final = 5  # pixels
+FINE_SPREAD: Final = 3
+
+NUM_RANKED: Final = 4000  # matches
+NUM_STARTS: Final = 60  # start poses
+
+# Poses that refinement would move to the same end.
+SAME_PLACE: Final = 0.1  # diameters
+SAME_DEPTH: Final = 0.05  # relative
+SAME_TURN: Final = math.radians(10.0)
+
+# Standard deviations of a start pose.
+TURN_ERROR: Final = math.radians(6.0)
+PLACE_ERROR: Final = 0.02  # diameters
+DEPTH_ERROR: Final = 0.03  # relative
+
+
+class TemplateDetector:
+    """Detects one part by templates of its mesh.
+
+    Args:
+        part: Part with a mesh.
+        working_distance: Nearest and farthest depth of the part, metres.
+        tilt_deg: Largest angle between the part's z axis and the direction to the camera, degrees.
+
+    Raises:
+        UserError: The part has no mesh.
+    """
+
+    def __init__(
+        self, part: Part, working_distance: tuple[float, float], tilt_deg: float = 180.0
+    ) -> None:
+        if part.mesh is None:
+            fix = "pass the part's mesh file"
+            raise UserError(
+                f"templates of {part.name}, which has no mesh", "a part with a mesh", fix
+            )
+        self.part, self._distances = part, working_distance
+        mesh = make_outline_mesh(part.mesh.vertices, part.mesh.faces)
+        self._centre = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
+        group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous, max_step=0.1)
+        rotations = view_rotations(tilt_deg, group[:, :3, :3])
+        depth = math.sqrt(working_distance[0] * working_distance[1])
+        self._templates = make_templates(mesh, self._centre, part.diameter, depth, rotations)
+
+    def detect(
+        self,
+        image: Picture,
+        K: CameraMatrix,
+        distances: tuple[float, float] | None = None,
+        roi: Region | None = None,
+    ) -> list[Detection]:
+        """Return start poses, best score first; several may belong to the same instance.
+
+        Args:
+            image: RGB, without distortion.
+            K: Camera matrix, pixels.
+            distances: Nearest and farthest depth, metres (default: the working distance).
+            roi: Region to search: (x, y, width, height), pixels.
+
+        Raises:
+            UserError: The part is too small on the image to be detected.
+        """
+        shown, left, top = image, 0, 0
+        if roi is not None:
+            left, top, width, height = (round(number) for number in roi)
+            shown = np.ascontiguousarray(image[top : top + height, left : left + width])
+        views, poses, features = self.ranked(
+            shown, crop_camera(K, left, top), distances or self._distances
+        )
+        weights, bias = learned_ranking()
+        odds = features @ weights + bias
+        order = np.argsort(-odds)
+        transforms = self.transforms(views[order], poses[order], crop_camera(K, left, top))
+        scores = 1 / (1 + np.exp(-np.clip(odds[order], -30.0, 30.0)))
+        chosen = _distinct(transforms, self._centre, self.part.diameter)
+        return [self.start(transforms[i], float(scores[i]), K) for i in chosen]
+
+    def start(self, T_cam_obj: Transform, score: float, K: CameraMatrix) -> Detection:
+        """Return a start pose with the covariance of a match."""
+        depth = float(T_cam_obj[2, 3])
+        deviations = (
+            [TURN_ERROR] * 3 + [PLACE_ERROR * self.part.diameter] * 2 + [DEPTH_ERROR * depth]
+        )
+        keypoints = project_keypoints(self.part.cuboid, T_cam_obj, K)
+        return Detection(
+            object=self.part.name,
+            score=score,
+            belief=score,
+            T_cam_obj=T_cam_obj,
+            keypoints=keypoints,
+            peaks=np.full_like(keypoints, np.nan),
+            reprojection_error_px=0.0,
+            covariance=np.diag(np.square(deviations)),
+        )
+
+    def ranked(
+        self, image: Picture, K: CameraMatrix, distances: tuple[float, float]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return views, poses on the image and features of the best matches at all distances.
+
+        Raises:
+            UserError: The part is too small on the image to be detected.
+        """
+        near, far = distances
+        length = self.part.diameter * focal_length(K)  # at a depth of one metre, pixels
+        count = max(1, math.ceil(math.log(far / near) / math.log(SCALE_STEP)))
+        sizes = length / (near * (far / near) ** ((np.arange(count) + 0.5) / count))
+        least = math.sqrt(image.shape[0] * image.shape[1] / MAX_PIXELS)
+        if sizes[-1] / max(least, 1.0) < SMALLEST_PX:
+            raise UserError(
+                f"{self.part.name}, {sizes[-1]:.0f} pixels long at {far:g} m in an image of "
+                f"{image.shape[1]}×{image.shape[0]}",
+                f"at least {SMALLEST_PX * max(least, 1.0):.0f} pixels",
+                "search a region (roi), or state a nearer working distance",
+            )
+        groups = [self._matches(image, size) for size in sizes]
+        matches = Matches(*(np.concatenate(columns) for columns in zip(*groups, strict=True)))
+        best = np.argsort(-matches.scores)[:NUM_RANKED]
+        matches = Matches(*(column[best] for column in matches))
+        octaves = np.floor(np.log(sizes[0] / matches.poses[:, 3]) / math.log(OCTAVE) + 1e-9)
+        views, poses, features = [], [], []
+        for octave in np.unique(octaves):
+            members = Matches(*(column[octaves == octave] for column in matches))
+            scale = min(1.0, FINE_PX / members.poses[:, 3].max())
+            small = _resized(image, scale)
+            responses = edge_responses(small, FINE_SPREAD, _odd(FINE_PX))
+            reach = 1 + STRIDE / 2 * float(members.poses[:, 3].mean()) * scale / COARSE_PX
+            members.poses[:, [0, 1, 3]] *= scale
+            moved, described = describe(members, self._templates, responses, small, reach)
+            moved[:, [0, 1, 3]] /= scale
+            views.append(members.views)
+            poses.append(moved)
+            features.append(described)
+        return np.concatenate(views), np.concatenate(poses), np.concatenate(features)
+
+    def _matches(self, image: Picture, size: float) -> Matches:
+        """Return the best places of all templates for a projected diameter, pixels of the image."""
+        most = math.sqrt(MAX_PIXELS / (image.shape[0] * image.shape[1]))
+        scale = min(1.0, most, COARSE_PX / size)
+        small = _resized(image, scale)
+        responses = edge_responses(small, COARSE_SPREAD, _odd(size * scale))
+        matches = match(responses, self._templates, size * scale)
+        matches.poses[:, [0, 1, 3]] /= scale
+        return matches
+
+    def transforms(
+        self, views: np.ndarray, poses: np.ndarray, K: CameraMatrix
+    ) -> Float[np.ndarray, "matches 4 4"]:
+        """Return the poses of matches, metres."""
+        u, v, turns, sizes = poses.T
+        depths = self.part.diameter * focal_length(K) / sizes
+        rays = np.column_stack(
+            [(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(len(poses))]
+        )
+        # A template shows the part on the optical axis, which turns to the ray.
+        sines = np.linalg.norm(rays[:, :2], axis=1) / np.linalg.norm(rays, axis=1)
+        axes = np.column_stack([-rays[:, 1], rays[:, 0], np.zeros(len(rays))])
+        axes *= (np.arcsin(sines) / np.maximum(np.linalg.norm(axes, axis=1), 1e-12))[:, None]
+        turned = rotation_vector_to_matrix(turns[:, None] * np.array([0.0, 0.0, 1.0]))
+        rotations = rotation_vector_to_matrix(axes) @ turned @ self._templates.rotations[views]
+        shifts = depths[:, None] * rays - rotations @ self._centre
+        transforms = np.tile(np.eye(4), (len(poses), 1, 1))
+        transforms[:, :3, :3], transforms[:, :3, 3] = rotations, shifts
+        return transforms
+
+
+def _distinct(
+    transforms: Float[np.ndarray, "matches 4 4"], centre: np.ndarray, diameter: float
+) -> list[int]:
+    """Return the indices of the first poses that differ from all poses before them."""
+    centres = transforms[:, :3, :3] @ centre + transforms[:, :3, 3]
+    free, chosen = np.ones(len(transforms), bool), []
+    for index in range(len(transforms)):
+        if not free[index]:
+            continue
+        chosen.append(index)
+        if len(chosen) == NUM_STARTS:
+            break
+        apart = np.linalg.norm(centres[:, :2] - centres[index, :2], axis=1)
+        trace = np.einsum("nij,ij->n", transforms[:, :3, :3], transforms[index, :3, :3])
+        free &= (
+            (apart > SAME_PLACE * diameter)
+            | (np.abs(centres[:, 2] / centres[index, 2] - 1) > SAME_DEPTH)
+            | (trace < 1 + 2 * math.cos(SAME_TURN))
+        )
+    return chosen
+
+
+def _resized(image: Picture, scale: float) -> Picture:
+    """Return an image that is not larger."""
+    if scale >= 1.0:
+        return image
+    size = [max(8, round(scale * side)) for side in image.shape[1::-1]]
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+
+
+def _odd(side: float) -> int:
+    return int(side) | 1

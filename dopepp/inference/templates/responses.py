@@ -1,0 +1,69 @@
+"""Responses of an image's edges, by orientation.
+
+A response is high where the image has an edge of that orientation nearby (the spread orientations
+of LINE-2D, Hinterstoisser et al. 2012). The mean response of the surroundings is subtracted,
+because in busy texture an edge of any orientation is near every pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import cv2
+import numpy as np
+from jaxtyping import Int16
+
+from dopepp.core.compiled import Array, compiled
+from dopepp.drawing.pictures import Picture
+
+BINS: Final = 16  # orientations, modulo 180 degrees
+NOISE: Final = 8.0  # gradient, grey levels per pixel, at which an edge has half its response
+FULL: Final = 127.0  # response of a strong edge of the same orientation
+FAINT: Final = 12.0  # strength below which a pixel is no edge
+
+Responses = Int16[np.ndarray, "bins height width"]
+
+
+def edge_responses(image: Picture, spread: int, surroundings: int) -> Responses:
+    """Return the response at each pixel to edges of each orientation, minus the mean around.
+
+    Args:
+        image: RGB.
+        spread: Side of the square in which an edge counts as near, pixels, odd.
+        surroundings: Side of the square whose mean response is subtracted, pixels.
+    """
+    soft = cv2.GaussianBlur(image, (3, 3), 0.8)
+    gx = cv2.Scharr(soft, cv2.CV_32F, 1, 0, scale=1 / 32)
+    gy = cv2.Scharr(soft, cv2.CV_32F, 0, 1, scale=1 / 32)
+    maps = np.zeros((BINS, *image.shape[:2]), np.uint8)
+    _orient(gx, gy, maps)
+    kernel = np.ones((spread, spread), np.uint8)
+    responses = np.stack([cv2.dilate(response, kernel) for response in maps]).astype(np.int16)
+    mean = responses.mean(axis=0, dtype=np.float32)
+    side = (surroundings, surroundings)
+    responses -= np.rint(cv2.blur(mean, side, borderType=cv2.BORDER_REFLECT)).astype(np.int16)
+    return responses
+
+
+@compiled()
+def _orient(gx: Array, gy: Array, maps: Array) -> None:
+    """Write the responses of each pixel, from the channel with the longest gradient."""
+    bins, height, width = maps.shape
+    cosines, sines = np.empty(bins), np.empty(bins)
+    for b in range(bins):
+        cosines[b], sines[b] = math.cos(b * math.pi / bins), math.sin(b * math.pi / bins)
+    for v in range(height):
+        for u in range(width):
+            longest, x, y = 0.0, 0.0, 0.0
+            for c in range(3):
+                square = gx[v, u, c] * gx[v, u, c] + gy[v, u, c] * gy[v, u, c]
+                if square > longest:
+                    longest, x, y = square, gx[v, u, c], gy[v, u, c]
+            length = math.sqrt(longest)
+            strength = FULL * length / (length + NOISE)
+            if strength < FAINT:
+                continue
+            for b in range(bins):
+                cosine = (x * cosines[b] + y * sines[b]) / length
+                maps[b, v, u] = int(strength * cosine * cosine * cosine * cosine)
