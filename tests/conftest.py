@@ -202,14 +202,14 @@ def near_truth(monkeypatch):
                 for score, turn in ((0.8, [0.03, 0, 0.02]), (0.7, [0, -0.03, 0.02])):
                     T = T_true.copy()
                     T[:3, :3] = rotation_vector_to_matrix(np.array(turn)) @ T[:3, :3]
-                    starts.append(self.detection(T, K, score))
+                    starts.append(self.start(T, score, K))
             for T in self.truth[:1]:
                 shift = np.eye(4)
                 shift[:3, 3] = 0.05
-                starts.append(self.detection(shift @ T, K, 0.5))
+                starts.append(self.start(shift @ T, 0.5, K))
             return starts
 
-        def detection(self, T, K, score):
+        def start(self, T, score, K):
             points, peaks = project_keypoints(self.part.cuboid, T, K), np.full((9, 2), np.nan)
             covariance = np.diag([0.03**2] * 3 + [0.001**2] * 3)
             return Detection(self.part.name, score, score, T, points, peaks, 0.0, covariance)

@@ -156,18 +156,12 @@ class PoseEstimator:
         Raises:
             UserError: The mesh or an option is invalid, or the working distance is missing.
         """
-        from dopepp.inference.template_estimator import (
-            TemplateEstimator,
-            checked_distances,
-            load_solid_part,
-        )
-        from dopepp.inference.templates import TemplateDetector
+        from dopepp.inference.template_estimator import TemplateEstimator, load_solid_part
 
-        distances = checked_distances(working_distance)
-        tilt = check("tilt_deg", tilt_deg, float, Range(0, 180, "degrees"))
         part = load_solid_part(mesh, unit, name, symmetries)
-        detector = TemplateDetector(part, distances, tilt)
-        return TemplateEstimator(detector, distances, refine, max_ms, scale_error)
+        return TemplateEstimator.of_parts(
+            [part], working_distance, tilt_deg, refine, max_ms, scale_error
+        )
 
     def refining(self, refine: Refine | None, parts: Sequence[Part] | None = None) -> PoseEstimator:
         """Return an estimator with the same network and another refinement; see the class."""

@@ -51,6 +51,8 @@ Coefficients = Float[np.ndarray, "coefficients"]  # lens distortion, in OpenCV's
 FARTHEST: Final = 50.0
 """Metres: beyond the range of any depth camera for parts, so larger values are millimetres."""
 
+METRES: Final = Span(0.001, 1000.0, "metres")  # valid distances
+
 MAX_PIXELS: Final = 640 * 480  # of a resized image: a part too small for that is not detected
 MARGIN: Final = 1.1  # factor on a size that makes no difference to a network
 
@@ -208,18 +210,31 @@ def network_views(
         UserError: The region extends beyond the image, or the distances are not a range of metres.
     """
     x, y = 0, 0
-    if roi is not None:
-        height, width = image.shape[:2]
-        x, y, columns, rows = (round(number) for number in roi)
-        if not (0 <= x < x + columns <= width and 0 <= y < y + rows <= height):
-            allowed = f"(x, y, width, height) within the {width}×{height} image, pixels"
-            raise UserError(f"roi {tuple(roi)}", allowed, "move or shrink the region")
+    region = checked_region(roi, image)
+    if region is not None:
+        x, y, columns, rows = region
         image = np.ascontiguousarray(image[y : y + rows, x : x + columns])
         K = crop_camera(K, x, y)
     boxes = letterboxes(checkpoint, K, image, distances)
     return [
         NetworkView(letterboxed(image, box, multiple), box, box.camera(K), (x, y)) for box in boxes
     ]
+
+
+def checked_region(roi: Region | None, image: Picture) -> Region | None:
+    """Return a region of an image in whole pixels.
+
+    Raises:
+        UserError: The region extends beyond the image.
+    """
+    if roi is None:
+        return None
+    height, width = image.shape[:2]
+    x, y, columns, rows = (round(number) for number in roi)
+    if not (0 <= x < x + columns <= width and 0 <= y < y + rows <= height):
+        allowed = f"(x, y, width, height) within the {width}×{height} image, pixels"
+        raise UserError(f"roi {tuple(roi)}", allowed, "move or shrink the region")
+    return x, y, columns, rows
 
 
 def letterboxed(
@@ -290,7 +305,7 @@ def _depths(
         scale = min(1.0, math.sqrt(MAX_PIXELS / (size[0] * size[1])))
         nearest = reach / min(size)
         return nearest, max(nearest, reach * scale / seen.smallest_px)
-    check("distances", distances, tuple[float, float], Span(0.001, 1000.0, "metres"))
+    check("distances", distances, tuple[float, float], METRES)
     return distances
 
 

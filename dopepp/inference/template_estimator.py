@@ -13,11 +13,19 @@ from typing import Final, Literal, NoReturn, Protocol
 import torch
 
 from dopepp.core.errors import UserError
-from dopepp.core.validation import Span, check
+from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.picture import Depth, Distances, NetworkView, Region, merge_scales
+from dopepp.inference.picture import (
+    METRES,
+    Depth,
+    Distances,
+    NetworkView,
+    Region,
+    checked_region,
+    merge_scales,
+)
 from dopepp.inference.refinement.refiner import Refine
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.catalogue import load_part
@@ -53,11 +61,11 @@ class Detector(Protocol):
 
 
 class TemplateEstimator(PoseEstimator):
-    """Estimates the poses of one part from its mesh alone.
+    """Estimates the poses of parts from their meshes alone.
 
     Args:
-        detector: Detector of the part.
-        distances: Nearest and farthest depth of the part, metres.
+        detectors: A detector for each part.
+        distances: Nearest and farthest depth of the parts, metres.
         refine: As of :class:`PoseEstimator`, with ``region``.
         max_ms: As of :class:`PoseEstimator`.
         scale_error: As of :class:`PoseEstimator`.
@@ -68,17 +76,35 @@ class TemplateEstimator(PoseEstimator):
 
     def __init__(
         self,
-        detector: Detector,
+        detectors: Sequence[Detector],
         distances: tuple[float, float],
         refine: Refine = "region",
         max_ms: float | None = None,
         scale_error: float | None = None,
     ) -> None:
-        self.detector, self.distances = detector, distances
+        self.detectors, self.distances = tuple(detectors), distances
         self.max_ms = max_ms
         self.scale_error = SCALE_ERROR if scale_error is None else scale_error
         self.device, self.recovery = torch.device("cpu"), RecoveryOptions()
         self._refine_by(refine, self.parts)
+
+    @classmethod
+    def of_parts(
+        cls,
+        parts: Sequence[Part],
+        distances: tuple[float, float] | None,
+        tilt_deg: float = 180.0,
+        refine: Refine = "region",
+        max_ms: float | None = None,
+        scale_error: float | None = None,
+    ) -> TemplateEstimator:
+        """Make templates of parts; the arguments are those of :meth:`PoseEstimator.from_mesh`."""
+        from dopepp.inference.templates import TemplateDetector
+
+        checked = _checked_distances(distances)
+        tilt = check("tilt_deg", tilt_deg, float, Range(0, 180, "degrees"))
+        detectors = [TemplateDetector(part, checked, tilt) for part in parts]
+        return cls(detectors, checked, refine, max_ms, scale_error)
 
     def _refine_by(self, refine: Refine | None, parts: Sequence[Part]) -> None:
         terms = (refine,) if isinstance(refine, str) else refine or ()
@@ -89,8 +115,8 @@ class TemplateEstimator(PoseEstimator):
 
     @property
     def parts(self) -> Sequence[Part]:
-        """The part."""
-        return (self.detector.part,)
+        """Detected parts."""
+        return tuple(detector.part for detector in self.detectors)
 
     @property
     def has_network(self) -> bool:
@@ -103,13 +129,16 @@ class TemplateEstimator(PoseEstimator):
 
     @property
     def _detector(self) -> str:
-        return f"{self.detector.part.name} by templates"
+        return "templates of meshes"
 
     def _start_detections(
         self, image: Picture, K: CameraMatrix, distances: Distances | None, roi: Region | None
     ) -> list[Detection]:
         with self._timed("decode"):
-            return self.detector.detect(image, K, self._range(distances), roi)
+            roi, depths = checked_region(roi, image), self._range(distances)
+            found = [detector.detect(image, K, depths, roi) for detector in self.detectors]
+            starts = [detection for detections in found for detection in detections]
+            return sorted(starts, key=lambda detection: -detection.score)
 
     def refined(
         self,
@@ -120,20 +149,26 @@ class TemplateEstimator(PoseEstimator):
     ) -> list[Detection]:
         """Refine detections; the most probable ends of start poses are refined again from there.
 
-        A start pose is off by so much that a single refinement may stop too early.
+        A start pose is off by so much that a single refinement may stop too early. With a time
+        limit, poses are refined once.
         """
         refined = super().refined(detections, image, K, depth)
-        for _ in range(REPEATS if all(it.agreement is None for it in detections) else 0):
-            refined.sort(key=lambda detection: -(detection.probability or 0.0))
-            starts = [
-                self.detector.start(it.T_cam_obj, it.score, K) for it in refined[:NUM_REPEATED]
-            ]
-            again = super().refined(starts, image, K, depth)
-            refined[:NUM_REPEATED] = [
-                max(pair, key=lambda it: it.probability or 0.0)
-                for pair in zip(again, refined[:NUM_REPEATED], strict=True)
-            ]
-        return refined
+        if any(detection.agreement is not None for detection in detections):
+            return refined
+        ends: list[Detection] = []
+        for detector in self.detectors:
+            its = [detection for detection in refined if detection.object == detector.part.name]
+            for _ in range(REPEATS if self.max_ms is None else 0):
+                its.sort(key=lambda detection: -(detection.probability or 0.0))
+                best = its[:NUM_REPEATED]
+                starts = [detector.start(end.T_cam_obj, end.score, K) for end in best]
+                again = super().refined(starts, image, K, depth)
+                its[:NUM_REPEATED] = [
+                    max(pair, key=lambda end: end.probability or 0.0)
+                    for pair in zip(again, best, strict=True)
+                ]
+            ends += its
+        return ends
 
     def _rescored(self, refined: Sequence[Detection]) -> list[Detection]:
         """Return the best refined detection of each instance, best first."""
@@ -142,15 +177,17 @@ class TemplateEstimator(PoseEstimator):
     def _missing(
         self, image: Picture, K: CameraMatrix, distances: Distances | None, roi: Region | None
     ) -> list[Reason]:
-        if self.detector.detect(image, K, self._range(distances), roi):
-            return []
         near, far = self._range(distances)
         text = f"no view of it fits the image at {near:.2g} – {far:.2g} m"
-        return [Reason(self.detector.part.name, "empty", 0.0, text)]
+        fitting = {it.object for it in self._start_detections(image, K, distances, roi)}
+        names = [part.name for part in self.parts if part.name not in fitting]
+        return [Reason(name, "empty", 0.0, text) for name in names]
 
     def _range(self, distances: Distances | None) -> tuple[float, float]:
         """Return depths to search; templates are searched at the working distance by default."""
-        return self.distances if distances is None or distances == "any" else distances
+        if distances is None or distances == "any":
+            return self.distances
+        return check("distances", distances, tuple[float, float], METRES)
 
     @property
     def network(self) -> NoReturn:  # type: ignore[override]
@@ -177,7 +214,7 @@ class TemplateEstimator(PoseEstimator):
         raise _networks_only("belief maps")
 
 
-def checked_distances(distances: object) -> tuple[float, float]:
+def _checked_distances(distances: object) -> tuple[float, float]:
     """Return the working distance of templates.
 
     Raises:
@@ -189,7 +226,7 @@ def checked_distances(distances: object) -> tuple[float, float]:
             "nearest and farthest distance of the part from the camera, metres",
             "state it: --working-distance 0.3,0.5 (working_distance=(0.3, 0.5) in Python)",
         )
-    return check("working_distance", distances, tuple[float, float], Span(0.001, 1000.0, "metres"))
+    return check("working_distance", distances, tuple[float, float], METRES)
 
 
 def load_solid_part(

@@ -38,7 +38,7 @@ def test_starts_are_refined_verified_and_merged_by_instance(near_truth, estimato
     image, K, truth = rendered.image, rendered.scene.K, true_pose(rendered)
     near_truth.truth = [truth]
     (detection,) = estimator.predict(image, K, roi=(0, 0, 300, 300))
-    assert estimator.detector.asked == [((NEAR, FAR), (0, 0, 300, 300))]
+    assert estimator.detectors[0].asked == [((NEAR, FAR), (0, 0, 300, 300))]
     turn = rotation_angle(detection.T_cam_obj[:3, :3].T @ truth[:3, :3])
     assert np.degrees(turn) < 1
     assert np.linalg.norm(detection.T_cam_obj[:3, 3] - truth[:3, 3]) < 0.002
@@ -52,7 +52,7 @@ def test_starts_are_refined_verified_and_merged_by_instance(near_truth, estimato
 def test_the_given_distances_replace_the_working_distance(estimator, rendered):
     estimator.candidates(rendered.image, rendered.scene.K, distances=(0.2, 0.3))
     estimator.candidates(rendered.image, rendered.scene.K, distances="any")
-    assert estimator.detector.asked == [((0.2, 0.3), None), ((NEAR, FAR), None)]
+    assert estimator.detectors[0].asked == [((0.2, 0.3), None), ((NEAR, FAR), None)]
 
 
 def test_an_empty_image_is_explained(near_truth, estimator, rendered):
@@ -72,7 +72,7 @@ def test_it_tracks_and_streams_as_a_network_does(near_truth, estimator, rendered
     for _ in range(3):
         (track,) = tracker.track(rendered.image, rendered.scene.K)
         identities.add(track.identity)
-    assert (len(identities), len(estimator.detector.asked)) == (1, 1)
+    assert (len(identities), len(estimator.detectors[0].asked)) == (1, 1)
     path = tmp_path / "picture.png"
     cv2.imwrite(str(path), rendered.image[..., ::-1])
     (result,) = estimator.stream(path, rendered.scene.K)
@@ -82,7 +82,7 @@ def test_it_tracks_and_streams_as_a_network_does(near_truth, estimator, rendered
 
 def test_repr_states_part_distances_and_thresholds(estimator):
     text = repr(estimator)
-    assert "pivconnector by templates, cpu, refine=region" in text
+    assert "templates of meshes, cpu, refine=region" in text
     assert "pivconnector: 105 × 52 × 7 mm, searched at 0.08 – 0.2 m" in text
 
 
@@ -96,8 +96,8 @@ def test_options_reach_the_part_and_the_detector(near_truth, tmp_path):
     assert (part.name, part.unit) == ("block", "mm")
     assert part.diameter == pytest.approx(np.linalg.norm([0.04, 0.03, 0.02]))
     assert len(part.symmetries_discrete) == 3  # half turns of a box
-    assert made.detector.tilt_deg == 40
-    assert made.detector.working_distance == (0.2, 0.3)
+    assert made.detectors[0].tilt_deg == 40
+    assert made.detectors[0].working_distance == (0.2, 0.3)
     plain = PoseEstimator.from_mesh(path, "mm", (0.2, 0.3), symmetries=None)
     assert plain.parts[0].symmetries_discrete is None
 

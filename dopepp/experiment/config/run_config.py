@@ -356,6 +356,8 @@ class EvaluationConfig(MeasurementConfig):
         ckpt_path: Checkpoint to measure.
         baseline: Second checkpoint, which comes first in tables.
         results: BOP challenge CSV with the poses of another method.
+        templates: Nearest and farthest distance of the parts, metres, at which templates of their
+            meshes are measured; None for no templates.
         negatives: Folder of pictures that show none of the parts.
         negatives_camera: Camera file of these pictures; None for the camera of the data.
         method: Name of that method; None derives it from the file name.
@@ -371,6 +373,7 @@ class EvaluationConfig(MeasurementConfig):
     ckpt_path: str | None
     baseline: str | None
     results: str | None
+    templates: tuple[float, float] | None = None
     negatives: str | None = None
     negatives_camera: str | None = None
     method: Any = None

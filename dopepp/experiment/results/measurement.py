@@ -112,6 +112,9 @@ class EstimatorMethod:
 
     def cost(self, seconds: Sequence[float]) -> Cost:
         """Return parameters, operations and the median time per frame."""
+        milliseconds = _median_ms(seconds[_WARM_UP_FRAMES:] or seconds)
+        if not self.estimator.has_network:
+            return Cost(ms_per_frame=milliseconds)
         checkpoint, network = self.estimator.checkpoint, self.estimator.network
         if isinstance(network, ExportedNetwork):  # an export has no modules to count
             parameters, gmacs = network.export.parameters, network.export.gmacs
@@ -119,7 +122,7 @@ class EstimatorMethod:
             with torch.device("meta"):  # as trained, because the estimator folds its network
                 trained = build_network(checkpoint.spec)
             parameters, gmacs = network_cost(trained, checkpoint.input_size)
-        return Cost(parameters, gmacs, _median_ms(seconds[_WARM_UP_FRAMES:] or seconds))
+        return Cost(parameters, gmacs, milliseconds)
 
 
 @dataclass(frozen=True)

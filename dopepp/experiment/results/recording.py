@@ -159,11 +159,11 @@ def main_report(reports: Sequence[Report]) -> Report:
 def with_refining(
     estimators: Mapping[str, PoseEstimator], refine: Refine | None, parts: Parts
 ) -> dict[str, PoseEstimator]:
-    """Return every estimator, each followed by a refining copy if ``refine`` is set."""
+    """Return every estimator, each network followed by a refining copy if ``refine`` is set."""
     pairs: dict[str, PoseEstimator] = {}
     for name, estimator in estimators.items():
         pairs[name] = estimator
-        if refine is not None:
+        if refine is not None and estimator.has_network:
             terms = " + ".join([refine] if isinstance(refine, str) else refine)
             pairs[f"{name} + {terms}"] = refining(estimator, refine, parts)
     return pairs
@@ -250,7 +250,7 @@ def _show_silence(
     """Print the number of images without detections of each estimator, with the reasons."""
     for name, numbers in silent.items():
         method = methods[name]
-        if numbers and isinstance(method, EstimatorMethod):
+        if numbers and isinstance(method, EstimatorMethod) and method.estimator.has_network:
             reasons = [method.silence(source.sample(number, 0)) for number in numbers]
             line = summary([reason for reason in reasons if reason is not None], len(source))
             display.console.print(f"{name}: {line}")

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import torch
 from rich.table import Table
@@ -33,8 +33,12 @@ from dopepp.experiment.run.resume import warn_of_other_images
 from dopepp.experiment.run.tuning import Tuning, tune, write_tuned
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.runtimes import is_export
+from dopepp.inference.template_estimator import TemplateEstimator
 from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part, Parts
+
+TEMPLATES: Final = "templates"
+"""Name of the method that needs no training."""
 
 _log = logging.getLogger(__name__)
 
@@ -105,7 +109,7 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
         device = "cuda" if torch.cuda.is_available() and not exported else "cpu"
     loaded = [PoseEstimator.load(path, device) for path in paths]
     checkpoint = loaded[-1].checkpoint if loaded else None
-    measured = str(asked.results if checkpoint is None else paths[-1])
+    measured = str(paths[-1] if paths else asked.results or TEMPLATES)
     stored = None if checkpoint is None else trained_on(checkpoint.data)
     data = chosen_data(asked.data, asked.virtual, stored, measured)
     write_config(run_dir, asked.plain)
@@ -122,6 +126,10 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
         return []
     names = [str(estimator.checkpoint.data.get("name", "estimate")) for estimator in loaded]
     files: dict[str, Path] = {}
+    if asked.templates is not None:
+        position = max(len(loaded) - 1, 0)  # metrics.json describes the last estimator
+        names.insert(position, TEMPLATES)
+        loaded.insert(position, TemplateEstimator.of_parts(parts, asked.templates))
     if asked.results is not None:  # BOP file names begin with the name of the method
         file = Path(asked.results)
         names.append(file.stem.partition("_")[0] if asked.method is None else str(asked.method))
@@ -154,9 +162,11 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
 def _check_combination(asked: EvaluationConfig) -> None:
     """Refuse options that exclude or need each other."""
     has_network = asked.ckpt_path is not None or asked.baseline is not None
-    if asked.ckpt_path is None and asked.results is None:
-        fix = "add ckpt_path=FILE for a checkpoint, or results=FILE for a file of poses"
-        raise UserError("neither ckpt_path nor results", "ckpt_path=…, results=… or both", fix)
+    if asked.ckpt_path is None and asked.results is None and asked.templates is None:
+        fix = "add ckpt_path=FILE for a checkpoint, results=FILE for a file of poses, or "
+        fix += "templates=[0.3,0.5] for the meshes alone"
+        allowed = "ckpt_path=…, results=…, templates=… or several"
+        raise UserError("neither ckpt_path nor results", allowed, fix)
     if asked.refine is not None and not has_network:
         allowed = "refine=… together with ckpt_path=… (poses from a file are not refined)"
         fix = "leave out refine, or add ckpt_path"
@@ -164,11 +174,12 @@ def _check_combination(asked: EvaluationConfig) -> None:
     if asked.negatives_camera is not None and asked.negatives is None:
         fix = "add negatives=FOLDER, or leave out negatives_camera"
         raise UserError(f"negatives_camera={asked.negatives_camera} without negatives", "both", fix)
-    if asked.negatives is not None and not has_network:
+    if asked.negatives is not None and not has_network and asked.templates is None:
         fix = "add ckpt_path, or leave out negatives: a file has no poses in these pictures"
         raise UserError(f"negatives={asked.negatives} without ckpt_path", "both", fix)
-    if asked.tune and (asked.protocols or asked.negatives is not None):
-        got, fix = "tune=true with shading, scale, by or negatives", "tune first, then measure"
+    if asked.tune and (asked.protocols or asked.negatives is not None or asked.templates):
+        got = "tune=true with shading, scale, by, negatives or templates"
+        fix = "tune first, then measure"
         raise UserError(got, "one of the two", fix)
 
 

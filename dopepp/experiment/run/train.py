@@ -7,6 +7,7 @@ name to :class:`~dopepp.experiment.config.run_config.RunConfig`.
 from __future__ import annotations
 
 import logging
+import shlex
 import shutil
 import signal
 from collections.abc import Callable, Mapping, Sequence
@@ -32,6 +33,7 @@ from dopepp.experiment.assembly.build_system import (
     keep_freed_memory,
 )
 from dopepp.experiment.assembly.photos import held_out_photos
+from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.config.run_config import RunConfig, TrainerConfig
 from dopepp.experiment.results import display, pages
 from dopepp.experiment.results.conditions import check_masks
@@ -170,6 +172,8 @@ def _train(
         for tracker in trackers:
             tracker.log_hyperparams(dict(config.plain))
     display.show_sources(datamodule.summary())
+    for line in template_commands(config.data):
+        display.console.print(f"already works without training: {line}", soft_wrap=True)
     _announce_duration(config.trainer, system, datamodule, trainer)
     _fit(trainer, system, datamodule, resume_from, run_dir)
     raise_if_pruned(trainer)
@@ -231,6 +235,27 @@ def _announce_duration(
     quick = f"; for a first result in minutes: {program.typed('train')} {QUICKSTART}"
     advice = quick if hours >= 1 else ""
     display.console.print(f"no accelerator: about {duration} to finish{advice}")
+
+
+def template_commands(data: DataConfig) -> list[str]:
+    """Return a command per part that estimates its poses without training, for the user's camera.
+
+    Only meshes have one, not the objects of a data set.
+    """
+    virtual, lens = data.virtual, data.virtual.camera
+    if data.root is not None or lens is None or virtual.working_distance is None:
+        return []
+    words = ["--K", *(f"{value:g}" for value in (lens.fx, lens.fy, lens.cx, lens.cy))]
+    words += ["--working-distance", ",".join(f"{metres:g}" for metres in virtual.working_distance)]
+    if data.unit is not None:
+        words += ["--unit", data.unit]
+    tilt_deg = getattr(data.preset.turning, "tilt_deg", None)
+    if tilt_deg is not None and data.preset.table is None:
+        words += ["--tilt", f"{tilt_deg:g}"]
+    return [
+        shlex.join(["dopepp", "predict", part, "PICTURE", *words, "--save", "out"])
+        for part in data.parts
+    ]
 
 
 def _resume_path(

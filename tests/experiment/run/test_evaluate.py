@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
+from dopepp.experiment.assembly.build_sources import held_out_source
+from dopepp.experiment.config.data_config import chosen_data, trained_on
 from dopepp.experiment.config.run_config import FalsePositiveTarget
 from dopepp.experiment.results.folder import METRICS_FILE, read_json
 from dopepp.experiment.results.recording import made_worse
@@ -70,6 +72,29 @@ def test_silent_images_are_counted_by_reason(composed, tmp_path, capsys):
     assert "below the threshold (best score" in line
 
 
+def test_templates_are_a_method_beside_the_network(composed, tmp_path, near_truth):
+    stored = trained_on(read(Path("pretrained/pivconnector")).data)
+    data = replace(chosen_data({}, {}, stored, "the release"), num_test=1)
+    sample = held_out_source(data, [pivconnector()], "test").sample(0)
+    near_truth.truth = [sample.instances[0].T_cam_obj]
+    options = ("ckpt_path=pretrained/pivconnector", "templates=[0.08,0.2]", "+data.num_test=1")
+    templates, network = run_evaluation(composed(*options, config="evaluate"), tmp_path / "run")
+    assert (templates.name, network.name) == ("templates", "dopepp_fast")
+    assert templates.errors["pivconnector"] == pytest.approx([0], abs=0.002)
+    assert templates.cost.parameters is None
+    assert templates.cost.ms_per_frame > 0
+    assert read_json(tmp_path / "run" / METRICS_FILE)["name"] == "dopepp_fast"
+    assert "templates" in (tmp_path / "run" / "compare.md").read_text()
+
+
+def test_templates_are_measured_without_a_checkpoint(composed, tmp_path, near_truth, capsys):
+    options = ("templates=[0.08,0.2]", "data=virtual", "virtual=default")
+    options += ("virtual.preset=quickstart", "data.parts=[pivconnector]", "data.num_test=1")
+    (report,) = run_evaluation(composed(*options, config="evaluate"), tmp_path)
+    assert (report.name, report.mean.miss_rate) == ("templates", 1)
+    assert "images without detections" not in capsys.readouterr().out
+
+
 def test_pictures_without_the_part_are_counted(composed, tmp_path, capsys):
     folder = tmp_path / "desk"
     folder.mkdir()
@@ -89,7 +114,7 @@ def test_pictures_without_the_part_are_counted(composed, tmp_path, capsys):
     [
         (["ckpt_path=x", "negatives_camera=y"], "negatives_camera=y without negatives"),
         (["results=x", "negatives=y"], "negatives=y without ckpt_path"),
-        (["ckpt_path=x", "tune=true", "negatives=y"], "tune=true with shading, scale, by or neg"),
+        (["ckpt_path=x", "tune=true", "negatives=y"], "tune=true with shading, scale, by, neg"),
     ],
 )
 def test_options_that_need_each_other(options, message, composed, tmp_path):
