@@ -49,7 +49,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 STEPS: Final = ("pre", "network", "decode", "refine")
-"""Steps of a prediction: undistorting and resizing, network, poses from maps, refinement."""
+"""Steps of a prediction: undistorting and resizing, network, poses from maps or templates,
+refinement."""
 
 FRAME: Final = "camera, OpenCV: x right, y down, z forward; metres"
 """Frame of all poses: ``T_cam_obj`` maps from the mesh's frame to this frame."""

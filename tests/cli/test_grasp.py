@@ -50,6 +50,13 @@ def test_other_layouts_end_in_a_report(grasped, tmp_path, layout):
     assert content["layout"] == layout
 
 
+def test_templates_grip_a_part_without_training(grasped, tmp_path):
+    content, output = grasped("-n", 1, "--poses", "templates", "--workers", 1)
+    assert content["sources"]["templates"]["caught"] == 1
+    assert content["network"] is None
+    assert "## Table 9: templates" in output
+
+
 def test_proposed_grasps_hold_a_part_of_ones_own(grasped, run, tmp_path):
     trimesh.creation.box((60, 30, 20)).export(tmp_path / "block.stl")
     done = run(
