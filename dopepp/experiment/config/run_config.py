@@ -368,6 +368,8 @@ class EvaluationConfig(MeasurementConfig):
         all_measures: Whether to print the symmetric measures of parts without symmetries.
         device: torch's name of the device, or ``auto``.
         num_pictures: Number of test images to draw.
+        scale_error: Largest relative error of the parts' size or of the focal length that
+            refinement assumes (default: 0.01).
     """
 
     ckpt_path: str | None
@@ -383,6 +385,7 @@ class EvaluationConfig(MeasurementConfig):
     all_measures: bool
     device: Any
     num_pictures: Annotated[int, Range(0, _MOST)]
+    scale_error: Annotated[float, Range(0.0, 0.1)] | None = None
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> EvaluationConfig:

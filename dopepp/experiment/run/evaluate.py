@@ -107,7 +107,7 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     if device == "auto":
         exported = any(is_export(Path(path)) for path in paths)
         device = "cuda" if torch.cuda.is_available() and not exported else "cpu"
-    loaded = [PoseEstimator.load(path, device) for path in paths]
+    loaded = [PoseEstimator.load(path, device, scale_error=asked.scale_error) for path in paths]
     checkpoint = loaded[-1].checkpoint if loaded else None
     measured = str(paths[-1] if paths else asked.results or TEMPLATES)
     stored = None if checkpoint is None else trained_on(checkpoint.data)
@@ -129,7 +129,10 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     if asked.templates is not None:
         position = max(len(loaded) - 1, 0)  # metrics.json describes the last estimator
         names.insert(position, TEMPLATES)
-        loaded.insert(position, TemplateEstimator.of_parts(parts, asked.templates))
+        templates = TemplateEstimator.of_parts(
+            parts, asked.templates, scale_error=asked.scale_error
+        )
+        loaded.insert(position, templates)
     if asked.results is not None:  # BOP file names begin with the name of the method
         file = Path(asked.results)
         names.append(file.stem.partition("_")[0] if asked.method is None else str(asked.method))
@@ -171,6 +174,9 @@ def _check_combination(asked: EvaluationConfig) -> None:
         allowed = "refine=… together with ckpt_path=… (poses from a file are not refined)"
         fix = "leave out refine, or add ckpt_path"
         raise UserError(f"refine={asked.refine} without ckpt_path", allowed, fix)
+    if asked.scale_error is not None and asked.refine is None and asked.templates is None:
+        fix = "add refine=region, or leave out scale_error"
+        raise UserError(f"scale_error={asked.scale_error} without refine", "both", fix)
     if asked.negatives_camera is not None and asked.negatives is None:
         fix = "add negatives=FOLDER, or leave out negatives_camera"
         raise UserError(f"negatives_camera={asked.negatives_camera} without negatives", "both", fix)

@@ -40,6 +40,16 @@ def test_refined_poses_are_measured_beside_the_networks(composed, tmp_path):
     assert "Matching radius, half a diameter" in (tmp_path / "compare.md").read_text()
 
 
+def test_an_exact_scale_lets_refinement_move_the_distance(composed, tmp_path):
+    options = ("ckpt_path=pretrained/pivconnector", "refine=region", "+data.num_test=4")
+    translations = []
+    for scale_error in (0.0001, 0.05):
+        config = composed(*options, f"scale_error={scale_error}", config="evaluate")
+        _, refined = run_evaluation(config, tmp_path / str(scale_error))
+        translations.append(np.nanmedian(refined.errors["pivconnector"]))
+    assert translations[0] < 0.8 * translations[1]
+
+
 def test_worse_is_by_more_than_a_millimetre():
     part = pivconnector()
 
@@ -114,6 +124,8 @@ def test_pictures_without_the_part_are_counted(composed, tmp_path, capsys):
     [
         (["ckpt_path=x", "negatives_camera=y"], "negatives_camera=y without negatives"),
         (["results=x", "negatives=y"], "negatives=y without ckpt_path"),
+        (["ckpt_path=x", "scale_error=0.01"], "scale_error=0.01 without refine"),
+        (["ckpt_path=x", "refine=region", "scale_error=0.2"], "scale_error=0.2"),
         (["ckpt_path=x", "tune=true", "negatives=y"], "tune=true with shading, scale, by, neg"),
     ],
 )
