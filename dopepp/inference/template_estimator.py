@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Final, Literal, NoReturn, Protocol
 
@@ -27,11 +28,18 @@ from dopepp.inference.picture import (
     merge_scales,
 )
 from dopepp.inference.refinement.refiner import Refine
+from dopepp.inference.templates.ranking import learned_ranking
+from dopepp.inference.templates.silence import silent_level
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Part, check_name
 from dopepp.parts.symmetry_finder import find_symmetries
-from dopepp.recovery.detection import Detection, RecoveryOptions
+from dopepp.recovery.detection import (
+    Detection,
+    RecoveryOptions,
+    refined_features,
+    rescored,
+)
 from dopepp.recovery.recover import Reason
 
 NUM_REPEATED: Final = 10  # refined poses that are refined again
@@ -85,7 +93,10 @@ class TemplateEstimator(PoseEstimator):
         self.detectors, self.distances = tuple(detectors), distances
         self.max_ms = max_ms
         self.scale_error = SCALE_ERROR if scale_error is None else scale_error
-        self.device, self.recovery = torch.device("cpu"), RecoveryOptions()
+        self.levels: dict[str, float] = {}
+        """Log odds of verification at which a pose of each part has a score of 0.5."""
+        self.device = torch.device("cpu")
+        self.recovery = RecoveryOptions.of(learned_ranking().score)
         self._refine_by(refine, self.parts)
 
     @classmethod
@@ -104,7 +115,18 @@ class TemplateEstimator(PoseEstimator):
         checked = _checked_distances(distances)
         tilt = check("tilt_deg", tilt_deg, float, Range(0, 180, "degrees"))
         detectors = [TemplateDetector(part, checked, tilt) for part in parts]
-        return cls(detectors, checked, refine, max_ms, scale_error)
+        estimator = cls(detectors, checked, refine, max_ms, scale_error)
+        alone = cls(detectors, checked)
+        for part in parts:
+            loudest = partial(alone._loudest, part.name)
+            estimator.levels[part.name] = silent_level(part, checked, tilt, loudest)
+        return estimator
+
+    def _loudest(self, name: str, image: Picture, K: CameraMatrix) -> float:
+        """Return the largest log odds of a part's verified poses."""
+        detector = next(it for it in self.detectors if it.part.name == name)
+        ends = self.refined(detector.detect(image, K, self.distances), image, K)
+        return max((float(refined_features(end)[2]) for end in ends), default=0.0)
 
     def _refine_by(self, refine: Refine | None, parts: Sequence[Part]) -> None:
         terms = (refine,) if isinstance(refine, str) else refine or ()
@@ -136,8 +158,11 @@ class TemplateEstimator(PoseEstimator):
     ) -> list[Detection]:
         with self._timed("decode"):
             roi, depths = checked_region(roi, image), self._range(distances)
-            found = [detector.detect(image, K, depths, roi) for detector in self.detectors]
-            starts = [detection for detections in found for detection in detections]
+            starts = [
+                start
+                for detector in self.detectors
+                for start in detector.detect(image, K, depths, roi)
+            ]
             return sorted(starts, key=lambda detection: -detection.score)
 
     def refined(
@@ -172,7 +197,11 @@ class TemplateEstimator(PoseEstimator):
 
     def _rescored(self, refined: Sequence[Detection]) -> list[Detection]:
         """Return the best refined detection of each instance, best first."""
-        return merge_scales([[detection] for detection in super()._rescored(refined)])
+        slope, scored = self.recovery.refined_verification, []
+        for detection in refined:
+            bias = -slope * self.levels.get(detection.object, 0.0)
+            scored += rescored([detection], replace(self.recovery, refined_bias=bias))
+        return merge_scales([[detection] for detection in scored])
 
     def _missing(
         self, image: Picture, K: CameraMatrix, distances: Distances | None, roi: Region | None

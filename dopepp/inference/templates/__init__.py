@@ -112,8 +112,8 @@ class TemplateDetector:
         views, poses, features = self.ranked(
             shown, crop_camera(K, left, top), distances or self._distances
         )
-        weights, bias = learned_ranking()
-        odds = features @ weights + bias
+        model = learned_ranking()
+        odds = features @ model.weights + model.bias
         order = np.argsort(-odds)
         transforms = self.transforms(views[order], poses[order], crop_camera(K, left, top))
         scores = 1 / (1 + np.exp(-np.clip(odds[order], -30.0, 30.0)))

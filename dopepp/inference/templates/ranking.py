@@ -46,10 +46,11 @@ GROWTH: Final = 0.03  # of the diameter in a step of the search
 
 
 class RankingModel(NamedTuple):
-    """Weights of :data:`FEATURES`, and the bias that makes their sum the log odds of a match."""
+    """What was learned about matches, and about the poses that refinement makes of them."""
 
-    weights: Float[np.ndarray, "features"]
-    bias: float
+    weights: Float[np.ndarray, "features"]  # of FEATURES
+    bias: float  # makes the weighted sum the log odds that a picture's best match is right
+    score: dict[str, float]  # RecoveryOptions of refined poses
 
 
 @cache
@@ -59,7 +60,7 @@ def learned_ranking() -> RankingModel:
     values: dict[str, Any] = json.loads(path.read_text("utf-8"))
     if tuple(values["weights"]) != FEATURES:
         raise ValueError(f"{path} was learned from other features: run {values['command']}")
-    return RankingModel(np.array(list(values["weights"].values())), values["bias"])
+    return RankingModel(np.array(list(values["weights"].values())), values["bias"], values["score"])
 
 
 def describe(

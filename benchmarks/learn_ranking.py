@@ -1,0 +1,208 @@
+"""Learn the ranking of template matches, and their final score, from procedural parts.
+
+    python benchmarks/learn_ranking.py samples.pickle --parts 40 --scenes 8 [--seed 0]
+    python benchmarks/learn_ranking.py samples.pickle --fit
+
+The first command renders random parts in any rotation among clutter and look-alikes, and stores the
+features of the ranked matches, and start score, verification and error of refined poses. Run it
+with other ``--seed`` values in parallel and pass all files to ``--fit``, which learns both models,
+prints their quality on parts that they have not seen, and writes ``ranking.json``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pickle
+from pathlib import Path
+
+import numpy as np
+import torch
+from learn_verification import errors, look_alike, random_part
+from scipy.optimize import minimize
+from sklearn.linear_model import LogisticRegression
+from sklearn.metrics import brier_score_loss
+
+from dopepp.geometry.camera import Transform
+from dopepp.inference.template_estimator import TemplateEstimator
+from dopepp.inference.templates import TemplateDetector, ranking
+from dopepp.parts.symmetry_finder import find_symmetries
+from dopepp.recovery.detection import refined_features
+from dopepp.virtual.backgrounds import find_backgrounds
+from dopepp.virtual.factory import Factory
+from dopepp.virtual.presets import preset_of
+
+SIZE, FOCAL = (480, 360), 450.0
+SMALLEST_PX, LARGEST_PX = 70.0, 260.0
+RATIO = 1.5  # of the working distances
+RIGHT_TURN, RIGHT_PLACE, RIGHT_DEPTH = 12.0, 0.08, 0.06  # degrees, diameters, relative
+HELD_OUT = 4  # every fourth part judges the models
+RIDGE = 1e-2
+MIN_SCORE = 0.5
+KEPT = 6  # refined poses of each picture
+ENDS = ("refined_bias", "refined_score", "refined_verification")  # features of a refined pose
+
+
+def samples(number: int, num_scenes: int, seed: int) -> list[dict[str, np.ndarray]]:
+    """Return the features and labels of the matches and refined poses of one part's pictures."""
+    rng = np.random.default_rng([seed, number, 1])
+    part = random_part(rng, f"part{number}")
+    assert part.mesh is not None
+    discrete, continuous = find_symmetries(part.mesh)
+    if (discrete is not None and len(discrete)) or continuous:
+        return []  # several rotations would be right
+    near = part.diameter * FOCAL / rng.uniform(SMALLEST_PX * RATIO, LARGEST_PX)
+    distances = (near, RATIO * near)
+    preset = preset_of(
+        "wide",
+        {
+            "width": SIZE[0], "height": SIZE[1],
+            "intrinsics_px": [FOCAL, FOCAL, SIZE[0] / 2 - 0.5, SIZE[1] / 2 - 0.5],
+            "turning": {"kind": "free"},
+            "placement": {"kind": "distance", "nearest": distances[0], "farthest": distances[1]},
+            "min_visible_fraction": 0.6, "clutter": [0, 60], "background_contrast": [0.5, 1.8],
+            "distractors": {"number": [0, 6], "lookalike_share": 0.3},
+            "materials": {"metal_share": 0.1, "coloured_share": 0.5},
+        },
+        "scene",
+    )  # fmt: skip
+    backgrounds, other = find_backgrounds(None, "train"), look_alike(rng, part)
+    true = Factory([part], preset, seed, backgrounds, negatives=[other])
+    false = Factory([other], preset, seed, backgrounds, negatives=[])
+    detector = TemplateDetector(part, distances)
+    estimator = TemplateEstimator([detector], distances)
+    rows = []
+    for index in range(num_scenes):
+        shows_part = index % 3 > 0
+        rendered = (true if shows_part else false).render(0, 1000 * number + index)
+        scene, image = rendered.scene, rendered.image
+        T = scene.objects[scene.targets[0]].T_cam_obj
+        views, poses, features = detector.ranked(image, scene.K, distances)
+        transforms = detector.transforms(views, poses, scene.K)
+        is_right = _near(transforms, T, part.diameter) & shows_part
+        refined = estimator.refined(detector.detect(image, scene.K), image, scene.K)
+        refined.sort(key=lambda detection: -(detection.probability or 0.0))
+        best = refined[:KEPT]
+        points = torch.from_numpy(part.points)
+        ends = [errors(it.T_cam_obj, T, points, part.diameter) for it in best]
+        rows.append(
+            {
+                "features": features,
+                "is_right": is_right,
+                "refined": np.array([refined_features(it) for it in best]),
+                "is_end_right": np.array([far < 0.1 or near < 0.015 for far, near in ends], bool)
+                & shows_part,
+                "part": np.array(seed * 1000 + number),
+            }
+        )
+    return rows
+
+
+def _near(transforms: np.ndarray, T: Transform, diameter: float) -> np.ndarray:
+    """Return which poses refinement would move to the true one."""
+    trace = np.einsum("nij,ij->n", transforms[:, :3, :3], T[:3, :3])
+    turns = np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+    apart = np.linalg.norm(transforms[:, :2, 3] - T[:2, 3], axis=1)
+    deep = np.abs(transforms[:, 2, 3] / T[2, 3] - 1)
+    return (turns < RIGHT_TURN) & (apart < RIGHT_PLACE * diameter) & (deep < RIGHT_DEPTH)
+
+
+def fit_ranking(rows: list[dict[str, np.ndarray]]) -> np.ndarray:
+    """Return weights that maximise the share of right matches under a softmax over each picture."""
+    shown = [(row["features"], row["is_right"]) for row in rows if row["is_right"].any()]
+    table = np.concatenate([features for features, _ in shown])
+    scale = table.std(axis=0) + 1e-9
+
+    def loss(weights: np.ndarray) -> tuple[float, np.ndarray]:
+        total, gradient = 0.0, np.zeros_like(weights)
+        for features, is_right in shown:
+            scores = features / scale @ weights
+            shares = np.exp(scores - scores.max())
+            shares /= shares.sum()
+            right = shares * is_right
+            total -= np.log(right.sum() + 1e-12)
+            gradient -= (features / scale).T @ (right / (right.sum() + 1e-12) - shares)
+        penalty = RIDGE * weights
+        return total / len(shown) + 0.5 * penalty @ weights, gradient / len(shown) + penalty
+
+    end = minimize(loss, np.zeros(table.shape[1]), jac=True, method="L-BFGS-B")
+    return np.asarray(end.x / scale)
+
+
+def fit_bias(rows: list[dict[str, np.ndarray]], weights: np.ndarray) -> float:
+    """Return the bias that makes the best score of a picture the log odds that it is right."""
+    best = [(row["features"] @ weights).argmax() for row in rows]
+    scores = [float(row["features"][i] @ weights) for row, i in zip(rows, best, strict=True)]
+    labels = [bool(row["is_right"][i]) for row, i in zip(rows, best, strict=True)]
+    model = LogisticRegression().fit(np.array(scores)[:, None], labels)
+    return float(model.intercept_[0] / model.coef_[0, 0])
+
+
+def main() -> None:
+    """Make samples, or learn from them."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("samples", type=Path, nargs="+")
+    parser.add_argument("--parts", type=int, default=40)
+    parser.add_argument("--scenes", type=int, default=8)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--fit", action="store_true")
+    options = parser.parse_args()
+    if not options.fit:
+        rows: list[dict[str, np.ndarray]] = []
+        for number in range(options.parts):
+            rows += samples(number, options.scenes, options.seed)
+            right = [row["is_right"].any() for row in rows]
+            print(number, len(rows), f"{np.mean(right):.2f} with a right match", flush=True)
+            with options.samples[0].open("wb") as file:
+                pickle.dump(rows, file)
+        return
+    rows = [row for path in options.samples for row in pickle.loads(path.read_bytes())]
+    held = [row for row in rows if row["part"] % HELD_OUT == 0]
+    learned = [row for row in rows if row["part"] % HELD_OUT]
+    report(fit_ranking(learned), fit_ends(learned), held)
+    weights = fit_ranking(rows)
+    bias, ends = fit_bias(rows, weights), fit_ends(rows)
+    names = [path.name for path in options.samples]
+    values = {
+        "command": f"python benchmarks/learn_ranking.py {' '.join(names)} --fit",
+        "weights": dict(zip(ranking.FEATURES, np.round(weights, 5).tolist(), strict=True)),
+        "bias": round(bias, 3),
+        "score": {
+            **dict(zip(ENDS, np.round(ends, 4).tolist(), strict=True)),
+            "refined_min_score": MIN_SCORE,
+        },
+    }
+    path = Path(ranking.__file__).with_name("ranking.json")
+    path.write_text(json.dumps(values, indent=1) + "\n", "utf-8")
+    print(f"written: {path}")
+
+
+def fit_ends(rows: list[dict[str, np.ndarray]]) -> np.ndarray:
+    """Return the weights of :data:`ENDS`, from the best refined poses of each picture."""
+    features = np.concatenate([row["refined"] for row in rows])
+    labels = np.concatenate([row["is_end_right"] for row in rows])
+    model = LogisticRegression(fit_intercept=False).fit(features, labels)
+    return np.asarray(model.coef_[0])
+
+
+def report(weights: np.ndarray, ends: np.ndarray, rows: list[dict[str, np.ndarray]]) -> None:
+    """Print the quality on parts that were not learned."""
+    shown = [row for row in rows if row["is_right"].any()]
+    ranks = np.array(
+        [row["is_right"][np.argsort(-row["features"] @ weights)].argmax() for row in shown]
+    )
+    print(f"{len(rows)} pictures; a right match in {len(shown)}, at rank", end="")
+    for limit in (1, 10, 60, 300):
+        print(f" < {limit}: {np.mean(ranks < limit):.1%}", end="")
+    features = np.concatenate([row["refined"] for row in rows])
+    labels = np.concatenate([row["is_end_right"] for row in rows])
+    stated = 1 / (1 + np.exp(-features @ ends))
+    print(f"\nrefined poses: Brier {brier_score_loss(labels, stated):.4f}")
+    for least in (0.3, 0.5, 0.7, 0.9, 0.95):
+        reported = stated >= least
+        precision = labels[reported].mean() if reported.any() else 1.0
+        print(f"  score {least}: precision {precision:.1%}, {reported.sum()} of {labels.sum()}")
+
+
+if __name__ == "__main__":
+    main()
