@@ -72,7 +72,7 @@ def config_folders() -> Iterator[tuple[str, Path]]:
     """Yield name and config folder of every installed package, without importing it."""
     for entry in _entries("conf"):
         package, *folders = entry.value.split(".")
-        spec = find_spec(package)  # of a top-level package, whose code does not run
+        spec = find_spec(package)  # finding a top-level package does not run its code
         roots = spec.submodule_search_locations if spec is not None else None
         paths = (Path(root, *folders) for root in roots or ())
         folder = next(filter(Path.is_dir, paths), None)

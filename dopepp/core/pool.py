@@ -339,7 +339,7 @@ class ClusterPool(Pool):
                 reason = " ".join(str(error).split())
                 lost = LostWorkerError(f"Ray: {type(error).__name__}: {reason[:300]}")
                 result.set_exception(lost)
-            except Exception as error:  # of the function
+            except Exception as error:  # raised by the user's function
                 result.set_exception(error)
 
         answered = self._apply.remote(self._content, self._content[0].hex(), item).future()

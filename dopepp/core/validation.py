@@ -146,7 +146,7 @@ def parse(kind: type[T], value: object, name: str = "", fix: str = "") -> T:
     try:
         typed: T = _validated(kind, value, name)
     except ValidationError as error:
-        if cause := _cause(error.errors()[0]):  # of a __post_init__
+        if cause := _cause(error.errors()[0]):  # error of a __post_init__
             raise cause from None
         first, *others = _mistakes(kind, value, error)
         depth = len(first.location)

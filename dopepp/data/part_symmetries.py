@@ -105,5 +105,5 @@ def _read_infos(choice: str) -> dict[str, bop_models.ModelInfo]:
         raise UserError(f"data.symmetries={choice}, no such file", allowed, fix)
     records = read_json(path)
     if isinstance(records, dict) and "diameter" in records:
-        records = {"1": records}  # one entry alone
+        records = {"1": records}  # a file with a single entry
     return {info.name: info for info in bop_models.parse_models(path, records).values()}

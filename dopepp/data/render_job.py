@@ -43,8 +43,8 @@ WRITERS: Final = {
 }
 """Module and class of each layout's writer."""
 
-RECORD_VERSION: Final = 1  # of the record's layout
-_HASH_DIGITS: Final = 16  # of the rendering code's hash, enough to distinguish versions
+RECORD_VERSION: Final = 1  # version of the record's layout
+_HASH_DIGITS: Final = 16  # digits of the rendering code's hash
 _NAMED: Final = re.compile(r"([^=/\\]+)=(.+)")  # ``NAME=FILE``; a name is not a path
 
 
@@ -211,8 +211,8 @@ def _part_record(part: Part) -> dict[str, Any]:
     }
 
 
-_MAX_RECORD_BYTES: Final = 4_000_000  # some 10,000 parts
-_MAX_DIFFERENCES: Final = 3  # as many as one line can hold
+_MAX_RECORD_BYTES: Final = 4_000_000  # about 10,000 parts
+_MAX_DIFFERENCES: Final = 3  # differences shown in an error message
 
 
 def is_begun(root: Path) -> bool:

@@ -33,7 +33,7 @@ from dopepp.virtual.scene import Rendered
 NUM_SCENES: Final = 8
 _PANELS: Final = 4
 _LISTED: Final = 4  # visible fractions in a caption, at most
-_AXIS_LENGTH: Final = 0.5  # of the part's diameter
+_AXIS_LENGTH: Final = 0.5  # length of a drawn axis, diameters
 
 
 def write_preview(job: Job, out: Path) -> Path:

@@ -33,7 +33,7 @@ from dopepp.virtual.renderers.photoreal import THREADS_SETTING
 _log = logging.getLogger(__name__)
 
 ENGINES: Final = ("local", "ray")
-MAX_WORKERS: Final = 1024  # more than any machine has cores, so a larger number is a typing error
+MAX_WORKERS: Final = 1024  # no machine has more cores: a larger number is a typing error
 _LINE_EVERY_S: Final = 30.0
 
 OpenPool = Callable[[bytes], Pool]

@@ -94,7 +94,7 @@ def draw_wireframe(
     """
     canvas = np.ascontiguousarray(image).copy()
     points = np.asarray(keypoints, np.float64)
-    shade = tuple(round(0.8 * value) for value in colour)  # of edges off the +z face
+    shade = tuple(round(0.8 * value) for value in colour)  # for edges off the +z face
     front = [edge for edge in EDGES if _FRONT.issuperset(edge)]
     for a, b in EDGES:
         if (a, b) not in front:

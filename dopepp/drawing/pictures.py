@@ -111,7 +111,7 @@ def whole_picture(content: bytes, formats: tuple[str, ...] = FORMATS) -> Image.I
         if image.width * image.height > MAX_PIXELS:
             raise ValueError(f"{image.width}×{image.height} pixels")
         image.load()
-    except Exception as error:  # as above
+    except Exception as error:  # decoders raise several types
         raise ValueError(_reason(error)) from error
     return image
 

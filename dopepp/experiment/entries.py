@@ -122,7 +122,7 @@ def entry(
         allowed, fix = "a folder that can be written", "set output_dir=FOLDER, or make it writable"
         problem = f"output folder {error.filename}: {error.strerror}"
         _exit(UserError(problem, allowed, fix), USERS_MISTAKE)
-    except UserError as error:  # of a sweeper or launcher; jobs handle their own errors
+    except UserError as error:  # raised by a sweeper or launcher: jobs handle their errors
         _exit(error, USERS_MISTAKE)
 
 
@@ -195,7 +195,7 @@ def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | Non
     from dopepp.training.pruning import PrunedError
 
     hydra = HydraConfig.get()
-    for name in (FAILURE_FILE, PRUNED_FILE):  # of an earlier attempt
+    for name in (FAILURE_FILE, PRUNED_FILE):  # remove the markers of an earlier attempt
         (run_dir / name).unlink(missing_ok=True)
     try:
         plain = _plain(config)

@@ -58,11 +58,11 @@ def time_frames(estimator: PoseEstimator, pictures: Pictures, num_frames: int) -
 class ExportAgreement:
     """Largest differences between an exported network and the original."""
 
-    maps: float  # of a map value, relative to the largest value if that exceeds 1
+    maps: float  # difference of a map value, relative to the largest value above 1
     position_mm: float
     rotation_deg: float
     num_poses: int  # best-scored poses that both networks detect
-    num_single: int  # poses that only one of them detects
+    num_single: int  # best-scored poses that only one network detects
     num_pictures: int
 
     @property

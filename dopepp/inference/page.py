@@ -38,7 +38,7 @@ from dopepp.parts.size import part_in_words
 from dopepp.recovery.recover import explained
 
 HOST: Final = "127.0.0.1"  # reachable from this machine only
-MAX_UPLOAD: Final = "64mb"  # of a file: an uncompressed image of 20 megapixels
+MAX_UPLOAD: Final = "64mb"  # size of an uncompressed image of 20 megapixels
 SHOWN_PX: Final = 1600  # longer side of the drawn image: a browser shows no more
 
 VIEW, NUMBERS, FILE = "field of view", "K", "camera file"

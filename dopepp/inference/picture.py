@@ -53,7 +53,7 @@ FARTHEST: Final = 50.0
 
 METRES: Final = Span(0.001, 1000.0, "metres")  # valid distances
 
-MAX_PIXELS: Final = 640 * 480  # of a resized image: a part too small for that is not detected
+MAX_PIXELS: Final = 640 * 480  # largest resized image; limits the smallest detectable part
 MARGIN: Final = 1.1  # factor on a size that makes no difference to a network
 
 

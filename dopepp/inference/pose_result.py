@@ -105,7 +105,7 @@ class PoseResult:
     name: str  # image file, or source
     number: int = 0  # index in the source, from 0
     time: float | None = None  # seconds since a video's start, or since 1970; None of an image
-    identities: Sequence[int] | None = None  # of the detections, if a tracker follows them
+    identities: Sequence[int] | None = None  # tracked instances; None without a tracker
     shapes: Mapping[str, Shape] = field(default_factory=dict, repr=False)  # by part name
     weaker: Sequence[float] = ()  # scores of the candidates below min_score, best first
     min_score: float = 0.0  # minimum score of a detection

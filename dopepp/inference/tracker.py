@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-import scipy  # its parts load when they are used
+import scipy  # SciPy loads its submodules on first use
 from jaxtyping import Float
 
 from dopepp.core.errors import UserError
@@ -89,8 +89,8 @@ class Motion:
     # Rotation per frame (rotation vector about the object's origin, radians) and shift (metres),
     # both in camera axes
     velocity: Step
-    covariance: Float[np.ndarray, "12 12"]  # of pose and velocity, six numbers each
-    correction: Step  # by the last frame, from the predicted pose
+    covariance: Float[np.ndarray, "12 12"]  # joint covariance of pose and velocity
+    correction: Step  # step from the predicted pose to the updated pose
 
     @property
     def pose_covariance(self) -> Float[np.ndarray, "6 6"]:
@@ -142,8 +142,8 @@ def at_rest(T_cam_obj: Transform, covariance: Float[np.ndarray, "6 6"]) -> Motio
 class Track:
     """A part on a frame."""
 
-    identity: int  # of the instance; it is kept while the part is tracked or lost
-    detection: Detection  # with this frame's pose; score and peaks are of the network's last run
+    identity: int  # number of the instance, kept while the part is tracked or lost
+    detection: Detection  # this frame's pose, with score and peaks of the network's last run
     # Motion per frame in camera axes: rotation vector about the object's origin (radians), and
     # shift (metres)
     velocity: Step
@@ -326,7 +326,7 @@ def _region_around(detections: Sequence[Detection], image: Picture) -> Region | 
     limits = np.array(image.shape[1::-1])
     start = np.clip(np.floor(points.min(axis=0) - margin), 0, limits)
     end = np.clip(np.ceil(points.max(axis=0) + margin), 0, limits)
-    if (end - start).min() < margin:  # hardly in view
+    if (end - start).min() < margin:  # the part is almost outside the image
         return None
     (x, y), (width, height) = start.astype(int), (end - start).astype(int)
     return x, y, width, height

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 MEMORY: Final = "2GB"  # limit of the viewer's window, which then drops the oldest data
 GROUPS: Final = ("parts", "meshes", "uncertainty")
-CENTRE: Final = 0.5  # of the top-left pixel, in Rerun's pixels
+CENTRE: Final = 0.5  # coordinate of the top-left pixel's centre in Rerun
 LOCALHOST: Final = "127.0.0.1"
 START_S: Final = 20.0  # timeout for opening a window, seconds
 

@@ -19,7 +19,7 @@ from dopepp.parts.part import Mesh, Part, make_part
 STRETCH: Final = 1.3
 """Factor on the longest side of the stretched copy."""
 
-_CUT_SHARE: Final = 0.25  # of the surface, which the cut removes
+_CUT_SHARE: Final = 0.25  # share of the surface that the cut removes
 _OWN_MIRROR: Final = 0.015  # largest mean distance of a part that is its own mirror image
 
 

@@ -154,7 +154,7 @@ def solve_group(group: KeypointGroup, cuboid: Cuboid, K: CameraMatrix) -> PnPRes
     errors, so deviations are widened while fewer than two thirds of the keypoints agree on a pose.
     """
     count = sum(math.isfinite(x) for x in group.position[:, 0].tolist())
-    if count < MIN_POINTS:  # as for most centroids that noise makes
+    if count < MIN_POINTS:  # noise produces many groups with too few keypoints
         return PnPResult(None, math.inf, np.zeros(NUM_KEYPOINTS, bool), too_few(count))
     covariance = _averaged(group.covariance_px)
     return solve_pnp(cuboid, group.position, K, covariance_px=covariance, widenings=WIDENINGS)

@@ -218,7 +218,7 @@ def _rejected(
         kind = "small"
         text += f" (too small: {extent:.0f} px across, a cell of the maps has {stride} px)"
     x, y = group.position[CENTROID]
-    size = f"{stride * cells[0]}×{stride * cells[1]}"  # of the network's input
+    size = f"{stride * cells[0]}×{stride * cells[1]}"  # size of the network's input
     return kind, best, f"at pixel ({x:.0f}, {y:.0f}) of {size}: {text}"
 
 

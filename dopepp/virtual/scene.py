@@ -44,7 +44,7 @@ class Grooves:
     irregularity: float = 0.0
 
 
-NOISE_LIMITS: Final = (0.05, 2.0)  # of the factor of a material's noise on its albedo
+NOISE_LIMITS: Final = (0.05, 2.0)  # limits of the noise factor on a material's albedo
 
 
 @dataclass(frozen=True)

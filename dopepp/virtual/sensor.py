@@ -230,7 +230,7 @@ def encode_srgb(light: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
 SRGB_TO_LINEAR: Final[NDArray[np.float32]] = decode_srgb(np.arange(256) / 255).astype(np.float32)
 """sRGB code 0–255 to linear light in [0, 1]."""
 
-CODE_STEPS: Final = 4096  # of the tables that encode light, per unit of light
+CODE_STEPS: Final = 4096  # entries of the encoding tables per unit of light
 
 LINEAR_TO_SRGB: Final[NDArray[np.float32]] = (
     255 * encode_srgb(np.arange(CODE_STEPS + 1) / CODE_STEPS)

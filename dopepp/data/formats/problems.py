@@ -30,7 +30,7 @@ MAX_KEPT: Final = 10_000
 FARTHEST: Final = 1e9
 """Largest number in a label, in any unit; its square is exact enough."""
 
-_IMAGES_A_LINE: Final = 1000  # of the log
+_IMAGES_A_LINE: Final = 1000  # images per progress line of the log
 
 T = TypeVar("T")
 

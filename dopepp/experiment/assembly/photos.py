@@ -23,7 +23,7 @@ from dopepp.virtual.backgrounds.photo_backgrounds import FEWEST_PHOTOS, PhotoSpl
 
 _log = logging.getLogger(__name__)
 
-_OWN_SHARE: Final = 0.25  # of the training backgrounds that are the user's own pictures
+_OWN_SHARE: Final = 0.25  # share of the user's pictures in the training backgrounds
 _NEEDED: Final = f"at least {3 * FEWEST_PHOTOS} different photos"
 
 

@@ -324,7 +324,7 @@ def with_files(virtual: object) -> object:
 
 def _chosen_virtual(given: Mapping[str, Any], stored: object, source: str) -> VirtualConfig:
     """Return the given whole node ``virtual``, or the stored node with changed options."""
-    if not {"renderer", "preset"} <= set(given):  # else a file of conf/virtual
+    if not {"renderer", "preset"} <= set(given):  # a file of conf/virtual sets both
         if stored is None:
             problem = f"{source}, which does not say how to render"
             raise UserError(problem, "virtual=… on the command line", "add virtual=default")

@@ -119,7 +119,7 @@ class EstimatorMethod:
         if isinstance(network, ExportedNetwork):  # an export has no modules to count
             parameters, gmacs = network.export.parameters, network.export.gmacs
         else:
-            with torch.device("meta"):  # as trained, because the estimator folds its network
+            with torch.device("meta"):  # the trained layout: the estimator folds batch norm
                 trained = build_network(checkpoint.spec)
             parameters, gmacs = network_cost(trained, checkpoint.input_size)
         return Cost(parameters, gmacs, milliseconds)

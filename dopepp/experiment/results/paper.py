@@ -289,7 +289,7 @@ def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path)
     for name, measure in product(everything["object"].unique(), measures):
         table = everything[everything[["object", "measure"]].eq([name, measure]).all(axis=1)]
         head = {_OBJECT: name, _MEASURE: heading(measure)}
-        firsts: dict[str, pd.DataFrame] = {}  # by how poses are refined
+        firsts: dict[str, pd.DataFrame] = {}  # table of the first run per refinement method
         for label, rows_of_label in table.groupby("method", sort=False):
             rates = 100 * rows_of_label.pivot(index="seed", columns="share", values="rate")
             rows.append({_METHOD: label, **head, **_by_share(rates, _mean)})

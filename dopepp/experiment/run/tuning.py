@@ -89,7 +89,7 @@ class Scored:
     scores: Float[np.ndarray, "n"]
     correct: Bool[np.ndarray, "n"]
     image: np.ndarray
-    kinds: Sequence[str]  # of each image, by source
+    kinds: Sequence[str]  # kind of each image's source
     num_instances: int
 
     @property

@@ -124,7 +124,7 @@ def on_joblib(n_jobs: int) -> Runner:
     def run(jobs: Jobs, overrides: Mapping[int, list[str]]) -> Ended:
         from joblib.externals.loky.cloudpickle_wrapper import (
             dumps,
-        )  # also pickles objects of scripts
+        )  # cloudpickle also serialises objects defined in scripts
 
         share = str(max(available_cores() // n_jobs, 1))
         limits = {name: os.environ.get(name, share) for name in THREAD_LIMITS}

@@ -236,7 +236,7 @@ class Bag(FrameSource):
                 yield reader
         except (UserError, GeneratorExit):
             raise
-        except Exception as error:  # of rosbags, SQLite, YAML, a decompressor …
+        except Exception as error:  # raised by rosbags, SQLite, YAML or a decompressor
             raise self._unreadable(f"{error}") from error
 
     def _select(self, links: Sequence[Connection], topic: str | None) -> str:

@@ -120,7 +120,7 @@ def filled_mask(
 class Contour:
     """Points on the outline of a posed part."""
 
-    arms: Float[np.ndarray, "points 3"]  # from the object's origin to each, camera axes, metres
+    arms: Float[np.ndarray, "points 3"]  # points from the object's origin, camera axes, metres
     pixels: Float[np.ndarray, "points 2"]
     normals: Float[np.ndarray, "points 2"]  # unit vectors on the image, pointing outwards
 

@@ -13,20 +13,20 @@ from typing import Final
 
 import cv2
 import numpy as np
-import scipy  # its submodules load on first use
+import scipy  # SciPy loads its submodules on first use
 from jaxtyping import Bool, Float, Int
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import CameraMatrix, Transform, crop_camera
 from dopepp.inference.picture import Depth
 
-Mask = Bool[np.ndarray, "height width"]  # some of the pixels
+Mask = Bool[np.ndarray, "height width"]  # True at the selected pixels
 Points = Float[np.ndarray, "points 3"]
 Visible = Bool[np.ndarray, "points"]
 
 # Lengths are in spacings of the surface points unless stated otherwise.
-MOST_POINTS: Final = 3000  # more make a refinement slower, but not better
-FEWEST_POINTS: Final = 100  # fewer do not describe a surface
+MOST_POINTS: Final = 3000  # further points slow refinement without improving accuracy
+FEWEST_POINTS: Final = 100  # least points that describe a surface
 NEIGHBOURS: Final = 12  # points that a normal is estimated from
 FLAT: Final = 0.3  # neighbours farther from a plane belong to another face
 SLIVER: Final = 0.3  # twice the area (squared spacings) of a triangle that determines a plane
@@ -143,7 +143,7 @@ class SurfaceOverlay:
     points: Points  # points within the view, camera frame, metres
     normals: Points  # unit normals of either sign
     pixels: Int[np.ndarray, "points 2"]  # column and row of each point
-    distance: Depth  # of every pixel of the view to the nearest point, spacings
+    distance: Depth  # distance of every pixel to the nearest point, spacings
     nearest: Int[np.ndarray, "height width"]  # index of that point
     # Measured depth minus the depth of the nearest point's plane, metres; NaN where unknown
     offset: Depth
@@ -186,7 +186,7 @@ def lay_over(
     if not inside.any():
         return None
     points, normals, pixels = points[inside], normals[inside], pixels[inside]
-    order = np.argsort(-points[:, 2])  # of two points at a pixel, the nearer one is written last
+    order = np.argsort(-points[:, 2])  # the nearer of two points overwrites the farther
     free = np.ones(view.depth.shape, np.uint8)
     free[pixels[:, 1], pixels[:, 0]] = 0
     distance, labels = nearest_zero(free)

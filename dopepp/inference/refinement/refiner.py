@@ -61,9 +61,9 @@ LOOSER: Final = 3.0
 training, and errors are larger on others."""
 
 FEW: Final = 4  # keypoints that determine a pose
-NUM_QUADRUPLES: Final = 40  # of the 126 of nine keypoints
+NUM_QUADRUPLES: Final = 40  # nine keypoints have 126 quadruples
 
-Refine = str | Sequence[str]  # one or several of TERMS
+Refine = str | Sequence[str]  # name or names in TERMS
 
 
 class Refiner:
@@ -273,7 +273,7 @@ def poses_of_four(
             solved, rotation, shift = cv2.solvePnP(
                 cuboid[four], peaks[four], K, None, flags=cv2.SOLVEPNP_SQPNP
             )
-        except cv2.error:  # all four at the same pixel
+        except cv2.error:  # all four keypoints have the same pixel
             continue
         if solved and np.isfinite(rotation).all() and shift[2, 0] > 0:
             poses.append(make_transform(rotation_vector_to_matrix(rotation[:, 0]), shift[:, 0]))

@@ -47,7 +47,7 @@ class Refinement:
     """Result of refining a pose."""
 
     T_cam_obj: Transform
-    covariance: PoseMatrix | None = None  # as in PnPResult; None if the given pose was kept
+    covariance: PoseMatrix | None = None  # see PnPResult; None if the given pose was kept
     reason: str = ""  # why the given pose was kept; empty if it was refined
     agreement: float | None = None  # share of the image's evidence that agrees with the outline
     support: float | None = None  # share of the outline with agreeing evidence
@@ -58,7 +58,7 @@ class Solution:
     """End of a descent."""
 
     T_cam_obj: Transform
-    information: PoseMatrix  # with that of the prior
+    information: PoseMatrix  # inverse covariance of evidence and prior
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,10 +40,10 @@ if TYPE_CHECKING:
 
 EVIDENCE: Final = (
     "outline",  # mean response of the image's edges along the outline, in [0, 1]
-    "outline_gain",  # the same minus that of outlines beside it: busy surroundings have edges too
+    "outline_gain",  # outline response minus that of shifted outlines, because clutter has edges
     "outline_weakest",  # mean response of the second weakest eighth of the outline
     "crease",  # mean response along visible creases
-    "crease_gain",  # the same minus that of creases beside them
+    "crease_gain",  # crease response minus that of shifted creases
     "creases",  # number of crease points relative to that of outline points, at most 1
     "contrast",  # difference of the colours on both sides of the outline, in [0, 1]
     "inside",  # mean log odds of the colours inside the outline
@@ -59,13 +59,13 @@ EVIDENCE: Final = (
 LONGEST_PX: Final = 120  # approximate length of the part on the crop
 SPACING: Final = 80.0  # points along an extent
 NOISE: Final = 8.0  # gradient, grey levels per pixel, at which an edge has half its response
-SHARP: Final = math.cos(math.radians(40.0))  # of the angle between normals at a crease
+SHARP: Final = math.cos(math.radians(40.0))  # cosine of the least angle between normals at a crease
 BESIDE: Final = 0.12  # distance of the outlines beside, share of the extent
 BESIDE_PX: Final = 2.5  # distance from the outline at which colours are compared
 RING: Final = 0.2  # width of the surroundings, share of the extent
-MOST_PIXELS: Final = 1500  # that the model of shading is fitted to
+MOST_PIXELS: Final = 1500  # pixels for the fit of the shading model
 SECTORS: Final = 8
-FEWEST_POINTS: Final = 12  # of the outline on the image
+FEWEST_POINTS: Final = 12  # least points of an outline on the image
 
 
 class VerificationModel(NamedTuple):

@@ -35,7 +35,7 @@ SUFFIXES: Final = {
 
 INPUT: Final = "pixels"
 OUTPUTS: Final = ("belief", "field")  # names in every exported graph
-MAX_BYTES: Final = 2**30  # of an exported file: five times the full DOPE in float32
+MAX_BYTES: Final = 2**30  # largest exported file: five times the full DOPE in float32
 
 _MAX_PER_PIXEL: Final = 512
 """Largest number of tensor elements per input pixel; VGG19 has 64."""

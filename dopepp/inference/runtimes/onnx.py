@@ -32,7 +32,7 @@ from dopepp.models.checkpoint import KEY, Checkpoint
 if TYPE_CHECKING:
     import onnx
 
-_DOMAINS: Final = ("", "ai.onnx")  # of ONNX's own operators
+_DOMAINS: Final = ("", "ai.onnx")  # namespaces of ONNX's standard operators
 
 _SMALL: Final = 1024
 """Elements up to which a constant may be a shape or a factor; larger constants are weights."""
@@ -53,7 +53,7 @@ def read_network(path: Path) -> OnnxNetwork:
     content = read_bytes(path)
     try:
         model = onnx.load_model_from_string(content)
-    except Exception as error:  # of protobuf
+    except Exception as error:  # protobuf raises several types
         raise invalid_export(path, "no ONNX model, or cut short") from error
     metadata = {entry.key: entry.value for entry in model.metadata_props}
     checkpoint, export = unpack(metadata.get(KEY), path)
@@ -163,7 +163,7 @@ def _shapes(
                 ir_version=model.ir_version,
             )
             values |= _evaluate(node, types, values)
-        except Exception as error:  # of onnx, about an inconsistent graph
+        except Exception as error:  # onnx raises several types for an inconsistent graph
             raise invalid_export(path, f"operator {node.op_type:.60}: {error!r}") from error
     outputs = (name for node in model.graph.node for name in node.output if name)
     return {name: _shape(types[name]) if name in types else None for name in (*types, *outputs)}

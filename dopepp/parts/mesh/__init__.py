@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
-import scipy  # its parts load when they are used
+import scipy  # SciPy loads its submodules on first use
 from jaxtyping import Float, Int, UInt8
 from numpy.random import Generator
 
@@ -167,7 +167,7 @@ def weld(vertices: Vertices, faces: Faces) -> tuple[Float[np.ndarray, "welded 3"
     """Merge vertices at the same position; degenerate faces remain."""
     # Adding 0.0 turns −0.0 into 0.0.
     positions = vertices + 0.0
-    order = np.lexsort(positions.T[::-1])  # by x, then y, then z
+    order = np.lexsort(positions.T[::-1])  # sort by x, then y, then z
     ranked = positions[order]
     new = np.ones(len(ranked), bool)
     new[1:] = (ranked[1:] != ranked[:-1]).any(axis=1)

@@ -93,7 +93,7 @@ def read_3mf(path: Path) -> RawMesh:
         if len(names) != 1:
             raise ValueError(f"{len(names)} 3D/3dmodel.model where one must be")
         model = archive.read(names[0])
-    if b"<!DOCTYPE" in model.replace(b"\0", b""):  # also in UTF-16
+    if b"<!DOCTYPE" in model.replace(b"\0", b""):  # without NUL bytes, the test also finds UTF-16
         raise ValueError("a document type, which 3MF forbids")
     num_pieces = _count_pieces(model)
     mesh, num_read = read_scene(path.read_bytes(), "3mf")

@@ -64,7 +64,7 @@ class BoardPose:
     # Of a rotation about the board's origin and a translation, camera axes (radians, metres).
     covariance: Float[np.ndarray, "6 6"]
     error_px: float  # RMS reprojection error, pixels
-    distance: float  # from the camera to the mean of the points, metres
+    distance: float  # distance from the camera to the mean of the points, metres
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Board:
     rows: int
     spacing: float  # side of a square; of circles, twice the distance between rows; metres
     marker: float = 0.0  # side of a ChArUco marker, metres
-    dictionary: str = DICTIONARY  # of the ChArUco markers, without OpenCV's prefix `DICT_`
+    dictionary: str = DICTIONARY  # ChArUco marker dictionary, without OpenCV's prefix `DICT_`
 
     @cached_property
     def points(self) -> Float[np.ndarray, "n 3"]:
@@ -307,7 +307,7 @@ def draw_view(
     on_board = np.column_stack([rays, np.ones(len(rays))]) @ homography.T
     on_page = 1000 * PX_PER_MM * on_board[:, :2] / on_board[:, 2:]
     on_page = (on_page + board.first_px - 0.5).astype(np.float32).reshape(len(v), len(u), 2)
-    blur = 0.4 * PX_PER_MM * float(1000 * t[2] / camera.K[0, 0])  # of the lens, in page pixels
+    blur = 0.4 * PX_PER_MM * float(1000 * t[2] / camera.K[0, 0])  # blur of the lens, page pixels
     page = cv2.GaussianBlur(board.drawing(), (0, 0), blur)
     border = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": BACKGROUND}
     drawn = cv2.remap(page, on_page[..., 0], on_page[..., 1], cv2.INTER_LINEAR, **border)

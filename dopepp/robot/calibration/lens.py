@@ -18,7 +18,7 @@ from dopepp.drawing.pictures import Size
 from dopepp.geometry.camera_file import Camera
 from dopepp.robot.calibration.board import MIN_POINTS, Sighting
 
-MIN_VIEWS: Final = 6  # of a trustworthy calibration; three views determine K
+MIN_VIEWS: Final = 6  # least views of a reliable calibration; three views determine K
 CELLS: Final = (8, 6)  # columns and rows of the grid that measures the coverage
 MIN_COVERAGE: Final = 0.5
 MIN_TILT: Final = 0.2
@@ -86,11 +86,11 @@ class LensCalibration:
 
     camera: Camera
     error_px: float  # RMS reprojection error over all used views, pixels
-    names: tuple[str, ...]  # of the used views
+    names: tuple[str, ...]  # picture of each view used in the calibration
     errors_px: Float[np.ndarray, "views"]  # their RMS reprojection errors, pixels
     outliers: tuple[str, ...]  # names of views that were rejected for their large errors
     coverage: float  # share of the picture's cells (8×6) with points
-    covered: Bool[np.ndarray, "rows columns"]  # these cells
+    covered: Bool[np.ndarray, "rows columns"]  # cells of the image that contain board points
     deviations: Float[np.ndarray, "4"]  # standard deviations of fx, fy, cx, cy, pixels
     findings: tuple[str, ...]  # reasons not to trust the calibration, with remedies
 
@@ -171,7 +171,7 @@ class _Solution(NamedTuple):
     error_px: float
     K: Float[np.ndarray, "3 3"]
     distortion: Float[np.ndarray, "5"]
-    deviations: Float[np.ndarray, "4"]  # of fx, fy, cx, cy
+    deviations: Float[np.ndarray, "4"]  # standard deviations of fx, fy, cx, cy, pixels
     errors_px: Float[np.ndarray, "views"]
     tilt: float  # standard deviation of the boards' normals
 

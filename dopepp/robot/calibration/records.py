@@ -50,7 +50,7 @@ Record = Mapping[object, object]
 class PoseFormat:
     """Conventions of a file of poses."""
 
-    unit: str = "m"  # of positions: m, mm, cm or inch
+    unit: str = "m"  # length unit of positions: m, mm, cm or inch
     degrees: bool = False  # whether angles are in degrees (default: radians)
     order: str = "wxyz"  # `xyzw` if a quaternion's w is in the last column, whatever their names
     inverted: bool = False  # whether the poses are T_flange_base
@@ -60,7 +60,7 @@ class PoseFormat:
 class RobotPoses:
     """The poses of a file, in the file's conventions."""
 
-    names: tuple[str, ...]  # of their pictures; empty strings if the file has no names
+    names: tuple[str, ...]  # file name of each picture, empty if the record has none
     positions: Float[np.ndarray, "poses 3"]  # x, y, z
     kind: str  # a key of `ROTATIONS`, or `matrix`
     rotations: Float[np.ndarray, "poses numbers"]  # the numbers of this kind

@@ -37,10 +37,10 @@ HOME: Final = np.radians([-90.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 """Joints of an arm whose tool points straight down over the tray, radians."""
 
 JOINTS: Final = 6
-DENSITY: Final = 1200.0  # of a printed part, kg/m³
-FRICTION: Final = 0.5  # of a part on the bench and on other parts; the pads have 0.6 and 0.7
+DENSITY: Final = 1200.0  # density of a printed part, kg/m³
+FRICTION: Final = 0.5  # coefficient between parts and bench; the pads have 0.6 and 0.7
 
-STEP: Final = 0.002  # of the simulation, seconds
+STEP: Final = 0.002  # time step of the simulation, seconds
 FLANGE, GRIPPER, CAMERA = "attachment_site", "gripper/", "wrist"
 
 _VISUAL: Final[dict[str, int]] = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 2}

@@ -36,7 +36,7 @@ class Outcome:
 
     held: int | None = None  # number of the thing that was held after lifting and shaking
     collided: bool = False  # whether the robot hit something before its fingers closed
-    times: list[float] = field(default_factory=list)  # of the recorded states, seconds
+    times: list[float] = field(default_factory=list)  # time of each recorded state, seconds
     states: list[Float[np.ndarray, "positions"]] = field(default_factory=list)  # qpos of MuJoCo
 
 

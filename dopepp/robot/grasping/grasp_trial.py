@@ -79,12 +79,12 @@ class GraspTask:
     """Options of an experiment."""
 
     part: str = "pivconnector"  # a built-in part or a mesh file
-    unit: str | None = None  # of the mesh file
+    unit: str | None = None  # length unit of the mesh file
     grasps: Path | None = None  # file of grasps (default: the built-in part's)
     network: str | None = None  # checkpoint, if a source of poses needs one
     refine: bool = True  # whether the network's poses are refined
-    layout: str = "single"  # of `LAYOUTS`
-    renderer: str = "raster"  # of `RENDERERS`
+    layout: str = "single"  # arrangement of parts, one of `LAYOUTS`
+    renderer: str = "raster"  # one of `RENDERERS`
     yaw_deg: float = 180.0  # largest rotation of parts to either side
     rest: str = "front"  # faces that point upwards; see `Layout`
     seed: int = 0
@@ -95,7 +95,7 @@ class GraspTask:
 class Record:
     """Result of a trial with one source of poses."""
 
-    number: int  # of the trial, from 0; trials of the same number have the same scene
+    number: int  # index of the trial, from 0; equal indices have equal scenes
     source: str  # name of the source
     off: float  # deliberate error of the pose, millimetres and degrees
     seen: bool  # whether there was a pose
@@ -103,12 +103,12 @@ class Record:
     # The errors are in the arm's base frame and include those of the calibration. They are those
     # before the part was laid flat, and NaN without a pose.
     add_mm: float  # ADD, millimetres
-    error_mm: float  # of the part's origin, millimetres
-    error_deg: float  # of the rotation, degrees
+    error_mm: float  # position error of the part's origin, millimetres
+    error_deg: float  # rotation error of the pose, degrees
     caught: bool  # whether the part was held after lifting and shaking
     failure: str  # one of `FAILURES`, or empty
     hand_eye_mm: float  # error of the hand-eye calibration at the part's distance
-    hand_eye_deg: float  # its rotation error
+    hand_eye_deg: float  # rotation error of the hand-eye calibration, degrees
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,10 +119,10 @@ class TrialScene:
     cell: Cell
     things: Sequence[PlacedThing]  # the parts first
     start: Any  # state of the simulation
-    poses: list[Transform]  # of the things at rest, T_base_obj
+    poses: list[Transform]  # T_base_obj of every object at rest
     robot: TrueRobot
     calibrated: CalibratedRobot
-    joints: Joints  # that the controller reads while the picture is taken, radians
+    joints: Joints  # measured joint angles at the time of the picture, radians
     T_base_cam: Transform  # the true pose of the camera
     picture: Picture
 

@@ -30,8 +30,8 @@ Path = Float[np.ndarray, "waypoints 6"]
 
 POSITION_TOLERANCE: Final = 1e-4  # metres
 ANGLE_TOLERANCE: Final = 1e-3  # radians
-STEPS: Final = 60  # of inverse kinematics; a reachable pose takes about ten
-COMMANDS: Final = np.linspace(0.0, 255.0, 18)  # of the gripper, open to closed
+STEPS: Final = 60  # iterations of inverse kinematics; a reachable pose needs about ten
+COMMANDS: Final = np.linspace(0.0, 255.0, 18)  # gripper commands, open to closed
 LOW: Final = 0.005  # largest height error of a part that lies on the bench, metres
 
 STEEPEST: Final = np.radians(40.0)  # largest angle between an approach and straight down
@@ -90,7 +90,7 @@ class Gripper:
     widths: Float[np.ndarray, "commands"]  # distance between the pads, metres, descending
     # Distance of the pads' ends from the flange, metres. Closing fingers swing forward.
     reaches: Float[np.ndarray, "commands"]
-    joints: Float[np.ndarray, "commands 8"]  # of the fingers, for collision checks
+    joints: Float[np.ndarray, "commands 8"]  # finger joints per gripper command
 
     @property
     def widest(self) -> float:
@@ -145,7 +145,7 @@ class Plan:
     approach: Path  # to above the part
     descent: Path  # straight to it
     lift: Path  # straight up
-    opening: float  # of the fingers before they close, metres
+    opening: float  # distance between the fingers before they close, metres
     grasp: Grasp  # the part's grasp that the motion executes
 
 

@@ -35,7 +35,7 @@ from dopepp.robot.calibration.tool import find_bench, find_tip
 from dopepp.robot.grasping.cell import JOINTS, TRAY
 from dopepp.robot.grasping.planner import Arm, Joints, Knowledge
 
-SIZE: Final[Size] = (640, 480)  # of the camera's pictures, pixels
+SIZE: Final[Size] = (640, 480)  # (width, height) of the camera's pictures, pixels
 FOCAL: Final = SIZE[0] / 2 / np.tan(np.radians(30.0))  # 60° across, as in the networks' training
 TRUE_K: Final[CameraMatrix] = camera_matrix(FOCAL, FOCAL, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
 
@@ -69,7 +69,7 @@ class CalibratedRobot:
     knowledge: Knowledge
     camera: Camera
     hand_eye_mm: float  # error of the camera's pose at the distance of the parts, millimetres
-    hand_eye_deg: float  # its rotation error, degrees
+    hand_eye_deg: float  # rotation error of the hand-eye calibration, degrees
 
 
 def draw_robot(rng: Generator, tip: Vector) -> TrueRobot:

@@ -58,7 +58,7 @@ class Message:
 
     topic: str  # `/tf`, or below the node's name without a slash (`pose_part`: `/dope/pose_part`)
     kind: str  # type, `package/Name`
-    fields: Fields  # by name; nested messages are dicts, a picture's data are bytes
+    fields: Fields  # values by field name; nested messages are dicts, image data is bytes
 
 
 @dataclass(frozen=True, eq=False)

@@ -60,7 +60,7 @@ class WorkerSettings:
 class Answer:
     """Poses in a picture."""
 
-    stamp: Stamp  # of the picture
+    stamp: Stamp  # capture time of the picture
     frame_id: str  # the camera's optical frame, in which the poses are
     result: PoseResult
 

@@ -32,7 +32,7 @@ cheaper than reducing the whole photo."""
 
 PhotoSplit = Literal["train", "val", "test", "all"]
 
-FEWEST_PHOTOS: Final = 2  # of validation and of test
+FEWEST_PHOTOS: Final = 2  # least photos of the validation split and of the test split
 HELD_OUT: Final = 0.15
 """Share of the photos for validation, and for test."""
 

@@ -195,8 +195,8 @@ def _scatter(rng: Generator, image: Picture, count: int) -> None:
             cv2.circle(image, centre, radius, colour, thickness, cv2.LINE_AA)
 
 
-_PLAIN_SHARE: Final = 0.4  # of pieces of one colour, lighter towards one side
-_PRINTED_SHARE: Final = 0.2  # of pieces of dark and light cells, like markers and keyboards
+_PLAIN_SHARE: Final = 0.4  # share of pieces of one colour with a brightness gradient
+_PRINTED_SHARE: Final = 0.2  # share of pieces with dark and light cells, like markers
 _WIDTHS: Final = (0.04, 0.4)  # over the picture's, logarithmically uniform: most things are small
 _FINE_BITS: Final = 4  # outlines are drawn in sixteenths of a pixel
 

@@ -26,9 +26,9 @@ PerFace = Float[np.ndarray, "faces"]
 _CREASE_ANGLE_DEG: Final = 35.0
 """Faces that meet at a larger angle keep a sharp edge; a CAD cylinder has facets of 5° to 30°."""
 
-_HULL_DIRECTIONS: Final = 400  # whose extreme points approximate the hull of a large mesh
-_NUM_POINTS: Final = 400  # that represent a mesh for the shadows on a plane
-_MOST_CORNERS: Final = 1024  # of a vertex whose normals are averaged, in quadratic time
+_HULL_DIRECTIONS: Final = 400  # search directions for the extreme points of a large mesh
+_NUM_POINTS: Final = 400  # surface points that cast a mesh's shadow on a plane
+_MOST_CORNERS: Final = 1024  # most triangles at a vertex with averaged normals (quadratic time)
 
 
 @dataclass(frozen=True, eq=False)

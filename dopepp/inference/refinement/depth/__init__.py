@@ -67,7 +67,7 @@ class DepthStage:
     steps: int = 2  # Gauss–Newton steps
     update_visible: bool = False  # whether the visible points are determined again
     search: float = 0.0  # step of the search across the viewing axis; 0 for no search
-    tolerance: float = 0.0  # of the search, standard deviations of the depth
+    tolerance: float = 0.0  # largest depth error in the search, standard deviations
     outline: float = 0.0  # largest difference of outlines that has a weight; 0 for none
 
 
@@ -213,7 +213,7 @@ class Fit:
 
     inliers: float  # share of the unobstructed points with depth that agree
     seen: float  # share of the visible points that agree
-    rms: float  # of the agreeing points' offsets, standard deviations of the depth
+    rms: float  # RMS offset of agreeing points, standard deviations of the depth
     uncovered: float  # area beside the part that continues its surface, relative to the part's
 
     @property

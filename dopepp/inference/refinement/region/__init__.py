@@ -185,7 +185,7 @@ def _search(rounds: Sequence[Round], prior: Prior, loose: Prior, starts: Starts 
     try:
         reach = _search_distance(rounds[0], prior)
         needed, start = _necessary(rounds, reach), prior.T_cam_obj
-        if needed[0] is not needed[-1]:  # else the last round only, once or twice
+        if needed[0] is not needed[-1]:  # the list may contain the last round only
             start, needed = _coarse_end(needed[0], start, prior, reach), needed[1:]
         near = _refine(needed, start, prior, reach)
     except UndecidedError as undecided:

@@ -41,7 +41,7 @@ from dopepp.inference.refinement.solver import (
 
 RING: Final = 0.2  # width of the part's surroundings, share of its extent
 SAMPLES: Final = 7  # steps on each side of a normal, which are 1 to 4 pixels
-FEWEST_POINTS: Final = 24  # of an outline on the image, to determine six numbers
+FEWEST_POINTS: Final = 24  # least outline points that determine a pose
 
 LEAST_GAIN: Final = 2.0
 """Decrease in the logarithm of the covariance's volume below which the image is uninformative."""
@@ -74,7 +74,7 @@ class RegionStage:
 class OutlineAgreement:
     """Agreement of a refined outline with the image."""
 
-    share: float  # of the image's information about the outline, in [0, 1]
+    share: float  # agreeing share of the image's information about the outline
     # Share of the outline with agreeing information, in [0, 1]: occluded points, and points in
     # front of the part's own colour, have none
     support: float

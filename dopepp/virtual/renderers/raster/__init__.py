@@ -122,7 +122,7 @@ def _rivals(scene: Scene, projected: Sequence[Projected], index: int) -> Box | N
     if scene.plane is not None:
         normal = np.array(scene.plane.normal) @ item.T_cam_obj[:3, :3]
         offset = scene.plane.offset - float(np.dot(scene.plane.normal, item.T_cam_obj[:3, 3]))
-        if (item.surface.hull @ normal).min() < offset:  # some of it lies below the plane
+        if (item.surface.hull @ normal).min() < offset:  # the object extends below the plane
             return whole
     # An object that begins behind the end of this one cannot hide it.
     depths = [_depths(other) for other in scene.objects]
@@ -149,7 +149,7 @@ def _whole_px(item: SceneObject, seen: Projected, K: Array) -> float:
     """Count the pixel centres an object covers alone on a canvas as large as it needs."""
     left, top, right, bottom = seen.extent
     if not math.isfinite(left):
-        return math.inf  # it surrounds the camera
+        return math.inf  # the object surrounds the camera
     hom, scale, extent = seen.hom, 1.0, seen.extent
     if (right - left + 2) * (bottom - top + 2) > _MOST_PX:
         scale = math.sqrt(_MOST_PX / ((right - left + 2) * (bottom - top + 2)))
