@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Float, Int, Int16, UInt8
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.drawing.pictures import Picture
@@ -66,6 +66,10 @@ RING: Final = 0.2  # width of the surroundings, share of the extent
 MOST_PIXELS: Final = 1500  # pixels for the fit of the shading model
 SECTORS: Final = 8
 FEWEST_POINTS: Final = 12  # least points of an outline on the image
+SCHARR: Final = 1 / 32  # grey levels per pixel in a sum of Scharr's kernel
+
+Gradients = tuple[Int16[np.ndarray, "height width 3"], Int16[np.ndarray, "height width 3"]]
+"""Derivatives of every channel along x and y, in sums of Scharr's kernel."""
 
 
 class VerificationModel(NamedTuple):
@@ -105,7 +109,7 @@ class SharpEdges:
     """
 
     def __init__(self, mesh: OutlineMesh) -> None:
-        self._mesh = mesh
+        self.mesh = mesh
         normals = mesh.planes[:, :3]
         self.normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
         """Unit normal of each triangle."""
@@ -120,8 +124,8 @@ class SharpEdges:
         ids = np.full((height, width), -1, np.int32)
         inverse_depth = 1.0 / (at.arms[:, 2] + at.T_cam_obj[2, 3])
         nearest = np.zeros((height, width), np.float32)
-        shown = at.front if self._mesh.is_closed else np.ones_like(at.front)
-        _draw(at.pixels, inverse_depth, self._mesh.faces, shown, ids, nearest)
+        shown = at.front if self.mesh.is_closed else np.ones_like(at.front)
+        _draw(at.pixels, inverse_depth, self.mesh.faces, shown, ids, nearest)
         return ids
 
     def visible(
@@ -143,7 +147,7 @@ class Verifier:
     """
 
     def __init__(self, mesh: OutlineMesh, diameter: float) -> None:
-        self._mesh, self._diameter = mesh, diameter
+        self.mesh, self._diameter = mesh, diameter
         self._edges = SharpEdges(mesh)
         self._normals = self._edges.normals
         spread = mesh.vertices - mesh.vertices.mean(axis=0)
@@ -179,7 +183,7 @@ class Verifier:
             covariance: Its covariance.
             moved: Mahalanobis distance from the pose before refinement.
         """
-        at = posed(self._mesh, T_cam_obj, K)
+        at = posed(self.mesh, T_cam_obj, K)
         if at is None:
             return None
         corners = np.array([at.pixels.min(axis=0), at.pixels.max(axis=0)])
@@ -187,12 +191,12 @@ class Verifier:
             crop = crop_around(image, K, corners, LONGEST_PX)
         except UndecidedError:
             return None
-        at = posed(self._mesh, T_cam_obj, crop.K)
+        at = posed(self.mesh, T_cam_obj, crop.K)
         assert at is not None
         ids = self._edges.drawn(at, crop.size)
         mask = (ids >= 0).astype(np.uint8)
         spacing = max(1.5, 3.0 * crop.extent / SPACING)
-        contour = find_contour(self._mesh, at, mask, spacing)
+        contour = find_contour(self.mesh, at, mask, spacing)
         odds = log_odds(crop.bins, mask, 1.5, RING * crop.extent, 1)
         if len(contour) < FEWEST_POINTS or odds is None or mask.sum() < SMALLEST_PX**2:
             return None
@@ -258,18 +262,14 @@ def _lines(contour: Contour) -> Float[np.ndarray, "points 4"]:
     return np.column_stack([contour.pixels, contour.normals])
 
 
-def _gradients(colours: Picture) -> Float32[np.ndarray, "height width 2"]:
-    """Return the gradient of the channel that changes most, grey levels per pixel."""
+def _gradients(colours: Picture) -> Gradients:
+    """Return the derivatives of every channel."""
     soft = cv2.GaussianBlur(colours, (3, 3), 0.8)
-    gx = cv2.Scharr(soft, cv2.CV_32F, 1, 0, scale=1 / 32)
-    gy = cv2.Scharr(soft, cv2.CV_32F, 0, 1, scale=1 / 32)
-    gradients = np.empty((*colours.shape[:2], 2), np.float32)
-    _strongest(gx, gy, gradients)
-    return gradients
+    return cv2.Scharr(soft, cv2.CV_16S, 1, 0), cv2.Scharr(soft, cv2.CV_16S, 0, 1)
 
 
 def _responses(
-    gradients: Float32[np.ndarray, "height width 2"],
+    gradients: Gradients,
     lines: Float[np.ndarray, "points 4"],
     distance: float,
 ) -> tuple[Float[np.ndarray, "points"], float]:
@@ -277,8 +277,8 @@ def _responses(
     angles = np.arange(8) * math.pi / 4
     shifts = distance * np.column_stack([np.cos(angles), np.sin(angles)])
     here, beside = np.zeros(len(lines)), np.zeros(len(lines))
-    for number, shift in enumerate(np.vstack([np.zeros(2), shifts])):
-        _respond(gradients, lines, shift, beside if number else here)
+    _respond(*gradients, lines, np.zeros((1, 2)), here)
+    _respond(*gradients, lines, shifts, beside)
     return here, float(beside.mean() / len(shifts)) if len(lines) else 0.0
 
 
@@ -316,13 +316,14 @@ def _draw(
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         ax, ay, bx, by = pixels[a, 0], pixels[a, 1], pixels[b, 0], pixels[b, 1]
         cx, cy = pixels[c, 0], pixels[c, 1]
+        first, last = max(0, math.ceil(min(ay, by, cy))), math.floor(max(ay, by, cy))
+        left, right = max(0, math.ceil(min(ax, bx, cx))), math.floor(max(ax, bx, cx))
+        last, right = min(height - 1, last), min(width - 1, right)
+        if first > last or left > right:  # most triangles of a fine mesh cover no pixel's centre
+            continue
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         if abs(area) < 1e-9:
             continue
-        first = int(max(0.0, math.ceil(min(ay, by, cy))))
-        last = int(min(height - 1.0, math.floor(max(ay, by, cy))))
-        left = int(max(0.0, math.ceil(min(ax, bx, cx))))
-        right = int(min(width - 1.0, math.floor(max(ax, bx, cx))))
         # Weights of the corners are linear over the image.
         per_area = 1.0 / area
         a_u, a_v = (by - cy) * per_area, (cx - bx) * per_area
@@ -333,7 +334,7 @@ def _draw(
                 wa = a_u * (u - cx) + a_v * (v - cy)
                 wb = b_u * (u - cx) + b_v * (v - cy)
                 wc = 1.0 - wa - wb
-                if wa < -1e-9 or wb < -1e-9 or wc < -1e-9:
+                if min(wa, wb, wc) < -1e-9:
                     continue
                 near = wa * za + wb * zb + wc * zc
                 if near > nearest[v, u]:
@@ -370,30 +371,26 @@ def _walk_creases(edges: Array, sides: Array, pixels: Array, ids: Array, spacing
 
 
 @compiled()
-def _strongest(gx: Array, gy: Array, gradients: Array) -> None:
-    """Write the gradient of the channel with the longest gradient."""
-    for v in range(gx.shape[0]):
-        for u in range(gx.shape[1]):
-            longest = -1.0
-            for c in range(3):
-                x, y = gx[v, u, c], gy[v, u, c]
-                if x * x + y * y > longest:
-                    longest = x * x + y * y
-                    gradients[v, u, 0], gradients[v, u, 1] = x, y
+def _respond(gx: Array, gy: Array, lines: Array, shifts: Array, responses: Array) -> None:
+    """Add the response at each shifted point: 1 for a strong gradient along the point's normal.
 
-
-@compiled()
-def _respond(gradients: Array, lines: Array, shift: Array, responses: Array) -> None:
-    """Add the response at each shifted point: 1 for a strong gradient along the point's normal."""
-    height, width = gradients.shape[:2]
+    The gradient of a pixel is that of the channel that changes most.
+    """
+    height, width = gx.shape[:2]
     for i in range(len(lines)):
-        x, y = lines[i, 0] + shift[0], lines[i, 1] + shift[1]
-        most = 0.0
-        for k in range(3):
-            u = round(x + (k - 1.0) * lines[i, 2])
-            v = round(y + (k - 1.0) * lines[i, 3])
-            if 0 <= u < width and 0 <= v < height:
-                gx, gy = gradients[v, u, 0], gradients[v, u, 1]
-                along = abs(gx * lines[i, 2] + gy * lines[i, 3])
-                most = max(most, along / (math.hypot(gx, gy) + NOISE))
-        responses[i] += most
+        nx, ny = lines[i, 2], lines[i, 3]
+        for s in range(len(shifts)):
+            x, y = lines[i, 0] + shifts[s, 0], lines[i, 1] + shifts[s, 1]
+            most = 0.0
+            for k in range(3):
+                u = round(x + (k - 1.0) * nx)
+                v = round(y + (k - 1.0) * ny)
+                if 0 <= u < width and 0 <= v < height:
+                    longest = dx = dy = -1
+                    for c in range(3):
+                        a, b = int(gx[v, u, c]), int(gy[v, u, c])
+                        if a * a + b * b > longest:
+                            longest, dx, dy = a * a + b * b, a, b
+                    along, length = abs(dx * nx + dy * ny), np.float32(math.sqrt(longest))
+                    most = max(most, along / (length + NOISE / SCHARR))
+            responses[i] += most

@@ -1,0 +1,119 @@
+"""Cost of the verification of a pose, beside that of its refinement, on one core.
+
+    python benchmarks/verification_cost.py [FOLDER] [--poses 60] [--other verification.py]
+
+Poses are those of a BOP data set's frames in FOLDER, and those of the released parts in renders.
+Each is moved as far as a refined pose is off: 2 mm and 1° (standard deviations). ``--other`` times another
+version of ``dopepp/inference/refinement/verification.py`` in turn and compares its evidence.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import math
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import numpy as np
+from refine_real import read_frames
+
+from dopepp.data.formats.bop.bop_models import bop_parts, parts_by_id
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import CameraMatrix, Transform, moved
+from dopepp.inference.refinement import verification
+from dopepp.inference.refinement.refiner import PartRefiner
+from dopepp.parts.catalogue import load_part
+from dopepp.parts.part import Part
+from dopepp.virtual import PRESETS, Factory
+
+RENDERED = ("pivconnector", "servoholder")
+COVARIANCE = np.diag(np.repeat([math.radians(1.0), 0.002], 3) ** 2)
+REPEATS = 5  # the fastest run counts
+
+Case = tuple[str, Part, Picture, CameraMatrix, Transform]
+
+
+def real_cases(folder: Path) -> Iterator[Case]:
+    """Yield the annotated poses of a BOP data set."""
+    parts = parts_by_id(folder, bop_parts(folder))
+    for scene in sorted((folder / "test").iterdir()):
+        for frame in read_frames(scene, slice(None)):
+            for number, T in frame.objects:
+                yield f"{folder.name}: {parts[number].name}", parts[number], *frame[:2], T
+
+
+def rendered_cases(name: str) -> Iterator[Case]:
+    """Yield the targets of renders."""
+    part = load_part(name)
+    factory, index = Factory([part], PRESETS["table"], 61), 0
+    while True:
+        picture = factory.render(0, index)
+        for number in picture.scene.targets:
+            if picture.visible_fractions[number] > 0.3:
+                T = picture.scene.objects[number].T_cam_obj
+                yield f"renders: {name}", part, picture.image, picture.scene.K, T
+        index += 1
+
+
+def fastest_ms(run: Callable[[], object]) -> float:
+    """Return the processor time of the fastest run, milliseconds."""
+    spent = []
+    for _ in range(REPEATS):
+        start = time.process_time()
+        run()
+        spent.append(1000 * (time.process_time() - start))
+    return min(spent)
+
+
+def main() -> None:
+    """Print a row for every part."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", nargs="?", type=Path, help="BOP data set")
+    parser.add_argument("--poses", type=int, default=60, help="per part")
+    parser.add_argument("--other", type=Path, help="another verification.py")
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    versions = [verification.Verifier]
+    if arguments.other is not None:
+        spec = importlib.util.spec_from_file_location("other_verification", arguments.other)
+        assert spec is not None
+        assert spec.loader is not None
+        other = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(other)
+        versions.append(other.Verifier)
+    sources = [rendered_cases(name) for name in RENDERED]
+    if arguments.folder is not None:
+        sources.insert(0, real_cases(arguments.folder))
+    print("| part | poses | verify ms | refine ms | verify/refine | this/other | difference |")
+    print("| --- | ---: | ---: | ---: | ---: | ---: | ---: |")
+    for source in sources:
+        rng, rows, refiner = np.random.default_rng(5), [], None
+        for title, part, image, K, T in islice(source, arguments.poses):
+            if refiner is None:
+                refiner = PartRefiner(part, ("region",))
+                assert refiner.verifier is not None
+                mesh = refiner.verifier.mesh
+                verifiers = [version(mesh, part.diameter) for version in versions]
+            pose = moved(T, rng.multivariate_normal(np.zeros(6), COVARIANCE))
+            case = (image, K, pose, COVARIANCE)
+            evidence = [verifier.evidence(*case, 1.0) for verifier in verifiers]
+            if any(values is None for values in evidence):
+                assert all(values is None for values in evidence)
+                continue
+            difference = float(np.abs(np.subtract(evidence[0], evidence[-1])).max())
+            spent = [fastest_ms(partial(each.evidence, *case, 1.0)) for each in verifiers]
+            refined = fastest_ms(partial(refiner.refine, *case))
+            rows.append((spent[0], refined, spent[0] / refined, spent[0] / spent[-1], difference))
+        *figures, _ = np.median(rows, axis=0)
+        difference = np.max(rows, axis=0)[-1]
+        text = " | ".join(f"{figure:.2f}" for figure in figures)
+        print(f"| {title} | {len(rows)} | {text} | {difference:.0e} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
