@@ -3,8 +3,9 @@
     python benchmarks/verification_cost.py [FOLDER] [--poses 60] [--other verification.py]
 
 Poses are those of a BOP data set's frames in FOLDER, and those of the released parts in renders.
-Each is moved as far as a refined pose is off: 2 mm and 1° (standard deviations). ``--other`` times another
-version of ``dopepp/inference/refinement/verification.py`` in turn and compares its evidence.
+Each is moved as far as a refined pose is off: 2 mm and 1° (standard deviations). ``--other``
+times another version of ``dopepp/inference/refinement/verification.py`` in turn and compares its
+evidence.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import math
+import sys
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -84,6 +86,7 @@ def main() -> None:
         assert spec is not None
         assert spec.loader is not None
         other = importlib.util.module_from_spec(spec)
+        sys.modules[spec.name] = other  # numba's cache finds compiled functions by their module
         spec.loader.exec_module(other)
         versions.append(other.Verifier)
     sources = [rendered_cases(name) for name in RENDERED]
@@ -92,9 +95,10 @@ def main() -> None:
     print("| part | poses | verify ms | refine ms | verify/refine | this/other | difference |")
     print("| --- | ---: | ---: | ---: | ---: | ---: | ---: |")
     for source in sources:
-        rng, rows, refiner = np.random.default_rng(5), [], None
-        for title, part, image, K, T in islice(source, arguments.poses):
+        rng, rows, refiner, title = np.random.default_rng(5), [], None, ""
+        for name, part, image, K, T in islice(source, arguments.poses):
             if refiner is None:
+                title = name
                 refiner = PartRefiner(part, ("region",))
                 assert refiner.verifier is not None
                 mesh = refiner.verifier.mesh
