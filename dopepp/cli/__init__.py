@@ -44,7 +44,7 @@ _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 
 class _OneLineErrors(TyperGroup):
-    """Reports a wrong option or a missing argument in one line, like every other mistake."""
+    """Reports a wrong option or a missing argument in one line."""
 
     def invoke(self, ctx: Any) -> Any:
         try:

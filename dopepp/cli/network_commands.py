@@ -139,7 +139,9 @@ def doctor(
         check_region(refine)
         shown_at = None if not centres and not empty else [_pixel(text) for text in centres or ()]
         if centres and empty:
-            raise UserError("--at with --empty", "one of the two", "leave out --at or --empty")
+            raise UserError(
+                "--at together with --empty", "only one of them", "leave out --at or --empty"
+            )
         K = None if intrinsics is None else camera_matrix(*intrinsics)
         lens = Lens(choose_camera(K, camera, Images([image])), K_size, crop)
         picture = read_photo(image)

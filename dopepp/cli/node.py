@@ -139,7 +139,8 @@ def _check_transport(
         raise UserError(problem, allowed, fix)
     if (transport == "--bag") != (out is not None):
         problem = "--out without --bag" if out else "--bag without --out"
-        raise UserError(problem, "both", "add --bag FILE" if out else "add --out poses.mcap")
+        fix = "add --bag FILE" if out else "add --out poses.mcap"
+        raise UserError(problem, "--bag together with --out", fix)
     if transport != "--ros2" and params:
         raise UserError(f"--params with {transport}", "--params with --ros2", "leave out --params")
     if transport in PACKAGES:

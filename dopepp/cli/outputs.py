@@ -40,7 +40,7 @@ class Output(Protocol):
 
 
 class Outputs:
-    """Several outputs as one. A refused disk operation is a :class:`RunError`."""
+    """Writes each result to several outputs; a failed disk operation raises a :class:`RunError`."""
 
     def __init__(self, outputs: Sequence[tuple[Path, Output]]) -> None:
         self._outputs = outputs

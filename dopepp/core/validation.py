@@ -285,7 +285,7 @@ def _location(value: object, detail: ErrorDetails) -> tuple[str | int, ...]:
 
 
 def _cause(detail: ErrorDetails) -> UserError | None:
-    """Return the error that a dataclass itself raised."""
+    """Return the error that a dataclass raised in ``__post_init__``."""
     cause = detail.get("ctx", {}).get("error")
     return cause if isinstance(cause, UserError) else None
 

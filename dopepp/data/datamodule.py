@@ -1,4 +1,4 @@
-"""Turn sources into batches for training and validation, with one seed for everything.
+"""Turn sources into batches for training and validation; one seed determines all batches.
 
 The sampler yields (epoch, index) pairs, so persistent workers never use an old epoch. The loader
 resumes inside an epoch and raises the user errors of workers.

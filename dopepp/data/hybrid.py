@@ -41,7 +41,7 @@ Order = Int[np.ndarray, " items"]
 def _shares(
     present: tuple[bool, ...], real_fraction: float, synthetic_fraction: float
 ) -> list[float]:
-    """Return the shares of (real, virtual, synthetic), without those of absent sources."""
+    """Return the shares of (real, virtual, synthetic) images; absent sources have share 0."""
     real, virtual, synthetic = present
     real_share = (real_fraction if virtual or synthetic else 1.0) if real else 0.0
     synthetic_part = (synthetic_fraction if virtual else 1.0) if synthetic else 0.0

@@ -146,7 +146,7 @@ def named_part(text: str, unit: str | None) -> Part:
 def _in_camera(
     scenes: Preset, parts: Sequence[Part], path: str | Path | None, distance: str | None
 ) -> Preset:
-    """Return the scenes in a camera's whole pictures, and log the sizes of the parts."""
+    """Return the preset with the camera of a file, and log the parts' sizes in its pictures."""
     if path is None or distance is None:
         missing = "--camera FILE" if path is None else "--working-distance 0.3,0.8"
         given = "--working-distance" if path is None else "--camera"

@@ -200,7 +200,7 @@ class CachedSource:
         return self._source.contains(label)
 
     def describe(self) -> list[SourceInfo]:
-        """Describe the source, marked as cached: its epochs are all the same."""
+        """Describe the source, marked as cached, because all its epochs are equal."""
         return [
             replace(info, identity={**info.identity, "cached": True})
             for info in self._source.describe()

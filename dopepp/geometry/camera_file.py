@@ -88,7 +88,7 @@ class Camera:
         """
         if K_size is not None and crop is not None:
             problem, fix = "--K-size with --crop", "crop first, and pass the K of the crop's size"
-            raise UserError(problem, "one of the two", fix)
+            raise UserError(problem, "only one of them", fix)
         if K_size is not None:
             stated = f"--K-size {K_size[0]} {K_size[1]}"
             if min(K_size) < 1:

@@ -123,7 +123,7 @@ def to_openvino(network: PoseNetwork, precision: str, images: Sequence[Pixels]) 
         folder.mkdir(exist_ok=True)
         try:
             openvino.save_model(model, folder / NAME, compress_to_fp16=precision == "fp16")
-        except RuntimeError as error:  # without the operating system's reason
+        except RuntimeError as error:  # OpenVINO does not state the operating system's reason
             raise OSError(errno.EIO, "OpenVINO could not write it, is the disk full?") from error
 
     return save
@@ -170,7 +170,7 @@ def _translating(network: PoseNetwork, language: str) -> Iterator[None]:
             yield
     except UserError:
         raise
-    except Exception as error:  # the libraries' own
+    except Exception as error:  # the libraries raise several types
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         parts = ", ".join(type(child).__name__ for child in network.children())
         raise UserError(

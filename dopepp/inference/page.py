@@ -39,7 +39,7 @@ from dopepp.recovery.recover import explained
 
 HOST: Final = "127.0.0.1"  # reachable from this machine only
 MAX_UPLOAD: Final = "64mb"  # size of an uncompressed image of 20 megapixels
-SHOWN_PX: Final = 1600  # longer side of the drawn image: a browser shows no more
+SHOWN_PX: Final = 1600  # longest side of the drawn image, pixels
 
 VIEW, NUMBERS, FILE = "field of view", "K", "camera file"
 """Ways to specify the camera."""
@@ -129,7 +129,7 @@ def make_page(estimator: PoseEstimator, folder: Path) -> gr.Blocks:
                 button = gr.Button("Find poses", variant="primary")
                 maps = _image("Belief maps", "maps", estimator.has_network)
             with gr.Column(scale=2, min_width=480):
-                greeting = _message("Drop a picture, say what took it, and find the poses.")
+                greeting = _message("Drop a picture, specify its camera, and find the poses.")
                 message = gr.HTML(greeting, padding=False)
                 drawn = _image("Poses", "poses")
                 table = gr.Dataframe(headers=COLUMNS, label=FRAME, interactive=False)
@@ -153,7 +153,7 @@ def _image(label: str, name: str, is_visible: bool = True) -> gr.Image:
 
 
 def _camera_inputs() -> list[Any]:
-    """Return the inputs of all ways to specify the camera; only those of the chosen are shown."""
+    """Return the input fields of all camera types; only those of the chosen type are visible."""
     kind = gr.Radio([VIEW, NUMBERS, FILE], value=VIEW, label="Camera")
     view = gr.Number(label="Degrees across the picture's width", placeholder="60")
     with gr.Row(visible=False) as row:

@@ -54,7 +54,7 @@ FARTHEST: Final = 50.0
 METRES: Final = Span(0.001, 1000.0, "metres")  # valid distances
 
 MAX_PIXELS: Final = 640 * 480  # largest resized image; limits the smallest detectable part
-MARGIN: Final = 1.1  # factor on a size that makes no difference to a network
+MARGIN: Final = 1.1  # size ratio that a network does not notice
 
 
 def prepare_image(

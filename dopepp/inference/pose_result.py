@@ -84,7 +84,7 @@ class Shape:
     """Geometry of a part for drawing."""
 
     diameter: float  # metres
-    mesh: OutlineMesh | None  # None: only the cuboid can be drawn
+    mesh: OutlineMesh | None  # None if the part has no mesh: only its cuboid is drawn
 
 
 def make_shape(part: Part) -> Shape:

@@ -1,4 +1,4 @@
-"""Detections on every frame of a source: the same loop for files, videos and cameras."""
+"""Estimation of poses on every frame of a file, video or camera."""
 
 from __future__ import annotations
 

@@ -147,7 +147,7 @@ class Viewer:
     def _open_window(self, blueprint: Any) -> None:
         """Open a window that other machines can neither see nor send data to."""
         viewer = [sys.executable, "-m", "rerun_cli"]
-        # It would report its use; `rerun analytics enable` allows that again.
+        # Disable Rerun's usage reports; `rerun analytics enable` turns them on.
         subprocess.run([*viewer, "analytics", "disable"], capture_output=True, check=False)
         with socket.socket() as free:
             free.bind((LOCALHOST, 0))

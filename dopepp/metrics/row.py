@@ -136,7 +136,7 @@ def bop_points(part: Part) -> Float[Tensor, "v 3"]:
 
 @dataclass
 class PoseRow:
-    """Measures of one method on one object; None if a measure does not exist ("n/a").
+    """Measures of one method on one object; None ("n/a") for an undefined measure.
 
     Shares lie in [0, 1], angles are degrees, distances metres. Medians and 90th percentiles are
     over matched instances. (Not frozen, because torchmetrics rebuilds what ``compute`` returns.)

@@ -283,5 +283,5 @@ def _subset(points: Points) -> Float[np.ndarray, "subset 3"]:
 
 
 def _clean(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Round away the errors of sine and cosine at zeros and ones."""
+    """Round to 12 decimals, and replace −0 by 0."""
     return np.asarray(np.round(values, 12) + 0.0)

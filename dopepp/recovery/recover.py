@@ -240,7 +240,7 @@ def furthest(reasons: Sequence[Reason]) -> list[Reason]:
 
 
 def explained(reasons: Sequence[Reason]) -> str:
-    """Return one line for an image without detections."""
+    """Return the reasons for missing detections on one image as a line of text."""
     counts = Counter(reason.object for reason in reasons)
     lines = []
     for reason in reversed(furthest(reasons)):
@@ -250,7 +250,7 @@ def explained(reasons: Sequence[Reason]) -> str:
 
 
 def summary(silent: Sequence[Reason], num_images: int) -> str:
-    """Return one line for images without detections; ``silent`` has one reason for each."""
+    """Return the reasons for missing detections on several images as a line of text."""
     groups = []
     for kind, words in KINDS.items():
         values = [reason.best for reason in silent if reason.kind == kind]

@@ -75,7 +75,7 @@ class FiniteSteps(Callback):
         return {"skipped": self.skipped}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Continue counting."""
+        """Restore the number of skipped steps."""
         self.skipped = int(state_dict["skipped"])
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -99,7 +99,7 @@ class FiniteSteps(Callback):
         self._loss = loss.detach()
 
     def on_after_backward(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Check the pass without synchronising with the device."""
+        """Record whether loss and gradients are finite, without synchronising with the device."""
         gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
         statistics = [buffer for buffer in self._buffers if buffer.is_floating_point()]
         norms = [
@@ -150,7 +150,7 @@ class FiniteSteps(Callback):
         pl_module.log("train/skipped_steps", float(self.skipped), rank_zero_only=False)
 
     def _dump(self, trainer: Trainer, passes: list[_Pass], names: list[str]) -> Path:
-        """Write the batch of the first pass that was not finite, on every process with such a pass.
+        """Write the first batch with non-finite values, on every process that has computed one.
 
         Gradients are summed over processes, so all processes have the same non-finite gradients.
         """
@@ -202,7 +202,7 @@ class EmptyMaps(Callback):
         return {"empty": self._num_empty, "warned": self._warned, "first_loss": self._first_loss}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Continue counting."""
+        """Restore the number of empty validations, the first loss and the warning."""
         self._num_empty, self._warned = int(state_dict["empty"]), bool(state_dict["warned"])
         self._first_loss = float(state_dict["first_loss"])
 
@@ -227,7 +227,7 @@ class EmptyMaps(Callback):
         self._sizes.append(extent.amax(dim=-1) / system.geometry.stride)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Count empty validations and warn after enough of them."""
+        """Count validations without belief peaks above the thresholds; warn after ``patience``."""
         assert isinstance(pl_module, PoseSystem)
         if trainer.world_size > 1:
             torch.distributed.all_reduce(self._highest, torch.distributed.ReduceOp.MAX)

@@ -294,7 +294,7 @@ def _capture() -> dict[str, Any]:
 
 
 def _restore(state: dict[str, Any]) -> None:
-    """Restore captured states, those of GPUs only if their number is the same."""
+    """Restore captured random states; those of GPUs only if the number of GPUs is unchanged."""
     version, numbers, gauss = state["python"]
     random.setstate((version, tuple(numbers), gauss))
     keys, position, has_gauss = state["numpy"]

@@ -54,7 +54,7 @@ class MetricsTable(Logger):
         self._rows = {key: row for key, row in self._rows.items() if key <= step}
 
     def log_hyperparams(self, params: dict[str, Any] | Namespace, *_: Any, **__: Any) -> None:
-        """Do nothing; the config has a file of its own."""
+        """Do nothing, because the run folder contains the config as a file."""
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:

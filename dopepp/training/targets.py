@@ -117,7 +117,7 @@ class Equivalents(NamedTuple):
 
 
 class SymmetryHandling:
-    """Computes the equivalent poses of labelled ones; parts are in channel order."""
+    """Computes the poses that symmetry makes equivalent to a label; parts are in channel order."""
 
     def __init__(self, parts: Sequence[Part], options: SymmetryOptions) -> None:
         self.options, self.num_objects = options, len(parts)

@@ -64,7 +64,7 @@ class Composition:
         return self.preset.distractors.draw(self.rng, width_at_depth, self.negatives)
 
     def add(self, body: Body, T_cam_obj: Transform, material: Material) -> bool:
-        """Add a body if it is in front of the camera and hides no target too much."""
+        """Add a body that is in front of the camera and leaves every target visible enough."""
         extremes = transform(T_cam_obj, body.surface.hull)
         if extremes[:, 2].min() <= NEAR:
             return False

@@ -136,7 +136,7 @@ class SceneObject:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The content of one image."""
+    """Objects, lights, background and camera of one image."""
 
     K: CameraMatrix
     background: Picture

@@ -71,7 +71,7 @@ class CheckReport(Problems):
 
     @property
     def ok(self) -> bool:
-        """Whether there is no defect."""
+        """Whether the data set has no defects."""
         return self.num_defects == 0
 
     def report(self, path: Path | str, where: str, message: str, allowed: str = "") -> None:

@@ -1,4 +1,4 @@
-"""Build the LightningModule and the Trainer from a config, and choose what suits this machine.
+"""Build the LightningModule and the Trainer from a config, with devices and precision.
 
 To allow an optimiser, scheduler, callback or logger of your own, register its dotted name before
 the run starts (``CALLBACKS.register("my_package.my_module.MyCallback")``) or list it here.

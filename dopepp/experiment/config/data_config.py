@@ -326,7 +326,7 @@ def _chosen_virtual(given: Mapping[str, Any], stored: object, source: str) -> Vi
     """Return the given whole node ``virtual``, or the stored node with changed options."""
     if not {"renderer", "preset"} <= set(given):  # a file of conf/virtual sets both
         if stored is None:
-            problem = f"{source}, which does not say how to render"
+            problem = f"{source}, which does not state how to render"
             raise UserError(problem, "virtual=… on the command line", "add virtual=default")
         given = _changed(stored, given, "virtual")
     return VirtualConfig.of(given)

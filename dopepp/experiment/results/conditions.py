@@ -147,7 +147,7 @@ much. An instance counts by what is visible of it from there, at least 10 %.""",
 
 @dataclass(frozen=True)
 class Level:
-    """Measurement at one level.
+    """Measurement at one level of a condition, such as 40 % shading.
 
     Attributes:
         value: Level.

@@ -152,7 +152,7 @@ def of_networks(reports: list[Report], num_files: int) -> list[Report]:
 
 
 def main_report(reports: Sequence[Report]) -> Report:
-    """Return the report that holds that of its refined poses, or the last one if there is none."""
+    """Return the report that contains a report of refined poses, or else the last report."""
     return next((report for report in reports if report.refined is not None), reports[-1])
 
 

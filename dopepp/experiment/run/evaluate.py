@@ -176,17 +176,25 @@ def _check_combination(asked: EvaluationConfig) -> None:
         raise UserError(f"refine={asked.refine} without ckpt_path", allowed, fix)
     if asked.scale_error is not None and asked.refine is None and asked.templates is None:
         fix = "add refine=region, or leave out scale_error"
-        raise UserError(f"scale_error={asked.scale_error} without refine", "both", fix)
+        raise UserError(
+            f"scale_error={asked.scale_error} without refine", "both options together", fix
+        )
     if asked.negatives_camera is not None and asked.negatives is None:
         fix = "add negatives=FOLDER, or leave out negatives_camera"
-        raise UserError(f"negatives_camera={asked.negatives_camera} without negatives", "both", fix)
+        raise UserError(
+            f"negatives_camera={asked.negatives_camera} without negatives",
+            "both options together",
+            fix,
+        )
     if asked.negatives is not None and not has_network and asked.templates is None:
         fix = "add ckpt_path, or leave out negatives: a file has no poses in these pictures"
-        raise UserError(f"negatives={asked.negatives} without ckpt_path", "both", fix)
+        raise UserError(
+            f"negatives={asked.negatives} without ckpt_path", "both options together", fix
+        )
     if asked.tune and (asked.protocols or asked.negatives is not None or asked.templates):
         got = "tune=true with shading, scale, by, negatives or templates"
         fix = "tune first, then measure"
-        raise UserError(got, "one of the two", fix)
+        raise UserError(got, "tune=true without these options", fix)
 
 
 def _tune_only(

@@ -132,7 +132,7 @@ class Figures:
 class Tuning:
     """Tuned recovery options, and their effect on test images with and without objects.
 
-    ``before`` is the network alone, as it was. ``kept`` says why the old factors were kept.
+    ``before`` is the untuned network. ``kept`` is the reason for keeping the old factors.
     """
 
     options: dict[str, float]

@@ -31,7 +31,7 @@ __all__ = ["CHECKS", "Case", "Diagnosis", "diagnose"]
 SAME: Final = 1.05  # factor on a part's size that simplification of the mesh may cause
 
 DARK: Final = 70.0
-"""Highlights, of 255: 106 and more in good renders, 35 to 60 with a 16th of the light."""
+"""Grey level of highlights, 0 to 255: above 105 in good renders, 35 to 60 at 1/16 of the light."""
 
 CLIPPED, CLIPPED_PART = 0.25, 0.15
 """Shares of white in an image and around the part: up to 0.1 in good renders, 0.2 to 0.8 with eight
@@ -41,16 +41,16 @@ BLURRED: Final = 2.5
 """Width of edges, pixels of the network's input: a blur of two pixels measures 1.1 to 2 and is
 harmless, a blur of five measures 3.2 to 4.7 and costs a quarter of the parts."""
 
-# K is doubted if another focal length (by this factor) fits the keypoints so many times better, and
-# its logarithm is determined to this standard deviation. With the right K the gain is 0.9 to 2.3,
-# with twice or half of it 3 to 20 on a third of the images.
+# K is reported as wrong if a focal length that differs by FOCAL reduces the keypoint error by GAIN,
+# and its logarithm has a standard deviation below CERTAIN. The error decreases 0.9 to 2.3 times
+# with the right K, and 3 to 20 times on a third of the images with a focal length off by 2.
 FOCAL, GAIN, CERTAIN = 1.35, 3.0, 0.2
 
 PARTLY: Final = 0.3
-"""Belief of a centre: 0.4 to 0.8 of half covered parts, mostly below 0.2 on images without it."""
+"""Belief at a part's centre: 0.4 to 0.8 if half occluded, mostly below 0.2 on images without it."""
 
 LEAST_SCORE: Final = 0.03
-"""Score of a detected part: false positives of a network that is not tuned have less."""
+"""Least score of a right detection; false positives of an untuned network score lower."""
 
 OFF: Final = 0.08
 """Reprojection error, share of the part's length on the image: up to 0.06 for good poses."""
@@ -119,7 +119,7 @@ def sharpness(case: Case) -> Diagnosis:
     """Check whether edges are sharp at the size on which the network runs."""
     width = edge_width(case.around())
     if width is None:
-        return Diagnosis("sharpness", "too few edges to tell")
+        return Diagnosis("sharpness", "too few edges to measure the sharpness")
     size = f"{case.box.width}×{case.box.height}"
     width_image = width / case.box.scale_x
     owner = "network's" if case.estimator.has_network else "templates'"
@@ -257,7 +257,7 @@ CHECKS: Final[Sequence[Check]] = (
 """Checks, in the order of causes."""
 
 EMPTY_CHECKS: Final[Sequence[Check]] = (part_size, elsewhere)
-"""Checks of an image without the parts, where every detection is false."""
+"""Checks of an image that shows none of the parts, so that every detection is a false positive."""
 
 
 def diagnose(case: Case) -> list[Diagnosis]:
@@ -288,7 +288,7 @@ def _near(ratio: float, factor: float) -> bool:
 
 
 def _unit_fix(ratio: float) -> str:
-    """Return which unit explains a mesh that is too large by a ratio."""
+    """Return the fix for a mesh that is too large by a ratio, such as a ratio of two units."""
     for read, metres in UNITS.items():
         for actual, actual_metres in UNITS.items():
             if read != actual and _near(ratio * actual_metres / metres, SAME):

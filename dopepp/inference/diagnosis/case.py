@@ -23,7 +23,7 @@ from dopepp.recovery.detection import Detection
 NEARER, FARTHER = 2.0, 4.0  # factors on the expected distances for a further search
 
 BELIEVED: Final = (0.4, 6)
-"""Least mean belief and keypoints of a detection elsewhere; false positives have less."""
+"""Least mean belief and number of keypoints of a detection outside the expected distances."""
 
 LEAST_PX: Final = 24  # smallest side of an image whose sharpness can be measured
 
@@ -151,7 +151,7 @@ class Case:
         return estimator.refined([self.found], self.image, self.K)[0]
 
     def around(self) -> Picture:
-        """Return the detected part's surroundings in the size of :attr:`box`, or the image."""
+        """Return a crop around the detected part in the size of :attr:`box`, or the whole image."""
         picture = self.box.image(self.image)
         if self.found is None:
             return picture

@@ -116,7 +116,7 @@ class Video(FrameSource):
         self.count = int(count) if 0 < count < math.inf else None
 
     def frames(self, stride: int = 1) -> Iterator[CameraFrame]:
-        """Yield every ``stride``-th frame; warn if the file has fewer than its header says.
+        """Yield every ``stride``-th frame; warn if the file has fewer than its header states.
 
         Raises:
             UserError: No frame can be read.

@@ -116,7 +116,7 @@ class CameraInfo:
         )
 
     def camera(self, source: str, rectified: bool) -> Camera:
-        """Return the camera of the images.
+        """Return the pinhole camera of the images.
 
         Args:
             source: Origin, for messages.
@@ -180,7 +180,7 @@ class Bag(FrameSource):
                 continue
             try:
                 image = decode_image(message)
-            except Exception as error:  # any error, as messages are not trusted
+            except Exception as error:  # untrusted messages can raise any exception
                 raise self._unreadable(f"picture {number} of {self.topic}: {error}") from error
             yield CameraFrame(image, self.name, number, seconds)
 
@@ -194,9 +194,10 @@ class Bag(FrameSource):
         return None
 
     def messages(self) -> Iterator[tuple[float, Any, Any | None]]:
-        """Yield the time, image message and latest ``camera_info`` message of each image.
+        """Yield time, image message and latest ``camera_info`` message of each image.
 
-        Images before the first ``camera_info`` have the first one. None: the recording has none.
+        Images before the first ``camera_info`` message are paired with that message. The third
+        value is None if the recording has no ``camera_info``.
         """
         topic = info_topic(self.topic)
         info = next((message for _, message in self._messages([topic], CAMERA)), None)
@@ -219,7 +220,7 @@ class Bag(FrameSource):
                 for link in reader.connections
                 if link.topic in topics and link.msgtype in kinds
             ]
-            # Without any connection, a reader would yield the messages of all.
+            # Without a selected connection, the reader would yield the messages of every topic.
             for link, recorded_ns, content in reader.messages(links) if links else ():
                 message: Any = decode(content, link.msgtype)
                 stamp = message.header.stamp

@@ -81,7 +81,7 @@ def given_camera(K: CameraMatrix | None, camera: Camera | Path | str | None) -> 
         UserError: Both are given, or the camera file cannot be read.
     """
     if K is not None and camera is not None:
-        raise UserError("--K and --camera", "one of the two", "leave out --K or --camera")
+        raise UserError("both --K and --camera", "only one of them", "leave out --K or --camera")
     if K is not None:
         return Camera(None, K, (), "--K")
     return read_camera(camera) if isinstance(camera, Path | str) else camera
@@ -98,5 +98,5 @@ def choose_camera(
     chosen = given_camera(K, camera) or source.camera
     if chosen is None:
         fix = "pass --K fx fy cx cy (pixels of this image) or --camera FILE"
-        raise UserError(f"neither --K nor --camera for {source.name}", "one of the two", fix)
+        raise UserError(f"neither --K nor --camera for {source.name}", "--K or --camera", fix)
     return chosen

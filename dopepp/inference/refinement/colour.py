@@ -45,7 +45,7 @@ class Crop:
     colours: Picture  # RGB
     K: CameraMatrix  # camera matrix of the crop, pixels
     extent: float  # longer side of the part, pixels of the crop
-    scale: float  # pixels of the crop per pixel of the image: 1 over an integer
+    scale: float  # crop pixels per image pixel: 1/n for an integer n
 
     @property
     def size(self) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""Refinement of poses: one solver, and the evidence that ``refine=`` names as its terms.
+"""Refinement of poses by one solver; ``refine=`` selects the evidence (terms).
 
 ``region`` is the outline on the image, ``depth`` a depth image. With both, the image alone is
 refined first. If it does not determine the pose, or ends too far from the measured surface, depth
@@ -94,13 +94,13 @@ class Refiner:
     def __call__(
         self, detection: Detection, image: Picture, K: CameraMatrix, depth: Depth | None
     ) -> Detection:
-        """Return the refined and verified detection; one that is not refined says why."""
+        """Return the refined, verified detection, or the detection with the reason for failure."""
         refiner, cuboid = self._refiners[detection.object], self._cuboids[detection.object]
         T_cam_obj, covariance = detection.T_cam_obj, detection.covariance
         is_tracked = detection.agreement is not None  # set by refinement only
         if is_tracked:
             refined = refiner.refine(image, K, T_cam_obj, covariance, depth, followed=True)
-        elif not np.isfinite(detection.peaks).any():  # a template's, one of several starts
+        elif not np.isfinite(detection.peaks).any():  # a template match
             refined = refiner.refine(image, K, T_cam_obj, covariance, depth)
         else:
             # A tracker knows how far a part may have moved; a network's covariance may be wrong.
@@ -214,7 +214,7 @@ class PartRefiner:
 
 
 def _checked(evidence: DepthEvidence, end: Solution) -> Refinement:
-    """Return the end of a descent by depth alone, if depth confirms it."""
+    """Return the result of a descent on depth alone, if the depth image confirms the pose."""
     evidence.check(end.T_cam_obj)
     return Refinement(end.T_cam_obj, np.linalg.inv(end.information))
 
@@ -291,7 +291,7 @@ def rehearse_pose() -> None:
 
 
 def rehearse_refinement() -> None:
-    """Refine the pose of a drawn box, for the same purpose."""
+    """Refine the pose of a drawn box, which compiles the inner loops; see :func:`rehearse_pose`."""
     corners, K, T, pixels = _box()
     image = np.full((128, 128, 3), 40, np.uint8)
     cv2.fillConvexPoly(image, cv2.convexHull(np.rint(pixels).astype(np.int32)), (200, 160, 90))

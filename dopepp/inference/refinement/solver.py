@@ -26,7 +26,7 @@ DAMPING: Final = 1e-6  # share of each unknown's information: the prior determin
 ARRIVED: Final = 0.1  # standard deviations; a shorter step ends the descent
 
 # Standard deviations of a pose without covariance: radians, and diameters across and along the
-# viewing ray. An image says little about the distance.
+# viewing ray. An image hardly determines the distance.
 UNKNOWN_TURN: Final = math.radians(8.0)
 UNKNOWN_ACROSS: Final = 0.07
 UNKNOWN_ALONG: Final = 0.30
@@ -55,7 +55,7 @@ class Refinement:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """End of a descent."""
+    """Pose and information at the end of a descent."""
 
     T_cam_obj: Transform
     information: PoseMatrix  # inverse covariance of evidence and prior

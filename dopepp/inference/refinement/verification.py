@@ -73,7 +73,7 @@ Gradients = tuple[Int16[np.ndarray, "height width 3"], Int16[np.ndarray, "height
 
 
 class VerificationModel(NamedTuple):
-    """A network of one hidden layer, and how its inputs are normalised."""
+    """A network of one hidden layer, with the mean and scale that normalise its inputs."""
 
     mean: Float[np.ndarray, "evidence"]
     scale: Float[np.ndarray, "evidence"]

@@ -205,7 +205,7 @@ def pack(checkpoint: Checkpoint, export: Export) -> str:
 
 
 def described(checkpoint: Checkpoint, export: Export) -> dict[str, Any]:
-    """Return a checkpoint's content (:meth:`Checkpoint.to_file`) and how it was exported."""
+    """Return a checkpoint's content (:meth:`Checkpoint.to_file`) with an :class:`Export`."""
     content = checkpoint.to_file()
     content[KEY][_SECTION] = asdict(export)
     return content

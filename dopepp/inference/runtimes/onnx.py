@@ -79,7 +79,7 @@ class OnnxNetwork(ExportedNetwork):
             self.session = onnxruntime.InferenceSession(
                 content, options, providers=["CPUExecutionProvider"]
             )
-        except Exception as error:  # any error of the runtime
+        except Exception as error:  # the runtime raises several types
             raise invalid_export(path, error) from error
 
     def run(self, pixels: Pixels) -> Arrays:

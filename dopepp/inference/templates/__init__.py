@@ -179,7 +179,7 @@ class TemplateDetector:
         return np.concatenate(views), np.concatenate(poses), np.concatenate(features)
 
     def _matches(self, image: Picture, size: float) -> Matches:
-        """Return the best places of all templates for a projected diameter, pixels of the image."""
+        """Return the best positions of all templates for a projected diameter in image pixels."""
         most = math.sqrt(MAX_PIXELS / (image.shape[0] * image.shape[1]))
         scale = min(1.0, most, COARSE_PX / size)
         small = _resized(image, scale)

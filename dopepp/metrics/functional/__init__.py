@@ -92,7 +92,7 @@ def average_recall(errors: Errors, thresholds: Sequence[float]) -> float:
         UserError: There are no thresholds.
     """
     if not len(thresholds):
-        raise UserError("no thresholds", "one or more", "pass e.g. BOP_THRESHOLDS")
+        raise UserError("no thresholds", "at least one threshold", "pass e.g. BOP_THRESHOLDS")
     return sum(pass_rate(errors, threshold) for threshold in thresholds) / len(thresholds)
 
 

@@ -116,7 +116,7 @@ def largest_distance(points: Points) -> float:
 
 
 def _is_round(points: Float[np.ndarray, "points axes"]) -> bool:
-    """Return whether most of many points are corners of their hull, which makes it slow."""
+    """Return whether most points are corners of their hull, which is then slow to compute."""
     if len(points) <= _FEW_CORNERS:
         return False
     sample = points[:: len(points) // _FEW_CORNERS + 1]

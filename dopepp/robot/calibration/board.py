@@ -210,7 +210,7 @@ def _parsed(text: str) -> Board:
 
 
 def _allowed_instead(board: Board) -> str:
-    """Return what is allowed in place of an impossible board, or an empty string."""
+    """Return the allowed values if the board's dimensions are impossible, or an empty string."""
     if min(board.columns, board.rows) < 3 or not board.spacing >= 0.001:
         return "at least 3×3, squares of at least 1 mm"
     if max(board.columns, board.rows) * board.spacing * 1000 > LONGEST_MM:

@@ -119,13 +119,14 @@ def find_bench(touched: Float[np.ndarray, "points 3"]) -> Bench:
 
 
 def bench_of_board(T_base_board: Sequence[Transform], board: Board) -> Bench:
-    """Return the bench under a board that lies on it.
+    """Estimate the frame of the bench from a board that lies flat on it.
 
-    z points out of the board. Origin and x are the board's. A residual is the distance along z
-    between the board's centre according to a picture and the mean of all pictures.
+    The bench frame has the board's origin and x axis; its z axis points out of the board. A
+    residual is the distance along z between the board's centre in a picture and the mean of all
+    pictures.
 
     Args:
-        T_base_board: The board's pose from every picture.
+        T_base_board: Pose of the board in the base frame, one per picture.
         board: The board.
 
     Raises:
@@ -133,7 +134,7 @@ def bench_of_board(T_base_board: Sequence[Transform], board: Board) -> Bench:
     """
     if not len(T_base_board):
         fix = "add the robot's poses of the pictures"
-        raise UserError("no picture with a pose", "one or more", fix)
+        raise UserError("no picture with a robot pose", "at least one picture", fix)
     poses, middle = np.stack(T_base_board), board.points.mean(axis=0)
     R = nearest_rotation(poses[:, :3, :3].sum(axis=0)) @ np.diag([1.0, -1.0, -1.0])
     centres = poses[:, :3, :3] @ middle + poses[:, :3, 3]

@@ -68,7 +68,7 @@ class Thing:
 
 
 class Cell:
-    """A model of arm, gripper, bench and things.
+    """MuJoCo model of arm, gripper, bench and objects.
 
     Args:
         things: Things on the bench.
@@ -114,7 +114,7 @@ class Cell:
         return state
 
     def put(self, state: Any, number: int, T_base_obj: Transform) -> None:
-        """Place a thing at rest."""
+        """Place an object at rest."""
         joint = self.model.joint(f"thing{number}")
         position, velocity = int(joint.qposadr[0]), int(joint.dofadr[0])
         state.qpos[position : position + 3] = T_base_obj[:3, 3]
@@ -122,7 +122,7 @@ class Cell:
         state.qvel[velocity : velocity + 6] = 0.0
 
     def pose(self, state: Any, number: int) -> Transform:
-        """Return the pose of a thing, T_base_obj."""
+        """Return the pose of an object, T_base_obj."""
         body = self.model.body(f"thing{number}").id
         return make_transform(state.xmat[body].reshape(3, 3), state.xpos[body])
 

@@ -57,7 +57,7 @@ def show(
 
 
 class SideView:
-    """Renders the robot and the things of a scene from the side; needs OpenGL."""
+    """Renders the robot and the objects of a scene from the side; needs OpenGL."""
 
     def __init__(self, scene: TrialScene) -> None:
         things = [item.thing for item in scene.things]

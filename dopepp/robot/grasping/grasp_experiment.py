@@ -208,7 +208,7 @@ class Counts:
     caught: int
 
     def interval(self, count: int) -> tuple[float, float]:
-        """Return the 95 % Wilson interval of a count's share."""
+        """Return the 95 % Wilson interval of a count divided by the number of trials."""
         from dopepp.metrics.functional import wilson_interval  # imports torch
 
         return wilson_interval(count, self.trials)

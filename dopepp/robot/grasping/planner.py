@@ -233,7 +233,7 @@ class Planner:
                     yield make_transform(T[:3, :3], T[:3, 3] + depth * T[:3, 2])
 
     def _motion(self, T_base_tool: Transform, grasp: Grasp, start: Joints) -> Plan | None:
-        """Return the motion to a pose of the pads' ends, or None if it is not free or reachable."""
+        """Return a collision-free motion to a pose of the finger pads' ends, or None."""
         tip = self._knowledge.tip.copy()
         tip[2] += self._gripper.reach(grasp.width) - self._gripper.reach(0.0)
         T_base_flange = T_base_tool @ make_transform(np.eye(3), -tip)

@@ -57,7 +57,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class PlacedThing:
-    """A thing, and its initial pose T_base_obj."""
+    """An object, and its initial pose T_base_obj."""
 
     body: Body
     thing: Thing
@@ -65,7 +65,7 @@ class PlacedThing:
 
 
 class Layout:
-    """Draws the things on the bench.
+    """Draws a random arrangement of objects on the bench.
 
     Args:
         part: The part to grasp.
@@ -82,7 +82,7 @@ class Layout:
         self._yaw, self._rest = np.radians(yaw_deg), rest
 
     def draw(self, rng: Generator) -> list[PlacedThing]:
-        """Draw the things, the parts first."""
+        """Draw the objects and their poses, the parts first."""
         things: list[PlacedThing] = getattr(self, self._name)(rng)
         return things
 

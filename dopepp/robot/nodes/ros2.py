@@ -240,7 +240,7 @@ def _ros_errors(what: str) -> Iterator[None]:
         yield
     except Exception as error:  # rclpy raises many types
         allowed = "a running ROS 2, and names and values that it accepts"
-        fix = f"change {what} as the message says"
+        fix = f"change {what} as the message describes"
         raise UserError(f"{what}: {error!s:.300}", allowed, fix) from error
 
 
@@ -262,7 +262,7 @@ class Slot(Generic[Item]):
         self._thread.start()
 
     def put(self, item: Item) -> None:
-        """Offer a picture."""
+        """Store a picture for the thread, in place of a picture that is still waiting."""
         self.check()
         with self._fresh:
             self.received += 1

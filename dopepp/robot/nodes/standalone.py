@@ -119,7 +119,9 @@ def process_bag(
     check_target(target, (SUFFIX,))
     if target.exists() and target.samefile(source):
         fix = "pass another path, e.g. --out poses.mcap"
-        raise UserError(f"--out {target}, the recording itself", "another file", fix)
+        raise UserError(
+            f"--out {target}, which is the recording to read", "the path of another file", fix
+        )
     bag = Bag(source, topic)
     with draft(target) as path, _Recorder(path, name, worker) as recorder:
         for seconds, message, info in bag.messages():

@@ -73,7 +73,7 @@ class MixedBackgrounds:
         return [*self.usual.identity(), f"mixed {self.share:g}", *self.other.identity()]
 
     def draw(self, rng: Generator, width: int, height: int) -> Picture:
-        """Return a background of one of the two."""
+        """Draw a background from one of the two sources."""
         chosen = self.other if rng.random() < self.share else self.usual
         return chosen.draw(rng, width, height)
 

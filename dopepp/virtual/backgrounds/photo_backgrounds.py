@@ -113,7 +113,7 @@ class PhotoBackgrounds:
 
     @property
     def is_divided(self) -> bool:
-        """Whether these are the photos of one split, which no other split has."""
+        """Whether the photos belong to one split and no other split uses them."""
         return self.split != "all"
 
     def draw(self, rng: Generator, width: int, height: int) -> Picture:

@@ -30,7 +30,7 @@ class ProceduralBackgrounds:
     """Textures made from noise, gradients, tiles, bricks, wood and scattered shapes."""
 
     def identity(self) -> list[str]:
-        """Return the kind: there are no files."""
+        """Return the kind alone: procedural backgrounds are drawn without files."""
         return ["procedural"]
 
     def draw(self, rng: Generator, width: int, height: int) -> Picture:

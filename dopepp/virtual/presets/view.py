@@ -167,8 +167,8 @@ class View:
             )
         if largest > _WIDE_RATIO * smallest:
             lines.append(
-                f"that is a wide range of sizes (1 : {largest / smallest:.1f}): it takes longer to "
-                "learn than a narrower working_distance"
+                f"the range of sizes is wide (1 : {largest / smallest:.1f}): training takes longer "
+                "than for a narrower working_distance"
             )
         return lines
 

@@ -195,7 +195,7 @@ def _corner_normals(
 def _take_given(
     normals: Corners, given: Corners, doubled: Float[np.ndarray, "faces 3"], length: PerFace
 ) -> None:
-    """Replace computed normals by the file's where these are close to the face's normal.
+    """Replace computed normals by the file's normals that are close to the face's normal.
 
     Files also average normals over sharp edges; such normals are over half the crease angle away
     from the face's normal.

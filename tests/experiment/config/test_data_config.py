@@ -81,7 +81,7 @@ def test_what_does_not_exist_is_named(override, message, evaluated, stored):
     ("override", "message"),
     [
         ("++data.num_test=5", r"best\.ckpt, which names no data"),
-        ("data=virtual", r"best\.ckpt, which does not say how to render"),
+        ("data=virtual", r"best\.ckpt, which does not state how to render"),
     ],
 )
 def test_a_checkpoint_without_data_asks_for_them(override, message, evaluated):

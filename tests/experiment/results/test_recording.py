@@ -131,7 +131,7 @@ def test_an_evaluation_needs_something_to_measure(composed, tmp_path):
         run_evaluation(composed(config="evaluate"), tmp_path)
     with pytest.raises(UserError, match=r"x\.csv, which names no data; .*data=…"):
         run_evaluation(composed("results=x.csv", config="evaluate"), tmp_path)
-    with pytest.raises(UserError, match=r"x\.csv, which does not say how to render"):
+    with pytest.raises(UserError, match=r"x\.csv, which does not state how to render"):
         run_evaluation(composed("results=x.csv", "data=virtual", config="evaluate"), tmp_path)
     with pytest.raises(UserError, match=r"got refine=region without ckpt_path; .*leave out refine"):
         run_evaluation(composed("results=x.csv", "refine=region", config="evaluate"), tmp_path)

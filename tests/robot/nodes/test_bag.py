@@ -72,7 +72,7 @@ def test_what_cannot_be_is_one_line(recording, tmp_path):
     for words, said in (
         (("--bag", recording), "--bag without --out"),
         (("--bag", recording, "--out", tmp_path / "x.bag"), ".mcap"),
-        (("--bag", recording, "--out", recording), "the recording itself"),
+        (("--bag", recording, "--out", recording), "the recording to read"),
         (("--bag", tmp_path / "no.mcap", "--out", tmp_path / "x.mcap"), "no.mcap"),
         (("--bag", recording, "--out", tmp_path / "x.mcap", "--topic", "/no"), "/no"),
     ):

@@ -133,7 +133,7 @@ def test_it_is_said_in_words():
     ]
     coarse = view(0.4, 3.0).in_words([part(0.1)])
     assert "that is coarse" in coarse[-2]
-    assert "a wide range of sizes (1 : 7.5)" in coarse[-1]
+    assert "the range of sizes is wide (1 : 7.5)" in coarse[-1]
 
 
 @pytest.mark.parametrize("name", ["wide", "table", "quickstart"])

@@ -229,7 +229,7 @@ class NddsSettings:
         return {str(name) for name in listed} if isinstance(listed, list) else None
 
     def _objects(self, annotation: Path, label: str) -> list[dict[str, Any]]:
-        """Return the settings' entries of a class."""
+        """Return the entries of a class in ``_object_settings.json``."""
         entries = _entries(self._of(annotation, OBJECT_SETTINGS)[1], "exported_objects")
         return [entry for entry in entries if entry.get("class") == label]
 

@@ -54,7 +54,7 @@ OPENGL: Final = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True)
 class PoseConvention:
-    """One way to write poses; the defaults are those of NDDS."""
+    """Convention of unit, axes and rotation in which a file states poses (default: NDDS)."""
 
     quaternion: Quaternion = "xyzw"
     unit: Unit = "cm"

@@ -1,4 +1,4 @@
-"""Evidence of a depth image about a pose, and when to accept it: the depth term of refinement.
+"""Depth term of refinement: the evidence of a depth image about a pose, and its acceptance.
 
 The part is represented by its surface points, so a checkpoint is sufficient. A search over shifts
 finds the measured surface: a descent needs a start from which the nearest surface is the right one,
@@ -41,7 +41,7 @@ FARTHEST: Final = 3.0
 
 LEAST_INLIERS: Final = 0.5  # share of the unobstructed points with depth that must agree
 LEAST_SEEN: Final = 0.25  # share of the visible points that must have agreeing depth
-MOST_RMS: Final = 2.0  # standard deviations of the depth: a right pose has about one
+MOST_RMS: Final = 2.0  # RMS offset in standard deviations of the depth; about 1 at a right pose
 CLOSE: Final = 5.0  # spacings in front of a part in which no other object is expected
 BESIDE: Final = 3.0  # spacings around the part in which its surface must not continue
 SEARCHED_POINTS: Final = 400  # points in the search

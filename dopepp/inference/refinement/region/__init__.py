@@ -1,4 +1,4 @@
-"""Refinement on the image alone: the outline is moved to where the part's colours end.
+"""Refinement on the image: move the outline to the border between part and background colours.
 
 Colours inside the part's outline and around it are learned at the pose to refine. Along the normals
 of the outline, they and the image's edges show where the part ends
@@ -77,7 +77,7 @@ ENOUGH: Final = 0.6
 Starts = Callable[[], Sequence[Transform]]
 """Returns further start poses; called only if the search is extended."""
 
-Outcome = tuple[Solution, OutlineAgreement]  # end of a descent, and agreement of its outline
+Outcome = tuple[Solution, OutlineAgreement]  # solution of a descent, and agreement of its outline
 
 
 class RegionRefiner:
@@ -248,7 +248,7 @@ def _necessary(rounds: Sequence[Round], reach: float) -> Sequence[Round]:
     while len(rounds) > 1 and rounds[1].farthest(reach) >= ENOUGH * reach:
         rounds = rounds[1:]
     if len(rounds) == 1 and rounds[0].farthest(reach) < reach:
-        # Run it twice: the second pass learns the colours from a better pose.
+        # Run the last round twice: the second pass learns the colours at a better pose.
         return [*rounds, *rounds]
     return rounds
 

@@ -154,7 +154,7 @@ class Round:
             spacing, extent, position = self._spacing, self.crop.extent, pose[:3, 3].copy()
             return region_terms(rows, shifts, prior, spacing, extent, position, self._scale_error)
 
-        # The outline is the last: whether its distance counts depends on that of the other terms.
+        # The outline term is last, because its distance counts relative to the other terms.
         end = descend(start, prior, [*self._more, outline], self.stage.steps)
         if end is None:
             raise UndecidedError("the part's outline left the picture")

@@ -27,7 +27,7 @@ from dopepp.inference.refinement.region.shifts import Shifts
 from dopepp.inference.refinement.solver import DAMPING, NormalEquations
 
 INDEPENDENT_PX: Final = 4.0  # length of the outline within which errors are equal
-LEAST_INFORMATION: Final = 1e-3  # pixels⁻²; less counts as none
+LEAST_INFORMATION: Final = 1e-3  # pixels⁻²; smaller information is ignored
 
 REWEIGHTINGS: Final = 2
 
@@ -86,7 +86,7 @@ def _eliminate_scale(
     under a normal error of the same variance, so that the covariance contains the error.
     """
     both, target, column = np.empty((6, 6)), np.empty(6), np.zeros(6)
-    step, pull = np.empty(6), np.empty(6)  # without an error, and by an error of 1
+    step, pull = np.empty(6), np.empty(6)  # steps for a scale error of 0 and of 1
     for c in range(6):
         for a in range(3):
             column[c] += H[c, 3 + a] * position[a]

@@ -148,7 +148,7 @@ def _shifts(
             second += sums[k] * shift * shift
         mean = first / total
         variance = second / total - mean * mean
-        # An end beyond the search distance is no measurement.
+        # A shift beyond the search distance is not a measurement.
         inner = 1.0 - (sums[0] + sums[len(sums) - 1]) / total
         information = 1.0 / (variance + floor) - CHANCE / (unknown + floor)
         shifts[i, 0] = mean

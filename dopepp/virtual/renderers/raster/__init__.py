@@ -41,7 +41,7 @@ _MOST_PX: Final = 1_000_000  # a whole silhouette in a larger box is counted at 
 
 
 def render(scene: Scene) -> Rendered:
-    """Render a scene with 2×2 anti-aliasing; one without objects is its background."""
+    """Render a scene with 2×2 anti-aliasing; return the background of a scene without objects."""
     image, depth, instances = backdrop(scene)
     projected = [project_object(item, scene.K) for item in scene.objects]
     window = box_around(seen.box(scene.size) for seen in projected) or (0, 0, 0, 0)
