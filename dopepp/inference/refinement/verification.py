@@ -186,7 +186,8 @@ class Verifier:
         at = posed(self.mesh, T_cam_obj, K)
         if at is None:
             return None
-        corners = np.array([at.pixels.min(axis=0), at.pixels.max(axis=0)])
+        pixels = at.pixels.T.copy()  # numpy reduces long rows much faster than long columns
+        corners = np.array([pixels.min(axis=1), pixels.max(axis=1)])
         try:
             crop = crop_around(image, K, corners, LONGEST_PX)
         except UndecidedError:
@@ -242,7 +243,7 @@ class Verifier:
         seen = colours.reshape(-1, 3)[inside].astype(np.float64)
         normal_matrix = rows.T @ rows + 1e-3 * len(rows) * np.diag([0.0, 1.0, 1.0, 1.0])
         rest = seen - rows @ np.linalg.solve(normal_matrix, rows.T @ seen)
-        total, unexplained = seen.var(axis=0).sum(), (rest**2).sum() / len(rest)
+        total, unexplained = seen.T.copy().var(axis=1).sum(), (rest**2).sum() / len(rest)
         surroundings = float((cv2.meanStdDev(colours, mask=ring)[1] ** 2).sum())
         residual = 0.5 * math.log((unexplained + NOISE**2) / (surroundings + NOISE**2))
         return float(1 - unexplained / (total + NOISE**2)), residual

@@ -304,6 +304,20 @@ def test_tiles_tell_a_part_of_two_colours_before_the_same_two() -> None:
         assert np.where(mask == 1, tiled, -tiled)[:, columns].min() > 0.5
 
 
+@pytest.mark.parametrize("tiles", [1, 3])
+def test_log_odds_do_not_depend_on_pixels_beyond_the_surroundings(tiles):
+    image = np.random.default_rng(0).integers(0, 256, (110, 130, 3), np.uint8)
+    mask = np.zeros((110, 130), np.uint8)
+    cv2.ellipse(mask, (65, 55), (30, 15), 30.0, 0.0, 360.0, 1, -1)
+    bins = colour_bins(image)
+    cut = slice(20, 90), slice(20, 110)  # 15 pixels and more around the ellipse
+    odds, inner = (
+        log_odds(bins, mask, 1.5, 10.0, tiles),
+        log_odds(bins[cut], mask[cut], 1.5, 10.0, tiles),
+    )
+    np.testing.assert_array_equal(odds[cut], inner)
+
+
 def test_descent_without_evidence_returns_to_the_prior() -> None:
     prior = Prior(TRUE, np.diag(1 / DEVIATIONS**2))
     result = descend(started(1), prior, [lambda pose, known: (np.zeros((6, 6)), np.zeros(6))], 8)
