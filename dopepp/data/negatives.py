@@ -93,7 +93,7 @@ class UnlabelledRenders:
         return False
 
     def describe(self) -> list[SourceInfo]:
-        """Describe the renders."""
+        """Return the description of the renders without labels."""
         return self.renders.describe()
 
 

@@ -45,7 +45,7 @@ def focal_factor(
 
     Args:
         cuboid: Keypoints of the object, metres.
-        keypoints: Their detected pixels; NaN if unknown.
+        keypoints: Detected positions of the keypoints, pixels; NaN if missing.
         T_cam_obj: Pose estimated with K, metres.
         K: Camera matrix, pixels.
 

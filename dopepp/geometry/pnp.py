@@ -83,7 +83,7 @@ def solve_pnp(
 
     Args:
         object_points: Points in the object frame, metres.
-        image_points: Their pixels; a row with NaN is a missing point.
+        image_points: Positions of the points on the image, pixels; NaN marks a missing point.
         K: Camera matrix, pixels; it may have skew.
         sigma_px: Standard deviation of each pixel position (isotropic), pixels.
         covariance_px: Covariance of each pixel position, pixels², instead of ``sigma_px``. A point

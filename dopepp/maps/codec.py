@@ -224,7 +224,7 @@ def _strongest(belief: Array, threshold: float, score: Array, cells: Array) -> i
 
 @compiled()
 def _is_highest(belief: Array, y: int, x: int) -> bool:
-    """Return whether a cell is the highest of its 3×3 neighbourhood, which has only one such."""
+    """Return whether a cell is the highest of its 3×3 neighbourhood; ties have a single winner."""
     value = belief[y, x]
     for v in range(max(y - 1, 0), min(y + 2, belief.shape[0])):
         for u in range(max(x - 1, 0), min(x + 2, belief.shape[1])):

@@ -23,7 +23,7 @@ FIRST_MARGIN: Final = 3.0
 """Squared cells by which a cell must be nearer to its peak than to another peak, while positions
 within cells are unknown."""
 
-MARGIN: Final = 1.0  # As above once both positions are fitted.
+MARGIN: Final = 1.0  # FIRST_MARGIN after both positions are fitted
 SURELY: Final = 1e-6  # Squared cells that exceed the rounding of distances.
 
 PLATEAU: Final = 3  # Number of cells as high as the peak that means a clamped top.

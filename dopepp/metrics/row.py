@@ -159,7 +159,7 @@ class PoseRow:
             nothing is reported.
         false_per_frame: Detections without an instance, per image.
         average_precision: AP over the scores, correct with ADD(-S) below a tenth of the diameter.
-        num_symmetries: As in :class:`PoseErrors`.
+        num_symmetries: Number of symmetry transforms of the object, including the identity.
     """
 
     object: str

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import scipy  # loads its submodules on first use
+import scipy  # SciPy loads its submodules on first use
 from jaxtyping import Float
 
 from dopepp.core.compiled import Array, compiled
@@ -52,7 +52,7 @@ the peak is pulled inward."""
 
 DIAGONALS: Final = np.array([(0, 6), (1, 7), (2, 4), (3, 5)])  # Opposite corners
 ALTERNATING: Final = np.array([1.0, -1.0, 1.0, -1.0])  # Arms of first corners sum to 0 with these
-RIVALS: Final = -2  # Replaces a peak that is the best one of two instances
+RIVALS: Final = -2  # marks a peak that is the best of two instances
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,8 @@ from dopepp.geometry.cuboid import NUM_CORNERS, Cuboid
 from dopepp.geometry.pnp import PnPResult
 from dopepp.recovery.association import KeypointGroup
 
-FEATURES: Final = ("bias", "belief", "spread", "misfit", "found")  # Of the score, in this order
-REFINED_FEATURES: Final = ("bias", "score", "verification")  # Of a refined pose's score
+FEATURES: Final = ("bias", "belief", "spread", "misfit", "found")  # features of the score, in order
+REFINED_FEATURES: Final = ("bias", "score", "verification")  # features of a refined pose's score
 
 _FORMER_FEATURES: Final = frozenset({"refined_agreement", "refined_support"})
 
@@ -46,15 +46,15 @@ PASSING: Final = 0.1  # ADD over the diameter below which a pose is right
 # Squared Mahalanobis distances in 6D that three quarters and a tenth exceed.
 _QUARTER: Final = 3.455
 _TENTH_BEYOND: Final = 10.645
-_WRONG_RANGE: Final = math.log(1e6)  # Of the logarithms of wrong poses' squared distances
+_WRONG_RANGE: Final = math.log(1e6)  # range of ln(squared distance) of wrong poses
 _CERTAIN: Final = 1e-3  # Beliefs within this distance of 0 or 1 are treated alike
 _EXPONENTS: Final = 4.0  # Logarithms are clipped beyond this, so that outliers do not dominate
 _TYPICAL_MISFIT: Final = 0.01  # Average reprojection error over the size in the image
 _RIDGE: Final = 0.1  # Weight of the squared weights, in detections, which keeps them finite
-_USUAL_RIDGE: Final = 1.0  # The same for weights that are known beforehand
+_USUAL_RIDGE: Final = 1.0  # ridge weight around ``usual`` weights
 _STEPS: Final = 50  # Maximum number of Newton steps
 _MEAN_BELIEF: Final = tuple(float(name == "belief") for name in FEATURES)
-_VERIFIED: Final = 1e-4  # As _CERTAIN, for the probability of a verified pose
+_VERIFIED: Final = 1e-4  # least distance of a verified probability from 0 and 1
 
 
 @dataclass(frozen=True)

@@ -277,9 +277,8 @@ class EmptyMaps(Callback):
         text += "train longer (trainer.max_epochs)"
         if isinstance(system.loss, MapMSE):
             text += (
-                "; to the squared error of model/loss=mse, whose peaks are a few cells of a map, "
-                "empty maps are a good answer for long: model/loss=spatial_ce learns from the "
-                "first step on"
+                "; with model/loss=mse, empty maps have a small squared error because peaks cover "
+                "few cells: model/loss=spatial_ce learns from the first step on"
             )
         return text
 

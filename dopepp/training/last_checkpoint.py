@@ -78,7 +78,7 @@ class LastCheckpoint(Checkpoint):
         epochs = fit_loop["epoch_progress"]["total"]
         if self._cut is not None:
             self._cut(fit_loop)
-        elif epochs["processed"] == epochs["ready"]:  # the best checkpoint, at the end of an epoch
+        elif epochs["processed"] == epochs["ready"]:  # the best checkpoint, saved after an epoch
             _between_epochs(fit_loop)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -214,7 +214,7 @@ def _restore_position(trainer: Trainer) -> None:
     batches = epoch_loop.batch_progress
     num_done = 0 if batches.is_last_batch else batches.current.ready
     if epochs.ready == epochs.completed or batches.current.ready == 0:
-        epoch_loop.restarting = False  # nothing of this epoch is done yet
+        epoch_loop.restarting = False  # no batch of this epoch is processed
         num_done = 0
     # Lightning does not do this if the schedule has requested the number of steps.
     loader = trainer.train_dataloader

@@ -107,7 +107,7 @@ class GuardedLogger(Logger):
             return None
         try:
             return call()
-        except Exception as error:  # networks, disks and services raise any exception
+        except Exception as error:  # networks, disks and services can raise any exception
             self._failed = True
             _log.warning("a logger failed and is disabled for the rest of the run: %r", error)
             return None
@@ -171,7 +171,7 @@ class GuardedLogger(Logger):
     def close(self, failed: bool) -> None:
         """End the logger's run; later values belong to another run."""
         if isinstance(self.inner, WandbLogger):
-            self._failed = False  # a run whose logging failed must end, too
+            self._failed = False  # a failed logger's run must end, too
             self.guard(lambda: _finish_wandb(failed))
         else:
             self.finalize("failed" if failed else "success")
@@ -179,7 +179,7 @@ class GuardedLogger(Logger):
 
 def _finish_wandb(failed: bool) -> None:
     """End the open run of Weights & Biases; the next run replaces a dead service."""
-    import wandb  # slow to import
+    import wandb  # Weights & Biases is slow to import
 
     try:
         wandb.finish(exit_code=int(failed))

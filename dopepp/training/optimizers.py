@@ -50,7 +50,7 @@ class Muon(AdamW):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
-        """Take one step; return the closure's loss."""
+        """Run one optimiser step; return the closure's loss."""
         loss = None
         if closure is not None:
             with torch.enable_grad():

@@ -60,7 +60,7 @@ class PoseSystem(LightningModule):
 
     Args:
         network: The network to train.
-        loss: Its loss.
+        loss: Loss of the network's maps against the target maps.
         parts: The objects, in the order of the network's channels.
         geometry: Geometry of the target maps.
         recovery: Options of the recovery from maps to poses.

@@ -147,7 +147,7 @@ def arrange_floating(composition: Composition, targets: Sequence[Body], usual: B
     """
     for body in targets:
         material = composition.draw_material(body)
-        # Of the preset ``paper``, four of five first poses are accepted.
+        # In the preset ``paper``, four of five first poses are accepted.
         for pose in islice(_poses(composition, body), 200):
             if _is_clear(composition, body, pose) and composition.add(body, pose, material):
                 break

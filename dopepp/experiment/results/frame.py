@@ -95,7 +95,7 @@ class Value(NamedTuple):
 
     @property
     def is_change(self) -> bool:
-        """Whether the value is a difference to the baseline."""
+        """Whether the value is a difference from the baseline."""
         return self.measure.startswith(DELTA)
 
     @property

@@ -180,7 +180,7 @@ class Verifier:
             image: RGB.
             K: Camera matrix, pixels.
             T_cam_obj: Pose, metres.
-            covariance: Its covariance.
+            covariance: Covariance of the pose, as in :class:`PartRefiner`; camera axes.
             moved: Mahalanobis distance from the pose before refinement.
         """
         at = posed(self.mesh, T_cam_obj, K)

@@ -31,7 +31,7 @@ MAX_UNPACKED_BYTES: Final = 50_000_000
 """Largest text in a 3MF file: trimesh uses 17 times as much memory."""
 
 MAX_PIECES: Final = 1000  # Most meshes of a part; bounds time
-MAX_TRIANGLES: Final = 5_000_000  # Of all pieces, counted once per instance
+MAX_TRIANGLES: Final = 5_000_000  # sum over all pieces, counted once per instance
 UNITS_3MF: Final = {"millimeter": "mm", "centimeter": "cm", "meter": "m", "inch": "inch"}
 """Unit by 3MF's name; 3MF also has feet and micrometres."""
 
@@ -39,7 +39,7 @@ _STL_HEADER: Final = 84
 _STL_TRIANGLE: Final = 50
 """Bytes of a binary STL file's header (title and uint32 count) and of each triangle."""
 
-MAX_HEADER_BYTES: Final = 10_000_000  # Of the JSON: Python uses twenty times as much memory
+MAX_HEADER_BYTES: Final = 10_000_000  # size of the JSON; Python needs 20 times as much memory
 MAX_VALUES: Final = 30_000_000
 """Most numbers and vectors of all primitives, which copy shared arrays."""
 

@@ -23,7 +23,7 @@ from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import FORMATS, MAX_SIDE, Picture, read_picture
 from dopepp.parts.mesh import Faces, RawMesh, Vertices
 
-MAX_OFF_BYTES: Final = 50_000_000  # Of an OFF file: its words use fifteen times as much memory
+MAX_OFF_BYTES: Final = 50_000_000  # size of an OFF file; parsing needs 15 times as much
 MAX_MATERIAL_BYTES: Final = 10_000_000
 """Largest material file (a hundred thousand materials); bounds memory."""
 

@@ -59,9 +59,9 @@ class Sighting:
 class BoardPose:
     """A board's pose in a picture."""
 
-    name: str  # of the picture
+    name: str  # name of the picture
     T_cam_board: Transform
-    # Of a rotation about the board's origin and a translation, camera axes (radians, metres).
+    # Covariance of the rotation about the board's origin (radians) and shift (metres), camera axes.
     covariance: Float[np.ndarray, "6 6"]
     error_px: float  # RMS reprojection error, pixels
     distance: float  # distance from the camera to the mean of the points, metres

@@ -56,7 +56,7 @@ class HandEye:
     mount: Mount  # `hand` (the camera is on the flange) or `bench`
     T_mount_cam: Transform  # T_flange_cam, or T_base_cam of a camera on the bench
     T_other_board: Transform  # T_base_board, or T_flange_board
-    # Of a rotation of the camera about its origin and a shift, camera axes (radians, metres).
+    # Covariance of the camera's rotation about its origin (radians) and shift (metres)
     covariance: Float[np.ndarray, "6 6"]
     turns: Float[np.ndarray, "poses"]  # rotation error of every pose, radians
     shifts: Float[np.ndarray, "poses"]  # translation error, metres

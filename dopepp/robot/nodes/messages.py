@@ -80,7 +80,7 @@ class AnswerFormatter:
         parts: The worker's parts, with meshes if available.
 
     Raises:
-        UserError: The names of two parts lead to the same topic.
+        UserError: Two parts' names give one topic name.
     """
 
     def __init__(self, parts: Sequence[Part]) -> None:
@@ -128,7 +128,7 @@ class AnswerFormatter:
         ]
 
     def _frames(self, answer: Answer) -> list[tuple[str, Detection]]:
-        """Return every detection with the name of its frame, ``<object>_<n>``."""
+        """Return every detection with its TF frame name, ``<object>_<n>``."""
         return [
             (f"{self._names[detection.object]}_{number}", detection)
             for number, detection in zip(answer.numbers, answer.result.detections, strict=True)

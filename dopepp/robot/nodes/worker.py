@@ -184,7 +184,7 @@ class Worker:
 
         Args:
             frame: The picture.
-            camera: Its camera.
+            camera: Camera that took the picture.
             cropped: Whether the principal point may be far from the centre.
 
         Raises:

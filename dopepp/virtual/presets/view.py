@@ -42,8 +42,8 @@ class View:
     """A camera and its working distances.
 
     Attributes:
-        size: (width, height) of its pictures, pixels.
-        K: Its camera matrix, pixels.
+        size: (width, height) of the camera's pictures, pixels.
+        K: Camera matrix, pixels.
         distance: Nearest and farthest distance of a part's middle, along the optical axis, metres.
         source: Origin of the camera, for messages.
 

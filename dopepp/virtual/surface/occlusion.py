@@ -168,7 +168,7 @@ def _bake(
     distance = 20.0 * radius  # almost parallel rays
     focal = 0.5 * (side - 4) * distance / radius
     K = np.array([[focal, 0.0, 0.5 * side], [0.0, focal, 0.5 * side], [0.0, 0.0, 1.0]])
-    # As for shadows: a point lifted by more than √2 texels is not hidden by its own plane.
+    # A point lifted by more than √2 texels is not hidden by its own plane.
     lift = 1.5 * 2.0 * radius / side
     cam, hom = np.empty_like(vertices), np.empty_like(vertices)
     depth = np.empty((side, side, 1), np.float32)

@@ -50,7 +50,7 @@ class NddsObject:
     Attributes:
         quaternion: The four numbers of ``quaternion_xyzw`` as they stand in the file.
         corners_px: ``projected_cuboid`` without its centroid, if stated.
-        cuboid: The same corners in space, if stated.
+        cuboid: Corners in space, in the order of ``corners_px``, if stated.
         centroid: ``cuboid_centroid``, or else the mean of ``cuboid``; None without both.
         visibility: In [0, 1], or −1 for unknown, if stated.
     """
@@ -257,7 +257,7 @@ def read_depth(record: Mapping[str, Any], annotation: Path, shape: Shape) -> Dep
 
     Args:
         record: The annotation, which may state the unit.
-        annotation: Its path; FAT's naming also implies a unit.
+        annotation: Path of the annotation; FAT's file names also imply a unit.
         shape: (height, width) of the image.
     """
     unit = stated(record, "depth_unit_m")

@@ -109,7 +109,7 @@ class RegionRefiner:
         """Refine one pose; see :meth:`~dopepp.inference.refinement.refiner.PartRefiner.refine`.
 
         ``starts`` returns further start poses if the image does not agree with poses near the given
-        one. Drawn poses are added to them. None: the covariance is trusted.
+        one. Randomly drawn poses are added. Without ``starts``, the search is not extended.
         """
         given = np.asarray(T_cam_obj, np.float64)
         try:

@@ -184,8 +184,8 @@ class Round:
 
         Args:
             end: End of the descent.
-            prior: Its prior.
-            reach: Its search distance, pixels of the image.
+            prior: Prior of the descent.
+            reach: Search distance of the descent, pixels of the image.
             information: Information at the end without the outline.
 
         Raises:

@@ -63,8 +63,8 @@ class Silhouette:
     """The pixels of an unoccluded object.
 
     Attributes:
-        mask: Its pixels within the image.
-        num_px: Its pixels on a canvas without borders; infinite around the camera.
+        mask: Whether each image pixel shows the object.
+        num_px: Number of pixels on an unbounded canvas; infinite around the camera.
         box: Bounds of those pixels, perhaps beyond the image; None behind the camera.
     """
 

@@ -67,7 +67,7 @@ _GROUP_TYPES: Final = {
 def gather_fragments(
     item: SceneObject, projected: Projected, scene: Scene, samples: Samples, first_id: int
 ) -> Fragments | None:
-    """Collect an object's fragments, or None without any; the arrays are reused for the next.
+    """Collect an object's fragments; None if it has none. The next call overwrites the arrays.
 
     ``first_id`` is the number of the object's first triangle; the albedo and alpha are not set.
     """
