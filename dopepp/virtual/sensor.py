@@ -191,7 +191,7 @@ def _add_noise(
     """Add read and shot noise, with normal values from a table.
 
     ``image`` and ``noisy`` are flat uint8. ``read`` is a variance in squared grey levels, and
-    ``shot`` a variance per grey level. The table has ``_NOISE_RUN`` more values than a power of two.
+    ``shot`` a variance per grey level. The table has a power of two plus ``_NOISE_RUN`` values.
     """
     count, mask = image.shape[0], np.uint32(table.shape[0] - _NOISE_RUN - 1)
     start = _mixed(np.uint32(seed) ^ np.uint32(0x9E3779B9))
