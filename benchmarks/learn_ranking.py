@@ -38,9 +38,7 @@ RATIO = 1.5  # of the working distances
 RIGHT_TURN, RIGHT_PLACE, RIGHT_DEPTH = 12.0, 0.08, 0.06  # degrees, diameters, relative
 HELD_OUT = 4  # every fourth part judges the models
 RIDGE = 1e-2
-MIN_SCORE = 0.5
 KEPT = 6  # refined poses of each picture
-ENDS = ("refined_bias", "refined_score", "refined_verification")  # features of a refined pose
 
 
 def samples(number: int, num_scenes: int, seed: int) -> list[dict[str, np.ndarray]]:
@@ -89,7 +87,7 @@ def samples(number: int, num_scenes: int, seed: int) -> list[dict[str, np.ndarra
             {
                 "features": features,
                 "is_right": is_right,
-                "refined": np.array([refined_features(it) for it in best]),
+                "odds": np.array([refined_features(it)[2] for it in best]),
                 "is_end_right": np.array([far < 0.1 or near < 0.015 for far, near in ends], bool)
                 & shows_part,
                 "part": np.array(seed * 1000 + number),
@@ -159,33 +157,31 @@ def main() -> None:
     rows = [row for path in options.samples for row in pickle.loads(path.read_bytes())]
     held = [row for row in rows if row["part"] % HELD_OUT == 0]
     learned = [row for row in rows if row["part"] % HELD_OUT]
-    report(fit_ranking(learned), fit_ends(learned), held)
+    report(fit_ranking(learned), fit_slope(learned), held)
     weights = fit_ranking(rows)
-    bias, ends = fit_bias(rows, weights), fit_ends(rows)
     names = [path.name for path in options.samples]
     values = {
         "command": f"python benchmarks/learn_ranking.py {' '.join(names)} --fit",
         "weights": dict(zip(ranking.FEATURES, np.round(weights, 5).tolist(), strict=True)),
-        "bias": round(bias, 3),
-        "score": {
-            **dict(zip(ENDS, np.round(ends, 4).tolist(), strict=True)),
-            "refined_min_score": MIN_SCORE,
-        },
+        "bias": round(fit_bias(rows, weights), 3),
+        "score": {"refined_verification": round(fit_slope(rows)[1], 4)},
     }
     path = Path(ranking.__file__).with_name("ranking.json")
     path.write_text(json.dumps(values, indent=1) + "\n", "utf-8")
     print(f"written: {path}")
 
 
-def fit_ends(rows: list[dict[str, np.ndarray]]) -> np.ndarray:
-    """Return the weights of :data:`ENDS`, from the best refined poses of each picture."""
-    features = np.concatenate([row["refined"] for row in rows])
+def fit_slope(rows: list[dict[str, np.ndarray]]) -> tuple[float, float]:
+    """Return the level and slope that turn log odds of verification into those of a best pose."""
+    odds = np.concatenate([row["odds"] for row in rows])
     labels = np.concatenate([row["is_end_right"] for row in rows])
-    model = LogisticRegression(fit_intercept=False).fit(features, labels)
-    return np.asarray(model.coef_[0])
+    model = LogisticRegression().fit(odds[:, None], labels)
+    return float(model.intercept_[0]), float(model.coef_[0, 0])
 
 
-def report(weights: np.ndarray, ends: np.ndarray, rows: list[dict[str, np.ndarray]]) -> None:
+def report(
+    weights: np.ndarray, line: tuple[float, float], rows: list[dict[str, np.ndarray]]
+) -> None:
     """Print the quality on parts that were not learned."""
     shown = [row for row in rows if row["is_right"].any()]
     ranks = np.array(
@@ -194,9 +190,9 @@ def report(weights: np.ndarray, ends: np.ndarray, rows: list[dict[str, np.ndarra
     print(f"{len(rows)} pictures; a right match in {len(shown)}, at rank", end="")
     for limit in (1, 10, 60, 300):
         print(f" < {limit}: {np.mean(ranks < limit):.1%}", end="")
-    features = np.concatenate([row["refined"] for row in rows])
+    odds = np.concatenate([row["odds"] for row in rows])
     labels = np.concatenate([row["is_end_right"] for row in rows])
-    stated = 1 / (1 + np.exp(-features @ ends))
+    stated = 1 / (1 + np.exp(-line[0] - line[1] * odds))
     print(f"\nrefined poses: Brier {brier_score_loss(labels, stated):.4f}")
     for least in (0.3, 0.5, 0.7, 0.9, 0.95):
         reported = stated >= least

@@ -33,7 +33,7 @@ from dopepp.inference.refinement.outline import make_outline_mesh
 from dopepp.inference.templates.matching import STRIDE, Matches, match
 from dopepp.inference.templates.ranking import describe, learned_ranking
 from dopepp.inference.templates.responses import edge_responses
-from dopepp.inference.templates.views import make_templates, view_rotations
+from dopepp.inference.templates.views import joined, make_templates, view_rotations
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 
@@ -41,11 +41,13 @@ COARSE_PX: Final = 80.0  # diameter of the part on the image that all places are
 FINE_PX: Final = 140.0  # largest diameter on the image that the best matches are ranked on
 SMALLEST_PX: Final = 12.0  # least diameter that templates can detect
 SCALE_STEP: Final = 1.13  # ratio of neighbouring distances
+PERSPECTIVE: Final = 0.15  # difference of diameter over distance between drawings of a view
 OCTAVE: Final = 2.0  # ratio of diameters that are ranked on one image
 COARSE_SPREAD: Final = 5  # pixels
 FINE_SPREAD: Final = 3
 
-NUM_RANKED: Final = 4000  # matches
+NUM_RANKED: Final = 6000  # matches
+EXTENT: Final = 2.5  # standard deviations that a view one diameter long is worth
 NUM_STARTS: Final = 60  # start poses
 
 # Poses that refinement would move to the same end.
@@ -84,8 +86,16 @@ class TemplateDetector:
         self._centre = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
         group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous, max_step=0.1)
         rotations = view_rotations(tilt_deg, group[:, :3, :3])
-        depth = math.sqrt(working_distance[0] * working_distance[1])
-        self._templates = make_templates(mesh, self._centre, part.diameter, depth, rotations)
+        # Near the camera, a part looks different at each distance.
+        nearness = part.diameter / np.array(working_distance)
+        count = max(1, math.ceil((nearness[0] - nearness[1]) / PERSPECTIVE))
+        steps = (np.arange(count) + 0.5) / count
+        self._nearness = nearness[0] + (nearness[1] - nearness[0]) * steps
+        self._groups = [
+            make_templates(mesh, self._centre, part.diameter, part.diameter / near, rotations)
+            for near in self._nearness
+        ]
+        self._templates = joined(self._groups)
 
     def detect(
         self,
@@ -158,9 +168,10 @@ class TemplateDetector:
                 f"at least {SMALLEST_PX * max(least, 1.0):.0f} pixels",
                 "search a region (roi), or state a nearer working distance",
             )
-        groups = [self._matches(image, size) for size in sizes]
+        groups = [self._matches(image, size, size / focal_length(K)) for size in sizes]
         matches = Matches(*(np.concatenate(columns) for columns in zip(*groups, strict=True)))
-        best = np.argsort(-matches.scores)[:NUM_RANKED]
+        promise = matches.scores + EXTENT * self._templates.extents[matches.views]
+        best = np.argsort(-promise)[:NUM_RANKED]
         matches = Matches(*(column[best] for column in matches))
         octaves = np.floor(np.log(sizes[0] / matches.poses[:, 3]) / math.log(OCTAVE) + 1e-9)
         views, poses, features = [], [], []
@@ -178,15 +189,19 @@ class TemplateDetector:
             features.append(described)
         return np.concatenate(views), np.concatenate(poses), np.concatenate(features)
 
-    def _matches(self, image: Picture, size: float) -> Matches:
-        """Return the best positions of all templates for a projected diameter in image pixels."""
+    def _matches(self, image: Picture, size: float, nearness: float) -> Matches:
+        """Return the best positions of all templates at a distance.
+
+        ``size`` is the projected diameter, pixels; ``nearness`` the diameter over the distance.
+        """
         most = math.sqrt(MAX_PIXELS / (image.shape[0] * image.shape[1]))
         scale = min(1.0, most, COARSE_PX / size)
         small = _resized(image, scale)
         responses = edge_responses(small, COARSE_SPREAD, _odd(size * scale))
-        matches = match(responses, self._templates, size * scale)
+        group = int(np.abs(self._nearness - nearness).argmin())
+        matches = match(responses, self._groups[group], size * scale)
         matches.poses[:, [0, 1, 3]] /= scale
-        return matches
+        return matches._replace(views=matches.views + group * len(self._groups[0].points))
 
     def transforms(
         self, views: np.ndarray, poses: np.ndarray, K: CameraMatrix

@@ -7,7 +7,8 @@ on the image follow from it by rotating, scaling and shifting its points.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import Final
 
 import cv2
@@ -111,6 +112,16 @@ def make_templates(
         rows[..., 4] > 0,
         (np.stack(inner) - half) / DRAWN_PX,
         np.ptp(points, axis=1).max(axis=1),
+    )
+
+
+def joined(groups: Sequence[Templates]) -> Templates:
+    """Return the templates of several groups in one, in their order."""
+    return Templates(
+        *(
+            np.concatenate([getattr(group, field.name) for group in groups])
+            for field in fields(Templates)
+        )
     )
 
 
