@@ -118,7 +118,7 @@ class RecoveryOptions:
             detections (ADD below a tenth of the diameter; mean of five networks) on one half of
             the frames. On the other half it kept 94 % of them and 6 % of the false candidates.
         distance_factor: Factor on the distance of every pose, set by ``evaluate.py tune=true``.
-        covariance_factor: Factor on the covariance of every pose, set likewise.
+        covariance_factor: Factor on the covariance of every pose, set by ``tune=true``.
         score_bias: First weight of the score's features, set by ``evaluate.py tune=true``; with
             the defaults, the score is the mean belief.
         refined_min_score: Refined detections below this score are dropped.

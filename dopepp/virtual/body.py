@@ -123,7 +123,7 @@ def make_hull(surface: Surface) -> Hull:
     except QhullError:
         # A flat or straight mesh has no volume; joggled by a rounding error, it has.
         hull = ConvexHull(used, qhull_options="QJ")
-    # Wound so that their normals point outwards.
+    # The order of corners makes normals point outwards.
     a, b, c = hull.points[hull.simplices].swapaxes(0, 1)
     inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
     triangles = hull.simplices.copy()

@@ -244,7 +244,7 @@ class BopScene:
 
     Attributes:
         files: Image files relative to the folder; empty for an image that is not on disk.
-        depth_files: Depth images likewise.
+        depth_files: Depth files relative to the folder; empty if missing.
         depth_scales: Millimetres per unit of the depth images; NaN where not stated.
         first: Image i has the objects ``first[i] … first[i + 1] − 1``.
         gt_ids: Each object's index in its image's list, which names its masks.
