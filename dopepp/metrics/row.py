@@ -149,7 +149,7 @@ class PoseRow:
         add_or_s_01d: Like ``add_01d``, with ADD-S for a part with symmetries.
         ar_mssd: BOP's average recall of MSSD.
         ar_mspd: BOP's average recall of MSPD; None if an image's camera is unknown.
-        mspd_5px: Share of instances with MSPD below 5 pixels of a 640 px wide image; None without cameras.
+        mspd_5px: Share of instances with MSPD below 5 px at 640 px width; None without cameras.
         median_deviations: Median ratio of the true errors to the stated standard deviations, 1 if
             they are calibrated; None without covariances.
         coverage: Share of matched poses within their 90 % covariance region, or None.
