@@ -7,7 +7,6 @@ import runpy
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any, ClassVar, NamedTuple
 
 import pytest
@@ -214,7 +213,9 @@ def near_truth(monkeypatch):
             covariance = np.diag([0.03**2] * 3 + [0.001**2] * 3)
             return Detection(self.part.name, score, score, T, points, peaks, 0.0, covariance)
 
-    templates = ModuleType("dopepp.inference.templates")
-    templates.TemplateDetector = NearTruth
-    monkeypatch.setitem(sys.modules, templates.__name__, templates)
+    def silent_level(part, distances, tilt, loudest):
+        return 0.0
+
+    monkeypatch.setattr("dopepp.inference.templates.TemplateDetector", NearTruth)
+    monkeypatch.setattr("dopepp.inference.template_estimator.silent_level", silent_level)
     return NearTruth

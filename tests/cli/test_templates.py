@@ -46,7 +46,7 @@ def test_predict_draws_and_writes_the_pose_of_a_mesh(run, truth, tmp_path):
     (line,) = map(json.loads, done.stdout.splitlines())
     assert line["object"] == "piv"
     assert np.abs(np.array(line["T_cam_obj"]) - truth).max() < 0.01
-    assert line["score"] == pytest.approx(line["probability"], abs=1e-3)
+    assert line["score"] > line["probability"] > 0.5  # above a silent level of 0
     assert line["agreement"] > 0.5
     assert len(list((tmp_path / "out").iterdir())) == 1
     assert json.loads((tmp_path / "p.json").read_text())

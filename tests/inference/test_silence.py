@@ -1,0 +1,61 @@
+"""The level that a pose must exceed: what templates find on photos without the part."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dopepp.inference.templates import silence
+from dopepp.parts.catalogue import pivconnector
+
+DISTANCES = (0.2, 0.3)
+
+
+@pytest.fixture
+def measured(monkeypatch, tmp_path):
+    """Use an empty cache folder, and return the pictures that are measured."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return []
+
+
+def level_of(measured, values, part=None, distances=DISTANCES, tilt=180.0):
+    def loudest(picture, K):
+        measured.append((picture, K))
+        return values[(len(measured) - 1) % len(values)]
+
+    return silence.silent_level(part or pivconnector(), distances, tilt, loudest)
+
+
+def test_level_is_mean_and_deviations_of_different_photos(measured):
+    values = list(np.random.default_rng(0).normal(2.0, 0.5, silence.NUM_PHOTOS))
+    level = level_of(measured, values)
+    assert level == pytest.approx(np.mean(values) + silence.MARGIN * np.std(values))
+    pictures = [picture for picture, _ in measured]
+    assert len(pictures) == silence.NUM_PHOTOS
+    assert {picture.shape for picture in pictures} == {(*silence.SIZE[::-1], 3)}
+    assert len({picture.tobytes() for picture in pictures}) == silence.NUM_PHOTOS
+    focal = measured[0][1][0, 0]
+    shown = focal * pivconnector().diameter / math.sqrt(0.2 * 0.3)
+    assert shown == pytest.approx(silence.PART_PX)
+
+
+def test_level_is_measured_once_for_a_part_and_its_options(measured):
+    first = level_of(measured, [1.0])
+    assert level_of(measured, [5.0]) == first
+    assert len(measured) == silence.NUM_PHOTOS
+    assert level_of(measured, [5.0], distances=(0.2, 0.4)) == 5.0
+    assert level_of(measured, [6.0], tilt=60.0) == 6.0
+
+
+def test_level_is_never_below_even_odds(measured):
+    assert level_of(measured, [-3.0]) == silence.LOWEST
+
+
+@pytest.mark.parametrize("damage", [b"", b"{", b'"high"', b"[1.0]"])
+def test_damaged_file_is_measured_again(measured, tmp_path, damage):
+    level_of(measured, [1.0])
+    (path,) = Path(tmp_path, "dopepp", "templates").iterdir()
+    path.write_bytes(damage)
+    assert level_of(measured, [2.0]) == 2.0
+    assert level_of(measured, [3.0]) == 2.0
