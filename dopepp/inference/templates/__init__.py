@@ -1,11 +1,12 @@
 """Detection of a part by templates of its mesh; needs no training.
 
 1. :mod:`~dopepp.inference.templates.views` draws the part from 600 directions.
-2. :mod:`~dopepp.inference.templates.matching` compares all drawings, turned in the image plane and
-   resized to the working distances, with the image's edges at every fourth pixel.
-3. :mod:`~dopepp.inference.templates.ranking` moves the best matches and ranks them.
+2. :mod:`~dopepp.inference.templates.responses` finds the image's edges by orientation.
+3. :mod:`~dopepp.inference.templates.matching` compares all drawings, turned in the image plane and
+   resized to the working distances, with these edges at every fourth pixel.
+4. :mod:`~dopepp.inference.templates.ranking` moves the best matches and ranks them.
 
-The result are start poses. Refinement and verification choose among them.
+The result is a list of start poses. Refinement and verification choose among them.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from dopepp.inference.refinement.outline import make_outline_mesh
 from dopepp.inference.templates.matching import STRIDE, Matches, match
 from dopepp.inference.templates.ranking import describe, learned_ranking
 from dopepp.inference.templates.responses import edge_responses
-from dopepp.inference.templates.views import joined, make_templates, view_rotations
+from dopepp.inference.templates.views import NEAREST, joined, make_templates, view_rotations
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 
@@ -87,7 +88,7 @@ class TemplateDetector:
         group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous, max_step=0.1)
         rotations = view_rotations(tilt_deg, group[:, :3, :3])
         # Near the camera, a part looks different at each distance.
-        nearness = part.diameter / np.array(working_distance)
+        nearness = np.minimum(part.diameter / np.array(working_distance), 1 / NEAREST)
         count = max(1, math.ceil((nearness[0] - nearness[1]) / PERSPECTIVE))
         steps = (np.arange(count) + 0.5) / count
         self._nearness = nearness[0] + (nearness[1] - nearness[0]) * steps
