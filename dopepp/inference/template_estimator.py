@@ -5,6 +5,7 @@ Everything after the start poses is that of a network's estimator: refinement, v
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -123,9 +124,11 @@ class TemplateEstimator(PoseEstimator):
         return estimator
 
     def _loudest(self, name: str, image: Picture, K: CameraMatrix) -> float:
-        """Return the largest log odds of a part's verified poses."""
+        """Return the largest log odds of a part's verified poses, within a depth ratio of 4."""
         detector = next(it for it in self.detectors if it.part.name == name)
-        ends = self.refined(detector.detect(image, K, self.distances), image, K)
+        middle = math.sqrt(self.distances[0] * self.distances[1])
+        depths = max(self.distances[0], middle / 2), min(self.distances[1], 2 * middle)
+        ends = self.refined(detector.detect(image, K, depths), image, K)
         return max((float(refined_features(end)[2]) for end in ends), default=0.0)
 
     def _refine_by(self, refine: Refine | None, parts: Sequence[Part]) -> None:
@@ -182,17 +185,17 @@ class TemplateEstimator(PoseEstimator):
             return refined
         ends: list[Detection] = []
         for detector in self.detectors:
-            its = [detection for detection in refined if detection.object == detector.part.name]
+            poses = [end for end in refined if end.object == detector.part.name]
             for _ in range(REPEATS if self.max_ms is None else 0):
-                its.sort(key=lambda detection: -(detection.probability or 0.0))
-                best = its[:NUM_REPEATED]
+                poses.sort(key=lambda detection: -(detection.probability or 0.0))
+                best = poses[:NUM_REPEATED]
                 starts = [detector.start(end.T_cam_obj, end.score, K) for end in best]
                 again = super().refined(starts, image, K, depth)
-                its[:NUM_REPEATED] = [
+                poses[:NUM_REPEATED] = [
                     max(pair, key=lambda end: end.probability or 0.0)
                     for pair in zip(again, best, strict=True)
                 ]
-            ends += its
+            ends += poses
         return ends
 
     def _rescored(self, refined: Sequence[Detection]) -> list[Detection]:
