@@ -11,6 +11,7 @@ setup(
             "py.typed",
             "experiment/results/templates/*",
             "inference/refinement/verification.json",
+            "inference/templates/ranking.json",
             "pretrained/*",
             "robot/grasping/data/*",
             "robot/nodes/share/*",

@@ -88,7 +88,7 @@ def test_what_is_wrong_comes_first(run, folder, options, line):
     [
         (["good.png"], "neither --K nor --camera"),
         (["good.png", "--camera", "K.txt", "--at", "5"], "--at 5; allowed: u,v in pixels"),
-        (["good.png", "--camera", "K.txt", "--at", "5,5", "--empty"], "--at with --empty"),
+        (["good.png", "--camera", "K.txt", "--at", "5,5", "--empty"], "--at together with --empty"),
         (["K.txt", "--camera", "K.txt"], "cannot identify the format"),
         (["good.png", "--camera", "K.txt", "--refine", "magic"], "--refine magic; allowed: region"),
         (["good.png", "--camera", "K.txt", "--distance", "2", "1"], "distances=(2.0, 1.0)"),
