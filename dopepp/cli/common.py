@@ -117,24 +117,31 @@ def load_estimator(
             raise UserError(problem, f"{option} with a {other}", f"leave out {option}")
     if not is_mesh:
         return PoseEstimator.load(model, device, max_ms=max_ms, scale_error=scale_error)
+    distances = None
+    if working_distance is not None:
+        option, fix = "--working-distance", "write e.g. --working-distance 0.3,0.5"
+        distances = two_numbers(option, working_distance, "NEAR,FAR in metres", fix)
     return PoseEstimator.from_mesh(
         model,
         unit,
-        None if working_distance is None else _distances(working_distance),
+        distances,
         180.0 if tilt is None else tilt,
         max_ms=max_ms,
         scale_error=scale_error,
     )
 
 
-def _distances(text: str) -> tuple[float, float]:
-    """Read a range ``NEAR,FAR``."""
+def two_numbers(option: str, text: str, allowed: str, fix: str) -> tuple[float, float]:
+    """Read two numbers with a comma between them.
+
+    Raises:
+        UserError: The text is something else; ``allowed`` and ``fix`` are parts of the message.
+    """
     try:
-        near, far = map(float, text.split(","))
+        first, second = map(float, text.split(","))
     except ValueError:
-        got, fix = f"--working-distance {text}", "write e.g. --working-distance 0.3,0.5"
-        raise UserError(got, "NEAR,FAR in metres", fix) from None
-    return near, far
+        raise UserError(f"{option} {text}", allowed, fix) from None
+    return first, second
 
 
 def check_region(refine: str | None) -> None:

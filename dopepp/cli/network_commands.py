@@ -29,6 +29,7 @@ from dopepp.cli.common import (
     check_region,
     load_estimator,
     report_errors,
+    two_numbers,
 )
 from dopepp.core.errors import UserError
 
@@ -174,12 +175,8 @@ def doctor(
 
 def _pixel(text: str) -> tuple[float, float]:
     """Read a pixel ``u,v``."""
-    try:
-        u, v = map(float, text.split(","))
-    except ValueError:
-        got, fix = f"--at {text}", "pass column and row of the part's centre, e.g. --at 412,230"
-        raise UserError(got, "u,v in pixels", fix) from None
-    return u, v
+    fix = "pass column and row of the part's centre, e.g. --at 412,230"
+    return two_numbers("--at", text, "u,v in pixels", fix)
 
 
 def serve(
