@@ -216,6 +216,6 @@ def near_truth(monkeypatch):
     def silent_level(part, distances, tilt, loudest):
         return 0.0
 
-    monkeypatch.setattr("dopepp.inference.templates.TemplateDetector", NearTruth)
+    monkeypatch.setattr("dopepp.inference.template_estimator.TemplateDetector", NearTruth)
     monkeypatch.setattr("dopepp.inference.template_estimator.silent_level", silent_level)
     return NearTruth

@@ -6,18 +6,18 @@ Everything after the start poses is that of a network's estimator: refinement, v
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Final, Literal, NoReturn, Protocol
+from typing import Final, Literal, NoReturn
 
 import torch
 
 from dopepp.core.errors import UserError
 from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import Picture
-from dopepp.geometry.camera import CameraMatrix, Transform
+from dopepp.geometry.camera import CameraMatrix
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.picture import (
     METRES,
@@ -29,6 +29,7 @@ from dopepp.inference.picture import (
     merge_scales,
 )
 from dopepp.inference.refinement.refiner import Refine
+from dopepp.inference.templates import TemplateDetector
 from dopepp.inference.templates.ranking import learned_ranking
 from dopepp.inference.templates.silence import silent_level
 from dopepp.models.checkpoint import Checkpoint
@@ -51,24 +52,6 @@ SCALE_ERROR: Final = 0.001
 """Relative error of size and focal length: a template's distance is too rough to be kept."""
 
 
-class Detector(Protocol):
-    """Detects a part without a network; one instance may have several start poses."""
-
-    part: Part
-
-    def start(self, T_cam_obj: Transform, score: float, K: CameraMatrix) -> Detection:
-        """Return a start pose."""
-
-    def detect(
-        self,
-        image: Picture,
-        K: CameraMatrix,
-        distances: tuple[float, float] | None = None,
-        roi: Region | None = None,
-    ) -> list[Detection]:
-        """Return start poses, best score first, on an image without distortion."""
-
-
 class TemplateEstimator(PoseEstimator):
     """Estimates the poses of parts from their meshes alone.
 
@@ -85,7 +68,7 @@ class TemplateEstimator(PoseEstimator):
 
     def __init__(
         self,
-        detectors: Sequence[Detector],
+        detectors: Sequence[TemplateDetector],
         distances: tuple[float, float],
         refine: Refine = "region",
         max_ms: float | None = None,
@@ -111,25 +94,15 @@ class TemplateEstimator(PoseEstimator):
         scale_error: float | None = None,
     ) -> TemplateEstimator:
         """Make templates of parts; the arguments are those of :meth:`PoseEstimator.from_mesh`."""
-        from dopepp.inference.templates import TemplateDetector
-
         checked = _checked_distances(distances)
         tilt = check("tilt_deg", tilt_deg, float, Range(0, 180, "degrees"))
         detectors = [TemplateDetector(part, checked, tilt) for part in parts]
         estimator = cls(detectors, checked, refine, max_ms, scale_error)
-        alone = cls(detectors, checked)
-        for part in parts:
-            loudest = partial(alone._loudest, part.name)
-            estimator.levels[part.name] = silent_level(part, checked, tilt, loudest)
+        for detector in detectors:
+            loudest = partial(_loudest, detector, checked)
+            level = silent_level(detector.part, checked, tilt, loudest)
+            estimator.levels[detector.part.name] = level
         return estimator
-
-    def _loudest(self, name: str, image: Picture, K: CameraMatrix) -> float:
-        """Return the largest log odds of a part's verified poses, within a depth ratio of 4."""
-        detector = next(it for it in self.detectors if it.part.name == name)
-        middle = math.sqrt(self.distances[0] * self.distances[1])
-        depths = max(self.distances[0], middle / 2), min(self.distances[1], 2 * middle)
-        ends = self.refined(detector.detect(image, K, depths), image, K)
-        return max((float(refined_features(end)[2]) for end in ends), default=0.0)
 
     def _refine_by(self, refine: Refine | None, parts: Sequence[Part]) -> None:
         terms = (refine,) if isinstance(refine, str) else refine or ()
@@ -244,6 +217,24 @@ class TemplateEstimator(PoseEstimator):
     def maps(self, image: Picture) -> NoReturn:
         """Raise, because there is no network."""
         raise _networks_only("belief maps")
+
+
+def _loudest(
+    detector: TemplateDetector,
+    distances: tuple[float, float],
+    images: Iterable[Picture],
+    K: CameraMatrix,
+) -> list[float]:
+    """Return the largest log odds of verified poses on each image, within a depth ratio of 4."""
+    estimator = TemplateEstimator([detector], distances)
+    near, far = distances
+    middle = math.sqrt(near * far)
+    depths = max(near, middle / 2), min(far, 2 * middle)
+    levels = []
+    for image in images:
+        ends = estimator.refined(detector.detect(image, K, depths), image, K)
+        levels.append(max((float(refined_features(end)[2]) for end in ends), default=0.0))
+    return levels
 
 
 def _checked_distances(distances: object) -> tuple[float, float]:

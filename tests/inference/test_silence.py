@@ -20,9 +20,10 @@ def measured(monkeypatch, tmp_path):
 
 
 def level_of(measured, values, part=None, distances=DISTANCES, tilt=180.0):
-    def loudest(picture, K):
-        measured.append((picture, K))
-        return values[(len(measured) - 1) % len(values)]
+    def loudest(pictures, K):
+        shown = list(pictures)
+        measured.extend((picture, K) for picture in shown)
+        return [values[number % len(values)] for number in range(len(shown))]
 
     return silence.silent_level(part or pivconnector(), distances, tilt, loudest)
 

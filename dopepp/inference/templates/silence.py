@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from importlib.resources import files
 from pathlib import Path
 from typing import Final
@@ -34,8 +34,8 @@ MARGIN: Final = 1.5  # standard deviations of the photos' levels above their mea
 LOWEST: Final = 0.0  # log odds
 VERSION: Final = 3  # changes when the search or the verification does
 
-Loudest = Callable[[Picture, CameraMatrix], float]
-"""Returns the largest log odds of the verified poses on a picture."""
+Loudest = Callable[[Iterable[Picture], CameraMatrix], list[float]]
+"""Returns the largest log odds of the verified poses on each picture."""
 
 
 def silent_level(
@@ -47,7 +47,7 @@ def silent_level(
         part: Part.
         distances: Nearest and farthest depth, metres.
         tilt: Largest angle of the part's z axis to the camera, degrees.
-        loudest: Measurement of a picture; called if the cache has no level of the part.
+        loudest: Measurement of pictures; called if the cache has no level of the part.
     """
     symmetries = [part.symmetries_discrete, part.symmetries_continuous]
     key = repr((VERSION, MARGIN, part.mesh_hash, part.diameter, distances, tilt, symmetries))
@@ -61,7 +61,7 @@ def silent_level(
     logger.info("%s: measuring what resembles the part on photos, once", part.name)
     focal = PART_PX * float(np.sqrt(distances[0] * distances[1])) / part.diameter
     K = camera_matrix(focal, focal, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
-    levels = [loudest(photo, K) for photo in _photos()]
+    levels = loudest(_photos(), K)
     level = max(LOWEST, float(np.mean(levels) + MARGIN * np.std(levels)))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
