@@ -126,7 +126,12 @@ def read_camera(path: Path | str) -> Camera:
         UserError: The file is missing, over 250 kB, in an unknown format, of several cameras,
             without a camera matrix, of a fisheye lens, or has an invalid field.
     """
-    return _camera(parse_calibration(_text(Path(path)), str(path)), str(path))
+    return camera_of_text(_text(Path(path)), str(path))
+
+
+def camera_of_text(text: str, source: str) -> Camera:
+    """Like :func:`read_camera`, for the text of a file."""
+    return _camera(parse_calibration(text, source), source)
 
 
 def camera_of_fields(fields: Mapping[str, object], source: str) -> Camera:

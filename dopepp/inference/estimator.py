@@ -19,7 +19,7 @@ from dopepp.core.errors import UserError
 from dopepp.core.extensions import enable
 from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import Picture
-from dopepp.geometry.camera import CameraMatrix
+from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.inference import runtimes
 from dopepp.inference.picture import (
     Coefficients,
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from dopepp.inference.frames import SourceLike
     from dopepp.inference.pose_result import PoseResult
     from dopepp.inference.refinement.refiner import Refine
+    from dopepp.inference.several_views.views_result import ViewsResult
     from dopepp.inference.stream import StreamOptions
 
 Maps = tuple[
@@ -367,6 +368,42 @@ class PoseEstimator:
         from dopepp.inference.stream import stream  # imports sources, drawing and the tracker
 
         return stream(self, source, K, camera, **options)
+
+    def predict_views(
+        self,
+        images: Sequence[Picture],
+        cameras: Sequence[Camera | CameraMatrix],
+        T_world_cam: Sequence[Transform],
+        depths: Sequence[Depth] | None = None,
+        distances: Distances | None = None,
+        camera_error: tuple[float, float] | None = None,
+        names: Sequence[str] | None = None,
+    ) -> ViewsResult:
+        """Estimate poses in the world from several pictures of a static scene.
+
+        Args:
+            images: RGB, uint8, of any sizes.
+            cameras: Camera of each image, or its K in pixels of an undistorted image.
+            T_world_cam: Pose of each camera, metres; any frame that does not move is the world.
+            depths: Depth of each image; as in :meth:`predict`.
+            distances: As in :meth:`predict`.
+            camera_error: Standard deviations of each camera's pose along and about each axis,
+                metres and radians (default: 0.2 mm and 0.02°, those of a hand-eye calibration).
+            names: Name of each image, for findings and files.
+
+        Returns:
+            Parts with their poses and covariances in the world and the evidence of each view, and
+            contradictions between the views.
+
+        Raises:
+            UserError: The estimator does not refine by region, an argument is invalid, or the
+                numbers of images, cameras and poses differ.
+        """
+        from dopepp.inference.several_views import CAMERA_ERROR, predict_views
+
+        error = CAMERA_ERROR if camera_error is None else camera_error
+        places = images, cameras, T_world_cam, depths
+        return predict_views(self, *places, distances, error, names)
 
     def explain(
         self,

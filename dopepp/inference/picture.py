@@ -286,7 +286,7 @@ def merge_scales(scales: Sequence[Sequence[Detection]]) -> list[Detection]:
     kept: list[tuple[Detection, int]] = []
     for detection, scale in ranked:
         others = (other for other, other_scale in kept if other_scale != scale)
-        if not any(_are_same(detection, other) for other in others):
+        if not any(are_same(detection, other) for other in others):
             kept.append((detection, scale))
     return [detection for detection, _ in kept]
 
@@ -322,7 +322,8 @@ def _scales(seen: Seen, reach: float, depths: tuple[float, float]) -> Sequence[f
     return scales
 
 
-def _are_same(first: Detection, second: Detection) -> bool:
+def are_same(first: Detection, second: Detection) -> bool:
+    """Return whether two detections of an image may show the same instance."""
     distance = np.linalg.norm(first.keypoints[-1] - second.keypoints[-1])
     extents = [np.ptp(detection.keypoints[:-1], axis=0).max() for detection in (first, second)]
     return first.object == second.object and bool(distance < max(extents) / 2)

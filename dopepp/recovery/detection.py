@@ -260,6 +260,11 @@ def detection_features(
     return np.array([1.0, *np.clip(logarithms, -2 * _EXPONENTS, 2 * _EXPONENTS), missing])
 
 
+def log_odds(probability: float) -> float:
+    """Return the logarithm of the odds of a probability that verification may have overstated."""
+    return math.log(_odds(probability, _VERIFIED))
+
+
 def _odds(probability: float, certain: float = _CERTAIN) -> float:
     bounded = float(np.clip(probability, certain, 1 - certain))
     return bounded / (1 - bounded)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int16
 
@@ -155,6 +156,37 @@ class Scene:
     def targets(self) -> tuple[int, ...]:
         """Indices of the objects that the network must detect."""
         return tuple(i for i, item in enumerate(self.objects) if item.is_target)
+
+    def seen_from(self, T_new_cam: Transform) -> Scene:
+        """Return the static scene in another camera with the same lens and sensor.
+
+        The background is the plane's picture, or infinitely far away; beyond its border it is
+        reflected.
+
+        Args:
+            T_new_cam: Transform from this camera into the other, metres.
+        """
+        R, shift = T_new_cam[:3, :3], T_new_cam[:3, 3]
+        homography, plane = R, self.plane
+        if plane is not None:
+            normal = R @ plane.normal
+            homography = R + np.outer(shift, plane.normal) / plane.offset
+            plane = Plane(triple(normal), plane.offset + float(normal @ shift))
+        homography, border = self.K @ homography @ np.linalg.inv(self.K), cv2.BORDER_REFLECT_101
+        return replace(
+            self,
+            background=cv2.warpPerspective(
+                self.background, homography, self.size, borderMode=border
+            ),
+            objects=tuple(
+                replace(item, T_cam_obj=T_new_cam @ item.T_cam_obj) for item in self.objects
+            ),
+            lights=tuple(
+                replace(light, position=triple(R @ light.position + shift)) for light in self.lights
+            ),
+            ambient=replace(self.ambient, up=triple(R @ self.ambient.up)),
+            plane=plane,
+        )
 
     def keypoints(self, index: int) -> Float[np.ndarray, "9 2"]:
         """Return a target's projected corners and centroid, pixels.

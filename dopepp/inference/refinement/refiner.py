@@ -40,6 +40,11 @@ from dopepp.inference.refinement.depth import DepthEvidence
 from dopepp.inference.refinement.part_surface import FEWEST_POINTS, Points, surface_points
 from dopepp.inference.refinement.region import RegionRefiner, Starts, refinement
 from dopepp.inference.refinement.region.shared_errors import SCALE_ERROR
+from dopepp.inference.refinement.several_views import (
+    JointRefinement,
+    PosedPicture,
+    refine_views,
+)
 from dopepp.inference.refinement.solver import (
     PoseMatrix,
     Prior,
@@ -124,6 +129,12 @@ class Refiner:
         moved = Prior(T_cam_obj, np.linalg.inv(covariance)).squared_distance(end.T_cam_obj) ** 0.5
         return self.verified(end, image, K, moved)
 
+    def refine_views(
+        self, name: str, views: Sequence[PosedPicture], start: Prior
+    ) -> JointRefinement:
+        """Refine the pose of a part in the world; see :func:`.several_views.refine_views`."""
+        return self._refiners[name].refine_views(views, start)
+
     def verified(
         self, detection: Detection, image: Picture, K: CameraMatrix, moved: float = 0.0
     ) -> Detection:
@@ -167,6 +178,21 @@ class PartRefiner:
         self._uses_depth, self._diameter = "depth" in terms, part.diameter
         has_surface = self._uses_depth and len(part.points) >= FEWEST_POINTS
         self._surface = surface_points(part.points) if has_surface else None
+
+    def refine_views(self, views: Sequence[PosedPicture], start: Prior) -> JointRefinement:
+        """Refine a pose in the world on several pictures.
+
+        Args:
+            views: Pictures with the poses of their cameras.
+            start: Pose in the world and its information.
+
+        Raises:
+            UndecidedError: The pictures do not determine the pose.
+        """
+        if self._region is None:
+            raise UndecidedError("several views are refined with the term region")
+        surface = self._surface if self._uses_depth else None
+        return refine_views(self._region, views, start, surface)
 
     def refine(
         self,

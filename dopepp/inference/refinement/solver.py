@@ -118,7 +118,8 @@ class Term(Protocol):
     def __call__(self, pose: Transform, prior: NormalEquations, /) -> NormalEquations | None:
         """Linearise the evidence at a pose; None without evidence.
 
-        ``prior`` is the prior of the step with the terms before this one.
+        ``prior`` is the prior of the step with the other terms: of this iteration before this
+        term, of the last iteration after it.
         """
 
 
@@ -131,14 +132,21 @@ def descend(
         The solution after at most ``steps`` steps; None if a term has no evidence.
     """
     pose, information = T_cam_obj, prior.information
-    step = np.empty(6)
+    step = np.zeros(6)
+    last: list[NormalEquations] = []
     for _ in range(steps):
-        information = prior.information
+        # A step changes what a term still asks for.
+        later = [(H, g - H @ step) for H, g in last]
+        last, information = [], prior.information
         gradient = information @ prior.offset(pose)
         for term in terms:
-            equations = term(pose, (information, gradient))
+            H, g = information, gradient
+            for others in (later := later[1:]):
+                H, g = H + others[0], g + others[1]
+            equations = term(pose, (H, g))
             if equations is None:
                 return None
+            last.append(equations)
             information, gradient = information + equations[0], gradient + equations[1]
         solve_damped(information, -gradient, DAMPING, step)
         pose = moved(pose, step)

@@ -95,7 +95,7 @@ class RegionRefiner:
     def __init__(self, vertices: Vertices, faces: Faces, scale_error: float = SCALE_ERROR) -> None:
         self._scale_error = scale_error
         self.mesh = make_outline_mesh(vertices, faces)
-        self._diameter = largest_distance(self.mesh.vertices)
+        self.diameter = largest_distance(self.mesh.vertices)
 
     def refine(
         self,
@@ -113,7 +113,7 @@ class RegionRefiner:
         """
         given = np.asarray(T_cam_obj, np.float64)
         try:
-            broad = make_prior(given, self._diameter)
+            broad = make_prior(given, self.diameter)
             prior = broad
             if covariance is not None and np.isfinite(covariance).all():
                 # A thousandth of a degree and of a millimetre avoid a singular matrix.
@@ -122,7 +122,7 @@ class RegionRefiner:
             # A weaker prior (larger covariance) at the same pose.
             weak = np.linalg.inv(prior.information) + FAR**2 * np.linalg.inv(broad.information)
             loose = Prior(given, np.linalg.inv(weak))
-            rounds = self._rounds(image, K, given, FOLLOWED if followed else FOUND)
+            rounds = self.rounds(image, K, given, FOLLOWED if followed else FOUND)
             return refinement(*_search(rounds, prior, loose, starts))
         except UndecidedError as undecided:
             return Refinement(given, reason=str(undecided))
@@ -136,14 +136,14 @@ class RegionRefiner:
             UndecidedError: The image does not determine the pose.
         """
         visible = depth.visible(start.T_cam_obj)
-        rounds = self._rounds(image, K, start.T_cam_obj, more=[depth.term(visible)])
-        reach = _search_distance(rounds[0], Prior(start.T_cam_obj, start.information))
+        rounds = self.rounds(image, K, start.T_cam_obj, more=[depth.term(visible)])
+        reach = search_distance(rounds[0], Prior(start.T_cam_obj, start.information))
         # Depth weighs more the nearer a pose is, so that the descent takes all rounds to converge.
         end = _descend(rounds, start.T_cam_obj, depth.prior, reach)
         information = depth.information(end.T_cam_obj, visible)
         return end, rounds[-1].check(end, depth.prior, reach, information)
 
-    def _rounds(
+    def rounds(
         self,
         image: Picture,
         K: CameraMatrix,
@@ -183,8 +183,8 @@ def _search(rounds: Sequence[Round], prior: Prior, loose: Prior, starts: Starts 
     """
     near, doubt = None, None
     try:
-        reach = _search_distance(rounds[0], prior)
-        needed, start = _necessary(rounds, reach), prior.T_cam_obj
+        reach = search_distance(rounds[0], prior)
+        needed, start = necessary_rounds(rounds, reach), prior.T_cam_obj
         if needed[0] is not needed[-1]:  # the list may contain the last round only
             start, needed = _coarse_end(needed[0], start, prior, reach), needed[1:]
         near = _refine(needed, start, prior, reach)
@@ -212,7 +212,7 @@ def _search_far(
     best: Outcome | None = None
     given, first, last = prior.T_cam_obj, rounds[0], rounds[-1]
     with contextlib.suppress(UndecidedError):
-        reach = _search_distance(first, loose)
+        reach = search_distance(first, loose)
         if near is None:
             last.learn(given, reach)
         before = last.agreement(given, reach) if near is None else near[1]
@@ -243,7 +243,7 @@ def _coarse_end(coarse: Round, start: Transform, prior: Prior, reach: float) -> 
     return coarse.descend(start, wide, reach).T_cam_obj
 
 
-def _necessary(rounds: Sequence[Round], reach: float) -> Sequence[Round]:
+def necessary_rounds(rounds: Sequence[Round], reach: float) -> Sequence[Round]:
     """Drop the rounds that search farther than necessary; a tracked part needs only the last."""
     while len(rounds) > 1 and rounds[1].farthest(reach) >= ENOUGH * reach:
         rounds = rounds[1:]
@@ -272,7 +272,7 @@ def _descend(rounds: Sequence[Round], start: Transform, prior: Prior, reach: flo
     return end
 
 
-def _search_distance(coarse: Round, prior: Prior) -> float:
+def search_distance(coarse: Round, prior: Prior) -> float:
     """Return how far the outline may be from the given pose, pixels of the image."""
     contour = coarse.contour(prior.T_cam_obj)
     if contour is None:

@@ -144,6 +144,14 @@ class Round:
         Raises:
             UndecidedError: The outline leaves the image.
         """
+        # The outline term is last, because its distance counts relative to the other terms.
+        end = descend(start, prior, [*self._more, self.term(reach)], self.stage.steps)
+        if end is None:
+            raise UndecidedError("the part's outline left the picture")
+        return end
+
+    def term(self, reach: float) -> Term:
+        """Return the term of the outline, in the colours learned last."""
 
         def outline(pose: Transform, prior: NormalEquations) -> NormalEquations | None:
             contour = self.contour(pose)
@@ -154,11 +162,7 @@ class Round:
             spacing, extent, position = self._spacing, self.crop.extent, pose[:3, 3].copy()
             return region_terms(rows, shifts, prior, spacing, extent, position, self._scale_error)
 
-        # The outline term is last, because its distance counts relative to the other terms.
-        end = descend(start, prior, [*self._more, outline], self.stage.steps)
-        if end is None:
-            raise UndecidedError("the part's outline left the picture")
-        return end
+        return outline
 
     def log_likelihood(self, pose: Transform, prior: Prior) -> float:
         """Return the logarithm of a pose's probability, up to a constant."""

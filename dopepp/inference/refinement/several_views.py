@@ -1,0 +1,255 @@
+"""Refinement of one pose on several pictures of a static scene with known camera poses.
+
+The unknown is the part's pose in the world. Every view contributes the terms of a single picture,
+with its own errors of offset and scale. A step of the solver is a rotation about the object's
+origin and a shift of the origin, so it only has to be turned into the axes of each camera.
+
+The error of a camera's pose moves the part in this camera alone. It is normally distributed with a
+stated covariance and eliminated from the view's equations: their covariance grows by that of the
+error.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import CameraMatrix, Transform
+from dopepp.geometry.rotation import RotationMatrix, Vector
+from dopepp.inference.picture import Depth
+from dopepp.inference.refinement.depth import DepthEvidence
+from dopepp.inference.refinement.part_surface import SurfacePoints
+from dopepp.inference.refinement.region import RegionRefiner, necessary_rounds, search_distance
+from dopepp.inference.refinement.region.round import OutlineAgreement, Round
+from dopepp.inference.refinement.solver import (
+    UNKNOWN_ALONG,
+    UNKNOWN_TURN,
+    NormalEquations,
+    PoseMatrix,
+    Prior,
+    Solution,
+    Term,
+    UndecidedError,
+    descend,
+)
+
+NEGLIGIBLE: Final = 1e-6
+"""Share of the largest information below which a direction is undetermined."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosedPicture:
+    """A picture with its camera matrix and the pose of its camera."""
+
+    image: Picture  # RGB, without lens distortion
+    K: CameraMatrix
+    T_cam_world: Transform
+    # Covariance of the camera's pose: rotation vector about the camera's centre and shift of the
+    # scene, in camera axes
+    error: PoseMatrix
+    depth: Depth | None = None  # metres along z
+
+    def pose(self, T_world_obj: Transform) -> Transform:
+        """Return a pose in the camera."""
+        return np.asarray(self.T_cam_world @ T_world_obj)
+
+    def error_at(self, position: Vector) -> PoseMatrix:
+        """Return the covariance by which the camera's error moves a part at a position (camera)."""
+        x, y, z = position
+        lever = np.eye(6)  # a rotation about the camera's centre shifts the object's origin
+        lever[3:, :3] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
+        return np.asarray(lever @ self.error @ lever.T)
+
+    def to_world(
+        self, T_cam_obj: Transform, covariance: PoseMatrix
+    ) -> tuple[Transform, PoseMatrix]:
+        """Return pose and covariance in the world, with the error of the camera's pose."""
+        R = self.T_cam_world[:3, :3]
+        T_world_obj = np.linalg.inv(self.T_cam_world) @ T_cam_obj
+        return T_world_obj, turned(R.T, covariance + self.error_at(T_cam_obj[:3, 3]))
+
+    def to_camera(self, T_world_obj: Transform, covariance: PoseMatrix) -> Prior:
+        """Return the distribution of a pose in the camera, with the error of the camera's pose."""
+        T_cam_obj = self.pose(T_world_obj)
+        error = self.error_at(T_cam_obj[:3, 3])
+        both = turned(self.T_cam_world[:3, :3], covariance) + error
+        return Prior(T_cam_obj, np.linalg.inv(both))
+
+
+def turned(R: RotationMatrix, matrix: PoseMatrix) -> PoseMatrix:
+    """Return a covariance or information in axes turned by R."""
+    turn = np.kron(np.eye(2), R)
+    return np.asarray(turn @ matrix @ turn.T)
+
+
+@dataclass(frozen=True, eq=False)
+class ViewTerm:
+    """A term of one view, as a term of the pose in the world."""
+
+    term: Term
+    view: PosedPicture
+
+    def __call__(self, pose: Transform, prior: NormalEquations, /) -> NormalEquations | None:
+        """Linearise the term; see :class:`~dopepp.inference.refinement.solver.Term`."""
+        T_cam_obj, R = self.view.pose(pose), self.view.T_cam_world[:3, :3]
+        error, turn = self.view.error_at(T_cam_obj[:3, 3]), np.kron(np.eye(2), R)
+        given = _widened(turned(R, prior[0]), turn @ prior[1], error)
+        equations = self.term(T_cam_obj, given)
+        if equations is None:
+            return None
+        H, g = _widened(*equations, error)
+        return turned(R.T, H), turn.T @ g
+
+
+def _widened(H: PoseMatrix, g: Vector, covariance: PoseMatrix) -> NormalEquations:
+    """Return normal equations of the same mean, with a covariance added: (H⁻¹ + C)⁻¹."""
+    solved = np.linalg.solve(np.eye(6) + H @ covariance, np.column_stack([H, g]))
+    return (solved[:, :6] + solved[:, :6].T) / 2, solved[:, 6]
+
+
+@dataclass(frozen=True, eq=False)
+class JointRefinement:
+    """Result of refining a pose on several pictures."""
+
+    T_world_obj: Transform
+    covariance: PoseMatrix  # rotation vector about the object's origin and shift, world axes
+    agreements: Sequence[OutlineAgreement | None]  # of each view; None without the outline
+    # Mahalanobis distance of each view's evidence from the other views', per √degree of freedom
+    disagreements: Sequence[float]
+
+
+def refine_views(
+    region: RegionRefiner,
+    views: Sequence[PosedPicture],
+    start: Prior,
+    surface: SurfacePoints | None = None,
+) -> JointRefinement:
+    """Refine a pose on all views that show its outline.
+
+    Args:
+        region: Refiner of the part.
+        views: Pictures.
+        start: Pose in the world and its information, which limits the search.
+        surface: Surface points of the part, for views with depth.
+
+    Raises:
+        UndecidedError: No view shows the outline.
+    """
+    # The start is a result of the same pictures, so it only limits the search.
+    spread = np.repeat([UNKNOWN_TURN, UNKNOWN_ALONG * region.diameter], 3)
+    prior = Prior(start.T_cam_obj, np.diag(1.0 / spread**2))
+    covariance = np.linalg.inv(start.information)
+    searches: list[_ViewSearch] = []
+    for number, view in enumerate(views):
+        try:
+            searches.append(_ViewSearch(number, view, region, start.T_cam_obj, covariance))
+        except UndecidedError:
+            continue
+        if surface is not None and view.depth is not None:
+            searches[-1].add_depth(surface, region.diameter)
+    end = Solution(start.T_cam_obj, prior.information)
+    num_stages = max((len(search.rounds) for search in searches), default=0)
+    terms: list[Term] = []
+    for left in range(num_stages, 0, -1):
+        searches = [search for search in searches if search.learn(end.T_cam_obj, left)]
+        terms = [term for search in searches for term in search.terms(left)]
+        steps = max((search.round(left).stage.steps for search in searches), default=0)
+        reached = descend(end.T_cam_obj, prior, terms, steps)
+        if reached is None or not terms:
+            raise UndecidedError("the part's outline left the picture")
+        end = reached
+    agreements: list[OutlineAgreement | None] = [None] * len(views)
+    for search in searches:
+        agreements[search.number] = search.agreement(end.T_cam_obj)
+    disagreements = _disagreements(end, prior, searches, len(views))
+    covariance = np.linalg.inv(end.information)
+    return JointRefinement(end.T_cam_obj, covariance, agreements, disagreements)
+
+
+class _ViewSearch:
+    """The rounds of one view.
+
+    Raises:
+        UndecidedError: Too little of the outline is on the picture.
+    """
+
+    def __init__(
+        self,
+        number: int,
+        view: PosedPicture,
+        region: RegionRefiner,
+        T_world_obj: Transform,
+        covariance: PoseMatrix,
+    ) -> None:
+        self.number, self._view = number, view
+        self._start = view.to_camera(T_world_obj, covariance)
+        rounds = region.rounds(view.image, view.K, self._start.T_cam_obj)
+        self._reach = search_distance(rounds[0], self._start)
+        self.rounds: Sequence[Round] = necessary_rounds(rounds, self._reach)
+        self._depth: list[Term] = []
+
+    def add_depth(self, surface: SurfacePoints, diameter: float) -> None:
+        """Add the term of the view's depth image, if the part is on it."""
+        assert self._view.depth is not None
+        try:
+            given = surface, diameter, self._view.depth, self._view.K, self._start
+            evidence = DepthEvidence(*given)
+        except UndecidedError:
+            return
+        self._depth = [evidence.term(evidence.visible(self._start.T_cam_obj))]
+
+    def round(self, left: int) -> Round:
+        """Return the round that is followed by ``left - 1`` others."""
+        return self.rounds[max(0, len(self.rounds) - left)]
+
+    def learn(self, T_world_obj: Transform, left: int) -> bool:
+        """Learn the colours at a pose; return False if too little is visible."""
+        stage, pose = self.round(left), self._view.pose(T_world_obj)
+        try:
+            stage.learn(pose, self._reach)
+        except UndecidedError:
+            return False
+        return stage.contour(pose) is not None
+
+    def terms(self, left: int) -> list[Term]:
+        """Return the terms of a round, in the world."""
+        terms = [*self._depth, self.round(left).term(self._reach)]
+        return [ViewTerm(term, self._view) for term in terms]
+
+    def agreement(self, T_world_obj: Transform) -> OutlineAgreement | None:
+        """Return the agreement of the outline with the view."""
+        try:
+            return self.rounds[-1].agreement(self._view.pose(T_world_obj), self._reach)
+        except UndecidedError:
+            return None
+
+
+def _disagreements(
+    end: Solution, prior: Prior, searches: Sequence[_ViewSearch], num_views: int
+) -> list[float]:
+    """Return the distance of each view's evidence from that of the other views; 0 for one view."""
+    before = prior.information, prior.information @ prior.offset(end.T_cam_obj)
+    known = end.information, np.zeros(6)
+    sums: dict[int, NormalEquations] = {}
+    for search in searches:
+        parts = [term(end.T_cam_obj, known) for term in search.terms(1)]
+        present = [part for part in parts if part is not None]
+        sums[search.number] = sum(H for H, _ in present), sum(g for _, g in present)  # type: ignore[assignment]
+    distances = [0.0] * num_views
+    for number, (H, g) in sums.items() if len(sums) > 1 else ():
+        others = [equations for other, equations in sums.items() if other != number]
+        H_others = before[0] + sum(other[0] for other in others)
+        g_others = before[1] + sum(other[1] for other in others)
+        solved = np.linalg.solve(H_others, np.column_stack([g_others, H]))
+        rest, spread = g - H @ solved[:, 0], H + H @ solved[:, 1:]
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(spread), 1e-300))
+        values, axes = np.linalg.eigh(spread * np.outer(scale, scale))
+        is_known = values > NEGLIGIBLE * values[-1]
+        along = (axes.T @ (scale * rest))[is_known]
+        distances[number] = math.sqrt(float((along**2 / values[is_known]).mean()))
+    return distances

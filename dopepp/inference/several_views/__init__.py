@@ -1,0 +1,135 @@
+"""Poses of parts from several pictures of a static scene with known camera poses.
+
+Each view is searched alone. Detections that agree in the world form a part
+(:mod:`~dopepp.inference.several_views.association`), whose pose is refined on all views together
+and verified in each of them (:mod:`~dopepp.inference.several_views.joint`). Of parts at one place,
+the most probable remains. Views that contradict each other are named
+(:mod:`~dopepp.inference.several_views.contradictions`).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from dopepp.core.errors import UserError
+from dopepp.core.validation import Range, check
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import CameraMatrix, Transform, invert_transform
+from dopepp.geometry.camera_file import Camera
+from dopepp.geometry.rotation import is_rotation
+from dopepp.geometry.symmetry import symmetry_group
+from dopepp.inference.picture import Depth, Distances, are_same, prepare_image
+from dopepp.inference.pose_result import PoseResult, make_shape, spent_between
+from dopepp.inference.refinement.several_views import PosedPicture
+from dopepp.inference.several_views.association import associate, sight
+from dopepp.inference.several_views.joint import JointEstimator, JointPart
+from dopepp.inference.several_views.views_result import ViewsResult
+
+if TYPE_CHECKING:
+    from dopepp.inference.estimator import PoseEstimator
+
+CAMERA_ERROR: Final = (2e-4, math.radians(0.02))
+"""Default standard deviations of a camera's pose along and about each axis: metres and radians.
+A hand-eye calibration reaches them."""
+
+
+def predict_views(
+    estimator: PoseEstimator,
+    images: Sequence[Picture],
+    cameras: Sequence[Camera | CameraMatrix],
+    T_world_cam: Sequence[Transform],
+    depths: Sequence[Depth] | None = None,
+    distances: Distances | None = None,
+    camera_error: tuple[float, float] = CAMERA_ERROR,
+    names: Sequence[str] | None = None,
+) -> ViewsResult:
+    """Estimate the poses of parts; see :meth:`PoseEstimator.predict_views`."""
+    refiner, count = estimator.refiner, len(images)
+    if refiner is None or not refiner.verifies:
+        fix = "load the estimator with refine='region'"
+        problem = f"several views with refine={estimator.refine}"
+        raise UserError(problem, "a refinement with region", fix)
+    lengths = {"cameras": cameras, "T_world_cam": T_world_cam, "depths": depths, "names": names}
+    for name, values in lengths.items():
+        if values is not None and len(values) != count:
+            problem = f"{len(values)} {name} for {count} images"
+            raise UserError(problem, f"{count}, one for each image", f"pass {count} {name}")
+    names = names or [f"view {number}" for number in range(count)]
+    shift, turn = (
+        check(f"camera_error[{n}]", error, float, Range(0.0, 1.0))
+        for n, error in enumerate(camera_error)
+    )
+    error = np.diag(np.repeat([turn, shift], 3) ** 2)
+    views = [
+        _posed(image, cameras[n], T_world_cam[n], depths[n] if depths else None, error, names[n])
+        for n, image in enumerate(images)
+    ]
+    clock = [dict(estimator.spent_ms)]
+    sightings = []
+    for number, view in enumerate(views):
+        candidates = estimator.candidates(view.image, view.K, None, view.depth, distances)
+        sightings.append([sight(number, candidate, view) for candidate in candidates])
+        clock.append(dict(estimator.spent_ms))
+    start = time.perf_counter()
+    cuboids = {part.name: part.cuboid for part in estimator.solid_parts}
+    groups = {
+        part.name: symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
+        for part in estimator.solid_parts
+    }
+    joint = JointEstimator(refiner, views, names, estimator.recovery.refined_verification)
+    parts: list[JointPart] = []
+    for cluster in associate(sightings, groups, cuboids):
+        name = cluster[0].detection.object
+        parts.append(joint.estimate(cluster, groups[name], cuboids[name]))
+    parts.sort(key=lambda part: -part.detection.score)
+    kept: list[JointPart] = []
+    for part in parts:
+        if not any(_are_one(part, other) for other in kept):
+            kept.append(part)
+    joint_ms = 1000 * (time.perf_counter() - start)
+    passed = [part.detection for part in kept if part.detection.score >= estimator.min_score]
+    weaker = [part.detection for part in kept if part.detection.score < estimator.min_score]
+    shapes = {part.name: make_shape(part) for part in estimator.solid_parts}
+    results = []
+    for number, view in enumerate(views):
+        evidence = [detection.evidence[number] for detection in passed]
+        shown = [item.detection for item in evidence if item.status == "supports"]
+        speed = spent_between(clock[number], clock[number + 1])
+        results.append(
+            PoseResult(view.image, view.K, shown, speed, names[number], number, shapes=shapes)
+        )
+    return ViewsResult(passed, [], results, weaker, joint_ms)
+
+
+def _posed(
+    image: Picture,
+    camera: Camera | CameraMatrix,
+    T_world_cam: Transform,
+    depth: Depth | None,
+    error: np.ndarray,
+    name: str,
+) -> PosedPicture:
+    """Check the arguments of a view and remove the lens distortion."""
+    distortion = None
+    if isinstance(camera, Camera):
+        camera = camera.for_picture((image.shape[1], image.shape[0]))
+        distortion, camera = camera.coefficients, camera.K
+    image, K, depth = prepare_image(image, camera, distortion, depth)
+    T = np.asarray(T_world_cam, np.float64)
+    if T.shape != (4, 4) or not is_rotation(T[:3, :3]) or T[3].tolist() != [0, 0, 0, 1]:
+        problem = f"T_world_cam of {name}: {T.tolist()!s:.200}"
+        raise UserError(problem, "a rigid 4×4 transform", "pass the camera's pose in the world")
+    return PosedPicture(image, K, invert_transform(T), error, depth)
+
+
+def _are_one(first: JointPart, second: JointPart) -> bool:
+    """Return whether two parts are one: at one place in all views, from different views."""
+    a, b = first.detection, second.detection
+    shared = {item.view for item in first.sightings} & {item.view for item in second.sightings}
+    pairs = zip(a.evidence, b.evidence, strict=True)
+    return not shared and all(are_same(x.detection, y.detection) for x, y in pairs)

@@ -1,0 +1,203 @@
+"""Files of camera poses: which camera took which picture from where.
+
+- YAML of this project, with a mapping ``views`` from each picture to its pose. A pose has the name
+  ``T_world_cam``, or ``T_base_flange`` with ``hand_eye`` (a file that ``dopepp calibrate handeye``
+  wrote), and one of the forms of :func:`transform_of`. ``camera`` names a camera file, for all
+  views or for one.
+- BOP's ``scene_camera.json``, with ``cam_R_w2c`` and ``cam_t_w2c``.
+- COLMAP's ``images.txt``, with ``cameras.txt`` beside it.
+
+To read another format, write a function that returns :data:`CameraPoses`, and call it in
+:func:`read_camera_poses`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from dopepp.core.errors import UserError
+from dopepp.core.json import read_json
+from dopepp.core.validation import Range, check, shown
+from dopepp.core.yaml import read_yaml
+from dopepp.geometry.camera import Transform, invert_transform, make_transform
+from dopepp.geometry.camera_file import Camera, camera_of_fields, camera_of_text, read_camera
+from dopepp.geometry.rotation import is_rotation, nearest_rotation, quaternion_to_matrix
+
+FORMATS: Final = (
+    "YAML with `views: {a.png: {T_world_cam: …}}`, BOP's scene_camera.json, or COLMAP's images.txt"
+)
+_FORMS: Final = (
+    "matrix: 4×4 numbers; ROS's translation and rotation; or position (metres) with "
+    "quaternion_wxyz or quaternion_xyzw"
+)
+_POSE_FIX: Final = "write the camera's pose in the world, metres"
+MAX_COLMAP_BYTES: Final = 64_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPose:
+    """The camera of a picture."""
+
+    T_world_cam: Transform
+    camera: Camera | None  # None if the file names no camera
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPoses:
+    """The cameras of several pictures.
+
+    Attributes:
+        poses: Camera of each picture, by the picture's name without folder (BOP: by its number).
+        error: Standard deviations of the poses, metres and radians; None if the file has none.
+        source: The file.
+    """
+
+    poses: Mapping[str, CameraPose]
+    error: tuple[float, float] | None
+    source: str
+
+    def of(self, picture: Path) -> CameraPose:
+        """Return the camera of a picture.
+
+        Raises:
+            UserError: The file does not name the picture.
+        """
+        number = picture.stem.lstrip("0") or "0"
+        for name in (picture.name, picture.stem, number):
+            if name in self.poses:
+                return self.poses[name]
+        names = ", ".join(list(self.poses)[:5]) + ", …" * (len(self.poses) > 5)
+        fix = "add the picture to the file, or correct its name"
+        raise UserError(f"{self.source} without {picture.name}", names or "a picture", fix)
+
+
+def read_camera_poses(path: Path) -> CameraPoses:
+    """Read a file of camera poses.
+
+    Raises:
+        UserError: The file is missing, of another format, or has an invalid pose or camera.
+    """
+    if path.name == "scene_camera.json":
+        return _bop(path)
+    if path.suffix == ".txt":
+        return _colmap(path)
+    content = read_yaml(path)
+    views = content.get("views") if isinstance(content, Mapping) else None
+    if not isinstance(content, Mapping) or not isinstance(views, Mapping) or not views:
+        raise UserError(f"{path} without views", FORMATS, "write a file of one of these forms")
+    camera, hand_eye, error = (content.get(key) for key in ("camera", "hand_eye", "camera_error"))
+    T_flange_cam = None
+    if hand_eye is not None:
+        mount = read_yaml(path.parent / str(hand_eye))
+        where = f"{hand_eye}: T_flange_cam"
+        values = mount.get("T_flange_cam") if isinstance(mount, Mapping) else None
+        T_flange_cam = transform_of(values, where)
+    pose_name = "T_world_cam" if T_flange_cam is None else "T_base_flange"
+    poses = {}
+    for name, view in views.items():
+        fields = view if isinstance(view, Mapping) else {}
+        T = transform_of(fields.get(pose_name), f"{path}: {name}: {pose_name}")
+        T_world_cam = T if T_flange_cam is None else T @ T_flange_cam
+        file = fields.get("camera", camera)
+        lens = None if file is None else read_camera(path.parent / str(file))
+        poses[str(name)] = CameraPose(T_world_cam, lens)
+    return CameraPoses(poses, None if error is None else _error(error, path), str(path))
+
+
+def transform_of(value: object, where: str) -> Transform:
+    """Return the rigid transform in the fields of a file.
+
+    Args:
+        value: ``matrix`` of 4×4 numbers; ROS's ``translation`` {x, y, z} and ``rotation``
+            {x, y, z, w}; or lists ``position`` and ``quaternion_wxyz`` or ``quaternion_xyzw``.
+            Metres.
+        where: Origin of the fields, for messages.
+
+    Raises:
+        UserError: The fields are others, or no rigid transform.
+    """
+    fields = value if isinstance(value, Mapping) else {}
+    problem = f"{where}={shown(value)}"
+    try:
+        if "matrix" in fields:
+            T = np.array(fields["matrix"], np.float64).reshape(4, 4)
+        else:
+            if "rotation" in fields:
+                shift, turn = fields["translation"], fields["rotation"]
+                position = [shift[axis] for axis in "xyz"]
+                quaternion = [turn[axis] for axis in "wxyz"]
+            else:
+                position = fields["position"]
+                x_first = fields.get("quaternion_xyzw")
+                quaternion = (
+                    fields["quaternion_wxyz"] if x_first is None else [x_first[3], *x_first[:3]]
+                )
+            R = quaternion_to_matrix(np.array(quaternion, np.float64).reshape(4))
+            T = make_transform(R, np.array(position, np.float64).reshape(3))
+    except (KeyError, IndexError, TypeError, ValueError):
+        raise UserError(problem, _FORMS, _POSE_FIX) from None
+    if not np.isfinite(T).all() or not is_rotation(T[:3, :3]) or T[3].tolist() != [0, 0, 0, 1]:
+        raise UserError(problem, "a rigid transform", _POSE_FIX)
+    return make_transform(nearest_rotation(T[:3, :3]), T[:3, 3])
+
+
+def _error(value: object, path: Path) -> tuple[float, float]:
+    metres, degrees = check(f"{path}: camera_error", value, tuple[float, float], Range(0.0, 10.0))
+    return metres, math.radians(degrees)
+
+
+def _bop(path: Path) -> CameraPoses:
+    """Read ``scene_camera.json``; lengths are millimetres."""
+    content: Any = read_json(path)
+    poses = {}
+    for name, record in content.items() if isinstance(content, Mapping) else ():
+        where = f"{path}: image {name}"
+        try:
+            R = np.array(record["cam_R_w2c"], np.float64).reshape(3, 3)
+            t = np.array(record["cam_t_w2c"], np.float64).reshape(3) / 1000.0
+        except (KeyError, TypeError, ValueError):
+            allowed = "cam_R_w2c (9 numbers) and cam_t_w2c (3 numbers, millimetres)"
+            raise UserError(where, allowed, "use a data set with camera poses") from None
+        T_cam_world = transform_of({"matrix": make_transform(R, t)}, where)
+        camera = camera_of_fields({"cam_K": record.get("cam_K")}, where)
+        poses[name] = CameraPose(invert_transform(T_cam_world), camera)
+    return CameraPoses(poses, None, str(path))
+
+
+def _colmap(path: Path) -> CameraPoses:
+    """Read ``images.txt``: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, in every second line."""
+    lines = _lines(path)
+    cameras = {
+        line.split()[0]: camera_of_text(line, f"{path.with_name('cameras.txt')}")
+        for line in _lines(path.with_name("cameras.txt"))
+        if line
+    }
+    poses = {}
+    for line in lines[::2]:
+        words = line.split(maxsplit=9)
+        if len(words) != 10 or words[8] not in cameras:
+            allowed = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of points"
+            raise UserError(f"{path}: {line:.100}", allowed, "export the model as text again")
+        fields = {"quaternion_wxyz": words[1:5], "position": words[5:8]}
+        T_cam_world = transform_of(fields, f"{path}: {words[9]}")
+        name = Path(words[9]).name
+        poses[name] = CameraPose(invert_transform(T_cam_world), cameras[words[8]])
+    return CameraPoses(poses, None, str(path))
+
+
+def _lines(path: Path) -> list[str]:
+    """Return the lines of a COLMAP file without comments; a line of points may be empty."""
+    try:
+        if path.stat().st_size > MAX_COLMAP_BYTES:
+            raise ValueError(f"more than {MAX_COLMAP_BYTES / 1e6:g} MB")
+        text = path.read_text("utf-8")
+    except (OSError, ValueError) as error:
+        problem = f"{path}: {getattr(error, 'strerror', None) or error}"
+        raise UserError(problem, FORMATS, "pass images.txt with cameras.txt beside it") from error
+    return [line.strip() for line in text.splitlines() if not line.startswith("#")]
