@@ -251,5 +251,6 @@ def _disagreements(
         values, axes = np.linalg.eigh(spread * np.outer(scale, scale))
         is_known = values > NEGLIGIBLE * values[-1]
         along = (axes.T @ (scale * rest))[is_known]
-        distances[number] = math.sqrt(float((along**2 / values[is_known]).mean()))
+        squared = float((along**2 / values[is_known]).sum())
+        distances[number] = math.sqrt(squared / max(1, is_known.sum()))
     return distances

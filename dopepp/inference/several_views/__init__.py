@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -27,6 +28,7 @@ from dopepp.inference.picture import Depth, Distances, are_same, prepare_image
 from dopepp.inference.pose_result import PoseResult, make_shape, spent_between
 from dopepp.inference.refinement.several_views import PosedPicture
 from dopepp.inference.several_views.association import associate, sight
+from dopepp.inference.several_views.contradictions import contradictions
 from dopepp.inference.several_views.joint import JointEstimator, JointPart
 from dopepp.inference.several_views.views_result import ViewsResult
 
@@ -82,10 +84,14 @@ def predict_views(
         for part in estimator.solid_parts
     }
     joint = JointEstimator(refiner, views, names, estimator.recovery.refined_verification)
+    associated = partial(associate, groups=groups, cuboids=cuboids)
     parts: list[JointPart] = []
-    for cluster in associate(sightings, groups, cuboids):
+    clusters = associated(sightings)
+    while clusters:
+        cluster = clusters.pop()
         name = cluster[0].detection.object
         parts.append(joint.estimate(cluster, groups[name], cuboids[name]))
+        clusters += [[other] for other in cluster if other not in parts[-1].sightings]
     parts.sort(key=lambda part: -part.detection.score)
     kept: list[JointPart] = []
     for part in parts:
@@ -93,7 +99,10 @@ def predict_views(
             kept.append(part)
     joint_ms = 1000 * (time.perf_counter() - start)
     passed = [part.detection for part in kept if part.detection.score >= estimator.min_score]
-    weaker = [part.detection for part in kept if part.detection.score < estimator.min_score]
+    sure = [[it for it in view if it.detection.score >= estimator.min_score] for view in sightings]
+    agreeing, findings = contradictions(passed, sure, views, names, associated)
+    weaker = [part.detection for part in kept if part.detection not in agreeing]
+    passed = agreeing
     shapes = {part.name: make_shape(part) for part in estimator.solid_parts}
     results = []
     for number, view in enumerate(views):
@@ -103,7 +112,7 @@ def predict_views(
         results.append(
             PoseResult(view.image, view.K, shown, speed, names[number], number, shapes=shapes)
         )
-    return ViewsResult(passed, [], results, weaker, joint_ms)
+    return ViewsResult(passed, findings, results, weaker, joint_ms)
 
 
 def _posed(
@@ -127,9 +136,13 @@ def _posed(
     return PosedPicture(image, K, invert_transform(T), error, depth)
 
 
-def _are_one(first: JointPart, second: JointPart) -> bool:
-    """Return whether two parts are one: at one place in all views, from different views."""
-    a, b = first.detection, second.detection
-    shared = {item.view for item in first.sightings} & {item.view for item in second.sightings}
-    pairs = zip(a.evidence, b.evidence, strict=True)
-    return not shared and all(are_same(x.detection, y.detection) for x, y in pairs)
+def _are_one(part: JointPart, better: JointPart) -> bool:
+    """Return whether a part is a better one: at its place in all views, which its own views show.
+
+    A place at which a view alone shows the part contradicts that view.
+    """
+    shared = {item.view for item in part.sightings} & {item.view for item in better.sightings}
+    shown, shown_better = set(part.detection.views), set(better.detection.views)
+    pairs = zip(part.detection.evidence, better.detection.evidence, strict=True)
+    is_at_place = all(are_same(a.detection, b.detection) for a, b in pairs)
+    return not shared and shown <= shown_better and is_at_place

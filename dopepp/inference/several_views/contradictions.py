@@ -1,0 +1,139 @@
+"""Contradictions between views: wrong or swapped camera poses, and moved parts.
+
+Two views contradict each other if either shows a part where the other shows something else, while
+the other shows a part of the same kind elsewhere. If they agree on no part, a camera pose is wrong,
+and detections that depend on it are rejected. If they agree on another part, the part was moved.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import combinations, product
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from dopepp.geometry.rotation import rotation_angle
+from dopepp.inference.refinement.several_views import PosedPicture
+from dopepp.inference.several_views.association import Sighting, sight
+from dopepp.inference.several_views.views_result import WorldDetection
+
+DISAGREEING: Final = 1.5
+"""Distance of a view's evidence from the others', deviations, beyond which a finding names it."""
+
+Views = Sequence[Sequence[Sighting]]  # sightings of each view
+Associate = Callable[[Views], list[list[Sighting]]]
+
+
+class _Conflict(NamedTuple):
+    """Two detections of one part, either in a view that does not show the other."""
+
+    views: tuple[int, int]
+    detections: tuple[WorldDetection, WorldDetection]
+    is_mutual: bool  # whether both places are on the pictures of both views
+
+    def describe(self, names: Sequence[str]) -> str:
+        """Return the views, the part and the difference of its poses."""
+        first, second = (detection.T_world_obj for detection in self.detections)
+        shift = 1e3 * np.linalg.norm(first[:3, 3] - second[:3, 3])
+        turn = math.degrees(float(rotation_angle(first[:3, :3] @ second[:3, :3].T)))
+        seen = " and ".join(names[view] for view in self.views)
+        return f"{seen} show {self.detections[0].object} {shift:.3g} mm and {turn:.2g}° apart"
+
+
+def contradictions(
+    detections: Sequence[WorldDetection],
+    sightings: Views,
+    pictures: Sequence[PosedPicture],
+    names: Sequence[str],
+    associated: Associate,
+) -> tuple[list[WorldDetection], list[str]]:
+    """Return the detections that no contradiction rejects, and the contradictions in words.
+
+    Args:
+        detections: Detections that pass the threshold.
+        sightings: Passing sightings of each view.
+        pictures: Pictures with the poses of their cameras.
+        names: Name of each view.
+        associated: Associates the sightings of the views.
+    """
+    supports = [_support(detection) for detection in detections]
+    confirmed = {pair for views in supports for pair in combinations(views, 2)}
+    trusted = {view for pair in confirmed for view in pair}
+    findings: list[str] = []
+    rejected: list[WorldDetection] = []
+    swapped: tuple[int, int] | None = None
+    for first, second in combinations(detections, 2):
+        conflict = _conflict(first, second)
+        if conflict is None:
+            continue
+        views, text = conflict.views, conflict.describe(names)
+        if (min(views), max(views)) in confirmed:
+            if conflict.is_mutual:
+                cause = "it was moved between the pictures, or each picture hides one of two parts"
+                findings.append(f"{text}: {cause}")
+            continue
+        blamed = [n for n in (0, 1) if views[n] not in trusted]
+        blamed = blamed if len(blamed) == 1 else [0, 1]
+        rejected += [conflict.detections[number] for number in blamed]
+        swapped = swapped or _swapped(sightings, pictures, associated)
+        if len(blamed) == 1:
+            cause = f"the camera pose of {names[views[blamed[0]]]} is wrong"
+        else:
+            cause = "a camera pose is wrong, or the part was moved between the pictures"
+        if swapped is not None:
+            pair = " and ".join(names[view] for view in swapped)
+            cause = f"the camera poses of {pair} are swapped"
+        findings.append(f"{text}: {cause}")
+    for detection in detections:
+        if detection.disagreement > DISAGREEING:
+            findings.append(
+                f"{' and '.join(detection.views)} disagree on {detection.object} by "
+                f"{detection.disagreement:.2g} standard deviations: calibrate the camera poses "
+                "again, or state their errors"
+            )
+    kept = [item for item in detections if not any(item is other for other in rejected)]
+    return kept, findings
+
+
+def _support(detection: WorldDetection) -> list[int]:
+    return [n for n, item in enumerate(detection.evidence) if item.status == "supports"]
+
+
+def _conflict(first: WorldDetection, second: WorldDetection) -> _Conflict | None:
+    """Return the conflict of two detections, if a view of one does not show the other."""
+    conflicts = []
+    for a, b in product(_support(first), _support(second)):
+        statuses = first.evidence[b].status, second.evidence[a].status
+        if first.object == second.object and "supports" not in statuses and "hidden" in statuses:
+            is_mutual = statuses == ("hidden", "hidden")
+            conflicts.append(_Conflict((a, b), (first, second), is_mutual))
+    return max(conflicts, key=lambda conflict: conflict.is_mutual, default=None)
+
+
+def _swapped(
+    sightings: Views, pictures: Sequence[PosedPicture], associated: Associate
+) -> tuple[int, int] | None:
+    """Return the two views whose exchanged poses make more detections agree, if any."""
+
+    def agreeing(order: Sequence[int]) -> int:
+        views = [
+            replace(picture, T_cam_world=pictures[other].T_cam_world)
+            for picture, other in zip(pictures, order, strict=True)
+        ]
+        again = [
+            [sight(item.view, item.detection, views[item.view]) for item in view]
+            for view in sightings
+        ]
+        return sum(len(cluster) - 1 for cluster in associated(again))
+
+    order = list(range(len(pictures)))
+    exchanged = {}
+    for first, second in combinations(order, 2):
+        other = order.copy()
+        other[first], other[second] = second, first
+        exchanged[first, second] = agreeing(other)
+    best = max(exchanged, key=lambda pair: exchanged[pair])
+    return best if exchanged[best] > agreeing(order) else None
