@@ -72,6 +72,13 @@ def predict(
     scale_error: ScaleError = None,
     depth: Annotated[Path | None, Option(help="Aligned 16-bit PNG, 0 = unknown.")] = None,
     depth_scale: Annotated[float, Option(help="Metres per unit of --depth.")] = 0.001,
+    views: Annotated[
+        Path | None,
+        Option(
+            help="Camera poses of pictures of one static scene: views.yaml, BOP's "
+            "scene_camera.json or COLMAP's images.txt."
+        ),
+    ] = None,
     verify: Annotated[
         bool, Option("--verify", help="Compare rendered parts with the picture.")
     ] = False,
@@ -96,17 +103,27 @@ def predict(
     gc.disable()  # imported objects stay alive: searching them takes a fifth of the start
     with resumable("the written files are complete"):
         from dopepp.cli.outputs import Outputs
+        from dopepp.cli.several_views import predict_scene, refuse_options
         from dopepp.geometry.camera import camera_matrix
         from dopepp.inference.frames import open_sources
-        from dopepp.inference.frames.source import choose_camera
+        from dopepp.inference.frames.source import choose_camera, given_camera
 
         terms = () if refine is None else tuple(refine.split(","))
         _check_options(terms, depth, track, verify, distance or roi)
-        terms = ("region",) if track else terms
+        terms = ("region",) if track or views else terms
+        if views is not None:
+            unused: dict[str, object] = {
+                "--track": track,
+                "--depth": depth,
+                "--verify": verify,
+                "--csv": csv,
+            }
+            unused |= {"--roi": roi, "--crop": crop, "--K-size": K_size, "--topic": topic}
+            refuse_options({**unused, "--rerun": rerun, "--show": show, "--stride": stride != 1})
         outputs = _file_outputs(save, json_file, csv, stride)
         sources = open_sources(source, topic)
         K = None if intrinsics is None else camera_matrix(*intrinsics)
-        cameras = [choose_camera(K, camera, opened) for opened in sources]
+        cameras = [] if views else [choose_camera(K, camera, opened) for opened in sources]
 
         from dopepp.parts.catalogue import with_meshes
 
@@ -119,6 +136,10 @@ def predict(
         if terms:
             estimator = estimator.refining(terms, known_parts)
         gc.enable()
+        if views is not None:
+            lens = given_camera(K, camera)
+            predict_scene(estimator, sources, views, lens, distance, save, json_file)
+            return
         if rerun is not None or show:
             from dopepp.inference.viewer import Viewer
 

@@ -192,3 +192,44 @@ def test_any_picture_has_an_answer_in_time(run, folder, name, camera, silent):
         assert re.match(rf"nothing found{weaker}: pivconnector: ", done.stderr)
         assert any(word in done.stderr for word in ("belief", "score", "points", "pose"))
         assert done.stderr.count("\n") == 1
+
+
+def test_several_views_of_a_scene(run, tmp_path):
+    from dopepp.geometry.camera import make_transform
+    from dopepp.geometry.rotation import rotation_vector_to_matrix
+    from dopepp.virtual import PRESETS, Factory, render
+    from dopepp.virtual.sensor import capture
+
+    scene = Factory([pivconnector()], PRESETS["quickstart"].reframed(640, 480), 2).scene(0, 9)
+    target = scene.objects[scene.targets[0]].T_cam_obj
+    turn = rotation_vector_to_matrix(np.array([0.0, 0.4, 0.0]))
+    T_new_cam = make_transform(turn, target[:3, 3] - turn @ target[:3, 3])
+    views = {}
+    for name, T in (("a.png", np.eye(4)), ("b.png", T_new_cam)):
+        seen = scene.seen_from(T)
+        cv2.imwrite(str(tmp_path / name), capture(render(seen).image, seen.sensor)[..., ::-1])
+        views[name] = {"T_world_cam": {"matrix": np.linalg.inv(T).tolist()}}
+    np.savetxt(tmp_path / "K.txt", scene.K)
+    path = tmp_path / "views.yaml"
+    path.write_text(json.dumps({"camera": "K.txt", "views": views}))  # JSON is YAML
+    pictures = [tmp_path / name for name in views]
+    outputs = ("--save", tmp_path / "out", "--json", tmp_path / "scene.json")
+    done = run("predict", RELEASED, *pictures, "--views", path, *outputs)
+    record = json.loads(done.stdout)
+    assert np.linalg.norm(np.array(record["T_world_obj"]) - target, axis=0)[3] < 5e-4
+    assert [view["status"] for view in record["views"]] == ["supports", "supports"]
+    assert "1 part: 2 of 2 views" in done.stderr
+    assert json.loads((tmp_path / "scene.json").read_text())["detections"] == [record]
+    drawn = sorted(file.name for file in (tmp_path / "out").iterdir())
+    assert drawn == ["0_a.png", "1_b.png"]
+    views["b.png"]["T_world_cam"]["matrix"][0][3] += 0.05
+    path.write_text(json.dumps({"camera": "K.txt", "views": views}))
+    done = run("predict", RELEASED, *pictures, "--views", path)
+    assert done.stdout == ""
+    assert "a camera pose is wrong" in done.stderr
+    assert (
+        "--track" in run("predict", RELEASED, *pictures, "--views", path, "--track", code=2).stderr
+    )
+    assert "two pictures" in run("predict", RELEASED, pictures[0], "--views", path, code=2).stderr
+    path.write_text(json.dumps({"views": views}))
+    assert "--camera" in run("predict", RELEASED, *pictures, "--views", path, code=2).stderr

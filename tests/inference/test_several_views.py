@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from dopepp import PoseEstimator
-from dopepp.geometry.camera import invert_transform, make_transform
+from dopepp.core.errors import UserError
+from dopepp.geometry.camera import invert_transform, make_transform, resize_camera
+from dopepp.geometry.camera_file import Camera
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
 from dopepp.parts.catalogue import pivconnector
 from dopepp.virtual import PRESETS, Factory, render
@@ -91,3 +95,95 @@ def test_the_world_is_any_frame(estimator, scene, views):
     turn = np.kron(np.eye(2), T_other_world[:3, :3])
     expected = turn @ detection.covariance @ turn.T
     assert_allclose(other.covariance, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def predicted(estimator, scene, views, order=(0, 1), **changes):
+    """Predict on some of the pictures, with other pictures or camera poses."""
+    images, poses = views
+    given = {"images": [images[n] for n in order], "poses": [poses[n] for n in order]} | changes
+    cameras = given.get("cameras", [scene.K] * len(order))
+    return estimator.predict_views(
+        given["images"], cameras, given["poses"], names=given.get("names")
+    )
+
+
+@pytest.mark.parametrize("millimetres", [8, 50])
+def test_a_wrong_camera_pose_is_named(estimator, scene, views, millimetres):
+    _, poses = views
+    wrong = poses[1].copy()
+    wrong[0, 3] += 1e-3 * millimetres
+    result = predicted(estimator, scene, views, poses=[poses[0], wrong], names=["a", "b"])
+    assert result.detections == []
+    assert {tuple(item.views) for item in result.weaker} >= {("a",), ("b",)}
+    (finding,) = result.findings
+    assert "a camera pose is wrong, or the part was moved" in finding
+    apart = float(finding.split("pivconnector ")[1].split(" mm")[0])
+    assert apart == pytest.approx(millimetres, abs=3)
+
+
+def test_the_third_view_tells_whose_camera_is_wrong(estimator, scene, views):
+    _, poses = views
+    wrong = poses[1].copy()
+    wrong[:3, 3] += 0.05
+    three = predicted(estimator, scene, views, (0, 1, 2), poses=[poses[0], wrong, poses[2]])
+    assert [detection.views for detection in three.detections] == [["view 0", "view 2"]]
+    assert all("the camera pose of view 1 is wrong" in finding for finding in three.findings)
+    assert three.findings
+
+
+def test_swapped_views_are_named(estimator, scene, views):
+    _, poses = views
+    result = predicted(estimator, scene, views, poses=[poses[1], poses[0]])
+    assert result.detections == []
+    assert "camera poses of view 0 and view 1 are swapped" in result.findings[0]
+
+
+def test_a_moved_part_is_not_averaged(estimator, scene, views, true):
+    images, poses = views
+    shift = np.eye(4)
+    shift[:3, 3] = 0.0, 0.02, 0.01
+    objects = [replace(item, T_cam_obj=shift @ item.T_cam_obj) for item in scene.objects]
+    seen = replace(scene, objects=tuple(objects)).seen_from(invert_transform(poses[1]))
+    images = [images[0], capture(render(seen).image, seen.sensor)]
+    result = predicted(estimator, scene, views, images=images)
+    assert result.detections == []
+    assert "the part was moved between the pictures" in result.findings[0]
+
+
+def test_a_view_without_the_part_leaves_the_single_view(estimator, scene, views):
+    images, _ = views
+    (alone,) = estimator.predict(images[0], scene.K)
+    empty = np.full_like(images[1], 90)
+    result = predicted(estimator, scene, views, images=[images[0], empty])
+    (detection,) = result.detections
+    assert not result.findings
+    assert [item.status for item in detection.evidence] == ["supports", "hidden"]
+    assert_allclose(detection.T_world_obj, alone.T_cam_obj, atol=1e-9)
+    added = detection.covariance - alone.covariance  # the errors of the camera's pose
+    assert np.linalg.eigvalsh(added).min() > 0
+    assert np.sqrt(np.diag(added)).max() < 1e-3
+    away = views[1][1].copy()
+    away[:3, :3] = -away[:3, :3] @ np.diag([1.0, -1.0, 1.0])  # turned away from the scene
+    result = predicted(estimator, scene, views, images=[images[0], empty], poses=[np.eye(4), away])
+    assert [item.status for item in result.detections[0].evidence] == ["supports", "outside"]
+    assert result.detections[0].score == pytest.approx(alone.score, abs=1e-6)
+
+
+def test_views_may_have_different_sizes_and_lenses(estimator, scene, views, true):
+    images, _ = views
+    half = cv2.resize(images[1], (320, 240), interpolation=cv2.INTER_AREA)
+    cameras = [scene.K, Camera((320, 240), resize_camera(scene.K, 0.5, 0.5), (), "half")]
+    result = predicted(estimator, scene, views, images=[images[0], half], cameras=cameras)
+    _, along, across = errors(result.detections[0].T_world_obj, true)
+    assert result.detections[0].views == ["view 0", "view 1"]
+    assert max(along, across) < 0.6
+
+
+def test_wrong_arguments_are_refused(estimator, scene, views):
+    images, poses = views
+    with pytest.raises(UserError, match="1 T_world_cam for 2 images"):
+        estimator.predict_views(images[:2], [scene.K] * 2, poses[:1])
+    with pytest.raises(UserError, match="T_world_cam of view 1"):
+        estimator.predict_views(images[:2], [scene.K] * 2, [poses[0], 2 * poses[1]])
+    with pytest.raises(UserError, match="refine='region'"):
+        PoseEstimator.load("pretrained/pivconnector_wide").predict_views([], [], [])

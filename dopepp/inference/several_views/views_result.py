@@ -81,6 +81,13 @@ class ViewsResult:
     weaker: Sequence[WorldDetection] = ()  # below the threshold, or contradicted; best score first
     joint_ms: float = 0.0  # time of association, joint refinement and verification, milliseconds
 
+    @property
+    def summary(self) -> str:
+        """Number of parts, and in how many of the views each is."""
+        count, shares = len(self.detections), [len(item.views) for item in self.detections]
+        shown = ", ".join(f"{share} of {len(self.views)} views" for share in shares)
+        return f"{count} part{'s' * (count > 1)}: {shown}" if count else "nothing found"
+
     def records(self) -> list[dict[str, Any]]:
         """Return each detection as plain values."""
         return [detection.to_record() for detection in self.detections]

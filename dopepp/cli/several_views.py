@@ -1,0 +1,80 @@
+"""``dopepp predict --views``: poses in the world from several pictures of one static scene."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from dopepp.core.errors import UserError
+
+if TYPE_CHECKING:
+    from dopepp.geometry.camera_file import Camera
+    from dopepp.inference.estimator import PoseEstimator
+    from dopepp.inference.frames import FrameSource
+    from dopepp.inference.picture import Distances
+
+
+def refuse_options(options: dict[str, object]) -> None:
+    """Refuse options of ``dopepp predict`` that several views do not have, by name and value."""
+    if given := [name for name, value in options.items() if value]:
+        problem = f"--views with {', '.join(given)}"
+        raise UserError(problem, "--views without them", f"leave out {', '.join(given)}")
+
+
+def predict_scene(
+    estimator: PoseEstimator,
+    sources: Sequence[FrameSource],
+    views: Path,
+    camera: Camera | None,
+    distances: Distances | None,
+    save: Path | None,
+    json_file: Path | None,
+) -> None:
+    """Print and write the parts in a static scene.
+
+    Args:
+        estimator: Estimator that refines by region.
+        sources: Pictures of the scene.
+        views: File of the camera poses.
+        camera: Camera of the pictures for which the file names none.
+        distances: Expected depths of the parts.
+        save: Folder for drawn pictures.
+        json_file: File for a line of JSON.
+    """
+    from dopepp.core.files import write_whole
+    from dopepp.inference.several_views.view_files import read_camera_poses
+
+    poses = read_camera_poses(views)
+    frames = [frame for source in sources for frame in source.frames()]
+    if len(frames) < 2 or any(source.rate is not None for source in sources):
+        problem = f"--views with {len(frames)} pictures"
+        raise UserError(problem, "two pictures or more", "pass the pictures of one static scene")
+    shots = [poses.of(Path(frame.name)) for frame in frames]
+    cameras: list[Camera] = []
+    for frame, shot in zip(frames, shots, strict=True):
+        lens = shot.camera or camera
+        if lens is None:
+            fix = f"add `camera: FILE` to {views}, or pass --camera or --K"
+            raise UserError(f"no camera of {frame.name}", "a camera for every picture", fix)
+        cameras.append(lens)
+    result = estimator.predict_views(
+        [frame.image for frame in frames],
+        cameras,
+        [shot.T_world_cam for shot in shots],
+        distances=distances,
+        camera_error=poses.error,
+        names=[Path(frame.name).name for frame in frames],
+    )
+    for record in result.records():
+        typer.echo(json.dumps(record, ensure_ascii=False))
+    for finding in result.findings:
+        typer.echo(finding, err=True)
+    typer.echo(result.summary, err=True)
+    if save is not None:
+        result.save(save)
+    if json_file is not None:
+        write_whole(json_file, f"{result.to_json()}\n".encode())
