@@ -82,6 +82,7 @@ class Detection:
         probability: Probability that ADD(-S) is below a tenth of the diameter, from the image at
             the refined pose (:mod:`dopepp.inference.refinement.verification`); None without
             refinement by region.
+        start: Pose and covariance from which refinement started; None without refinement.
     """
 
     object: str
@@ -96,6 +97,7 @@ class Detection:
     agreement: float | None = None
     support: float | None = None
     probability: float | None = None
+    start: tuple[Transform, Float[np.ndarray, "6 6"]] | None = None
 
 
 _Belief = Annotated[float, Range(1e-6, 1.0)]

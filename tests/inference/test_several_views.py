@@ -107,11 +107,11 @@ def predicted(estimator, scene, views, order=(0, 1), **changes):
     )
 
 
-@pytest.mark.parametrize("millimetres", [8, 50])
-def test_a_wrong_camera_pose_is_named(estimator, scene, views, millimetres):
+@pytest.mark.parametrize(("axis", "millimetres"), [(0, 15), (1, 8), (0, 50), (2, 50)])
+def test_a_wrong_camera_pose_is_named(estimator, scene, views, axis, millimetres):
     _, poses = views
     wrong = poses[1].copy()
-    wrong[0, 3] += 1e-3 * millimetres
+    wrong[axis, 3] += 1e-3 * millimetres
     result = predicted(estimator, scene, views, poses=[poses[0], wrong], names=["a", "b"])
     assert result.detections == []
     assert {tuple(item.views) for item in result.weaker} >= {("a",), ("b",)}
@@ -119,6 +119,22 @@ def test_a_wrong_camera_pose_is_named(estimator, scene, views, millimetres):
     assert "a camera pose is wrong, or the part was moved" in finding
     apart = float(finding.split("pivconnector ")[1].split(" mm")[0])
     assert apart == pytest.approx(millimetres, abs=3)
+
+
+def test_views_that_disagree_are_named(estimator, scene, views):
+    """An error along the baseline changes the distance only, and a consistent pose remains."""
+    _, poses = views
+    wrong = poses[1].copy()
+    wrong[0, 3] += 0.008
+    result = predicted(estimator, scene, views, poses=[poses[0], wrong])
+    (finding,) = result.findings
+    assert "view 0 and view 1 disagree on pivconnector" in finding
+    right = predicted(estimator, scene, views).detections[0]
+    ratio = (
+        np.linalg.slogdet(result.detections[0].covariance)[1]
+        - np.linalg.slogdet(right.covariance)[1]
+    )
+    assert ratio > 0
 
 
 def test_the_third_view_tells_whose_camera_is_wrong(estimator, scene, views):

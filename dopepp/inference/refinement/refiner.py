@@ -103,15 +103,15 @@ class Refiner:
         refiner, cuboid = self._refiners[detection.object], self._cuboids[detection.object]
         T_cam_obj, covariance = detection.T_cam_obj, detection.covariance
         is_tracked = detection.agreement is not None  # set by refinement only
-        if is_tracked:
-            refined = refiner.refine(image, K, T_cam_obj, covariance, depth, followed=True)
-        elif not np.isfinite(detection.peaks).any():  # a template match
-            refined = refiner.refine(image, K, T_cam_obj, covariance, depth)
-        else:
+        starts, prior = None, covariance
+        if not is_tracked and np.isfinite(detection.peaks).any():  # of a network, not a template
             # A tracker knows how far a part may have moved; a network's covariance may be wrong.
-            starts = partial(poses_of_four, cuboid, detection.peaks, K)
-            loose = LOOSER**2 * covariance
-            refined = refiner.refine(image, K, T_cam_obj, loose, depth, starts=starts)
+            starts, prior = (
+                partial(poses_of_four, cuboid, detection.peaks, K),
+                LOOSER**2 * covariance,
+            )
+        refined = refiner.refine(image, K, T_cam_obj, prior, depth, is_tracked, starts)
+        detection = replace(detection, start=(T_cam_obj, prior))
         if refined.covariance is None:
             end = replace(detection, kept=refined.reason, agreement=None, support=None)
         else:
@@ -130,10 +130,10 @@ class Refiner:
         return self.verified(end, image, K, moved)
 
     def refine_views(
-        self, name: str, views: Sequence[PosedPicture], start: Prior
+        self, name: str, views: Sequence[PosedPicture], start: Prior, prior: Prior
     ) -> JointRefinement:
-        """Refine the pose of a part in the world; see :func:`.several_views.refine_views`."""
-        return self._refiners[name].refine_views(views, start)
+        """Refine the pose of a part in the world; see :meth:`PartRefiner.refine_views`."""
+        return self._refiners[name].refine_views(views, start, prior)
 
     def verified(
         self, detection: Detection, image: Picture, K: CameraMatrix, moved: float = 0.0
@@ -179,12 +179,16 @@ class PartRefiner:
         has_surface = self._uses_depth and len(part.points) >= FEWEST_POINTS
         self._surface = surface_points(part.points) if has_surface else None
 
-    def refine_views(self, views: Sequence[PosedPicture], start: Prior) -> JointRefinement:
+    def refine_views(
+        self, views: Sequence[PosedPicture], start: Prior, prior: Prior
+    ) -> JointRefinement:
         """Refine a pose in the world on several pictures.
 
         Args:
             views: Pictures with the poses of their cameras.
-            start: Pose in the world and its information.
+            start: Pose in the world from which the search starts; its information limits the
+                search.
+            prior: What is known of the pose without the pictures' outlines.
 
         Raises:
             UndecidedError: The pictures do not determine the pose.
@@ -192,7 +196,7 @@ class PartRefiner:
         if self._region is None:
             raise UndecidedError("several views are refined with the term region")
         surface = self._surface if self._uses_depth else None
-        return refine_views(self._region, views, start, surface)
+        return refine_views(self._region, views, start, prior, surface)
 
     def refine(
         self,

@@ -27,8 +27,6 @@ from dopepp.inference.refinement.part_surface import SurfacePoints
 from dopepp.inference.refinement.region import RegionRefiner, necessary_rounds, search_distance
 from dopepp.inference.refinement.region.round import OutlineAgreement, Round
 from dopepp.inference.refinement.solver import (
-    UNKNOWN_ALONG,
-    UNKNOWN_TURN,
     NormalEquations,
     PoseMatrix,
     Prior,
@@ -127,6 +125,7 @@ def refine_views(
     region: RegionRefiner,
     views: Sequence[PosedPicture],
     start: Prior,
+    prior: Prior,
     surface: SurfacePoints | None = None,
 ) -> JointRefinement:
     """Refine a pose on all views that show its outline.
@@ -134,15 +133,13 @@ def refine_views(
     Args:
         region: Refiner of the part.
         views: Pictures.
-        start: Pose in the world and its information, which limits the search.
+        start: Pose in the world from which the search starts; its information limits the search.
+        prior: What is known of the pose without the pictures' outlines.
         surface: Surface points of the part, for views with depth.
 
     Raises:
         UndecidedError: No view shows the outline.
     """
-    # The start is a result of the same pictures, so it only limits the search.
-    spread = np.repeat([UNKNOWN_TURN, UNKNOWN_ALONG * region.diameter], 3)
-    prior = Prior(start.T_cam_obj, np.diag(1.0 / spread**2))
     covariance = np.linalg.inv(start.information)
     searches: list[_ViewSearch] = []
     for number, view in enumerate(views):

@@ -27,9 +27,9 @@ from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.picture import Depth, Distances, are_same, prepare_image
 from dopepp.inference.pose_result import PoseResult, make_shape, spent_between
 from dopepp.inference.refinement.several_views import PosedPicture
-from dopepp.inference.several_views.association import associate, sight
+from dopepp.inference.several_views.association import associate, separation, sight
 from dopepp.inference.several_views.contradictions import contradictions
-from dopepp.inference.several_views.joint import JointEstimator, JointPart
+from dopepp.inference.several_views.joint import CONSISTENT, JointEstimator, JointPart
 from dopepp.inference.several_views.views_result import ViewsResult
 
 if TYPE_CHECKING:
@@ -137,12 +137,15 @@ def _posed(
 
 
 def _are_one(part: JointPart, better: JointPart) -> bool:
-    """Return whether a part is a better one: at its place in all views, which its own views show.
+    """Return whether a part is a better one: at its place in all views, as far as they show it.
 
-    A place at which a view alone shows the part contradicts that view.
+    A pose that only its own view shows, and that is farther away than the covariances explain,
+    contradicts the other views.
     """
+    found, other = part.detection, better.detection
     shared = {item.view for item in part.sightings} & {item.view for item in better.sightings}
-    shown, shown_better = set(part.detection.views), set(better.detection.views)
-    pairs = zip(part.detection.evidence, better.detection.evidence, strict=True)
-    is_at_place = all(are_same(a.detection, b.detection) for a, b in pairs)
-    return not shared and shown <= shown_better and is_at_place
+    pairs = zip(found.evidence, other.evidence, strict=True)
+    if shared or not all(are_same(a.detection, b.detection) for a, b in pairs):
+        return False
+    is_shown = set(found.views) <= set(other.views)
+    return is_shown or separation(found.pose, other.pose) <= CONSISTENT

@@ -22,8 +22,9 @@ from dopepp.inference.refinement.several_views import PosedPicture
 from dopepp.inference.refinement.solver import PoseMatrix, Prior
 from dopepp.recovery.detection import Detection
 
-GATE: Final = 4.5
-"""Largest Mahalanobis distance between detections of one part, with loosened covariances."""
+GATE: Final = 4.5 * LOOSER
+"""Largest Mahalanobis distance between detections of one part. It is generous, because covariances
+were fitted to images like those of training, and the joint pose is verified."""
 
 Group = Float[np.ndarray, "group 4 4"]  # transforms that map the part onto itself
 
@@ -34,14 +35,28 @@ class Sighting:
 
     view: int
     detection: Detection  # in the camera
-    T_world_obj: Transform
-    covariance: PoseMatrix  # loosened, with the error of the camera's pose; world axes
+    pose: Prior  # refined pose in the world, with the error of the camera's pose
+    start: Prior  # pose before refinement, weak enough to admit the refined pose
 
 
 def sight(view: int, detection: Detection, picture: PosedPicture) -> Sighting:
     """Express a detection in the world."""
-    loose = LOOSER**2 * detection.covariance
-    return Sighting(view, detection, *picture.to_world(detection.T_cam_obj, loose))
+    pose = _in_world(picture, detection.T_cam_obj, detection.covariance)
+    assert detection.start is not None
+    start = _in_world(picture, *detection.start)
+    surprise = max(1.0, start.squared_distance(pose.T_cam_obj) / 6)
+    return Sighting(view, detection, pose, Prior(start.T_cam_obj, start.information / surprise))
+
+
+def _in_world(picture: PosedPicture, T_cam_obj: Transform, covariance: PoseMatrix) -> Prior:
+    T_world_obj, in_world = picture.to_world(T_cam_obj, covariance)
+    return Prior(T_world_obj, np.linalg.inv(in_world))
+
+
+def separation(first: Prior, second: Prior) -> float:
+    """Return the Mahalanobis distance between two poses."""
+    both = np.linalg.inv(first.information) + np.linalg.inv(second.information)
+    return math.sqrt(Prior(first.T_cam_obj, np.linalg.inv(both)).squared_distance(second.T_cam_obj))
 
 
 def nearest_equivalent(
@@ -56,9 +71,8 @@ def nearest_equivalent(
 
 def distance(first: Sighting, second: Sighting, group: Group, cuboid: Cuboid) -> float:
     """Return the Mahalanobis distance between two sightings."""
-    pose = nearest_equivalent(second.T_world_obj, first.T_world_obj, group, cuboid)
-    information = np.linalg.inv(first.covariance + second.covariance)
-    return math.sqrt(Prior(first.T_world_obj, information).squared_distance(pose))
+    pose = nearest_equivalent(second.pose.T_cam_obj, first.pose.T_cam_obj, group, cuboid)
+    return separation(first.pose, Prior(pose, second.pose.information))
 
 
 def associate(
@@ -93,13 +107,12 @@ def associate(
     return clusters
 
 
-def fused(cluster: Sequence[Sighting], group: Group, cuboid: Cuboid) -> Prior:
-    """Return the mean of the sightings of a part, weighted by their information."""
-    seed = Prior(cluster[0].T_world_obj, np.linalg.inv(cluster[0].covariance))
-    information, gradient = seed.information, np.zeros(6)
-    for other in cluster[1:]:
-        pose = nearest_equivalent(other.T_world_obj, seed.T_cam_obj, group, cuboid)
-        weight = np.linalg.inv(other.covariance)
-        information = information + weight
-        gradient += weight @ Prior(pose, weight).offset(seed.T_cam_obj)
-    return Prior(moved(seed.T_cam_obj, np.linalg.solve(information, gradient)), information)
+def fused(poses: Sequence[Prior], group: Group, cuboid: Cuboid) -> Prior:
+    """Return the mean of several poses of a part, weighted by their information."""
+    first = poses[0].T_cam_obj
+    information, gradient = np.zeros((6, 6)), np.zeros(6)
+    for pose in poses:
+        nearest = nearest_equivalent(pose.T_cam_obj, first, group, cuboid)
+        information = information + pose.information
+        gradient += pose.information @ Prior(nearest, pose.information).offset(first)
+    return Prior(moved(first, np.linalg.solve(information, gradient)), information)

@@ -1,8 +1,9 @@
 """Contradictions between views: wrong or swapped camera poses, and moved parts.
 
 Two views contradict each other if either shows a part where the other shows something else, while
-the other shows a part of the same kind elsewhere. If they agree on no part, a camera pose is wrong,
-and detections that depend on it are rejected. If they agree on another part, the part was moved.
+the other shows a part of the same kind elsewhere, farther than the covariances explain. If the
+views agree on no part, a camera pose is wrong, and detections that depend on the pose are rejected.
+If the views agree on another part, the part was moved.
 """
 
 from __future__ import annotations
@@ -17,11 +18,13 @@ import numpy as np
 
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.inference.refinement.several_views import PosedPicture
-from dopepp.inference.several_views.association import Sighting, sight
+from dopepp.inference.several_views.association import Sighting, separation, sight
+from dopepp.inference.several_views.joint import CONSISTENT
 from dopepp.inference.several_views.views_result import WorldDetection
 
-DISAGREEING: Final = 1.5
-"""Distance of a view's evidence from the others', deviations, beyond which a finding names it."""
+DISAGREEING: Final = 1.2
+"""Disagreement of views on a part from which a finding states it. On rendered scenes with cameras
+as calibrated, the largest of 30 was 0.9."""
 
 Views = Sequence[Sequence[Sighting]]  # sightings of each view
 Associate = Callable[[Views], list[list[Sighting]]]
@@ -104,10 +107,12 @@ def _support(detection: WorldDetection) -> list[int]:
 
 def _conflict(first: WorldDetection, second: WorldDetection) -> _Conflict | None:
     """Return the conflict of two detections, if a view of one does not show the other."""
+    if first.object != second.object or separation(first.pose, second.pose) <= CONSISTENT:
+        return None
     conflicts = []
     for a, b in product(_support(first), _support(second)):
         statuses = first.evidence[b].status, second.evidence[a].status
-        if first.object == second.object and "supports" not in statuses and "hidden" in statuses:
+        if "supports" not in statuses and "hidden" in statuses:
             is_mutual = statuses == ("hidden", "hidden")
             conflicts.append(_Conflict((a, b), (first, second), is_mutual))
     return max(conflicts, key=lambda conflict: conflict.is_mutual, default=None)

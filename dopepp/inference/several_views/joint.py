@@ -13,14 +13,21 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 
-from dopepp.geometry.camera import Transform, project_keypoints
-from dopepp.geometry.cuboid import Cuboid
-from dopepp.inference.refinement.refiner import Refiner
+from dopepp.geometry.camera import project_keypoints
+from dopepp.geometry.cuboid import CENTROID, Cuboid
+from dopepp.inference.refinement.refiner import LOOSER, Refiner
 from dopepp.inference.refinement.region.round import OutlineAgreement
 from dopepp.inference.refinement.several_views import PosedPicture
-from dopepp.inference.refinement.solver import PoseMatrix, UndecidedError
-from dopepp.inference.several_views.association import Group, Sighting, fused
+from dopepp.inference.refinement.solver import Prior, UndecidedError
+from dopepp.inference.several_views.association import (
+    Group,
+    Sighting,
+    fused,
+    nearest_equivalent,
+    separation,
+)
 from dopepp.inference.several_views.views_result import Status, ViewEvidence, WorldDetection
 from dopepp.recovery.detection import log_odds
 
@@ -30,8 +37,17 @@ AGREEING: Final = 0.7
 which a view supports a pose. At right poses the share is above 0.9; if a camera is off by 4 mm at
 20 cm, it is below 0.7 in one view."""
 
+WEAKER: Final = (0.5, 0.15)
+"""Factor on the probability, and decrease of the share, that a view's own detection may lose."""
+
+CONSISTENT: Final = 4.5
+"""Largest Mahalanobis distance of a joint pose from a detection that the image did not refine."""
+
 AGAINST: Final = -1.5
-"""Lower bound of the log odds of a view that does not support a pose: the part may be hidden."""
+"""Lower bound of the log odds of a view: the part may be hidden or hardly visible there."""
+
+COINCIDENCE: Final = 1.5
+"""Log odds that each further detection at the same pose adds: wrong detections differ."""
 
 USUAL_MOVE: Final = 1.0
 """Mahalanobis distance from the network's pose, where the network has not found the part."""
@@ -62,106 +78,121 @@ class JointEstimator:
 
     def estimate(self, sightings: Sequence[Sighting], group: Group, cuboid: Cuboid) -> JointPart:
         """Return the joint pose of the sightings of one part, with those that agree with it."""
-        start = fused(sightings, group, cuboid)
-        everything, tried = set(range(len(self._views))), list[set[int]]()
-        chosen = everything
+        name, everything = sightings[0].detection.object, set(range(len(self._views)))
+        start = fused([sighting.pose for sighting in sightings], group, cuboid)
+        limit = Prior(start.T_cam_obj, start.information / LOOSER**2)
+        members = {sighting.view for sighting in sightings}
+        chosen, tried = everything, list[set[int]]()
         while len(chosen) > 1 and chosen not in tried:
             tried.append(chosen)
             numbers = sorted(chosen)
+            known = [item.start for item in sightings if item.view in chosen]
+            prior = fused(known or [sightings[0].start], group, cuboid)
             try:
                 views = [self._views[number] for number in numbers]
-                joint = self._refiner.refine_views(sightings[0].detection.object, views, start)
+                joint = self._refiner.refine_views(name, views, limit, prior)
             except UndecidedError:
                 break
-            agreements = dict(zip(numbers, joint.agreements, strict=True))
-            pose = joint.T_world_obj, joint.covariance
-            evidence = self._evidence(sightings, cuboid, *pose, agreements)
+            pose = Prior(joint.T_world_obj, np.linalg.inv(joint.covariance))
+            shown = dict(zip(numbers, joint.agreements, strict=True))
+            evidence = [
+                self._evidence(number, pose, sightings, group, cuboid, shown.get(number))
+                for number in everything
+            ]
             supporting = {n for n in everything if evidence[n].status == "supports"}
             if supporting >= chosen:
-                own = [sighting for sighting in sightings if sighting.view in chosen]
-                # Views that disagree more than they should state too small errors.
+                own = [sighting for sighting in sightings if sighting.view in chosen] or sightings
                 disagreement = max(joint.disagreements)
-                covariance = max(1.0, disagreement) ** 2 * joint.covariance
-                return self._part(own, pose[0], covariance, evidence, disagreement)
+                if len(own) > 1:
+                    apart = [_separation(sighting, pose, group, cuboid) for sighting in own]
+                    disagreement = max(disagreement, min(apart) / math.sqrt(6))
+                # Views that disagree more than they should have larger errors than stated.
+                looser = Prior(pose.T_cam_obj, pose.information / max(1.0, disagreement) ** 2)
+                return self._part(own, looser, evidence, disagreement)
             several = len(supporting & chosen) > 1
-            chosen = supporting & chosen if several else {item.view for item in sightings}
+            chosen = supporting & chosen if several else members
         best = max(sightings, key=lambda sighting: sighting.detection.score)
-        seen = best.detection
-        pose = self._views[best.view].to_world(seen.T_cam_obj, seen.covariance)
-        return self._part([best], *pose, self._evidence([best], cuboid, *pose, {}, best))
+        alone = best.detection
+        evidence = [
+            self._evidence(number, best.pose, [best], group, cuboid, None)
+            if number != best.view
+            else ViewEvidence(self._names[number], "supports", alone.probability or 0.0, alone)
+            for number in everything
+        ]
+        return self._part([best], best.pose, evidence)
 
     def _evidence(
         self,
+        number: int,
+        pose: Prior,
         sightings: Sequence[Sighting],
+        group: Group,
         cuboid: Cuboid,
-        T_world_obj: Transform,
-        covariance: PoseMatrix,
-        agreements: dict[int, OutlineAgreement | None],
-        only: Sighting | None = None,
-    ) -> list[ViewEvidence]:
-        """Return what each view shows at a pose; ``only`` is the sighting of a single view."""
-        found = {sighting.view: sighting.detection for sighting in sightings}
-        evidence = []
-        for number, (view, name) in enumerate(zip(self._views, self._names, strict=True)):
-            if only is not None and number == only.view:
-                probability = only.detection.probability or 0.0
-                evidence.append(ViewEvidence(name, "supports", probability, only.detection))
-                continue
-            at = view.to_camera(T_world_obj, covariance)
-            T_cam_obj = at.T_cam_obj
-            detection = replace(
-                found.get(number, sightings[0].detection),
-                T_cam_obj=T_cam_obj,
-                keypoints=project_keypoints(cuboid, T_cam_obj, view.K),
-                covariance=np.linalg.inv(at.information),
-                kept="",
-            )
-            if number not in found:
-                detection = replace(detection, peaks=np.full((9, 2), np.nan))
-            agreement = agreements.get(number)
-            share, support = (
-                (0.0, 0.0) if agreement is None else (agreement.share, agreement.support)
-            )
-            detection = replace(detection, agreement=share, support=support)
-            detection = self._refiner.verified(detection, view.image, view.K, USUAL_MOVE)
-            probability = detection.probability or 0.0
-            status: Status = "hidden"
-            if not _is_inside(detection.keypoints[-1], view):
-                status = "outside"
-            elif probability >= SUPPORTING and share >= AGREEING:
-                status = "supports"
-            evidence.append(ViewEvidence(name, status, probability, detection))
-        return evidence
+        agreement: OutlineAgreement | None,
+    ) -> ViewEvidence:
+        """Return what a view shows at a pose in the world."""
+        view = self._views[number]
+        own = next((sighting for sighting in sightings if sighting.view == number), None)
+        at = view.to_camera(pose.T_cam_obj, np.linalg.inv(pose.information))
+        found = sightings[0].detection if own is None else own.detection
+        detection = replace(
+            found,
+            T_cam_obj=at.T_cam_obj,
+            keypoints=project_keypoints(cuboid, at.T_cam_obj, view.K),
+            peaks=np.full_like(found.peaks, np.nan) if own is None else found.peaks,
+            covariance=np.linalg.inv(at.information),
+            agreement=None if agreement is None else agreement.share,
+            support=None if agreement is None else agreement.support,
+        )
+        detection = self._refiner.verified(detection, view.image, view.K, USUAL_MOVE)
+        probability, share = detection.probability or 0.0, detection.agreement or 0.0
+        least, least_share = SUPPORTING, AGREEING
+        if own is not None:
+            factor, decrease = WEAKER
+            least = min(least, factor * (found.probability or 0.0))
+            least_share = min(least_share, (found.agreement or 0.0) - decrease)
+        is_shown = agreement is not None and probability >= least and share >= least_share
+        if own is not None and found.kept:
+            is_shown = _separation(own, pose, group, cuboid) <= CONSISTENT
+        status: Status = "supports" if is_shown else "hidden"
+        if not _is_inside(detection.keypoints[CENTROID], view):
+            status = "outside"
+        return ViewEvidence(self._names[number], status, probability, detection)
 
     def _part(
         self,
         sightings: Sequence[Sighting],
-        T_world_obj: Transform,
-        covariance: PoseMatrix,
+        pose: Prior,
         evidence: Sequence[ViewEvidence],
         disagreement: float = 0.0,
     ) -> JointPart:
         """Return the detection of a part with the probability and score of all views."""
-        odds = 0.0
-        for item in evidence:
-            if item.status == "supports":
-                odds += log_odds(item.probability)
-            elif item.status == "hidden":
-                odds += min(0.0, max(AGAINST, log_odds(item.probability)))
         best = max((item.detection for item in sightings), key=lambda detection: detection.score)
+        alone, odds = log_odds(best.probability or 0.0), 0.0
+        for item in evidence:
+            seen = max(AGAINST, log_odds(item.probability))
+            if item.detection is best:
+                odds += alone
+            elif item.status != "outside":
+                odds += seen if item.status == "supports" else min(0.0, seen)
+        odds += COINCIDENCE * (len(sightings) - 1)
         # The score of the best single view, with the odds of all views instead of its own.
-        alone = log_odds(best.probability or 0.0)
         score = _probability(log_odds(best.score) + self._slope * (odds - alone))
-        pose = T_world_obj, covariance
-        name, probability = best.object, _probability(odds)
-        detection = WorldDetection(name, score, probability, *pose, evidence, disagreement)
-        return JointPart(sightings, detection)
+        covariance = np.linalg.inv(pose.information)
+        given = best.object, score, _probability(odds), pose.T_cam_obj, covariance
+        return JointPart(sightings, WorldDetection(*given, evidence, disagreement))
+
+
+def _separation(sighting: Sighting, pose: Prior, group: Group, cuboid: Cuboid) -> float:
+    """Return the Mahalanobis distance of a sighting's own pose from a pose."""
+    nearest = nearest_equivalent(sighting.pose.T_cam_obj, pose.T_cam_obj, group, cuboid)
+    return separation(pose, Prior(nearest, sighting.pose.information))
 
 
 def _probability(odds: float) -> float:
     return 1.0 / (1.0 + math.exp(-odds))
 
 
-def _is_inside(pixel: np.ndarray, view: PosedPicture) -> bool:
+def _is_inside(pixel: Float[np.ndarray, "2"], view: PosedPicture) -> bool:
     height, width = view.image.shape[:2]
     return bool((pixel >= 0).all() and pixel[0] < width and pixel[1] < height)

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
+import numpy as np
+
 from dopepp.geometry.camera import Transform
 from dopepp.inference.pose_result import PoseResult
-from dopepp.inference.refinement.solver import PoseMatrix
+from dopepp.inference.refinement.solver import PoseMatrix, Prior
 from dopepp.recovery.detection import Detection
 
 WORLD_FRAME: Final = "world, the frame of the camera poses; metres"
@@ -43,7 +45,14 @@ class WorldDetection:
     # world axes; it contains the errors of the camera poses
     covariance: PoseMatrix
     evidence: Sequence[ViewEvidence]  # of each view
-    disagreement: float = 0.0  # largest distance of a view's evidence from the others', deviations
+    # Largest distance of a view's evidence from the others', or least distance of the joint pose
+    # from a view's own, whichever is larger; standard deviations per √degree of freedom
+    disagreement: float = 0.0
+
+    @property
+    def pose(self) -> Prior:
+        """Pose and information in the world."""
+        return Prior(self.T_world_obj, np.linalg.inv(self.covariance))
 
     @property
     def views(self) -> list[str]:
