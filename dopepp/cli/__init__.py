@@ -40,7 +40,7 @@ COMMANDS: Final = (
 """Commands with options of their own, in the order of ``--help``."""
 
 _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
-"""Of the click that this version of Typer bundles or imports."""
+"""Usage error of the click version that Typer bundles or imports."""
 
 
 class _OneLineErrors(TyperGroup):

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 BOARD: Final = "charuco:8x11:20:15, chess:7x10:25 or circles:4x11:40 (columns × rows, mm)."
 
 Out = Annotated[Path, Option(help="YAML file to write.")]
-Force = Annotated[bool, Option("--force", help="Also write a doubtful calibration, marked.")]
+Force = Annotated[bool, Option("--force", help="Also write a doubtful calibration, with a mark.")]
 BoardSpec = Annotated[str, Option("--board", help=BOARD)]
 Pictures = Annotated[Path, Argument(help="Folder with pictures of the board.")]
 Poses = Annotated[
@@ -45,14 +45,14 @@ app = typer.Typer(
 
 @app.command()
 def board(
-    what: Annotated[str, Argument(help=BOARD)],
+    spec: Annotated[str, Argument(help=BOARD)],
     out: Annotated[Path, Option(help="PDF or PNG to print.")],
 ) -> None:
     """Write a calibration board for printing at true scale."""
     from dopepp.robot.calibration.board import parse_board
 
     with report_errors():
-        typer.echo(f"{out}: {parse_board(what).write(out)}")
+        typer.echo(f"{out}: {parse_board(spec).write(out)}")
 
 
 @app.command()
@@ -60,8 +60,8 @@ def camera(
     source: Annotated[
         str,
         Argument(
-            help="Pictures of the board: a folder, a video, a ROS bag, a camera's number or "
-            "address (Ctrl-C ends the recording)."
+            help="Pictures of the board: a folder, a video, a ROS bag, or the number or address of "
+            "a camera (Ctrl-C ends the recording)."
         ),
     ],
     board: BoardSpec,
@@ -98,7 +98,7 @@ def tcp(
     quaternion: Quaternion = "wxyz",
     direction: Direction = "flange-to-base",
 ) -> None:
-    """Calibrate a tool's tip from flange poses in which the tip touches one fixed point."""
+    """Calibrate a tool's tip from flange poses in which the tip touches a fixed point."""
     from dopepp.robot.calibration.records import read_robot_poses, write_calibration
     from dopepp.robot.calibration.tool import find_tip
 
@@ -155,7 +155,7 @@ def bench(
         if board is not None:
             result, names = _bench_from_board(source, board, camera, hand_eye, poses, pose_format)
         elif source.is_dir():
-            problem = f"{source}, a folder, without --board"
+            problem = f"{source}, which is a folder, without --board"
             fix = "describe the board, e.g. --board charuco:8x11:20:15"
             raise UserError(problem, "a CSV, or pictures with --board", fix)
         else:
@@ -250,7 +250,7 @@ def _folder_sightings(folder: Path, board: Board) -> tuple[list[Sighting], Size]
         if size != first_size:
             problem = f"{folder / name} of {size[0]}×{size[1]} pixels among pictures of "
             problem += f"{first_size[0]}×{first_size[1]}"
-            fix = "delete the pictures of the other size, which another camera took"
+            fix = "delete the pictures of the other size"
             raise UserError(problem, "pictures of one size", fix)
         sighting = _find_board(board, picture, name, quiet=False)
         if sighting is not None:
@@ -289,7 +289,7 @@ def _stream_sightings(source: str, board: Board) -> tuple[list[Sighting], Size]:
 
 
 def _find_board(board: Board, picture: Picture, name: str, quiet: bool) -> Sighting | None:
-    """Find the board in a picture; print if there is none (unless quiet) or more than one."""
+    """Find the board in a picture; print a missing board (unless quiet) or a second board."""
     try:
         sighting = board.find(picture, name)
     except UserError as error:
@@ -305,8 +305,8 @@ def _check_sightings(
 ) -> tuple[list[Sighting], Size]:
     if not sightings or size is None:
         raise UserError(
-            f"{source}: the board is on none of {count} pictures",
-            "pictures of the board that --board describes",
+            f"{source}: no board in any of {count} pictures",
+            "pictures of the board described by --board",
             "compare --board with the board: kind, numbers of columns and rows, dictionary",
         )
     return sightings, size
@@ -320,7 +320,7 @@ def _bench_from_board(
     poses: Path | None,
     pose_format: PoseFormat,
 ) -> tuple[Bench, list[str]]:
-    """Calibrate the bench from pictures of a board; return the pictures' names, too."""
+    """Calibrate the bench from pictures of a board; return the bench and the pictures' names."""
     from dopepp.core.yaml import read_yaml
     from dopepp.geometry.camera_file import read_camera
     from dopepp.robot.calibration.board import board_pose, parse_board
@@ -338,7 +338,7 @@ def _bench_from_board(
         problem = f"{hand_eye} of a camera on the {'flange' if on_flange else 'bench'}, "
         problem += "without --poses" if on_flange else "with --poses"
         fix = "add --poses FILE with the robot's poses" if on_flange else "leave out --poses"
-        raise UserError(problem, "--poses only, and always, for a camera on the flange", fix)
+        raise UserError(problem, "--poses if, and only if, the camera is on the flange", fix)
     T_mount_cam = read_transform(hand_eye, "T_flange_cam" if on_flange else "T_base_cam")
     board = parse_board(spec)
     sightings, size = _folder_sightings(folder, board)
@@ -360,7 +360,7 @@ def _show_lens(calibration: LensCalibration) -> None:
     for name, error in zip(calibration.names, calibration.errors_px, strict=True):
         typer.echo(f"{name}: {error:.3f} px")
     for name in calibration.outliers:
-        typer.echo(f"{name}: rejected, far worse than the others")
+        typer.echo(f"{name}: rejected, because its error is far above the median")
     typer.echo(f"points cover {calibration.coverage:.0%} of the picture:")
     for row in calibration.covered:
         typer.echo("  " + "".join("■ " if cell else "· " for cell in row))

@@ -94,7 +94,7 @@ def load_estimator(
     """Load a checkpoint, or make an estimator of a mesh, which always refines by region.
 
     Raises:
-        UserError: The model is invalid, or an option does not belong to its kind.
+        UserError: The model is invalid, or an option does not apply to it.
     """
     from dopepp.inference.estimator import PoseEstimator
     from dopepp.parts.catalogue import BUILTIN
@@ -135,7 +135,7 @@ def two_numbers(option: str, text: str, allowed: str, fix: str) -> tuple[float, 
     """Read two numbers with a comma between them.
 
     Raises:
-        UserError: The text is something else; ``allowed`` and ``fix`` are parts of the message.
+        UserError: The text has another form; ``allowed`` and ``fix`` are parts of the message.
     """
     try:
         first, second = map(float, text.split(","))
@@ -145,7 +145,7 @@ def two_numbers(option: str, text: str, allowed: str, fix: str) -> tuple[float, 
 
 
 def check_region(refine: str | None) -> None:
-    """Refuse any refinement other than ``region``."""
+    """Raise a UserError for any refinement other than ``region``."""
     if refine not in (None, "region"):
         raise UserError(f"--refine {refine}", "region", "pass --refine region, or leave it out")
 
@@ -165,7 +165,7 @@ def resumable(advice: str = RESUME) -> Iterator[None]:
     """Report errors, and exit in order on Ctrl-C or SIGTERM.
 
     Args:
-        advice: What the message of an interruption recommends.
+        advice: Recommendation in the message of an interruption.
     """
     with report_errors(), interruptible(advice):
         yield

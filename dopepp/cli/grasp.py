@@ -97,7 +97,7 @@ def propose(
 
 
 def _require_extra() -> None:
-    """Refuse a missing extra without importing its packages."""
+    """Raise a UserError for a missing extra, without importing its packages."""
     from dopepp.core.errors import require
 
     for package in EXTRA:

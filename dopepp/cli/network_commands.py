@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from dopepp.inference.benchmark import Timing
 
 NUM_SCENES: Final = 10  # number of rendered pictures that the benchmark cycles through
-SIZE: Final = (640, 480)  # their width and height
+SIZE: Final = (640, 480)  # width and height of rendered pictures
 
 
 def benchmark(
@@ -70,7 +70,7 @@ def benchmark(
                 pictures = [(read_photo(image), camera_matrix(*intrinsics))]
             elif not estimator.has_network:
                 fix = "pass a picture and its camera: --image FILE --K FX FY CX CY"
-                raise UserError(f"{path} without --image", "a picture to time a mesh on", fix)
+                raise UserError(f"{path} without --image", "a picture, which a mesh requires", fix)
             else:
                 source = validation_renders(estimator.checkpoint, path, NUM_SCENES, SIZE)
                 samples = map(source.sample, range(NUM_SCENES))
@@ -208,5 +208,5 @@ def serve(
         estimator = estimator if refine is None else estimator.refining(refine)
         estimator = estimator.reporting(conf)
         with suppress(Interruption), interruptible(""), served(estimator, port) as address:
-            typer.echo(f"{address} (Ctrl-C ends it)")
+            typer.echo(f"{address} (press Ctrl-C to stop)")
             Event().wait()

@@ -123,7 +123,7 @@ def _counts(result: PoseResult) -> tuple[int, int]:
 def _check_transport(
     chosen: Sequence[str], words: Sequence[str], out: Path | None, params: Path | None
 ) -> str:
-    """Return the chosen transport; refuse options that exclude each other."""
+    """Return the transport after rejecting options that exclude each other."""
     if len(chosen) != 1:
         problem = " and ".join(chosen) or "no input and output"
         allowed = "one of --ros2, --bag FILE --out FILE, --json, --udp HOST:PORT"

@@ -36,7 +36,7 @@ class Output(Protocol):
         """Write a result."""
 
     def close(self) -> None:
-        """Complete the files, however the command ends."""
+        """Complete the files, also after an error."""
 
 
 class Outputs:
@@ -116,14 +116,14 @@ class OverlayFolder:
         self._names.add(name)
         path = self._folder / name
         if path.exists() and source.exists() and path.samefile(source):
-            problem = f"--save {self._folder}, the folder of {source} itself"
+            problem = f"--save {self._folder}, which is the folder of {source}"
             fix = "pass another folder, e.g. --save poses"
             raise UserError(problem, "a folder without the sources", fix)
         return path
 
 
 class JsonLines:
-    """A file with a line of JSON for each picture, also for those without detections."""
+    """A file with a line of JSON for each picture, with or without detections."""
 
     def __init__(self, path: Path) -> None:
         check_target(path)
@@ -135,7 +135,7 @@ class JsonLines:
         self._file = self._file or self._partial.open("wb", buffering=0)
 
     def take(self, result: PoseResult) -> None:
-        """Append a line; on a full disk, no part of it."""
+        """Append a line, completely or not at all."""
         assert self._file is not None
         line, end = f"{result.to_json()}\n".encode(), self._file.tell()
         if self._file.write(line) < len(line):

@@ -44,7 +44,7 @@ _warm_ups: Final[list[str]] = []
 
 
 def compile_beside(function: str) -> None:
-    """Register a function that calls inner loops which this process will need later.
+    """Register a function that calls the inner loops of a later job.
 
     When this process has to compile, as on a new machine, a second process calls the function. Both
     use the same cache, so that two cores share the compilation.
@@ -57,9 +57,9 @@ def compile_beside(function: str) -> None:
 
 
 class _Compilation(event.Listener):  # type: ignore[misc]  # numba has no types
-    """Shares the first compilation with a second process, and logs why the first call takes long.
+    """Shares the first compilation with a second process, and logs the reason for the delay.
 
-    Garbage collection is off meanwhile: it would take a quarter of the time and find nothing.
+    Garbage collection is paused, because it would take a quarter of the time without effect.
     """
 
     is_first, depth, collects = True, 0, False

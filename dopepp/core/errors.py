@@ -12,7 +12,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Final, NoReturn
 
-NO_SPACE: Final = (errno.ENOSPC, errno.EDQUOT)  # the disk is full, or the user's share of it
+NO_SPACE: Final = (errno.ENOSPC, errno.EDQUOT)  # full disk, exceeded quota
 RESUME: Final = "run the same command again to continue"
 
 
@@ -82,14 +82,14 @@ def require(package: str, choice: str, extra: str) -> ModuleSpec:
 
 
 def system_failure(error: OSError, path: Path) -> str:
-    """Describe an operation that the operating system refused on a path."""
+    """Describe a failed operation of the operating system on a path."""
     if error.errno in NO_SPACE:
         return f"no space left for {path}: free some disk space"
     return f"{error.filename or path}: {error.strerror or error}"
 
 
 def stopped(error: OSError, root: Path) -> StoppedError:
-    """Return the resumable error for an operation that the operating system refused."""
+    """Return the resumable error for a failed operation of the operating system."""
     return StoppedError(system_failure(error, root))
 
 
@@ -98,7 +98,7 @@ def interruptible(advice: str = RESUME) -> Iterator[None]:
     """Raise :class:`Interruption` on SIGINT and SIGTERM inside the block (main thread only).
 
     Args:
-        advice: What the message of the interruption recommends.
+        advice: Recommendation in the message of the interruption.
     """
 
     def interrupt(number: int, _: FrameType | None) -> NoReturn:

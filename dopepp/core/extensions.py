@@ -60,7 +60,7 @@ def components(group: str) -> dict[str, str]:
 
 
 def advice(group: str, name: str) -> str:
-    """Return how to enable a component that no enabled package provides."""
+    """Return instructions for enabling a component of an installed or missing package."""
     for entry in _entries(group):
         if name in (entry.name, entry.value.replace(":", ".")):
             return f"enable its package: extensions=[{_package(entry)}]"

@@ -35,7 +35,7 @@ PICTURES: Final = (".png", ".jpg", ".jpeg")
 
 
 def write_png(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> None:
-    """Write an RGB image as PNG, whatever the path's suffix.
+    """Write an RGB image as PNG, for any suffix of the path.
 
     Raises:
         ValueError: The image is not uint8 of shape (H, W, 3), or is empty.
@@ -78,13 +78,13 @@ def check_target(path: Path, suffixes: Sequence[str] = ()) -> None:
         partial_path(path).unlink()
     except OSError as error:
         problem, fix = f"{path}: {error.strerror}", "pass another path, or make it writable"
-        raise UserError(problem, "a file that can be written", fix) from error
+        raise UserError(problem, "a writable file", fix) from error
 
 
 def write_csv(
     path: Path | str, rows: Sequence[Mapping[str, object]], header: Sequence[str] = ()
 ) -> None:
-    """Write a CSV file. Missing values are empty; the default header is that of the longest row."""
+    """Write a CSV file with empty missing values; the default header is the longest row's."""
     text = io.StringIO(newline="")
     longest: Mapping[str, object] = max(rows, key=len)
     writer = csv.DictWriter(text, header or list(longest), restval="", lineterminator="\n")
@@ -94,7 +94,7 @@ def write_csv(
 
 
 def read_csv(path: Path) -> list[dict[str, str]]:
-    """Read the rows of a CSV, also of an incomplete one; a missing file has no rows."""
+    """Read the rows of a CSV file, which may be truncated; a missing file has no rows."""
     if not path.is_file():
         return []
     with path.open(newline="", errors="replace") as stream:
@@ -151,7 +151,7 @@ def is_abandoned(path: Path, now: float) -> bool:
     if match and match[1] == _machine() and not _is_running(int(match[2])):
         return True
     try:
-        # The process id may have been reused, so the age counts as well.
+        # The process id may have been reused, so the age is checked as well.
         return now - path.stat().st_mtime > _ABANDONED_S
     except FileNotFoundError:  # its process has just completed it
         return False
@@ -174,7 +174,7 @@ def _is_running(process: int) -> bool:
 def _machine() -> str:
     """Return eight hex digits that identify the scope in which process ids are unique."""
     # Host names are not unique (containers, ``localhost``), so on Linux the boot and the process
-    # namespace count as well.
+    # namespace are included.
     facts = [socket.gethostname()]
     boot, namespace = Path("/proc/sys/kernel/random/boot_id"), Path("/proc/self/ns/pid")
     if boot.is_file() and namespace.is_symlink():

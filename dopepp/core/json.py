@@ -1,7 +1,7 @@
 """Strict JSON for untrusted files.
 
-``json.loads`` accepts ``NaN``, ``1e999`` and duplicate keys, and crashes on deep nesting. Here each
-of these raises :class:`~dopepp.core.errors.UserError`.
+``json.loads`` accepts ``NaN``, ``1e999`` and duplicate keys, and crashes on deep nesting. This
+module raises :class:`~dopepp.core.errors.UserError` in these cases.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import numpy as np
 from dopepp.core.errors import UserError
 
 MAX_BYTES: Final = 64_000_000
-"""About 10,000 images of a BOP scene with ten objects each. Parsed JSON takes up to 20 times its
+"""Size of 10,000 images of a BOP scene with ten objects each. Parsed JSON takes up to 20 times this
 size in memory."""
 
 MAX_DEPTH: Final = 64  # the formats here need six
 
 _STRING: Final = r'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)'
-"""A string literal, also one that is cut off at the end of the text."""
+"""A string literal, possibly cut off at the end of the text."""
 
 _STRING_BYTES: Final = re.compile(_STRING.encode(), re.DOTALL)
 _EXPONENT: Final = re.compile(rb"[eE]\+?0*[1-9]\d\d")
@@ -38,7 +38,7 @@ def read_json(path: str | Path, max_bytes: int = MAX_BYTES) -> object:
     """Read a JSON file.
 
     Raises:
-        UserError: The file is missing, too large, or refused by :func:`parse_json`.
+        UserError: The file is missing, too large, or rejected by :func:`parse_json`.
     """
     path = Path(path)
     allowed = f"a JSON file of at most {max_bytes / 1e6:.3g} MB"
@@ -53,7 +53,7 @@ def read_json(path: str | Path, max_bytes: int = MAX_BYTES) -> object:
         raise UserError(f"{path}: {error.strerror}", allowed, fix) from error
     if len(content) > max_bytes:
         size = path.stat().st_size / 1e6
-        fix = "pass the right file; this one is too large"
+        fix = "pass a smaller file"
         raise UserError(f"{path} of {size:,.3g} MB", allowed, fix)
     return parse_json(content, str(path))
 
@@ -72,7 +72,7 @@ def parse_json(text: str | bytes, where: str) -> object:
     content = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
     bare = _STRING_BYTES.sub(b"", content)
     if _depth(bare) > MAX_DEPTH:
-        raise _bad(where, f"brackets nested more than {MAX_DEPTH} deep")
+        raise _bad(where, f"more than {MAX_DEPTH} levels of nesting")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -89,7 +89,7 @@ def parse_json(text: str | bytes, where: str) -> object:
         problem = f"line {error.lineno}, column {error.colno}: {error.msg}"
         raise _bad(where, problem) from error
     except _NotFiniteError as error:
-        raise _bad(where, f"{_position(text)}{str(error)!r:.40}, no finite number") from error
+        raise _bad(where, f"{_position(text)}{str(error)!r:.40}, not a finite number") from error
     except ValueError as error:  # a key twice; an integer of thousands of digits
         raise _bad(where, str(error)) from error
 

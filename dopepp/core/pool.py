@@ -53,7 +53,7 @@ _CORES_EVERY_S: Final = 10.0
 
 
 def available_cores() -> int:
-    """Return the number of cores that this process may use (Linux), or all of the machine's."""
+    """Return the number of cores that this process may use (Linux), or the machine's number."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -121,7 +121,8 @@ class Pool(ABC):
     """Applies a pickled function to items in parallel; a context manager."""
 
     batch_size: int
-    """Recommended size of an item: small ones lose little when stopped, large ones cost less."""
+    """Recommended size of an item. Small items lose little work when stopped; large items have less
+    overhead."""
 
     def __enter__(self) -> Pool:
         return self
@@ -141,7 +142,7 @@ class Pool(ABC):
         """Yield items and their futures in the order of completion.
 
         A future raises the function's exception or :class:`LostWorkerError`. Further items are read
-        only after finished ones were yielded, because the consumer may decide what comes next.
+        only after finished items were yielded, because the consumer may decide on further items.
         """
         waiting, running = iter(items), dict[Future[Any], Item]()
         while True:
@@ -163,13 +164,13 @@ class _Worker(threading.local):
 class ProcessPool(Pool):
     """Processes of this machine.
 
-    They are spawned, because Mitsuba's thread pool does not survive a fork; this takes about a
-    second. They complete their item when the pipe is closed, so that no file is half-written if the
-    pool is stopped or this process is killed.
+    Processes are spawned, because Mitsuba's thread pool does not survive a fork; this takes about a
+    second. Processes complete their item when the pipe is closed, so no file is half-written if
+    the pool is stopped or this process is killed.
 
     Args:
         content: Pickled function of one item.
-        num_workers: Maximum number of processes. They are started on demand, and again when lost.
+        num_workers: Maximum number of processes, which are started on demand and restarted if lost.
         environment: Environment variables of the processes (default: one thread per library).
     """
 
@@ -306,7 +307,7 @@ class ClusterPool(Pool):
         try:
             # In a list, a worker fetches the object once and not for every task.
             self._content = [self._ray.put(content)]
-            # Without SPREAD, Ray fills one machine before it uses the next.
+            # Without SPREAD, Ray fills a machine before using the next machine.
             options = {"scheduling_strategy": "SPREAD", "num_cpus": 1} | task_options
             self._apply = self._ray.remote(**options)(_apply)
         except BaseException:
@@ -372,8 +373,8 @@ def _connect(address: str | None, num_workers: int, asked_by: str, option: str) 
     except (OSError, ValueError, OverflowError, RuntimeError) as error:
         raise UserError(
             f"{option} {address}: {error}",
-            "host:port of a running Ray cluster that this machine belongs to",
-            "start one with `ray start --head`, or leave out the address",
+            "host:port of a running Ray cluster that includes this machine",
+            "start a cluster with `ray start --head`, or leave out the address",
         ) from error
     return ray
 

@@ -53,7 +53,7 @@ _WORDS: Final = {
 class Range:
     """Closed range of a number, as in ``Annotated[int, Range(1, 10)]``.
 
-    For a tuple, e.g. ``Annotated[tuple[int, int], Range(1, 10)]``, it holds for every number.
+    In a tuple, e.g. ``Annotated[tuple[int, int], Range(1, 10)]``, all numbers have this range.
     """
 
     lowest: float
@@ -135,7 +135,7 @@ def parse(kind: type[T], value: object, name: str = "", fix: str = "") -> T:
         kind: Type to build.
         value: Null, true or false, numbers, text, and lists and mappings of them.
         name: Dotted name or file of the value, for messages.
-        fix: What the user should do (default: correct the field).
+        fix: Advice for the user (default: correct the field).
 
     Returns:
         The typed object.
@@ -190,7 +190,7 @@ def check(
 
 
 class Checked:
-    """Base of a frozen dataclass that refuses unknown fields and values outside their ranges.
+    """Base of a frozen dataclass that rejects unknown fields and values outside their ranges.
 
     Ranges are also checked when Python code creates the dataclass.
     """
@@ -255,7 +255,7 @@ def _user_error(mistake: _Mistake, root: str, fix: str) -> UserError:
 
 
 def _mistakes(kind: type[Any], value: object, error: ValidationError) -> Iterator[_Mistake]:
-    """Translate pydantic's errors, and merge those of a union's alternatives."""
+    """Translate pydantic's errors, and merge the errors of a union's alternatives."""
     located = [(_location(value, detail), detail) for detail in error.errors()]
     for location, group in groupby(located, key=lambda pair: pair[0]):
         details = [detail for _, detail in group]

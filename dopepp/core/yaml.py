@@ -1,7 +1,7 @@
 """Strict YAML for untrusted files, such as run folders and camera files.
 
-``yaml.safe_load`` runs no code, but expands anchors to gigabytes and crashes on deep nesting. Here
-each of these raises :class:`~dopepp.core.errors.UserError`.
+``yaml.safe_load`` runs no code, but expands anchors to gigabytes and crashes on deep nesting. This
+module raises :class:`~dopepp.core.errors.UserError` in these cases.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def parse_yaml(text: str, where: Path | str) -> object:
     """Parse YAML text. The caller limits its size.
 
     Raises:
-        UserError: As :func:`read_yaml`.
+        UserError: As for :func:`read_yaml`.
     """
     try:
         _check_events(text)

@@ -1,7 +1,7 @@
-"""Unpack an untrusted tar file into a folder that exists completely or not at all.
+"""Unpack an untrusted tar file, completely or not at all.
 
-All names, kinds and sizes of members are checked before the first byte is written, and the folder
-gets its name last. Only plain files and folders are unpacked, with default permissions.
+All names, kinds and sizes of members are checked before the first byte is written. The folder is
+renamed to its final name last. Only plain files and folders are unpacked, with default permissions.
 ``tarfile``'s ``filter="data"`` is not enough: it accepts links within the folder, makes absolute
 paths relative, and ignores backslashes, drives, repeated names, files below files and sizes
 (``tests/security/test_hostile_files.py`` has a case for each).
@@ -93,8 +93,8 @@ def safe_extract(archive: Path | str, folder: Path | str, most_members: int = MO
         raise
     except OSError as error:
         problem = f"{archive}, which cannot be unpacked into {folder}: {error}"
-        allowed = "an archive to read and a folder with room to write"
-        fix = "make both accessible, and free space on the disk"
+        allowed = "a readable archive and a writable folder with enough space"
+        fix = "check the permissions of archive and folder, and free space on the disk"
         raise UserError(problem, allowed, fix) from error
     except Exception as error:  # a damaged header makes tarfile raise any type
         raise _refused(archive, f"damaged: {error or type(error).__name__}") from error
@@ -139,7 +139,7 @@ def _problem(member: tarfile.TarInfo, path: PurePosixPath) -> str:
     odd = any(c in _RESERVED or not c.isprintable() for c in member.name)
     long = len(member.name) > _MAX_NAME or any(len(part) > _MAX_PART for part in path.parts)
     if odd or long or (path == PurePosixPath() and not member.isdir()):
-        return ", no name that every system can write"
+        return ", a name that some systems cannot write"
     return ""
 
 
@@ -154,7 +154,7 @@ def _unpack(tar: tarfile.TarFile, member: tarfile.TarInfo, path: Path) -> None:
     with source, path.open("xb") as target:
         shutil.copyfileobj(source, target, CHUNK_BYTES)
     if path.stat().st_size != member.size:
-        raise tarfile.ReadError(f"member {member.name!r} is shorter than it claims")
+        raise tarfile.ReadError(f"member {member.name!r} is shorter than stated in its header")
 
 
 def _refused(archive: Path, reason: str) -> UserError:

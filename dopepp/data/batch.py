@@ -68,7 +68,7 @@ class Batch:
 
 def collate(samples: Sequence[Sample], object_index: Mapping[str, int]) -> Batch:
     """Stack samples of one size; ``object_index`` gives the index of each object by name."""
-    # At least one slot, because an empty axis would be a special case everywhere.
+    # At least one slot, because code that uses batches does not handle an empty axis.
     shape = (len(samples), max(1, *(len(sample.instances) for sample in samples)))
     stated = {
         "T_cam_obj": np.tile(np.eye(4, dtype=np.float32), (*shape, 1, 1)),

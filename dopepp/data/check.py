@@ -38,7 +38,7 @@ def check_dataset(root: Path) -> CheckReport:
     """Check a data set.
 
     Raises:
-        UserError: The folder is missing, of no known layout, or holds several data sets.
+        UserError: The folder is missing, has an unknown layout, or holds several data sets.
     """
     root = Path(root)
     allowed = (
@@ -52,7 +52,7 @@ def check_dataset(root: Path) -> CheckReport:
     if layout in (None, "NDDS"):  # NDDS includes annotations of all subfolders
         _refuse_parent(root, layout)
     if layout is None:
-        problem = f"{root}, a folder of no known layout"
+        problem = f"{root}, a folder with an unknown layout"
         raise UserError(problem, allowed, "pass the folder of the data set")
     report = CheckReport(root, layout)
     LAYOUTS[layout][1](report)
@@ -64,7 +64,7 @@ def _layout_of(root: Path) -> str | None:
 
 
 def _refuse_parent(root: Path, layout: str | None) -> None:
-    """Reject a folder that holds data sets and is no data set itself.
+    """Reject a folder that holds data sets and is not a data set itself.
 
     FAT's scene folders form one data set, but each folder of a render job is its own data set.
     """

@@ -85,7 +85,7 @@ class PoseDataModule(LightningDataModule):
 
     def train_item(self, epoch: int, index: int) -> Sample:
         """Return a training item, a pure function of (seed, epoch, index)."""
-        # Padding comes last, so that it has no noise and is no background, as in prediction.
+        # Padding comes last: as in prediction, it has no noise and is not used as background.
         sample = resize_sample(self.train_source.sample(index, epoch), self.input_size)
         rng = item_rng(self.seed, Purpose.AUGMENT, epoch, index)
         if self._jitter is not None:
@@ -151,7 +151,7 @@ class PoseDataModule(LightningDataModule):
         return {name: widest(sizes) for name, sizes in views.items() if sizes}
 
     def summary(self) -> list[tuple[str, SourceInfo]]:
-        """Return the sources with their splits, for the start-up print."""
+        """Return the splits and descriptions of all sources, for the log at the start."""
         splits = self._splits().items()
         return [(split, info) for split, source in splits for info in source.describe()]
 
@@ -173,7 +173,7 @@ Item = Callable[[int, int], Sample]
 
 
 class SampleDataset(Dataset[Sample | UserError]):
-    """Items by (epoch, index); a UserError is an item too, see :class:`PoseLoader`."""
+    """Items by (epoch, index); an item is a sample or a UserError, see :class:`PoseLoader`."""
 
     def __init__(self, item: Item, num_items: int) -> None:
         self._item, self._num_items = item, num_items
@@ -277,7 +277,7 @@ class PoseLoader(DataLoader[Any]):
         return {"num_batches": self._num_batches}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Start the next pass after the batches that were yielded before."""
+        """Start the next pass after the batches yielded so far."""
         self._resume_at = state["num_batches"] % max(1, len(self))
 
 

@@ -1,7 +1,7 @@
 """Download data sets on an explicit command.
 
-A data set is an archive of known size and checksum. An interrupted download resumes, and the
-unpacked folder exists completely or not at all.
+A data set is an archive of known size and checksum. An interrupted download resumes, and an archive
+is unpacked completely or not at all.
 
 To add a data set, add a :class:`DownloadSource` to :data:`SOURCES`, with a checksum from another
 server than the file.
@@ -78,7 +78,7 @@ def download(name: str, folder: Path | str, progress: Progress | None = None) ->
     target = Path(folder) / name
     photos = target / source.photos
     if photos.is_dir():
-        logger.info("%s is already there", photos)
+        logger.info("%s exists already", photos)
         return photos
     logger.info("%s: %.0f MB from %s; %s", name, source.num_bytes / 1e6, source.url, source.licence)
     archive = Path(folder) / PurePosixPath(urlsplit(source.url).path).name
@@ -121,8 +121,8 @@ def fetch(
     except (http.client.HTTPException, TimeoutError, ConnectionError) as error:
         raise _failed(url, f"the connection broke: {error or type(error).__name__}") from error
     except OSError as error:
-        allowed = f"a folder to write to with {num_bytes} bytes of room"
-        fix = "pass another folder, or free space; the next call continues with what was received"
+        allowed = f"a writable folder with {num_bytes} bytes of free space"
+        fix = "pass another folder, or free space; the next call resumes the download"
         raise UserError(f"{path}, which cannot be written: {error}", allowed, fix) from error
 
 
@@ -189,8 +189,8 @@ def _verify(path: Path, url: str, sha256: str) -> None:
 
 
 def _failed(url: str, reason: str) -> UserError:
-    fix = "check the network and run the command again; it continues where it stopped"
-    return UserError(f"{url}: {reason}", "a server that can be reached and has the file", fix)
+    fix = "check the network and run the command again, which resumes the download"
+    return UserError(f"{url}: {reason}", "a reachable server with the file", fix)
 
 
 def _other_file(url: str, problem: str, expected: str) -> UserError:

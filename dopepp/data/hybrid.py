@@ -51,9 +51,9 @@ def _shares(
 class HybridSource:
     """A mix with exact shares, a pure function of (seed, epoch, index).
 
-    An epoch holds round(share × samples_per_epoch) items of each source in an order drawn per
-    epoch. Each source is traversed in its own shuffled order across epochs, so that its items are
-    used equally often; the number of the traversal is the epoch of the source.
+    An epoch holds round(share × samples_per_epoch) items of each source in a random order. Each
+    source is traversed in its own shuffled order across epochs, so that its items are used equally
+    often; the number of the traversal is the epoch of the source.
 
     Args:
         real: Real camera frames; the real share is 0 without them.

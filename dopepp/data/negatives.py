@@ -18,13 +18,13 @@ from dopepp.virtual.backgrounds import PhotoBackgrounds
 class PictureFrames:
     """Whole pictures as frames of a camera.
 
-    Each picture is scaled and cropped in the middle until it covers the frame; pictures of the
-    camera itself stay as they are. If there are more frames than pictures, the second round is
-    mirrored, and further rounds show random regions.
+    Pictures are scaled to cover the frame and cropped at the centre; pictures of the camera itself
+    stay unchanged. If there are more frames than pictures, the second round is mirrored, and
+    further rounds show random regions.
 
     Args:
         pictures: Pictures of a folder or of one split of a folder.
-        num_frames: Number of frames; None for one per picture.
+        num_frames: Number of frames (default: the number of pictures).
         K: Camera matrix, pixels.
         size: (width, height) of the frames, pixels.
         seed: Seed of the pictures' order and regions.
@@ -98,7 +98,7 @@ class UnlabelledRenders:
 
 
 class FrameMix:
-    """Frames of several sources in turn; the index decides the source.
+    """Frames of several sources in turn, selected by the index.
 
     Args:
         sources: One or more sources, each with at least ``num_frames / len(sources)`` frames,
@@ -122,7 +122,7 @@ class FrameMix:
         return self.sources[kind].sample(item, epoch)
 
     def contains(self, label: str) -> bool:
-        """Tell whether any source holds this object."""
+        """Return whether any source holds this object."""
         return any(source.contains(label) for source in self.sources)
 
     def describe(self) -> list[SourceInfo]:

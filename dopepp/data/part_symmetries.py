@@ -73,8 +73,8 @@ def with_found_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
         UserError: The part has no mesh.
     """
     if part.mesh is None:
-        problem = f"part {part.name} without a mesh to find symmetries on"
-        fix = "state its symmetries in a file, or leave them out"
+        problem = f"part {part.name} without a mesh, which the search for symmetries needs"
+        fix = "write its symmetries into a file, or set data.symmetries=none"
         raise UserError(problem, "parts with a mesh", fix)
     discrete, continuous = find_symmetries(part.mesh, tolerance)
     counts = (
@@ -84,7 +84,7 @@ def with_found_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
     _log.info("%s: %s within %.3g mm", part.name, counts, tolerance_mm)
     is_coloured = part.mesh.texture is not None or part.mesh.colours is not None
     if is_coloured and (len(discrete) or continuous):
-        reason = "a print that distinguishes the sides leaves no symmetry"
+        reason = "if they distinguish the sides, set data.symmetries=none"
         _log.warning("%s has colours, which the search ignores: %s", part.name, reason)
     return _with(part, discrete if len(discrete) else None, continuous)
 

@@ -136,7 +136,7 @@ def _find_writer(layout: str) -> Callable[[Path, Sequence[Part]], Writer]:
 
 
 def named_part(text: str, unit: str | None) -> Part:
-    """Load a part that is written as in :func:`make_job`."""
+    """Load a part from a text as in :func:`make_job`."""
     match = None if Path(text).exists() else _NAMED.fullmatch(text)
     if match is None:
         return load_part(text, unit)
@@ -249,15 +249,15 @@ def _claim(root: Path, record: Mapping[str, Any]) -> None:
         foreign = [name for name in names if not name.endswith(PARTIAL_SUFFIX)]
         if foreign:
             problem = f"folder {root}, which holds {foreign[0]!r} and no {RECORD_FILE}"
-            allowed = "an empty folder, or one that a render job began"
+            allowed = "an empty folder, or the folder of a render job"
             raise UserError(problem, allowed, "pass a new folder with --out")
         write_whole(path, (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())
     # This also follows writing, as two jobs may begin simultaneously.
     differences = list(_differences(read_json(path, _MAX_RECORD_BYTES), record, ""))
     if differences:
         problem = f"{path} of another job: {', '.join(differences[:_MAX_DIFFERENCES])}"
-        fix = "repeat those settings with that version of dopepp, or pass a new folder with --out"
-        raise UserError(problem, "the settings that the folder was begun with", fix)
+        fix = "use the folder's settings and version of dopepp, or pass a new folder with --out"
+        raise UserError(problem, "the settings of the folder's first job", fix)
 
 
 def _differences(there: object, now: object, where: str) -> Iterator[str]:

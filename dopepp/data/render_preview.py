@@ -41,7 +41,7 @@ def write_preview(job: Job, out: Path) -> Path:
 
     Args:
         job: The job.
-        out: A PNG file, or the data set's folder, to whose name ``.preview.png`` is added.
+        out: A PNG file, or the data set's folder; the sheet is then ``FOLDER.preview.png``.
 
     Raises:
         UserError: The sheet cannot be written.
@@ -88,7 +88,7 @@ def scene_tiles(rendered: Rendered, name: str) -> Iterator[Tile]:
     if len(percents) > _LISTED:
         seen = f"visible: {min(percents)} to {max(percents)} % of {len(percents)} targets"
     elif not percents:
-        seen = "nothing to find"
+        seen = "no instance"
     yield Tile(mask_panel(rendered.image, masks), f"{seen}; distractors: {others}")
     yield Tile(*depth_panel(rendered.depth, rendered.instances >= 0))
 

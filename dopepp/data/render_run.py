@@ -55,7 +55,7 @@ class RenderReport:
 
     def __str__(self) -> str:
         if not self.num_rendered:
-            return f"all {self.num_images:,} images were there"
+            return f"all {self.num_images:,} images exist already"
         render_ms, write_ms = (
             1000 * seconds / self.num_rendered for seconds in (self.render_s, self.write_s)
         )
@@ -203,8 +203,8 @@ class RenderTasks:
             cv2.setNumThreads(1)
             os.environ.setdefault(THREADS_SETTING, "1")
             if not is_begun(self._root):
-                problem = f"{self._root} without {RECORD_FILE}, as one of the workers sees it"
-                allowed = "a folder that every machine of the cluster sees under the same path"
+                problem = f"{self._root} without {RECORD_FILE}, seen from a worker"
+                allowed = "a folder with the same path on every machine of the cluster"
                 raise UserError(problem, allowed, "pass an --out on a shared file system")
             self._opened = self._job.factory, self._job.writer(self._root)
         return self._opened

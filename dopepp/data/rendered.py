@@ -39,7 +39,7 @@ class RenderedSource:
 
     Args:
         split: One of the three disjoint index ranges; ``val`` and ``test`` ignore the epoch.
-        scale: Enlargement of the parts by a camera that is moved in the same scenes.
+        scale: Magnification of the parts, by moving the camera closer.
     """
 
     def __init__(
@@ -168,7 +168,7 @@ class CachedSource:
             available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
             if self.num_bytes > available / 2:
                 size = f"{self.num_bytes / 1e9:.1f} GB"
-                problem = f"data.cache=memory for {len(source)} images of {source.name}: {size}"
+                problem = f"data.cache=memory for {len(source)} images of {source.name} ({size})"
                 allowed = f"at most half of this machine's {available / 1e9:.1f} GB"
                 fix = "set data.cache=none or disk, or lower data.input_size or "
                 fix += "data.samples_per_epoch"
@@ -238,7 +238,7 @@ class CachedSource:
             raise ValueError(f"{len(sample.instances)} instances; at most {_MAX_INSTANCES}")
         kept = (self._shape, self._source_name, self._has_depth)
         if (sample.image.shape[:2], sample.source, sample.depth is not None) != kept:
-            rule = "a cache keeps one size and one source, and depth of all or none"
+            rule = "a cache holds images of one size and source, all with depth or all without"
             raise ValueError(f"a {sample.size} image of {sample.source}; {rule}")
         texts = [sample.key, *(instance.label for instance in sample.instances)]
         if max(map(len, texts)) > _TEXT_LENGTH:

@@ -23,7 +23,7 @@ from dopepp.geometry.camera import CameraMatrix, Letterbox, Transform, crop_came
 
 @dataclass
 class Instance:
-    """One object on an image.
+    """An object on an image.
 
     Attributes:
         T_cam_obj: Rigid transform from object to camera frame, (4, 4), metres, float64.
@@ -47,7 +47,7 @@ class Instance:
 
 @dataclass
 class Sample:
-    """One image and its ground truth.
+    """An image and its ground truth.
 
     Attributes:
         K: Camera matrix in pixels of this image, float64.
@@ -83,12 +83,12 @@ class SampleSource(Protocol):
 
 @dataclass(frozen=True)
 class SourceInfo:
-    """Content of a source, for the start-up print and the data fingerprint.
+    """Content of a source, for the log at the start and the data fingerprint.
 
     Attributes:
         identity: Everything that determines the items, as values that JSON can encode.
         num_instances: Instances of each object; empty if counting is expensive.
-        num_per_epoch: Number of its images in an epoch (default: all).
+        num_per_epoch: Number of the source's images in an epoch (default: all).
     """
 
     name: str

@@ -27,7 +27,7 @@ _NUM_STEPS: Final = 200
 """Steps of a curve: 0.5 mm each up to 0.1 m."""
 
 _SMOOTHING: Final = 50
-"""Lines of more points are drawn pale, below their moving average over 1/50 of the points."""
+"""Longer lines are drawn pale, below their moving average over 1/50 of the points."""
 
 
 def accuracy_curve(
@@ -78,7 +78,7 @@ def save_accuracy_curves(
 ) -> Figure:
     """Write the curves as ``<path>.png`` and ``<path>.csv`` and return the figure.
 
-    The CSV has a column ``threshold_m`` and a column per method, the share below in [0, 1].
+    The CSV has a column ``threshold_m`` and, for each method, a column with the share in [0, 1].
     """
     path = Path(path)
     columns = {"threshold_m": np.linspace(0.0, max_threshold, _NUM_STEPS + 1)}
@@ -114,7 +114,7 @@ def _area(errors: Float[np.ndarray, "n"], max_threshold: float) -> float:
     """Return the exact area under the curve (``metrics.auc`` is in a higher layer)."""
     if len(errors) == 0:
         return 0.0
-    # fmin ignores NaN, which counts NaN as a miss.
+    # fmin ignores NaN, so NaN is a miss.
     return float(np.mean(1 - np.fmin(errors, max_threshold) / max_threshold))
 
 

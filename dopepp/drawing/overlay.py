@@ -68,7 +68,7 @@ def overlay(
     """
     factor = max(1, -(-min_width_px // image.shape[1]))
     canvas = enlarge(image, factor)
-    # On a sheet of tiles half as wide, lines are still a pixel thick.
+    # Lines keep a width of a pixel on a sheet with tiles of half the width.
     thickness = max(1, canvas.shape[1] // 320)
     for wireframe in wireframes:
         points = resize_points(wireframe.keypoints, factor, factor)
@@ -94,7 +94,7 @@ def draw_wireframe(
     """
     canvas = np.ascontiguousarray(image).copy()
     points = np.asarray(keypoints, np.float64)
-    shade = tuple(round(0.8 * value) for value in colour)  # for edges off the +z face
+    shade = tuple(round(0.8 * value) for value in colour)  # for edges outside the +z face
     front = [edge for edge in EDGES if _FRONT.issuperset(edge)]
     for a, b in EDGES:
         if (a, b) not in front:

@@ -59,7 +59,7 @@ MAX_BYTES: Final = 256_000_000
 """Largest file: the pixels that :data:`MAX_SIDE` allows, without compression."""
 
 DARKEST: Final = 16
-"""Brightest value, of 255, of 16-bit pixels that hold no more than 12 bits."""
+"""Largest value (of 255) of 16-bit pixels with no more than 12 significant bits."""
 
 LEAST_FREE: Final = 16_000_000
 """Free bytes on the disk below which writing stops, so that the file can still be completed."""
@@ -84,7 +84,7 @@ def read_picture(path: Path, longest_px: int | None = None) -> Picture:
             of its size and time).
 
     Raises:
-        ValueError: The file is missing, damaged, no picture, or a side exceeds :data:`MAX_SIDE`.
+        ValueError: The file is missing, damaged or not a picture, or exceeds :data:`MAX_SIDE`.
     """
     try:
         with _opened(_content(path), FORMATS) as image:
@@ -104,7 +104,7 @@ def whole_picture(content: bytes, formats: tuple[str, ...] = FORMATS) -> Image.I
     """Decode a file's content with its original depth and channels.
 
     Raises:
-        ValueError: The content is none of the formats, damaged, or over :data:`MAX_PIXELS`.
+        ValueError: The content has another format, is damaged, or exceeds :data:`MAX_PIXELS`.
     """
     try:
         image = _opened(content, formats)
@@ -129,7 +129,7 @@ def read_content(path: Path) -> bytes:
         fix = "save the picture with fewer pixels"
         if isinstance(error, OSError):
             reason, allowed = str(error.strerror), "a readable file"
-            fix = "copy the file there, or make it readable"
+            fix = "pass the path of an existing file, or make it readable"
         raise UserError(f"image {path}: {reason}", allowed, fix) from error
 
 
@@ -165,7 +165,7 @@ def read_rgb(path: Path) -> Picture:
     """Read an 8-bit frame as RGB; alpha is dropped, grey becomes three channels.
 
     Raises:
-        UserError: As :func:`read_image`, or the image does not have 8 bits.
+        UserError: As for :func:`read_image`, or the image does not have 8 bits.
     """
     image = read_image(path)
     if image.dtype != np.uint8:
@@ -177,7 +177,7 @@ def read_rgb(path: Path) -> Picture:
 
 
 def read_photo(path: Path) -> Picture:
-    """Read a picture in one of :data:`FORMATS` as upright 8-bit RGB, as OpenCV reads it.
+    """Read a picture in one of :data:`FORMATS` as upright 8-bit RGB, with OpenCV's values.
 
     The EXIF orientation is applied, alpha dropped, grey repeated, and 16 bits cut to the upper 8.
 
@@ -195,7 +195,7 @@ def read_photo(path: Path) -> Picture:
             raise ValueError(f"of mode {image.mode}, {getattr(image, 'n_frames', 1)} pages")
         is_deep = _is_deep(image, content)
         image = ImageOps.exif_transpose(image)
-    except Exception as error:  # PIL raises a different type for every way to be damaged
+    except Exception as error:  # PIL raises many types for damaged files
         raise UserError(f"image {path}: {_reason(error)}", allowed, save) from error
     if is_grey16:
         picture = np.repeat((np.asarray(image, np.uint16) >> 8)[..., None], 3, 2).astype(np.uint8)
@@ -203,8 +203,8 @@ def read_photo(path: Path) -> Picture:
         picture = np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
     if is_deep and picture[..., :3].max() < DARKEST:
         raise UserError(
-            f"image {path} of 16 bits, the brightest of which is {picture[..., :3].max()} of 255",
-            "values that use all 16 bits, not 10 or 12 of them",
+            f"image {path} of 16 bits, with values up to {picture[..., :3].max()} of 255",
+            "values that use all 16 bits, not only 10 or 12 bits",
             f"stretch it: magick {path.name} -auto-level -depth 8 picture.png",
         )
     return np.ascontiguousarray(picture[..., :3])
@@ -338,7 +338,7 @@ class VideoFile(AbstractContextManager["VideoFile"]):
         self._partial.unlink(missing_ok=True)
         if num_saved < self._written:
             frames = f"{num_saved} of {self._written} frames"
-            raise RunError(f"{self.path}: only {frames} were saved: is the disk full?")
+            raise RunError(f"{self.path}: only {frames} were saved; is the disk full?")
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -26,7 +26,7 @@ COLOURS: Final[tuple[Colour, ...]] = (
 """Colours of instances, distinguishable with most kinds of colour blindness."""
 
 AXIS_COLOURS: Final[tuple[Colour, ...]] = ((255, 60, 60), (60, 255, 60), (90, 140, 255))
-"""x red, y green, z blue, as everywhere."""
+"""Colours of the axes x (red), y (green) and z (blue)."""
 
 _COVER: Final = 0.65
 """Opacity of a mask."""
@@ -34,7 +34,7 @@ _COVER: Final = 0.65
 
 @dataclass(frozen=True)
 class Tile:
-    """A picture of a contact sheet with a line of text below it, or ``""``."""
+    """A picture of a contact sheet, with an optional line of text below."""
 
     image: Picture
     caption: str = ""
@@ -58,7 +58,7 @@ def _draw_tile(tile: Tile, width: int) -> Picture:
     """Scale the picture and add its caption, shrunk to fit."""
     scale = width / tile.image.shape[1]
     height = max(1, round(tile.image.shape[0] * scale))
-    # Averaging is right for shrinking, cubic for enlarging.
+    # Area averaging suits shrinking; cubic interpolation suits enlarging.
     method = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
     picture = np.asarray(cv2.resize(tile.image, (width, height), interpolation=method), np.uint8)
     return np.concatenate([picture, text_line(tile.caption, width)]) if tile.caption else picture
@@ -66,7 +66,7 @@ def _draw_tile(tile: Tile, width: int) -> Picture:
 
 def text_line(text: str, width: int) -> Picture:
     """Return a line of black text on a white strip of ``width`` pixels, shrunk to fit."""
-    # Hinted glyphs do not scale exactly with the size: try sizes, the largest first.
+    # Hinted glyphs do not scale exactly with the size, so sizes are tried in descending order.
     lines = (text_coverage(text, px) for px in range(_CAPTION_PX, _MIN_CAPTION_PX, -1))
     smallest = text_coverage(text, _MIN_CAPTION_PX)
     coverage = next((line for line in lines if line.shape[1] <= width), smallest)[:, :width, None]
@@ -115,7 +115,7 @@ def belief_tiles(
 ) -> list[Tile]:
     """Return tiles of the corners' and the centroid's beliefs over an image, with their maxima.
 
-    See :func:`heat_picture`; the captions begin with ``name``.
+    Tiles are drawn by :func:`heat_picture`; captions begin with ``name``.
     """
     maps = {"corners": beliefs[:CENTROID].max(axis=0), "centroid": beliefs[CENTROID]}
     return [

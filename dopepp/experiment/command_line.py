@@ -93,7 +93,7 @@ def _resumed(arguments: list[str]) -> list[str]:
     run = Path(runs[-1])
     overrides = read_overrides(run)
     if overrides is None:
-        return arguments  # the run reports what is wrong with the folder
+        return arguments  # the run reports the problem with the folder
     # Hydra must not write into the run before the checks of resuming have passed.
     return [*overrides, *arguments, f"hydra.run.dir={run}", "hydra.output_subdir=null"]
 
@@ -120,12 +120,12 @@ def explain(error: Exception) -> UserError:
 
 
 def _nearest(key: str) -> str:
-    """Return a hint at the most similar option, or at the program that has this option."""
+    """Return a hint: the most similar option, or the program that has the option."""
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
         options = {name: set(_flat(compose(name))) for name in ("train", "evaluate")}
     for name, names in options.items():
         if key in names:
-            return f"; it is one of {name}.py"
+            return f"; {key} is an option of {name}.py"
     close = difflib.get_close_matches(key, sorted(set().union(*options.values())), n=1)
     return f", nearest {close[0]}" if close else ""
 
@@ -147,7 +147,7 @@ def complete(name: str, words: Sequence[str], incomplete: str) -> list[str]:
 
     Args:
         name: ``train`` or ``evaluate``.
-        words: Words before the incomplete one.
+        words: Words before the incomplete word.
         incomplete: Word to complete.
     """
     line = re.sub(r" ?= ?", "=", " ".join([*words, incomplete]))

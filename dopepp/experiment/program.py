@@ -23,7 +23,7 @@ def typed(verb: str) -> str:
 
 
 def shown(path: Path) -> str:
-    """Return a path relative to the working directory if it lies below it, else absolute."""
+    """Return a path relative to the working directory if possible, else absolute."""
     path = path.absolute()
     below = path.is_relative_to(Path.cwd())
     return str(path.relative_to(Path.cwd()) if below else path)

@@ -57,7 +57,7 @@ def moved(T_cam_obj: Transform, step: Step) -> Transform:
 
 
 def step_between(before: Transform, after: Transform) -> Step:
-    """Return the step with which :func:`moved` maps one pose to the other."""
+    """Return the step from one pose to another, the inverse of :func:`moved`."""
     turn = matrix_to_rotation_vector(after[:3, :3] @ before[:3, :3].T)
     return np.concatenate([turn, after[:3, 3] - before[:3, 3]])
 
@@ -181,7 +181,7 @@ def pinhole_matrix(K: CameraMatrix, source: str) -> CameraMatrix:
         matrix = np.array(K, np.float64)
     except (TypeError, ValueError):
         matrix = np.empty(0)
-    # Zeros and ones need only be as accurate as the digits of a calibration file.
+    # Calibration files have few digits, so zeros and ones are compared with a tolerance.
     fixed = np.array([[np.nan, 0, np.nan], [0, np.nan, np.nan], [0, 0, 1]])
     is_finite = matrix.shape == (3, 3) and bool(np.isfinite(matrix).all())
     if not is_finite or np.nanmax(np.abs(matrix - fixed)) > 1e-6:
@@ -198,11 +198,11 @@ MOST_VIEW_DEG: Final = 150.0
 """Limits of the field of view along the longer side of a whole image, degrees."""
 
 WHOLE: Final = 0.2
-"""Largest offset of a whole image's principal point from the centre, as a share of the side. Lenses
-stay within a tenth; the K of half or one and a half times the size is a quarter off."""
+"""Largest offset of a whole image's principal point from the centre, as a share of the side. Real
+lenses stay below 0.1; the K of an image half or one and a half times as large is off by 0.25."""
 
-INSIDE: Final = 0.5  # Largest such offset for an image that may be a crop, as in some data sets
-ANYWHERE: Final = math.inf  # Largest such offset for a crop
+INSIDE: Final = 0.5  # Largest offset for an image that may be a crop, as in some data sets
+ANYWHERE: Final = math.inf  # Largest offset for a crop
 
 
 def check_camera(

@@ -38,7 +38,7 @@ Crop = tuple[int, int, int, int]
 """x and y of the upper left pixel, width and height, pixels."""
 
 MAX_BYTES: Final = 250_000
-"""Larger than a calibration with all its points; YAML of this size takes 10 s."""
+"""Largest size of a camera file, more than any calibration; parsing as much YAML takes 10 s."""
 
 COEFFICIENTS: Final = (0, 4, 5, 8, 12, 14)  # Numbers of coefficients of OpenCV's lens models
 
@@ -105,11 +105,11 @@ class Camera:
             K = check_camera(_cut(self.K, calibrated, size, crop), size, self.source, ANYWHERE)
         elif calibrated is None or calibrated == size:
             K = check_camera(self.K, size, self.source, WHOLE)
-        elif K_size is None or not _one_shape(size, calibrated):
+        elif K_size is None or not _equal_aspect(size, calibrated):
             problem = (
-                f"{self.source}, whose K is of {_by(calibrated)}, for a picture of {_by(size)}"
+                f"{self.source}, whose K is for {_by(calibrated)}, with a picture of {_by(size)}"
             )
-            allowed = "K of the picture's size, or an option that states how the picture was made"
+            allowed = "K for the picture's size, or an option that explains the difference"
             raise UserError(problem, allowed, _fix(size, calibrated))
         else:
             K = resize_camera(self.K, size[0] / calibrated[0], size[1] / calibrated[1])
@@ -123,8 +123,8 @@ def read_camera(path: Path | str) -> Camera:
     pixel.
 
     Raises:
-        UserError: The file is missing, over 250 kB, in an unknown format, of several cameras,
-            without a camera matrix, of a fisheye lens, or has an invalid field.
+        UserError: The file is missing, over 250 kB or in an unknown format, describes several
+            cameras or a fisheye lens, lacks the camera matrix, or has an invalid field.
     """
     return camera_of_text(_text(Path(path)), str(path))
 
@@ -149,7 +149,7 @@ def _camera(calibration: Calibration, source: str) -> Camera:
     if len(calibration.distortion) not in COEFFICIENTS:
         problem = f"{source}: {len(calibration.distortion)} distortion coefficients"
         allowed = f"{', '.join(map(str, COEFFICIENTS))} in OpenCV's order (k1, k2, p1, p2, k3, …)"
-        raise UserError(problem, allowed, "add zeros for those that the calibration left out")
+        raise UserError(problem, allowed, "add zeros for the missing coefficients")
     lens = calibration.distortion if any(calibration.distortion) else ()
     return Camera(calibration.size, K, lens, source)
 
@@ -165,7 +165,7 @@ def _text(path: Path) -> str:
     except (OSError, ValueError) as error:  # ValueError also for a null character in its name
         problem = f"camera file {path!s:.200}: {getattr(error, 'strerror', None) or error}"
         allowed = f"a UTF-8 camera file of at most {MAX_BYTES / 1e3:g} kB: {FORMATS}"
-        raise UserError(problem, allowed, "pass a camera file of this form") from error
+        raise UserError(problem, allowed, "pass such a camera file") from error
 
 
 def _cut(K: CameraMatrix, calibrated: Size | None, size: Size, crop: Crop) -> CameraMatrix:
@@ -184,8 +184,8 @@ def _cut(K: CameraMatrix, calibrated: Size | None, size: Size, crop: Crop) -> Ca
     return crop_camera(K, x, y)
 
 
-def _one_shape(a: Size, b: Size) -> bool:
-    """Return whether two sizes have one aspect ratio, up to rounding to whole pixels."""
+def _equal_aspect(a: Size, b: Size) -> bool:
+    """Return whether the aspect ratios of two sizes are equal, up to rounding to whole pixels."""
     return min(abs(a[0] - a[1] * b[0] / b[1]), abs(a[1] - a[0] * b[1] / b[0])) <= 1
 
 
@@ -193,7 +193,7 @@ def _fix(size: Size, calibrated: Size) -> str:
     """Return advice for a picture whose size differs from the calibrated size."""
     fits = size[0] <= calibrated[0] and size[1] <= calibrated[1]
     cut = f"--crop X Y {size[0]} {size[1]} if it was cropped" if fits else ""
-    if _one_shape(size, calibrated):
+    if _equal_aspect(size, calibrated):
         resized = f"--K-size {calibrated[0]} {calibrated[1]} if the picture was resized"
         return f"{resized}, {cut}" if cut else resized
     if size == calibrated[::-1]:

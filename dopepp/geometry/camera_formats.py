@@ -79,7 +79,9 @@ def parse_calibration(text: str, source: str) -> Calibration:
         text = re.sub(r"\A%YAML.*\n", "", text).removesuffix("---")
         content = parse_yaml(re.sub(r"!!opencv-(nd-)?matrix\b", "", text), source)
     if not isinstance(content, Mapping):
-        raise UserError(f"{source} without any fields", FORMATS, "pass a file of this form")
+        raise UserError(
+            f"{source} without any fields", FORMATS, "pass a file in one of these formats"
+        )
     return calibration_of_fields(content, source)
 
 
@@ -88,7 +90,7 @@ def _colmap(lines: Sequence[Sequence[str]], source: str) -> Calibration:
     if len(lines) > 1:
         numbers = ", ".join(words[0][:20] for words in lines[:10]) + ", …" * (len(lines) > 10)
         fix = "keep the line of the camera that took the picture"
-        raise UserError(f"{source} of {len(lines)} cameras ({numbers})", "one camera", fix)
+        raise UserError(f"{source} with {len(lines)} cameras ({numbers})", "one camera", fix)
     _, model, *rest = lines[0]
     if model not in _COLMAP_MODELS:
         allowed = ", ".join(_COLMAP_MODELS)
@@ -109,7 +111,7 @@ def _colmap(lines: Sequence[Sequence[str]], source: str) -> Calibration:
 
 
 def _xml(text: str, source: str) -> dict[object, object]:
-    """Return the fields of OpenCV's XML; without a document type, entities cannot expand."""
+    """Return the fields of OpenCV's XML; DOCTYPE is refused, because entities could expand."""
     allowed = "OpenCV's XML (opencv_storage), without DOCTYPE"
     if "<!DOCTYPE" in text:
         fix = "write the file with cv2.FileStorage"
@@ -149,7 +151,7 @@ def calibration_of_fields(content: Mapping[Any, object], source: str) -> Calibra
     elif all(four):
         K = camera_matrix(*(_number(*field) for field in four if field))
     else:
-        fix = "pass a file of this form, of one camera"
+        fix = "pass a file in one of these formats, with one camera"
         raise UserError(f"{source} without camera_matrix (it has {fields})", FORMATS, fix)
     lens = fields.find(
         "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distortion", "D"
@@ -176,7 +178,7 @@ class _Fields:
             camera = cameras[0] if len(cameras) == 1 else None
             inner = camera.get("intrinsic_settings") if isinstance(camera, Mapping) else None
             if not isinstance(camera, Mapping) or not isinstance(inner, Mapping):
-                problem = f"{source}: camera_settings of {len(cameras)} cameras"
+                problem = f"{source}: camera_settings with {len(cameras)} cameras"
                 fix = "delete the other cameras from a copy of the file"
                 raise UserError(problem, "one camera with intrinsic_settings", fix)
             size = camera.get("captured_image_size")
@@ -204,7 +206,7 @@ def _size(fields: _Fields) -> Size | None:
         name, sides = both[0], _numbers(*both)
         if len(sides) != 2:
             fix = f"write {name}: [width, height]"
-            raise UserError(f"{name} of {len(sides)} numbers", "width and height", fix)
+            raise UserError(f"{name} with {len(sides)} numbers", "width and height", fix)
         return _side(name, sides[0]), _side(name, sides[1])
     width, height = (fields.find(f"image_{side}", side) for side in ("width", "height"))
     if width is None and height is None:

@@ -1,8 +1,8 @@
 """Estimation of a focal length from the perspective of a part of known size.
 
-A lens of twice the focal length shows the part at twice the distance in the same size, but with
-less difference between its near and far ends. A thin part that faces the camera has no such
-difference.
+At twice the focal length and twice the distance, a part appears equally large, but with weaker
+perspective: its near and far ends differ less in size. A thin part that faces the camera shows no
+perspective, so its focal length cannot be estimated.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Perspective-n-point: estimate a pose from up to nine keypoints and K, or state why not.
+"""Perspective-n-point: estimate a pose from up to nine keypoints and K, or explain the failure.
 
 OpenCV supplies the closed-form start (SQPnP). This module adds covariances of the points, robust
 weights, the covariance of the pose, a mirrored start for thin plates, and checks that no returned
@@ -52,14 +52,14 @@ PLATE: Final = 0.3  # Largest thickness over length of a part whose mirrored til
 
 @dataclass(frozen=True)
 class PnPResult:
-    """A pose, or the reason why there is none.
+    """An estimated pose, or the reason for its absence.
 
     Attributes:
         T_cam_obj: Object-to-camera transform, metres; None without a plausible pose.
         reprojection_error_px: RMS distance over the inliers, pixels; infinite without a pose.
         inliers: Points that agree with the pose within :data:`~dopepp.geometry.refine.GATE`
             standard deviations.
-        reason: Why there is no pose; empty with a pose.
+        reason: Reason for the missing pose; empty with a pose.
         covariance: Covariance of a rotation vector about the object's origin and a shift (camera
             axes, radians, metres), from the inliers' covariances; None without a pose.
     """
@@ -183,10 +183,10 @@ def _solve(
         ray_whitening = whitening @ to_px / widening
         pose, agree = _best_pose(ray_whitening, starts)
         if pose is None:
-            reason = "no start led to a pose in front of the camera"
+            reason = "no initial pose converged in front of the camera"
             result = PnPResult(None, math.inf, no_inliers, reason)
         elif agree.sum() < MIN_POINTS:
-            reason = f"only {int(agree.sum())} points agree on one pose, {MIN_POINTS} are needed"
+            reason = f"only {int(agree.sum())} points agree on a pose, {MIN_POINTS} are needed"
             result = PnPResult(None, math.inf, no_inliers, reason)
         else:
             T, error, covariance = _concluded(
@@ -390,11 +390,11 @@ def _principal_axes(points: Array) -> tuple[Array, Array]:
 
 @compiled()
 def _mirror(R: Array, t: Array, normal: Array) -> None:
-    """Replace a pose by the other tilt under which a plate looks almost the same.
+    """Replace a plate's pose by the mirrored tilt, which has almost the same image.
 
-    From far away, plates tilted by +θ and by −θ about the same axis have the same image. The second
-    pose is the first, reflected in the plane across the viewing ray r and, as a reflection is no
-    rotation, also in the plate's plane with normal n: R' = (I − 2rrᵀ) R (I − 2nnᵀ).
+    From afar, plates tilted by +θ and by −θ about an axis have the same image. The mirrored pose
+    is reflected twice: in the plane perpendicular to the viewing ray r, and in the plate's plane
+    with normal n. The product is a rotation: R' = (I − 2rrᵀ) R (I − 2nnᵀ).
     """
     squared = t[0] ** 2 + t[1] ** 2 + t[2] ** 2
     for column in range(3):

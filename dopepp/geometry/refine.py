@@ -27,10 +27,10 @@ ROUNDING: Final = 1e-12
 FIRST_DAMPING: Final = 1e-4
 
 LEAST_DAMPING: Final = 1e-9
-"""Above the rounding errors of the scaled 6×6 system, so that it is never singular."""
+"""Larger than rounding errors of the scaled 6×6 system, which is therefore never singular."""
 
 MOST_DAMPING: Final = 1e6
-"""Converged: steps of a millionth of Gauss–Newton's do not reduce the cost."""
+"""Damping at convergence: steps of a millionth of Gauss–Newton's do not reduce the cost."""
 
 NO_GATE: Final = 1e3  # A gate so wide that the cost is the least-squares cost
 _TINY_ANGLE: Final = 1e-8

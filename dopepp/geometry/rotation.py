@@ -35,7 +35,7 @@ def quaternion_to_matrix(quaternion_wxyz: Float[np.ndarray, "4"]) -> RotationMat
 def matrix_to_quaternion(rotation: RotationMatrix) -> Float[np.ndarray, "4"]:
     """Convert a rotation matrix to its unit quaternion (w, x, y, z) with w >= 0.
 
-    It is the leading eigenvector of Bar-Itzhack's symmetric 4×4 matrix (J. Guidance 2000), which
+    The quaternion is the leading eigenvector of a symmetric 4×4 matrix (Bar-Itzhack 2000), which
     has no singular case and tolerates slightly non-orthogonal matrices.
     """
     (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, np.float64)

@@ -15,7 +15,7 @@ MAX_FINITE: Final = 60
 """Order of the icosahedral group: the largest finite group apart from dihedral groups."""
 
 SAME_TURN: Final = math.radians(10.0)
-"""Largest angle between equal rotations: those of a 12-fold axis are 30° apart."""
+"""Largest angle between rotations that count as equal; a 12-fold axis has steps of 30°."""
 
 _AVERAGINGS: Final = 5  # Each averaging squares the error: 10° become less than 1e-15
 BALL_STEP: Final = 0.2  # Smallest angle between neighbouring rotations of a ball, radians
@@ -80,9 +80,9 @@ def rotations_about(
 
 
 def _ball_rotations(step: float) -> Float[np.ndarray, "rotations 3 3"]:
-    """Return rotations about a step (radians) apart, from a spiral of directions and turns."""
+    """Return rotations about ``step`` radians apart, from a spiral of directions with turns."""
     number = np.arange(math.ceil(4 * math.pi / step**2))
-    z = 1 - 2 * number / number[-1]  # the first is z itself
+    z = 1 - 2 * number / number[-1]  # the first direction is z
     polar, around = np.arccos(z), np.pi * (3 - math.sqrt(5)) * number
     tilt = np.stack([-np.sin(around), np.cos(around), np.zeros_like(z)], axis=1)
     angles = np.arange(0, 2 * math.pi, 2 * math.pi / math.ceil(2 * math.pi / step))

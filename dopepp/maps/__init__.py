@@ -1,4 +1,4 @@
-"""The DOPE representation: belief maps and vector fields, drawn and read."""
+"""The DOPE representation: encoding poses as belief maps and vector fields, and finding peaks."""
 
 from dopepp.maps.codec import MapGeometry, Peaks, encode, find_peaks
 

@@ -24,15 +24,15 @@ Beliefs = Float[Tensor, "batch beliefs height width"]
 Fields = Float[Tensor, "batch fields height width"]
 
 REACH: Final = 2.5
-"""Half-width of the fitted neighbourhood in standard deviations of a perfect peak: it contains the
-flanks of a clamped top, and cells beyond add more noise than information."""
+"""Half-width of the fitted neighbourhood in standard deviations of a perfect peak. It contains the
+flanks of a clamped top; cells outside add more noise than information."""
 
 HALF_WIDTHS: Final = (2, 4)
 """Smallest and largest half-width, cells: a fit needs 5×5 cells, and 9×9 always suffice."""
 
 TIE_BREAK: Final = 1e-11
-"""Weight of the neighbourhood's sum in the rank of equal cells, so small that sums which differ by
-the rounding of 25 beliefs give the same float64."""
+"""Weight of the neighbourhood's sum in the rank of equal cells; the rounding of 25 beliefs does not
+change the weighted float64."""
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,9 @@ def encode(
 ) -> tuple[Beliefs, Fields]:
     """Draw the target maps of a batch: 9·C belief and 16·C field channels.
 
-    Beliefs are Gaussians of peak 1, combined over instances by their maximum. Keypoints off the map
-    and keypoints that are not finite are left out. Fields are unit vectors from a corner to its
-    instance's centroid; where discs overlap, the nearest corner's vector counts.
+    Beliefs are Gaussians of peak 1, combined over instances by their maximum. Keypoints outside the
+    map or not finite are ignored. Fields are unit vectors from a corner to its instance's centroid;
+    in overlapping discs, a cell has the vector of the nearest corner.
 
     Args:
         keypoints: Input pixels.
@@ -115,11 +115,11 @@ class Peaks:
     Attributes:
         position: (x, y) in input pixels; NaN in an empty slot.
         score: Belief at the peak's cell; 0 in an empty slot.
-        covariance_px: Covariance of the position, pixels²: the variance by which the peak is wider
-            than a perfect peak, plus that of the fit. A network trained with a proper loss returns
+        covariance_px: Covariance of the position, pixels²: the excess variance of the peak over a
+            perfect peak, plus the variance of the fit. A network trained with a proper loss returns
             the target Gaussian blurred by its own uncertainty, so variances subtract.
-        toward: Mean of the field's vectors around a corner's peak, which is shorter the more they
-            differ; zero for a centroid.
+        toward: Mean of the field's vectors around a corner's peak, shorter for differing vectors;
+            zero for a centroid.
     """
 
     position: Float[np.ndarray, "batch channels peaks 2"]
@@ -137,9 +137,9 @@ def find_peaks(
 ) -> Peaks:
     """Find up to ``max_peaks`` local maxima above ``threshold`` in each channel.
 
-    A peak is a cell not below its eight neighbours. Of equal cells, as on the flat top of a clamped
-    belief, the cell with the highest neighbourhood counts, which is the middle one, or else the
-    first in raster order. A Gaussian fitted to the neighbourhood gives the position.
+    A peak is a cell not below its eight neighbours. Among equal cells, as on the flat top of a
+    clamped belief, the peak is the cell with the highest neighbourhood (usually the middle cell),
+    or else the first cell in raster order. A Gaussian fit to the neighbourhood gives the position.
 
     Args:
         belief: Maps of nine channels per object.
@@ -159,7 +159,7 @@ def find_peaks(
     half = min(max(math.ceil(REACH * geometry.sigma), HALF_WIDTHS[0]), HALF_WIDTHS[1])
     least = float(np.float32(threshold))  # rounded like the beliefs
     inputs = maps.reshape(-1, height, width), vectors, least, half, geometry.sigma
-    # The views by channel share the memory of the arrays, which are filled.
+    # The views by channel share the memory of the arrays, so filling the views fills the arrays.
     outputs = (
         array.reshape(-1, *array.shape[2:]) for array in (score, position, covariance, toward)
     )
@@ -241,7 +241,7 @@ def _is_highest(belief: Array, y: int, x: int) -> bool:
 
 @compiled()
 def _tie_break(belief: Array, y: int, x: int) -> float:
-    """Return the rank among equal cells: the belief plus a tiny share of the 5×5 cells' sum."""
+    """Return the rank among equal cells: the belief plus a tiny multiple of the 5×5 cells' sum."""
     total = np.float32(0.0)
     for u in range(max(x - 2, 0), min(x + 3, belief.shape[1])):
         column = np.float32(0.0)

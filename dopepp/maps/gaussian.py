@@ -16,24 +16,24 @@ from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.refine import solve_inside
 
 FLOOR: Final = 1e-6
-"""Smallest belief, relative to its peak, whose logarithm is used; a peak of σ = 0.5 on the border
-needs its third column, which falls to e⁻¹²·⁵ = 4e-6."""
+"""Smallest relative belief whose logarithm is used. A peak of σ = 0.5 on the border needs its third
+column, with a relative belief of e⁻¹²·⁵ = 4e-6."""
 
 FIRST_MARGIN: Final = 3.0
-"""Squared cells by which a cell must be nearer to its peak than to another peak, while positions
-within cells are unknown."""
+"""Smallest difference between a cell's squared distances to another peak and to its own peak,
+cells², while positions within cells are unknown."""
 
 MARGIN: Final = 1.0  # FIRST_MARGIN after both positions are fitted
-SURELY: Final = 1e-6  # Squared cells that exceed the rounding of distances.
+SURELY: Final = 1e-6  # Margin above the rounding errors of squared distances, cells²
 
-PLATEAU: Final = 3  # Number of cells as high as the peak that means a clamped top.
+PLATEAU: Final = 3  # Number of cells as high as the peak that indicates a clamped top
 
 STEPS: Final = 3  # Gauss–Newton steps; without noise, the start is exact.
 
 STEEPEST: Final = 10.0
 """Largest logarithm of a fitted top, relative to the peak's belief."""
 
-ARRIVED: Final = 1e-4  # Change of the parameters of a converged fit: 1e-3 px at stride 8.
+ARRIVED: Final = 1e-4  # Largest parameter change at convergence: 1e-3 px at stride 8
 
 SHAPE_PRIOR: Final = 0.5
 """Prior standard deviation of a peak's curvature, relative to the target's."""
@@ -61,8 +61,8 @@ def fit_peaks(
         half: Half-width of the fitted window, cells.
         sigma: Standard deviation of a perfect peak, cells.
         position: Filled with (x, y) of each peak, cells.
-        covariance: Filled with the covariance of each position, cells²: that of the fit, plus the
-            fitted Gaussian's minus the target's if the map's noise does not explain it.
+        covariance: Filled with the covariance of each position, cells²: the covariance of the fit,
+            plus the excess of the fitted Gaussian over the target if larger than the map's noise.
     """
     count, side = len(cells), 2 * half + 1
     theta, hessian = np.zeros((count, 6)), np.zeros((count, 6, 6))
@@ -233,7 +233,7 @@ def _fit_logarithm(
     _system(work, theta, noise, sigma, hessian, room[0])
     solve_inside(hessian, room[0], 0.0, room[1], room[4:])
     theta += room[1]
-    if work[0, 0] == 0.0:  # only a clamped top: no slope, no peak
+    if work[0, 0] == 0.0:  # a clamped top only, without slopes
         theta[:] = 0.0
 
 
@@ -259,7 +259,7 @@ def _linearised(
         for x in range(side):
             if usable[y, x]:
                 u = float(x - half)
-                # A steeper fit is wrong anyway, and its square must stay finite.
+                # Clipped, because a steeper fit is wrong and its square could overflow.
                 model = math.exp(min(level + u * (slope - theta[3] * u), STEEPEST))
                 residual = model - window[y, x]
                 squared += residual * residual
@@ -294,7 +294,7 @@ def _add(work: Array, x: float, weight: float, residual: float) -> None:
 
 @compiled()
 def _end_row(work: Array, y: float) -> None:
-    """Add a row's sums, times powers of y, to the window's, and clear them."""
+    """Add a row's sums, times powers of y, to the window's sums, and clear the row's sums."""
     power = 1.0
     for b in range(5):
         for a in range(5 - b):
@@ -327,7 +327,7 @@ def _system(
 
 @compiled()
 def _mode(window: Array, theta: Array) -> tuple[float, float, bool]:
-    """Return a fit's maximum, or else the centre of the highest cells, and whether it is sound."""
+    """Return the fit's maximum and True, or the centre of the highest cells and False."""
     half = len(window) // 2
     across, down, count = 0.0, 0.0, 0
     for v in range(-2, 3):
@@ -370,7 +370,7 @@ def _covariance(
     xx, xy, yy = c / determinant, -b / determinant, a / determinant
     slopes, moved, mean = room[:2], room[2], room[3]
     for k in range(2):
-        # With a minus sign, as the equations are solved for the negative.
+        # The sign is negative, because the equations are solved for the negative.
         across, down = (-xx, -xy) if k == 0 else (-xy, -yy)
         slopes[k, 0], slopes[k, 1], slopes[k, 2] = 0.0, across, down
         slopes[k, 3] = -2 * x * across
@@ -381,7 +381,7 @@ def _covariance(
         for m in range(2):
             out[k, m] = -noise * _product(slopes[m], moved)
     out[0, 1] = out[1, 0]
-    # Relative uncertainty of the variance: that of (r + s)/2.
+    # The relative uncertainty of the variance equals the relative uncertainty of (r + s)/2.
     mean[:] = 0.0
     mean[3] = mean[5] = -0.5
     solve_inside(hessian, mean, 0.0, moved, room[4:])

@@ -1,9 +1,9 @@
 """Confidence intervals of differences between two methods: a paired, hierarchical bootstrap.
 
-Both methods are measured on the same instances, and each is trained with one or several seeds. A
-resample draws seeds and instances with replacement, the same for both methods, and recomputes the
-difference; the interval holds the middle share of these differences (percentile bootstrap; Efron
-and Tibshirani, An Introduction to the Bootstrap, 1993).
+Both methods are measured on the same instances and trained with one or several seeds. A resample
+draws seeds and instances with replacement, jointly for both methods, and recomputes the difference.
+The interval holds the middle share of the resampled differences (percentile bootstrap; Efron and
+Tibshirani, An Introduction to the Bootstrap, 1993).
 
 To support another statistic, add its function to :data:`STATISTICS`.
 """
@@ -23,15 +23,15 @@ from scipy.stats import norm, t
 from dopepp.core.errors import UserError
 
 Numbers = Sequence[Float[np.ndarray, "_ instances"]]
-"""One array per object: a number per seed and instance."""
+"""Array of each object: a number for each seed and instance."""
 
 Draws = Float[np.ndarray, "resamples seeds"]
-"""Share of each resample that each seed makes up."""
+"""Weight of each seed in each resample; weights sum to 1."""
 
 _Statistic = Callable[[Float[np.ndarray, "... n"]], Float[np.ndarray, "..."]]
 StatisticName = Literal["mean", "median"]
 
-_BLOCK: Final = 4_000_000  # Numbers resampled at once: 32 MB
+_BLOCK: Final = 4_000_000  # Count of numbers resampled at once: 32 MB
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Difference:
         low: Lower end of the confidence interval.
         high: Upper end of the confidence interval.
         num_differing: Number of instances on which the methods differ.
-        fewest: Smallest significant ``num_differing`` (:func:`fewest_differing`).
+        fewest: Smallest ``num_differing`` that can be significant (:func:`fewest_differing`).
         seeds_to_tell: Estimated number of seeds that would make the difference significant
             (:func:`seeds_to_tell`); None if unknown.
     """
@@ -57,7 +57,7 @@ class Difference:
 
     @property
     def within_noise(self) -> bool:
-        """Whether two equally good methods may differ by as much."""
+        """Whether the difference is not significant."""
         return self.num_differing < self.fewest or self.low <= 0 <= self.high
 
 
@@ -78,23 +78,23 @@ def paired_difference(
     the interval does not cover the noise of training.
 
     Args:
-        mine: Numbers of the method. The median ignores those that are not finite (misses).
+        mine: Numbers of the method. The median ignores numbers that are not finite (misses).
         baseline: Numbers of the baseline, on the same instances.
         statistic: Name of the statistic.
-        same_seeds: Row s of both methods has the same seed, so seeds are drawn in pairs.
+        same_seeds: Whether row s of both methods has the same seed, to draw seeds in pairs.
         confidence: Share of the resamples inside the interval.
         num_resamples: Number of resamples.
-        few_seeds: Resamples of S seeds spread less than new seeds would, so the seeds' part of each
-            resample is stretched as Student's t stretches the normal distribution, by
-            t₍S₋₁₎ / z · √(S / (S − 1)): 9.2 for two seeds, 2.7 for three, 1.6 for five.
+        few_seeds: Whether to correct for few seeds. Resamples of S seeds spread less than new
+            seeds, so the seed effect of each resample is multiplied by t₍S₋₁₎ / z · √(S / (S − 1)),
+            the ratio of Student's t to the normal quantile: 9.2 for S = 2, 2.7 for 3, 1.6 for 5.
         seed: Seed of the resamples.
 
     Returns:
-        The difference, or None if a figure does not exist (a median over nothing).
+        The difference, or None if a figure is undefined (a median without finite numbers).
 
     Raises:
-        UserError: The numbers of objects, instances or paired seeds differ or are zero, or a mean
-            covers numbers that are not finite.
+        UserError: The counts of objects, instances or paired seeds differ or are zero, or the
+            statistic is a mean and numbers are not finite.
     """
     mine = [np.asarray(values, np.float64) for values in mine]
     baseline = [np.asarray(values, np.float64) for values in baseline]
@@ -127,12 +127,11 @@ def paired_difference(
 def seeds_to_tell(mine: Numbers, baseline: Numbers, confidence: float = 0.95) -> float:
     """Estimate how many paired seeds would make a difference in means significant.
 
-    With S seeds the interval reaches √(z² · V + t₍S₋₁₎² · W / S) to both sides, where V is the
-    variance of the mean over instances and W the variance of the difference over seeds.
+    With S seeds the interval's half-width is √(z² · V + t₍S₋₁₎² · W / S), where V is the variance
+    of the mean over instances and W the variance of the difference over seeds.
 
     Returns:
-        S, larger than the present number of seeds; infinite if the instances are too few for any
-        number of seeds.
+        Number of seeds, larger than the present number; infinite if there are too few instances.
     """
     differences = [ours - theirs for ours, theirs in zip(mine, baseline, strict=True)]
     if min(values.shape[1] for values in differences) < 2:
@@ -146,24 +145,24 @@ def seeds_to_tell(mine: Numbers, baseline: Numbers, confidence: float = 0.95) ->
     if room <= 0:
         return math.inf
     over_seeds = effects.var(ddof=1)
-    # Student's t exceeds z and approaches it soon, so the search starts here and is short.
+    # Student's t exceeds z, so z gives a lower bound; t is close to z, so the search is short.
     fewest = max(len(effects) + 1, math.ceil(z**2 * over_seeds / room))
     spread = ((num, t.ppf(level, num - 1) ** 2 * over_seeds) for num in itertools.count(fewest))
     return float(next(num for num, reached in spread if reached < room * num))
 
 
 def fewest_differing(confidence: float) -> int:
-    """Return the smallest number of differing instances that any test calls significant.
+    """Return the smallest number of differing instances that can be significant.
 
-    If both methods are equally good, all of k differing instances favour the same method with
-    probability 2 · ½ᵏ (sign test). With fewer the bootstrap is overconfident, because its resamples
-    hardly differ.
+    If both methods are equally good, k differing instances all favour the same method with
+    probability 2 · ½ᵏ (sign test). The bootstrap is overconfident for fewer differing instances,
+    because its resamples hardly differ.
     """
     return math.ceil(math.log2(2 / (1 - confidence)))
 
 
 def _finite_median(values: Float[np.ndarray, "... n"]) -> Float[np.ndarray, "..."]:
-    """Return the median of the finite numbers, NaN where there are none."""
+    """Return the median of the finite numbers, or NaN without finite numbers."""
     ordered = np.sort(np.where(np.isfinite(values), values, np.inf), axis=-1)
     count = np.isfinite(ordered).sum(axis=-1, keepdims=True)
     middle = np.maximum(np.concatenate([(count - 1) // 2, count // 2], axis=-1), 0)
@@ -186,16 +185,16 @@ def _check(mine: Numbers, baseline: Numbers, statistic: str, same_seeds: bool) -
     counts = [[shape[-1] for shape in method] for method in shapes] if plain else [[], []]
     if not plain or not mine or counts[0] != counts[1] or max(map(len, seeds)) > 1:
         raise UserError(
-            f"numbers of shapes {shapes[0]} and, of the baseline, {shapes[1]}",
-            "(seeds, instances) for each object, with the same instances in both",
+            f"arrays of shapes {shapes[0]} for the method and {shapes[1]} for the baseline",
+            "shape (seeds, instances) for each object, with the same instances in both methods",
             "measure both methods on the same test set",
         )
     if same_seeds and seeds[0] != seeds[1]:
         problem = f"{seeds[0].pop()} seeds against {seeds[1].pop()}"
         raise UserError(problem, "equal numbers of seeds, to pair them", "pass same_seeds=False")
     if statistic == "mean" and not all(np.isfinite(v).all() for v in [*mine, *baseline]):
-        problem, fix = "a mean over numbers that are not finite", "replace misses, e.g. by 0"
-        raise UserError(problem, "finite numbers", fix)
+        problem, fix = "a mean over values that are not finite", "replace misses, e.g. by 0"
+        raise UserError(problem, "finite values", fix)
 
 
 def _resampled_difference(
@@ -215,7 +214,7 @@ def _resampled_difference(
             drawn = rng.integers(count, size=(len(total[rows]), count))
             for sign, values, weights in ((1, ours, draws[0]), (-1, theirs, draws[1])):
                 by_seed = compute(values[:, drawn]).T
-                # A seed that was not drawn must not count, even if its figure is NaN.
+                # Seeds with weight 0 are excluded, because their figure may be NaN.
                 weighted = np.where(weights[rows] > 0, weights[rows] * by_seed, 0.0)
                 total[rows] += sign * weighted.sum(axis=1)
     return total / len(mine)
@@ -239,6 +238,6 @@ def _num_differing(mine: Numbers, baseline: Numbers) -> int:
     for ours, theirs in zip(mine, baseline, strict=True):
         finite = [np.where(np.isfinite(v), v, np.inf) for v in (ours, theirs)]
         means = [np.sort(values, axis=0).mean(axis=0) for values in finite]
-        # With different numbers of seeds, means of equal numbers may differ in the last digit.
+        # Means of equal numbers over different numbers of seeds may differ by rounding.
         count += int((~np.isclose(means[0], means[1], rtol=1e-12, atol=0)).sum())
     return count

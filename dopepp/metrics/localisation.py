@@ -1,10 +1,10 @@
 """BOP's scores of 6D localisation: recall over the targets for three errors and their thresholds.
 
-A target is a number of instances of an object in an image, given by a list of targets
-(``test_targets_bop19.json``) or by visibility (at least a tenth). As many of the best-scored
-estimates are evaluated. For each error and threshold, estimates are matched by descending score,
-each with the free target of the smallest error below the threshold. AR is the mean of AR_VSD,
-AR_MSSD and AR_MSPD (Hodan et al., "BOP Challenge 2020", 2020), as computed by bop_toolkit.
+Targets are the instances in a list (``test_targets_bop19.json``) or, without a list, those with a
+visible fraction of at least a tenth. For n targets of an object in an image, the n estimates with
+the highest scores are evaluated. For each error and threshold, estimates are matched by descending
+score, each with the free target of the smallest error below the threshold. AR is the mean of
+AR_VSD, AR_MSSD and AR_MSPD (Hodan et al., "BOP Challenge 2020", 2020), as computed by bop_toolkit.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from dopepp.metrics.row import bop_points, symmetry_transforms
 from dopepp.parts.part import Part
 
 Draw = Callable[[Part, Transform, CameraMatrix, Size], DepthMap]
-"""Renders the depth of a single part, metres, 0 outside the part."""
+"""Function that renders the depth of a single part, metres, 0 outside the part."""
 
 _STRICT: Final = 0.1  # Threshold of ADD(-S), diameters
 
@@ -50,8 +50,8 @@ class BopScores:
         ar_vsd: Average recall of VSD; None if an image has no depth or a part no mesh.
         ar_mssd: Average recall of MSSD.
         ar_mspd: Average recall of MSPD.
-        ar: Mean of the three; None without AR_VSD.
-        add_or_s_01d: Recall of ADD, ADD-S for symmetric parts, below a tenth of the diameter.
+        ar: Mean of AR_VSD, AR_MSSD and AR_MSPD; None without AR_VSD.
+        add_or_s_01d: Recall of ADD (ADD-S for symmetric parts) below a tenth of the diameter.
     """
 
     num_targets: int
@@ -75,11 +75,11 @@ class BopScores:
 
 
 class Localisation:
-    """Accumulates the errors of one method's poses, image by image.
+    """Accumulates the errors of a method's poses, image by image.
 
     Args:
         parts: The evaluated objects.
-        draw: Renderer of a part's depth, for VSD; None leaves VSD out.
+        draw: Renderer of a part's depth, for VSD; without a renderer, VSD is not computed.
     """
 
     def __init__(self, parts: Sequence[Part], draw: Draw | None = None) -> None:
@@ -98,8 +98,8 @@ class Localisation:
         """Add the detections and ground truth of one image, with its measured depth in metres."""
         for part in self._parts.values():
             true = [i.T_cam_obj for i in instances if i.label == part.name and counted(i)]
-            own_detections = (d for d in detections if d.object == part.name)
-            ranked = sorted(own_detections, key=lambda detection: -detection.score)
+            candidates = (d for d in detections if d.object == part.name)
+            ranked = sorted(candidates, key=lambda detection: -detection.score)
             estimated = [detection.T_cam_obj for detection in ranked[: len(true)]]
             if not true:
                 continue
@@ -144,20 +144,20 @@ class Localisation:
 def num_matched(errors: Errors, threshold: float) -> int:
     """Count the targets matched with an error below a threshold.
 
-    Each estimate, in order of its score, takes the free target with the smallest error.
+    Each estimate, by descending score, is matched with the free target of the smallest error.
     """
     free = np.ones(errors.shape[1], bool)
     for row in errors:
-        left = np.where(free, row, np.inf)
-        nearest = int(left.argmin())
-        if left[nearest] < threshold:
+        free_errors = np.where(free, row, np.inf)
+        nearest = int(free_errors.argmin())
+        if free_errors[nearest] < threshold:
             free[nearest] = False
     return int((~free).sum())
 
 
 @dataclass
 class _Group:
-    """Errors between all estimates and targets of one object in one image.
+    """Errors between all estimates and targets of an object in an image.
 
     ``mssd`` and ``add_or_s`` are in diameters, ``mspd`` in pixels of an image 640 wide.
     """
@@ -175,7 +175,7 @@ def _errors(
     K: CameraMatrix,
     width: int,
 ) -> _Group:
-    """Compute all errors but VSD over the mesh's vertices."""
+    """Compute MSSD, MSPD and ADD(-S) over the mesh's vertices."""
     shape = len(estimated), len(true)
     T_est = torch.from_numpy(np.repeat(estimated.astype(np.float64), shape[1], axis=0))
     T_gt = torch.from_numpy(np.tile(true.astype(np.float64), (shape[0], 1, 1)))

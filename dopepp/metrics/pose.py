@@ -1,7 +1,7 @@
-"""The accumulator of pose errors for validation, evaluation and other methods' poses.
+"""Accumulator of pose errors for validation, for evaluation and for the poses of other methods.
 
-Its state consists of the poses themselves, so that all errors of an object are computed in one
-batch and a new measure needs no new state.
+The state of the accumulator consists of poses, so all errors of an object are computed in a single
+batch, and a new measure needs no new state.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MAX_MATCHING_RADIUS: Final = 0.1
 """Largest matching radius of any part, metres."""
 
 MIN_VISIBLE_FRACTION: Final = 0.1
-"""Smallest visible share of the silhouette of an evaluated instance."""
+"""Smallest visible share of an evaluated instance's silhouette."""
 
 CurveMeasure = Literal["add", "add_s", "mssd"]
 """Error in metres, for accuracy-threshold curves."""
@@ -44,8 +44,8 @@ InstanceError = Literal["add", "add_s", "mssd", "rotation_deg", "rotation_s_deg"
 _WIDTH: Final = 81
 _T_EST, _T_GT, _CAMERA = slice(1, 17), slice(17, 33), slice(33, 43)
 _VISIBLE, _SCORE, _COVARIANCE = 43, 44, slice(45, 81)
-"""Columns of an instance in the state: object index, T_est, T_gt, K and image width, visible
-fraction, score, covariance; NaN for a miss and for unknown values."""
+"""State columns of an instance: object index, T_est, T_gt, K and image width, visible fraction,
+score, covariance. Missed and unknown values are NaN."""
 
 
 class PredictedPose(Protocol):
@@ -89,9 +89,9 @@ class TruePose(Protocol):
 
 
 def matching_radius(part: Part) -> float:
-    """Return the distance within which the centres of a detection and an instance match, metres.
+    """Return the largest distance between the centres of a detection and its instance, metres.
 
-    The radius is half of the part's diameter, and at most :data:`MAX_MATCHING_RADIUS`.
+    The radius is half of the part's diameter and at most :data:`MAX_MATCHING_RADIUS`.
     """
     return min(MAX_MATCHING_RADIUS, float(part.diameter) / 2)
 
@@ -99,10 +99,10 @@ def matching_radius(part: Part) -> float:
 def assign(
     part: Part, detections: Sequence[PredictedPose], instances: Sequence[TruePose]
 ) -> Int[np.ndarray, "detections"]:
-    """Match the detections of one object in one image with its instances.
+    """Match the detections of an object in an image with its instances.
 
-    The positions of the cuboid's centre are matched (:func:`~dopepp.metrics.functional.match`)
-    within :func:`matching_radius`, first with evaluated instances, then with hidden ones.
+    Cuboid centres within :func:`matching_radius` match, by
+    :func:`~dopepp.metrics.functional.match`: first evaluated instances, then hidden instances.
 
     Args:
         part: The object.
@@ -112,7 +112,7 @@ def assign(
     Returns:
         Index of each detection's instance; −1 if it matches none.
     """
-    # An infinite pose would warn (infinity times zero); as NaN throughout, it matches nothing.
+    # NaN poses match no instance. Infinite poses are set to NaN, because ∞ · 0 would warn.
     estimates = [np.asarray(d.T_cam_obj, np.float64) for d in detections]
     centre, radius = part.cuboid[CENTROID], matching_radius(part)
     predicted = [transform(np.where(np.isfinite(T), T, np.nan), centre) for T in estimates]
@@ -161,8 +161,8 @@ class PoseMetrics(Metric):
         super().__init__(**kwargs)
         names = [part.name for part in parts]
         if not names or len(set(names)) < len(names) or MEAN in names:
-            allowed = f"one or more parts of different names, none {MEAN!r}"
-            raise UserError(f"parts {names}", allowed, "pass a part, or rename one of these")
+            allowed = f"one or more parts with distinct names other than {MEAN!r}"
+            raise UserError(f"parts {names}", allowed, "add a part, or rename parts")
         self.parts = {part.name: part for part in parts}
         self.method = method
         self.set_dtype(torch.float64)
@@ -190,14 +190,14 @@ class PoseMetrics(Metric):
 
         Raises:
             UserError: A detection is of another object.
-            ValueError: Only one of K and width is given, or is invalid.
+            ValueError: K or width is invalid, or given without the other.
         """
         for detection in detections:
             if detection.object not in self.parts:
                 raise UserError(
                     f"a detection of {detection.object!r}",
-                    f"the scored parts {', '.join(self.parts)}",
-                    "score it with a PoseMetrics that knows this part",
+                    f"detections of the evaluated parts {', '.join(self.parts)}",
+                    "pass this part to PoseMetrics, or drop the detection",
                 )
         camera = _camera(K, width)
         self.num_images += 1
@@ -224,9 +224,9 @@ class PoseMetrics(Metric):
             state.append(torch.from_numpy(rows.ravel()).to(self.device))
 
     def compute(self) -> dict[str, PoseRow]:
-        """Return a row per object, then their :data:`MEAN`; see :mod:`dopepp.metrics.row`.
+        """Return a row (:mod:`dopepp.metrics.row`) for each object, then their :data:`MEAN`.
 
-        Without evaluated instances, all measures of an object but its counts are None.
+        An object without evaluated instances has counts only; its other measures are None.
         """
         poses, false_positives = _table(self.poses, _WIDTH), _table(self.false_positives, 2)
         rows, num_images = {}, int(self.num_images)
@@ -239,7 +239,7 @@ class PoseMetrics(Metric):
         return rows
 
     def errors(self, name: str, measure: InstanceError = "add") -> Float[np.ndarray, "instances"]:
-        """Return an error of every instance of a part, infinite for a miss.
+        """Return the error of every instance of a part, infinite for a miss.
 
         All ranks must call this method, like ``compute``.
         """
@@ -247,7 +247,7 @@ class PoseMetrics(Metric):
         return np.asarray(getattr(self._gathered[name].errors, measure).numpy())
 
     def references(self, seed: int = 0) -> dict[str, dict[str, PoseRow]]:
-        """Return the rows of each reference on the same instances, by object or :data:`MEAN`.
+        """Return the rows of each reference on the evaluated instances, by object or :data:`MEAN`.
 
         All ranks must call this method, like ``compute``.
         """
@@ -306,7 +306,7 @@ class Gathered:
         self.errors = PoseErrors.of(part, T_est, self.T_gt, self.K, camera[:, 9], covariance)
 
     def row(self, method: str) -> PoseRow:
-        """Return the row of the object; without ground truth it has only counts."""
+        """Return the row of the object, which has only counts without ground truth."""
         errors, num_false = self.errors, len(self.false_positives)
         if len(errors.add) == 0:
             row = PoseRow(self.part.name, method, 0, num_symmetries=errors.num_symmetries)
@@ -316,20 +316,21 @@ class Gathered:
             row.miss_rate = 1 - matched / len(errors.add)
             row.matching_radius = matching_radius(self.part)
             if matched + num_false:
-                row.precision = int(self._right.sum()) / (matched + num_false)
+                row.precision = int(self._correct.sum()) / (matched + num_false)
             row.average_precision = self._average_precision()
         row.false_per_frame = num_false / max(self.num_images, 1)
         return row
 
     @property
-    def _right(self) -> Bool[Tensor, "n"]:
+    def _correct(self) -> Bool[Tensor, "n"]:
         """Return which instances have a pose with ADD(-S) below a tenth of the diameter."""
         return self.errors.add_or_s < 0.1 * self.part.diameter
 
     def _average_precision(self) -> float:
-        hits = self._right
+        hits = self._correct
         misses = ~hits & self.errors.add.isfinite()
-        # Among equal scores, wrong predictions come first: AP must not depend on images or ranks.
+        # Wrong predictions precede correct ones of equal score, so that AP does not depend on the
+        # order of images and ranks.
         scores = torch.cat([self.false_positives, self.scores[misses], self.scores[hits]])
         correct = torch.arange(len(scores)) >= len(scores) - int(hits.sum())
         return average_precision(scores, correct, len(hits))

@@ -1,14 +1,13 @@
 """Reference rows of a result table: poses that need no estimate.
 
-The three references use the true position and, in turn, a random rotation, a rotation from the test
-set, and the constant rotation that suits the test set best. They show how high the pass rates are
-for a narrow range of poses.
+The three references combine the true position with a random rotation, with a rotation from the test
+set, and with the best constant rotation. A narrow range of test poses has high reference rows.
 
-A part is rotated about the centre of its cuboid, so every measure here depends only on the rotation
-Q between the true and the guessed orientation, and a reference is a list of Qs. AR_MSPD, which also
-depends on the position in the image, and average precision, which needs scores, do not exist.
+A part is rotated about the centre of its cuboid, so every measure depends only on the rotation Q
+between the true and the guessed orientation. A reference is a list of rotations Q. It has no
+AR_MSPD, which depends on the position in the image, and no average precision, which needs scores.
 
-To add a reference, write a function that returns its Qs and name it in :func:`reference_rows`.
+To add a reference, write a function that returns rotations Q and call it in :func:`reference_rows`.
 """
 
 from __future__ import annotations
@@ -31,13 +30,13 @@ CHANCE_RANGE: Final = "chance, test range"
 BEST_CONSTANT: Final = "best constant pose"
 REFERENCES: Final = (CHANCE_ALL, CHANCE_RANGE, BEST_CONSTANT)
 
-_MAX_POSES: Final = 300  # Most test poses used; the best constant compares all pairs
+_MAX_POSES: Final = 300  # Largest number of test poses; the best constant compares all pairs
 _NUM_DRAWS: Final = 2000
-"""Guesses of a chance row: the standard error of a share near 15 % is 0.8 %."""
+"""Number of guesses in a chance row: the standard error of a share near 15 % is 0.8 %."""
 _NUM_POINTS: Final = 500
-"""ADD points of a guess: the mean of 500 of 2,000 distances is accurate to about 1 %."""
+"""Number of ADD points: the mean of 500 of 2,000 distances is accurate to about 1 %."""
 _NUM_SURFACE_DRAWS: Final = 300
-"""Guesses evaluated by ADD-S and symmetric errors, which cost far more than ADD."""
+"""Number of guesses evaluated by ADD-S and symmetric errors, which cost far more than ADD."""
 
 
 def reference_rows(
@@ -47,12 +46,12 @@ def reference_rows(
 
     Args:
         part: The object.
-        T_cam_obj: True poses of its evaluated instances, metres.
+        T_cam_obj: True poses of the evaluated instances, metres.
         seed: Seed of the guesses.
 
     Returns:
-        Rows by name, in the order of :data:`REFERENCES`. Without instances their measures are None;
-        with a single instance, those of ``chance, test range`` are None.
+        Rows by name, in the order of :data:`REFERENCES`. Measures are None without instances, and
+        for ``chance, test range`` also with a single instance.
     """
     rng = np.random.default_rng(seed)
     rotations = np.asarray(T_cam_obj, np.float64).reshape(-1, 4, 4)[:, :3, :3]
@@ -79,10 +78,10 @@ def reference_rows(
 
 
 def _row(part: Part, name: str, Q: Tensor, few_points: Tensor, points: Tensor) -> PoseRow:
-    """Measure guesses with the rotation errors Q, (n, 3, 3), at the true position."""
+    """Measure guesses at the true position with the rotation errors Q, (n, 3, 3)."""
     identity = torch.eye(3, dtype=torch.float64).expand_as(Q)
     origin = Q.new_zeros(len(Q), 3)
-    # The first chance guesses are a fair sample, as their order is random.
+    # Chance guesses are in random order, so the first guesses are a random sample.
     subset = slice(_NUM_SURFACE_DRAWS)
     about_centre = Q[subset], origin[subset], identity[subset], origin[subset]
     # Symmetries are transforms of the object frame, whose origin may lie anywhere.
@@ -107,9 +106,9 @@ def _row(part: Part, name: str, Q: Tensor, few_points: Tensor, points: Tensor) -
 def _other_poses(
     rotations: Float[np.ndarray, "n 3 3"], rng: np.random.Generator
 ) -> Float[np.ndarray, "draws 3 3"]:
-    """Return the errors of guessing another pose of the test set: all pairs, or a random subset."""
+    """Return the rotation errors between pairs of test poses: all pairs, or a random subset."""
     n = len(rotations)
-    # Pair k of the n·(n − 1) ordered pairs: the true pose, and the guessed pose's offset from it.
+    # Pair k of the n·(n − 1) ordered pairs has a true pose and the index offset of its guess.
     true, step = np.divmod(rng.permutation(n * (n - 1))[:_NUM_DRAWS], max(n - 1, 1))
     guessed = (true + 1 + step) % n
     return np.asarray(rotations[true].transpose(0, 2, 1) @ rotations[guessed])
@@ -118,7 +117,7 @@ def _other_poses(
 def _best_constant(
     rotations: Float[np.ndarray, "n 3 3"], points: Tensor, threshold: float
 ) -> Float[np.ndarray, "n 3 3"]:
-    """Return the errors of the best of all test rotations and their mean; ADD breaks ties."""
+    """Return the errors of the best constant: a test rotation or the mean; ADD breaks ties."""
     mean = nearest_rotation(rotations.mean(axis=0))
     candidates = np.concatenate([rotations, mean[None]])
     Q = rotations.transpose(0, 2, 1)[None] @ candidates[:, None]

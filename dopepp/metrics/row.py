@@ -55,10 +55,10 @@ class PoseErrors:
         mspd: MSPD over the part's symmetries, pixels of an image 640 wide; None if a camera is
             unknown.
         rotation_deg: Angle between the orientations, degrees.
-        rotation_s_deg: Smallest such angle over the part's symmetries, degrees.
+        rotation_s_deg: Smallest angle over the part's symmetries, degrees.
         translation: Distance between the object frame's origins, metres; None for guesses.
-        mahalanobis: Mahalanobis distance by the stated covariance; infinite without a covariance,
-            None for guesses.
+        mahalanobis: Mahalanobis distance under the estimated covariance; infinite without a
+            covariance, None for guesses.
         diameter: Diameter of the part, metres.
         num_symmetries: Number of symmetry transforms, including the identity.
     """
@@ -124,11 +124,9 @@ def symmetry_transforms(part: Part) -> Float[Tensor, "s 4 4"]:
 
 
 def bop_points(part: Part) -> Float[Tensor, "v 3"]:
-    """Return the points on which BOP's scores are computed.
+    """Return the points for BOP's scores: the mesh's vertices, or ADD points without a mesh.
 
-    These are the mesh's vertices, or the ADD points if the part has no mesh.
-
-    Surface samples miss the corners, which have the largest distances.
+    Vertices include the corners, which have the largest distances; surface samples miss corners.
     """
     points = part.points if part.mesh is None else part.mesh.vertices
     return torch.from_numpy(np.asarray(points, np.float64))
@@ -139,20 +137,20 @@ class PoseRow:
     """Measures of one method on one object; None ("n/a") for an undefined measure.
 
     Shares lie in [0, 1], angles are degrees, distances metres. Medians and 90th percentiles are
-    over matched instances. (Not frozen, because torchmetrics rebuilds what ``compute`` returns.)
+    over matched instances. The class is not frozen, because torchmetrics rebuilds the rows.
 
     Attributes:
         object: The part's name, or ``mean``.
-        method: What produced the poses: the estimator, or a reference row's name.
+        method: Source of the poses: the estimator, or the name of a reference.
         num_instances: Number of evaluated ground-truth instances.
         add_01d: Share of instances with ADD below a tenth of the diameter.
         add_or_s_01d: Like ``add_01d``, with ADD-S for a part with symmetries.
         ar_mssd: BOP's average recall of MSSD.
         ar_mspd: BOP's average recall of MSPD; None if an image's camera is unknown.
         mspd_5px: Share of instances with MSPD below 5 px at 640 px width; None without cameras.
-        median_deviations: Median ratio of the true errors to the stated standard deviations, 1 if
-            they are calibrated; None without covariances.
-        coverage: Share of matched poses within their 90 % covariance region, or None.
+        median_deviations: Median ratio of true errors to estimated standard deviations, 1 for
+            calibrated covariances; None without covariances.
+        coverage: Share of matched poses inside their 90 % covariance region, or None.
         matching_radius: Largest distance of a match (:func:`~dopepp.metrics.pose.matching_radius`).
         miss_rate: Share of instances without a matched prediction.
         precision: Share of the reported poses with ADD(-S) below a tenth of the diameter; None if
@@ -196,7 +194,7 @@ class PoseRow:
 
 
 Formula = Callable[[PoseErrors], float | None]
-"""Function of the errors of N >= 1 poses; None if the measure does not exist."""
+"""Function of the errors of N >= 1 poses; None for an undefined measure."""
 
 
 @dataclass(frozen=True)
@@ -208,7 +206,7 @@ class Column:
         heading: Heading with the unit.
         scale: Factor from the stored to the displayed unit.
         decimals: Displayed digits after the point.
-        group: Group of measures in a printed table; ``symmetry`` is for parts with symmetries.
+        group: Group in a printed table; only parts with symmetries have the group ``symmetry``.
         formula: Function of the errors; None if errors alone do not determine the measure.
     """
 
@@ -243,7 +241,7 @@ def _area(error: str) -> Formula:
 
 
 def _of_finite(error: str, statistic: Callable[[Tensor], float]) -> Formula:
-    """Return the formula of a statistic of the finite errors; None without any."""
+    """Return a formula: the statistic of the finite errors, or None without finite errors."""
 
     def formula(errors: PoseErrors) -> float | None:
         values = getattr(errors, error)
@@ -325,7 +323,7 @@ _TOTALS: Final = ("num_instances", "false_per_frame")
 
 
 def shown_columns(row: PoseRow, all_measures: bool = False) -> list[Column]:
-    """Return the columns of a row, with symmetric measures only if its object has symmetries."""
+    """Return the columns of a row; only objects with symmetries have symmetric measures."""
     has_symmetries = all_measures or row.num_symmetries > 1
     return [column for column in COLUMNS if has_symmetries or column.group != "symmetry"]
 

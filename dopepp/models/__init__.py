@@ -1,1 +1,1 @@
-"""Networks, their losses, the plain spec that describes them and the checkpoint that keeps them."""
+"""Networks, losses, the plain spec that describes a network, and checkpoints."""

@@ -41,7 +41,7 @@ class Backbone(nn.Module, ABC):
     Attributes:
         out_channels: Channels of the feature maps.
         stride: Input pixels per feature cell, along each axis.
-        cell_multiple: The feature map's height and width are multiples of this.
+        cell_multiple: Divisor of the feature map's height and width.
     """
 
     out_channels: int
@@ -82,10 +82,10 @@ class VGG19(_Chain):
     """DOPE's backbone: VGG19's layers 0–22, then 3×3 convolutions 512→256 and 256→128.
 
     Args:
-        width: Factor on every channel count; 1 is the paper's.
+        width: Factor on every channel count (paper: 1).
         batch_norm: Whether batch norm replaces the bias of every convolution.
         weights_path: File with a ``state_dict`` of torchvision's ``vgg19`` that initialises the VGG
-            layers. It is not part of the architecture, so checkpoints do not store it.
+            layers. Checkpoints do not store this path.
 
     Raises:
         UserError: An argument is out of range, or the file does not match the layers.
@@ -111,7 +111,7 @@ class VGG19(_Chain):
             raise UserError(values, allowed, fix)
         weights = read_mapping(Path(weights_path), "a torchvision state_dict of vgg19 (.pth)")
         convolutions = (layer for layer in self.modules() if isinstance(layer, nn.Conv2d))
-        # torchvision numbers all layers: a convolution counts with its ReLU, a pooling alone.
+        # torchvision numbers all layers: a convolution has a ReLU after it, a pooling has none.
         positions = accumulate((1 if step == POOL else 2 for step in self.plan), initial=0)
         for step, position in zip(self.plan, positions, strict=False):
             if step != POOL:
@@ -151,7 +151,7 @@ class DSC(_Chain):
 class Pyramid(Backbone):
     """Residual blocks at strides 4, 8, 16 and 32, summed top-down into stride 8.
 
-    Fast also on CPUs: no layer works at the resolution of the image, and no 3×3 convolution is
+    The backbone is fast on CPUs: no layer works at full resolution, and no 3×3 convolution is
     depthwise. 4×4 pixels become 48 channels (Shi et al. 2016), followed by a 3×3 convolution and
     the residual blocks (He et al. 2016) of each stride. From stride 32 to stride 8, a 1×1
     convolution and upsampling by 2 precede the sum with the finer features (Lin et al. 2017) and

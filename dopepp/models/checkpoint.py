@@ -53,7 +53,7 @@ _FOLDER_KEYS: Final = ("root", "cache_dir", "backgrounds")
 """Keys of a data configuration that name folders of the training machine."""
 
 _WHAT: Final = "a checkpoint (.ckpt) written by train.py"
-_FIX: Final = "use a checkpoint that training wrote"
+_FIX: Final = "use a checkpoint written by train.py"
 
 
 @dataclass(eq=False)
@@ -139,7 +139,7 @@ def read(path: Path) -> Checkpoint:
         content = read_mapping(path, _WHAT)
     if KEY not in content:
         raise UserError(
-            f"{path} without {KEY!r} entry", _WHAT, "pass a checkpoint that training wrote"
+            f"{path} without {KEY!r} entry", _WHAT, "pass a checkpoint written by train.py"
         )
     try:
         checkpoint = parse_description(content[KEY])
@@ -178,9 +178,9 @@ def parse_description(payload: object) -> Checkpoint:
     _check_plain(payload)
     version = payload.get("format_version")
     if type(version) is not int or version != FORMAT_VERSION:
-        fix = "read the file with the dopepp that wrote it, or train again"
+        fix = "use the version of dopepp that wrote the file, or train again"
         raise UserError(f"format_version {version!r:.100}", f"{FORMAT_VERSION}", fix)
-    # Containers with a parser of their own are not copied; empty ones replace them here.
+    # Containers with their own parser are not copied; empty containers replace them here.
     kept = {name: payload[name] for name in ("spec", "parts", "data") if name in payload}
     empty = {name: type(value)() for name, value in kept.items() if isinstance(value, (dict, list))}
     fields = vars(parse(_Header, {**payload, **empty}, fix=_FIX))
@@ -211,7 +211,7 @@ def _count(value: object, depth: int, counts: dict[int, int]) -> int:
         return 1
     if id(value) not in counts:
         if depth == _MAX_DEPTH:
-            raise ValueError(f"values nested more than {_MAX_DEPTH} deep")
+            raise ValueError(f"more than {_MAX_DEPTH} levels of nesting")
         items: Iterable[object] = value  # type: ignore[assignment]
         if isinstance(value, dict):
             odd = next((key for key in value if type(key) not in (str, int)), None)
@@ -231,7 +231,7 @@ def _check_weights(checkpoint: Checkpoint, size: int) -> None:
     described = f"stride {checkpoint.stride} and {len(checkpoint.parts)} parts"
     needed = f"stride {network.stride} and {network.num_objects} parts"
     if described != needed:
-        raise UserError(described, f"{needed}, as the spec has it", _FIX)
+        raise UserError(described, f"{needed}, as in the spec", _FIX)
     expected, weights = network.state_dict(), checkpoint.state_dict
     odd = sorted(expected.keys() ^ weights.keys()) or [
         name for name, value in expected.items() if not _same_kind(weights[name], value)
@@ -330,7 +330,7 @@ def _half(name: str, value: Tensor) -> Tensor:
     if not half.isfinite().all():
         problem = f"{name} with values up to {float(value.abs().max()):g}"
         allowed = f"finite weights of at most {torch.finfo(torch.float16).max:g}"
-        raise UserError(problem, allowed, "train again: such weights come from a run that diverged")
+        raise UserError(problem, allowed, "train again, because this training has diverged")
     return half
 
 

@@ -52,7 +52,7 @@ class EfficientNetLite(Backbone):
         channels: Channels of the sums, 8–1024.
         top_down: Number of residual blocks after the sums at strides 16 and 8, each 0–16.
         width: Factor on ``channels``; the encoder's channels are fixed.
-        frozen: Freeze the encoder down to this stride, 8, 16 or 32; 0 freezes nothing.
+        frozen: Stride down to which the encoder is frozen, 8, 16 or 32; 0 freezes no layer.
         weights_path: File with a ``state_dict`` in EfficientNet-PyTorch's names that initialises
             the encoder, or ``imagenet`` for the file of this extra; checkpoints do not store it.
 
@@ -221,6 +221,6 @@ def _weights_file(path: object) -> str:
         raise UserError(f"weights_path={path!r:.200}", allowed, "set weights_path to one of these")
     if path != IMAGENET:
         return path
-    # Not imported, because only its file is needed.
+    # The package is not imported, because only its file is needed.
     package = require(_PACKAGE, f"weights_path={IMAGENET}", "imagenet")
     return str(Path(cast(str, package.origin)).parent / _FILE)

@@ -54,9 +54,9 @@ class Branch(nn.Module, ABC):
 class Head(nn.Module):
     """A chain of stages, each a belief branch and a field branch.
 
-    Stage 1 reads the features. Later stages also read the belief maps of the previous stage, after
-    the activation so that both losses give the same input, and its field. C objects have 9·C belief
-    and 16·C field channels.
+    Stage 1 reads the features. Later stages also read the field and the belief maps of the previous
+    stage; belief maps are activated, so that inputs do not depend on the loss. C objects have 9·C
+    belief and 16·C field channels.
 
     Args:
         in_channels: Channels of the feature maps.
@@ -66,7 +66,7 @@ class Head(nn.Module):
         make_branch: Builds a branch from input channels, output channels and stage (from 0).
 
     Attributes:
-        cell_multiple: The feature map's height and width are multiples of this.
+        cell_multiple: Divisor of the feature map's height and width.
     """
 
     cell_multiple: int = 1
@@ -144,7 +144,7 @@ class Cascade(Head):
 
 
 class ChainBranch(nn.Sequential, Branch):
-    """A sequence of layers; the last one produces the maps."""
+    """A sequence of layers, the last of which produces the maps."""
 
     @property
     def outputs(self) -> list[nn.Conv2d]:
@@ -159,10 +159,10 @@ class ChainBranch(nn.Sequential, Branch):
 class MultiScale(Head):
     """The paper's MultiScaleDOPEstage (§3.3), 1 to 12 of them.
 
-    ``width`` is a factor on the channels; 1 means 128. If ``batch_norm``, batch norm follows every
-    convolution but those of maps. ``maps`` selects the input of the fusion from each scale:
-    ``plain`` for maps of 9 or 16 channels (§3.3), ``learned`` for such maps with a loss of their
-    own, None for features.
+    ``width`` is a factor on the 128 channels. If ``batch_norm``, batch norm follows every
+    convolution except output convolutions. ``maps`` selects the fusion's input from each scale:
+    ``plain`` for maps of 9 or 16 channels (§3.3), ``learned`` for maps with a loss of their own,
+    None for features.
     """
 
     cell_multiple = 4
@@ -192,8 +192,8 @@ class MultiScaleBranch(Branch):
 
     Down: five 3×3 convolutions at full scale, three at half and three at quarter scale. Up: a
     convset and a 1×1 convolution at quarter scale, upsampling by 2, concatenation with the half
-    scale; likewise into full scale; a convset; 1×1 to the maps. ReLU follows every convolution but
-    those of maps: without ReLU, the five convolutions of a convset would be one linear map.
+    scale; likewise into full scale; a convset; 1×1 to the maps. ReLU follows every convolution
+    except output convolutions, because a convset without ReLU would be a single linear map.
     """
 
     def __init__(
@@ -247,9 +247,9 @@ class MultiScaleBranch(Branch):
 class SharedTrunk(Head):
     """One stage with a shared trunk and a short branch each for beliefs and field.
 
-    The trunk has ``blocks`` (1–16) residual blocks, a branch a 3×3 convolution and a 1×1 to the
-    maps. Both have ``channels`` · ``width`` channels; batch norm follows every convolution but
-    those of maps.
+    The trunk has ``blocks`` (1–16) residual blocks; a branch has a 3×3 and a 1×1 convolution. Both
+    have ``channels`` · ``width`` channels, and batch norm after every convolution except output
+    convolutions.
     """
 
     def __init__(

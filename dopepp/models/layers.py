@@ -60,8 +60,8 @@ def conv_block(
 class ResidualBlock(nn.Module):
     """Two 3×3 convolutions with batch norm, added to their input (He et al. 2016, Fig. 2).
 
-    If the shape changes, a 1×1 convolution with batch norm adapts the input. ``stride`` is that of
-    the first convolution.
+    If the shape changes, a 1×1 convolution with batch norm adapts the input. The first convolution
+    has the ``stride``.
     """
 
     def __init__(self, in_channels: int, out_channels: int, stride: int = 1) -> None:
@@ -89,8 +89,8 @@ def initialise(module: nn.Module) -> None:
     """Draw convolution and linear weights from He's normal distribution; set biases to 0.
 
     The variance 2 / fan_in (He et al. 2015, Eq. 10) preserves the scale of activations in networks
-    without batch norm that are as deep as DOPE's cascade. Weights on ``meta`` are skipped: drawing
-    them would import PyTorch's compiler.
+    without batch norm that are as deep as DOPE's cascade. Weights on ``meta`` are skipped, because
+    drawing them would import PyTorch's compiler.
     """
     for layer in module.modules():
         if isinstance(layer, (nn.Conv2d, nn.Linear)) and not layer.weight.is_meta:
@@ -115,7 +115,7 @@ ACTIVATIONS: Final[Mapping[str, Activation]] = {
     # The output is the belief itself, as in DOPE; paired with MSE.
     "identity": Activation(lambda logits: logits, 0.0),
     # belief = exp(logit), at most 1 and in float32: the log link of `losses.SpatialCrossEntropy`.
-    # An untrained map starts at 0.01 in every cell, so its sum is that of one Gaussian of 2 cells
+    # An untrained map starts at 0.01 in every cell, so its sum equals one Gaussian of σ = 2 cells
     # on a 52×52 map (2π·2² / 52² = 0.0093) and the "how much" term starts near its minimum.
     "exp": Activation(lambda logits: logits.float().clamp(max=0.0).exp(), math.log(0.01)),
 }
@@ -128,6 +128,6 @@ def find_activation(name: object) -> Activation:
         UserError: No activation has this name.
     """
     if not isinstance(name, str) or name not in ACTIVATIONS:
-        fix = "set the activation that your loss requires"
+        fix = "set the activation of the loss"
         raise UserError(f"activation {name!r:.100}", ", ".join(ACTIVATIONS), fix)
     return ACTIVATIONS[name]

@@ -67,7 +67,7 @@ class MapLoss(nn.Module, ABC):
 
 
 class MapMSE(MapLoss):
-    """DOPE's loss: mean squared error of the belief maps plus that of the vector fields."""
+    """DOPE's loss: the sum of the mean squared errors of belief maps and vector fields."""
 
     activation = "identity"
 
@@ -97,16 +97,16 @@ class SpatialCrossEntropy(MapLoss):
     - *where*: N · KL(g/N ‖ softmax(z)), and
     - *how much*: Λ − N − N·log(Λ/N).
 
-    Both are divided by the mass 2πσ² of one Gaussian: a visible keypoint weighs about 1, a keypoint
-    cut off by the border less, and an absent keypoint contributes only Λ. MSE on such sparse maps
-    starts on a plateau, because an all-zero map is a good solution. The *where* term depends only
-    on the distribution of beliefs over cells, so it has a gradient from the first step.
+    Both terms are divided by the mass 2πσ² of one Gaussian: a visible keypoint weighs about 1, a
+    keypoint cut off by the border less, and an absent keypoint contributes only Λ. MSE on sparse
+    maps starts on a plateau, because an all-zero map has a small error. The *where* term depends
+    only on the distribution of beliefs over cells, so it has a gradient from the first step.
 
     Args:
         sigma: Standard deviation of the target's Gaussians, cells.
         count_weight: Weight of the *how much* term.
-        field_weight: Weight of the field's term: smooth L1 per cell inside the keypoints' discs,
-            where alone the field is defined and read.
+        field_weight: Weight of the field's term: smooth L1 per cell inside the keypoints' discs.
+            The field is undefined outside the discs.
     """
 
     activation = "exp"
@@ -123,7 +123,8 @@ class SpatialCrossEntropy(MapLoss):
     ) -> dict[str, Float[Tensor, "batch"]]:
         """Return the ``where``, ``count`` and ``field`` terms of one stage per image."""
         z, g = logits.flatten(2), belief_target.flatten(2)
-        # Unit of both terms: one Gaussian's mass; `count` is N and `log_total` log Λ in that unit.
+        # The unit of both terms is one Gaussian's mass; in this unit, `count` is N and `log_total`
+        # is log Λ.
         share = g / self.mass
         count = share.sum(-1)
         log_total = z.logsumexp(-1) - math.log(self.mass)
@@ -150,7 +151,7 @@ def _capped_exp(value: Tensor, count: Tensor) -> Tensor:
 def _field_error(field: Tensor, target: Tensor) -> Tensor:
     """Return the smooth L1 distance of the vectors inside the discs per image.
 
-    It is divided by the mean number of cells, so that its mean over images is that over cells.
+    Dividing by the mean number of cells makes the mean over images equal to the mean over cells.
     """
     corners = (field.shape[0], field.shape[1] // 2, 2, *field.shape[2:])
     field, target = field.view(corners), target.view(corners)

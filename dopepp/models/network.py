@@ -1,6 +1,6 @@
 """The pose network: normalisation, backbone, attention and head, built from a plain spec.
 
-A spec, in configs and checkpoints alike, holds the nodes ``backbone``, ``attention`` and ``head``
+A spec, in configs and checkpoints, holds the nodes ``backbone``, ``attention`` and ``head``
 (``_target_`` and arguments), ``activation`` and ``num_objects``. Channel counts follow from the
 backbone. To allow a class of another package, call ``BACKBONES.register(dotted name)``.
 """
@@ -42,7 +42,7 @@ class PoseNetwork(nn.Module):
 
     Attributes:
         stride: Pixels per map cell.
-        size_multiple: Image height and width are multiples of this.
+        size_multiple: Divisor of the image's height and width.
     """
 
     mean: Tensor

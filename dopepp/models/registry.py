@@ -4,7 +4,7 @@ A node is a plain dict ``{"_target_": "package.module.Class", argument: value, â
 must be in the allow-list before anything is imported, and the resolved class is checked again. This
 excludes paths through other modules (``dopepp.models.network.os.system``) and re-bound names;
 Hydra's own block-list can be circumvented. Arguments of backbones, attention modules, heads and
-losses must have their annotated types; torch and Lightning check those of their classes themselves.
+losses must have their annotated types; torch and Lightning check their classes' own arguments.
 
 To allow your own class, enable its package (:mod:`dopepp.core.extensions`), or call ``register`` of
 the registry of its kind (``BACKBONES.register("package.module.Class")``).
@@ -123,9 +123,9 @@ class Registry(Generic[T]):
             raise
         except (NameError, TypeError, ValueError) as error:
             raise UserError(
-                f"{node[TARGET]} with {arguments!r:.300}, which it refuses: {error}",
+                f"{node[TARGET]} with {arguments!r:.300}, which failed: {error}",
                 f"{node[TARGET]}{inspect.signature(target)}",
-                f"pass the {self.kind} arguments that this signature accepts",
+                f"pass {self.kind} arguments of this signature",
             ) from error
 
     def _load(self, dotted: str) -> type[T]:
@@ -138,8 +138,8 @@ class Registry(Generic[T]):
                 f"the dotted name of an importable {self.base.__name__}",
                 "install or import the module that defines it, or correct the name",
             ) from error
-        # A package may re-export a class of its submodules. A class from elsewhere, or with another
-        # name, is not the allowed one.
+        # A package may re-export a class of its submodules. A class of another module or name is
+        # rejected.
         genuine = (
             inspect.isclass(value)
             and value.__qualname__ == name
@@ -148,7 +148,7 @@ class Registry(Generic[T]):
         if not genuine or not issubclass(value, self.base):
             raise UserError(
                 f"{self.kind} {dotted}, which is {value!r:.200}",
-                f"a class below {self.base.__name__} that {module_name} itself defines",
+                f"a subclass of {self.base.__name__} defined in {module_name}",
                 "register the class under the module that defines it",
             )
         return value  # type: ignore[no-any-return]
@@ -183,12 +183,12 @@ class Registry(Generic[T]):
 
 
 def _check_plain(value: object, where: str) -> None:
-    """Reject all values but plain data: arguments are never built themselves."""
+    """Reject all values but plain data, because arguments are never instantiated."""
     if isinstance(value, Mapping):
         for key, item in value.items():
             if not isinstance(key, str) or key.startswith("_"):
                 problem = f"key {key!r:.100} in {where}"
-                fix = "write only plain values; nested targets are not built"
+                fix = "write only plain values, without nested targets"
                 raise UserError(problem, "plain values", fix)
             _check_plain(item, where)
     elif isinstance(value, (list, tuple)):

@@ -1,10 +1,11 @@
 """Torch and safetensors files: written atomically, read as untrusted input.
 
-``torch.load(weights_only=True)`` runs no code, but a pickle of a few bytes can make it allocate any
-amount of memory. The archive, the names in the pickle and the claimed sizes are therefore compared
-with the bytes of the file before ``torch.load``. A safetensors file consists of the length of its
-header (8 bytes, little endian), the header in JSON, and numbers. The library compares every tensor
-with its bytes in the file.
+``torch.load(weights_only=True)`` runs no code, but may allocate any memory for a pickle of a few
+bytes. Before ``torch.load``, this module therefore compares the archive, the names in the
+pickle and the claimed sizes with the bytes of the file.
+
+A safetensors file consists of the length of its header (8 bytes, little endian), the header in
+JSON, and numbers. The library compares every tensor with its bytes in the file.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ MAX_BYTES: Final = 4 * 2**30  # Six times the checkpoint of the full DOPE with A
 _MAX_PICKLE_BYTES: Final = 16_000_000  # Half a million ADD points; builds at most 80 times as much
 
 _MAX_TUPLES: Final = 50_000
-"""Ten for each tensor of any optimiser. Python hashes nested tuples recursively, on the stack."""
+"""Ten for each tensor of any optimiser; a limit, because hashing nested tuples uses the stack."""
 
 _ZIP: Final = b"PK\x03\x04"
 _LEGACY: Final = b"\x80\x02"
@@ -88,8 +89,7 @@ def write_atomic(payload: Mapping[str, Any], path: Path, previous: Path | None =
             try:
                 torch.save(dict(payload), stream)
             except RuntimeError as error:
-                # torch hides the original error (no space, Ctrl-C) behind that of an incomplete
-                # file.
+                # torch replaces the original error (no space, Ctrl-C) by an incomplete-file error.
                 if isinstance(error.__context__, (OSError, KeyboardInterrupt)):
                     raise error.__context__ from None
                 raise
@@ -139,7 +139,7 @@ def read_mapping(path: Path, what: str) -> dict[Any, Any]:
         raise
     except Exception as error:  # a damaged or hostile file may raise any exception
         reason = " ".join(str(error).split("\n")[0].split()) or type(error).__name__
-        problem = f"{path}, which torch refuses to load ({reason[:200]})"
+        problem = f"{path}, which torch cannot load ({reason[:200]})"
         fix = "download the file again; load only files that you trust"
         raise UserError(problem, what, fix) from error
     if not isinstance(content, dict):
@@ -149,7 +149,7 @@ def read_mapping(path: Path, what: str) -> dict[Any, Any]:
 
 
 def check_container(path: Path, what: str) -> int:
-    """Return the unpacked size of a torch file, which may not exceed that of the file, bytes.
+    """Return the unpacked size of a torch file, at most the size of the file, bytes.
 
     Raises:
         UserError: The file is missing, truncated, not a torch file or compressed.
@@ -160,11 +160,11 @@ def check_container(path: Path, what: str) -> int:
         with path.open("rb") as file:
             # torch would read content before a zip archive.
             if file.read(len(_ZIP)) != _ZIP:
-                raise zipfile.BadZipFile("something else before the archive")
+                raise zipfile.BadZipFile("other content before the archive")
         with zipfile.ZipFile(path) as archive:
             size = sum(member.file_size for member in archive.infolist())
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
-        problem = f"{path}, which is not a torch file or was cut short"
+        problem = f"{path}, which is truncated or not a torch file"
         raise UserError(problem, what, "copy the file again, or write it again") from error
     limit = min(MAX_BYTES, path.stat().st_size)
     if size > limit:
@@ -182,10 +182,10 @@ def _check_file(path: Path, what: str) -> None:
 def _check_archive(path: Path) -> None:
     """Raise ``ValueError`` if a zip archive has members that torch would not write."""
     with zipfile.ZipFile(path) as archive:
-        # torch may read either of two members of one name, and either of two pickles.
+        # torch may read either of two members with equal names, and either of two pickles.
         sizes = {member.filename.casefold(): member.file_size for member in archive.infolist()}
         if len(sizes) < len(archive.infolist()):
-            raise ValueError("two members of one name")
+            raise ValueError("two members with equal names")
         pickles = [name for name in archive.namelist() if name.endswith("/data.pkl")]
         if len(pickles) != 1:
             raise ValueError(f"{len(pickles)} members FOLDER/data.pkl")
@@ -196,7 +196,7 @@ def _check_archive(path: Path) -> None:
     for key, size in claimed.items():
         stored = sizes.get(f"{folder}data/{key}".casefold())
         if stored != size:
-            raise ValueError(f"a storage of {size} bytes, of which {stored} are in the file")
+            raise ValueError(f"a storage of {size} bytes, but {stored} bytes in the file")
 
 
 def _check_legacy(path: Path) -> None:
@@ -207,7 +207,9 @@ def _check_legacy(path: Path) -> None:
     with path.open("rb") as file:
         claimed = _claimed_storages(file.read(_MAX_PICKLE_BYTES + 1), _NUM_LEGACY_PICKLES)
     if sum(claimed.values()) > path.stat().st_size:
-        raise ValueError(f"{sum(claimed.values())} bytes of numbers in {path.stat().st_size}")
+        raise ValueError(
+            f"{sum(claimed.values())} bytes of numbers in a file of {path.stat().st_size}"
+        )
 
 
 def _claimed_storages(content: bytes, num_pickles: int = 1) -> dict[str, int]:
@@ -218,7 +220,7 @@ def _claimed_storages(content: bytes, num_pickles: int = 1) -> dict[str, int]:
         num_pickles: Number of pickles.
 
     Raises:
-        ValueError: A pickle is damaged, too long, or does more than weights need.
+        ValueError: A pickle is damaged, too long, or has operations that weights do not need.
     """
     stream, storages = io.BytesIO(content[:_MAX_PICKLE_BYTES]), dict[str, int]()
     try:
@@ -235,7 +237,7 @@ def _claimed_storages(content: bytes, num_pickles: int = 1) -> dict[str, int]:
 
 
 class _Name(str):
-    """A name that a pickle refers to, as opposed to a string in it."""
+    """A name that a pickle refers to, unlike a plain string."""
 
     __slots__ = ()
 
@@ -243,8 +245,8 @@ class _Name(str):
 def _storage_references(stream: IO[bytes]) -> Iterator[tuple[str, str, int]]:
     """Yield kind, key and number of values of every storage that a pickle refers to.
 
-    References are tuples of constants. ``top`` is the last constant on the stack and ``items`` are
-    those since the last mark; all other objects are None.
+    References are tuples of constants. ``top`` is the last constant on the stack, and ``items`` are
+    the constants since the last mark; all other objects are None.
     """
     top: Any = None
     items: list[Any] = [None]
@@ -278,7 +280,7 @@ def _storage_reference(value: object) -> tuple[str, str, int]:
         case ("storage", _Name() as kind, str(key), str(), int(count), *_):
             if kind in _STORAGE_BYTES and key.isascii():
                 return kind, key, count
-    raise ValueError("a reference to something that is no storage")
+    raise ValueError("a reference to an object that is not a storage")
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -306,7 +308,7 @@ def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
             raise ValueError(f"an unknown field, or a name not of 1 to {_MAX_NAME} characters")
     except Exception as error:  # a foreign header may raise any exception
         reason = getattr(error, "strerror", None) or getattr(error, "got", None) or str(error)
-        allowed = f"a whole safetensors file of at most {MAX_SAFETENSORS_BYTES >> 20} MiB"
+        allowed = f"a complete safetensors file of at most {MAX_SAFETENSORS_BYTES >> 20} MiB"
         problem = f"{path}: {' '.join(reason[:300].split())}"
         raise UserError(problem, allowed, "download the file again from its source") from error
     return tensors, metadata

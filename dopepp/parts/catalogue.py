@@ -125,7 +125,7 @@ def with_meshes(
 
     Args:
         parts: Parts of the checkpoint.
-        given: Meshes that replace those of the checkpoint, as ``NAME=FILE``; NAME may be omitted if
+        given: Meshes that replace the checkpoint's meshes, as ``NAME=FILE``. NAME may be omitted if
             it is the file's stem or if there is a single part.
         unit: Unit of the mesh files; None for the unit of their format.
 
@@ -147,7 +147,7 @@ def with_meshes(
                 f"--part {text}, which is not in the checkpoint",
                 ", ".join(names),
             )
-            raise UserError(problem, allowed, "write which part the file is of: --part NAME=FILE")
+            raise UserError(problem, allowed, "name the part of the file: --part NAME=FILE")
         chosen[name] = path
     return [_with_mesh(part, chosen.get(part.name), unit) for part in parts]
 
@@ -159,7 +159,7 @@ def _with_mesh(part: Part, chosen: str | None, unit: str | None) -> Part:
             return part
         fix = f"add --part {part.name}=FILE and its --unit"
         problem = f"no mesh of {part.name} in the checkpoint"
-        raise UserError(problem, "a mesh file for every part without one", fix)
+        raise UserError(problem, "a mesh file for every part without a mesh", fix)
     loaded = load_part(chosen, unit)
     if part.mesh_hash and loaded.mesh_hash != part.mesh_hash:
         _log.warning("the checkpoint was not trained on this mesh of %s (%s)", part.name, chosen)

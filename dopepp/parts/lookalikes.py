@@ -29,7 +29,7 @@ def lookalikes(parts: Sequence[Part]) -> list[Part]:
     A part that is its own mirror image has no mirrored copy.
 
     Args:
-        parts: Parts with meshes; parts without one are left out.
+        parts: Parts; parts without a mesh are ignored.
     """
     return [
         make_part(f"{part.name}, {kind}", mesh)

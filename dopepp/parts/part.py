@@ -76,7 +76,7 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Part:
-    """A rigid object the network can learn.
+    """A rigid object that a network can detect.
 
     Attributes:
         cuboid: Eight bounding-box corners in NDDS order and the centre, metres, object frame.
@@ -157,7 +157,7 @@ class Part:
             faces = np.array(values.mesh.faces, np.int32)
             if faces.max() >= len(values.mesh.vertices):
                 allowed = f"0 to {len(values.mesh.vertices) - 1}"
-                raise UserError(f"part.mesh with a face of vertex {faces.max()}", allowed, _FIX)
+                raise UserError(f"part.mesh whose faces use vertex {faces.max()}", allowed, _FIX)
             mesh = Mesh(np.array(values.mesh.vertices, np.float64), faces)
             deviation = values.mesh.deviation
         return cls(

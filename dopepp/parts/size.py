@@ -80,6 +80,6 @@ class Seen(NamedTuple):
 
 
 def widest(ranges: Sequence[Seen]) -> Seen:
-    """Return the smallest range that contains all given ones."""
+    """Return the smallest range that contains all ranges."""
     smallest, largest, nearest, farthest = zip(*ranges, strict=True)
     return Seen(min(smallest), max(largest), min(nearest), max(farthest))

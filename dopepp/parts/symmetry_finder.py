@@ -27,7 +27,7 @@ from dopepp.parts.part import Mesh
 
 _ROUGH: Final = 0.06  # Mean distance that excludes a symmetry within 2.6° of the axis, diameters
 _GIVE: Final = 0.02
-"""Distance above which a point pulls with constant force, diameters: its feature may have no
+"""Distance above which a point's loss is linear, diameters (Huber): a feature may lack a
 counterpart."""
 
 TOLERANCE: Final = 0.01  # Largest distance from the surface, diameters
@@ -102,8 +102,8 @@ class _Shape:
 
     def is_round(self, axis: Vector) -> bool:
         """Return whether every rotation about an axis fits."""
-        # By the golden ratio, 36 angles come within a few per cent of a side of the worst angle of
-        # any prism.
+        # For any prism, one of 36 golden-ratio angles is within a few per cent of a side of the
+        # worst angle.
         golden = (np.sqrt(5) - 1) / 2
         angles = 2 * np.pi * (golden * np.arange(1, 37) % 1)
         return all(self.fits(axis_rotation(axis, float(angle))) for angle in angles)
@@ -152,7 +152,7 @@ def _largest_group(
     shape: _Shape, generators: list[RotationMatrix]
 ) -> Float[np.ndarray, "rotations 3 3"]:
     """Return a group of rotations that all fit, without the identity."""
-    # A rotation that barely fits may generate rotations that do not fit; it is left out then.
+    # Rotations that barely fit are excluded if they generate rotations that do not fit.
     group = np.eye(3)[None]
     for rotation in generators:
         larger = exact_group(np.concatenate([group, rotation[None]]))
@@ -205,7 +205,7 @@ class Candidates:
         # The axis is an eigenvector, because the skew part of a half turn vanishes.
         better = np.asarray(np.linalg.eigh(rotation + rotation.T)[1][:, -1])
         better = better if better @ axis > 0 else -better
-        # Special axes, e.g. along edges, are exact and give way only to a much smaller error.
+        # Special axes, e.g. along edges, are exact, so only a much smaller error replaces them.
         if special and self._error(better, order) > 0.8 * self._error(axis, order):
             return axis
         return better

@@ -143,7 +143,7 @@ class FiniteSteps(Callback):
             raise RunError(f"{message} ({reason}): the run ends; its batch is in {folder}")
         if trainer.is_global_zero:
             counts = f"{self.in_a_row} in a row; at {self.max_in_a_row} the run ends"
-            _log.warning("%s: the step is left out (%s)", message, counts)
+            _log.warning("%s: skipping the step (%s)", message, counts)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Log the number of skipped steps."""
@@ -254,7 +254,7 @@ class EmptyMaps(Callback):
         corners, centroid = self._highest.tolist()
         options = system.recovery
         lines = [
-            f"all belief maps are empty, no pose can be found (validations so far: "
+            f"all belief maps are empty, so no pose can be detected (validations so far: "
             f"{self._num_empty}): the highest belief of a corner is {corners:.2g} "
             f"(recovery.peak_threshold={options.peak_threshold:g}), of a centroid {centroid:.2g} "
             f"(recovery.centroid_threshold={options.centroid_threshold:g}). The usual causes:"
@@ -262,9 +262,9 @@ class EmptyMaps(Callback):
         rate, labels = self._rate(trainer), self._labels()
         early = not rate[0] and not labels[0], self._early(trainer, system)
         causes = {
-            "too little training so far": early,
+            "too few training steps": early,
             "a learning rate that is too high or too low": rate,
-            "labels or units that do not fit the images": labels,
+            "labels or units that contradict the images": labels,
         }
         likely_first = sorted(causes.items(), key=lambda item: not item[1][0])
         for number, (name, (likely, text)) in enumerate(likely_first, start=1):
@@ -278,7 +278,7 @@ class EmptyMaps(Callback):
         if isinstance(system.loss, MapMSE):
             text += (
                 "; with model/loss=mse, empty maps have a small squared error because peaks cover "
-                "few cells: model/loss=spatial_ce learns from the first step on"
+                "few cells; model/loss=spatial_ce has no such plateau"
             )
         return text
 
@@ -300,7 +300,7 @@ class EmptyMaps(Callback):
         inside, sizes = torch.cat(self._inside), torch.cat(self._sizes)
         look = "check the green labels in val_overlay.png, and run dopepp check on the data"
         if not len(inside):
-            return True, f"no object in the validation images is visible enough to count; {look}"
+            return True, f"no object in the validation images is visible enough; {look}"
         share, cells = float(inside.mean()), float(sizes.nanmedian())
         wrong = share < _MIN_INSIDE or not cells >= _MIN_CELLS
         return wrong, (

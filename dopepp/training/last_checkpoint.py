@@ -4,10 +4,10 @@ A run that was interrupted anywhere and resumed ends with the weights, best chec
 of an uninterrupted run, if its arithmetic is deterministic (as on CPUs). See
 ``docs/explanation/reliability.md``. Ctrl-C and SIGTERM take effect between two steps.
 
-Lightning's ``ModelCheckpoint`` keeps the best checkpoint, but is not suitable for the last one. It
-saves inside a batch or a validation, or at the end of an epoch, where Lightning's counters cause
-replayed or skipped batches. This module sets the counters of every checkpoint to a moment between
-two batches, before a validation or between two epochs.
+Lightning's ``ModelCheckpoint`` keeps the best checkpoint, but is not suitable for the last
+checkpoint. ``ModelCheckpoint`` saves inside a batch or a validation, or at the end of an epoch,
+where Lightning's counters cause replayed or skipped batches. This module sets the counters of every
+checkpoint to a moment between two batches, before a validation or between two epochs.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ Cut = Callable[[dict[str, Any]], None]
 
 
 class LastCheckpoint(Checkpoint):
-    """Saves ``checkpoints/last.ckpt``, also during an epoch, and keeps the previous one.
+    """Saves ``checkpoints/last.ckpt``, also during an epoch, and keeps the previous file.
 
-    It saves between two batches or before a validation: after ``every_s`` seconds, after a new best
-    checkpoint, at the end, and when a signal requests a stop. Periodic saving takes at most
-    ``max_share`` of the time.
+    Files are saved between two batches or before a validation: every ``every_s`` seconds, after a
+    new best checkpoint, at the end, and when a signal requests a stop. Periodic saving takes at
+    most ``max_share`` of the time.
     """
 
     def __init__(self, every_s: float = 60.0, max_share: float = 0.01) -> None:
@@ -63,7 +63,7 @@ class LastCheckpoint(Checkpoint):
         self._saved: tuple[int, float | None] = (0, None)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the states of the random generators; in a validation, those at its start."""
+        """Return the random states; in a validation, the states at the start of the validation."""
         return {"random": self._random or _capture()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -90,7 +90,7 @@ class LastCheckpoint(Checkpoint):
         if trainer.is_global_zero:
             run_dir, resumed = Path(trainer.default_root_dir), trainer.ckpt_path
             files.sweep(run_dir)
-            # A damaged file must not replace the complete one that is resumed from.
+            # A damaged file must not replace the complete file from which the run resumes.
             last = run_dir / files.FOLDER / files.LAST
             if resumed is not None and Path(resumed).name != files.LAST and last.exists():
                 last.replace(last.with_name(f"{files.LAST}.damaged"))
@@ -216,14 +216,14 @@ def _restore_position(trainer: Trainer) -> None:
     if epochs.ready == epochs.completed or batches.current.ready == 0:
         epoch_loop.restarting = False  # no batch of this epoch is processed
         num_done = 0
-    # Lightning does not do this if the schedule has requested the number of steps.
+    # Lightning omits this step if the schedule has requested the number of steps.
     loader = trainer.train_dataloader
     if isinstance(loader, PoseLoader):
         loader.load_state_dict({"num_batches": num_done})
 
 
 def _progress(trainer: Trainer) -> tuple[int, float | None]:
-    """Return step and best score; a checkpoint that differs in neither is not saved."""
+    """Return step and best score; a checkpoint is saved only if either has changed."""
     score = getattr(_best(trainer), "best_model_score", None)
     return trainer.global_step, None if score is None else float(score)
 
@@ -239,8 +239,8 @@ def _best(trainer: Trainer) -> ModelCheckpoint | None:
 def _forget_later_best(trainer: Trainer) -> None:
     """Reset the best checkpoint if its file is newer than the resumed step.
 
-    Without deterministic arithmetic, the resumed run would not reproduce this checkpoint, and its
-    metrics would belong to another one.
+    Without deterministic arithmetic, the resumed run would not reproduce this checkpoint, and the
+    metrics would belong to another checkpoint.
     """
     best = _best(trainer)
     if best is None or not best.best_model_path:
@@ -248,7 +248,7 @@ def _forget_later_best(trainer: Trainer) -> None:
     step = files.saved_step(Path(best.best_model_path))
     if step is None or step > trainer.global_step:
         _log.info(
-            "%s is newer than step %d: the best checkpoint is chosen again",
+            "%s is newer than step %d: selecting the best checkpoint again",
             best.best_model_path,
             trainer.global_step,
         )
@@ -266,16 +266,16 @@ def _before_batch(fit_loop: dict[str, Any]) -> None:
 
 
 def _before_validation(fit_loop: dict[str, Any]) -> None:
-    """Reset the validation: all batches of the epoch are trained on, none is validated."""
+    """Reset the validation: all batches of the epoch are trained, none is validated."""
     validation = fit_loop["epoch_loop.val_loop.batch_progress"]
-    # Lightning recognises an interrupted validation by one started and no processed batch.
+    # Lightning recognises an interrupted validation by a started batch and no processed batch.
     validation["total"].update(ready=1, started=1, processed=0, completed=0)
     validation["current"].update(ready=0, started=0, processed=0, completed=0)
     validation["is_last_batch"] = False
 
 
 def _between_epochs(fit_loop: dict[str, Any]) -> None:
-    """Complete the epoch, so that the next one starts with its first batch."""
+    """Complete the epoch, so that the next epoch starts with its first batch."""
     for counter in fit_loop["epoch_progress"].values():
         counter["completed"] = counter["processed"]
 
@@ -294,7 +294,7 @@ def _capture() -> dict[str, Any]:
 
 
 def _restore(state: dict[str, Any]) -> None:
-    """Restore captured random states; those of GPUs only if the number of GPUs is unchanged."""
+    """Restore captured random states; GPU states only if the number of GPUs is unchanged."""
     version, numbers, gauss = state["python"]
     random.setstate((version, tuple(numbers), gauss))
     keys, position, has_gauss = state["numpy"]

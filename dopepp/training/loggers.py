@@ -69,7 +69,7 @@ class MetricsTable(Logger):
         except OSError as error:
             if not self._failing:
                 reason = error.strerror or error
-                _log.warning("cannot write %s: %s; its rows are kept", self.path, reason)
+                _log.warning("cannot write %s: %s; keeping the rows in memory", self.path, reason)
             self._failing = True
         else:
             self._failing = False

@@ -35,7 +35,7 @@ class Muon(AdamW):
     The weight of a convolution is treated as a matrix, output channels by the rest. Its step is
     Nesterov's momentum with all singular values near 1 (Jordan et al. 2024), scaled to the size of
     AdamW's steps, so that learning rates and decays suit both. torch's own Muon needs torch 2.9 and
-    accepts matrices only. The arguments are those of AdamW; ``betas[0]`` is also the momentum.
+    accepts matrices only. Arguments are as in AdamW; ``betas[0]`` is also the momentum.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ def orthogonalised(matrix: Float[Tensor, "m n"]) -> Float[Tensor, "m n"]:
 
 
 def _polynomial(gram: Float[Tensor, "m m"]) -> Float[Tensor, "m m"]:
-    """Return the factor of one round for a matrix with this Gram matrix."""
+    """Return the factor of a round for a matrix with a Gram matrix."""
     a, b, c = _QUINTIC
     identity = torch.eye(len(gram), dtype=gram.dtype, device=gram.device)
     return a * identity + b * gram + c * (gram @ gram)
@@ -158,7 +158,7 @@ class AveragedWeights(WeightAveraging):
         """Keep the trained weights, because a run may be resumed for longer."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the average's number of updates and the step of the last one."""
+        """Return the average's number of updates and the step of the last update."""
         num_updates = int(self._averaged.n_averaged) - 1
         return {"num_updates": num_updates, "step": self._latest_update_step}
 
@@ -186,7 +186,7 @@ class AveragedWeights(WeightAveraging):
 
 
 def go_on_with_trained(checkpoint: dict[str, Any]) -> None:
-    """Make the trained weights of a loaded checkpoint its ``state_dict``, to train further."""
+    """Replace a loaded checkpoint's ``state_dict`` by the trained weights, to resume training."""
     if TRAINED in checkpoint:
         checkpoint[_AVERAGED] = checkpoint["state_dict"]
         checkpoint["state_dict"] = checkpoint.pop(TRAINED)

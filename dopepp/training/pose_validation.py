@@ -105,8 +105,7 @@ def batch_instances(batch: Batch, parts: tuple[Part, ...]) -> Iterator[list[Inst
 class EarlyStop(EarlyStopping):
     """Lightning's early stopping for resumed runs.
 
-    The patience is that of the current config. A run that has stopped trains further only with a
-    larger patience.
+    The patience comes from the current config. A stopped run continues only with a larger patience.
     """
 
     @property
@@ -119,7 +118,7 @@ class EarlyStop(EarlyStopping):
         super().load_state_dict({**state_dict, "patience": self.patience})
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Stop a run again that has stopped before."""
+        """Stop a resumed run that had stopped before, unless the patience has grown."""
         if self.impatient:
             trainer.should_stop = True
 
@@ -224,13 +223,13 @@ def _log_picture(trainer: Trainer, name: str, image: Picture) -> None:
 
 
 @contextmanager
-def best_effort(what: str) -> Iterator[None]:
+def best_effort(name: str) -> Iterator[None]:
     """Log a warning instead of an ``OSError``.
 
     Args:
-        what: Name of the file for the warning.
+        name: Name of the file, for the warning.
     """
     try:
         yield
     except OSError as error:
-        _log.warning("cannot write %s: %s", what, error.strerror or error)
+        _log.warning("cannot write %s: %s", name, error.strerror or error)

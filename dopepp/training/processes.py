@@ -1,8 +1,8 @@
-"""Distributed training whose processes end when one of them dies.
+"""Distributed training in which all processes end if one process dies.
 
-A process in a collective would wait for a dead process until the timeout of half an hour, and
-Lightning kills rank 0 without a message when another process ends. Here, rank 0 watches its
-children and the children watch their parent.
+Without this module, a process in a collective would wait half an hour for a dead process, and
+Lightning would kill rank 0 without a message. Rank 0 watches its children, and the children watch
+their parent.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class ProcessDiedError(RunError):
 
 
 class Watch(threading.Thread):
-    """Watches this process's children, rank 1 first, and its parent if that belongs to the run."""
+    """Watches this process's children, rank 1 first, and the parent if it is part of the run."""
 
     def __init__(self, children: Sequence[subprocess.Popen[Any]], parent: int | None) -> None:
         super().__init__(daemon=True, name="process-watch")
@@ -42,7 +42,7 @@ class Watch(threading.Thread):
         self._stopped = threading.Event()
 
     def run(self) -> None:
-        """End this process if it still runs some time after the death of another."""
+        """End this process some time after the death of another process."""
         while not self._stopped.wait(_POLL_S):
             death = self.death()
             if death is not None:
@@ -56,7 +56,7 @@ class Watch(threading.Thread):
         self._stopped.set()
 
     def death(self, wait_s: float = 0.0) -> str | None:
-        """Return which process has died within ``wait_s`` seconds; None if none has."""
+        """Wait up to ``wait_s`` seconds for the death of a process; describe it, or return None."""
         deadline = time.monotonic() + wait_s
         while True:
             for rank, child in enumerate(self._children, start=1):

@@ -43,7 +43,7 @@ class TrialReport(Callback):
         after_epochs: Number of epochs before a trial is stopped.
 
     Attributes:
-        pruned: Why training was stopped; empty otherwise.
+        pruned: Reason for stopping the training; empty otherwise.
     """
 
     _study: Study
@@ -121,7 +121,7 @@ def open_storage(location: str) -> BaseStorage:
             return RDBStorage(location)
         path = Path(location)
         path.parent.mkdir(parents=True, exist_ok=True)
-        # Absolute, because jobs may run in other folders.
+        # The path is made absolute, because jobs may run in other folders.
         url = f"sqlite:///{path.absolute()}"
         return RDBStorage(url, engine_kwargs={"connect_args": {"timeout": _WAIT_S}})
     except (OSError, ImportError, RuntimeError, SQLAlchemyError, StorageInternalError) as error:

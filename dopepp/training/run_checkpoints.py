@@ -1,4 +1,4 @@
-"""Checkpoint files of a run, complete or absent however the run ends.
+"""Checkpoint files of a run, each complete or absent after any end of the run.
 
 :class:`AtomicCheckpointIO` writes the files and keeps checkpoints in memory that cannot be written;
 :func:`newest_checkpoint` returns the checkpoint to resume from.
@@ -37,7 +37,7 @@ _NUM_FILES: Final = 4  # last, previous, best, and a file being written
 _WEIGHTS_PER_FILE: Final = 3  # the weights and an optimiser's two moments
 _ADVICE: Final = {
     errno.ENOSPC: "free some space there",
-    errno.EDQUOT: "free some of your share of it",
+    errno.EDQUOT: "free some of your quota",
     errno.EROFS: "make it writable",
     errno.EACCES: "make it writable",
 }
@@ -52,8 +52,8 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     """Saves Lightning's checkpoints atomically and loads them without running code.
 
     A checkpoint that cannot be written (disk full, server unavailable) is kept in memory and
-    written before the next one, so that no file refers to a missing file. A newer version of the
-    same file replaces it.
+    written before the next checkpoint, so that no file refers to a missing file. A newer version of
+    the same file replaces the kept version.
 
     Args:
         prepare: Called before each writing; if it raises ``OSError``, nothing is written.
@@ -87,7 +87,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         self._waiting[target] = (checkpoint, (storage_options or {}).get("previous"))
         error = self._write_waiting()
         if error is not None:
-            _log.warning("%s; the next save tries again", _failure(self.waiting[0], error))
+            _log.warning("%s; retrying at the next save", _failure(self.waiting[0], error))
 
     def finish(self) -> None:
         """Write the waiting files.
@@ -116,7 +116,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         return None
 
     def remove_checkpoint(self, path: str | Path) -> None:
-        """Remove a file of the run; the untrusted checkpoint names it, so others are kept."""
+        """Remove a file of the run; other paths are kept, because checkpoints are not trusted."""
         target = Path(os.fspath(path))
         folder = target.parent.resolve()
         if self._folder is not None and not folder.is_relative_to(self._folder.resolve()):
@@ -155,14 +155,14 @@ def newest_checkpoint(run_dir: Path) -> tuple[Path, Checkpoint] | None:
             checkpoint, step = _read_whole(path)
         except UserError as error:
             damaged.append(path.name)
-            _log.warning("left out: %s", error.got)
+            _log.warning("ignoring %s", error.got)
             continue
         if damaged:
             _log.warning("continuing from %s, step %d", path.name, step)
         return path, checkpoint
     if damaged:
         problem = f"{run_dir}, whose checkpoints are all damaged ({', '.join(damaged)})"
-        allowed = f"a run with at least one whole file among {LAST}, {PREVIOUS} and {BEST}"
+        allowed = f"a run with at least one complete file {LAST}, {PREVIOUS} or {BEST}"
         fix = "restore one of these files from a backup, or start a new run without resume"
         raise UserError(problem, allowed, fix)
     return None
@@ -197,7 +197,7 @@ def check_room(run_dir: Path, weight_bytes: int) -> None:
     except OSError as error:
         problem = f"{folder}, which cannot be written: {error.strerror or error}"
         fix = "set output_dir=FOLDER, or make the folder writable"
-        raise UserError(problem, "a folder that can be written, for checkpoints", fix) from error
+        raise UserError(problem, "a writable folder for checkpoints", fix) from error
     needed = _NUM_FILES * _WEIGHTS_PER_FILE * weight_bytes
     needed -= sum(path.stat().st_size for path in folder.glob("*.ckpt"))
     if free < needed:
@@ -215,7 +215,7 @@ def sweep(run_dir: Path) -> None:
 
 
 def _read_whole(path: Path) -> tuple[Checkpoint, int]:
-    """Read a checkpoint and check its checksums, which torch does not."""
+    """Read a checkpoint and verify its checksums, which torch ignores."""
     checkpoint = read(path)
     with zipfile.ZipFile(path) as archive:
         try:
@@ -226,7 +226,7 @@ def _read_whole(path: Path) -> tuple[Checkpoint, int]:
     missing = sorted(_NEEDED - content.keys())
     if bad is not None or missing:
         problem = f"{path}, damaged in {bad}" if bad else f"{path}, without {', '.join(missing)}"
-        raise UserError(problem, "a checkpoint as training wrote it", "use another checkpoint")
+        raise UserError(problem, "an intact checkpoint of a training", "use another checkpoint")
     return checkpoint, int(content["global_step"])
 
 
@@ -253,5 +253,5 @@ def _moved(state: Any, folder: Path) -> Any:
 
 
 def _failure(path: Path, error: OSError) -> str:
-    advice = _ADVICE.get(error.errno or 0, "see to it")
+    advice = _ADVICE.get(error.errno or 0, "repair it")
     return f"cannot save {path.name} in {path.parent}: {error.strerror or error}; {advice}"

@@ -95,7 +95,7 @@ class PoseSystem(LightningModule):
         self.make_optimizer, self.make_scheduler = make_optimizer, make_scheduler
         self.payload = dict(payload or {})
         self._resumed_schedules: list[dict[str, Any]] | None = None
-        # In place, so that parameters keep their names.
+        # The network is compiled in place, so that parameters keep their names.
         if compile_network:
             self.network.compile()
 
@@ -139,7 +139,7 @@ class PoseSystem(LightningModule):
         return ValidationOutput(loss, self.network.activate(logits.float()), field.float())
 
     def recover(self, output: ValidationOutput, batch: Batch) -> list[list[Detection]]:
-        """Recover all candidates on every image of a validation batch, also weak ones."""
+        """Recover all candidates, also weak candidates, on every image of a validation batch."""
         cameras, names = batch.K.cpu().numpy(), [part.name for part in self.parts]
         maps = (output.belief, output.field, self.cuboids, cameras, self.geometry.stride)
         return recover_batch(*maps, names, **vars(replace(self.recovery, min_score=0.0)))
@@ -152,12 +152,12 @@ class PoseSystem(LightningModule):
             scheduler = self.make_scheduler(optimizer, int(self.trainer.estimated_stepping_batches))
             schedule: Any = {"scheduler": scheduler, "interval": "step"}
             configured = {"optimizer": optimizer, "lr_scheduler": schedule}
-        # After the schedule, which adds settings of its own.
+        # Settings are stored after the schedule has added its own settings.
         self._settings = [dict(group) for group in optimizer.param_groups]
         return configured
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep only the progress of schedules: a run resumed for longer has a longer schedule."""
+        """Restore only the progress of schedules; a resumed run may have a longer schedule."""
         go_on_with_trained(checkpoint)
         states = checkpoint["lr_schedulers"]
         self._resumed_schedules = [_without_progress(state) for state in states]
@@ -177,7 +177,7 @@ class PoseSystem(LightningModule):
         if present == self._resumed_schedules:
             return  # the optimiser's rates already equal those of this schedule
         for config in configs:
-            # A schedule that multiplies the last rate would stay at 0 if a shorter one ended there.
+            # A schedule that multiplies the last rate would stay at 0 after a shorter schedule.
             closed_form = getattr(config.scheduler, "_get_closed_form_lr", None)
             if closed_form is not None:
                 groups = config.scheduler.optimizer.param_groups

@@ -42,7 +42,7 @@ class SymmetryOptions(Checked):
     Attributes:
         canonical: Whether targets use the equivalent pose nearest to the reference.
         border_deg: Difference of angles to the reference, degrees, within which equivalent poses
-            are alternatives; the one with the lowest loss is used. 0 allows no alternatives.
+            are alternatives; the pose with the lowest loss is used. 0 allows no alternatives.
     """
 
     canonical: bool = True
@@ -53,7 +53,7 @@ class SymmetryOptions(Checked):
         if self.border_deg > 0 and not self.canonical:
             problem = f"symmetry.border_deg={self.border_deg} with symmetry.canonical=false"
             fix = "set symmetry=none, or symmetry.canonical=true"
-            raise UserError(problem, "symmetry.border_deg=0 without sectors", fix)
+            raise UserError(problem, "symmetry.border_deg=0 with symmetry.canonical=false", fix)
 
 
 def draw_maps(
@@ -117,7 +117,7 @@ class Equivalents(NamedTuple):
 
 
 class SymmetryHandling:
-    """Computes the poses that symmetry makes equivalent to a label; parts are in channel order."""
+    """Computes the poses that are equivalent to a label by symmetry; parts are in channel order."""
 
     def __init__(self, parts: Sequence[Part], options: SymmetryOptions) -> None:
         self.options, self.num_objects = options, len(parts)
@@ -213,7 +213,7 @@ def _between(start: np.ndarray, end: np.ndarray) -> Float[np.ndarray, "3 3"]:
     """Return the smallest rotation of one unit vector to another."""
     across = np.cross(start, end)
     sine, cosine = np.linalg.norm(across), start @ end
-    if sine < 1e-9:  # equal, or opposite: then a half turn in the image plane
+    if sine < 1e-9:  # equal, or opposite (a half turn in the image plane)
         return np.eye(3) if cosine > 0 else np.diag([-1.0, -1.0, 1.0])
     return rotation_vector_to_matrix(across / sine * np.arctan2(sine, cosine))
 
@@ -223,7 +223,7 @@ def _line_of_sight(
 ) -> Float[Tensor, "batch instances 3 3"]:
     """Return the smallest rotation from the optical axis to the direction of a part's centre.
 
-    A part that moves across the image and rotates so keeps its appearance.
+    A part that moves across the image and rotates by this matrix keeps its appearance.
     """
     centre = (T_cam_obj[..., :3, :3] @ fixed[..., None])[..., 0] + T_cam_obj[..., :3, 3]
     x, y, z = torch.nn.functional.normalize(centre, dim=-1).unbind(-1)

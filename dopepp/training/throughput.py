@@ -32,7 +32,7 @@ Total = tuple[str, int, float]
 
 
 class Throughput(Callback):
-    """Logs images per second of training time and the share of it spent waiting for the loader.
+    """Logs images per second of training, and the share of time spent waiting for the loader.
 
     The values are ``throughput/images_per_s`` and ``throughput/loader_wait``.
     """
@@ -46,7 +46,7 @@ class Throughput(Callback):
         self._images, self._waited = 0, 0.0
         self._started = self._step_ended = time.perf_counter()
 
-    on_train_start = on_train_epoch_start  # a resumed epoch is measured from there on
+    on_train_start = on_train_epoch_start  # a resumed epoch is measured from its resumed step
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Add the time since the end of the last step to the waiting time."""
@@ -76,7 +76,7 @@ class RunProgress(TQDMProgressBar):
     """Adds ``left``, the estimated time until the last step of the run."""
 
     def __init__(self) -> None:
-        super().__init__(refresh_rate=5)  # drawing it costs more than a small network's step
+        super().__init__(refresh_rate=5)  # drawing the bar takes longer than a small network's step
         self._start, self._first_step = 0.0, 0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -98,7 +98,7 @@ class RunProgress(TQDMProgressBar):
 
 
 class Operators(PyTorchProfiler):
-    """Profiles torch operators of all recorded steps, unlike Lightning, which reports the last."""
+    """Profiles torch operators over all recorded steps (Lightning reports the last step only)."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(dirpath=folder, filename=_FILE, on_trace_ready=self._collect)

@@ -20,7 +20,7 @@ from dopepp.virtual.renderers.raster.visibility import draw_alone, project_objec
 from dopepp.virtual.scene import NEAR, SceneObject
 from dopepp.virtual.surface import Surface
 
-MOST_POINTS: Final = 1500  # contour pixels that are read
+MOST_POINTS: Final = 1500  # largest number of evaluated contour pixels
 FLOOR: Final = 2.0  # gradient of noise, grey levels per pixel
 
 

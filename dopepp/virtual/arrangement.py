@@ -31,11 +31,11 @@ from dopepp.virtual.renderers.raster.visibility import centres_within, draw_alon
 from dopepp.virtual.scene import NEAR, Material, SceneObject
 
 _REDRAWS: Final = 25
-"""Redraws of a position before the whole pose is drawn anew: some positions fit no depth."""
+"""Redraws of a position before the orientation is drawn again; some orientations never fit."""
 
 
 class Composition:
-    """Objects that a preset accepts together; ``negatives`` may serve as distractors."""
+    """Objects of a scene that satisfy a preset; ``negatives`` are possible distractors."""
 
     def __init__(self, preset: Preset, rng: Generator, negatives: Sequence[Body]) -> None:
         self.preset, self.rng, self.negatives = preset, rng, negatives
@@ -64,7 +64,7 @@ class Composition:
         return self.preset.distractors.draw(self.rng, width_at_depth, self.negatives)
 
     def add(self, body: Body, T_cam_obj: Transform, material: Material) -> bool:
-        """Add a body that is in front of the camera and leaves every target visible enough."""
+        """Add a body if all targets stay visible enough; return whether the body was added."""
         extremes = transform(T_cam_obj, body.surface.hull)
         if extremes[:, 2].min() <= NEAR:
             return False
@@ -75,7 +75,7 @@ class Composition:
         return True
 
     def _is_well_placed(self, item: SceneObject, extremes: Float[np.ndarray, "hull 3"]) -> bool:
-        """Return whether a target is large enough, inside the frame and at a wanted depth."""
+        """Return whether a target is large enough, inside the frame and within the depth range."""
         if item.part is None:
             return True
         middle = transform(item.T_cam_obj, item.part.cuboid[CENTROID])
@@ -97,7 +97,7 @@ class Preview:
         scale = min(160 / size[0], 1.0)  # smaller images keep their size
         self._size = width, height = tuple(max(round(side * scale), 1) for side in size)
         self._K = resize_camera(K, width / size[0], height / size[1])
-        self._least = min_visible + 0.03  # because coarse pixels are counted
+        self._least = min_visible + 0.03  # margin for the errors of coarse pixels
         self._nearest = np.zeros((height, width), np.float32)
         self._owners = np.full((height, width), -1, np.int64)
         self._visible: list[int] = []
@@ -123,7 +123,7 @@ class Preview:
         frame = slice(top, bottom), slice(left, right)
         canvas = slice(top - box[1], bottom - box[1]), slice(left - box[0], right - box[0])
         drawn, nearest = inverse_depth[canvas], self._nearest[frame]
-        # At equal depth the first stays, as in the renderer.
+        # At equal depth the earlier object is visible, as in the renderer.
         in_front = drawn > nearest
         hidden = self._owners[frame][in_front]
         losses = np.bincount(hidden[hidden >= 0], minlength=len(self._visible))
@@ -171,7 +171,7 @@ def _draw_pose(composition: Composition, body: Body) -> Transform:
 
 
 def _poses(composition: Composition, body: Body) -> Iterator[Transform]:
-    """Yield candidate poses; redraws keep the orientation and whatever the placement keeps."""
+    """Yield candidate poses; position redraws keep the orientation."""
     while True:
         pose = _draw_pose(composition, body)
         for _ in range(_REDRAWS):
@@ -183,7 +183,7 @@ def _poses(composition: Composition, body: Body) -> Iterator[Transform]:
 
 
 def _place_distractor(composition: Composition, reference: float) -> None:
-    """Add a distractor that neither pierces nor hides a target; give up after eight trials."""
+    """Add a distractor that neither pierces nor hides a target, in at most eight trials."""
     rng, ranges = composition.rng, composition.preset.distractors
     for _ in range(8):
         depth = reference * rng.uniform(*ranges.depth)

@@ -32,7 +32,7 @@ class Body:
 
     Attributes:
         part: The part, if the network must detect it.
-        source: The body that was stretched by ``stretch`` along x, y and z to make this one.
+        source: Original of a stretched body; ``stretch`` holds the factors along x, y and z.
     """
 
     surface: Surface
@@ -61,7 +61,7 @@ def make_body(part: Part, *, is_target: bool) -> Body:
     """
     if part.mesh is None:
         allowed = "parts that were read from a mesh file or built in"
-        fix = "pass the part's mesh file; this checkpoint holds no mesh"
+        fix = "pass the part's mesh file, because the checkpoint contains no mesh"
         raise UserError(f"part {part.name} without a mesh", allowed, fix)
     return Body(make_surface(part.mesh), part if is_target else None)
 
@@ -83,7 +83,7 @@ class Hull:
 
     def scaled(self, scale: Vector) -> Hull:
         """Return the hull stretched along its axes by positive factors."""
-        # A linear map takes hull to hull, flat faces to flat faces and centre to centre.
+        # A linear map preserves the hull, its flat faces and the centre of mass.
         return replace(self, vertices=self.vertices * scale, centre=self.centre * scale)
 
     @cached_property
@@ -104,10 +104,10 @@ class Hull:
         stable = np.bincount(self.facets, supported, number) > 0
         largest = np.zeros(number, np.int64)
         order = np.argsort(areas, kind="stable")
-        largest[self.facets[order]] = order  # the last one written is the largest
-        chosen = np.flatnonzero(stable & (shares > 0.002))  # rarer ones are left out
+        largest[self.facets[order]] = order  # the last and largest value remains
+        chosen = np.flatnonzero(stable & (shares > 0.002))  # rarer faces are omitted
         if not len(chosen):
-            # A ball of thousands of faces rests on any of them, each rarely.
+            # A ball of thousands of faces rests on each face rarely.
             chosen = np.flatnonzero(stable)
         shares = shares[chosen]
         if not shares.any():
@@ -121,7 +121,7 @@ def make_hull(surface: Surface) -> Hull:
     try:
         hull = ConvexHull(used)
     except QhullError:
-        # A flat or straight mesh has no volume; joggled by a rounding error, it has.
+        # A flat or straight mesh has no volume; "QJ" moves its points slightly to get a hull.
         hull = ConvexHull(used, qhull_options="QJ")
     # The order of corners makes normals point outwards.
     a, b, c = hull.points[hull.simplices].swapaxes(0, 1)
@@ -161,7 +161,7 @@ def _centre_of_mass(corners: Float[np.ndarray, "faces 3 3"]) -> Vector:
     a, b, c = (corners - origin).swapaxes(0, 1)
     volumes = np.einsum("ij,ij->i", a, np.cross(b, c))
     if not abs(volumes.sum()) > 1e-9 * np.abs(corners - origin).max() ** 3:
-        return np.asarray(origin)  # no volume to speak of
+        return np.asarray(origin)  # almost no volume
     return np.asarray(origin + volumes @ (a + b + c) / (4 * volumes.sum()))
 
 
@@ -172,7 +172,7 @@ def _foot_inside(
     foot = np.einsum("ij,ij->i", corners[:, 0], normals)[:, None, None] * normals[:, None]
     along = np.roll(corners, -1, axis=1) - corners
     side = np.einsum("ijk,ijk->ij", np.cross(along, foot - corners), normals[:, None])
-    # A foot on the edge between two triangles of one face must count for one of them.
+    # With the tolerance, a foot on the edge between two triangles counts for at least one.
     return np.asarray((side >= -1e-9 * np.abs(along).max() ** 2).all(axis=1))
 
 
@@ -192,10 +192,10 @@ class Distractors(Checked):
     """Random objects around the targets.
 
     Attributes:
-        number: Count per image; objects that would hide a target too much are left out.
+        number: Number per image; objects that would hide too much of a target are omitted.
         image_share: Diameter of a primitive's image.
         depth: Depth of floating distractors; unused on a table.
-        lookalike_share: Chance that a distractor is a negative, if there are negatives.
+        lookalike_share: Probability that a distractor is a negative, if negatives exist.
         lookalike_scale: Size of a negative over its real size.
     """
 

@@ -76,7 +76,7 @@ class Light:
 
     Attributes:
         intensity: Linear RGB that a white surface facing the light shows at ``reach``.
-        reach: Distance at which the intensity holds, metres; it falls off with the square.
+        reach: Distance at which a surface has this intensity, metres (inverse-square law).
     """
 
     position: Triple
@@ -116,7 +116,7 @@ class SceneObject:
     """One posed object.
 
     Attributes:
-        part: None for a distractor.
+        part: Part of a target; None for a distractor.
     """
 
     surface: Surface

@@ -79,7 +79,7 @@ class Sensors(Checked):
         on = rng.random(5) < [getattr(self, f"{step}_probability") for step in steps]
         direction, length = rng.uniform(0, 2 * np.pi), rng.uniform(*self.motion_px)
         motion = (float(length * np.cos(direction)), float(length * np.sin(direction)))
-        # Draw every number, used or not, so that a probability changes no other effect.
+        # All numbers are drawn, used or not, so that a probability changes no other effect.
         exposure, blur = rng.uniform(*self.exposure_ev), rng.uniform(*self.blur_px)
         read, shot = rng.uniform(*self.read_noise), rng.uniform(*self.shot_noise)
         quality = int(rng.integers(self.jpeg_quality[0], self.jpeg_quality[1] + 1))

@@ -69,16 +69,16 @@ class _Setting:
         distance = float(self.T_cam_table[2, 3])
         diameter = max((2 * body.surface.radius for body in targets), default=0.3 * distance)
         self._radius = diameter * self.rng.uniform(*table.heap_radius)
-        # A heap needs fine cells but little room; on a free table it is the other way round.
+        # A heap needs fine cells and little room; a free table needs room and allows coarse cells.
         reach = self._radius + 2 * diameter if table.heaped else 2 * distance
-        # A cell is a hundredth of the largest target; at most 512 are to either side.
+        # A cell is a hundredth of the largest target; at most 512 cells lie to either side.
         self._map = HeightMap(max(0.01 * diameter, reach / 512), reach)
         self._inverse_depth = inverse_depth_row(plane_of(self.T_cam_table), composition.K)
 
     def place(self, body: Body) -> bool:
         """Lay a body down; return whether it fits."""
         material = self.composition.draw_material(body)
-        for _ in range(6):  # turned anew, until it fits
+        for _ in range(6):  # random orientations, until the body fits
             for lying in self._candidates(body):
                 T_cam_obj = self.T_cam_table @ lying.T_table_obj
                 if self.composition.add(body, T_cam_obj, material):
@@ -123,7 +123,7 @@ class _Setting:
             return radius * math.cos(angle), radius * math.sin(angle)
         pixel = np.array([*(rng.uniform(0, 1, 2) * self.composition.size - 0.5), 1.0])
         inverse_depth = float(self._inverse_depth @ pixel)
-        # Farther than three camera distances it would be tiny.
+        # Objects beyond three camera distances would be tiny.
         if inverse_depth < 1 / (3 * self.T_cam_table[2, 3]):
             return None
         point = np.linalg.solve(self.composition.K, pixel) / inverse_depth
@@ -135,7 +135,7 @@ def _in_the_middle(T_cam_table: Transform, composition: Composition) -> Transfor
     """Turn the camera so that the middle of the window, not of the picture, shows the origin."""
     middle = np.array([*(np.array(composition.size) / 2 - 0.5), 1.0])
     ray = np.linalg.solve(composition.K, middle)
-    aside = np.array([-ray[1], ray[0], 0.0])  # z × ray: about it, by the angle between them
+    aside = np.array([-ray[1], ray[0], 0.0])  # rotation axis z × ray
     length = float(np.linalg.norm(aside))
     angle = math.atan(length)
     turned = rotation_vector_to_matrix(aside * (angle / length if length else 0.0))
@@ -172,7 +172,7 @@ class HeightMap:
     ) -> Footprint | None:
         """Return the footprint of a turned object, or None if it covers too many cells.
 
-        ``lowest`` is the height of its lowest point relative to its origin, metres.
+        ``lowest`` is the height of the object's lowest point relative to its origin, metres.
         """
         # In cells; one contiguous row per coordinate.
         x, y, z = (rotation / self.cell) @ surface.vertices.T

@@ -21,7 +21,7 @@ from numpy.typing import DTypeLike, NDArray
 from dopepp.core.compiled import Array, Scalar, compiled
 
 NUM_COLOUR_SAMPLES: Final = 4
-"""The first samples of a pixel make its colour; the last one, its centre, makes the labels."""
+"""Number of samples for a pixel's colour; the last sample, the centre, gives the labels."""
 
 PIXEL_SAMPLES: Final = np.array(
     [(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25), (0.0, 0.0)]
@@ -132,7 +132,7 @@ def rasterise(
             top, bottom = max(top, math.ceil(low)), min(bottom, math.floor(high))
             if left > right or top > bottom:
                 continue
-        # Scaled by 1/det, inside means all three >= 0 and their sum is 1/z.
+        # After scaling by 1/det, points inside have three values >= 0, whose sum is 1/z.
         scale = 1.0 / det
         e0x, e0y, e0c = e0x * scale, e0y * scale, e0c * scale
         e1x = (cy * aw - cw * ay) * scale
@@ -147,7 +147,7 @@ def rasterise(
             delta[s, 1] = e1x * dx + e1y * dy
             delta[s, 2] = e2x * dx + e2y * dy
             delta[s, 3] = delta[s, 0] + delta[s, 1] + delta[s, 2]
-        # Slack to the pixel centre's edge functions, so that no sample of the pixel is missed.
+        # A margin on the edge functions at the pixel's centre, so that no sample is missed.
         slack0 = -reach * (abs(e0x) + abs(e0y))
         slack1 = -reach * (abs(e1x) + abs(e1y))
         slack2 = -reach * (abs(e2x) + abs(e2y))
@@ -156,7 +156,7 @@ def rasterise(
             y = float(j + y0)
             first, last = left, right
             if wide:
-                # Long slanted triangles fill little of their bounding box: solve for the span.
+                # Long slanted triangles fill little of their bounding box, so solve for the span.
                 row0, row1, row2 = e0y * y + e0c, e1y * y + e1c, e2y * y + e2c
                 first, last = _narrow(first, last, x0, e0x, slack0 - row0)
                 first, last = _narrow(first, last, x0, e1x, slack1 - row1)

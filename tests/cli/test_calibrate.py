@@ -182,4 +182,4 @@ def test_pictures_without_the_board_are_told(run, cell, tmp_path):
         tmp_path / "c.yaml",
         code=2,
     )
-    assert "on none of 10 pictures" in done.output
+    assert "no board in any of 10 pictures" in done.output

@@ -80,7 +80,7 @@ def test_proposed_grasps_hold_a_part_of_ones_own(grasped, run, tmp_path):
         (["-n", "0"], "-n=0"),
         (["--yaw", "270"], "--yaw=270"),
         (["--part", "gearbox"], "gearbox"),
-        (["--network", "pretrained/servoholder"], "does not know pivconnector"),
+        (["--network", "pretrained/servoholder"], "was not trained on pivconnector"),
         (["--video", "film.avi"], "film.avi"),
         (["--grasps", "none.yaml"], "none.yaml"),
     ],

@@ -32,7 +32,7 @@ def test_reads_what_json_writes(value, ascii_only, indent):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('{"a":\n [1, NaN]}', "line 2, column 6: 'NaN', no finite number"),
+        ('{"a":\n [1, NaN]}', "line 2, column 6: 'NaN', not a finite number"),
         ('["NaN Infinity", -Infinity]', "line 1, column 18: '-Infinity'"),
         ("[1.0, 1e308, 1e999]", "line 1, column 14: '1e999'"),
         ("[" + "9" * 400 + ".5]", "line 1, column 2: '9"),

@@ -67,7 +67,7 @@ def test_an_empty_folder_is_used_and_another_one_left_alone(tmp_path):
 def test_a_path_out_of_the_folder_is_refused(tmp_path, name):
     folder = tmp_path / "inner"
     folder.mkdir()
-    message = "leads out of the folder|no name that every system can write"
+    message = "leads out of the folder|a name that some systems cannot write"
     refused(folder, pack([("good", b"1"), (name, b"2")]), message)
     assert [path.name for path in tmp_path.iterdir()] == ["inner"]
 

@@ -45,5 +45,5 @@ def test_folders_of_scenes_are_one_data_set(tmp_path):
 @pytest.mark.parametrize("names", [[], ["notes/readme.txt"]])
 def test_a_folder_of_nothing_known(names, tmp_path):
     make(tmp_path, *names)
-    with pytest.raises(UserError, match="a folder of no known layout"):
+    with pytest.raises(UserError, match="a folder with an unknown layout"):
         check_dataset(tmp_path)

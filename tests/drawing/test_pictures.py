@@ -123,4 +123,4 @@ def test_photos_that_are_refused_say_what_to_do(tmp_path, image):
     refused("colours.png", "-auto-level")
     (tmp_path / "text.png").write_text("no picture")
     refused("text.png", "save it as PNG")
-    refused("missing.png", "copy the file there")
+    refused("missing.png", "pass the path of an existing file")

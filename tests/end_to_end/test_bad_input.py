@@ -31,13 +31,13 @@ def train(call, tiny, tmp_path):
         (["data.bach_size=4"], "override 'data.bach_size', which names no option; allowed: the "
                                "options of `--cfg job`, nearest data.batch_size"),
         (["bop_csv=true"], "'bop_csv', which names no option; allowed: the options of `--cfg job`; "
-                           "it is one of evaluate.py"),
+                           "bop_csv is an option of evaluate.py"),
         (["model/attention=cbm"], "model/attention=cbm; allowed: cbam none se"),
         (["trainer.max_epochs"], "trainer.max_epochs"),
         (["trainer.max_epochs=1,2"], "Ambiguous value"),
         (["trainer.max_epochs=many"], "trainer.max_epochs='many'; allowed: an integer from 1"),
-        (["trainer.precision=17"], "which Lightning refuses"),
-        (["trainer.accelerator=abacus"], "which Lightning refuses"),
+        (["trainer.precision=17"], "which Lightning rejects"),
+        (["trainer.accelerator=abacus"], "which Lightning rejects"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )  # fmt: skip
@@ -85,8 +85,8 @@ def absent(path: Path, good: Path) -> None:
 @pytest.mark.parametrize(
     ("write", "place", "expected"),
     [
-        (hostile_pickle, "ckpt_path", "which torch refuses to load"),
-        (hostile_pickle, "init_from", "which torch refuses to load"),
+        (hostile_pickle, "ckpt_path", "which torch cannot load"),
+        (hostile_pickle, "init_from", "which torch cannot load"),
         (absent, "baseline", "which is not a file"),
     ],
 )

@@ -151,8 +151,8 @@ def test_resume_takes_the_newest_whole_checkpoint(how, run, call, caplog):
     damage(folder / "previous.ckpt", how)
     done = call("train.py", f"resume={run}", "trainer.max_epochs=2")  # from best.ckpt
     assert done.code == 0, done.err
-    assert f"left out: {folder}/last.ckpt" in caplog.text
-    assert f"left out: {folder}/previous.ckpt" in caplog.text
+    assert f"ignoring {folder}/last.ckpt" in caplog.text
+    assert f"ignoring {folder}/previous.ckpt" in caplog.text
     assert "continuing from best.ckpt, step 2" in caplog.text
     assert (folder / "last.ckpt.damaged").exists()
     assert steps(run) == [0, 1, 2, 3]

@@ -325,7 +325,7 @@ def test_the_camera_of_a_picture(camera):
 @pytest.mark.parametrize(
     ("camera", "size", "options", "message"),
     [
-        (CAMERA, (320, 240), {}, "K is of 640×480, for a picture of 320×240"),
+        (CAMERA, (320, 240), {}, "K is for 640×480, with a picture of 320×240"),
         (CAMERA, (320, 240), {}, "--K-size 640 480 if the picture was resized, --crop X Y 320 240"),
         (CAMERA, (1280, 960), {}, "fix: --K-size 640 480 if the picture was resized$"),
         (CAMERA, (640, 360), {}, "fix: --crop X Y 640 360 if it was cropped"),

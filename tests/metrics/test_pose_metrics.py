@@ -186,7 +186,9 @@ def test_the_distance_is_taken_between_centres_not_origins():
 
 def test_objects_do_not_match_each_other():
     metric = PoseMetrics([part("a"), part("b")])
-    with pytest.raises(UserError, match="got a detection of 'c'; allowed: the scored parts a, b"):
+    with pytest.raises(
+        UserError, match="got a detection of 'c'; allowed: detections of the evaluated"
+    ):
         metric.update([Detection("c", 1, pose())], [])
     metric.update([Detection("a", 0.9, pose())], [truth("b", pose()), truth("other", pose())])
     rows = metric.compute()
@@ -196,7 +198,7 @@ def test_objects_do_not_match_each_other():
 
 @pytest.mark.parametrize("names", [[], ["a", "a"], ["a", "mean"]])
 def test_parts_must_have_names_of_their_own(names):
-    with pytest.raises(UserError, match="one or more parts of different names"):
+    with pytest.raises(UserError, match="one or more parts with distinct names"):
         PoseMetrics([part(name) for name in names])
 
 

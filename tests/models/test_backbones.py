@@ -119,5 +119,5 @@ def test_a_file_of_something_else_is_refused(tmp_path, torchvision):
         with pytest.raises(UserError, match=message):
             VGG19(weights_path=str(path))
     path.write_text("<html>404</html>")
-    with pytest.raises(UserError, match="torch refuses to load"):
+    with pytest.raises(UserError, match="torch cannot load"):
         VGG19(weights_path=str(path))

@@ -136,7 +136,7 @@ def test_a_file_that_is_no_torch_file_or_was_cut_short(saved, content):
     whole = saved.read_bytes()
     cut = whole[: int(len(whole) * content)] if isinstance(content, float) else content
     saved.write_bytes(cut)
-    with pytest.raises(UserError, match="not a torch file or was cut short"):
+    with pytest.raises(UserError, match="truncated or not a torch file"):
         read(saved)
     saved.unlink()
     with pytest.raises(UserError, match=r"which is not a file; allowed: a checkpoint \(\.ckpt\)"):

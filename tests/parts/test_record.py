@@ -110,7 +110,7 @@ def mesh(**change) -> dict[str, object]:
         ("symmetries_continuous", [[[0, 0, 0], [0, 0, 0]]], "axis of length 0"),
         ("symmetries_continuous", [[[0, 0, 1]]], "symmetries_continuous"),
         ("mesh", mesh(deviation=-1), "mesh.deviation=-1"),
-        ("mesh", mesh(faces=[[0, 1, 3]]), "a face of vertex 3; .*0 to 2"),
+        ("mesh", mesh(faces=[[0, 1, 3]]), "whose faces use vertex 3; .*0 to 2"),
         ("mesh", mesh(faces=[[0, 1, -1]]), r"mesh.faces\[0\]\[2\]=-1"),
         ("mesh", mesh(faces=[[0, 1, 0.5]]), "an integer"),
         ("mesh", mesh(faces=[]), "at least 1 "),

@@ -35,7 +35,7 @@ def test_two_members_of_one_name(again, good, tmp_path, rejected):
     folder = next(iter(members(good))).split("/")[0]
     content = [(name.replace(folder, "good"), data) for name, data in members(good).items()]
     path = pack(tmp_path / "bad.ckpt", [*content, (again, b"\x80\x02N.")])
-    rejected(path, "two members of one name")
+    rejected(path, "two members with equal names")
 
 
 def test_two_pickles_in_two_folders(good, tmp_path, rejected):
@@ -56,7 +56,7 @@ def test_an_archive_behind_something_else(good, tmp_path, rejected):
 def test_members_that_lead_out_of_the_archive(name, good, tmp_path, rejected):
     content = [*members(good).items(), (name, b"\x80\x02N.")]
     path = pack(tmp_path / "bad.ckpt", content)
-    rejected(path, "bad.ckpt, which torch refuses to load")
+    rejected(path, "bad.ckpt, which torch cannot load")
     assert not list(tmp_path.parent.glob("data.pkl"))
 
 
@@ -150,7 +150,7 @@ def test_a_payload_nested_very_deep(tmp_path, rejected):
         (name, pickled if name.endswith(".pkl") else data)
         for name, data in members(tmp_path / "empty.ckpt").items()
     ]
-    rejected(pack(tmp_path / "bad.ckpt", content), r"data with values nested more than 32 deep")
+    rejected(pack(tmp_path / "bad.ckpt", content), r"data with more than 32 levels of nesting")
 
 
 DSC = "dopepp.models.backbones.DSC"

@@ -54,7 +54,7 @@ def write(saved):
 @pytest.mark.parametrize("place", PLACES)
 def test_os_system_anywhere(place, write, Call, canary, rejected):
     path = write(place, Call(os.system, canary))
-    rejected(path, r"bad\.ckpt, which torch refuses to load .*the name 'posix\.system'")
+    rejected(path, r"bad\.ckpt, which torch cannot load .*the name 'posix\.system'")
 
 
 CALLS = {
@@ -72,7 +72,7 @@ CALLS = {
 
 @pytest.mark.parametrize("name", CALLS)
 def test_other_ways_to_run_code(name, write, Call, canary, rejected):
-    rejected(write("data", CALLS[name](Call, canary)), "which torch refuses to load .*the name '")
+    rejected(write("data", CALLS[name](Call, canary)), "which torch cannot load .*the name '")
 
 
 def test_torch_load_inside_of_a_checkpoint(write, Call, canary, rejected, tmp_path):
@@ -87,7 +87,7 @@ class Subclass(torch.Tensor):
 
 def test_a_tensor_of_another_class(write, rejected):
     rejected(
-        write("another weight", torch.ones(3).as_subclass(Subclass)), "which torch refuses to load"
+        write("another weight", torch.ones(3).as_subclass(Subclass)), "which torch cannot load"
     )
 
 
@@ -121,7 +121,7 @@ def test_a_call_that_fills_the_memory(name, place, write, Call, rejected):
     except NotImplementedError:  # torch cannot write a bare storage
         pytest.skip("cannot be written")
     assert path.stat().st_size < 1_000_000
-    rejected(path, "which torch refuses to load")
+    rejected(path, "which torch cannot load")
 
 
 def repacked(source: Path, target: Path, edit: Callable[[str, bytes], bytes]) -> Path:
@@ -141,7 +141,7 @@ def test_a_storage_that_reaches_beyond_its_bytes(tmp_path, rejected):
         return content.replace(b"K\xc8", b"M\xff\xff") if name.endswith(".pkl") else content
 
     path = repacked(tmp_path / "good.ckpt", tmp_path / "bad.ckpt", enlarge)
-    rejected(path, "a storage of 262140 bytes, of which 800 are in the file")
+    rejected(path, "a storage of 262140 bytes, but 800 bytes in the file")
 
 
 def pickled(body: bytes) -> bytes:
@@ -163,7 +163,7 @@ OPERATIONS = {
     "nothing on the stack": b"R",
     "no end": b"}" + b"(" * 100_000,
     "a persistent name": b"Pos.system\n",
-    "a reference that is no storage": b"X\x06\x00\x00\x00moduleX\x01\x00\x00\x00a\x86Q",
+    "an object that is not a storage": b"X\x06\x00\x00\x00moduleX\x01\x00\x00\x00a\x86Q",
     "another protocol": b"\x80\x05}",
     "a key of tuples in tuples": b"})" + b"\x85" * 3_000_000 + b"Ns",
 }
@@ -175,7 +175,7 @@ def test_operations_that_no_checkpoint_needs(name, good, tmp_path, rejected):
         good, tmp_path / "bad.ckpt",
         lambda member, old: pickled(OPERATIONS[name]) if member.endswith(".pkl") else old,
     )  # fmt: skip
-    rejected(path, r"bad\.ckpt(, which torch refuses to load| with a NoneType)")
+    rejected(path, r"bad\.ckpt(, which torch cannot load| with a NoneType)")
 
 
 def storage_reference(count: int) -> bytes:
@@ -216,5 +216,5 @@ def test_hostile_pretrained_weights(name, tmp_path, Call, canary, refused):
     """Pretrained backbones come from anywhere, and torchvision's own is of the old format."""
     path = tmp_path / "vgg19.pth"
     path.write_bytes(LEGACY[name](Call, canary))
-    with refused(r"vgg19\.pth, which torch refuses to load"):
+    with refused(r"vgg19\.pth, which torch cannot load"):
         VGG19(weights_path=str(path))

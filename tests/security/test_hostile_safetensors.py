@@ -72,7 +72,7 @@ FILES = {
 def test_a_header_that_lies(name, tmp_path, refused):
     path = tmp_path / "a.safetensors"
     path.write_bytes(FILES[name])
-    with refused(r"a\.safetensors: .*allowed: a whole safetensors file"):
+    with refused(r"a\.safetensors: .*allowed: a complete safetensors file"):
         read_safetensors(path)
 
 

@@ -210,8 +210,8 @@ SCENES = {
         model=model(body(1), before='<!DOCTYPE m SYSTEM "http://localhost/m.dtd">')
         .decode().replace('"1.0"?', '"1.0" encoding="UTF-16"?').encode("utf-16")
     ),
-    "h.3mf|an object that holds itself|used above its end": one_model(assembly(1, 1)),
-    "i.3mf|two objects that hold each other|used above its end": one_model(
+    "h.3mf|an object that holds itself|used before its definition": one_model(assembly(1, 1)),
+    "i.3mf|two objects that hold each other|used before its definition": one_model(
         assembly(1, 2, 2) + assembly(2, 1, 1)
     ),
     "j.3mf|one that is doubled forty times|over 1000 objects": one_model(
@@ -234,8 +234,8 @@ SCENES = {
         body(1, MESH.replace('x="9"', f'x="{"9" * 1_000_000}"'))
     ),
     "o.3mf|elements that nest|depth": one_model("<a>" * 100_000 + "</a>" * 100_000),
-    "p.3mf|no model|where one must be": archive(readme=b"hello"),
-    "q.3mf|an archive of names|where one must be": archive(
+    "p.3mf|no model|instead of one": archive(readme=b"hello"),
+    "q.3mf|an archive of names|instead of one": archive(
         **{f"../../{n}": b"" for n in range(20_000)}
     ),
     "a.off|a billion vertices|promises 1000000000": b"OFF\n1000000000 1 0\n0 0 0\n",

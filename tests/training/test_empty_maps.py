@@ -13,7 +13,7 @@ from dopepp.data.batch import Batch
 from dopepp.training.guards import EmptyMaps
 from dopepp.training.system import PoseSystem, ValidationOutput
 
-CAUSES = ("too little training", "a learning rate", "labels or units")
+CAUSES = ("too few training steps", "a learning rate", "labels or units")
 
 
 class Validations:
@@ -68,7 +68,7 @@ def test_a_falling_loss_needs_more_steps(validations, caplog):
     assert not caplog.messages
     validations(0.001, 1.0)
     cause = first_cause(caplog)
-    assert "too little training" in cause
+    assert "too few training steps" in cause
     assert "step 20 of 1,000" in cause
     validations(0.001, 0.9)
     validations.callback.on_train_end(validations.trainer, validations.system)
@@ -107,7 +107,7 @@ def test_a_short_training_says_it_at_its_end_and_a_resumed_one_counts_on(validat
     validations(0.001, 2.0)
     state = validations.callback.state_dict()
     validations.callback.on_train_end(validations.trainer, validations.system)
-    assert "too little training" in first_cause(caplog)
+    assert "too few training steps" in first_cause(caplog)
     validations.callback = EmptyMaps(patience=2)
     validations.callback.load_state_dict(state)
     validations(0.001, 1.0)

@@ -120,7 +120,7 @@ def read_object(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
     content = read_json(path, max_bytes) if path.exists() else {}
     if not isinstance(content, dict):
         fix = "restore the file from a copy, or choose another folder"
-        raise UserError(f"{path}, no JSON object", "the file that this writer wrote", fix)
+        raise UserError(f"{path}, no JSON object", "a file of this writer", fix)
     return content
 
 
@@ -161,7 +161,7 @@ def finalizing(staging: Path) -> Iterator[None]:
             yield
             if not any(entry.name != _LOCK for entry in staging.iterdir()):
                 path.unlink()
-                with suppress(OSError):  # another process has staged an item in this moment
+                with suppress(OSError):  # another process may have just staged an item
                     staging.rmdir()
             return
         finally:

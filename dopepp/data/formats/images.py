@@ -44,7 +44,7 @@ def picture(
     Args:
         node: The file or tar member.
         content: Bytes of an image in a tar file.
-        modes: Pillow's names of the allowed pixel types; none allows any.
+        modes: Pillow's names of the allowed pixel types; empty to allow all.
     """
     if content is None:
         content = node["image"].attempt(lambda: pictures.read_content(Path(node.path)))
@@ -88,7 +88,7 @@ def decode_rgb(content: bytes, where: str) -> Picture:
     """Decode a colour or grey image as RGB, without an alpha channel.
 
     Raises:
-        UserError: The image is no PNG, JPEG or TIFF, is damaged or too large, or has not 8 bits.
+        UserError: The image is not a PNG, JPEG or TIFF of 8 bits, is damaged, or too large.
     """
     image = picture(Node(STRICT, where), content, COLOUR_MODES)
     assert image is not None
@@ -145,8 +145,8 @@ def read_map(node: Node, shape: Shape | None, colour: bool = False) -> NDArray[A
 
     Args:
         node: The file.
-        shape: (height, width) of the colour image; None allows any.
-        colour: Whether several channels, whose meaning no file states, are None without a report.
+        shape: (height, width) of the colour image; None to allow any shape.
+        colour: Whether to return None for several channels, without a report.
     """
     image = node["image"].attempt(lambda: pictures.read_image(Path(node.path)))
     if image is not None and image.ndim > 2 and colour:
@@ -162,7 +162,7 @@ def one_channel(
     if image is None:
         return None
     if image.ndim != 2:
-        node["channels"].report(f"an image of {image.shape[2]}", "one channel")
+        node["channels"].report(f"an image with {image.shape[2]} channels", "one channel")
         return None
     if shape is not None and image.shape != tuple(shape[:2]):
         problem = f"{image.shape[1]}×{image.shape[0]} pixels"
@@ -181,7 +181,7 @@ def encode_png(pixels: NDArray[Any]) -> bytes:
 def depth_units(depth: DepthMap, covered: Mask) -> tuple[NDArray[np.uint16], float]:
     """Convert metres into units of a 16-bit image; return the units and BOP's ``depth_scale``.
 
-    The scale is the finest scale that reaches all objects, the pixels of ``covered``: 0.1 mm within
+    The scale is the finest that covers all objects (the pixels of ``covered``): 0.1 mm up to
     6.5 m. Background beyond its range becomes 0, unknown.
     """
     farthest = 1000 * float(depth[covered].max(initial=0.0))
@@ -210,7 +210,7 @@ def decode_runs(record: object, shape: Shape, node: Node) -> Mask | None:
     whole = isinstance(counts, list) and all(type(n) is int and n >= 0 for n in counts)
     if size != list(shape):
         problem = "missing" if record is None else f"size {size!r:.40}"
-        node.report(problem, f"runs of size [{shape[0]}, {shape[1]}], the image's")
+        node.report(problem, f"runs of the image's size [{shape[0]}, {shape[1]}]")
     elif not whole or counts is None or sum(counts) != shape[0] * shape[1]:
         allowed = f"a list of run lengths that add up to {shape[0] * shape[1]} pixels"
         node.report(f"counts {counts!r:.40}", allowed)

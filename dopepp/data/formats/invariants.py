@@ -73,7 +73,7 @@ def rotation_problem(rotation: RotationMatrix, tolerance: float = 1e-3) -> str |
         return None
     deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
     allowed = f"{deviation:.2g} (allowed {tolerance:.0e})"
-    return f"no rotation: R·Rᵀ off by {allowed}, determinant {np.linalg.det(rotation):.3g}"
+    return f"not a rotation: R·Rᵀ off by {allowed}, determinant {np.linalg.det(rotation):.3g}"
 
 
 def check_translation(node: Node, translation: Vector, diameter: float | None) -> bool:
@@ -82,10 +82,10 @@ def check_translation(node: Node, translation: Vector, diameter: float | None) -
     Args:
         node: Parent of the two reported fields.
         translation: Camera frame, in the unit of ``diameter``.
-        diameter: The object's diameter; None where it is unknown.
+        diameter: The object's diameter; None if unknown.
 
     Returns:
-        Whether nothing is reported; a NaN is reported elsewhere.
+        Whether nothing is reported. A NaN is not reported here.
     """
     depth = float(translation[2])
     if depth <= 0:
@@ -107,12 +107,12 @@ def check_translation(node: Node, translation: Vector, diameter: float | None) -
 def plausible_camera(
     node: Node, K: CameraMatrix | None, shape: Shape | None
 ) -> CameraMatrix | None:
-    """Return K, or None where it is missing, damaged or reported as implausible for the image.
+    """Return K; None if K is missing or damaged, or after reporting an implausible K.
 
     Args:
         node: The camera matrix's field.
         K: Camera matrix in pixels.
-        shape: (height, width) of the image; None where it is unknown.
+        shape: (height, width) of the image; None if unknown.
     """
     if K is None or not np.isfinite(K).all():
         return None
@@ -144,9 +144,9 @@ def check_box(
         node: The box's field.
         points_cam: Points in the camera frame whose hull contains the object.
         K: Camera matrix in pixels.
-        seen: Box of the visible pixels; None where nothing is visible.
-        visible_fraction: Visible share of the object, where it is known.
-        shape: (height, width) of the image, where ``visible_fraction`` ignores its border.
+        seen: Box of the visible pixels; None if no pixel is visible.
+        visible_fraction: Visible share of the object, if known.
+        shape: (height, width) of the image, if ``visible_fraction`` ignores truncation.
     """
     predicted = Box.of_points(project(points_cam, K))
     if predicted is None or seen is None:
@@ -156,7 +156,7 @@ def check_box(
     beyond = predicted.beyond(seen)
     if beyond > tolerance:
         distance = f"{beyond:.0f} px outside the reprojected box {predicted}"
-        node.report(f"seen at {seen}, {distance} (allowed {tolerance:.0f} px)")
+        node.report(f"visible at {seen}, {distance} (allowed {tolerance:.0f} px)")
         return
     is_whole = visible_fraction is not None and visible_fraction >= FULLY_VISIBLE
     if not is_whole or (shape is not None and not predicted.is_inside(shape)):

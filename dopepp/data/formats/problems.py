@@ -75,7 +75,7 @@ class CheckReport(Problems):
         return self.num_defects == 0
 
     def report(self, path: Path | str, where: str, message: str, allowed: str = "") -> None:
-        """Keep a defect."""
+        """Store a defect."""
         where = where.lstrip(".") or "top level"
         self.num_defects += 1
         self.counts[where.rpartition(".")[2]] += 1
@@ -87,17 +87,17 @@ class CheckReport(Problems):
             self.defects.append(" ".join(f"{shown}: {where}: {full_message}".split()))
 
     def take(self, path: Path | str, where: str, error: UserError) -> None:
-        """Keep an error as a defect, without the file's name in its message."""
+        """Store an error as a defect, without the file's name in its message."""
         message = error.got.rpartition(str(path))[2].lstrip(" ,:") or error.got
         self.report(path, where, "missing" if where == "file" else message, error.allowed)
 
     def note(self, text: str) -> None:
-        """Add a remark that is no defect, unless it has been added already."""
+        """Add a remark that is not a defect; repeated remarks are ignored."""
         if text not in self.notes:
             self.notes.append(text)
 
     def count_image(self) -> None:
-        """Count an image, and log the progress once in a while."""
+        """Count an image, and log the progress at intervals."""
         self.num_images += 1
         if self.num_images % _IMAGES_A_LINE == 0:
             _log.info("%s images checked, %s defects", self.num_images, self.num_defects)
@@ -216,5 +216,5 @@ def _leniently(content: bytes) -> Any:
 
 
 def mapping(value: object) -> Mapping[str, Any]:
-    """Return a JSON object, or an empty one for any other value."""
+    """Return a JSON object, or an empty object for any other value."""
     return value if isinstance(value, dict) else {}

@@ -1,4 +1,4 @@
-"""Augment light, colour, focus, sensor noise and compression; poses stay.
+"""Augment light, colour, focus, sensor noise and compression; poses are unchanged.
 
 Lens, sensor and file are those of the virtual camera (:mod:`dopepp.virtual.sensor`). To add a
 change, write a function of an image, add a field for its range and call it in

@@ -23,7 +23,7 @@ from dopepp.geometry.rotation import rotation_vector_to_matrix
 
 @dataclass(frozen=True)
 class CameraJitter(Checked):
-    """Roll, zoom and shift the camera's picture at random; new pixels repeat its border.
+    """Roll, zoom and shift the camera's picture at random; new pixels repeat the border.
 
     Attributes:
         roll_deg: Largest rotation of the picture about its centre, in either direction.
@@ -72,5 +72,5 @@ class CameraJitter(Checked):
             image=warped(sample.image, cv2.BORDER_REPLICATE, cv2.INTER_LINEAR),
             K=crop_camera(K, *-offset),
             instances=[moved(instance) for instance in sample.instances],
-            depth=None,  # no training reads it
+            depth=None,  # unused in training
         )

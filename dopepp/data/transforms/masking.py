@@ -25,7 +25,7 @@ from dopepp.virtual.backgrounds import Backgrounds
 
 MIN_PATCH_PX: Final = 2  # A patch of one pixel is always a solid colour.
 MIN_CONTRAST: Final = 3.0
-"""A crop is solid if no colour channel's standard deviation reaches this many grey levels."""
+"""Smallest standard deviation of a colour channel of a crop that is not solid, grey levels."""
 
 MAX_DRAWS: Final = 8  # Largest number of crops to draw from a picture.
 
@@ -61,13 +61,13 @@ class BackgroundCrops:
         return None
 
     def search(self, size: Size, rng: Generator) -> Picture | None:
-        """Return a crop of (height, width) with contrast, else with two colours, else None."""
+        """Return a crop of (height, width) with contrast, or with two colours, or None."""
         free = self._is_free(size)
         if not free.any():
             return None
         sums, squares = self._moments
         num = size[0] * size[1]
-        # num²·variance is a whole number below 2⁵³, so a single colour gives exactly 0.
+        # num²·variance is an integer below 2⁵³, so a single colour gives exactly 0.
         spread = (num * _windows(squares, size) - _windows(sums, size) ** 2).max(axis=2)
         spread[~free] = 0
         for least in ((num * self.min_contrast) ** 2, 1.0):
@@ -77,7 +77,7 @@ class BackgroundCrops:
         return None
 
     def largest(self, size: Size, rng: Generator) -> Picture | None:
-        """Return a crop of (height, width), halved until the background has one, or None."""
+        """Return a crop of (height, width), halved until it fits the background, or None."""
         height, width = size
         while True:
             crop = self.draw((height, width), rng)
@@ -137,7 +137,7 @@ def covered_instances(
 
 @dataclass(frozen=True)
 class RandomMask(Checked):
-    """Cover each instance with one background patch, with a probability.
+    """Cover each instance with a background patch, with a probability.
 
     Attributes:
         max_height: Largest patch height as a share of the object's box height (paper: 0.8).

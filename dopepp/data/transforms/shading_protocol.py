@@ -1,12 +1,12 @@
 """Shade objects (paper Table 3): cover a given share of the visible pixels of each object.
 
 Random crops of the image's background cover an object inside its box, one after another, until the
-requested number of visible pixels is covered. The order in which pixels are covered defines all
-shares: a share is the start of this order with the right number of visible pixels. It is exact to
-half a pixel, and a larger share contains a smaller share. The last patch is cut between two pixels.
+requested number of visible pixels is covered. Pixels are ordered by the time of covering; a share
+is the beginning of this order with the requested number of visible pixels. Shares are exact to
+half a pixel, and a larger share contains a smaller share. The last patch is cut.
 
-A patch passes behind the other objects, so that only its own patches cover an object. Training
-uses :mod:`dopepp.data.transforms.masking` (Eq. 4, one patch) instead.
+A patch is drawn behind other objects, so that only its own patches cover an object. Training uses
+:mod:`dopepp.data.transforms.masking` (Eq. 4, one patch) instead.
 """
 
 from __future__ import annotations
@@ -53,8 +53,7 @@ def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> lis
 
     Args:
         sample: The image.
-        shares: Shares of each instance's visible pixels, in [0, 1]; they do not influence each
-            other.
+        shares: Shares of each instance's visible pixels, in [0, 1], independent of each other.
         seed: Seed of the patches.
         index: Index of the image in the test set.
 
@@ -106,7 +105,7 @@ def _shaded(
 class _Cover:
     """Patches that cover ``share`` of an instance's visible pixels.
 
-    ``order`` numbers the pixels of its box as they are covered; ``spared`` pixels stay.
+    ``order`` numbers the pixels of the box in the order of covering; ``spared`` pixels stay.
     """
 
     def __init__(
@@ -138,7 +137,7 @@ class _Cover:
         return round(share * self._num_seen)
 
     def _draw_crop(self, crops: BackgroundCrops, rng: Generator) -> Picture | None:
-        """Draw a crop of random size, or smaller if the background has none, or None."""
+        """Draw a crop of random size, reduced to fit the background, or None."""
         extent = self._seen.shape
         if min(extent) < MIN_PATCH_PX:
             return None
@@ -148,7 +147,7 @@ class _Cover:
         return crops.largest((height, width), rng)
 
     def _lay(self, crop: Picture, pixel: Int[np.ndarray, "2"], rng: Generator) -> None:
-        """Lay a crop below earlier crops at random, so that it covers a given pixel."""
+        """Draw a crop below earlier crops, at a random position that covers ``pixel``."""
         slices = []
         for position, length, extent in zip(pixel, crop.shape, self.order.shape, strict=False):
             first, last = max(0, position - length + 1), min(position, extent - length)

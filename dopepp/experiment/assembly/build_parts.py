@@ -37,7 +37,7 @@ def _read_parts(data: DataConfig) -> list[Part]:
             if value is not None:
                 raise UserError(
                     f"data.{option}={list(value)} without data.root",
-                    f"data.{option} names {option} of a data set; data.parts names meshes",
+                    f"data.{option} together with data.root, or data.parts for mesh files",
                     "set data.root, or use data.parts",
                 )
     elif data.format == "ycb_video":

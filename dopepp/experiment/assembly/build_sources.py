@@ -46,7 +46,7 @@ from dopepp.virtual.backgrounds import Backgrounds
 _log = logging.getLogger(__name__)
 
 _TRAINING_SHARE: Final = 0.8
-"""Share of the training in a folder of images that it shares with validation or test."""
+"""Share of training in an image folder that is also used for validation or test."""
 
 _DIVIDED: Final = ("bop", "ndds", "webdataset")  # formats whose folders `share_of` divides
 
@@ -86,7 +86,7 @@ def held_out_source(data: DataConfig, parts: Parts, split: Split) -> DescribedSo
     if seen or any(part.mesh is None for part in parts):
         return labelled
     _log.warning(
-        "%s shows none of %s: validation is on renders, as with data.image_sets.val=null",
+        "%s shows none of %s: validating on renders, as with data.image_sets.val=null",
         labelled.name,
         ", ".join(part.name for part in parts),
     )
@@ -104,12 +104,11 @@ def _train_source(
         if data.real_fraction == 1:
             raise UserError(
                 f"data={data.name} without data.root",
-                f"a folder of {data.format}: only labelled images were asked for",
+                f"a folder in the format {data.format}, because only labelled images are used",
                 "set data.root, or train on renders with data=virtual",
             )
         _log.warning(
-            "no real images were given (data.root is not set): the real share is 0, "
-            "training on renders of %s",
+            "no real images (data.root is not set): training on renders of %s only",
             ", ".join(part.name for part in parts),
         )
     if data.root is not None and data.synthetic_fraction > 0 and data.real_fraction < 1:
@@ -142,7 +141,7 @@ def labelled_images(data: DataConfig, parts: Parts, seed: int, split: Split) -> 
     """Open a split's labelled images.
 
     Raises:
-        UserError: ``data.root`` does not hold them.
+        UserError: ``data.root`` has no such images.
     """
     assert data.root is not None
     if data.format in FORMATS:
@@ -229,17 +228,17 @@ def share_in_words(data: DataConfig) -> str | None:
     sharing = [name for name in ("train", "val") if data.image_sets[name] == folder]
     all_of_it = " ".join(f"data.image_sets.{name}=none" for name in sharing)
     return (
-        f"measured is the last {last - first:.0%} of the images in {folder}, because "
-        f"data.image_sets names it for {' and '.join(sharing)} as well: {all_of_it} measures all "
-        "of it, training images included, and data.image_sets.test=FOLDER another one"
+        f"measuring the last {last - first:.0%} of the images in {folder}, which "
+        f"is shared with {' and '.join(sharing)}; {all_of_it} measures the whole folder "
+        "with its training images, and data.image_sets.test=FOLDER another folder"
     )
 
 
 def fitted_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
     """Choose the camera scale and the input size by the apparent size of the parts.
 
-    Without a camera, only renders of the models of a BOP data set are fitted, to the camera of its
-    pictures. The chosen values are logged and stored in the config.
+    Without a camera, only renders of a BOP data set's models are fitted, to the data set's camera.
+    The chosen values are logged and stored in the config.
 
     Raises:
         UserError: A part is larger than ``data.input_size``, or the working distance is unknown.
@@ -256,7 +255,7 @@ def fitted_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
     if largest > min(size):
         raise UserError(
             f"data.input_size={list(size)} for parts of {largest:.0f} pixels across",
-            "an input that is larger than the parts in it",
+            "an input size above the size of the parts",
             "leave data.input_size=null, or set a smaller virtual.camera_scale",
         )
     for line in view.in_words(parts, scale, size):
@@ -295,7 +294,7 @@ def _with_camera_of_pictures(config: RunConfig, parts: Parts) -> RunConfig:
         )
     if virtual.working_distance is None:
         _log.info(
-            "%s: renders are as its camera sees parts at %g – %g m, as they are annotated there; "
+            "%s: rendering with the data set's camera and its annotated distances, %g – %g m; "
             "set camera=FILE and working_distance=[near,far] to change this",
             source.name,
             *distance,

@@ -213,14 +213,14 @@ def build_trainer(config: RunConfig, run_dir: Path, trackers: Sequence[Logger] =
         )
     except (MisconfigurationException, TypeError, ValueError) as error:
         raise UserError(
-            f"trainer {config.plain['trainer']}, which Lightning refuses: {error}",
+            f"trainer {config.plain['trainer']}, which Lightning rejects: {error}",
             "values of Lightning's Trainer that this machine can run",
-            "change the option trainer.… that this message names, or leave it out",
+            "change or remove the option trainer.… that this message names",
         ) from error
 
 
 def choose_precision(asked: str, accelerator: str) -> tuple[str, str]:
-    """Return Lightning's precision and the reason for the choice.
+    """Return Lightning's name of the precision, and the reason for the choice.
 
     ``auto`` selects bf16 if the hardware supports it, because emulation is slow. The choice depends
     on the hardware only, not on timings, so runs are repeatable.
@@ -264,7 +264,7 @@ def estimate_training_s(
     """Estimate the duration of a run on a CPU, in seconds, from a few steps and items.
 
     Loading and training share the cores, so their times add up. Items are loaded twice, because a
-    cache makes all epochs after the first one faster.
+    cache accelerates all epochs after the first epoch.
     """
     per_epoch = len(datamodule.train_source)
     num_images = per_epoch * trainer.max_epochs
@@ -332,7 +332,7 @@ def scheduler_factory(node: Mapping[str, Any]) -> SchedulerFactory | None:
     def make(optimizer: Optimizer, num_steps: int) -> LRScheduler:
         try:
             return SCHEDULERS.build(node, optimizer=optimizer, **{total: max(1, num_steps)})
-        except ZeroDivisionError:  # OneCycleLR whose warm-up is exactly one step long
+        except ZeroDivisionError:  # OneCycleLR with a warm-up of exactly one step
             return SCHEDULERS.build(node, optimizer=optimizer, **{total: num_steps + 1})
 
     return make

@@ -39,10 +39,10 @@ KINDS: Final = {
     LOOKALIKES: "renders of look-alikes of the parts in front of photos",
     OWN: "the user's own pictures without the parts",
 }
-"""Kinds of frames and what they show, in the order of the frames.
+"""Content of each kind of frame, in the order of the frames.
 
-No threshold rejects look-alikes without missing the part as well, so a table shows them in a
-separate row: refinement or verification may reject them."""
+A threshold that rejects look-alikes would reject the part as well, so tables show look-alikes in a
+separate row."""
 
 FRAME: Final[Size] = (640, 480)
 """(width, height) of the frames if there is no camera and the preset's pictures are smaller."""
@@ -50,7 +50,7 @@ FRAME: Final[Size] = (640, 480)
 _MOST_DISTRACTORS: Final = 12  # in a frame, which bounds the time to render it
 _LOOKALIKES_SHOWN: Final = (1, 3)  # in a frame
 _MARGIN: Final = 0.3  # border without look-alikes, share of the frame, if there is no camera
-_NUM_POSES: Final = 64  # drawn of each part to measure the preset's distances
+_NUM_POSES: Final = 64  # number of drawn poses per part for measuring the preset's distances
 
 
 def negative_frames(
@@ -65,14 +65,14 @@ def negative_frames(
         num_images: Number of frames.
 
     Raises:
-        UserError: A folder of photos has too few of them to be divided.
+        UserError: A folder of photos has too few photos to be divided.
     """
     view, preset = frame_view(data, parts), data.preset
     photos, user_photos = held_out_photos(data, split), own_photos(data, split)
     dense = _as_dense(preset, view.size) if data.virtual.view is None else preset
     preset = view.whole(dense, data.virtual.camera_scale or 1.0)
     if data.virtual.view is None:
-        # Far from the middle, the short focal length distorts parts as in no picture of the preset.
+        # Far from the centre, the short focal length distorts parts more than in the preset.
         near, far = view.distance
         preset = replace(preset, placement=DistancePlacement(near, far, _MARGIN))
     share = math.ceil(num_images / (3 if user_photos is None else 4))
@@ -92,7 +92,7 @@ def negative_frames(
         background_contrast=(1.0, 1.0),
     )
     behind = find_backgrounds(data.virtual.backgrounds, split)
-    # The quick renderer, whatever renders the other images.
+    # Frames always use the fast renderer.
     scenes = Factory(parts, empty, data.eval_seed, behind, negatives=build_negatives(data, parts))
     similar = Factory(lookalikes(parts), bare, data.eval_seed, photos)
     sources: list[DescribedSource] = [
@@ -108,8 +108,8 @@ def negative_frames(
 def frame_view(data: DataConfig, parts: Parts) -> View:
     """Return the camera of the frames and the distances of the parts.
 
-    It is the camera of the user or of the labelled pictures. Without one, it has the preset's focal
-    length in at least :data:`FRAME` pixels, so that parts have as many pixels as in the preset.
+    The camera is the user's camera or the camera of the labelled pictures. Otherwise the camera has
+    the preset's focal length and at least :data:`FRAME` pixels.
     """
     if data.virtual.view is not None:
         return data.virtual.view
@@ -135,7 +135,7 @@ def _distances(preset: Preset, parts: Parts) -> tuple[float, float]:
 
 
 def _as_dense(preset: Preset, size: Size) -> Preset:
-    """Return a preset whose distractors are as large and as dense in larger frames."""
+    """Return a preset with distractors of equal size and density in larger frames."""
     old, scale = preset.distractors, size[0] / preset.width
     growth = size[0] * size[1] / (preset.width * preset.height)
     low, high = (min(math.ceil(count * growth), _MOST_DISTRACTORS) for count in old.number)

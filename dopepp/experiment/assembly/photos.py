@@ -1,7 +1,7 @@
 """Divide the user's photos: backgrounds for training, other photos for the detection threshold.
 
-Photos stand behind rendered parts in training. A network learns to ignore them, so its threshold is
-tuned and tested on photos that training has not used.
+Training shows photos behind rendered parts, and the network learns to ignore these photos. Its
+threshold is therefore tuned and tested on other photos.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def training_backgrounds(data: DataConfig) -> Backgrounds:
 
 
 def held_out_photos(data: DataConfig, split: Literal["val", "test"]) -> PhotoBackgrounds:
-    """Return photos that training does not use; those of the package if backgrounds are drawn.
+    """Return photos that training does not use: the user's, or the package's if none are given.
 
     Raises:
         UserError: The folder of the backgrounds has too few photos to be divided.
@@ -61,8 +61,8 @@ def held_out_photos(data: DataConfig, split: Literal["val", "test"]) -> PhotoBac
     if photos.is_divided:
         return photos
     raise UserError(
-        f"tuning with virtual.backgrounds={data.virtual.backgrounds}, whose {len(photos.paths)} "
-        "photos are too few to keep some from training",
+        f"tuning with the {len(photos.paths)} photos of "
+        f"virtual.backgrounds={data.virtual.backgrounds}, too few to divide",
         _NEEDED,
         "add photos, leave out virtual.backgrounds (procedural backgrounds), or set tune=false",
     )

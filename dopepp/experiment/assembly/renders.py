@@ -55,11 +55,11 @@ def held_out_renders(
 
 
 def scaled_test_renders(data: DataConfig, parts: Parts, scale: float) -> DescribedSource:
-    """Render the test scenes with a camera that is nearer by a factor."""
+    """Render the test scenes with the camera closer to the parts by a factor."""
     if not data.is_rendered("test"):
         raise UserError(
             f"scale={scale:g} on the images in data.root={data.root}",
-            "renders, whose camera can be moved",
+            "renders, because photographs have a fixed camera",
             "leave out scale, or test on renders of these objects with data.test.renderer=raster",
         )
     return held_out_renders(data, parts, "test", scale)
@@ -70,7 +70,7 @@ def validation_renders(
 ) -> DescribedSource:
     """Render the parts of a checkpoint as in its validation images.
 
-    The data set of the training is not needed, and its other models are not shown.
+    The training's data set is not needed; other models of the data set are not shown.
 
     Args:
         checkpoint: Checkpoint.

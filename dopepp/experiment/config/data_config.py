@@ -64,7 +64,7 @@ class VirtualConfig:
         renderer: ``raster`` or ``photoreal``.
         camera: Camera of the application; None uses the camera of the preset.
         working_distance: Nearest and farthest distance of the parts from the camera, metres.
-        camera_scale: Scale at which the network sees the camera's pictures; None selects it.
+        camera_scale: Scale of the camera's pictures at the network's input; None selects it.
     """
 
     __pydantic_config__ = STRICT
@@ -134,16 +134,16 @@ class DataConfig:
             else all objects.
         parts: Built-in names or mesh files; used without a root and for NDDS.
         unit: Unit of the mesh files: m, cm, mm or inch; None as in :mod:`dopepp.parts.mesh`.
-        symmetries: Symmetries of the objects: None as the data set states them, ``none``, ``auto``,
-            a file, or symmetries by object name (:mod:`dopepp.data.part_symmetries`).
+        symmetries: Symmetries of the objects: None for the data set's symmetries, ``none``,
+            ``auto``, a file, or symmetries by object name (:mod:`dopepp.data.part_symmetries`).
         real_fraction: Share of labelled images in an epoch.
         synthetic_fraction: Share of YCB-Video's synthetic images among the unlabelled images.
         frames: Frames of YCB-Video for training and test, instead of image sets.
         image_sets: Image set (YCB-Video) or folder (other formats) of each split ``train``, ``val``
-            and ``test``. Splits may share a folder. None renders the split.
-        targets: BOP's list of test images; None uses all images, ``auto`` the list of the root if
-            there is one.
-        classes: Part for each class name in NDDS files, where the names differ.
+            and ``test``; None for renders. Splits may share a folder.
+        targets: BOP's list of test images; None for all images, ``auto`` for the root's list, if
+            present.
+        classes: Part names by class name in NDDS files, if the names differ.
         download_dir: Folder for downloaded shards; None downloads nothing.
         jitter: Node of the camera jitter, if any.
         masking: Node of the random masks, if any.
@@ -234,9 +234,9 @@ class DataConfig:
         """
         if self.input_size is None:
             raise UserError(
-                "no data.input_size and no camera to choose it for",
+                "neither data.input_size nor a camera",
                 "camera=FILE working_distance=[0.3,0.8], or data.input_size=[width,height]",
-                "add the camera's file and the distances at which it will see the part, metres",
+                "add the camera's file and the working distances in metres",
             )
         return self.input_size
 
@@ -278,7 +278,7 @@ def chosen_data(data: Node | None, virtual: Node | None, stored: object, source:
     whole = "name" in given  # a file of conf/data, not single options
     if not whole and not isinstance(stored, dict):
         allowed, fix = "data=… on the command line", "add the data, e.g. data=virtual"
-        raise UserError(f"{source}, which names no data", allowed, fix)
+        raise UserError(f"{source}, which contains no data config", allowed, fix)
     base, how = {key: base[key] for key in base if key != "virtual"}, base.get("virtual")
     try:
         merged = given if whole else _changed(base, given, "data")
@@ -323,10 +323,10 @@ def with_files(virtual: object) -> object:
 
 
 def _chosen_virtual(given: Mapping[str, Any], stored: object, source: str) -> VirtualConfig:
-    """Return the given whole node ``virtual``, or the stored node with changed options."""
+    """Return the user's node ``virtual`` if complete, or the stored node with changed options."""
     if not {"renderer", "preset"} <= set(given):  # a file of conf/virtual sets both
         if stored is None:
-            problem = f"{source}, which does not state how to render"
+            problem = f"{source}, which contains no options of the renders"
             raise UserError(problem, "virtual=… on the command line", "add virtual=default")
         given = _changed(stored, given, "virtual")
     return VirtualConfig.of(given)

@@ -26,7 +26,7 @@ _MOST: Final = 10**6
 _MAX_EPOCHS: Final = 10**9
 _MAX_WAIT_S: Final = 7 * 24 * 3600
 _MIN_CELLS: Final = 0.1
-"""Minimum width of a peak or disc in cells; narrower ones may cover no cell."""
+"""Minimum width of a peak or disc in cells; a narrower peak may cover no cell."""
 _MAX_THRESHOLD: Final = 1000
 """Upper limit for map sizes in cells, angles in degrees and numbers of peaks."""
 
@@ -103,7 +103,7 @@ class TrainerConfig:
 
     @classmethod
     def node(cls, options: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the options, with those of Lightning moved below ``lightning``."""
+        """Return the options, with Lightning's own options moved below ``lightning``."""
         ours = {field.name for field in fields(cls)} - {"lightning"}
         lightning = {key: value for key, value in options.items() if key not in ours}
         return {**{key: options[key] for key in options if key in ours}, "lightning": lightning}
@@ -221,7 +221,7 @@ class Protocols:
 def _levels(
     option: str, given: object, bounds: tuple[float, float], usual: float, allowed: str
 ) -> tuple[float, ...]:
-    """Read one or several levels, without the ``usual`` level, which is always measured."""
+    """Read levels; the ``usual`` level is omitted, because it is always measured."""
     levels = [] if given is None else given if isinstance(given, list) else [given]
     numbers: list[float] = [n for n in levels if isinstance(n, int | float) and type(n) is not bool]
     wrong = len(numbers) < len(levels) or not all(bounds[0] <= n <= bounds[1] for n in numbers)
@@ -363,7 +363,7 @@ class EvaluationConfig(MeasurementConfig):
         method: Name of that method; None derives it from the file name.
         data: Data to measure on: a whole node, or changes to the data of the checkpoint; see
             :func:`~dopepp.experiment.config.data_config.chosen_data`.
-        virtual: Options of the renders: a whole node, or changes to those of the checkpoint.
+        virtual: Options of the renders: a whole node, or changes to the checkpoint's options.
         bop_csv: Whether to write the poses of every method as a BOP challenge CSV.
         all_measures: Whether to print the symmetric measures of parts without symmetries.
         device: torch's name of the device, or ``auto``.

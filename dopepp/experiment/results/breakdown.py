@@ -174,11 +174,11 @@ def record_breakdown(
 ) -> None:
     """Print a table of :func:`break_down` and write ``by_QUANTITY.csv`` and ``by_QUANTITY.png``.
 
-    Log a warning instead if no instance of the test set counts.
+    If the test set has no evaluated instance, log a warning instead.
     """
     bins, values = break_down(metrics, quantity, num_bins, rates)
     if not bins:
-        _log.warning("by=%s: the test set has no instance that counts, so no bin", quantity)
+        _log.warning("by=%s: no bins, because the test set has no evaluated instance", quantity)
         return
     title, _, decimals = QUANTITIES[quantity]
     by_middle = {each.middle: each for each in bins}

@@ -59,7 +59,7 @@ PICTURES_FILE: Final = "compare_pictures.png"
 LOG_FILE: Final = "metrics.csv"
 
 NUM_PICTURES: Final = 3
-"""Number of test images to show; the first ones, so that nobody selects them."""
+"""Number of shown test images: the first images, to avoid a biased selection."""
 
 _LOGGED: Final = {
     "train/loss": ("training loss", 1, True),
@@ -255,8 +255,7 @@ def logged(path: Path, column: str) -> dict[int, float]:
 def picture_tiles(entries: Sequence[Entry], num: int = NUM_PICTURES) -> tuple[list[Tile], str]:
     """Predict on the first test images of the first method whose images can be opened.
 
-    The first seed of each method is shown. Networks of different parts are shown one after the
-    other.
+    The first seed of each method is shown. Networks of different parts have separate rows.
 
     Returns:
         Tiles row by row (one row per image, one tile per method), and why images are missing.
@@ -325,7 +324,7 @@ class _Model:
         truths = [instance for instance in sample.instances if instance.label in names]
         wireframes = [Wireframe(truth.keypoints, GREEN, "true") for truth in truths]
         wireframes += [Wireframe(pose.keypoints, colour, "predicted") for pose in poses]
-        missed = "" if poses else ": finds nothing"
+        missed = "" if poses else ": no detection"
         return Tile(overlay(sample.image, wireframes), f"{self.name}{missed} ({sample.key})")
 
 
@@ -342,7 +341,7 @@ def _rows(models: Sequence[_Model], num: int) -> tuple[list[Tile], str]:
         except UserError as error:
             reasons.append(f"{model.name}: {error}")
     if not samples:
-        return [], f"No pictures of the same test images. {'; '.join(reasons)}" if num else ""
+        return [], f"No pictures of common test images. {'; '.join(reasons)}" if num else ""
     return [
         model.tile(sample, BLUE if model is loaded[0] and len(models) > 1 else YELLOW)
         for sample in samples

@@ -35,7 +35,7 @@ BASELINE: Final = "dope"
 
 _HYDRA: Final = ".hydra"
 _TRACES: Final = (_HYDRA, CONFIG_FILE, METRICS_FILE, FAILURE_FILE)
-"""Files and folders of which every run leaves at least one."""
+"""Files and folders, at least one of which every run writes."""
 
 _ELSEWHERE: Final = ("output_dir", "resume", "ckpt_path", "baseline", "device", "num_pictures")
 """Options that state a location or a device and do not affect the result."""
@@ -55,9 +55,9 @@ class Run:
     """A run folder.
 
     Attributes:
-        overrides: Overrides of the run, without those that only state a location.
+        overrides: Overrides of the run, without options of locations.
         report: Result on the test set, or None.
-        failure: Reason for a missing result; empty if no result was asked for (``job=cost``).
+        failure: Reason for a missing result; empty if no result was requested (``job=cost``).
         config: Resolved config; empty if the run has none.
         recipe: All options that affect the result, except seed and objects, as one string; empty if
             unknown.
@@ -97,7 +97,7 @@ class Entry:
     Attributes:
         reports: Results on one test set, one per seed.
         seeds: Seed of each report's training; None if unknown.
-        failure: Reason for a missing result; empty if only the cost was asked for.
+        failure: Reason for a missing result; empty if only the cost was requested.
         pruned: Whether a search stopped the run, which does not count as a failure.
         runs: Run folders; empty if the reports were not read from a folder.
         refine: Kind of refinement; empty for the poses of the network itself.
@@ -213,7 +213,7 @@ def _read_result(run: Run) -> None:
     names = (FAILURE_FILE, PRUNED_FILE, METRICS_FILE, COST_FILE)
     name = next((name for name in names if (run.folder / name).is_file()), None)
     if name is None:
-        run.failure = f"unfinished: it left no {METRICS_FILE}"
+        run.failure = f"unfinished: no {METRICS_FILE}"
         if (run.folder / LAST_CHECKPOINT).is_file():
             run.failure += f"; continue with resume={run.folder}"
         return
@@ -225,14 +225,14 @@ def _read_result(run: Run) -> None:
         elif name == COST_FILE:
             run.cost = Cost(*(record[key] for key in Cost.__annotations__))
         else:
-            run.failure = str(record.get("reason", "without a reason"))
+            run.failure = str(record.get("reason", "failed for an unknown reason"))
             run.pruned = name == PRUNED_FILE
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        run.failure = f"{name} is not of this version: {error!r}"
+        run.failure = f"{name} is of another version: {error!r}"
 
 
 def overrides_of(folder: Path) -> list[str]:
-    """Return a run's overrides, without those of Hydra and those that only state a location."""
+    """Return a run's overrides, without options of Hydra and of locations."""
     listed = _yaml(folder / _HYDRA / "overrides.yaml")
     texts = [str(text).lstrip("+") for text in listed] if isinstance(listed, list) else []
     ignored = tuple(f"{name}=" for name in _ELSEWHERE)
@@ -240,7 +240,7 @@ def overrides_of(folder: Path) -> list[str]:
 
 
 def _mapping(path: Path) -> dict[str, Any]:
-    """Read a YAML mapping; return an empty one if there is none."""
+    """Read a YAML mapping; return an empty mapping if the file has none."""
     content = _yaml(path)
     return content if isinstance(content, dict) else {}
 
@@ -289,7 +289,7 @@ def group(runs: Sequence[Run]) -> list[Entry]:
 
 
 def with_refined(entries: Sequence[Entry]) -> list[Entry]:
-    """Return the methods, each followed by its refined version if every run measured one."""
+    """Return the methods, each followed by its refined version if measured in every run."""
     pairs: list[Entry] = []
     for entry in entries:
         pairs.append(entry)
@@ -322,8 +322,8 @@ def _join(method: Sequence[Entry]) -> Entry:
 def _name(entries: Sequence[Entry]) -> None:
     """Name each entry after its model and the overrides in which the entries differ.
 
-    Names that are too long or not unique contain the name of the folder, or its path if even the
-    folders have the same name.
+    Names that are too long or not unique contain the folder's name, or its path if the folder names
+    are equal as well.
     """
     overrides = [
         [text for text in entry.runs[0].overrides if all(text in r.overrides for r in entry.runs)]

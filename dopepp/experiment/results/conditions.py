@@ -75,7 +75,7 @@ _MARGIN: Final = 0.3
 """Margin around shaded objects on the sheet of examples, as a share of their extent."""
 
 _NOTABLE: Final = 0.05
-"""Change of the mean visible fraction above which a note is written."""
+"""Smallest change of the mean visible fraction that a note mentions."""
 
 
 @dataclass(frozen=True)
@@ -86,10 +86,10 @@ class Condition:
         name: Name of the option and of the files.
         axis: Quantity with its unit, for axes and titles.
         level: Column of the levels in the CSV file.
-        form: Format of a level in that unit.
+        form: Format of a level in the unit of ``axis``.
         introduction: Beginning of the page.
         images: Images of the levels, for error messages.
-        per_unit: Factor that converts a level to that unit.
+        per_unit: Factor that converts a level to the unit of ``axis``.
         ratio: Whether levels are ratios, which need a logarithmic axis.
     """
 
@@ -107,7 +107,7 @@ class Condition:
         return self.form.format(self.per_unit * level)
 
     def check_methods(self, methods: Mapping[str, Method]) -> None:
-        """Raise a user error for files of poses, which cannot be run on other images."""
+        """Raise a user error for files of poses, which have no poses on other images."""
         for name, method in methods.items():
             if isinstance(method, FileMethod):
                 raise UserError(
@@ -124,23 +124,23 @@ SHADING: Final = Condition(
     form="{:g} %",
     introduction="""# Shading
 
-Columns: the share of every object's visible pixels that patches of the image's own background
-cover (paper Table 3). What counts is decided before the shading.""",
+Columns: the share of every object's visible pixels that is covered by patches of the image's
+background (paper Table 3). Instances are selected before the shading.""",
     images="images with patches",
     per_unit=100,
 )
 
 SCALE: Final = Condition(
     name="scale",
-    axis="how many times as large the parts appear",
+    axis="apparent size of the parts, relative to the test set",
     level="scale",
     form="×{:g}",
     introduction="""# Scale
 
-Columns: how many times as large the parts appear as in the test set (paper Fig. 11). The scenes are
-those of the test set; the camera moves along its ray to the parts and divides their distance by so
-much. An instance counts by what is visible of it from there, at least 10 %.""",
-    images="images from elsewhere",
+Columns: the apparent size of the parts relative to the test set (paper Fig. 11). The camera moves
+along its ray to the parts and divides their distance by this factor; the scenes are unchanged.
+Instances with at least 10 % visible from the moved camera are evaluated.""",
+    images="images of the moved camera",
     ratio=True,
 )
 
@@ -240,7 +240,7 @@ def check_masks(source: SampleSource) -> None:
     """Check early that the images have instance masks.
 
     Raises:
-        UserError: No image has an instance mask, so there is nothing to shade.
+        UserError: No image has an instance mask.
     """
     samples = (source.sample(index) for index in range(len(source)))
     masks = (instance.mask for sample in samples for instance in sample.instances)
@@ -262,8 +262,8 @@ def measure_shading(
 ) -> tuple[list[Level], list[Tile]]:
     """Measure every method with shares of the visible area of every instance covered.
 
-    The visible fraction before the shading decides whether an instance counts. Otherwise heavily
-    shaded instances would be excluded from the measurement.
+    Instances are selected by the visible fraction before the shading. Otherwise heavily shaded
+    instances would be excluded from the measurement.
 
     Args:
         methods: Methods by name.
@@ -306,8 +306,8 @@ def _shaded(share: float, metrics: Mapping[str, PoseMetrics], reached: Sequence[
     finite = [covered for covered in reached if np.isfinite(covered)]
     mean = float(np.mean(finite)) if finite else math.nan
     note = (
-        f"At {SHADING.heading(share)}, {num_outside} of {len(reached)} instances are not within "
-        f"{100 * TOLERANCE:g} points of it: no mask, or no background to cover them with."
+        f"At {SHADING.heading(share)}, the covered share of {num_outside} of {len(reached)} "
+        f"instances is off by over {100 * TOLERANCE:g} points: no mask, or too little background."
     )
     rows = {name: accumulator.compute() for name, accumulator in metrics.items()}
     facts = {"share_reached": mean, "num_outside_tolerance": num_outside}
@@ -379,7 +379,7 @@ def _scale_level(scale: float, measured: Measured, unmoved: Measured) -> Level:
     visible, usual = _visible_fractions(measured), _visible_fractions(unmoved)
     mean = float(visible.mean()) if len(visible) else math.nan
     note = (
-        f"Instances that count at {SCALE.heading(scale)}: {_in_words(visible)}; "
+        f"Evaluated instances at {SCALE.heading(scale)}: {_in_words(visible)}; "
         f"at {SCALE.heading(1)}: {_in_words(usual)}."
         if len(visible) != len(usual) or abs(mean - usual.mean()) > _NOTABLE
         else ""
@@ -388,7 +388,7 @@ def _scale_level(scale: float, measured: Measured, unmoved: Measured) -> Level:
 
 
 def _in_words(fractions: Float[np.ndarray, "n"]) -> str:
-    share = f", of which {100 * fractions.mean():.0f} % is in sight on average"
+    share = f", {100 * fractions.mean():.0f} % visible on average"
     return f"{len(fractions)}{share}" if len(fractions) else "none"
 
 

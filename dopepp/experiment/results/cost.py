@@ -47,8 +47,8 @@ COST_FILE: Final = "cost.json"
 FRAMES_FILE: Final = "frames.csv"
 
 NOTE: Final = (
-    "ms/frame: the whole way from a test picture to poses. The network is untrained and would find "
-    "nothing, so poses are recovered from the picture's true maps with a trained network's noise."
+    "ms/frame: time from a test picture to poses. The untrained network would detect nothing, so "
+    "poses are recovered from the picture's true maps with the noise of a trained network."
 )
 """Note below tables with times."""
 
@@ -249,7 +249,7 @@ def save_frame_rates(path: Path, frames: Mapping[str, pd.DataFrame]) -> None:
 def full_size_cost(spec: Mapping[str, Any], input_size: tuple[int, int]) -> Cost:
     """Measure the untrained network of a spec at width 1.
 
-    The time is the median of three forward passes after an untimed one.
+    The time is the median of three forward passes after an untimed pass.
 
     Args:
         spec: Spec of the network.
@@ -272,7 +272,7 @@ def full_size_cost(spec: Mapping[str, Any], input_size: tuple[int, int]) -> Cost
 
 @torch.inference_mode()
 def _frames_per_s(estimator: PoseEstimator, batch_size: int, size: tuple[int, int]) -> float:
-    """Return the frames per second of the network alone, in its fastest pass over random images."""
+    """Return the network's frames per second in its fastest pass over random images."""
     device = estimator.device
     shape = (batch_size, 3, size[1], size[0])
     images = torch.randint(0, 256, shape, dtype=torch.uint8, device=device)

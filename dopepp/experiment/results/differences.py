@@ -232,7 +232,7 @@ def notes(entries: Sequence[Entry], table: pd.DataFrame) -> list[str]:
     widths = {float(model.get("width", 1.0)) for model in models if isinstance(model, dict)}
     if factors := ", ".join(f"{width:g}" for width in sorted(widths - {1.0})):
         narrowed = f"The networks were narrowed by model.width={factors}"
-        sentences.append(f"{narrowed}; figures of cost are of these.")
+        sentences.append(f"{narrowed}; costs are of the narrowed networks.")
     return sentences
 
 
@@ -247,13 +247,13 @@ def _baseline_notes(
     seeds = set(baseline.seeds)
     several = [entry for entry in alike if max(len(entry.seeds), len(seeds)) > 1]
     if unpaired := [entry.name for entry in several if set(entry.seeds) != seeds]:
-        reason = f"Not of the same seeds as {baseline.name}, so not paired over them"
+        reason = f"Not paired over seeds, because the seeds differ from those of {baseline.name}"
         yield f"{reason}: {', '.join(unpaired)}."
     if not baseline.test_set:
-        sentence = f"Without Δ: {baseline.name} does not say which images it was measured on"
-        yield f"{sentence}; evaluate.py measures it again."
+        sentence = f"Without Δ: the result of {baseline.name} does not identify its test images"
+        yield f"{sentence}; measure again with evaluate.py."
     elif unlike := [entry.name for entry in others if not comparable(entry, baseline)]:
-        sentence = f"Without Δ, because not measured on the same images as {baseline.name}"
+        sentence = f"Without Δ, because measured on other images than {baseline.name}"
         yield f"{sentence}: {', '.join(unlike)}."
 
 
@@ -266,11 +266,11 @@ def _interval_note(baseline: Entry, alike: Sequence[Entry]) -> str:
     )
     alone = [entry.name for entry in (baseline, *alike) if len(entry.reports) == 1]
     if len(alone) == len(alike) + 1:
-        return f"{sentence}. One training each: the noise of training is not in it."
+        return f"{sentence}. The interval excludes the noise of training (one training each)."
     if alone:
         names = ", ".join(alone)
-        unknown = "the noise of that training is not in it"
-        return f"{sentence} and over seeds. Of {names} there is one training: {unknown}."
+        unknown = f"the training noise of {names}, which has a single training"
+        return f"{sentence} and over seeds. The interval excludes {unknown}."
     return f"{sentence} and over the seeds of the trainings."
 
 
@@ -287,8 +287,8 @@ def noise(table: pd.DataFrame) -> list[str]:
             measures = (f"{value.column.heading}{_needed(value)}" for value in unsure)
             sentences.append(f"Within noise, {subject}: {', '.join(measures)}.")
     if (existing["num_differing"] < FEWEST_DIFFERING).any():
-        sentence = f"Where methods differ on fewer than {FEWEST_DIFFERING} instances"
-        sentences.append(f"{sentence}, no difference is called more than noise.")
+        sentence = f"If methods differ on fewer than {FEWEST_DIFFERING} instances"
+        sentences.append(f"{sentence}, the difference counts as noise.")
     return sentences
 
 
@@ -297,5 +297,5 @@ def _needed(change: Value) -> str:
     if math.isnan(change.seeds_to_tell) or change.value == 0:
         return ""
     if math.isinf(change.seeds_to_tell):
-        return " (more images would be needed to tell)"
-    return f" (about {change.seeds_to_tell:,.0f} seeds would tell)"
+        return " (significance needs more images)"
+    return f" (significance needs about {change.seeds_to_tell:,.0f} seeds)"

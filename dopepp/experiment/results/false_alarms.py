@@ -1,7 +1,7 @@
-"""Count what estimators report on pictures that show none of their parts.
+"""Count false detections of estimators on pictures that show none of their parts.
 
-The pictures are a user's own. They are taken with the camera of the test data, or with a camera
-that the user names.
+The user provides the pictures, taken with the camera of the test data or with another camera, whose
+file the user names.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ NUM_LOUDEST: Final = 6
 
 @dataclass(frozen=True)
 class FalseAlarms:
-    """What an estimator reports on pictures without its parts.
+    """Detections of an estimator on pictures without its parts.
 
     Attributes:
         num_pictures: Number of pictures.
@@ -89,8 +89,8 @@ def frames_without_parts(
 
     Args:
         folder: Folder of photos, searched recursively.
-        camera: Camera file; None for the camera of the data. Pictures of another size are scaled
-            and cropped to the camera's.
+        camera: Camera file; None for the camera of the data. Pictures are scaled and cropped to
+            the camera's size.
         data: Test data.
         parts: Parts of the estimators.
 
@@ -147,7 +147,7 @@ def _tile(estimator: PoseEstimator, sample: Sample) -> Tile:
 
 
 def alarm_rows(report: Report) -> list[Row]:
-    """Return the table of a method and its refined poses; empty without such pictures."""
+    """Return the table of a method and its refined poses; empty without pictures."""
     reports = [report] if report.refined is None else [report, report.refined]
     return [
         FalseAlarms(**each.details[KEY]).row(each.name) for each in reports if KEY in each.details

@@ -41,7 +41,7 @@ BEST_CHECKPOINT: Final = Path(FOLDER, BEST)
 LAST_CHECKPOINT: Final = Path(FOLDER, LAST)
 
 _MAX_DIFF_BYTES: Final = 10_000_000
-"""Maximum size of the uncommitted changes to store; only the hash of larger ones is stored."""
+"""Maximum size of stored uncommitted changes; of larger changes, only the hash is stored."""
 _MAX_UNTRACKED: Final = 100
 
 
@@ -132,7 +132,7 @@ def environment(seed: int, data_fingerprint: str) -> dict[str, Any]:
 
 
 def _memory_bytes() -> int | None:
-    """Return the size of the machine's memory, or None where the system does not report it."""
+    """Return the size of the machine's memory, or None if the system does not report it."""
     try:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError):
@@ -151,7 +151,7 @@ def _git(*arguments: str) -> bytes | None:
 def _git_state() -> dict[str, Any] | None:
     """Return the commit of the package and its uncommitted files, or None outside git.
 
-    A package that is installed inside another repository does not count as part of it.
+    A package installed inside another repository is outside git.
     """
     is_part = _git("ls-files", "--error-unmatch", "__init__.py") is not None
     commit, status = _git("rev-parse", "HEAD"), _git("status", "--porcelain")

@@ -47,7 +47,7 @@ WITHIN: Final = "within noise"
 BEYOND: Final = "beyond noise"
 
 FEWEST_DIFFERING: Final = fewest_differing(0.95)
-"""Minimum number of differing instances for a difference that is not due to chance."""
+"""Minimum number of differing instances for a significant difference."""
 
 _TEXTS: Final = ("method", "object", "measure", "overrides", "folder", "job", "state")
 """Headings of text columns."""
@@ -70,7 +70,7 @@ class Value(NamedTuple):
         high: Upper end.
         num_differing: For a difference, number of instances on which the methods differ; NaN if
             the methods cannot be compared.
-        seeds_to_tell: For a difference, approximate number of seeds that would make it significant.
+        seeds_to_tell: For a difference, approximate number of seeds for significance.
         deviation: For a mean, sample standard deviation over the seeds.
         seeds: Seeds of the method on the object.
     """
@@ -140,7 +140,7 @@ class Value(NamedTuple):
 
     @property
     def summary(self) -> str:
-        """Mean ± deviation, or Δ with its interval and a mark if the difference may be chance."""
+        """Mean ± deviation, or Δ with its interval and a mark if not significant."""
         if self.is_change and self.ends:
             unsure = f" {WITHIN}" if self.within_noise else ""
             return f"{self.text} [{', '.join(self.ends)}]{unsure}"
@@ -176,7 +176,7 @@ def row_values(
     rates: Sequence[str] = (),
     condition: float = 0.0,
 ) -> Iterator[Value]:
-    """Yield the values of some fields of a row; ``rates`` are the fields that have an interval."""
+    """Yield the values of some fields of a row; fields in ``rates`` have an interval."""
     for field in fields:
         value = getattr(row, field)
         value = math.nan if value is None else float(value)
@@ -221,7 +221,7 @@ def heading(measure: str) -> str:
 
 
 def header_of(rows: Sequence[Mapping[str, object]]) -> list[str]:
-    """Return all headings, beginning with those of the longest row."""
+    """Return all headings, beginning with the headings of the longest row."""
     return list(dict.fromkeys([*max(rows, key=len), *(key for row in rows for key in row)]))
 
 
@@ -256,7 +256,7 @@ def rate_curves(rates: Iterable[Value], per_unit: float = 1.0) -> dict[str, Rate
 def coverage_curve(instances: Gathered) -> RateCurve | None:
     """Return the observed coverage of an object's covariance regions over the nominal coverage.
 
-    Matched poses with a covariance count; None if there are none.
+    The curve covers matched poses with a covariance; None without any.
     """
     distances = instances.errors.mahalanobis
     stated = None if distances is None else distances[distances.isfinite()]
@@ -309,8 +309,8 @@ MSSD_01D: Final = PassRate("mssd_01d", "mssd", 0.1)
 def reported_rates(data: DataConfig, parts: Parts) -> tuple[PassRate, ...]:
     """Return the pass rates to report for a data set.
 
-    These are the paper's rate (ADD below 0.1 m on YCB-Video, below 0.05 m elsewhere) and ADD-0.1d.
-    If a part has symmetries, which ADD ignores, MSSD-0.1d is reported as well.
+    The rates are the paper's rate (ADD below 0.1 m on YCB-Video, below 0.05 m elsewhere), ADD-0.1d
+    and, if a part has symmetries, MSSD-0.1d.
     """
     is_ycb = data.root is not None and data.format == "ycb_video"
     rates = (ADD_10CM if is_ycb else ADD_5CM), ADD_01D

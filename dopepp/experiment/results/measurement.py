@@ -67,14 +67,14 @@ class Method(Protocol):
 
     Attributes:
         parts: Objects to score, as defined by the test set.
-        min_score: Score from which a candidate is reported.
+        min_score: Smallest score of a reported candidate.
     """
 
     parts: Parts
     min_score: float
 
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
-        """Return all candidates in an image and the seconds it took, or None if unknown."""
+        """Return all candidates in an image, and the time in seconds, or None if unknown."""
 
     def cost(self, seconds: Sequence[float]) -> Cost:
         """Return the cost of the method, given the known times of all images in order."""
@@ -86,7 +86,7 @@ def reported(method: Method, candidates: Sequence[ScoredPose]) -> list[ScoredPos
 
 
 class EstimatorMethod:
-    """Estimator that runs on images at their own size and is scored on its own objects."""
+    """Estimator that runs on images at native size and is evaluated on its own objects."""
 
     def __init__(self, estimator: PoseEstimator, parts: Parts) -> None:
         names = {part.name for part in estimator.parts}
@@ -159,7 +159,7 @@ class FileMethod:
             self._unused.setdefault((row.scene_id, row.im_id), []).append(row)
 
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
-        """Return the poses of an image and the largest time that its lines state."""
+        """Return the poses of an image and the largest time in its lines."""
         rows = self._used.setdefault(image, self._unused.pop(image, []))
         poses = [
             FilePose(part.name, row.score, T, project_keypoints(part.cuboid, T, sample.K))
@@ -183,16 +183,16 @@ class FileMethod:
         unused = [row for rows in self._unused.values() for row in rows]
         if unused and not used:
             raise UserError(
-                f"{self._path}, whose {len(unused):,} poses are all on other images, the first "
-                f"in scene {unused[0].scene_id}, image {unused[0].im_id}",
+                f"{self._path}, whose {len(unused):,} poses are all on other images, e.g. scene "
+                f"{unused[0].scene_id}, image {unused[0].im_id}",
                 f"images of the test set, e.g. scene and image {next(iter(self._used), 'none')}",
-                "choose the images that the file was made for, e.g. with data.image_sets.test",
+                "select the images of the file, e.g. with data.image_sets.test",
             )
         others = sum(row.obj_id not in self._parts for row in used)
         if unused or others:
             _log.warning(
-                "%s: left out %s poses on images that are not in the test set and %s of objects "
-                "that are not measured",
+                "%s: ignoring %s poses on images outside the test set and %s poses of other "
+                "objects",
                 self._path,
                 f"{len(unused):,}",
                 f"{others:,}",
@@ -261,8 +261,8 @@ def measure(
 ) -> Measured:
     """Run methods over the same images at their native size.
 
-    AP, BOP scores and files of poses are over all candidates, as scores rank them; every other
-    measure is over the reported poses. Pictures show the ground truth in green, predictions of the
+    AP, BOP scores and files of poses include all candidates; every other measure includes the
+    reported poses only. Pictures show the ground truth in green, predictions of the
     last method in yellow and those of the other methods in blue (paper Fig. 14).
 
     Args:

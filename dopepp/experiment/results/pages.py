@@ -39,37 +39,37 @@ FAILED: Final = "failed"
 PRUNED: Final = "stopped by the search"
 
 FILES: Final = {
-    "checkpoints/best_tuned.ckpt": "the same as `best.ckpt`, tuned; the one to use",
-    "checkpoints/best.ckpt": "the weights with the best validation",
-    "checkpoints/last.ckpt": "where `resume=` continues",
-    "checkpoints/previous.ckpt": "the one before, should that be damaged",
-    "metrics.json": "the measurement on the test set, every instance's error included",
+    "checkpoints/best_tuned.ckpt": "`best.ckpt` after tuning; the checkpoint to use",
+    "checkpoints/best.ckpt": "weights with the best validation result",
+    "checkpoints/last.ckpt": "latest state, from which `resume=` continues",
+    "checkpoints/previous.ckpt": "the state before `last.ckpt`, as a backup",
+    "metrics.json": "result on the test set, with the error of every instance",
     "metrics.csv": "losses, rates and validation over the steps",
-    "config.yaml": "every option, resolved",
+    "config.yaml": "all options, resolved",
     "versions.json": "command, commit, packages, hardware, seed and fingerprint of the data",
     "without_part.png": "highest-scoring pictures without the part, with the best candidates",
     "overlay.png": "test images: truth in green, prediction in yellow",
-    "coverage.png": "how often the truth lies within the stated covariance region, over its level",
+    "coverage.png": "share of true poses inside their covariance region, over its level",
     "auc.png": "share of test instances below each error (numbers in `auc.csv`)",
     "val_overlay.png": "validation images of the last epoch",
     "val_belief.png": "their belief maps: strongest corner and centroid",
     "val_auc.png": "their errors (numbers in `val_auc.csv`)",
-    "shading.png": "pass rate with parts of the object covered (`shading.csv`)",
-    "scale.png": "pass rate with the camera nearer or farther (`scale.csv`)",
+    "shading.png": "pass rate of partly covered objects (`shading.csv`)",
+    "scale.png": "pass rate at other camera distances (`scale.csv`)",
     "scale_examples.png": "the same scenes at every scale, drawn as in `overlay.png`",
     "compare.md": "the methods side by side (numbers in `compare.csv`)",
-    "table.md": "the same in the paper's layout, its figures beside them (`table.csv`)",
+    "table.md": "the methods in the layout of the paper, with the paper's figures (`table.csv`)",
     "lr_finder.png": "loss against learning rate (numbers in `lr_finder.csv`)",
-    "cost.json": "parameters, operations, and times from picture to poses and of the network alone",
-    "frame_rate.png": "frames a second over time, dashed the network alone (`frames.csv`)",
-    "tuning.json": "what tuning has changed",
-    "job.log": "what the job has printed",
-    "wandb": "what Weights & Biases holds of it; `wandb sync` sends it",
-    "tensorboard": "what TensorBoard shows of it",
-    "profile": "where the time went",
+    "cost.json": "parameters, operations, and times of whole frames and of the network alone",
+    "frame_rate.png": "frames per second over time; dashed: the network alone (`frames.csv`)",
+    "tuning.json": "changes by tuning",
+    "job.log": "output of the job",
+    "wandb": "log for Weights & Biases; upload with `wandb sync`",
+    "tensorboard": "log for TensorBoard",
+    "profile": "running time by function",
     "nonfinite": "the batch whose loss or gradient was not finite",
-    "failed.json": "why the job failed",
-    "pruned.json": "why the search stopped it",
+    "failed.json": "reason for the failure of the job",
+    "pruned.json": "reason for stopping the trial",
 }
 """Files that a run may write, ordered by relevance."""
 
@@ -127,12 +127,12 @@ class RunReadme:
         since = datetime.now().astimezone().isoformat(" ", "seconds")
         self.end(
             RUNNING,
-            f"Since {since}, process {os.getpid()} on {socket.gethostname()}. If that process is "
-            "gone, it was killed: resume the run.",
+            f"Since {since}, process {os.getpid()} on {socket.gethostname()}. If this process no "
+            "longer exists, the run was killed: resume it.",
         )
 
     def end(self, state: str, reason: str = "", report: Report | None = None) -> None:
-        """Write how the run ended: the state, the reason and the result."""
+        """Write the final state, the reason and the result."""
         if not self._begun:
             return
         title = f"{self._config.model.name} on {self._config.data.name}: {state}"
@@ -146,7 +146,7 @@ class RunReadme:
         best = self._folder / checkpoint.get("checkpoint", BEST_CHECKPOINT)
         best = shlex.quote(program.shown(best))
         train, evaluate = program.typed("train"), program.typed("evaluate")
-        lines = [f"{train} resume={run}  # go on"]
+        lines = [f"{train} resume={run}  # continue"]
         if state == FINISHED:
             epochs = 2 * self._config.trainer.max_epochs
             lines = [
@@ -172,10 +172,10 @@ def write_run_readme(
 
     Args:
         folder: Run folder.
-        title: What was run.
+        title: Title of the page.
         report: Result on the test set.
-        reason: Why the run ended or how it stands, as a sentence.
-        next_commands: Commands that a reader may type next.
+        reason: Sentence on the state of the run, or on the reason for its end.
+        next_commands: Suggested commands.
         is_trial: Whether the run is a trial of a search, which keeps no checkpoints.
     """
     present = read_json(folder / VERSIONS_FILE)
@@ -235,7 +235,7 @@ def release(checkpoint: Path, results: Path, name: str, folder: Path) -> list[Pa
         folder: Folder to write to.
 
     Raises:
-        UserError: A file is of another kind, or the release is too large.
+        UserError: A file is of the wrong kind, or the release is too large.
     """
     if not name.isidentifier():
         allowed = "letters, digits and _, not starting with a digit"

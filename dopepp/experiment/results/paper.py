@@ -65,7 +65,7 @@ _LABELS: Final = ("method", "object", "measure")
 _METHOD, _OBJECT, _MEASURE = _LABELS
 _STRICT: Final = "add_01d"
 _NETWORK: Final = "network"
-"""Key in place of an object for figures that belong to the whole network."""
+"""Key of the whole network's figures, in place of an object."""
 _PAPER: Final = "the paper"
 
 _PASS_FIELDS: Final = {rate.threshold: rate.field for rate in (ADD_5CM, ADD_10CM)}
@@ -123,7 +123,7 @@ class PaperTable:
         table = config.get("table") if isinstance(config, dict) else None
         if not isinstance(table, dict):
             raise UserError(
-                f"{path}, which lays out no table",
+                f"{path}, which has no table layout",
                 "an experiment with `table:`",
                 "pass e.g. conf/experiment/table4_parameters.yaml",
             )
@@ -189,11 +189,11 @@ def _notes(table: PaperTable, entries: Sequence[Entry]) -> list[str]:
         if any(entry.refine for entry in entries):
             notes.append(REFINED_NOTE)
         if any(_starts_untrained(run.config) for entry in entries for run in entry.runs):
-            sentence = "DOPE's VGG19 started untrained, as nothing is downloaded"
+            sentence = "DOPE's VGG19 started untrained, because nothing is downloaded"
             option = "model.backbone.weights_path=FILE"
             notes.append(f"{sentence}; {option} starts it from a file of torchvision's.")
     if not table.paper:
-        notes.append("The paper prints no such table.")
+        notes.append("The paper has no table of these figures.")
     return notes
 
 
@@ -211,7 +211,7 @@ Laid = tuple[list[Row], list[str]]
 
 
 def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
-    """Return a row per object and method, with the paper's measures and stricter ones.
+    """Return a row per object and method, with the paper's measures and stricter measures.
 
     The baseline of Δ is the first method with a result, or the first refined method for refined
     poses. The reference rows come last.
@@ -236,7 +236,7 @@ def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
             if entry is not None and name in entry.objects:
                 rows.append(_pose_row(layout, label, name, texts[label, name], printed))
             elif entry is not None:
-                reason = f"{label}: {entry.failure or 'not measured on it'}"
+                reason = f"{label}: {entry.failure or 'not measured on this object'}"
                 rows.append(_pose_row(layout, reason, name, {}, printed))
             elif name in in_paper or name in recomputed:
                 numbers = recomputed.get(name, {}).items()
@@ -415,7 +415,7 @@ def _cost_rows(
 
 
 def _failed(label: str, entry: Entry) -> str:
-    return f"{label}: {entry.failure or 'no such measurement'}"
+    return f"{label}: {entry.failure or 'not measured'}"
 
 
 KINDS: Final[Mapping[str, Callable[[PaperTable, Mapping[str, Entry], Path], Laid]]] = {

@@ -73,7 +73,7 @@ def measure_and_record(
         bop_csv: Whether to write the poses of each method.
         all_measures: Whether to print symmetric measures of objects without symmetries.
         protocols: Further protocols to measure.
-        refine: Refinement with which every estimator is measured in addition.
+        refine: Refinement to measure in addition, for every estimator.
         without_parts: Pictures without the parts, on which detections are counted.
 
     Returns:
@@ -124,7 +124,7 @@ def measure_and_record(
             measured.metrics[main.name], measured.metrics[main.refined.name]
         )
         in_words = ", ".join(f"{share:.1%} in {error}" for error, share in shares.items())
-        display.console.print(f"refined poses worse than the network's by over 1 mm: {in_words}")
+        display.console.print(f"poses that refinement made worse by over 1 mm: {in_words}")
     write_json(run_dir / METRICS_FILE, main.to_record())
     if bop_csv:
         _write_results(run_dir, measured.poses, data, numbers)
@@ -152,7 +152,7 @@ def of_networks(reports: list[Report], num_files: int) -> list[Report]:
 
 
 def main_report(reports: Sequence[Report]) -> Report:
-    """Return the report that contains a report of refined poses, or else the last report."""
+    """Return the first report with refined poses, or else the last report."""
     return next((report for report in reports if report.refined is not None), reports[-1])
 
 
@@ -170,7 +170,7 @@ def with_refining(
 
 
 def refining(estimator: PoseEstimator, refine: Refine | None, parts: Parts) -> PoseEstimator:
-    """Return a copy of an estimator that refines its poses; None returns the same estimator.
+    """Return a copy of an estimator that refines its poses; without ``refine``, the estimator.
 
     Parts of the checkpoint without a mesh use the mesh of ``parts``.
     """
@@ -186,7 +186,7 @@ def refining(estimator: PoseEstimator, refine: Refine | None, parts: Parts) -> P
 def made_worse(network: PoseMetrics, refined: PoseMetrics) -> dict[str, float]:
     """Return the shares of refined poses that exceed the network's error by more than 1 mm.
 
-    Parts that refinement loses do not count; the recall shows them.
+    Parts that are missing after refinement are ignored; the recall includes them.
 
     Returns:
         Shares by error: ``add`` and ``translation``.

@@ -1,4 +1,4 @@
-"""The result of one method on one test set, as stored in ``metrics.json``.
+"""The result of a method on a test set, as stored in ``metrics.json``.
 
 A report holds a fingerprint of its test images, because results on different images cannot be
 compared.
@@ -34,7 +34,7 @@ Errors = dict[str, Float[np.ndarray, "instances"]]
 
 @dataclass(frozen=True)
 class Cost:
-    """Cost of a method; None where unknown.
+    """Cost of a method; None if unknown.
 
     Attributes:
         parameters: Number of trained parameters.
@@ -49,7 +49,7 @@ class Cost:
 
 @dataclass
 class Report:
-    """Result of one method on one test set.
+    """Result of a method on a test set.
 
     Attributes:
         name: Name of the method.
@@ -84,7 +84,7 @@ class Report:
 
     @property
     def tables(self) -> dict[str, list[PoseRow]]:
-        """Rows of every object, and of the mean if there are several: own, refined, references."""
+        """Rows by object or ``mean``: of the method, of its refined poses, and of references."""
         refined = [] if self.refined is None else [self.refined.rows]
         return {
             name: [row, *(rows[name] for rows in (*refined, *self.references.values()))]

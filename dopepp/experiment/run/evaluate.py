@@ -53,7 +53,7 @@ def tune_and_record(
 ) -> Path:
     """Tune a checkpoint, write it next to the original and print the changes; return its path."""
     if target.false_positive_rate == 1:
-        fix = "0.005 keeps the network silent on images without the part"
+        fix = "set e.g. 0.005 to suppress detections on images without the part"
         _log.warning("false_positive_rate=1: every candidate is reported; %s", fix)
     tuning = tune(estimator, data, parts, target)
     tuned = write_tuned(estimator.checkpoint, path, tuning.options)
@@ -79,7 +79,7 @@ def _show(tuning: Tuning, path: Path) -> None:
 
 
 def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part]:
-    """Return the last estimator's parts as the test data define them, or all without estimators."""
+    """Return the test data's parts: those of the last estimator, or all without estimators."""
     if not estimators:
         return build_parts(data)
     names = [part.name for part in estimators[-1].parts]
@@ -163,7 +163,7 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
 
 
 def _check_combination(asked: EvaluationConfig) -> None:
-    """Refuse options that exclude or need each other."""
+    """Raise a UserError for options that exclude or require each other."""
     has_network = asked.ckpt_path is not None or asked.baseline is not None
     if asked.ckpt_path is None and asked.results is None and asked.templates is None:
         fix = "add ckpt_path=FILE for a checkpoint, results=FILE for a file of poses, or "
@@ -187,14 +187,14 @@ def _check_combination(asked: EvaluationConfig) -> None:
             fix,
         )
     if asked.negatives is not None and not has_network and asked.templates is None:
-        fix = "add ckpt_path, or leave out negatives: a file has no poses in these pictures"
+        fix = "add ckpt_path, or leave out negatives (a file has no poses on these pictures)"
         raise UserError(
             f"negatives={asked.negatives} without ckpt_path", "both options together", fix
         )
     if asked.tune and (asked.protocols or asked.negatives is not None or asked.templates):
-        got = "tune=true with shading, scale, by, negatives or templates"
+        problem = "tune=true with shading, scale, by, negatives or templates"
         fix = "tune first, then measure"
-        raise UserError(got, "tune=true without these options", fix)
+        raise UserError(problem, "tune=true without these options", fix)
 
 
 def _tune_only(
@@ -217,7 +217,7 @@ def _tune_only(
         fix = "add ckpt_path=FILE" if is_missing else "leave out baseline"
         raise UserError(problem, "one ckpt_path, and no baseline", fix)
     if not isinstance(loaded[0].network, PoseNetwork):
-        fix = "tune the checkpoint, then export the tuned one"
+        fix = "tune the checkpoint, then export the tuned checkpoint"
         raise UserError(f"tune=true of {asked.ckpt_path}, which is an export", "a checkpoint", fix)
     estimator = refining(loaded[0], asked.refine, parts)
     tune_and_record(estimator, Path(asked.ckpt_path), parts, data, run_dir, asked)

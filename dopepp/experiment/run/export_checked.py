@@ -66,7 +66,7 @@ def export(
     """
     target = _target(path, layout, precision, out)
     if runtimes.is_export(path):
-        fix = "pass the checkpoint that it was exported from"
+        fix = "pass the original checkpoint"
         raise UserError(f"{path}, which is an export", "a checkpoint", fix)
     check_possible(layout, precision)
     network, checkpoint = load_network(path)
@@ -121,12 +121,12 @@ def _target(path: Path, layout: str, precision: str, out: Path | None) -> Path:
         out = folder / f"{path.stem}{short}{ending}"
     is_file = ending.startswith(".")
     if (is_file and out.suffix != ending) or (not is_file and out.suffix in (".xml", ".onnx")):
-        what = f"a file NAME{ending}" if is_file else "a folder"
+        allowed = f"a file NAME{ending}" if is_file else "a folder"
         fix = f"pass e.g. --out {path.stem}{ending}"
-        raise UserError(f"--out {out} for --format {layout}", what, fix)
+        raise UserError(f"--out {out} for --format {layout}", allowed, fix)
     others = [path for path in out.glob("*") if path.suffix not in (".xml", ".bin")]
     if (is_file and out.is_dir()) or (not is_file and out.is_file()) or others:
-        problem = f"--out {out}, where something else exists"
+        problem = f"--out {out}, which exists and is not an export"
         raise UserError(problem, "a new path, or an earlier export", "pass a new path with --out")
     if out.exists() and path.exists() and out.samefile(path):
         fix = "pass another path with --out"

@@ -140,7 +140,7 @@ def _sweep(
             num_training=options.num_steps,
             update_attr=False,
         )
-    assert sweep is not None, "Lightning skips the sweep in its fast_dev_run alone"
+    assert sweep is not None, "Lightning skips the sweep only with fast_dev_run"
     per_step = trainer.accumulate_grad_batches
     count = min(len(sweep.results["lr"]), len(passes) // per_step)
     losses = np.array(passes[: count * per_step]).reshape(count, per_step).mean(axis=1)
@@ -192,11 +192,11 @@ def _report(rates: Steps, losses: Steps, run_dir: Path) -> Suggestion | None:
         axes.legend()
     write_png(run_dir / PICTURE_FILE, figure_image(figure))
     text = (
-        "the loss does not fall anywhere in the sweep: widen lr_finder.min_lr … max_lr, or look at "
+        "the loss does not fall anywhere in the sweep: widen lr_finder.min_lr … max_lr, or check "
         "the data"
         if suggestion is None
         else f"suggested optimizer.lr={suggestion.steepest:.2g}, where the loss falls fastest; "
-        f"it is lowest at {suggestion.lowest:.2g}"
+        f"the lowest loss is at {suggestion.lowest:.2g}"
     )
     display.console.print(f"{text}; {run_dir / PICTURE_FILE}")
     return suggestion

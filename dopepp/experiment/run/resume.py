@@ -103,8 +103,8 @@ def check_resume(
             f"resume={run}, whose network differs from the chosen one ({_listed(network + state)})"
             if not state
             else f"resume={run} with another optimiser ({_listed(state)})",
-            "the model, the number of objects and the optimiser of that run",
-            "set these options as in that run, or start a new run with "
+            "the model, the number of objects and the optimiser of the interrupted run",
+            "restore these options, or start a new run with "
             f"init_from={run / BEST_CHECKPOINT} if the network is the same",
         )
     learnt = [change for change in differences if below(change.key, LEARNT_FROM)]
@@ -114,8 +114,8 @@ def check_resume(
     if learnt and not config.resume_anyway:
         raise UserError(
             f"resume={run} with other data or another loss ({_listed(learnt)})",
-            "the data and the loss of that run",
-            "set these options as in that run, or add resume_anyway=true",
+            "the data and the loss of the interrupted run",
+            "restore these options, or add resume_anyway=true",
         )
     return list(dict.fromkeys([*differences, *learnt]))
 
@@ -135,7 +135,7 @@ def image_differences(saved: object, present: object) -> list[ConfigDifference]:
     if not isinstance(saved, Mapping) or not isinstance(present, Mapping):
         return []  # the checkpoint was not written by train.py
     return [
-        ConfigDifference(f"{split} images", ("as trained on", f"others ({'; '.join(lines)})"))
+        ConfigDifference(f"{split} images", ("as trained on", f"changed ({'; '.join(lines)})"))
         for split in ("train", "val")
         for lines in [differing_images(saved[split], present[split])]
         if lines
@@ -165,7 +165,7 @@ def trusted_overrides(stored: object, source: Path) -> list[str]:
             continue
         if "hydra" in re.split(r"[/.@:]", match["key"]):
             _log.warning(
-                "%s: %r is left out, options of Hydra are not read from a run", source, text
+                "%s: ignoring %r, because options of Hydra are not read from a run", source, text
             )
             continue
         kept.append(text)
@@ -177,8 +177,8 @@ def read_overrides(run: Path) -> list[str] | None:
     resume_file, overrides, hydra = (run / path for path in (OVERRIDES_FILE, OVERRIDES, _HYDRA))
     if resume_file.is_file():
         return trusted_overrides(read_json(resume_file).get("overrides"), resume_file)
-    # The run was killed before it wrote its own file. Hydra writes the overrides into two files,
-    # and a truncated file differs from the other one.
+    # The run was killed before it wrote its own file. Hydra writes the overrides into two files;
+    # if they differ, a file is truncated.
     if not overrides.is_file():
         return None
     stored = read_yaml(overrides)
@@ -188,7 +188,7 @@ def read_overrides(run: Path) -> list[str] | None:
 
 
 def remember_overrides(run: Path) -> None:
-    """Store the overrides of a run atomically, as Hydra does not."""
+    """Store the overrides of a run atomically, unlike Hydra."""
     if not HydraConfig.initialized():
         return
     overrides = [str(text) for text in HydraConfig.get().overrides.task]
@@ -277,7 +277,7 @@ def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Parts)
     Args:
         checkpoint: Checkpoint to evaluate.
         data: Test data; data with other options are not compared.
-        parts: Objects of the checkpoint as the test data define them.
+        parts: Objects of the checkpoint, as defined by the test data.
     """
     pairs = zip(checkpoint.parts, parts, strict=True)
     others = [a.name for a, b in pairs if a.mesh_hash and b.mesh_hash not in ("", a.mesh_hash)]
@@ -296,8 +296,8 @@ def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Parts)
     differences = differing_images(stored["test"], present)
     if differences:
         _log.warning(
-            "the test images differ from those of the checkpoint's own measurement, "
-            "though their configuration is the same: %s",
+            "the test images have changed since the checkpoint was measured, although the "
+            "configuration is equal: %s",
             "; ".join(differences),
         )
 

@@ -93,7 +93,7 @@ def _refuse_parallel_multirun(trainer: TrainerConfig) -> None:
         nodes = "" if trainer.num_nodes == 1 else f" trainer.num_nodes={trainer.num_nodes}"
         raise UserError(
             f"trainer.devices={trainer.devices}{nodes} in a multirun",
-            "one process per job: each further process would run the whole sweep again",
+            "one process per job (each further process would repeat the whole sweep)",
             "set trainer.devices=1 and start one process, or run the jobs one by one",
         )
 
@@ -134,7 +134,7 @@ def _train(
     if not config.keep_checkpoints and config.resume is not None:
         raise UserError(
             f"resume={config.resume} with keep_checkpoints=false",
-            "a run whose checkpoints are kept",
+            "a run with keep_checkpoints=true",
             "set keep_checkpoints=true, or start a new run without resume",
         )
     seed_everything(config.seed, verbose=False)
@@ -173,7 +173,7 @@ def _train(
             tracker.log_hyperparams(dict(config.plain))
     display.show_sources(datamodule.summary())
     for line in template_commands(config.data):
-        display.console.print(f"already works without training: {line}", soft_wrap=True)
+        display.console.print(f"available now, without training: {line}", soft_wrap=True)
     _announce_duration(config.trainer, system, datamodule, trainer)
     _fit(trainer, system, datamodule, resume_from, run_dir)
     raise_if_pruned(trainer)
@@ -184,7 +184,7 @@ def _train(
     log_report(trackers, report, run_dir)
     if not config.keep_checkpoints:
         shutil.rmtree(run_dir / FOLDER)
-        display.console.print("everything has run; the checkpoints are removed")
+        display.console.print("training and measurement are complete; removing the checkpoints")
     return report
 
 
@@ -220,7 +220,7 @@ def _say_how_it_ended(trainer: Trainer, run_dir: Path) -> None:
             )
     rows = profile_rows(trainer.profiler)  # type: ignore[attr-defined]
     if rows:
-        display.show_table(f"where the time went; all of it in {run_dir / PROFILE}", rows)
+        display.show_table(f"running time by function; details in {run_dir / PROFILE}", rows)
 
 
 def _announce_duration(
@@ -238,9 +238,9 @@ def _announce_duration(
 
 
 def template_commands(data: DataConfig) -> list[str]:
-    """Return a command per part that estimates its poses without training, for the user's camera.
+    """Return a command for each part that estimates poses by templates with the user's camera.
 
-    Only meshes have one, not the objects of a data set.
+    The objects of a data set have no command.
     """
     virtual, lens = data.virtual, data.virtual.camera
     if data.root is not None or lens is None or virtual.working_distance is None:
@@ -266,7 +266,9 @@ def _resume_path(
     if resume is None:
         if config.resume_anyway:
             fix = "add resume=FOLDER, or leave out resume_anyway"
-            raise UserError("resume_anyway=true without resume", "both, or resume alone", fix)
+            raise UserError(
+                "resume_anyway=true without resume", "both options, or resume alone", fix
+            )
         return None, []
     run_dir = Path(resume)
     newest = newest_checkpoint(run_dir)

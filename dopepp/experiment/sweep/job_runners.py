@@ -90,7 +90,7 @@ class Jobs:
 
 
 Ended = Iterator[tuple[int, JobReturn | Exception]]
-"""Results of jobs by number as they end; an exception if the process was lost."""
+"""Results of jobs by number, in the order of completion; an exception for a lost process."""
 
 Runner = Callable[[Jobs, Mapping[int, list[str]]], Ended]
 """Function that runs jobs, given as overrides by number."""
@@ -152,7 +152,7 @@ def on_ray(address: str | None, num_cpus: float, num_gpus: float) -> Runner:
             available_cores(),
             "hydra/launcher=ray",
             "hydra.launcher.address",
-            # A job that crashed its process would probably crash it again.
+            # A job that crashed its process would probably crash a second process.
             max_retries=0,
             num_cpus=num_cpus,
             num_gpus=num_gpus,
@@ -196,8 +196,8 @@ def on_slurm(folder: str, cluster: str, max_num_timeout: int, sbatch: Mapping[st
             handles = executor.map_array(jobs, overrides.items())
         except (RuntimeError, ValueError, NameError, TypeError, OSError) as error:
             raise UserError(
-                f"hydra/launcher=submitit_slurm, which this machine or SLURM refuses: {error}",
-                "a machine with srun and sbatch, and options of sbatch that the cluster takes",
+                f"hydra/launcher=submitit_slurm, which failed: {error}",
+                "a machine with srun and sbatch, and sbatch options that the cluster accepts",
                 "change the option hydra.launcher.… that this message names, or run the jobs on "
                 "this machine with hydra.launcher.cluster=local",
             ) from error

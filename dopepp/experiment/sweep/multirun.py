@@ -136,7 +136,7 @@ def _redirect(targets: list[int]) -> None:
 def goes_on(config: Mapping[str, Any], run_dir: Path) -> bool:
     """Return whether a job was interrupted in this folder with the same config.
 
-    This is the case for requeued SLURM jobs and for restarted searches.
+    Requeued SLURM jobs and restarted searches continue in their folder.
     """
     from dopepp.experiment.results.folder import CONFIG_FILE, LAST_CHECKPOINT
     from dopepp.experiment.run.resume import config_differences

@@ -182,7 +182,7 @@ def read_space(loader: ConfigLoader, space: Sequence[str], arguments: Sequence[s
     """Read the search space; overrides of the command line take precedence.
 
     Raises:
-        UserError: An entry is not a sweep, or there is nothing to vary.
+        UserError: An entry is not a sweep, or no option is varied.
     """
     parser = OverridesParser.create(config_loader=loader)
     try:
@@ -193,7 +193,7 @@ def read_space(loader: ConfigLoader, space: Sequence[str], arguments: Sequence[s
     sweeps: dict[str, Override] = {}
     for entry in entries:
         if not entry.is_sweep_override():
-            raise _bad_entry(f"{entry.input_line!r}, which is one value")
+            raise _bad_entry(f"{entry.input_line!r}, which is a single value")
         sweeps[entry.get_key_element()] = entry
     fixed = []
     for override in given:
@@ -204,7 +204,7 @@ def read_space(loader: ConfigLoader, space: Sequence[str], arguments: Sequence[s
         else:
             fixed.append(str(override.input_line))
     if not sweeps:
-        raise _bad_entry("nothing to vary")
+        raise _bad_entry("no option to vary")
     texts = {key: str(sweep.input_line).partition("=")[2] for key, sweep in sweeps.items()}
     return Space({key: _distribution(sweep) for key, sweep in sweeps.items()}, texts, fixed)
 
@@ -250,7 +250,7 @@ def examples(space: Space) -> list[list[str]]:
 
 
 def _ends(distribution: Any) -> list[object]:
-    """Return all choices, or one number of a range, since all numbers compose alike."""
+    """Return all choices of a distribution, or one number of a range."""
     return list(getattr(distribution, "choices", ())) or [distribution.low]
 
 
@@ -323,13 +323,15 @@ def _check_same(before: Mapping[str, str], now: Mapping[str, str], study: str) -
     keys = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
     if not keys:
         return
-    shown = [f"{key}={now.get(key, 'absent')}" for key in keys[:_NUM_SHOWN]]
-    was = [f"{key}={before.get(key, 'absent')}" for key in keys[:_NUM_SHOWN]]
+    present, original = (
+        ", ".join(f"{key}={facts.get(key, 'absent')}" for key in keys[:_NUM_SHOWN])
+        for facts in (now, before)
+    )
     more = f" and {len(keys) - _NUM_SHOWN} more" if len(keys) > _NUM_SHOWN else ""
     raise UserError(
-        f"{', '.join(shown)}{more}, while the study {study} was begun with {', '.join(was)}",
-        "the command that the study was begun with",
-        "repeat that command, or begin another study with search.study=NAME",
+        f"{present}{more}, but {original} at the start of the study {study}",
+        "the options of the study's first command",
+        "repeat that command, or start another study with search.study=NAME",
     )
 
 

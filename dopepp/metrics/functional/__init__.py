@@ -2,8 +2,7 @@
 
 Functions are pure and batched, and compute in float64. Poses are ``(R_est, t_est, R_gt, t_gt)`` of
 shapes (N, 3, 3), (N, 3), (N, 3, 3), (N, 3) in metres, ``T_cam_obj`` convention; object points are
-(V, 3). Every error is (N,). The error of a pose that is not finite is infinite: no function returns
-NaN.
+(V, 3). Errors are (N,), infinite for poses that are not finite, and never NaN.
 
 To add an error, write one function of this form in ``distances.py``, its formula in
 ``docs/reference/metrics.md`` and a test against an independent implementation.
@@ -108,13 +107,13 @@ def wilson_interval(passed: int, num: int, confidence: float = 0.95) -> tuple[fl
     rate, weight = passed / num, z * z / num
     centre = (rate + weight / 2) / (1 + weight)
     half = math.sqrt(rate * (1 - rate) * weight + weight * weight / 4) / (1 + weight)
-    # At the ends, rounding alone would leave the interval without the rate itself.
+    # Rounding errors could exclude the rates 0 and 1 from their own intervals.
     low = 0.0 if passed == 0 else centre - half
     return low, 1.0 if passed == num else centre + half
 
 
 def region_levels(distances: Errors) -> Errors:
-    """Return the level of the covariance region on whose border each true pose lies, in [0, 1].
+    """Return the smallest level in [0, 1] at which each covariance region holds the true pose.
 
     The squared Mahalanobis distance x of a true pose from its estimate follows χ² with six degrees
     of freedom if the covariance is right. The level is that distribution's value at x,
@@ -169,7 +168,7 @@ def match(
 ) -> Int[Tensor, "p"]:
     """Match predictions with instances one-to-one, greedily by descending score.
 
-    Ties keep the input order; NaN scores come last.
+    Predictions with equal scores keep the input order; NaN scores come last.
 
     Args:
         scores: Score of each prediction.
@@ -188,7 +187,7 @@ def match(
     matches = torch.full((len(scores),), -1, dtype=torch.int64, device=scores.device)
     if distances.shape[1] == 0:
         return matches
-    # Comparing with <= is False for NaN, so pairs that must not match are infinitely far apart.
+    # Pairs farther apart, or with a NaN distance, get an infinite distance and never match.
     free = torch.where(distances <= max_distance, distances, torch.inf)
     for prediction in scores.nan_to_num(nan=-torch.inf).argsort(descending=True, stable=True):
         nearest = free[prediction].argmin()
@@ -203,12 +202,15 @@ def average_precision(
 ) -> float:
     """Return COCO's average precision: the mean interpolated precision at 101 recall levels.
 
-    Ties keep the input order; NaN scores come last. Without predictions or instances it is 0.0.
+    Predictions with equal scores keep the input order; NaN scores come last.
 
     Args:
         scores: Score of each prediction.
         correct: Whether each prediction is correct; duplicates are not.
         num_instances: Number of ground-truth instances.
+
+    Returns:
+        The average precision in [0, 1]; 0.0 without predictions or instances.
 
     Raises:
         ValueError: The lengths differ, or more predictions are correct than there are instances.

@@ -22,18 +22,18 @@ Errors = Float[Tensor, "n"]
 """N poses and their errors (infinite for a miss), V points of one object; metres."""
 
 BOP_THRESHOLDS: Final = tuple(round(0.05 * k, 2) for k in range(1, 11))
-"""0.05 to 0.5: of MSSD, times the diameter (BOP)."""
+"""Thresholds of MSSD in diameters, 0.05 to 0.5 (BOP)."""
 
 BOP_MSPD_THRESHOLDS: Final = tuple(5.0 * k for k in range(1, 11))
-"""5 to 50 pixels: of MSPD in an image 640 pixels wide; times width/640 in others (BOP)."""
+"""Thresholds of MSPD in pixels of a 640-pixel-wide image, 5 to 50 (BOP)."""
 
 Depths = Float[np.ndarray, "height width"]
 
 VSD_DELTA: Final = 0.015
-"""Distance by which a visible surface may lie behind the measured depth, metres."""
+"""Largest distance of a visible surface behind the measured depth, metres."""
 
 _CHUNK_POINTS: Final = 1 << 17
-"""Transformed points held at once: 3 MB in float64, which stays in a CPU's cache."""
+"""Number of points transformed at once: 3 MB in float64, which fits into a CPU's cache."""
 
 
 def add(
@@ -41,7 +41,7 @@ def add(
 ) -> Errors:
     """Return the mean distance between corresponding points at both poses (ADD), metres."""
     R_est, t_est, R_gt, t_gt, points = _checked(R_est, t_est, R_gt, t_gt, points)
-    # R_est·x + t_est − R_gt·x − t_gt needs one product instead of two.
+    # (R_est − R_gt)·x + (t_est − t_gt) needs a single matrix product.
     rotation, translation = R_est - R_gt, t_est - t_gt
     errors = t_est.new_empty(len(t_est))
     for chunk in _chunks(len(t_est), len(points)):
@@ -73,7 +73,7 @@ def mssd(
 ) -> Errors:
     """Return the maximum symmetry-aware surface distance, metres (MSSD; Drost 2017, BOP 2019).
 
-    This is min over S of max over x of ‖(R̂x + t̂) − (R(Sx) + t)‖.
+    The formula is min over S of max over x of ‖(R̂x + t̂) − (R(Sx) + t)‖.
 
     Args:
         R_est: Estimated rotations.
@@ -99,8 +99,8 @@ def reprojection_error(
 ) -> Errors:
     """Return the mean distance between the points' projections at both poses, pixels.
 
-    ``K`` is one camera matrix or one per pose. The error is infinite if a point lies at or behind
-    the camera in either pose.
+    The error is infinite if a point lies at or behind the camera in either pose. ``K`` is a camera
+    matrix for all poses (3, 3) or for each pose (N, 3, 3), pixels.
     """
     R_est, t_est, R_gt, t_gt, points = _checked(R_est, t_est, R_gt, t_gt, points)
     K = _check_cameras(K, len(R_est))
@@ -123,12 +123,12 @@ def mspd(
 ) -> Errors:
     """Return the maximum symmetry-aware projection distance, pixels (MSPD; BOP 2019).
 
-    This is min over S of max over x of ‖π(R̂x + t̂) − π(R(Sx) + t)‖, and infinite if a point lies at
-    or behind the camera. ``K`` is one camera matrix or one per pose; the other arguments are those
-    of :func:`mssd`.
+    The formula is min over S of max over x of ‖π(R̂x + t̂) − π(R(Sx) + t)‖. The distance is infinite
+    if a point lies at or behind the camera. ``K`` is as in :func:`reprojection_error`; the other
+    arguments are as in :func:`mssd`.
     """
     R_est, t_est, R_gt, t_gt, points = _checked(R_est, t_est, R_gt, t_gt, points)
-    # Pixels are the first two of K·x over x's depth, whatever the last row of K holds.
+    # The last row of K is replaced, so that the projection always divides by the point's depth.
     to_pixels = _check_cameras(K, len(R_est)).clone()
     to_pixels[:, 2] = to_pixels.new_tensor([0.0, 0.0, 1.0])
     estimated, true = (
@@ -152,10 +152,10 @@ def rotation_error_deg(
 ) -> Errors:
     """Return the angle between two orientations, degrees in [0, 180].
 
-    ``symmetries`` are those of :func:`mssd`; the smallest angle to any R_gt·S counts.
+    With ``symmetries`` (as in :func:`mssd`), return the smallest angle to any R_gt·S.
 
     Raises:
-        ValueError: An array has another shape.
+        ValueError: An array has an unexpected shape.
     """
     R_est, R_gt = to_float64(R_est), to_float64(R_gt)
     if R_est.shape != R_gt.shape or R_est.shape[1:] != (3, 3):
@@ -168,7 +168,7 @@ def rotation_error_deg(
 
 
 def _angles_deg(Q: Rotations) -> Errors:
-    """Return ``atan2(|axial vector|, trace − 1)``: arccos is inaccurate near 0° and 180°."""
+    """Return the angles of rotations by atan2, since arccos is inaccurate near 0° and 180°."""
     axial = torch.stack(
         [Q[:, 2, 1] - Q[:, 1, 2], Q[:, 0, 2] - Q[:, 2, 0], Q[:, 1, 0] - Q[:, 0, 1]], dim=1
     )
@@ -198,13 +198,13 @@ def mahalanobis(
         t_gt: True translations, metres.
         covariance: Σ of the step δ from the estimated to the true pose: a rotation vector about
             the object's origin (radians) and a shift (metres), in camera axes.
-        symmetries: As in :func:`mssd`; the nearest equivalent pose counts.
+        symmetries: As in :func:`mssd`; the distance is the smallest to any equivalent pose.
 
     Returns:
-        Distances; infinite if a covariance is not finite or singular.
+        Distances; infinite for a singular or non-finite covariance.
 
     Raises:
-        ValueError: An array has another shape.
+        ValueError: An array has an unexpected shape.
     """
     R_est, t_est, R_gt, t_gt, _ = _checked(R_est, t_est, R_gt, t_gt, points=torch.zeros(1, 3))
     covariance = to_float64(covariance)
@@ -239,7 +239,7 @@ def _all_finite(*tensors: Tensor) -> Bool[Tensor, "n"]:
 def _checked(
     R_est: Tensor, t_est: Tensor, R_gt: Tensor, t_gt: Tensor, points: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Cast to float64 and refuse shapes that broadcasting would hide."""
+    """Convert poses and points to float64 after checking their shapes."""
     tensors = tuple(map(to_float64, (R_est, t_est, R_gt, t_gt, points)))
     shapes = [tuple(tensor.shape) for tensor in tensors[:4]]
     n = len(tensors[1])
@@ -275,7 +275,7 @@ def _check_symmetries(
 
 
 def _chunks(num_poses: int, num_points: int) -> Iterator[slice]:
-    """Yield slices of the poses that need little memory with ``num_points`` points each."""
+    """Return slices of the poses that need little memory with ``num_points`` points each."""
     step = max(1, _CHUNK_POINTS // num_points)
     return (slice(start, start + step) for start in range(0, num_poses, step))
 
@@ -296,16 +296,16 @@ def vsd(
 ) -> Float[np.ndarray, "tolerances"]:
     """Return the visible surface discrepancy in [0, 1] for each tolerance (VSD; BOP 2019).
 
-    A pixel that shows the object at either pose counts as wrong if it shows the object at one of
-    them only, or if the two distances from the camera differ by at least the tolerance.
+    A pixel that shows the object is wrong if it shows the object at a single pose only, or if the
+    surface's distances from the camera at both poses differ by at least the tolerance.
 
     Args:
         depth_est: Rendered depth at the estimated pose, metres along z, 0 outside the object.
         depth_gt: Rendered depth at the true pose, metres.
-        depth: Depth of the depth camera, metres, 0 without a measurement (surfaces are visible).
+        depth: Measured depth, metres; 0 without a measurement, where every surface is visible.
         K: Camera matrix, pixels.
         diameter: Diameter of the object, metres.
-        delta: Distance by which a visible surface may lie behind the measured depth, metres.
+        delta: Largest distance of a visible surface behind the measured depth, metres.
         tolerances: Tolerances in diameters.
     """
     rays = _ray_lengths(K, depth.shape)
@@ -322,12 +322,12 @@ def vsd(
 
 
 def _ray_lengths(K: CameraMatrix, shape: tuple[int, ...]) -> Depths:
-    """Return the distance of every pixel's point at depth 1, metres."""
+    """Return the distance from the camera to each pixel's point at depth 1, metres."""
     rows, columns = np.indices(shape)
     rays = np.linalg.solve(K, np.stack([columns.ravel(), rows.ravel(), np.ones(rows.size)]))
     return np.asarray(np.linalg.norm(rays / rays[2], axis=0).reshape(shape))
 
 
 def _seen(distance: Depths, measured: Depths, delta: float) -> Bool[np.ndarray, "height width"]:
-    """Return where a surface is visible: not behind the measured depth, or without one."""
+    """Return where a surface is visible: not behind the measured depth, or depth is missing."""
     return np.asarray((distance > 0) & ((distance - measured <= delta) | (measured == 0)))

@@ -1,13 +1,12 @@
 """Exact, compiled searches behind the pose errors.
 
-Nearest points (ADD-S): one k-d tree over the object's points serves all poses. Queries come in the
-order of the tree's leaves, so the previous answer is a close first guess, which prunes most of the
-tree.
+Nearest points (ADD-S): a k-d tree over the object's points serves all poses. Queries follow the
+order of the tree's leaves, so each query starts with the nearest point of the previous query. This
+close bound prunes most of the tree.
 
-Symmetry with the smallest maximum distance (MSSD, MSPD): a symmetry is rejected at the first point
-that is farther than the maximum of the best symmetry so far. Eight probes far apart are evaluated
-under every symmetry first, and the most promising symmetry is evaluated in full; nearly all others
-are then rejected after a point or two.
+Symmetry with the smallest maximum distance (MSSD, MSPD): first, eight probes (points far apart) are
+evaluated under every symmetry. Then the most promising symmetry is evaluated at all points. Each
+remaining symmetry is rejected at its first point that is farther than the best maximum so far.
 """
 
 from __future__ import annotations
@@ -25,11 +24,11 @@ from dopepp.core.compiled import Array, compiled
 Affine = tuple[Float[Tensor, "k 3 3"], Float[Tensor, "k 3"]]
 """Matrices and translations of affine maps."""
 
-_LEAF: Final = 16  # Largest number of points in a leaf; the fastest of 4 to 32
+_LEAF: Final = 16  # Largest number of points in a leaf
 _ROUNDING: Final = 1e-9
-"""Share by which a bound is lowered, so that rounding never prunes the nearest point."""
+"""Share by which a bound is lowered, so that rounding errors never prune the nearest point."""
 
-_NUM_PROBES: Final = 8  # Number of probes, as many as a box has corners
+_NUM_PROBES: Final = 8  # Number of corners of a box
 
 
 def mean_nearest(
@@ -53,7 +52,7 @@ def mean_nearest(
     targets = np.empty_like(points)
     for n in range(len(offset)):
         _transform(points, np.ascontiguousarray(R_gt[n]), offset[n], targets)
-        # A singular matrix has no inverse; the bound 0 then prunes nothing.
+        # A singular matrix has no inverse; its bound is 0, which prunes nothing.
         inverse = np.linalg.inv(R_est[n]) if least[n] > 0 else np.zeros((3, 3))
         bound = least[n] ** 2 * (1 - _ROUNDING)
         R, queries = np.ascontiguousarray(R_est[n]), targets @ inverse.T
@@ -84,7 +83,7 @@ def _tree(
 
 @compiled()
 def _transform(points: Array, R: Array, offset: Array, out: Array) -> None:
-    """Write R·x + offset of every point, with the rounding of :func:`_squared`."""
+    """Write R·x + offset of every point, with the same rounding as :func:`_squared`."""
     for i in range(len(points)):
         for r in range(3):
             out[i, r] = (
@@ -94,6 +93,7 @@ def _transform(points: Array, R: Array, offset: Array, out: Array) -> None:
 
 @compiled(inline="always")
 def _squared(point: Array, R: Array, target: Array) -> float:
+    """Return ‖R·point − target‖²."""
     dx = R[0, 0] * point[0] + R[0, 1] * point[1] + R[0, 2] * point[2] - target[0]
     dy = R[1, 0] * point[0] + R[1, 1] * point[1] + R[1, 2] * point[2] - target[1]
     dz = R[2, 0] * point[0] + R[2, 1] * point[1] + R[2, 2] * point[2] - target[2]
@@ -121,9 +121,16 @@ def _mean_distance(
 ) -> float:
     """Average the distances from targets to the nearest ``R·point``.
 
-    Points are in the tree's order. Node k has a box (:func:`_to_box`) and the children 2k + 1 and
-    2k + 2; ``firsts`` is the first point of every leaf, then the number of points. Queries are
-    R⁻¹·targets; ‖R v‖² is at least ``bound`` times ‖v‖².
+    Node k of the tree has the children 2k + 1 and 2k + 2.
+
+    Args:
+        points: Object points in the tree's order.
+        boxes: Box of every node (:func:`_to_box`).
+        firsts: Index of the first point of every leaf, then the number of points.
+        R: Matrix of the estimated pose.
+        targets: True points.
+        queries: R⁻¹·targets.
+        bound: Lower bound of ‖R v‖² / ‖v‖².
     """
     num_inner = len(boxes) // 2
     nodes, floors = np.empty(64, np.int64), np.empty(64)
@@ -166,7 +173,7 @@ def least_farthest(
     symmetries: Affine,
     perspective: bool,
 ) -> Float[Tensor, "n"]:
-    """Return min over S of max over x of ‖π(Bx + b) − π(A(Sx) + a)‖, infinite instead of NaN.
+    """Return min over S of max over x of ‖π(Bx + b) − π(A(Sx) + a)‖; infinite if undefined.
 
     Args:
         estimated: Estimated maps (B, b).
@@ -187,7 +194,7 @@ def least_farthest(
 
 
 def _probes_first(points: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
-    """Put the probes first: each is the point farthest from all before it."""
+    """Reorder points so that the probes come first, each farthest from all earlier probes."""
     order = np.arange(len(points))
     distances = ((points - points.mean(axis=0)) ** 2).sum(axis=1)
     for k in range(min(_NUM_PROBES, len(points))):
@@ -216,10 +223,7 @@ def _squared_gap(P: Array, p: Array, x: Array, target: Array, perspective: bool)
 
 @compiled()
 def _set_targets(B: Array, b: Array, points: Array, perspective: bool, targets: Array) -> bool:
-    """Write π(Bx + b) of every point; return False at the first point behind the camera.
-
-    Two passes would take a quarter longer.
-    """
+    """Write π(Bx + b) of every point; return False at the first point behind the camera."""
     for j in range(len(points)):
         for r in range(3):
             targets[j, r] = (
@@ -281,17 +285,17 @@ def _least(
     ``floors`` are lower bounds: each symmetry's maximum over the probes.
     """
     promising = floors.argmin()
-    best, culprit = np.inf, 0
+    best, worst = np.inf, 0
     for k in range(len(floors)):
         s = promising if k == 0 else (0 if k == promising else k)
         if not floors[s] < best:
             continue
-        farthest = _squared_gap(P[s], p[s], points[culprit], targets[culprit], perspective)
+        farthest = _squared_gap(P[s], p[s], points[worst], targets[worst], perspective)
         j = 0
         while farthest < best and j < len(points):
             gap = _squared_gap(P[s], p[s], points[j], targets[j], perspective)
             if gap > farthest:
-                farthest, culprit = gap, j
+                farthest, worst = gap, j
             j += 1
         best = min(best, farthest)
     return float(best)

@@ -2,8 +2,8 @@
 
 The vertices in each cell of a cubic grid become one vertex at the least-squares intersection of the
 planes of all triangles in the cell (quadric error metric: Garland and Heckbert 1997; in grid cells:
-Lindstrom 2000), so that flat sides stay flat and edges sharp. This works in seconds for any
-triangles, also with holes or disconnected, and moves no point by more than a cell's diagonal.
+Lindstrom 2000), so that flat sides stay flat and edges sharp. The method takes seconds, accepts
+holes and disconnected pieces, and moves no point by more than a cell's diagonal.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def decimate(
     placed = _cell_positions(vertices, faces, cells)
     moved = float(np.sqrt(np.square(placed[cells] - vertices).sum(axis=1).max()))
     owners = cells if values is None else _islands(faces, cells)
-    # Each owner becomes a vertex, at its cell's position and with its mean values.
+    # Each group becomes a vertex at the cell's position, with the mean values of the group.
     used, index = np.unique(owners[faces[kept]], return_inverse=True)
     first = np.empty(int(owners.max()) + 1, np.int64)
     first[owners] = np.arange(len(owners))
@@ -62,7 +62,7 @@ def decimate(
 def _cluster(
     vertices: Vertices, faces: Faces, max_faces: int
 ) -> tuple[Int[np.ndarray, " vertices"], Int[np.ndarray, " kept"]]:
-    """Return the cells of the grid that keeps most triangles below the limit, and the kept ones."""
+    """Return each vertex's cell and the kept triangles, for the finest grid within the limit."""
     # A surface through a cell becomes two triangles.
     side = float(np.sqrt(2 * face_areas(vertices, faces).sum() / max_faces))
     best_cells, best_kept = np.zeros(len(vertices), np.int64), np.zeros(0, np.int64)
@@ -73,11 +73,11 @@ def _cluster(
             best_cells, best_kept = cells, kept
         if _WELL_USED * max_faces <= len(kept) <= max_faces:
             break
-        # The number falls with the square of the side; aim at the middle of the good range.
+        # The number of triangles falls with the square of a cell's side.
         aim = (1 + _WELL_USED) / 2 * max_faces
         side *= float(np.clip(np.sqrt(len(kept) / aim), 0.25, 4.0))
     if len(best_kept) == 0:
-        raise ValueError(f"its {len(faces)} triangles cannot be reduced to {max_faces}")
+        raise ValueError(f"{len(faces)} triangles that cannot be reduced to {max_faces}")
     return best_cells, best_kept
 
 
@@ -92,7 +92,7 @@ def _cells(vertices: Vertices, side: float) -> Int[np.ndarray, " vertices"]:
 
 
 def _surviving(corners: Faces) -> Int[np.ndarray, " kept"]:
-    """Return the first triangle of every three cells and orientation."""
+    """Return the first triangle for every triple of cells and orientation."""
     a, b, c = corners.T
     candidates = np.flatnonzero((a != b) & (b != c) & (c != a))
     a, b, c = corners[candidates].T

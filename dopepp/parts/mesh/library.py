@@ -1,7 +1,7 @@
 """STL, 3MF and GLB files: checked to be complete and harmless, then read by trimesh.
 
-trimesh reads a truncated file as a smaller mesh, ignores what it does not know, and uses as much
-memory and time as a file requests (``tests/parts/mesh/test_library.py``,
+trimesh reads a truncated file as a smaller mesh, ignores unknown content, and uses as much memory
+and time as a file requests (``tests/parts/mesh/test_library.py``,
 ``tests/security/test_hostile_scenes.py``). GLB files with compressed, quantised or sparse data,
 triangle fans or transformed textures are refused, and so is glTF in several files. Only shape and
 texture are read.
@@ -60,7 +60,7 @@ def read_stl(path: Path) -> RawMesh:
     is_text = len(data) != promised or not num_triangles
     if is_text and b"\0" in data:  # never in text
         stated = f"{num_triangles} triangles, {promised} bytes"
-        raise ValueError(f"{len(data)} bytes where its header promises {stated}")
+        raise ValueError(f"{len(data)} bytes, but the header states {stated}")
     (vertices, faces, *_), _ = read_scene(data, "stl")
     # trimesh omits a text file's last solid if it is truncated.
     facets = re.finditer(rb"\bfacet\s+normal\b", data, re.IGNORECASE)
@@ -91,7 +91,7 @@ def read_3mf(path: Path) -> RawMesh:
         _check_size(unpacked, max(MAX_UNPACKED_BYTES // 10, 30 * size))
         names = [name for name in archive.namelist() if "3d/3dmodel.model" in name.lower()]
         if len(names) != 1:
-            raise ValueError(f"{len(names)} 3D/3dmodel.model where one must be")
+            raise ValueError(f"{len(names)} files 3D/3dmodel.model instead of one")
         model = archive.read(names[0])
     if b"<!DOCTYPE" in model.replace(b"\0", b""):  # without NUL bytes, the test also finds UTF-16
         raise ValueError("a document type, which 3MF forbids")
@@ -121,7 +121,7 @@ def _count_pieces(model: bytes) -> int:
             raise ValueError("objects in other files of the archive")
         unknown = [user.get("objectid") for user in users if user.get("objectid") not in pieces]
         if unknown:
-            raise ValueError(f"object {unknown[0]!r} used above its end, or nowhere defined")
+            raise ValueError(f"object {unknown[0]!r} used before its definition, or never defined")
         count = sum(pieces[user.get("objectid")] for user in users)
         if element.tag.endswith("item"):
             shown += count
@@ -197,7 +197,7 @@ def _packed(header: dict[str, Any], binary: bytes) -> bytes:
 
 
 def _check(header: dict[str, Any], primitives: list[dict[str, Any]], num_bytes: int) -> None:
-    """Refuse what trimesh ignores, and what costs far more memory or time than the file."""
+    """Reject features that trimesh ignores, and files that need excessive memory or time."""
     required = [name for name in header.get("extensionsRequired", ()) if "_materials_" not in name]
     if required:
         raise ValueError(f"the extension {required[0]}, which is not read")
@@ -256,7 +256,7 @@ def read_scene(data: bytes, kind: str) -> tuple[RawMesh, int]:
 
     # Infinite corners are reported later, not by trimesh.
     with warnings.catch_warnings(), np.errstate(invalid="ignore", over="ignore"):
-        # For a damaged number, numpy only stops with this warning.
+        # numpy stops at a damaged number with a warning only.
         warnings.simplefilter("error", DeprecationWarning)
         scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False)
     vertices, faces = [np.empty((0, 3))], [np.empty((0, 3), np.int64)]

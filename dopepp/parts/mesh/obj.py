@@ -2,9 +2,9 @@
 
 trimesh is not used here (``tests/parts/mesh/test_library.py``). In OBJ files it omits faces that
 are truncated or written with tabs, misreads index 0 and relative indices, silently loses textures,
-and splits vertices where normals differ. It reads a truncated OFF file as a smaller mesh and fails
-at pentagons. Here a damaged line is an error that names the line. Only shape and the ``map_Kd``
-texture are read. Files named by a mesh must lie in its own folder.
+and splits vertices where normals differ. trimesh reads a truncated OFF file as a smaller mesh and
+fails at pentagons. This module reports the first damaged line. Only shape and the ``map_Kd``
+texture are read. Files named by a mesh must lie in the mesh's folder.
 """
 
 from __future__ import annotations
@@ -226,12 +226,14 @@ def read_off(path: Path) -> RawMesh:
     num_vertices, num_faces = map(int, promised[:2])
     if min(num_vertices, num_faces) < 0 or len(rows) != num_vertices + num_faces:
         stated = f"{num_vertices} vertices and {num_faces} faces"
-        raise ValueError(f"{len(rows)} lines where its header promises {stated}")
+        raise ValueError(f"{len(rows)} lines, but the header states {stated}")
     vertices = np.array([row[:3] for row in rows[:num_vertices]], np.float64).reshape(-1, 3)
     polygons = [[int(word) for word in row[: int(row[0]) + 1]] for row in rows[num_vertices:]]
     for number, (count, *corners) in enumerate(polygons):
         if len(corners) != count:
-            raise ValueError(f"face {number} of {count} corners, {len(corners)} in its line")
+            raise ValueError(
+                f"face {number} with {len(corners)} instead of {count} corners in its line"
+            )
     counts = np.array([count for count, *_ in polygons], np.int64)
     row_of_corners = np.array([i for _, *corners in polygons for i in corners], np.int64)
     return RawMesh(vertices, row_of_corners[fans(vertices, row_of_corners, counts)])
@@ -255,7 +257,7 @@ def fans(
         ValueError: A polygon has fewer than three corners.
     """
     if (counts < 3).any():
-        raise ValueError(f"face {int((counts < 3).argmax())} of fewer than 3 corners")
+        raise ValueError(f"face {int((counts < 3).argmax())} with fewer than 3 corners")
     polygons = np.repeat(np.arange(len(counts)), counts - 2)
     first = (np.cumsum(counts) - counts)[polygons]
     # Number of each triangle within its polygon.

@@ -81,7 +81,7 @@ def read_ply(path: Path) -> RawMesh:
     for element in elements:
         tables[element.name], start = _read_table(body, start, element)
     if start != len(body):
-        raise ValueError(f"{len(body) - start} bytes more than its header promises")
+        raise ValueError(f"{len(body) - start} bytes more than stated in its header")
     vertex, face = tables.get("vertex", {}), tables.get("face", {})
     list_name = "vertex_indices" if "vertex_indices" in face else "vertex_index"
     if not {"x", "y", "z"} <= set(vertex) or f"{list_name}#" not in face:
@@ -171,7 +171,7 @@ def _parse_header(lines: list[list[str]]) -> tuple[bool, list[Element]]:
 def _doubles(text: bytes) -> bytes:
     """Convert a text body to the bytes of its numbers."""
     with warnings.catch_warnings():
-        # For a damaged number, numpy only stops with this warning.
+        # numpy stops at a damaged number with a warning only.
         warnings.simplefilter("error", DeprecationWarning)
         numbers = np.fromstring(text.decode("ascii").strip() or "0", np.float64, sep=" ")
     return numbers.astype("<f8").tobytes() if text.strip() else b""

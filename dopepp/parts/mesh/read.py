@@ -73,7 +73,7 @@ def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         suffixes = ", ".join(READERS)
-        fix = "export the mesh as one of these, e.g. as STL"
+        fix = "export the mesh in one of these formats, e.g. as STL"
         raise UserError(f"mesh {path}", f"files ending in {suffixes}", fix)
     try:
         is_file = path.is_file()
@@ -114,7 +114,7 @@ def ycb_part(root: str | Path, name: str) -> Part:
         name: Name of the object, a folder in ``models``.
 
     Raises:
-        UserError: There are no models, none of that name, or a damaged file.
+        UserError: The folder has no models, the name is unknown, or a file is damaged.
     """
     models = Path(root) / "models"
     names = sorted(path.parent.name for path in models.glob("*/points.xyz"))

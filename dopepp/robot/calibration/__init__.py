@@ -1,1 +1,1 @@
-"""Calibration of a camera, a tool, a bench, and of where the camera is on the robot (paper 4.3)."""
+"""Calibration of a camera, a tool, a bench, and the camera's pose on the robot (paper 4.3)."""

@@ -38,7 +38,7 @@ SPELLING: Final = (
 NUM_FIELDS: Final = {"charuco": (3, 4), "chess": (2, 2), "circles": (2, 2)}
 DICTIONARY: Final = "5X5_100"
 
-PIXEL_NOISE: Final = 0.1  # minimum standard deviation of a detected point, pixels
+PIXEL_NOISE: Final = 0.1  # smallest standard deviation of a detected point, pixels
 OVERSAMPLING: Final = 2
 BACKGROUND: Final = 110
 
@@ -52,7 +52,7 @@ class Sighting:
 
     name: str  # of the picture
     points: Float[np.ndarray, "n 3"]  # detected points in the board's frame, metres
-    pixels: Float[np.ndarray, "n 2"]  # their positions in the picture
+    pixels: Float[np.ndarray, "n 2"]  # positions of the points in the picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,10 +182,10 @@ def _markers(dictionary: str) -> Any:
 
 
 def parse_board(text: str) -> Board:
-    """Parse a board's description, spelt like :data:`SPELLING`.
+    """Parse a board's description in the notation of :data:`SPELLING`.
 
     Raises:
-        UserError: The description cannot be parsed, or there is no such board.
+        UserError: The description cannot be parsed, or the board is impossible.
     """
     try:
         board = _parsed(text)
@@ -216,7 +216,7 @@ def _allowed_instead(board: Board) -> str:
     if max(board.columns, board.rows) * board.spacing * 1000 > LONGEST_MM:
         return f"a board of at most {LONGEST_MM} mm"
     if board.kind == "chess" and (board.columns + board.rows) % 2 == 0:
-        return "one even and one odd number of corners: others look the same after half a turn"
+        return "one even and one odd number of corners, so that a half turn changes the board"
     if board.kind != "charuco":
         return ""
     names = [name.removeprefix("DICT_") for name in dir(cv2.aruco) if name.startswith("DICT_")]
@@ -226,7 +226,7 @@ def _allowed_instead(board: Board) -> str:
         return "markers smaller than their squares"
     num_markers = len(_markers(board.dictionary).bytesList)
     if board.columns * board.rows // 2 > num_markers:
-        return f"at most {num_markers} markers, as {board.dictionary} has"
+        return f"at most {num_markers} markers, the size of {board.dictionary}"
     return ""
 
 
@@ -246,9 +246,9 @@ def board_pose(sighting: Sighting, camera: Camera) -> BoardPose:
     projections = [cv2.projectPoints(points, *pose, *lens)[0][:, 0] for pose in poses]
     errors = [float(np.square(projection - pixels).sum()) for projection in projections]
     if not errors or not np.isfinite(min(errors)):
-        problem = f"{sighting.name}, whose board has no pose"
+        problem = f"{sighting.name}, from which no pose of the board can be estimated"
         fix = "delete this picture, or take it again with the board facing the camera"
-        raise UserError(problem, "a board that is seen from the front", fix)
+        raise UserError(problem, "a board that faces the camera", fix)
     error = min(errors)
     turn, shift = poses[errors.index(error)]
     T = make_transform(cv2.Rodrigues(turn)[0], shift.ravel())
@@ -292,7 +292,7 @@ def draw_view(
 ) -> Picture:
     """Render a board at a pose, with the camera's distortion and noise (grey levels).
 
-    Every pixel averages two by two rays, which are intersected with the board's plane.
+    Every pixel averages 2×2 rays, which are intersected with the board's plane.
     """
     assert camera.size is not None
     width, height = camera.size

@@ -9,10 +9,10 @@ for a camera on the bench, with the board on the flange,
     T_flange_base · T_base_cam · T_cam_board = T_flange_board,
 
 for all poses i: M_i X B_i = Y with the unknown poses X of the camera and Y of the board.
-Pairs of poses eliminate Y (AX = XB: Park and Martin 1994), or X and Y are solved for together
-(AX = ZB: Shah 2013). Both have closed-form solutions, rotation first. The better one initialises a
-joint refinement, which weights every pose by the covariances of its picture and of the robot, and
-rejects poses that contradict the others.
+Park and Martin (1994) eliminate Y by pairs of poses (AX = XB); Shah (2013) solves for X and Y
+together (AX = ZB). Both methods have closed forms, rotation first. The better solution initialises
+a joint refinement, which weights every pose by the covariances of picture and robot, and rejects
+outliers.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Noise = Float[np.ndarray, "2"]  # standard deviations of a robot's rotation and 
 MIN_POSES: Final = 3
 
 ROBOT_NOISE: Final = (0.0005, 0.0005)
-"""Initial standard deviations of a robot's pose, radians and metres; then they are estimated."""
+"""Initial standard deviations of a robot's pose, radians and metres."""
 
 OUTLIER: Final = 40.0
 """Squared Mahalanobis distance of a rejected pose. With six degrees of freedom, one in two million
@@ -86,16 +86,16 @@ def calibrate_hand_eye(
             f"at least {MIN_POSES}, better 15",
             "record more poses, rotated by 30° or more about different axes",
         )
-    M, B, seen = equations(T_base_flange, boards, mount)
+    M, B, B_cov = equations(T_base_flange, boards, mount)
     starts = [solve(M, B) for solve in (park, shah)]
     costs = [np.median(np.linalg.norm(_residuals(M, B, *start), axis=1)) for start in starts]
     X, Y = starts[int(np.argmin(costs))]
     inliers = np.ones(len(M), bool)
     robot = np.array(ROBOT_NOISE)
     for _ in range(4):
-        X, Y, covariance = refined(M[inliers], B[inliers], seen[inliers], X, Y, robot)
-        robot = _robot_noise(_residuals(M, B, X, Y)[inliers], seen[inliers])
-        distances = _distances(M, B, seen, X, Y, robot)
+        X, Y, covariance = refined(M[inliers], B[inliers], B_cov[inliers], X, Y, robot)
+        robot = _robot_noise(_residuals(M, B, X, Y)[inliers], B_cov[inliers])
+        distances = _distances(M, B, B_cov, X, Y, robot)
         scale = max(1.0, float(np.median(distances[inliers])) / MEDIAN_CHI2)
         inliers = distances <= OUTLIER * scale
         if inliers.sum() < MIN_POSES:
@@ -156,14 +156,14 @@ def pairs(M: Transforms, B: Transforms) -> tuple[Transforms, Transforms]:
 
 
 def refined(
-    M: Transforms, B: Transforms, seen: Covariances, X: Transform, Y: Transform, robot: Noise
+    M: Transforms, B: Transforms, B_cov: Covariances, X: Transform, Y: Transform, robot: Noise
 ) -> tuple[Transform, Transform, Float[np.ndarray, "6 6"]]:
     """Refine X and Y by robust least squares.
 
     Args:
         M: Transforms of the robot, as in :func:`equations`.
         B: Transforms of the board.
-        seen: Covariances of B.
+        B_cov: Covariances of B.
         X: Initial pose of the camera.
         Y: Initial pose of the board.
         robot: Standard deviations of the robot's rotation (radians) and position (metres).
@@ -171,7 +171,7 @@ def refined(
     Returns:
         X, Y, and the covariance of X (see :class:`HandEye`).
     """
-    whitening = np.linalg.inv(np.linalg.cholesky(_covariances(M, X, Y, seen, robot)))
+    whitening = np.linalg.inv(np.linalg.cholesky(_covariances(M, X, Y, B_cov, robot)))
 
     def residuals(step: Float[np.ndarray, "12"]) -> Float[np.ndarray, "numbers"]:
         moved = displaced(np.stack([X, Y]), step.reshape(2, 6))
@@ -187,19 +187,16 @@ def refined(
 
 
 def _residuals(M: Transforms, B: Transforms, X: Transform, Y: Transform) -> Residuals:
-    """Return each view's rotation error (about the board's origin) and translation error.
-
-    Both are in camera axes.
-    """
+    """Return each view's errors of rotation (about the board's origin) and translation."""
     expected = invert_transform(X) @ inverted(M) @ Y
     turn = Rotation.from_matrix(B[:, :3, :3] @ expected[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
     return np.concatenate([turn, B[:, :3, 3] - expected[:, :3, 3]], axis=1)
 
 
 def _covariances(
-    M: Transforms, X: Transform, Y: Transform, seen: Covariances, robot: Noise
+    M: Transforms, X: Transform, Y: Transform, B_cov: Covariances, robot: Noise
 ) -> Covariances:
-    """Return the covariances of the residuals: those of the pictures plus the robot's."""
+    """Return the covariances of the residuals: the sum of picture and robot covariances."""
     # Jacobian of the board's pose, in camera axes, with respect to a small rotation (about the
     # origin of the camera's mount) and translation of the robot's pose.
     to_cam = X[:3, :3].T
@@ -207,25 +204,25 @@ def _covariances(
     jacobian[:, :3, :3] = jacobian[:, 3:, 3:] = to_cam
     jacobian[:, 3:, :3] = -to_cam @ _cross((inverted(M) @ Y)[:, :3, 3])
     variances = np.diag(np.repeat(robot**2, 3))
-    return np.asarray(seen + jacobian @ variances @ jacobian.transpose(0, 2, 1))
+    return np.asarray(B_cov + jacobian @ variances @ jacobian.transpose(0, 2, 1))
 
 
-def _robot_noise(residuals: Residuals, seen: Covariances) -> Noise:
+def _robot_noise(residuals: Residuals, B_cov: Covariances) -> Noise:
     """Estimate the robot's standard deviations (radians, metres) from residuals.
 
     Medians make the estimate robust. Its minimum is a fifth of :data:`ROBOT_NOISE`.
     """
-    excess = residuals**2 - 0.455 * np.diagonal(seen, axis1=1, axis2=2)
+    excess = residuals**2 - 0.455 * np.diagonal(B_cov, axis1=1, axis2=2)
     variances = np.array([np.median(excess[:, k : k + 3]) / 0.455 for k in (0, 3)])
     return np.asarray(np.sqrt(np.maximum(variances, (0.2 * np.array(ROBOT_NOISE)) ** 2)))
 
 
 def _distances(
-    M: Transforms, B: Transforms, seen: Covariances, X: Transform, Y: Transform, robot: Noise
+    M: Transforms, B: Transforms, B_cov: Covariances, X: Transform, Y: Transform, robot: Noise
 ) -> Float[np.ndarray, "poses"]:
     """Return every pose's squared Mahalanobis distance from its expected pose."""
     residuals = _residuals(M, B, X, Y)
-    whole = np.linalg.solve(_covariances(M, X, Y, seen, robot), residuals[..., None])[..., 0]
+    whole = np.linalg.solve(_covariances(M, X, Y, B_cov, robot), residuals[..., None])[..., 0]
     return np.asarray((residuals * whole).sum(axis=1))
 
 

@@ -18,7 +18,7 @@ from dopepp.drawing.pictures import Size
 from dopepp.geometry.camera_file import Camera
 from dopepp.robot.calibration.board import MIN_POINTS, Sighting
 
-MIN_VIEWS: Final = 6  # least views of a reliable calibration; three views determine K
+MIN_VIEWS: Final = 6  # views of a reliable calibration; three views determine K
 CELLS: Final = (8, 6)  # columns and rows of the grid that measures the coverage
 MIN_COVERAGE: Final = 0.5
 MIN_TILT: Final = 0.2
@@ -26,20 +26,20 @@ MIN_TILT: Final = 0.2
 length from the distance."""
 
 MAX_ERROR_PX: Final = 1.0
-OUTLIER: Final = 3.0  # error of a rejected view, as a multiple of the median view's
+OUTLIER: Final = 3.0  # smallest error of a rejected view, as a multiple of the median error
 LEAST_OUTLIER_PX: Final = 0.5
 
 MIN_SHIFT: Final = 0.04
 """Mean shift of the points between two distinct views, as a share of the picture's width."""
 
 MAX_VIEWS: Final = 60
-CHECKS_PER_S: Final = 5.0  # frames of a video in which the board is searched, per second
+CHECKS_PER_S: Final = 5.0  # searched frames of a video, per second
 
 
 class Views:
-    """Keeps distinct views of a board, and of similar views the one with the least motion.
+    """Keeps distinct views of a board; of similar views, keeps the view with the least motion.
 
-    In a video, sharp pauses thus replace frames with motion blur.
+    In a video, sharp frames of pauses therefore replace frames with motion blur.
 
     Args:
         width: Width of the pictures, pixels.
@@ -87,8 +87,8 @@ class LensCalibration:
     camera: Camera
     error_px: float  # RMS reprojection error over all used views, pixels
     names: tuple[str, ...]  # picture of each view used in the calibration
-    errors_px: Float[np.ndarray, "views"]  # their RMS reprojection errors, pixels
-    outliers: tuple[str, ...]  # names of views that were rejected for their large errors
+    errors_px: Float[np.ndarray, "views"]  # RMS reprojection error of each view, pixels
+    outliers: tuple[str, ...]  # names of views rejected for large errors
     coverage: float  # share of the picture's cells (8×6) with points
     covered: Bool[np.ndarray, "rows columns"]  # cells of the image that contain board points
     deviations: Float[np.ndarray, "4"]  # standard deviations of fx, fy, cx, cy, pixels
@@ -98,14 +98,14 @@ class LensCalibration:
 def calibrate_lens(sightings: Sequence[Sighting], size: Size) -> LensCalibration:
     """Calibrate a camera from views of a board.
 
-    Views with far larger errors than the others are rejected, once.
+    Views with far larger errors than the others are rejected, in a single pass.
 
     Args:
         sightings: The board's points in the pictures.
         size: Width and height of the pictures, pixels.
 
     Raises:
-        UserError: There are fewer than three views, or they determine no camera.
+        UserError: There are fewer than three views, or the views determine no camera.
     """
     if len(sightings) < 3:
         raise UserError(
@@ -143,7 +143,7 @@ def calibrate_lens(sightings: Sequence[Sighting], size: Size) -> LensCalibration
 
 
 def write_camera(path: Path, camera: Camera, trusted: bool = True) -> None:
-    """Write a camera as ROS's ``camera_info`` YAML, which every ``--camera`` reads."""
+    """Write a camera as ROS's ``camera_info`` YAML, a format of every ``--camera`` option."""
     check_target(path, (".yaml", ".yml"))
     assert camera.size is not None
     lens = list(camera.distortion)
@@ -184,7 +184,7 @@ def _solve(views: Sequence[Sighting], size: Size) -> _Solution:
             points, pixels, size, None, None
         )
     except cv2.error as reason:
-        problem = f"{len(views)} views of the board that determine no camera ({reason.err})"
+        problem = f"{len(views)} views of the board, which do not determine a camera ({reason.err})"
         allowed = "views tilted by 20 to 40° in several directions"
         raise UserError(problem, allowed, "take more pictures of the tilted board") from reason
     normals = np.array([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])

@@ -1,7 +1,7 @@
 """Checks of robot poses before a hand-eye calibration, and the quality of its result.
 
-A motion rotates robot and camera by the same angle, wherever the camera is mounted. The pictures
-can therefore be compared with every possible reading of the file before the calibration.
+A motion rotates robot and camera by equal angles, for any mount of the camera. Therefore, pictures
+and poses can be compared under every pose convention before the calibration.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from dopepp.robot.calibration.hand_eye import (
 from dopepp.robot.calibration.records import UNITS, PoseFormat, RobotPoses
 from dopepp.robot.calibration.tool import axis_name
 
-MIN_TURN: Final = np.radians(5.0)  # between the two poses that are farthest from each other
-TURN: Final = np.radians(1.5)  # largest median disagreement of rotations of a correct reading
-SHIFT: Final = 0.01  # the same of translations, metres
+MIN_TURN: Final = np.radians(5.0)  # smallest valid rotation between the two farthest poses
+TURN: Final = np.radians(1.5)  # largest median rotation error under the correct convention
+SHIFT: Final = 0.01  # largest median translation error under the correct convention, metres
 MOUNTS: Final[tuple[Mount, Mount]] = ("hand", "bench")
 SCALE: Final = 1.03  # largest negligible factor between robot's and camera's lengths
 MIN_POSES: Final = 8
 
 MIN_DIVERSITY: Final = np.radians(15.0)
-"""Of rotations about the second most common axis, RMS over pairs."""
+"""Smallest RMS rotation over pairs about the second most common axis."""
 
-MAX_ERROR: Final = 0.003  # of a part at the board's distance, metres, one standard deviation
+MAX_ERROR: Final = 0.003  # largest standard deviation at the board's distance, metres
 MAX_TURN: Final = np.radians(0.5)
 MIN_USED: Final = 0.7  # share of poses that agree with each other
 
@@ -113,7 +113,7 @@ def check_poses(
 
     Raises:
         UserError: The robot or the board did not move, or poses and pictures contradict each other.
-            The message names the conventions that would be right, if there are any.
+            The message names the conventions that fit, if any.
     """
     B = np.stack([board.T_cam_board for board in boards])
     flanges = poses.transforms(pose_format)[list(chosen)]
@@ -150,7 +150,7 @@ def check_poses(
 
 
 def _check_motion(T: Transforms, what: str, source: str) -> None:
-    """Refuse poses without rotations between them."""
+    """Raise a UserError for poses with equal orientations."""
     i, j = np.triu_indices(len(T), 1)
     between = T[i, :3, :3] @ T[j, :3, :3].transpose(0, 2, 1)
     largest = Rotation.from_matrix(between).magnitude().max(initial=0.0)
@@ -163,7 +163,7 @@ def _check_motion(T: Transforms, what: str, source: str) -> None:
 
 
 def _other_formats(poses: RobotPoses, pose_format: PoseFormat) -> Iterator[tuple[PoseFormat, str]]:
-    """Yield possible conventions of a file with the option that sets them, the given ones first."""
+    """Yield conventions with the option that selects them, the user's convention first."""
     yield pose_format, ""
     if poses.kind == "quaternion":
         order, position = ("xyzw", "last") if pose_format.order == "wxyz" else ("wxyz", "first")
@@ -190,7 +190,7 @@ def _format_error(
     elif unit != pose_format.unit:
         changes.append(f"--unit {unit}")
     problem = f"{source}, whose poses contradict the pictures"
-    allowed = f"poses that fit, which would be: {', and '.join(changes)}"
+    allowed = f"poses that fit, such as {', and '.join(changes)}"
     return UserError(problem, allowed, "run the command again with these options")
 
 
@@ -201,7 +201,7 @@ def _scale_error(scale: float, unit: str, source: str) -> UserError:
         problem = f"{source} in {unit}, which makes the robot's motions {factor:.4g} times too long"
         return UserError(problem, f"--unit {right}", f"run the command again with --unit {right}")
     return UserError(
-        f"{source}: the robot's motions are {factor:.3f} times those seen by the camera",
+        f"{source}: the robot's motions are {factor:.3f} times the camera's motions",
         f"a factor from {1 / SCALE:.2f} to {SCALE:.2f}",
         f"measure the board's squares (they may be {factor:.3f} times as large as stated), or "
         "calibrate the camera again",

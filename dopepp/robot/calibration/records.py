@@ -52,7 +52,7 @@ class PoseFormat:
 
     unit: str = "m"  # length unit of positions: m, mm, cm or inch
     degrees: bool = False  # whether angles are in degrees (default: radians)
-    order: str = "wxyz"  # `xyzw` if a quaternion's w is in the last column, whatever their names
+    order: str = "wxyz"  # `xyzw` if w is in the last quaternion column, whatever its name
     inverted: bool = False  # whether the poses are T_flange_base
 
 
@@ -128,7 +128,7 @@ def read_points(path: Path, unit: str) -> Float[np.ndarray, "points 3"]:
         The points in metres.
 
     Raises:
-        UserError: As :func:`read_robot_poses`.
+        UserError: As for :func:`read_robot_poses`.
     """
     return _numbers(_read_csv(path), ("x", "y", "z"), path).reshape(-1, 3) * UNITS[unit]
 
@@ -151,7 +151,7 @@ def _read_csv(path: Path) -> list[Record]:
         raise UserError(problem, "a readable CSV file", fix) from error
     if len(content) > MAX_BYTES:
         problem = f"{path} of more than {MAX_BYTES / 1e6:g} MB"
-        raise UserError(problem, FORMAT, "pass the file of the poses, which is smaller")
+        raise UserError(problem, FORMAT, "pass a file of poses only")
     separator = ";" if text.partition("\n")[0].count(";") >= 3 else ","
     rows = csv.DictReader(io.StringIO(text), delimiter=separator)
     return [{str(key).strip().lower(): value for key, value in row.items()} for row in rows]
@@ -271,7 +271,7 @@ def read_transform(path: Path, name: str) -> Transform:
         T = np.zeros(0)
     if T.shape != (4, 4) or not is_rotation(T[:3, :3], 1e-6) or not np.isfinite(T).all():
         allowed = f"{name}: {{matrix: 4×4 numbers of a rigid transform}}"
-        fix = "pass a file that `dopepp calibrate` has written"
+        fix = "pass a file written by `dopepp calibrate`"
         raise UserError(f"{path} without {name}", allowed, fix)
     return T
 

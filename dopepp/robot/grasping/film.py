@@ -60,8 +60,8 @@ class SideView:
     """Renders the robot and the objects of a scene from the side; needs OpenGL."""
 
     def __init__(self, scene: TrialScene) -> None:
-        things = [item.thing for item in scene.things]
-        self._cell = Cell(things, "all", T_flange_cam=MOUNT)
+        solids = [item.solid for item in scene.placed]
+        self._cell = Cell(solids, "all", T_flange_cam=MOUNT)
         self._state = self._cell.data()
         self._renderer = open_gl(self._cell.model, VIDEO_SIZE)
         self._camera = mujoco.MjvCamera()
@@ -112,7 +112,7 @@ def write_video(path: Path, trials: Trials, scene: TrialScene, attempt: Attempt)
 
 
 def write_rerun(path: Path, trials: Trials, scene: TrialScene, attempt: Attempt) -> None:
-    """Write a trial as a Rerun recording of the moving shapes of robot and things."""
+    """Write a trial as a Rerun recording of the moving shapes of robot and solids."""
     require("rerun", "--rerun", "rerun")
     import rerun as rr
 
@@ -122,7 +122,7 @@ def write_rerun(path: Path, trials: Trials, scene: TrialScene, attempt: Attempt)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         picture = draw_estimate(trials, scene, attempt)
         recording.log("picture", rr.Image(picture), static=True)
-        model = Cell([item.thing for item in scene.things], "all", T_flange_cam=MOUNT).model
+        model = Cell([item.solid for item in scene.placed], "all", T_flange_cam=MOUNT).model
         state = mujoco.MjData(model)
         bodies = _log_shapes(recording, model)
         for time, positions in zip(attempt.outcome.times, attempt.outcome.states, strict=True):

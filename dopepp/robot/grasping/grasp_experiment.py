@@ -41,7 +41,7 @@ from dopepp.robot.grasping.workbench import LAYOUTS, RENDERERS, open_gl
 MAX_TRIALS: Final = 100_000
 
 CURVE: Final = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
-"""Errors of exact poses, in millimetres and at the same time in degrees."""
+"""Errors of exact poses, each in millimetres and in degrees."""
 
 PAPER: Final = ((49, 47), (46, 46), (47, 43), (46, 45))
 """Table 9: recognised and caught of every 50 grasps with a real arm."""
@@ -94,7 +94,7 @@ def check_task(task: GraspTask, poses: str, count: int) -> GraspTask:
         raise UserError(f"part {task.part} without a network", allowed, fix)
     part = load_part(task.part, task.unit)
     find_grasps(part, task.grasps)
-    convex_pieces(part)  # takes a minute for a new mesh: here, and not in every process
+    convex_pieces(part)  # cached for all processes: a new mesh takes a minute
     return replace(task, sources=sources, network=task.network if needs_network else None)
 
 
@@ -129,7 +129,7 @@ def make_experiment(
         if path is not None:
             check_target(path, suffixes)
     if video is not None or task.renderer == "mujoco":
-        open_gl(Cell(shown="things").model, SIZE).close()  # fails now, not after all trials
+        open_gl(Cell(shown="solids").model, SIZE).close()  # fails now, not after all trials
     start, records = time.monotonic(), []
     for record in run_trials(task, count, workers or available_cores()):
         records.append(record)
@@ -149,7 +149,7 @@ def make_experiment(
 
 
 def _facts(task: GraspTask, records: Sequence[Record], seconds: float) -> dict[str, object]:
-    """Return the facts at the top of a report."""
+    """Return the settings and totals at the top of a report."""
     shift = max(record.hand_eye_mm for record in records)
     turn = max(record.hand_eye_deg for record in records)
     return {
@@ -169,7 +169,7 @@ def run_trials(task: GraspTask, count: int, workers: int) -> Iterator[Record]:
 
     Raises:
         RunError: A process died.
-        UserError: A trial refuses the task.
+        UserError: A trial cannot run the task.
     """
     run = _TrialRunner(task)
     if workers == 1:

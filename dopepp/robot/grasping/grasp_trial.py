@@ -34,7 +34,7 @@ from dopepp.robot.grasping.rehearsal import (
     draw_robot,
     looking_at,
 )
-from dopepp.robot.grasping.workbench import Layout, MujocoView, PlacedThing, RasterView
+from dopepp.robot.grasping.workbench import Layout, MujocoView, PlacedSolid, RasterView
 
 if TYPE_CHECKING:
     from dopepp.inference.estimator import PoseEstimator
@@ -47,9 +47,9 @@ DEFAULT_DISTANCE: Final = (0.18, 0.22)  # distances of the camera without a trai
 TILT: Final = np.radians(17.0)
 """Largest rotation of the camera about its x and y axes from straight down, radians."""
 
-DISTANCE_MARGIN: Final = 1.2  # factor on these distances, for parts away from the tray's centre
+DISTANCE_MARGIN: Final = 1.2  # factor on camera distances, for parts off the tray's centre
 FLAT_TILT_DEG: Final = 60.0
-"""Tilt that templates cover for parts that lie flat: that of the camera and of the perspective."""
+"""Largest tilt of templates for flat parts: the camera's tilt plus the effect of perspective."""
 
 SETTLE_S: Final = {"single": 0.2, "distractors": 0.4, "heap": 1.5}
 MAX_OBSTACLES: Final = 8  # number of parts in the planner's model
@@ -100,8 +100,8 @@ class Record:
     off: float  # deliberate error of the pose, millimetres and degrees
     seen: bool  # whether there was a pose
     recognised: bool  # whether ADD was below a tenth of the diameter
-    # The errors are in the arm's base frame and include those of the calibration. They are those
-    # before the part was laid flat, and NaN without a pose.
+    # Errors are in the arm's base frame, include calibration errors, and are measured before the
+    # pose is aligned with the bench. Without a pose, errors are NaN.
     add_mm: float  # ADD, millimetres
     error_mm: float  # position error of the part's origin, millimetres
     error_deg: float  # rotation error of the pose, degrees
@@ -117,7 +117,7 @@ class TrialScene:
 
     number: int
     cell: Cell
-    things: Sequence[PlacedThing]  # the parts first
+    placed: Sequence[PlacedSolid]  # the parts first
     start: Any  # state of the simulation
     poses: list[Transform]  # T_base_obj of every object at rest
     robot: TrueRobot
@@ -129,7 +129,7 @@ class TrialScene:
     @property
     def targets(self) -> list[Transform]:
         """Poses of the parts, the highest first."""
-        placed = zip(self.things, self.poses, strict=True)
+        placed = zip(self.placed, self.poses, strict=True)
         return sorted((pose for item, pose in placed if item.body.part), key=_height, reverse=True)
 
 
@@ -139,7 +139,7 @@ class Attempt:
 
     record: Record
     outcome: Outcome = field(default_factory=Outcome)
-    estimate: Transform | None = None  # T_base_obj by which the part was grasped, if there was one
+    estimate: Transform | None = None  # estimated T_base_obj of the grasped part
 
 
 class Trials:
@@ -156,8 +156,8 @@ class Trials:
         self._symmetries = symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
         self._raster = RasterView(task.renderer == "raster-shadows")
         self.robot = cache(self._robot)
-        self._parts_cell = cache(lambda count: Cell([self.layout.thing] * count))
-        self._parts_view = cache(lambda count: MujocoView([self.layout.thing] * count))
+        self._parts_cell = cache(lambda count: Cell([self.layout.solid] * count))
+        self._parts_view = cache(lambda count: MujocoView([self.layout.solid] * count))
 
     @cached_property
     def estimator(self) -> PoseEstimator:
@@ -170,7 +170,7 @@ class Trials:
 
     @cached_property
     def templates(self) -> PoseEstimator:
-        """Estimator of the part's mesh, for the distances at which the camera stands."""
+        """Estimator of the part's mesh by templates, for the camera's distances."""
         from dopepp.inference.estimator import PoseEstimator
 
         near, far = self.distance
@@ -183,7 +183,7 @@ class Trials:
         """Return distances inside the network's training range, metres."""
         names = [part.name for part in self.estimator.parts]
         if self.part.name not in names:
-            problem = f"--network {self.task.network}, which does not know {self.part.name}"
+            problem = f"--network {self.task.network}, which was not trained on {self.part.name}"
             allowed = f"a network of this part, not of {', '.join(names)}"
             raise UserError(problem, allowed, f"pass a network trained on {self.part.name}")
         depths = self.estimator.depth_range(self.part.name)
@@ -201,13 +201,13 @@ class Trials:
         """Set up a trial and take its picture."""
         rng = np.random.default_rng([self.task.seed, number])
         robot, calibrated = self.robot(number // BLOCK)
-        things = self.layout.draw(rng)
+        placed = self.layout.draw(rng)
         # Models and renderers of scenes with parts only are cached.
-        is_parts_only = all(item.body.part is not None for item in things)
-        solids, count = [item.thing for item in things], len(things)
+        is_parts_only = all(item.body.part is not None for item in placed)
+        solids, count = [item.solid for item in placed], len(placed)
         cell = self._parts_cell(count) if is_parts_only else Cell(solids)
         state = cell.data()
-        for index, item in enumerate(things):
+        for index, item in enumerate(placed):
             cell.put(state, index, item.T_base_obj)
         joints, T_base_cam = self._aim_camera(robot, rng)
         execution = Execution(cell, state, self.gripper, robot.zero)
@@ -217,9 +217,9 @@ class Trials:
         view: RasterView | MujocoView = self._raster
         if self.task.renderer == "mujoco":
             view = self._parts_view(count) if is_parts_only else MujocoView(solids)
-        picture = view.take([item.body for item in things], poses, T_base_cam, rng)
+        picture = view.take([item.body for item in placed], poses, T_base_cam, rng)
         return TrialScene(
-            number, cell, things, state, poses, robot, calibrated, joints, T_base_cam, picture
+            number, cell, placed, state, poses, robot, calibrated, joints, T_base_cam, picture
         )
 
     def attempt(self, scene: TrialScene, source: PoseSource) -> Attempt:
@@ -284,7 +284,7 @@ class Trials:
         shift = float(np.linalg.norm(estimate[:3, 3] - target[:3, 3]))
         turn = float(np.degrees(rotation_angle(estimate[:3, :3].T @ target[:3, :3])))
         is_recognised = bool(add < RECOGNISED * self.part.diameter)
-        parts = [index for index, item in enumerate(scene.things) if item.body.part]
+        parts = [index for index, item in enumerate(scene.placed) if item.body.part]
         is_caught = outcome is not None and outcome.held in parts
         if is_caught:
             failure = ""
@@ -306,7 +306,7 @@ class Trials:
         )
 
     def _aim_camera(self, robot: TrueRobot, rng: Generator) -> tuple[Joints, Transform]:
-        """Draw joints of the arm from which the camera sees the tray; return the camera's pose."""
+        """Draw joints from which the camera sees the tray; return joints and T_base_cam."""
         for _ in range(20):
             point = TRAY + np.array([*rng.uniform(-0.01, 0.01, 2), 0.0])
             distance = rng.uniform(*self.distance)
@@ -318,7 +318,7 @@ class Trials:
         raise UserError(
             f"--network {self.task.network}, trained for distances of "
             f"{self.distance[0]:.2f} to {self.distance[1]:.2f} m",
-            "distances at which this arm can hold its camera over the tray, up to about 0.6 m",
+            "distances that this arm can reach over the tray, up to about 0.6 m",
             "train for smaller distances: working_distance=[0.2,0.4]",
         )
 

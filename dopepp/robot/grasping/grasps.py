@@ -41,11 +41,11 @@ MAX_GRASPS: Final = 1000
 WIDEST: Final = 0.085  # largest opening of the fingers (2F-85), metres
 CLEARANCE: Final = 0.006  # preferred distance of each descending finger from the part, metres
 PAD_HALF: Final = np.array([0.004, 0.011, 0.009375])
-"""Half the thickness, width and length of a finger pad, metres. A finger has two, in a row."""
+"""Half the thickness, width and length of a finger pad, metres. A finger has two pads in a row."""
 
 INSERTIONS: Final = (0.009, 0.003)
-"""Distances of the pads' ends beyond a grasp's point, metres: half a pad, or less if something lies
-below."""
+"""Distances of the pads' ends beyond a grasp's point, metres: half a pad, or less above an
+obstacle."""
 
 ABOVE_BENCH: Final = 0.001  # distance of the pads' ends from the bench, metres
 PAIRS: Final = 1500  # sampled points for the search of pairs
@@ -247,7 +247,7 @@ def _pairs(mesh: Mesh, rng: np.random.Generator) -> Iterator[tuple[Vector, Vecto
     flat = np.cross(b - a, c - a)
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
     for point, normal in zip(points, normals, strict=True):
-        # Faces through which the inward ray may leave the solid along their normals.
+        # Faces through which the inward ray may leave the solid, i.e. normals along the ray.
         exits = flat @ -normal > FLAT
         for depth in _hits(point, -normal, a[exits], b[exits], c[exits]):
             if THINNEST <= depth <= WIDEST - CLEARANCE:

@@ -153,7 +153,7 @@ def laid_flat(T_base_obj: Transform, hull: Hull, T_base_bench: Transform) -> Tra
     """Align the estimated pose of a part with the bench.
 
     A picture from above determines tilt and height poorly, and the bench determines them well. A
-    part whose height differs by more than :data:`LOW` leans on something, and its pose is kept.
+    part whose height differs by more than :data:`LOW` leans on an obstacle, so its pose is kept.
 
     Args:
         T_base_obj: The estimated pose.

@@ -40,8 +40,7 @@ FOCAL: Final = SIZE[0] / 2 / np.tan(np.radians(30.0))  # 60° across, as in the 
 TRUE_K: Final[CameraMatrix] = camera_matrix(FOCAL, FOCAL, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
 
 MOUNT: Final = make_transform(np.eye(3), np.array([0.0, 0.09, 0.11]))
-"""T_flange_cam in the drawing of the bracket: beside the fingers, outside the picture, looking
-along the tool."""
+"""Nominal T_flange_cam: beside the fingers, which stay out of view, with z along the tool."""
 
 BRACKET: Final = (np.radians(1.0), 0.003)
 """Standard deviations of the bracket's error about and along each axis, radians and metres."""
@@ -73,14 +72,14 @@ class CalibratedRobot:
 
 
 def draw_robot(rng: Generator, tip: Vector) -> TrueRobot:
-    """Draw a robot's errors; ``tip`` is the true position of its closed fingers' ends."""
+    """Draw a robot's errors; ``tip`` is as in :class:`TrueRobot`."""
     turn, shift = (rng.normal(0, spread, 3) for spread in BRACKET)
     error = make_transform(Rotation.from_rotvec(turn).as_matrix(), shift)
     return TrueRobot(rng.normal(0, ZERO, JOINTS), MOUNT @ error, tip)
 
 
 def calibrate(robot: TrueRobot, arm: Arm, rng: Generator, distance: float) -> CalibratedRobot:
-    """Calibrate tool, bench, lens and hand-eye; ``distance`` is that of the parts, metres."""
+    """Calibrate tool, bench, lens and hand-eye; ``distance`` is the parts' distance, metres."""
     tip = find_tip(_pivot_poses(robot, arm, rng)).position
     bench = find_bench(_touch_bench(robot, arm, rng, tip)).T_base_bench
     camera, T_flange_cam = _calibrate_camera(robot, arm, rng)
@@ -111,7 +110,7 @@ def _draw_reachable(draw: Callable[[], FlangePair | None], count: int) -> list[F
 
 
 def _pivot_poses(robot: TrueRobot, arm: Arm, rng: Generator) -> Float[np.ndarray, "poses 4 4"]:
-    """Return readings of the flange's pose in which the tip touches one point above the tray."""
+    """Return the controller's flange poses while the tip touches a point above the tray."""
 
     def draw() -> FlangePair | None:
         turn = Rotation.from_rotvec([*rng.uniform(-0.5, 0.5, 2), rng.uniform(-1, 1)]).as_matrix()
@@ -167,7 +166,7 @@ def looking_at(
         point: The point in the base's frame, metres.
         distance: Distance of the camera from the point, metres.
         tilt: Rotation about the camera's x and y axes from straight down, radians.
-        roll: Rotation about its optical axis, radians.
+        roll: Rotation about the camera's optical axis, radians.
     """
     turn = Rotation.from_rotvec([*tilt, 0.0]) * Rotation.from_rotvec([0.0, 0.0, roll])
     rotation = _DOWN @ turn.as_matrix()

@@ -1,4 +1,4 @@
-"""The bench of a trial: the things on it, and the camera's picture of them.
+"""The bench of a trial: the solids on it, and the camera's picture of them.
 
 To add a layout, write a method of :class:`Layout` and add its name to :data:`LAYOUTS`.
 """
@@ -21,7 +21,7 @@ from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import Transform, invert_transform, make_transform
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.parts.part import Part
-from dopepp.robot.grasping.cell import CAMERA, JOINTS, TRAY, Cell, Thing, convex_pieces
+from dopepp.robot.grasping.cell import CAMERA, JOINTS, TRAY, Cell, Solid, convex_pieces
 from dopepp.robot.grasping.rehearsal import SIZE, TRUE_K
 from dopepp.virtual.backgrounds import ProceduralBackgrounds
 from dopepp.virtual.body import Body, distractor_shapes, make_body
@@ -35,16 +35,16 @@ LAYOUTS: Final = ("single", "distractors", "heap")  # methods of `Layout`
 SPREAD: Final = 0.025  # radius of the circle that contains a part's centre, metres
 DROP_HEIGHT: Final = 0.0005  # above the bench, metres
 HEAP: Final = (3, 5)  # minimum and maximum number of parts in a heap
-HEAP_SPREAD: Final = 0.05  # radius in which they fall, metres
-HEAP_TILT: Final = 15.0  # their largest initial tilt, degrees
-DISTRACTORS: Final = (2, 4)  # minimum and maximum number of things beside a part
-DISTRACTOR_RADIUS: Final = (0.012, 0.025)  # range of half their sizes, metres
-DISTRACTOR_AREA: Final = 0.11  # radius in which they stand, metres
+HEAP_SPREAD: Final = 0.05  # radius within which parts of a heap fall, metres
+HEAP_TILT: Final = 15.0  # largest initial tilt of a falling part, degrees
+DISTRACTORS: Final = (2, 4)  # smallest and largest number of distractors
+DISTRACTOR_RADIUS: Final = (0.012, 0.025)  # range of a distractor's radius, metres
+DISTRACTOR_AREA: Final = 0.11  # radius within which distractors are placed, metres
 COLOUR: Final = (0.93, 0.55, 0.14)
 
 RENDERERS: Final = ("raster", "raster-shadows", "mujoco")
-"""Renderers of the camera's pictures: the project's as in the training of the released networks,
-on a bench without shadows; the same with the shadows of the parts; and MuJoCo's."""
+"""Renderers of the camera's pictures: ``raster``, as in the training of the released networks, has
+a bench without shadows; ``raster-shadows`` adds the shadows of parts."""
 
 STYLE: Final = PRESETS["wide"]
 """Preset of the released networks: light, materials and camera errors."""
@@ -56,11 +56,11 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedThing:
+class PlacedSolid:
     """An object, and its initial pose T_base_obj."""
 
     body: Body
-    thing: Thing
+    solid: Solid
     T_base_obj: Transform
 
 
@@ -78,19 +78,19 @@ class Layout:
     def __init__(self, part: Part, name: str, yaw_deg: float, rest: str) -> None:
         self._name = name
         self.part, self.body = part, make_body(part, is_target=True)
-        self.thing = Thing(convex_pieces(part), part.mesh, COLOUR)
+        self.solid = Solid(convex_pieces(part), part.mesh, COLOUR)
         self._yaw, self._rest = np.radians(yaw_deg), rest
 
-    def draw(self, rng: Generator) -> list[PlacedThing]:
+    def draw(self, rng: Generator) -> list[PlacedSolid]:
         """Draw the objects and their poses, the parts first."""
-        things: list[PlacedThing] = getattr(self, self._name)(rng)
-        return things
+        solids: list[PlacedSolid] = getattr(self, self._name)(rng)
+        return solids
 
     def draw_pose(self, rng: Generator) -> Transform:
-        """Draw the pose of a part that lies alone in the tray."""
+        """Draw the pose of a single part in the tray."""
         return self._placed(rng, SPREAD, DROP_HEIGHT, 0.0).T_base_obj
 
-    def _placed(self, rng: Generator, spread: float, height: float, tilt_deg: float) -> PlacedThing:
+    def _placed(self, rng: Generator, spread: float, height: float, tilt_deg: float) -> PlacedSolid:
         up = np.array([0.0, 0.0, 1.0])
         if self._rest == "any":
             normals, shares = self.body.hull.rests
@@ -104,16 +104,16 @@ class Layout:
         centre = rotation @ self.part.cuboid[-1]
         offset = np.array([*_draw_in_disc(rng, spread), height - lowest])
         position = TRAY + offset - [*centre[:2], 0.0]
-        return PlacedThing(self.body, self.thing, make_transform(rotation, position))
+        return PlacedSolid(self.body, self.solid, make_transform(rotation, position))
 
-    def single(self, rng: Generator) -> list[PlacedThing]:
-        """Place a part alone."""
+    def single(self, rng: Generator) -> list[PlacedSolid]:
+        """Place a single part."""
         return [self._placed(rng, SPREAD, DROP_HEIGHT, 0.0)]
 
-    def distractors(self, rng: Generator) -> list[PlacedThing]:
-        """Place a part among other things that do not touch it."""
-        things = self.single(rng)
-        occupied = [(things[0].T_base_obj[:3, 3], self.part.diameter / 2)]
+    def distractors(self, rng: Generator) -> list[PlacedSolid]:
+        """Place a part among distractors that do not touch the part."""
+        solids = self.single(rng)
+        occupied = [(solids[0].T_base_obj[:3, 3], self.part.diameter / 2)]
         shapes = distractor_shapes()
         for _ in range(int(rng.integers(DISTRACTORS[0], DISTRACTORS[1] + 1))):
             radius = rng.uniform(*DISTRACTOR_RADIUS)
@@ -126,24 +126,24 @@ class Layout:
                     for centre, other in occupied
                 ):
                     occupied.append((position, radius))
-                    things.append(_standing(body, position, rng))
+                    solids.append(_standing(body, position, rng))
                     break
-        return things
+        return solids
 
-    def heap(self, rng: Generator) -> list[PlacedThing]:
+    def heap(self, rng: Generator) -> list[PlacedSolid]:
         """Drop parts onto each other."""
         count = int(rng.integers(HEAP[0], HEAP[1] + 1))
         heights = [0.002 + 0.02 * index for index in range(count)]
         return [self._placed(rng, HEAP_SPREAD, height, HEAP_TILT) for height in heights]
 
 
-def _standing(body: Body, position: np.ndarray, rng: Generator) -> PlacedThing:
-    """Place a thing upright on the bench, with a random yaw."""
+def _standing(body: Body, position: np.ndarray, rng: Generator) -> PlacedSolid:
+    """Place a distractor upright on the bench, with a random yaw."""
     rotation = Rotation.from_rotvec([0.0, 0.0, rng.uniform(0, 2 * np.pi)]).as_matrix()
     height = DROP_HEIGHT - float(body.surface.vertices[:, 2].min())
-    thing = Thing((np.asarray(body.hull.vertices),), None, (0.35, 0.45, 0.6))
+    solid = Solid((np.asarray(body.hull.vertices),), None, (0.35, 0.45, 0.6))
     T_base_obj = make_transform(rotation, position + np.array([0.0, 0.0, height]))
-    return PlacedThing(body, thing, T_base_obj)
+    return PlacedSolid(body, solid, T_base_obj)
 
 
 def _draw_in_disc(rng: Generator, radius: float) -> tuple[float, float]:
@@ -155,14 +155,14 @@ class RasterView:
     """The project's renderer: random materials and lights, a random picture on the bench.
 
     Args:
-        shadows: Whether parts throw shadows on the bench.
+        shadows: Whether parts cast shadows on the bench.
     """
 
     def __init__(self, shadows: bool) -> None:
         self._shadows = shadows
         self._render = find_renderer("raster")
         self._backgrounds = ProceduralBackgrounds()
-        # The preset defines blur and motion for pictures of its own height.
+        # The preset's blur and motion are for pictures of the preset's height.
         self._sensors = STYLE.sensors.resized(SIZE[1] / STYLE.height)
 
     def take(
@@ -192,10 +192,10 @@ class RasterView:
 
 
 class MujocoView:
-    """MuJoCo's renderer, which needs OpenGL: one colour per thing, a plain bench."""
+    """MuJoCo's renderer, which needs OpenGL: one colour per solid, a plain bench."""
 
-    def __init__(self, things: Sequence[Thing]) -> None:
-        self._cell = Cell(things, shown="things")
+    def __init__(self, solids: Sequence[Solid]) -> None:
+        self._cell = Cell(solids, shown="solids")
         self._state = self._cell.data()
         self._renderer = open_gl(self._cell.model, SIZE)
         self._sensors = STYLE.sensors.resized(SIZE[1] / STYLE.height)
@@ -208,7 +208,7 @@ class MujocoView:
         T_base_cam: Transform,
         rng: Generator,
     ) -> Picture:
-        """Render the things at poses T_base_obj on the bench."""
+        """Render the solids at poses T_base_obj on the bench."""
         model, state = self._cell.model, self._state
         for number, pose in enumerate(poses):
             self._cell.put(state, number, pose)
@@ -231,9 +231,9 @@ def table_pose(T_base_cam: Transform) -> Transform:
 
 @cache
 def has_gl() -> bool:
-    """Return whether MuJoCo can render; log why not."""
+    """Return whether MuJoCo can render; otherwise log the reason."""
     try:
-        open_gl(Cell(shown="things").model, (64, 64)).close()
+        open_gl(Cell(shown="solids").model, (64, 64)).close()
     except UserError as error:
         _log.warning("pictures of failures show the camera's view only: %s", error.got)
         return False
@@ -244,7 +244,7 @@ def open_gl(model: Any, size: tuple[int, int]) -> Any:
     """Return a MuJoCo renderer for pictures of (width, height).
 
     Raises:
-        UserError: There is no OpenGL.
+        UserError: OpenGL is not available.
     """
     try:
         return mujoco.Renderer(model, size[1], size[0])

@@ -26,7 +26,7 @@ from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 from dopepp.robot.nodes.worker import Answer, Stamp
 
-MARKER_FACES: Final = 1000  # triangles of a marker; its message has 36 kB
+MARKER_FACES: Final = 1000  # triangles of a marker, whose message has 36 kB
 
 TRIANGLE_LIST, ADD, DELETE_ALL = 11, 0, 3  # type and actions of visualization_msgs/Marker
 OK, WARN = 0, 1  # levels of diagnostic_msgs/DiagnosticStatus
@@ -47,7 +47,7 @@ VISION: Final = {
         "std_msgs/Header header\nvision_msgs/Detection3D[] detections\n"
     ),
 }
-"""Definitions of ``vision_msgs``, which not every installation has."""
+"""Definitions of ``vision_msgs``, which may be missing in an installation."""
 
 Fields = dict[str, Any]
 
@@ -80,7 +80,7 @@ class AnswerFormatter:
         parts: The worker's parts, with meshes if available.
 
     Raises:
-        UserError: Two parts' names give one topic name.
+        UserError: The names of two parts give the same topic name.
     """
 
     def __init__(self, parts: Sequence[Part]) -> None:
@@ -105,7 +105,7 @@ class AnswerFormatter:
         ]
 
     def messages(self, answer: Answer, is_wanted: Callable[[str], bool]) -> list[Message]:
-        """Return an answer's messages on the topics that are wanted."""
+        """Return the messages of an answer on the requested topics."""
         header = {"stamp": answer.stamp._asdict(), "frame_id": answer.frame_id}
         makers: dict[str, Callable[[], Fields]] = {}
         for name, word in self._names.items():
@@ -153,7 +153,7 @@ class AnswerFormatter:
         return {"transforms": transforms}
 
     def _markers(self, answer: Answer, header: Fields) -> Fields:
-        """Return the parts' triangles, which replace those of the last picture."""
+        """Return the parts' triangles, which replace the markers of the last picture."""
         markers: list[Fields] = [{"header": header, "action": DELETE_ALL}]
         for index, detection in enumerate(answer.result.detections):
             red, green, blue = (np.array(COLOURS[index % len(COLOURS)]) / 255).tolist()

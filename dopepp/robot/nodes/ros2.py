@@ -37,13 +37,12 @@ from dopepp.robot.nodes.messages import (
 from dopepp.robot.nodes.worker import Stamp, Worker
 
 QUEUE_IN: Final = 5
-"""A shorter queue loses pictures when a busy machine delays the process. A longer one starts with
-old pictures."""
+"""Shorter input queues lose pictures on a busy machine; longer queues start with old pictures."""
 
 QUEUE_OUT: Final = 10
 WAIT_S: Final = 0.2  # seconds between two checks whether the node should stop
 CHECKPOINTS: Final = -1.0
-"""Parameter ``confidence`` for the checkpoint's threshold: ROS has no empty parameter."""
+"""Value of the parameter ``confidence`` that selects the checkpoint's threshold."""
 
 RECENT: Final = 100  # number of pictures over which rates and latencies are reported
 
@@ -150,7 +149,7 @@ class _Node:
         self._publishers[topic] = self.handle.create_publisher(message, full, QUEUE_OUT)
 
     def _subscribe(self) -> None:
-        """Subscribe to the pictures and the ``camera_info`` beside them."""
+        """Subscribe to the pictures and their ``camera_info``."""
         from rclpy.qos import QoSProfile, ReliabilityPolicy
 
         policy = ReliabilityPolicy.RELIABLE if self._is_reliable else ReliabilityPolicy.BEST_EFFORT
@@ -167,7 +166,7 @@ class _Node:
         ]
 
     def _take_info(self, message: Any) -> None:
-        self._info = message  # valid until the next
+        self._info = message  # valid until the next message
 
     def _take_picture(self, message: Any) -> None:
         self.slot.put((message, self._info))
@@ -182,7 +181,7 @@ class _Node:
         self._summary = answer.result.summary
 
     def _tick(self) -> None:
-        """Publish the diagnosis once a second, and find out why no pictures arrive."""
+        """Publish the diagnosis once a second, and warn if no pictures arrive."""
         self._publish(self._diagnosis())
         if self.slot.received:
             return
@@ -234,14 +233,14 @@ class _Node:
 
 
 @contextmanager
-def _ros_errors(what: str) -> Iterator[None]:
+def _ros_errors(source: str) -> Iterator[None]:
     """Turn an error of ROS into a :class:`UserError`."""
     try:
         yield
     except Exception as error:  # rclpy raises many types
-        allowed = "a running ROS 2, and names and values that it accepts"
-        fix = f"change {what} as the message describes"
-        raise UserError(f"{what}: {error!s:.300}", allowed, fix) from error
+        allowed = "a running ROS 2, and names and values that ROS 2 accepts"
+        fix = f"correct {source} according to the message"
+        raise UserError(f"{source}: {error!s:.300}", allowed, fix) from error
 
 
 class Slot(Generic[Item]):
@@ -262,7 +261,7 @@ class Slot(Generic[Item]):
         self._thread.start()
 
     def put(self, item: Item) -> None:
-        """Store a picture for the thread, in place of a picture that is still waiting."""
+        """Store a picture for the thread, replacing a waiting picture."""
         self.check()
         with self._fresh:
             self.received += 1
@@ -304,13 +303,13 @@ class Pace:
         self._answered = 0
 
     def count(self, latency_s: float) -> None:
-        """Count an answer with the age of its picture."""
+        """Count an answer; ``latency_s`` is the age of its picture."""
         self._times.append(self._clock())
         self._latencies.append(1000 * latency_s)
         self._answered += 1
 
     def values(self) -> dict[str, str]:
-        """Return the values that are already known, for a diagnosis."""
+        """Return the available values, for a diagnosis."""
         values = {"answered": str(self._answered)}
         if len(self._times) > 1:
             span = self._times[-1] - self._times[0]
@@ -328,7 +327,11 @@ def native(kind: str, fields: Fields) -> Any:
 
 @cache
 def type_of(kind: str) -> Any:
-    """Return the class of a message type, ``package/Name``; may raise ImportError."""
+    """Return the class of a message type ``package/Name``.
+
+    Raises:
+        ImportError: The package is not installed.
+    """
     package, _, name = kind.partition("/")
     return getattr(import_module(f"{package}.msg"), name)
 
@@ -341,7 +344,7 @@ def _fill(message: Any, fields: Fields) -> Any:
 
 
 def _value(default: Any, kind: str, value: Any) -> Any:
-    """Return the value of a field, whose type ROS spells ``kind``."""
+    """Return the value of a field of the ROS type ``kind``."""
     if isinstance(value, dict):
         return _fill(default, value)
     if isinstance(value, Triangles):

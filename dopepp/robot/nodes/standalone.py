@@ -45,7 +45,7 @@ def send_lines(
 
     Raises:
         UserError: The address is invalid, or a source cannot be read.
-        RunError: A camera stream ended, or nobody reads stdout any more.
+        RunError: A camera stream ended, or the reader of stdout has exited.
     """
     with nullcontext(_print) if address is None else _datagrams(address) as send:
         for source, camera in sources:
@@ -63,7 +63,7 @@ def _datagrams(address: str) -> Iterator[Callable[[str], None]]:
             content = f"{line}\n".encode()
             if len(content) > MAX_DATAGRAM:
                 if not has_warned:
-                    text = "skipped a line of %d bytes, too long for a datagram (%d): raise --conf"
+                    text = "skipped a line of %d bytes (a datagram holds %d): raise --conf"
                     logger.warning(f"{text}, or use --json", len(content), MAX_DATAGRAM)
                 has_warned = True
                 return
@@ -80,7 +80,7 @@ def _print(line: str) -> None:
         sys.stdout.write(f"{line}\n")
         sys.stdout.flush()  # a reader must not wait for a full buffer
     except BrokenPipeError as error:
-        raise RunError("the program that reads the lines has ended") from error
+        raise RunError("the program that reads stdout has exited") from error
 
 
 def _parse_address(text: str) -> tuple[str, int]:

@@ -1,4 +1,4 @@
-"""Worker: processes the pictures of a node, whatever their transport.
+"""Worker: processes the pictures of a node, for any transport.
 
 An invalid picture or camera does not stop the node. The worker warns once, with a remedy, and
 continues with the next picture.
@@ -22,7 +22,7 @@ from dopepp.inference.pose_result import PoseResult, make_shape, spent_between
 from dopepp.inference.tracker import PoseTracker
 
 PATIENCE: Final = 5
-"""Consecutive pictures without ``camera_info`` before the warning: the first may arrive early."""
+"""Number of consecutive pictures without ``camera_info`` before the warning."""
 
 OPTICAL: Final = "optical"  # part of the name of a frame whose z axis points forward (REP 103)
 
@@ -66,10 +66,10 @@ class Answer:
 
     @property
     def numbers(self) -> list[int]:
-        """The number n in every pose's frame ``<object>_<n>``.
+        """The number n of each pose, for its frame ``<object>_<n>``.
 
-        The track's identity if parts are tracked, otherwise the rank among the detections of the
-        object, the best score first.
+        Tracked parts have the identity of the track; other detections of an object are numbered by
+        descending score.
         """
         if self.result.identities is not None:
             return [*self.result.identities]
@@ -84,7 +84,7 @@ class Worker:
         estimator: Estimates the poses.
         settings: Initial settings (see :meth:`update`).
         camera: Camera of all pictures, in place of their ``camera_info``.
-        frame_id: The camera's optical frame, in place of the pictures' own.
+        frame_id: The camera's optical frame, in place of the frame in the messages.
         track: Track the parts from frame to frame; this includes refinement.
         warn: Receives warnings.
 
@@ -118,7 +118,7 @@ class Worker:
         """Change the settings.
 
         Raises:
-            UserError: The settings are not supported; the previous settings stay.
+            UserError: The settings are not supported; the previous settings remain.
         """
         if self._tracker is not None and not settings.refine:
             fix = "set refine=true, or start the node without --track"
@@ -147,14 +147,14 @@ class Worker:
         """
         try:
             image = decode_image(message)
-        except Exception as error:  # messages come from anywhere: any error is the sender's
+        except Exception as error:  # a message of any sender may cause any error
             fix = "configure the driver to send rgb8, bgr8 or JPEG"
             self._reject("picture", f"a picture of {topic}: {error!s:.300}; fix: {fix}")
             return None
         try:
             lens = None if info is None else CameraInfo.from_message(info)
         except Exception as error:
-            self._reject("info", f"the camera_info beside {topic}: {error!s:.300}")
+            self._reject("info", f"the camera_info of {topic}: {error!s:.300}")
             return None
         if lens is None and self._camera is None:
             self._num_without_info += 1
@@ -223,14 +223,14 @@ class Worker:
         )
 
     def _checked_frame(self, frame_id: str, info: CameraInfo | None, topic: str) -> str:
-        """Return the frame of the poses; warn if it is not an optical one."""
+        """Return the frame of the poses; warn if the frame is not an optical frame."""
         if self._frame_id is not None:
             return self._frame_id
         pictures = f"pictures on {topic} are in frame {frame_id!r:.80}"
         fix = "name the camera's optical frame: --frame camera_optical_frame"
         if OPTICAL not in frame_id:
             problem = (
-                f"{pictures}, which is not named as an optical one; a pose's frame has x right, "
+                f"{pictures}, which is not named as an optical frame; a pose's frame has x right, "
             )
             self._warn("frame", f"{problem}y down and z forward; {fix}")
         elif info is not None and info.frame_id not in ("", frame_id):
@@ -260,7 +260,7 @@ class Worker:
         self._warn(kind, problem)
 
     def _warn(self, kind: str, text: str) -> None:
-        """Send a warning, once of each kind."""
+        """Send a warning, once for each kind of problem."""
         if kind not in self._warned:
             self._warned.add(kind)
             self._send_warning(text)

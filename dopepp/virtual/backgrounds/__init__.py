@@ -50,7 +50,7 @@ def find_backgrounds(choice: str | Path | None, split: PhotoSplit = "all") -> Ba
 
     Args:
         choice: None or ``procedural``, the same on every machine; ``skimage`` for the photos in an
-            installed scikit-image; or a folder of photos (``./skimage`` for one of that name).
+            installed scikit-image; or a folder of photos (``./skimage`` for a folder of that name).
         split: Photos to draw from (:meth:`PhotoBackgrounds.part`).
 
     Raises:
@@ -63,13 +63,13 @@ def find_backgrounds(choice: str | Path | None, split: PhotoSplit = "all") -> Ba
 
 
 class MixedBackgrounds:
-    """Backgrounds of which a share comes from other backgrounds."""
+    """Backgrounds from two sources: ``other`` with probability ``share``, else ``usual``."""
 
     def __init__(self, usual: Backgrounds, other: Backgrounds, share: float) -> None:
         self.usual, self.other, self.share = usual, other, share
 
     def identity(self) -> list[str]:
-        """Return the identities of both, and the share."""
+        """Return the identities of both sources, and the share."""
         return [*self.usual.identity(), f"mixed {self.share:g}", *self.other.identity()]
 
     def draw(self, rng: Generator, width: int, height: int) -> Picture:

@@ -27,19 +27,19 @@ _LONGEST_PHOTO_PX: Final = 1000
 so 1000 lets a photo of 4000 pixels decode at a quarter."""
 
 _LEAST_REDUCTION: Final = 2.0
-"""A crop comes from the smallest halving of a photo that it still reduces by this factor, which is
-cheaper than reducing the whole photo."""
+"""Smallest factor by which a crop is reduced. A crop is taken from the coarsest halving of a photo
+that allows this factor, which is cheaper than reducing the whole photo."""
 
 PhotoSplit = Literal["train", "val", "test", "all"]
 
-FEWEST_PHOTOS: Final = 2  # least photos of the validation split and of the test split
+FEWEST_PHOTOS: Final = 2  # smallest number of photos in the validation split and in the test split
 HELD_OUT: Final = 0.15
-"""Share of the photos for validation, and for test."""
+"""Share of the photos in the validation split, and in the test split."""
 
-_HASHED_BYTES: Final = 2**16  # beginning of a photo that decides about its split
+_HASHED_BYTES: Final = 2**16  # leading bytes of a photo, whose hash determines the split
 
-_SMALLEST_PX: Final = 30  # shorter side of the smallest halving, at least
-_KEPT_BYTES: Final = 200_000_000  # decoded photos a process keeps: about 260 of VOC2007
+_SMALLEST_PX: Final = 30  # smallest valid shorter side of a halving
+_KEPT_BYTES: Final = 200_000_000  # decoded photos cached per process: about 260 of VOC2007
 
 
 class PhotoBackgrounds:
@@ -86,13 +86,13 @@ class PhotoBackgrounds:
     def part(self, split: PhotoSplit, held_out: float = HELD_OUT) -> PhotoBackgrounds:
         """Return the photos of one split.
 
-        The order of the files' hashes decides, so the splits do not depend on names or folders, and
-        copies of a photo are in the same split. If there are fewer than six different photos, all
-        splits are the whole folder (:meth:`is_divided` is False).
+        Photos are divided by the order of their hashes. Splits therefore do not depend on names or
+        folders, and copies of a photo are in the same split. With fewer than six different photos,
+        all splits are the whole folder (:meth:`is_divided` is False).
 
         Args:
             split: Split to return; ``all`` for the whole folder.
-            held_out: Share of the photos for validation, and for test; training has the others.
+            held_out: Share of the photos in the validation split, and in the test split.
         """
         if split == "all":
             return self
@@ -113,7 +113,7 @@ class PhotoBackgrounds:
 
     @property
     def is_divided(self) -> bool:
-        """Whether the photos belong to one split and no other split uses them."""
+        """Whether the photos belong to a single split."""
         return self.split != "all"
 
     def draw(self, rng: Generator, width: int, height: int) -> Picture:
@@ -204,10 +204,10 @@ class PhotoBackgrounds:
             listed = "; ".join(f"{bad}: {reason}" for bad, reason in self.bad.items())
             raise UserError(
                 f"{len(self.bad)} damaged of {len(self.paths)} background photos ({listed})",
-                f"whole photos of at most {MAX_SIDE} pixels a side; {most} damaged ones of these",
+                f"photos of at most {MAX_SIDE} pixels a side, with at most {most} damaged files",
                 "delete these files, or copy them again",
             )
-        text = "background photo %s left out: %s (%d damaged of at most %d)"
+        text = "skipping the damaged background photo %s: %s (%d of at most %d)"
         logger.warning(text, path, damage, len(self.bad), most)
 
 

@@ -84,11 +84,11 @@ def _noise(rng: Generator, width: int, height: int, cells: int) -> Field:
     rows = max(round(cells * height / width), 1)
     grid = rng.random((rows + 1, cells + 1), np.float32)
     if cells * 32 <= width:
-        # Cells this large lose nothing when enlarged from a quarter of their size.
+        # Large cells are smooth enough to be drawn at a quarter of the resolution.
         quarter = (width // 4, max(height // 4, 1))
         grid = np.asarray(cv2.resize(grid, quarter, interpolation=cv2.INTER_CUBIC))
         return np.asarray(cv2.resize(grid, (width, height), interpolation=cv2.INTER_LINEAR))
-    # Large cells show the creases of linear interpolation; small ones do not.
+    # Linear interpolation shows creases in large cells only.
     smooth = cv2.INTER_CUBIC if cells * 8 <= width else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(grid, (width, height), interpolation=smooth))
 
@@ -102,12 +102,12 @@ def _clouds(rng: Generator, width: int, height: int) -> Field:
             break
         cv2.scaleAdd(_noise(rng, width, height, cells * 2**octave), gain**octave, field, field)
         total += gain**octave
-    # A sum of noises concentrates around its middle: spread it over the palette.
+    # Sums of noise concentrate around their mean, so they are stretched over the palette.
     return np.asarray((field / total - 0.5) * 1.8 + 0.5)
 
 
 def _coordinates(rng: Generator, width: int, height: int) -> tuple[Field, Field]:
-    """Return image coordinates, turned, in perspective and bent; the width is about 1."""
+    """Return rotated, bent image coordinates with perspective, in units of about the width."""
     angle, bend = rng.uniform(0, 2 * np.pi), rng.uniform(0, 0.08)
     x = np.linspace(-0.5, 0.5, width, dtype=np.float32)[None]
     y = (np.linspace(-0.5, 0.5, height, dtype=np.float32) * (height / width))[:, None]
@@ -133,7 +133,7 @@ def _checker(rng: Generator, width: int, height: int) -> Field:
 
 
 def _whole(values: Field) -> Int32[np.ndarray, "height width"]:
-    """Return the integers below, as int32, whose remainders are fast to compute."""
+    """Round down to int32, whose remainders are fast to compute."""
     return np.asarray(np.floor(values), np.int32)
 
 
@@ -197,12 +197,12 @@ def _scatter(rng: Generator, image: Picture, count: int) -> None:
 
 _PLAIN_SHARE: Final = 0.4  # share of pieces of one colour with a brightness gradient
 _PRINTED_SHARE: Final = 0.2  # share of pieces with dark and light cells, like markers
-_WIDTHS: Final = (0.04, 0.4)  # over the picture's, logarithmically uniform: most things are small
+_WIDTHS: Final = (0.04, 0.4)  # of a piece over the picture's, log-uniform: most objects are small
 _FINE_BITS: Final = 4  # outlines are drawn in sixteenths of a pixel
 
 
 class ClutteredBackgrounds:
-    """Backgrounds with pieces of other pictures: polygons, turned boxes, ellipses and rings.
+    """Backgrounds with pieces of other pictures: polygons, rotated boxes, ellipses and rings.
 
     Args:
         behind: Backgrounds, from which some of the pieces are cut as well.
@@ -223,7 +223,7 @@ class ClutteredBackgrounds:
         return [*self.behind.identity(), "cluttered", *map(str, (*self.number, *self.contrast))]
 
     def draw(self, rng: Generator, width: int, height: int) -> Picture:
-        """Return a background with pieces on it."""
+        """Return a background with pieces."""
         image = self.behind.draw(rng, width, height).copy()
         for _ in range(int(rng.integers(self.number[0], self.number[1] + 1))):
             self._add_piece(rng, image)
@@ -234,7 +234,7 @@ class ClutteredBackgrounds:
         return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
 
     def _add_piece(self, rng: Generator, image: Picture) -> None:
-        """Lay a piece on a picture, cut off at the border."""
+        """Paint a piece on a picture, clipped at the border."""
         rows, columns = image.shape[:2]
         size = columns * math.exp(rng.uniform(*np.log(_WIDTHS)))
         outline = _outline(rng) * size / 2
@@ -257,7 +257,7 @@ class ClutteredBackgrounds:
 
 
 def _outline(rng: Generator) -> Float[np.ndarray, "loops points 2"]:
-    """Return a closed line, or two nested ones, within the unit circle."""
+    """Return one closed line or two nested closed lines within the unit circle."""
     kind = int(rng.integers(4))
     corners = (int(rng.integers(3, 9)), 4, 32, 32)[kind]
     angles = np.arange(corners) / corners * 2 * np.pi
@@ -271,7 +271,7 @@ def _outline(rng: Generator) -> Float[np.ndarray, "loops points 2"]:
 
 
 def _plain(rng: Generator, width: int, height: int) -> Picture:
-    """Return one colour, lighter towards one side."""
+    """Return a picture of one colour with a brightness gradient."""
     colour = rng.uniform(0, 255, 3)
     grey = colour.mean()
     colour = grey + rng.uniform(0, 1) * (colour - grey)
@@ -282,7 +282,7 @@ def _plain(rng: Generator, width: int, height: int) -> Picture:
 
 
 def _printed(rng: Generator, width: int, height: int) -> Picture:
-    """Return cells of one dark and one light colour, turned."""
+    """Return a rotated pattern of dark and light cells."""
     columns, rows = rng.integers(1, 9, 2)
     dark, light = rng.uniform((0, 140), (90, 255))
     cells = np.where(rng.random((rows, columns, 1)) < 0.5, dark, light) * rng.uniform(0.8, 1.2, 3)

@@ -110,12 +110,12 @@ class Preset(Checked):
         return crop_camera(K, *corner), self.window
 
     def resized(self, width: int, height: int) -> Preset:
-        """Return the same scenes in another size; another aspect ratio stretches the image."""
+        """Return the preset for another picture size; another aspect ratio stretches pictures."""
         K = resize_camera(self.K, width / self.width, height / self.height)
         return self._with_camera(K, width, height, width / self.width)
 
     def reframed(self, width: int, height: int) -> Preset:
-        """Return the same scenes in another size and shape, with the pixels' aspect ratio kept.
+        """Return the preset for another picture size, with the pixels' aspect ratio kept.
 
         The field of view along the shorter side stays. Along the longer side the picture is cropped
         or extended equally at both ends.
@@ -128,7 +128,7 @@ class Preset(Checked):
         return self._with_camera(K, width, height, scale)
 
     def _with_camera(self, K: CameraMatrix, width: int, height: int, scale: float) -> Preset:
-        """Return the same scenes in another camera, with pixels ``scale`` times as fine."""
+        """Return the preset for another camera, with pixels ``scale`` times as fine."""
         sensors, intrinsics = self.sensors.resized(scale), intrinsics_of(K)
         return replace(self, width=width, height=height, sensors=sensors, intrinsics_px=intrinsics)
 

@@ -37,19 +37,19 @@ class Materials(Checked):
         roughness: Roughness of dielectrics.
         specular: Reflectance of dielectrics at normal incidence.
         texture_gain: Factor on the colours of coloured surfaces.
-        texture_tint: Largest relative deviation of a channel from that factor, because scans are
-            taken with another camera.
-        texture_noise: Relative amplitude of noise on these colours, for the stains and openings
-            that a model lacks.
+        texture_tint: Largest relative deviation of a colour channel from ``texture_gain``, for
+            scans by another camera.
+        texture_noise: Relative amplitude of noise on coloured surfaces, for stains and openings
+            that are missing in the model.
         noise: Relative amplitude of noise on the albedo of an untextured surface.
         noise_pitch: Size of the noise over the object's radius.
         metal_albedo: Reflectance of metals at normal incidence.
         brush_pitch: Mean distance of the marks on brushed metals.
-        brush_slope: Largest slope of their flanks, the tangent of the normal's tilt.
+        brush_slope: Largest slope of a mark's flanks, the tangent of the normal's tilt.
         print_share: Share of untextured dielectrics that are 3D prints with layer lines.
         layer_pitch: Height of a print's layers.
         layer_slope: Largest slope of the layers' flanks, as ``brush_slope``.
-        alike_share: Chance that all instances of a part in an image share a material.
+        alike_share: Probability that all instances of a part in an image share a material.
     """
 
     albedo: Shares = (0.02, 0.9)
@@ -106,7 +106,7 @@ class Materials(Checked):
         brightness = rng.uniform(*self.albedo)
         if rng.random() < self.coloured_share:
             srgb = colorsys.hsv_to_rgb(rng.random(), rng.uniform(*self.saturation), 1.0)
-            # The usual power for sRGB, exact enough for a random colour.
+            # A gamma of 2.2 approximates sRGB well enough for a random colour.
             colour = triple(brightness * channel**2.2 for channel in srgb)
         else:
             colour = _grey(rng, brightness)
@@ -147,16 +147,16 @@ _RGB_FROM_XYZ: Final = np.array(
 
 @dataclass(frozen=True)
 class Lighting(Checked):
-    """Ranges of light; an intensity is what a white surface facing the light reflects, 1 is white.
+    """Ranges of light; an intensity is the radiance of a white surface that faces the light.
 
     Attributes:
         num_lights: Number of point lights; the first, the key light, casts the sharpest shadows.
         max_angle_deg: Largest angle at the scene between a light and the camera (or, over a plane,
             the plane's normal); 0 is a flash light on the camera.
         distance: Distance of a light from the scene.
-        temperature_k: Colour temperature as a camera balanced for 6500 K sees it; low is warm.
-        tint: Largest relative deviation of a colour channel from that colour.
-        ground_share: Light from below over the light from above.
+        temperature_k: Colour temperature at a white balance of 6500 K; low is warm.
+        tint: Largest relative deviation of a colour channel from the lamp's colour.
+        ground_share: Ratio of the light from below to the light from above.
     """
 
     num_lights: Annotated[tuple[int, int], Span(0, 8, "a count")] = (1, 3)
@@ -165,7 +165,7 @@ class Lighting(Checked):
     ambient_intensity: Intensity = (0.08, 0.4)
     max_angle_deg: Annotated[float, Range(0.0, 180.0, "degrees")] = 75.0
     distance: Annotated[Pair, Span(0.1, 1000.0, "camera distances")] = (1.0, 5.0)
-    # Where the approximation of the Planckian locus holds.
+    # Limits of the approximation of the Planckian locus.
     temperature_k: Annotated[Pair, Span(1667.0, 25000.0, "kelvin")] = (4000.0, 8500.0)
     tint: Annotated[float, Range(0.0, 0.9, "share")] = 0.06
     ground_share: Shares = (0.3, 0.9)
@@ -175,7 +175,7 @@ class Lighting(Checked):
     ) -> tuple[tuple[Light, ...], Ambient]:
         """Draw the ambient light and point lights around ``centre``, camera frame, metres.
 
-        ``normal`` is the supporting plane's, if there is a plane.
+        ``normal`` is the normal of the supporting plane; None without a plane.
         """
         towards = np.array([0.0, 0.0, -1.0]) if normal is None else normal
         far = float(np.linalg.norm(centre))
@@ -195,7 +195,7 @@ class Lighting(Checked):
 
     def _colour(self, rng: Generator) -> Vector:
         """Draw the linear RGB of a lamp of luminance about 1."""
-        # Uniform in 1/T, because equal steps of it look equally different (mired).
+        # Uniform in 1/T, because equal steps of 1/T are equally visible (mired).
         warm, cold = self.temperature_k
         colour = black_body_rgb(1.0 / rng.uniform(1.0 / cold, 1.0 / warm))
         return np.asarray(colour * (1 + rng.uniform(-self.tint, self.tint, 3)))

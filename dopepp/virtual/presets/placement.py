@@ -131,10 +131,10 @@ class _Placement(Checked):
             raise UserError(problem, f"{first} <= {last}", f"lower {first}, or raise {last}")
 
     def redraw(self, rng: Generator, position: Vector) -> Vector | None:
-        """Return another position for an object that the frame does not show well, or None.
+        """Return another position for an object that is not well visible, or None.
 
-        Coordinates that a placement keeps retain their distribution, however many positions are
-        rejected. None also draws the orientation again.
+        Coordinates that a placement keeps retain their distribution for any number of rejections.
+        After None, the orientation is drawn again as well.
         """
         return None
 
@@ -143,7 +143,7 @@ class _Placement(Checked):
 class OffsetPlacement(_Placement):
     """A box of positions around a point on the optical axis (the paper's scene, section 2.1).
 
-    A position that the camera does not see is moved along the optical axis. Lateral offsets and
+    An object outside the image is moved along the optical axis. Lateral offsets and
     orientations therefore keep their uniform distributions.
 
     Attributes:
@@ -183,7 +183,7 @@ class OffsetPlacement(_Placement):
 class DistancePlacement(_Placement):
     """Uniform in the depth of the object's origin and, laterally, over the image.
 
-    ``margin`` is the share of width and height that the origin keeps from the border.
+    ``margin`` is the smallest distance of the origin from the border, in image widths and heights.
     """
 
     _ends = ("nearest", "farthest")
@@ -205,7 +205,7 @@ class FillPlacement(_Placement):
     """The part fills a drawn share of the image and lies inside it.
 
     The share is the larger of bounding-box width over image width and bounding-box height over
-    image height. The distance follows from it by iteration.
+    image height. The distance is found by iteration.
     """
 
     _ends = ("smallest", "largest")
@@ -220,7 +220,7 @@ class FillPlacement(_Placement):
         offset = rng.uniform(-0.5, 0.5, 2)
         centre = (rotated_hull.min(axis=0) + rotated_hull.max(axis=0)) / 2
         pixel, hull = np.array(size) / 2 - 0.5, rotated_hull - centre
-        # Perspective moves a tilted part's box away from its centre's image: iterate.
+        # The image of a tilted part's box is not centred on the image of its centre, so iterate.
         for _ in range(10):
             ray = np.linalg.solve(K, [*pixel, 1.0])
             depth = _depth_that_fills(share, ray, K, size, hull)
@@ -237,9 +237,9 @@ class FillPlacement(_Placement):
 
 @dataclass(frozen=True)
 class WorkingPlacement(_Placement):
-    """Uniform in the depth of the part's middle and laterally wherever the picture shows all of it.
+    """Uniform in depth and over the lateral positions at which the whole part is visible.
 
-    The middle is the centre of the turned part's bounding box. Parts larger than the picture are
+    A position is the centre of the rotated part's bounding box. Parts larger than the picture are
     centred.
     """
 
@@ -292,8 +292,8 @@ def _depth_that_fills(
         if abs(filled / share - 1) < 1e-4:  # far below a pixel
             break
         low, high = (depth, high) if filled > share else (low, depth)
-        # The share falls nearly as 1/depth. That guess alternates with bisection, because it
-        # converges from one side only near the camera.
+        # The share is nearly proportional to 1/depth. Steps by this rule alternate with bisection,
+        # because they converge from one side only near the camera.
         depth *= filled / share
         if step % 2 or not low < depth < high:
             depth = (low + high) / 2 if np.isfinite(high) else 2 * low

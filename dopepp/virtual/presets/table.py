@@ -31,7 +31,7 @@ class Table(Checked):
         tilted_share: Share of objects that lean by ``tilt_deg`` instead of resting on a face.
         heaped: Whether objects are dropped onto a heap instead of lying side by side.
         heap_radius: Radius within which a heap's objects are dropped.
-        picture_width: Width of the plane that the background's picture covers; beyond it the
+        picture_width: Width of the plane that the background's picture covers; outside, the
             picture is mirrored.
     """
 
@@ -137,7 +137,7 @@ def inverse_depth_row(plane: Plane, K: CameraMatrix) -> Vector:
 
 
 def _beyond(end: float, K: CameraMatrix, size: Size, T_cam_table: Transform) -> Mask | None:
-    """Return the mask of pixels beyond the plane's end, or None without any."""
+    """Return the mask of pixels beyond the plane's end, or None if the mask is empty."""
     width, height = size
     slope = inverse_depth_row(plane_of(T_cam_table), K)
     across, down = slope[0] * np.arange(width), slope[1] * np.arange(height) + slope[2]

@@ -31,8 +31,8 @@ _FINE_PX: Final = 45.0
 _USUAL_PX: Final = 70.0
 _WIDE_RATIO: Final = 3.5
 
-_ROOM: Final = 1.3  # the shorter side of a window over the diameter of the largest part in it
-_MULTIPLE: Final = 32  # both sides of a window are multiples of it, pixels
+_ROOM: Final = 1.3  # ratio of a window's shorter side to the diameter of the largest part
+_MULTIPLE: Final = 32  # both sides of a window are multiples of this number, pixels
 _MOST_BLUR: Final = 10.0  # largest factor on the blur in large pictures
 _BEYOND: Final = 1.25  # largest depth of a part on a table over that of the table's origin
 
@@ -132,7 +132,7 @@ class View:
         )
 
     def whole(self, preset: Preset, scale: float) -> Preset:
-        """Return a preset's scenes in whole pictures, with more blur to be equal when scaled."""
+        """Return a preset's scenes in whole pictures, with blur matched to the scaled windows."""
         sensors = preset.sensors.resized(min(1 / scale, _MOST_BLUR))
         return replace(self.window(preset, 1.0, None), sensors=sensors)
 
@@ -156,12 +156,12 @@ class View:
         if window is not None:
             lines.insert(
                 1,
-                f"the network sees its pictures scaled by {scale:g} and learns on windows of "
+                f"the network's input is scaled by {scale:g}, and training uses windows of "
                 f"{window[0]}×{window[1]} pixels",
             )
         if smallest < _FINE_PX:
             lines.append(
-                f"that is coarse: below {_FINE_PX:g} pixels across, more parts are missed; stay "
+                f"parts are small: networks miss more parts below {_FINE_PX:g} pixels across; stay "
                 f"within {self.distance[1] * smallest / _FINE_PX:.2g} m, or use a longer lens or "
                 "larger pictures"
             )

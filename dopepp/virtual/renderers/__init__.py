@@ -1,7 +1,7 @@
 """The renderers by name, imported on demand.
 
-To add one, write a module with ``render(scene) -> Rendered`` and one line in :data:`RENDERERS`, or
-an entry point ``dopepp.renderers`` in a package of your own (:mod:`dopepp.core.extensions`).
+To add a renderer, write a module with ``render(scene) -> Rendered`` and add it to
+:data:`RENDERERS`, or add an entry point ``dopepp.renderers`` (:mod:`dopepp.core.extensions`).
 """
 
 from __future__ import annotations

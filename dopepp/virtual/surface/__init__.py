@@ -61,7 +61,7 @@ class Surface:
 
     @property
     def is_coloured(self) -> bool:
-        """Whether it has a texture or vertex colours."""
+        """Whether the surface has a texture or vertex colours."""
         return self.texture is not None or len(self.colours) > 0
 
     @property
@@ -107,7 +107,7 @@ def make_surface(mesh: Mesh) -> Surface:
     length = np.linalg.norm(doubled, axis=1)
     normals = _corner_normals(merged, doubled, length, edges)
     if mesh.normals is not None:
-        _take_given(normals, mesh.normals[faces], doubled, length)
+        _use_file_normals(normals, mesh.normals[faces], doubled, length)
     closed = _is_closed(merged, vertices[faces])
     uv, texture = np.zeros((0, 2), np.float32), None
     colours = np.zeros((0, 3), np.float32)
@@ -119,12 +119,12 @@ def make_surface(mesh: Mesh) -> Surface:
         texture = make_texture(mesh.texture, uv, faces)
     elif mesh.colours is not None:
         colours = SRGB_TO_LINEAR[mesh.colours]
-    # Texture coordinates may differ where positions do not.
+    # Vertices at the same position may have different texture coordinates.
     patches = _smooth_patches(merged if texture is None else faces, normals, length > 0)
     sky = bake_open_sky(vertices, faces, normals, closed)
     hull = vertices[np.unique(faces)]
     if len(hull) > _HULL_DIRECTIONS:
-        # One direction at a time: all at once would take gigabytes for a large mesh.
+        # Directions are processed singly; together they would need gigabytes for a large mesh.
         extreme = [int((hull @ along).argmax()) for along in spread_directions(_HULL_DIRECTIONS)]
         hull = hull[np.unique(extreme)]
     spacing = float(np.sqrt(length.sum() / 2 / _NUM_POINTS))
@@ -192,8 +192,8 @@ def _corner_normals(
     return normals
 
 
-def _take_given(
-    normals: Corners, given: Corners, doubled: Float[np.ndarray, "faces 3"], length: PerFace
+def _use_file_normals(
+    normals: Corners, in_file: Corners, doubled: Float[np.ndarray, "faces 3"], length: PerFace
 ) -> None:
     """Replace computed normals by the file's normals that are close to the face's normal.
 
@@ -201,7 +201,7 @@ def _take_given(
     from the face's normal.
     """
     with np.errstate(all="ignore"):  # normals may be zero or not finite
-        unit = given / np.linalg.norm(given, axis=2, keepdims=True)
+        unit = in_file / np.linalg.norm(in_file, axis=2, keepdims=True)
         facing = np.einsum("fki,fi->fk", unit, doubled / np.maximum(length, 1e-300)[:, None])
         near = facing >= math.cos(math.radians(_CREASE_ANGLE_DEG / 2))
     normals[near] = unit[near]

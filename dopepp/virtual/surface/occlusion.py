@@ -73,7 +73,7 @@ def bake_open_sky(
 
 
 def _bake_mesh(vertices: Array, faces: Array, normals: Array, closed: bool) -> OpenSky:
-    """Draw a mesh from all directions and look its points up in the depth maps."""
+    """Render depth maps of a mesh from all directions, and look up its points."""
     corners = vertices[faces]
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
@@ -133,7 +133,8 @@ def _spread(
     ground = np.empty(count, np.int32)
     for n in np.unique(steps).tolist():
         j, i = np.nonzero(np.add.outer(np.arange(n + 1), np.arange(n + 1)) <= n)
-        # A little inside the triangle: a point in a corner of the mesh would lie on both walls.
+        # Points lie slightly inside the triangle: in a corner of the mesh, they would lie on two
+        # walls.
         inset = 0.1 / n
         k1, k2 = (inset / 3 + (1 - inset) * step[:, None] / n for step in (i, j))
         k0 = 1.0 - k1 - k2
@@ -158,7 +159,7 @@ def _bake(
     grid: _Points,
     sums: Array,
 ) -> None:
-    """Sum the cosine over all directions: open front, all front, open back and all back.
+    """Sum cosines over directions in four rows: open front, all front, open back, all back.
 
     The mesh lies within ``radius`` around ``centre``; depth maps along ``directions`` are sampled
     at the texels' centres.
@@ -176,7 +177,7 @@ def _bake(
     T, P = np.zeros((4, 4)), np.empty((3, 4), np.float32)
     for k in range(directions.shape[0]):
         dx, dy, dz = directions[k]
-        # Any two perpendicular axes serve.
+        # The camera's x and y axes are arbitrary.
         if abs(dz) < 0.9:
             norm = 1.0 / math.sqrt(dx * dx + dy * dy)
             rx, ry, rz = -dy * norm, dx * norm, 0.0
@@ -230,7 +231,7 @@ def look_up_sky(
         x, y = n * share[1, p], n * share[2, p]
         i, j = min(int(x), n - 1), min(int(y), n - 1)
         if i + j > n - 1:
-            # On the far edge, rounded beyond the last cell.
+            # A point on the far edge may be rounded into the next cell.
             i, j = max(i - 1, 0), j if i > 0 else j - 1
         x, y = x - i, y - j
         # Row j starts after n + 1, n, n − 1, … points.

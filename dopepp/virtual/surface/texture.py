@@ -119,7 +119,7 @@ def _halve(
 def _bilinear(
     texels: Array, first: int, rows: int, columns: int, decode: Array, u: float, v: float
 ) -> tuple[float, float, float]:
-    """Look a repeating level up in linear light; v points up, row 0 is the top."""
+    """Sample a repeating level in linear light; v points up, row 0 is the top."""
     x = (u - math.floor(u)) * columns - 0.5
     y = (1.0 - (v - math.floor(v))) * rows - 0.5
     i, j = math.floor(x), math.floor(y)

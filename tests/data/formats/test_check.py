@@ -290,7 +290,7 @@ NDDS = {
         f"{SETTINGS}:exported_objects.0.cuboid_dimensions", [9, 4, 2],
         "objects[0].cuboid.size: edges",
     ),
-    "cuboid no box": read(f"{OBJECT}.cuboid.3.0", 99.0, "objects[0].cuboid: no box"),
+    "cuboid no box": read(f"{OBJECT}.cuboid.3.0", 99.0, "objects[0].cuboid: not a box"),
     "cuboid short": Case(f"{OBJECT}.cuboid", [[1, 2, 3]], "objects[0].cuboid: [[1, 2, 3]]"),
     "cuboid order": read(f"{OBJECT}.cuboid", lambda corners: corners[::-1], "objects[0]."),
     "centroid": read(f"{OBJECT}.cuboid_centroid", [0, 0, 40], "objects[0].cuboid_centroid: "),
@@ -308,7 +308,7 @@ NDDS = {
     "visibility of words": Case(f"{OBJECT}.visibility", "much", "objects[0].visibility: 'much'"),
     "bounding box": read(
         f"{OBJECT}.bounding_box", {"top_left": [0, 0], "bottom_right": [9, 9]},
-        "objects[0].bounding_box: (0, 0)–(9, 9) does not hold",
+        "objects[0].bounding_box: (0, 0)–(9, 9) does not contain",
     ),
     "bounding box turned": read(
         f"{OBJECT}.bounding_box", {"top_left": [9, 9], "bottom_right": [0, 0]},
@@ -431,7 +431,7 @@ NOTED = {
     "an image of empty info": (f"{INFO}:1", [], "2 objects without visib_fract"),
     "an object of null info": (f"{INFO}:1", first_null, "1 objects without visib_fract"),
     "an object of a box only": (f"{INFO}:0.0.visib_fract", None, "1 objects without visib_fract"),
-    "a model missing": ("models/obj_000002.ply", None, "no file of object 2, left out"),
+    "a model missing": ("models/obj_000002.ply", None, "no file of object 2, whose annotations"),
     "an object without a model": (f"{GT}:0.0.obj_id", 9, "object 9 is annotated 1 times and has"),
 }
 

@@ -45,7 +45,7 @@ def test_no_target_is_said_so():
     job = make_job(["servoholder"], changes=["targets_per_image=[0,0]", *SMALL])
     _, posed, masks, depth = scene_tiles(job.factory.render(0, 0), "image 0")
     assert posed.caption == "no target"
-    assert masks.caption == "nothing to find; distractors: 0"
+    assert masks.caption == "no instance; distractors: 0"
     assert depth.caption == "no depth"
 
 

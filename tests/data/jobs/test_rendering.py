@@ -90,7 +90,7 @@ def test_whatever_stops_a_job_it_ends_with_the_same_files(job, tmp_path, content
     assert contents(tmp_path) == whole
     again = render_dataset(job, tmp_path, NUM, InlinePool)
     assert again.num_rendered == 0
-    assert str(again) == f"all {NUM} images were there"
+    assert str(again) == f"all {NUM} images exist already"
     assert contents(tmp_path) == whole
 
 

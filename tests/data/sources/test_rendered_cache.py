@@ -86,7 +86,7 @@ def test_what_does_not_fit_is_refused(fake_source, monkeypatch):
         source = fake_source()
         cached = CachedSource(source, (64, 64))
         vars(source).update(change)
-        with pytest.raises(ValueError, match="one size and one source"):
+        with pytest.raises(ValueError, match="one size and source"):
             cached.sample(1)
     monkeypatch.setattr(rendered, "_MAX_INSTANCES", 0)
     with pytest.raises(ValueError, match="1 instances; at most 0"):

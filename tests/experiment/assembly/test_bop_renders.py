@@ -73,7 +73,7 @@ def test_renders_are_as_the_pictures_camera_sees_the_models(config, caplog):
     near, far = chosen.data.virtual.working_distance
     assert 0.40 <= near < far <= 0.60
     assert chosen.plain["virtual"]["working_distance"] == [near, far]
-    assert "as they are annotated there" in caplog.text
+    assert "its annotated distances" in caplog.text
     module = build_datamodule(chosen.data, parts, 0)
     names = [(split, info.name) for split, info in module.summary()]
     assert names == [("train", "virtual"), ("val", "virtual"), ("test", "bop/test")]
@@ -172,7 +172,7 @@ def test_validation_is_on_renders_where_pictures_show_no_object(config, root, tm
     data = config(f"data.root={empty}", "data.image_sets.val=val").data
     parts = build_parts(data)
     assert held_out_source(data, parts, "val").describe()[0].name == "virtual"
-    assert "bop/val shows none of red, blue: validation is on renders" in caplog.text
+    assert "bop/val shows none of red, blue: validating on renders" in caplog.text
 
 
 def test_true_poses_from_a_file_have_full_marks_in_every_score(call, root, tmp_path):

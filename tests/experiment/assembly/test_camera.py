@@ -71,7 +71,7 @@ def test_what_was_chosen_stands_in_the_config_and_in_the_checkpoint(my_part, cam
     assert config.data.network_input == (128, 128)
     scale = config.data.virtual.camera_scale
     assert scale == pytest.approx(70 * math.sqrt(0.4 * 0.7) / FOCAL / DIAMETER, rel=0.01)
-    assert "the network sees its pictures scaled by" in caplog.text
+    assert "the network's input is scaled by" in caplog.text
     assert "windows of 128×128 pixels" in caplog.text
     stored = config.stored_data()
     lens = {"width": 1280, "height": 720, "fx": FOCAL, "fy": FOCAL, "cx": 640.0, "cy": 360.0}
@@ -146,7 +146,7 @@ def test_without_a_camera_nothing_is_chosen(parsed):
     config = parsed("experiment=my_part")
     assert fitted_to_camera(config, []) is config
     with pytest.raises(
-        UserError, match=r"no data\.input_size and no camera.*add the camera's file"
+        UserError, match=r"neither data\.input_size nor a camera.*add the camera's file"
     ):
         build_datamodule(config.data, build_parts(config.data), 0)
 

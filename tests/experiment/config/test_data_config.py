@@ -80,8 +80,8 @@ def test_what_does_not_exist_is_named(override, message, evaluated, stored):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("++data.num_test=5", r"best\.ckpt, which names no data"),
-        ("data=virtual", r"best\.ckpt, which does not state how to render"),
+        ("++data.num_test=5", r"best\.ckpt, which contains no data config"),
+        ("data=virtual", r"best\.ckpt, which contains no options of the renders"),
     ],
 )
 def test_a_checkpoint_without_data_asks_for_them(override, message, evaluated):

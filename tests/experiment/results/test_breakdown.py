@@ -163,7 +163,7 @@ def test_methods_share_the_bins_and_keep_their_own_objects(measured):
 @pytest.mark.filterwarnings("ignore:The ``compute`` method of metric PoseMetrics was called")
 def test_without_instances_there_is_a_warning(tmp_path, caplog):
     record_breakdown(tmp_path, {"dopepp": PoseMetrics([part("a")])}, "rotation", 5, RATES)
-    assert "by=rotation: the test set has no instance that counts" in caplog.text
+    assert "by=rotation: no bins, because the test set has no evaluated instance" in caplog.text
     assert not list(tmp_path.iterdir())
 
 

@@ -193,17 +193,17 @@ def test_an_evaluation_is_what_its_checkpoint_was_trained_as(tmp_path, report_of
     ("file", "content", "reason"),
     [
         (METRICS_FILE, "{", "unreadable"),
-        (METRICS_FILE, "{}", "metrics.json is not of this version"),
-        (METRICS_FILE, '{"name": 1, "objects": []}', "not of this version"),
-        (COST_FILE, "{}", "cost.json is not of this version"),
-        ("checkpoints/last.ckpt", "", "it left no metrics.json; continue with resume="),
+        (METRICS_FILE, "{}", "metrics.json is of another version"),
+        (METRICS_FILE, '{"name": 1, "objects": []}', "of another version"),
+        (COST_FILE, "{}", "cost.json is of another version"),
+        ("checkpoints/last.ckpt", "", "no metrics.json; continue with resume="),
     ],
 )
 def test_a_damaged_or_unfinished_run_is_a_row_with_the_reason(
     file, content, reason, tmp_path, write_run
 ):
     run = write_run(tmp_path / "0")
-    assert read_run(run).failure == "unfinished: it left no metrics.json"
+    assert read_run(run).failure == "unfinished: no metrics.json"
     (run / file).parent.mkdir(exist_ok=True)
     (run / file).write_text(content)
     (run / CONFIG_FILE).write_text("a: [")

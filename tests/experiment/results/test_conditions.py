@@ -153,7 +153,7 @@ def test_every_method_is_measured_at_every_share(tmp_path):
 
 def test_shares_that_are_not_reached_are_counted_and_said(tmp_path, caplog):
     run_shading(Discs(contrast=False), tmp_path, 0)
-    said = f"At 60 %, {NUM_IMAGES} of {NUM_IMAGES} instances are not within 2 points"
+    said = f"At 60 %, the covered share of {NUM_IMAGES} of {NUM_IMAGES} instances is off"
     assert said in caplog.text
     assert not (tmp_path / "shading_examples.png").exists()
 
@@ -207,7 +207,7 @@ def test_every_method_is_measured_at_every_scale(tiny, tmp_path, caplog):
         assert float(row["pass_5cm"]) == result
         assert float(row["add_01d"]) == (method == "dopepp")
         assert float(row["miss_rate"]) == 1 - result
-    note = "Instances that count at ×20: none; at ×1: 3, of which "
+    note = "Evaluated instances at ×20: none; at ×1: 3, "
     assert note in caplog.text
     assert [tile.caption for tile in tiles] == [f"test/0/0, ×{scale}" for scale in ("0.5", 1, 20)]
     check_pictures(tmp_path, SCALE, 3)

@@ -39,7 +39,7 @@ def test_a_sweep_ends_with_its_table_and_fails_after_it(tmp_path, report_of, wri
         end(tmp_path, {"title": "6"})
     assert failed.value.code == 1
     rows = read_csv(tmp_path / "table.csv")
-    assert rows[1]["method"].endswith("unfinished: it left no metrics.json")
+    assert rows[1]["method"].endswith("unfinished: no metrics.json")
 
 
 def test_a_part_with_other_seeds_stands_alone(tmp_path, report_of, write_run):
@@ -138,6 +138,6 @@ def test_an_experiment_without_a_table_is_refused_before_anything_is_written(
     write_run(tmp_path / "0", ["model=dope"], report_of("dope", ERRORS))
     path = tmp_path / "experiment.yaml"
     path.write_text(text)
-    with pytest.raises(UserError, match="lays out no table"):
+    with pytest.raises(UserError, match="has no table layout"):
         compare_paths([tmp_path / "0"], tmp_path / "out", table=path)
     assert not (tmp_path / "out").exists()

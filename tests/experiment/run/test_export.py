@@ -71,7 +71,7 @@ def test_a_full_disk_leaves_the_old_file_and_nothing_else(monkeypatch, tmp_path)
         ({"layout": "safetensors", "precision": "int8"}, "allowed: fp32 or fp16"),
         ({"out": Path("a.pt")}, r"--out a\.pt for --format onnx; allowed: a file NAME\.onnx"),
         ({"layout": "openvino", "out": Path("a.xml")}, "allowed: a folder"),
-        ({"layout": "openvino", "out": Path("full")}, "where something else exists"),
+        ({"layout": "openvino", "out": Path("full")}, "which exists and is not an export"),
         ({"path": Path("a.onnx")}, "which is an export; allowed: a checkpoint"),
         ({"path": Path("none.ckpt")}, "which is not a file"),
     ],

@@ -167,7 +167,7 @@ def test_trials_below_the_median_are_pruned(call_fast, tmp_path):
 def test_a_study_is_not_mixed_with_another_configuration(call_fast):
     assert call_fast(*FAST, "search.num_trials=1")[0] == 0
     line = call_fast(*FAST, "search.num_trials=2", "data.batch_size=7").line
-    assert "data.batch_size=7, while the study s was begun with data.batch_size=32" in line
+    assert "data.batch_size=7, but data.batch_size=32 at the start of the study s" in line
     done = call_fast(*SEARCH, "optimizer.lr=interval(1e-6,1e-5)", "search.prune=false")
     assert "search.study=NAME" in done.line
 
@@ -189,8 +189,8 @@ def test_a_folder_of_another_study_or_command_is_refused(call_fast, tmp_path):
         (["experiment=table6_dope_vs_dopepp"], "sweeps over model, data.parts itself"),
         (["optimizer.lr=range(0.1,0.5,0.1)", "optimizer.lx=interval(0,1)"], "optimizer.lx"),
         (["optimizer.lr=tag(log, interval(0.0, 1.0))"], "optimizer.lr"),
-        (["search.space=['optimizer.lr=1']"], "which is one value"),
-        (["search.space=[]", "optimizer.lr=1"], "nothing to vary"),
+        (["search.space=['optimizer.lr=1']"], "which is a single value"),
+        (["search.space=[]", "optimizer.lr=1"], "no option to vary"),
         (["model/attention=choice(cbam,cbbm)"], "cbbm"),
         (["search.storage=/dev/null/study.db"], "search.storage=/dev/null/study.db"),
         (["search.storage=nowhere://x"], "search.storage=nowhere://x"),

@@ -128,5 +128,5 @@ def test_specks_that_no_triangle_can_stand_for_are_refused():
     # Far more separate specks than the limit, each inside of a cell of any grid that is tried.
     grid = np.stack(np.meshgrid(*[np.arange(6.0)] * 3), axis=-1).reshape(-1, 1, 3) + 0.45
     specks = grid + 1e-6 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    with pytest.raises(ValueError, match="its 216 triangles cannot be reduced to 4"):
+    with pytest.raises(ValueError, match="216 triangles that cannot be reduced to 4"):
         decimate(specks.reshape(-1, 3), np.arange(648).reshape(-1, 3), None, 4)

@@ -94,7 +94,7 @@ def test_trimesh_puts_the_triangles_of_quads_in_another_order(write):
 def test_a_binary_stl_that_lies_about_its_triangles(refused, count):
     binary = export_stl(BOX)
     lie = binary[:80] + struct.pack("<I", count) + binary[84:]
-    refused("a.stl", lie, rf"684 bytes where its header promises {count} triangles")
+    refused("a.stl", lie, rf"684 bytes, but the header states {count} triangles")
 
 
 def test_a_binary_stl_may_begin_like_text(write):

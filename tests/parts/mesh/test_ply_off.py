@@ -112,12 +112,12 @@ def test_agrees_with_trimesh(tmp_path, encoding):
     ("options", "message"),
     [
         ({"promised": (7, 12)}, "export the mesh again"),
-        ({"promised": (8, 11)}, "more than its header promises"),
+        ({"promised": (8, 11)}, "more than stated in its header"),
         ({"promised": (8, 13)}, "less data|buffer is smaller"),
-        ({"promised": (0, 0)}, "more than its header promises"),
+        ({"promised": (0, 0)}, "more than stated in its header"),
         ({"types": ("int", "int"), "count": -3}, "a list of -3"),
         ({"count": 200}, "less data than 12 rows"),
-        ({"count": 2}, "face 0 of fewer than 3|bytes more"),
+        ({"count": 2}, "face 0 with fewer than 3|bytes more"),
     ],
 )
 def test_a_header_or_a_list_that_lies_is_refused(refused, form, options, message):
@@ -172,7 +172,7 @@ def test_fans_lie_around_first_corners():
     assert triangles.tolist() == [
         [0, 1, 2], [3, 4, 5], [3, 5, 6], [3, 6, 7], [8, 9, 10], [8, 10, 11]
     ]  # fmt: skip
-    with pytest.raises(ValueError, match="face 1 of fewer than 3 corners"):
+    with pytest.raises(ValueError, match="face 1 with fewer than 3 corners"):
         fans(ROUND, np.arange(5), np.array([3, 2]))
 
 
@@ -211,9 +211,9 @@ def test_a_prism_of_hexagons_in_an_off_file(write, volume):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("8 6", "8 5", "14 lines where its header promises 8 .* 5 faces"),
-        ("8 6", "8 7", "14 lines where its header promises 8 .* 7 faces"),
-        ("4 0 1 3 2", "2 0 1", "face 0 of fewer than 3 corners"),
+        ("8 6", "8 5", "14 lines, but the header states 8 .* 5 faces"),
+        ("8 6", "8 7", "14 lines, but the header states 8 .* 7 faces"),
+        ("4 0 1 3 2", "2 0 1", "face 0 with fewer than 3 corners"),
         ("4 0 1 3 2", "4 0 1 3 8", "a face index outside of its 8"),
         ("4 0 1 3 2", "4 0 1 3 1.5", "invalid literal"),
         ("4 0 1 3 2", "4 0 3 1 2", "a polygon that is not convex, face 0"),

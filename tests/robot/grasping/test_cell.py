@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import make_transform
 from dopepp.parts.catalogue import BUILTIN, load_part
-from dopepp.robot.grasping.cell import TRAY, Cell, Thing, convex_pieces
+from dopepp.robot.grasping.cell import TRAY, Cell, Solid, convex_pieces
 from dopepp.robot.grasping.rehearsal import SIZE
 from dopepp.robot.grasping.workbench import HEAP, LAYOUTS, SPREAD, Layout, RasterView
 
@@ -34,7 +34,7 @@ def test_a_part_without_a_mesh_has_no_pieces(part):
 
 
 def test_a_thing_is_where_it_was_put(part):
-    cell = Cell([Thing(convex_pieces(part))] * 2)
+    cell = Cell([Solid(convex_pieces(part))] * 2)
     state = cell.data()
     turn = Rotation.random(rng=np.random.default_rng(0)).as_matrix()
     T = make_transform(turn, np.array([0.1, 0.2, 0.3]))
@@ -81,7 +81,7 @@ def test_a_part_that_lies_on_its_front_looks_up_and_turns_within_its_yaw(part):
 
 @pytest.mark.parametrize("shadows", [False, True])
 def test_a_picture_shows_the_part_and_repeats_with_its_seed(trials, scene, shadows):
-    view, bodies = RasterView(shadows), [item.body for item in scene.things]
+    view, bodies = RasterView(shadows), [item.body for item in scene.placed]
 
     def take(poses):
         return view.take(bodies, poses, scene.T_base_cam, np.random.default_rng(1))

@@ -1,4 +1,4 @@
-"""What a node makes of pictures: the estimator's poses, and one warning for each thing wrong."""
+"""What a node makes of pictures: the estimator's poses, and one warning for each problem."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -57,7 +57,7 @@ def test_poses_are_the_estimators_on_the_picture_without_distortion(
         ({"distortion_model": "equidistant"}, "equidistant", "undistort"),
         ({"d": [0.1] * 3}, "3 distortion coefficients", "zeros"),
         ({"k": [float("nan")] * 9}, "K=nan", "fix"),
-        ({"k": "abc"}, "camera_info beside", ""),
+        ({"k": "abc"}, "camera_info of", ""),
     ],
 )
 def test_a_wrong_camera_is_said_once_and_ends_nothing(take, worker, said, spoilt, said_of_it, fix):
@@ -101,7 +101,7 @@ def test_stamps_that_go_back_are_told_once(take, said):
 @pytest.mark.parametrize(
     ("frame", "beside", "line"),
     [
-        ("camera_link", "camera_link", "'camera_link', which is not named as an optical one"),
+        ("camera_link", "camera_link", "'camera_link', which is not named as an optical frame"),
         ("", "", "frame '', which"),
         ("left_optical_frame", "right_optical_frame", "their camera_info in 'right_optical_frame'"),
         ("left_optical_frame", "", None),

@@ -127,12 +127,12 @@ def test_it_is_said_in_words():
     lines = view().in_words([part(0.1)], 0.4, (224, 128))
     assert lines == [
         "cam.yaml: 1280×720 pixels, 69° × 42°, parts at 0.4 – 0.7 m",
-        "the network sees its pictures scaled by 0.4 and learns on windows of 224×128 pixels",
+        "the network's input is scaled by 0.4, and training uses windows of 224×128 pixels",
         "bracket: 53 – 93 pixels across; a pixel is 1.1 mm on the part at the nearest and 1.9 mm "
         "at the farthest",
     ]
     coarse = view(0.4, 3.0).in_words([part(0.1)])
-    assert "that is coarse" in coarse[-2]
+    assert "parts are small" in coarse[-2]
     assert "the range of sizes is wide (1 : 7.5)" in coarse[-1]
 
 

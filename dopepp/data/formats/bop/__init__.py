@@ -29,10 +29,10 @@ MM: Final = 1000.0
 """Millimetres per metre."""
 
 EXACT: Final = 1e-3
-"""Largest deviation of R·Rᵀ from the identity of a rotation that is kept as stated."""
+"""Largest deviation of R·Rᵀ from the identity at which a rotation is kept unchanged."""
 
 INEXACT: Final = 1e-2
-"""Largest deviation of a matrix that the nearest rotation replaces; LM-O's reach 2e-3."""
+"""Largest deviation at which the nearest rotation replaces a matrix; LM-O has up to 2e-3."""
 
 _ROUNDING: Final = 1e-3
 """Distance by which a visible fraction may lie outside [0, 1]."""
@@ -42,7 +42,7 @@ MAX_SCENE_BYTES: Final = 128_000_000
 
 PICTURES: Final = ("rgb", "gray"), (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 DEPTHS: Final = ("depth",), (".png", ".tif", ".tiff")
-"""Folders, of which the first existing one counts, and suffixes of a scene's images."""
+"""Alternative folders and suffixes of a scene's images; the first existing folder is used."""
 
 Record = Mapping[str, Any]
 
@@ -55,9 +55,9 @@ class BopPoses:
     """The posed objects of one or more images.
 
     Attributes:
-        obj_ids: BOP's object numbers; −1 for a damaged one.
-        T_cam_obj: Rigid transforms, metres; NaN in a damaged one.
-        visible_fractions: Stated fractions; NaN for a missing one.
+        obj_ids: BOP's object numbers; −1 if damaged.
+        T_cam_obj: Rigid transforms, metres; NaN if damaged.
+        visible_fractions: Stated fractions; NaN if missing.
         inexact: Whether the nearest rotation replaces the stated matrix (``INEXACT``).
     """
 
@@ -90,7 +90,7 @@ def read_cameras(
 
 
 def pair_infos(truths: Sequence[Record], stated: object, node: Node) -> list[Record | None]:
-    """Return the ``gt_info`` record of each object of an image; None for a missing one.
+    """Return the ``gt_info`` record of each object of an image; None if missing.
 
     Args:
         truths: The image's ``gt`` records.
@@ -103,7 +103,7 @@ def pair_infos(truths: Sequence[Record], stated: object, node: Node) -> list[Rec
         stated = [{} if info is None else info for info in stated]
     infos = node.entries(stated)
     if len(infos) != len(truths):
-        node.report(f"{len(infos)} objects", f"{len(truths)}, as many as have a pose")
+        node.report(f"{len(infos)} objects", f"{len(truths)}, the number of poses")
     return [*infos[: len(truths)], *[None] * (len(truths) - len(infos))]
 
 
@@ -153,7 +153,7 @@ def _stated_column(
 def _column(
     records: Sequence[object], field: str, count: int, node: Callable[[int], Node]
 ) -> Float[np.ndarray, "records count"]:
-    """Convert a field of all records at once, or record by record to report the wrong ones.
+    """Convert a field of all records at once, or record by record to report wrong records.
 
     Nested lists of the right size, e.g. ``[[…], […], […]]`` for a matrix, are accepted.
     """
@@ -213,7 +213,7 @@ def _by_image(node: Node) -> dict[int, Any]:
         if not is_number(key):
             node[f"{key!r:.40}"].report("not an image number", allowed)
         elif int(key) in by_image:
-            node[f"{key!r:.40}"].report(f"image {int(key)} twice", "each once")
+            node[f"{key!r:.40}"].report(f"image {int(key)} twice", "each image once")
         else:
             by_image[int(key)] = record
     return by_image
@@ -248,9 +248,9 @@ class BopScene:
         depth_scales: Millimetres per unit of the depth images; NaN where not stated.
         first: Image i has the objects ``first[i] … first[i + 1] − 1``.
         gt_ids: Each object's index in its image's list, which names its masks.
-        num_other: Number of objects that have a model and are not wanted.
+        num_other: Number of objects with a model that were not requested.
         without_model: Counts of objects without a model, by object number.
-        num_behind: Number of wanted objects behind the camera, which are left out too.
+        num_behind: Number of requested objects behind the camera, which are omitted.
     """
 
     folder: Path
@@ -282,7 +282,7 @@ def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int
     cameras, truths, infos = read_records(folder)
     images = sorted(cameras)
     if without := truths.keys() - cameras.keys():
-        problem = f"{len(without)} images have ground truth and no camera, and are left out"
+        problem = f"ignoring {len(without)} images with ground truth but without a camera"
         _log.warning("%s: %s; first: %d", folder, problem, min(without))
     owners = [(row, n) for row, i in enumerate(images) for n in range(len(truths.get(i, ())))]
 

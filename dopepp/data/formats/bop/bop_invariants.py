@@ -37,10 +37,10 @@ PIXEL_TOLERANCE: Final = 0.01
 """Allowed difference of a stated count from a mask's pixels, as a share (plus a border row)."""
 
 BOX_EDGE_PX: Final = 2.0
-"""Allowed distance of ``bbox_visib`` from the mask's box: tools disagree on whether ends count."""
+"""Allowed distance of ``bbox_visib`` from the mask's box: some tools exclude the last pixel."""
 
 _ROUNDING: Final = 1.001
-"""Factor by which a diameter may contradict a box: both are rounded to a few digits."""
+"""Allowed factor between a diameter and its box, which are rounded to a few digits."""
 
 _CAMERA, _TRUTH, _INFO = "scene_camera.json", "scene_gt.json", "scene_gt_info.json"
 _MASKS: Final = ("mask", "mask_visib")
@@ -68,7 +68,7 @@ def _is_scene(folder: Path) -> bool:
 
 def check_bop(report: CheckReport) -> None:
     """Check the models and every scene of a data set, a split, or a single scene."""
-    # The models lie beside the splits: in this folder, or above the split or scene that it is.
+    # The models lie beside the splits: in this folder, or above this split or scene.
     models = load_models(report, (report.root, *report.root.resolve().parents[:2]))
     for folder in scene_folders(report.root):
         if folder != report.root and not bop.is_number(folder.name):
@@ -87,7 +87,7 @@ class _SceneCheck:
         self._has_truth = (folder / _TRUTH).is_file()
 
     def _image_files(self, kind: tuple[tuple[str, ...], tuple[str, ...]]) -> dict[int, Path]:
-        """Return numbered images; report images of another name beside them."""
+        """Return numbered images; report images with other names."""
         files = bop.image_files(self._folder, kind, self._report)
         for folder in {path.parent for path in files.values()}:
             for path in sorted(folder.glob("[!.]*")):
@@ -177,13 +177,13 @@ class Oddities:
         """Note the oddities and how a reader handles them."""
         if self.inexact:
             message = f"{self.inexact:,} rotations are orthogonal to {bop.INEXACT:g} only"
-            report.note(f"{where}: {message}; the nearest rotation is taken")
+            report.note(f"{where}: {message}; readers use the nearest rotation")
         if self.without_fraction:
             message = f"{self.without_fraction:,} objects without visib_fract"
-            report.note(f"{where}: {message}; how much of them is visible is estimated")
+            report.note(f"{where}: {message}; readers estimate the visible fractions")
         for number, count in sorted(self.without_model.items()):
             message = f"object {number} is annotated {count:,} times and has no model"
-            report.note(f"{where}: {message}; it is left out")
+            report.note(f"{where}: {message}; readers ignore the object")
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,7 @@ def load_models(report: CheckReport, roots: Sequence[Path]) -> Models | None:
     present = modelled(infos)
     if absent := infos.keys() - present:
         numbers = ", ".join(map(str, sorted(absent)))
-        report.note(f"{path.parent}: no file of object {numbers}, left out where it is annotated")
+        report.note(f"{path.parent}: no file of object {numbers}, whose annotations are ignored")
     for number in sorted(present):
         Node(report, infos[number].path)["mesh"].attempt(partial(part_of, infos[number]))
     sizes = {
@@ -327,7 +327,7 @@ def _check_counts(
 
 
 def _check_boxes(node: Node, info: Mapping[str, Any], seen: Box | None) -> Box | None:
-    """Compare ``bbox_visib`` with the mask's box; return the latter, or else the former."""
+    """Compare ``bbox_visib`` with the mask's box; return the mask's box, or else the stated box."""
     boxes: dict[str, Box] = {}
     for field_name in ("bbox_visib", "bbox_obj"):
         if field_name in info:

@@ -49,7 +49,7 @@ Continuous = tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]
 _ALLOWED: Final = 'objects by number, each once: {"1": {"diameter": …}, …}'
 
 _DIAMETER_TOLERANCE: Final = 0.01
-"""Allowed relative difference of a stated diameter from the mesh's; decimation causes less."""
+"""Allowed relative difference between the stated diameter and the mesh's diameter."""
 
 
 @dataclass(frozen=True)
@@ -68,10 +68,10 @@ def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Pa
 
     Args:
         root: Folder of the data set.
-        objects: Names in the wanted order; None takes all objects with a file, by number.
+        objects: Names in the requested order (default: all objects with a file, by number).
 
     Raises:
-        UserError: The folder has no models, or no object of such a name.
+        UserError: The folder has no models, or a name is unknown.
     """
     infos = read_models(Path(root))
     if not infos:
@@ -82,7 +82,7 @@ def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Pa
     wanted = list(objects or by_name)
     absent = [name for name in wanted if objects is None and not by_name[name].path.is_file()]
     if 0 < len(absent) < len(wanted):
-        _log.warning("%s: left out models without a file: %s", root, ", ".join(absent))
+        _log.warning("%s: ignoring models without a file: %s", root, ", ".join(absent))
         wanted = [name for name in wanted if name not in absent]
     for name in wanted:
         if name not in by_name:
@@ -152,7 +152,7 @@ def part_of(info: ModelInfo) -> Part:
 
 
 def read_models(root: Path) -> dict[int, ModelInfo]:
-    """Return the objects of ``models_info.json`` by number; none without such a file."""
+    """Return the objects of ``models_info.json`` by number; empty without the file."""
     path = info_path(root)
     return {} if path is None else parse_models(path, Node(STRICT, path).load(_ALLOWED))
 
@@ -164,7 +164,7 @@ def modelled(infos: Mapping[int, ModelInfo]) -> set[int]:
 
 
 def info_path(root: Path) -> Path | None:
-    """Return the path of a data set's ``models_info.json``, or None without such a file."""
+    """Return the path of a data set's ``models_info.json``, or None if missing."""
     paths = (root / folder / INFO_FILE for folder in MODEL_FOLDERS)
     return next((path for path in paths if path.is_file()), None)
 
@@ -178,7 +178,7 @@ def parse_models(path: Path, records: object, problems: Problems = STRICT) -> di
     names: set[str] = set()
     for key, record in mapping(records).items():
         if not is_number(key) or int(key) in infos:
-            node[f"{key!r:.40}"].report("not an object number, or a repeated one", _ALLOWED)
+            node[f"{key!r:.40}"].report("not an object number, or a repeated number", _ALLOWED)
             continue
         info = _info(node[key], path.parent / f"obj_{int(key):06d}.ply", record)
         if info.name in names:
@@ -213,11 +213,11 @@ def parse_symmetries(name: str, fields: object) -> tuple[Discrete | None, Contin
     """Return the symmetries in a config's entry, which is written as in ``models_info.json``.
 
     Raises:
-        UserError: The entry has other fields, or a value is no rigid transform or no axis.
+        UserError: The entry has other fields, or a value is not a rigid transform or axis.
     """
     node = Node(STRICT, f"data.symmetries.{name}")
     if not isinstance(fields, Mapping) or not {*fields} <= {*SYMMETRY_FIELDS}:
-        node.report(f"{fields!r:.80}", f"{' and '.join(SYMMETRY_FIELDS)} as BOP has them")
+        node.report(f"{fields!r:.80}", f"{' and '.join(SYMMETRY_FIELDS)} as in BOP")
     return _symmetries(node, mapping(fields))
 
 

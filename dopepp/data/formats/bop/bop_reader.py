@@ -76,7 +76,7 @@ def read_targets(path: Path) -> Targets:
 class BopReader:
     """The images of a split, by scene and number.
 
-    Opening reads the scenes' JSON files and checks every record; images are read one by one. An
+    The constructor reads the scenes' JSON files and checks every record; images are read singly. An
     image without ground truth has no instances. The reader leaves out and counts objects that are
     none of the parts, and objects behind the camera (rendered sets have some). The visible fraction
     is ``visib_fract`` of ``scene_gt_info.json``, or an estimate of
@@ -86,8 +86,8 @@ class BopReader:
         parts: Objects to return, named as in ``models_info.json`` or ``obj_000001``.
         split: Folder of the scenes, e.g. ``test``, ``train_pbr``, ``train_real``.
         targets: File in ``root`` that selects images and the number of instances of each object,
-            e.g. ``test_targets_bop19.json``. The most visible instances count. ``auto`` uses that
-            file if it exists.
+            e.g. ``test_targets_bop19.json``. Of an object's instances, the most visible are
+            targets. ``auto`` uses ``test_targets_bop19.json`` if it exists.
         part_of: Consecutive share of the images as (first, last) fractions, so that disjoint
             shares of a folder serve training, validation and test.
     """
@@ -127,15 +127,17 @@ class BopReader:
         num_wanted = len(listed) if self._targets is None else len(self._targets)
         if not present:
             problem = f"no image under {self.root / self.split} ({num_wanted:,} listed)"
-            allowed = "at least one listed image in rgb/ or gray/"
-            raise UserError(problem, allowed, "unpack all archives of the data set there")
+            allowed = "at least one of the listed images in rgb/ or gray/"
+            raise UserError(
+                problem, allowed, "unpack all archives of the data set into this folder"
+            )
         if len(present) < num_wanted:
             absent = f"{num_wanted - len(present):,} of {num_wanted:,}"
             _log.warning("%s: %s listed images are absent", self.name, absent)
         return np.array(present, np.int64)
 
     def _log_oddities(self, with_model: Collection[int]) -> None:
-        """Log which objects are left out and which values are estimated or replaced."""
+        """Log the ignored objects and the estimated or replaced values."""
         other = sum(scene.num_other for scene in self._scenes)
         behind = sum(scene.num_behind for scene in self._scenes)
         without: Counter[int] = sum((scene.without_model for scene in self._scenes), Counter())
@@ -143,15 +145,15 @@ class BopReader:
         self._left_out = {"other_objects": left_out, "behind_the_camera": behind}
         if other or behind:
             problem = (
-                f"{other:,} objects that are none of the parts and {behind:,} behind the camera"
+                f"{other:,} objects that are not among the parts and {behind:,} behind the camera"
             )
-            _log.info("%s: left out %s", self.name, problem)
+            _log.info("%s: ignoring %s", self.name, problem)
         if inexact := sum(int(scene.poses.inexact.sum()) for scene in self._scenes):
             problem = f"{inexact:,} rotations are orthogonal to {bop.INEXACT:g} only"
-            _log.warning("%s: %s; the nearest are taken", self.name, problem)
+            _log.warning("%s: %s; using the nearest rotations", self.name, problem)
         if without:
             listed = ", ".join(f"{number} ({count:,})" for number, count in sorted(without.items()))
-            _log.warning("%s: left out objects without a model: %s", self.name, listed)
+            _log.warning("%s: ignoring objects without a model: %s", self.name, listed)
         fractions = np.concatenate([scene.poses.visible_fractions for scene in self._scenes])
         if unknown := int(np.isnan(fractions).sum()):
             _log.info("%s: %s objects' visible fractions are estimated", self.name, f"{unknown:,}")
@@ -175,7 +177,7 @@ class BopReader:
         return len(self._items)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Read an image; the epoch does not matter."""
+        """Read an image; the epoch is ignored."""
         number, row = self._items[index].tolist()
         scene = self._scenes[number]
         path = scene.folder / scene.files[row]
@@ -205,7 +207,7 @@ class BopReader:
         return make_instance(part, poses.T_cam_obj[k].copy(), K, fraction, mask, shape)
 
     def _depth(self, scene: BopScene, row: int, shape: Shape) -> DepthMap | None:
-        """Read the depth image; None in a scene without any."""
+        """Read the depth image; None in a scene without depth images."""
         if not any(scene.depth_files):
             return None
         missing = f"depth/{scene.image_ids[row]:06d}.png"
@@ -260,7 +262,7 @@ class BopReader:
 
 
 def _scene_folders(root: Path, split: str) -> list[Path]:
-    """Return a split's scenes in order: the folders whose names are numbers."""
+    """Return a split's scenes in order, i.e. the folders whose names are numbers."""
     if not (root / split).is_dir():
         splits = sorted({path.parent.parent.name for path in root.glob("*/*/scene_camera.json")})
         raise UserError(

@@ -1,4 +1,4 @@
-"""Write poses as a BOP challenge CSV, and read those of any other method.
+"""Write poses as a BOP challenge CSV, and read the CSV of any method.
 
 Lines are ``scene_id,im_id,obj_id,score,R,t,time``. R (row by row) and t (millimetres) are numbers
 between spaces; time is in seconds for the whole image, −1 if unknown. BOP calls such a file
@@ -34,7 +34,7 @@ _MAX_LINE_BYTES: Final = 4096  # fourteen numbers of 25 digits take 400
 _FARTHEST: Final = 1e9  # mm; squares of such distances stay finite
 
 _PLAUSIBLE_MM: Final = (10.0, 100_000.0)
-"""Range of the objects' median distance from the camera; another median means another unit."""
+"""Range of the median distance from the camera; a median outside means another unit."""
 
 _COUNTS: Final = {"score": 1, "R": 9, "t": 3, "time": 1}
 
@@ -47,7 +47,7 @@ _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 @dataclass(frozen=True)
 class BopResult:
-    """One estimated pose; ``seconds`` is the time for the whole image, −1 if unknown."""
+    """An estimated pose; ``seconds`` is the time for the whole image, −1 if unknown."""
 
     scene_id: int
     im_id: int
@@ -84,9 +84,9 @@ def read_results(path: Path, objects: Collection[int]) -> list[BopResult]:
         objects: Numbers of the data set's objects.
 
     Raises:
-        UserError: The file is missing, not text, or has more than 500,000 poses; a line has
-            another form, a number that is not finite or an unknown object; R is no rotation within
-            1e-3; a line repeats another; or the size of t contradicts millimetres.
+        UserError: The file is missing, not text, or has more than 500,000 poses; a line is damaged
+            or repeated, or has an unknown object; R is not a rotation within 1e-3; or t is not in
+            millimetres.
     """
     values = array("d")
     for number, text in _lines(path):
@@ -158,27 +158,27 @@ def _numbers(name: str, field: str, where: str) -> list[float]:
             raise _bad(f"{where}: {name}: {word!r:.40}", "finite numbers")
     numbers = [float(word) for word in words]
     largest, allowed = max(map(abs, numbers)), ""
-    # Bounded before it is squared: numbers like 1e200 overflow.
+    # Numbers are bounded before squaring, because squares of numbers like 1e200 overflow.
     if name == "R" and not (largest < 2 and is_rotation(np.array(numbers).reshape(3, 3))):
         allowed = "a rotation matrix within 1e-3, row by row"
     elif name == "t" and largest > _FARTHEST:
         allowed = "millimetres"
     elif name == "time" and numbers[0] < 0 and numbers[0] != UNKNOWN_TIME:
-        allowed = "seconds, or -1 where unknown"
+        allowed = "seconds, or -1 if unknown"
     if allowed:
         raise _bad(f"{where}: {name} {field!r:.90}", allowed)
     return numbers
 
 
 def _check_repeats(path: Path, table: Table) -> None:
-    """Reject a pose that repeats another pose of its object, whatever the time."""
+    """Reject repeated poses of an object; times are ignored."""
     keys = table[:, 1:17]
-    order = np.lexsort(keys.T[::-1])  # stable: of equal rows the earlier line stands first
+    order = np.lexsort(keys.T[::-1])  # stable: equal rows keep the order of lines
     same = (keys[order[1:]] == keys[order[:-1]]).all(axis=1)
     if same.any():
         first, second = table[order[:-1][same][0], 0], table[order[1:][same][0], 0]
         problem = f"{path}: line {second:.0f}, which repeats line {first:.0f}"
-        fix = "remove one: the second would count as a false positive"
+        fix = "remove one line, because a repeated pose counts as a false positive"
         raise _bad(problem, "each pose once", fix)
 
 

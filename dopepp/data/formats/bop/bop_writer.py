@@ -37,7 +37,7 @@ from dopepp.virtual.scene import SceneObject
 from dopepp.virtual.surface import Surface, make_surface
 
 IMAGES_A_SCENE: Final = 1000
-"""As in the rendered training sets of BOP."""
+"""Number of images in a scene, as in the rendered training sets of BOP."""
 
 SCENE_FIELDS: Final = ("gt", "gt_info", "camera")
 """Fields of a staged item, each for a file ``scene_FIELD.json``. The cameras list the finalized
@@ -58,12 +58,12 @@ class BopFolder:
         """Write the models.
 
         Raises:
-            UserError: The split has images, and the folder has no models or those of other parts.
+            UserError: The split has images, and the models are missing or of other parts.
         """
         info = f"{MODEL_FOLDERS[0]}/{INFO_FILE}"
         if (self.root / self.split).exists() and not (self.root / info).exists():
             problem = f"{self.root}, which has {self.split}/ and no {info}"
-            allowed = "an empty folder, or a data set that this command began"
+            allowed = "an empty folder, or a data set begun by this command"
             raise UserError(problem, allowed, "pass another folder")
         write_models(self.root, self._parts)
 
@@ -115,7 +115,7 @@ class BopWriter(BopFolder):
                 path = scene / f"scene_{field}.json"
                 merged = read_object(path, MAX_SCENE_BYTES)
                 merged |= {f"{image}": item[field] for image, item in items.items()}
-                # In order: the bytes do not depend on who wrote what first.
+                # Sorted, so that the bytes do not depend on the order of writing.
                 merged = dict(sorted(merged.items(), key=lambda entry: int(entry[0])))
                 if items:
                     write_whole(path, by_line(merged))
@@ -129,7 +129,7 @@ class BopWriter(BopFolder):
         return self.root / self.split / f"{chunk:06d}"
 
     def _write_camera(self, chunk: int, image: int, camera: Mapping[str, Any]) -> None:
-        """Write ``camera.json``, by which tools know the sensor, from the first image."""
+        """Write ``camera.json``, which describes the sensor, from the first image."""
         folders = (self.root / self.split).iterdir()
         if chunk > min(int(path.name) for path in folders if path.name.isdecimal()):
             return
@@ -147,7 +147,7 @@ def _staged(scene: Path) -> list[Path]:
 
 @dataclass(frozen=True)
 class Labels:
-    """An image's annotation as BOP's JSON and images hold it.
+    """An image's annotation in BOP's format.
 
     Attributes:
         camera: ``cam_K`` and ``depth_scale``.
@@ -201,7 +201,7 @@ def _info(
     return {
         "bbox_obj": _bop_box(None if seen is None else _beyond_the_border(inside, whole)),
         "bbox_visib": _bop_box(seen),
-        # A silhouette around the camera has no finite size; then its pixels in the image count.
+        # A silhouette around the camera has no finite size, so its pixels in the image are counted.
         "px_count_all": int(whole.num_px if math.isfinite(whole.num_px) else whole.mask.sum()),
         "px_count_valid": int(np.count_nonzero(depth[whole.mask])),
         "px_count_visib": int(np.count_nonzero(visible)),
@@ -218,7 +218,7 @@ def _bop_box(box: Box | None) -> list[int]:
 
 def _beyond_the_border(inside: Box | None, whole: Silhouette) -> Box | None:
     """Return the box of a silhouette, including its pixels beyond the image's border."""
-    # Its box bounds the vertices; where no vertex lies beyond the border, the pixels are exact.
+    # The silhouette's box bounds the vertices; the box of pixels is exact inside the border.
     if inside is None or whole.box is None:
         return inside
     height, width = whole.mask.shape

@@ -2,8 +2,8 @@
 
 An item is ``STEM.json`` with an image ``STEM.png`` or ``STEM.jpg``; ``STEM`` is ``000000`` (NDDS)
 or ``000000.left`` (FAT), in the folder or anywhere below it. Each folder may hold
-``_object_settings.json`` and ``_camera_settings.json``; otherwise those of the data set's folder
-count. The readme of the Falling Things data set (Tremblay et al., 2018) documents the formats.
+``_object_settings.json`` and ``_camera_settings.json``; otherwise the settings in the data set's
+folder apply. The readme of Falling Things (Tremblay et al., 2018) documents the formats.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ Objects = list[tuple[Node, Mapping[str, Any], str]]
 
 @dataclass(frozen=True)
 class NddsObject:
-    """One object as annotated, in unknown units and orders; NaN for damaged numbers.
+    """An object as annotated, in unknown units and orders; NaN for damaged numbers.
 
     Attributes:
-        quaternion: The four numbers of ``quaternion_xyzw`` as they stand in the file.
+        quaternion: The four numbers of ``quaternion_xyzw`` in the order of the file.
         corners_px: ``projected_cuboid`` without its centroid, if stated.
         cuboid: Corners in space, in the order of ``corners_px``, if stated.
         centroid: ``cuboid_centroid``, or else the mean of ``cuboid``; None without both.
@@ -71,7 +71,7 @@ def read_record(path: Path, problems: Problems = STRICT) -> Mapping[str, Any] | 
 
 
 def objects_of(record: Mapping[str, Any], path: Path, problems: Problems = STRICT) -> Objects:
-    """Return an annotation's objects, and report those without a class."""
+    """Return an annotation's objects, and report objects without a class."""
     objects: Objects = []
     node = Node(problems, path, "objects")
     for number, item in enumerate(node.entries(record.get("objects"))):
@@ -112,12 +112,12 @@ def parse_object(item: Mapping[str, Any], node: Node) -> NddsObject:
 
 
 def stated(record: Mapping[str, Any], name: str) -> object:
-    """Return an entry of the ``conventions`` that our writer adds, or None."""
+    """Return an entry of the ``conventions`` added by our writer, or None."""
     return mapping(record.get("conventions")).get(name)
 
 
 def find_items(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Return the annotations with an image and those without, sorted.
+    """Return the annotations with an image, and the annotations without an image, sorted.
 
     The search skips settings (``_*.json``) and hidden files.
     """
@@ -172,8 +172,8 @@ class NddsSettings:
     ) -> CameraMatrix:
         """Return K from the annotation's ``camera_data.intrinsics`` or the camera settings.
 
-        Among several cameras in the settings, the stem's end names the camera (FAT's ``left`` and
-        ``right``). K is NaN if no camera or several cameras remain, which is reported.
+        If the settings have several cameras, the end of the stem names the camera (FAT's ``left``
+        and ``right``). If no camera or several cameras match, the problem is reported and K is NaN.
         """
         node = Node(problems, annotation, "camera_data.intrinsics")
         stated_here = mapping(record.get("camera_data")).get("intrinsics")

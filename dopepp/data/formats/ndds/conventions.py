@@ -1,9 +1,9 @@
 """Determine the pose convention of an NDDS data set by reprojection.
 
 ``quaternion_xyzw`` holds x, y, z, w or w, x, y, z; lengths are centimetres (NDDS, FAT), metres
-(nvisii) or millimetres; camera axes are OpenCV's or, in old nvisii files, OpenGL's. The pose is
-that of the mesh, or of a frame into which ``fixed_model_transform`` maps the mesh (FAT). No field
-states the choice, but every object states ``projected_cuboid``, its box in the image.
+(nvisii) or millimetres; camera axes are OpenCV's or, in old nvisii files, OpenGL's. Poses refer to
+the mesh frame or to a frame into which ``fixed_model_transform`` maps the mesh (FAT). No field
+states these conventions, but every object has ``projected_cuboid``, its box in the image.
 :func:`find_convention` applies each :class:`PoseConvention` to objects with known meshes and keeps
 the convention that projects the mesh's box onto the stated box. :func:`check_observation` later
 compares every object.
@@ -75,12 +75,12 @@ POSE_CONVENTIONS: Final = tuple(
     for unit in METRES
     for quaternion in get_args(Quaternion)
 )
-"""All combinations, the documented ones first; the first of equally good fits wins."""
+"""All combinations, documented conventions first; the first of equally good fits is chosen."""
 
 
 @dataclass(frozen=True)
 class Observation:
-    """An annotated object of a known part, on which a convention can be tested.
+    """An annotated object of a known part, for testing conventions.
 
     ``fixed`` is the class's rigid ``fixed_model_transform``, with a translation in the file's unit.
     """
@@ -135,7 +135,7 @@ class Observation:
 
 def _turned_corners(part: Part, rotation: RotationMatrix) -> Float[np.ndarray, "8 3"]:
     """Return the corners of the part's box along rotated axes, in NDDS order, part frame."""
-    # The box of the turned cuboid is too large unless the turn is by right angles.
+    # For rotations other than by right angles, the box of the rotated cuboid is too large.
     quarter_turns = np.abs(np.abs(rotation).max(axis=0) - 1).max() < 1e-6
     shape = part.points if part.mesh is None else part.mesh.vertices
     turned = (part.cuboid[:8] if quarter_turns else shape) @ rotation.T
@@ -143,19 +143,19 @@ def _turned_corners(part: Part, rotation: RotationMatrix) -> Float[np.ndarray, "
 
 
 MAX_ERROR_PX: Final = 5.0
-"""Largest error of most instances under the right convention; real photos need this much."""
+"""Largest error of most instances under the correct convention, sufficient for real photos."""
 
 _MAX_SHARE: Final = 0.05
 """Allowed error of one instance as a share of its projected cuboid's longer side."""
 
 _MOST: Final = 0.75
-"""Share of the instances that must fit, so that a few damaged instances do not decide."""
+"""Share of the instances that must fit; the others may be damaged."""
 
 _RATIO: Final = 3.0
 """Factor by which any convention with other poses must fit worse."""
 
-_ROUNDING_PX: Final = 0.05  # between equally good fits: files round to a few digits
-_SAME_POSE: Final = 0.05  # distance of corners, in diameters, of conventions with the same poses
+_ROUNDING_PX: Final = 0.05  # error difference of equally good fits, due to rounding in files
+_SAME_POSE: Final = 0.05  # largest corner distance between equal poses, diameters
 
 
 @dataclass(frozen=True)
@@ -164,9 +164,8 @@ class NddsFinding:
 
     Attributes:
         error_px: Largest error of three quarters of the instances.
-        rival_px: That error under the best convention with other poses.
-        undecided: Conventions with the same poses on these instances, e.g. if the quaternions read
-            the same in both orders.
+        rival_px: The same error under the best convention with different poses.
+        undecided: Conventions that give equal poses on these instances.
     """
 
     convention: PoseConvention
@@ -177,22 +176,22 @@ class NddsFinding:
 
     def __str__(self) -> str:
         text = (
-            f"{self.convention} (reprojection error {self.error_px:.2g} px, of the next best "
+            f"{self.convention} (reprojection error {self.error_px:.2g} px, next best convention "
             f"{self.rival_px:.3g} px, {self.num_instances} instances)"
         )
         if self.undecided:
-            text += f"; the same poses so far with: {'; '.join(map(str, self.undecided))}"
+            text += f"; equal poses under: {'; '.join(map(str, self.undecided))}"
         return text
 
 
 def find_convention(observations: Sequence[Observation], where: str) -> NddsFinding:
-    """Find the one convention under which the parts' cuboids land on ``projected_cuboid``.
+    """Find the only convention under which the parts' cuboids project to ``projected_cuboid``.
 
     One observation is enough in most cases.
 
     Raises:
-        UserError: No convention fits three quarters of the instances within 5 px, or two that give
-            different poses fit equally well.
+        UserError: No convention fits three quarters of the instances within 5 px, or two
+            conventions with different poses fit equally well.
     """
     errors = {
         convention: _most([observation.error_px(convention) for observation in observations])
@@ -224,18 +223,18 @@ def check_observation(observation: Observation, convention: PoseConvention) -> T
     T_cam_obj, node = observation.T_cam_obj(convention), item.node
     if T_cam_obj is None:
         problem = f"no fixed_model_transform of {item.label} in the object settings"
-        node["class"].report(problem, f"the class's matrix, because poses are {convention}")
+        node["class"].report(problem, f"a matrix of this class, because poses are {convention}")
     assert T_cam_obj is not None
     if T_cam_obj[2, 3] <= 0:
         problem = f"an object behind the camera (z = {T_cam_obj[2, 3]:.3g} m)"
-        node["location"].report(problem, f"an object in front of it ({convention})")
+        node["location"].report(problem, f"an object in front of the camera ({convention})")
     predicted = observation.predicted_px(convention)
     # Projections of hidden objects, and of objects partly behind the camera, are meaningless.
     if predicted is None or not np.isfinite(predicted).all() or item.visibility == 0:
         return T_cam_obj
     error, extent = observation.error_px(convention), float(np.ptp(predicted, axis=0).max())
     if item.corners_px is not None and error > max(MAX_ERROR_PX, _MAX_SHARE * extent):
-        problem = f"{error:.3g} px from where the pose puts the cuboid of {observation.part.name}"
+        problem = f"{error:.3g} px from the projection of the cuboid of {observation.part.name}"
         node["projected_cuboid"].report(problem, f"the data set's {convention}")
     return T_cam_obj
 
@@ -253,7 +252,7 @@ def _same_poses(observations: Sequence[Observation], a: PoseConvention, b: PoseC
 
 
 def _most(values: Sequence[float]) -> float:
-    """Return the bound of three quarters of the values, which a few damaged items do not change."""
+    """Return the bound of three quarters of the values, which is robust to damaged items."""
     return float(np.quantile(values, _MOST, method="higher"))
 
 
@@ -263,6 +262,6 @@ def _undecidable(
     figures = "; ".join(f"{errors[convention]:.3g} px: {convention}" for convention in shown)
     return UserError(
         f"{where}: {why}; reprojection error: {figures}",
-        f"one convention with at most {MAX_ERROR_PX:g} px and a third of any other's error",
-        "pass the meshes and units that the data set was made with, and compare its K",
+        f"one convention with at most {MAX_ERROR_PX:g} px and a third of any other error",
+        "pass the data set's own meshes in the right unit, and check its K",
     )

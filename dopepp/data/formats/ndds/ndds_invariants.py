@@ -33,12 +33,12 @@ def check_ndds(report: CheckReport) -> None:
     items, lonely = ndds.find_items(report.root)
     _check_unannotated(report, items + lonely)
     for path in lonely:
-        report.report(path, "image", f"missing: neither {' nor '.join(IMAGE_SUFFIXES)} beside it")
+        report.report(path, "image", f"missing: no {' or '.join(IMAGE_SUFFIXES)} of this name")
     folders = {path.parent for path in items}
     settings = NddsSettings(report.root, report)
     for folder in sorted(folders | {report.root}):
         _check_settings(report, settings, folder)
-    # A map that one image of a folder has is required for all images.
+    # If any image of a folder has a map, every image must have the map.
     expected = {
         folder: [suffix for suffix in _MAPS if any(folder.glob(f"*{suffix}"))] for folder in folders
     }
@@ -83,7 +83,7 @@ def _check_unannotated(report: CheckReport, annotations: list[Path]) -> None:
             starts = (stem[:end] for end, character in enumerate(stem) if character == ".")
             belongs = stem in annotated or not annotated.isdisjoint(starts)
             if is_picture and not belongs and not stem.endswith(_DERIVED):
-                report.report(path, "annotation", f"missing: no {stem}.json beside it")
+                report.report(path, "annotation", f"missing: no {stem}.json in the folder")
 
 
 def _check_item(
@@ -132,7 +132,7 @@ def _check_camera(
 
 
 def _check_ids(node: Node, objects: Objects) -> set[int]:
-    """Report ids that two objects share; return the segmentation ids."""
+    """Report ids shared by two objects; return the segmentation ids."""
     for name in ("instance_id", "segmentation_id"):
         stated = [item.get(name) for _, item, _ in objects]
         ids = [value for value in stated if type(value) is int and value > 0]  # −1, 0: none

@@ -27,7 +27,7 @@ from dopepp.parts.part import Part
 _log = logging.getLogger(__name__)
 
 _FAT_SUFFIX: Final = "_16k"
-"""End of a class name in FAT, which names the part and its mesh: ``003_cracker_box_16k``."""
+"""Suffix of class names in FAT, e.g. ``003_cracker_box_16k``."""
 
 _MAX_OBSERVATIONS: Final = 60
 """Instances, evenly spread over the items, that determine the convention."""
@@ -41,13 +41,12 @@ class NddsReader:
 
     Most files state a ``visibility`` that ignores the image's border: 1 or 0 for visible or not, or
     the visible share of the silhouette. The reader then multiplies it by the share of the projected
-    cuboid inside the image. If it is missing or −1 (nvisii: unknown), only that share counts. The
-    reader leaves out and counts objects of other classes, and objects behind the camera that the
-    file calls invisible.
+    cuboid inside the image. A visibility that is missing or −1 (nvisii: unknown) counts as 1. The
+    reader ignores and counts objects of other classes, and invisible objects behind the camera.
 
-    An instance has a mask if a value in ``STEM.seg.png`` is its alone: its ``segmentation_id``, or
-    the ``segmentation_class_id`` of its class. An item has depth if the annotation states the unit
-    of ``STEM.depth.png``, or if FAT's naming (``.left``, ``.right``) implies 0.1 mm.
+    An instance has a mask if ``STEM.seg.png`` has a unique value for the instance: its
+    ``segmentation_id`` or its class's ``segmentation_class_id``. An item has depth if the unit of
+    ``STEM.depth.png`` is annotated or implied by FAT's naming (``.left``, ``.right``: 0.1 mm).
 
     Args:
         parts: Objects to return. An instance's ``class`` is a part's name, FAT's form of that name
@@ -88,7 +87,7 @@ class NddsReader:
         hidden: list[Observation] = []
         others: Counter[str] = Counter()
         step = max(1, len(items) // _MAX_OBSERVATIONS)
-        # Evenly spread items come first, so that a few represent the whole data set.
+        # Evenly spread items come first, so that the first items represent the whole data set.
         for path in (path for start in range(step) for path in items[start::step]):
             observations, labels = self._read(path)
             others.update(labels)
@@ -114,7 +113,7 @@ class NddsReader:
         return self._parts.get(label)
 
     def _read(self, path: Path) -> tuple[list[Observation], list[str]]:
-        """Return an annotation's instances of the parts, and its other objects' classes."""
+        """Return an annotation's instances of the parts, and the classes of its other objects."""
         record = ndds.read_record(path) or {}
         observations: list[Observation] = []
         others: list[str] = []
@@ -214,9 +213,9 @@ def _find(folder: Path) -> list[Path]:
     if not items:
         counts = f"({len(lonely)} JSON files without an image)"
         allowed = "an NDDS or FAT folder with pairs such as 000000.json and 000000.png or .jpg"
-        problem = f"{folder} without one annotated image {counts}"
+        problem = f"{folder} without an annotated image {counts}"
         raise UserError(problem, allowed, "pass the folder of the data set")
     if lonely:
-        message = "%s: %s annotations have no image and are left out; first: %s"
+        message = "%s: ignoring %s annotations without an image; first: %s"
         _log.warning(message, folder, f"{len(lonely):,}", lonely[0])
     return items

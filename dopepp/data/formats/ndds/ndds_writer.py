@@ -1,6 +1,6 @@
 """Write NDDS: ``000000.png``, ``.depth.png``, ``.seg.png`` and, last, ``000000.json``.
 
-Files follow the conventions that NDDS documents. Every annotation repeats them under
+Files follow the documented conventions of NDDS. Every annotation repeats the conventions under
 ``conventions``, which other readers ignore:
 
 - Lengths are centimetres. The camera frame is OpenCV's. ``quaternion_xyzw`` is x, y, z, w.
@@ -8,11 +8,11 @@ Files follow the conventions that NDDS documents. Every annotation repeats them 
   metres to centimetres), transposed as NDDS transposes it.
 - ``pose_transform`` is NDDS's: with R and t the pose, its rows are ``P·Rᵀ`` and t, where P maps
   (x, y, z) to (z, x, −y) (Unreal's axes). ``R = (first 3×3)ᵀ·P`` inverts it.
-- ``bounding_box`` corners are (row, column): of the visible pixels or, without one, of the
-  projected cuboid.
+- ``bounding_box`` bounds the visible pixels or, without visible pixels, the projected cuboid;
+  corners are (row, column).
 - ``projected_cuboid`` of a corner behind the camera is its projection through the camera's centre.
 - ``visibility`` is the visible share of the whole silhouette; occlusion and border both count.
-- ``.depth.png`` holds 0.1 mm a step as in FAT, 0 for unknown or beyond 6.55 m; ``.seg.png`` holds
+- ``.depth.png`` has the unit 0.1 mm as in FAT, 0 for unknown or beyond 6.55 m; ``.seg.png`` holds
   an object's ``segmentation_id``, 0 elsewhere.
 """
 
@@ -60,10 +60,10 @@ CAMERA_FIELDS: Final = ("width", "height", "intrinsics")
 """Fields of ``camera_data`` that images of one camera share."""
 
 _FARTHEST_PX: Final = 1e6
-"""Limit of projections, which are huge for points beside the camera."""
+"""Largest projected coordinate, since points beside the camera have huge projections."""
 
 _DATA_SUFFIXES: Final = (".json", ".png", ".jpg", ".tar")
-"""Suffixes of files that, like a subfolder, mark another data set."""
+"""Suffixes of files that belong to another data set, like any subfolder."""
 
 
 class NddsWriter:
@@ -91,7 +91,7 @@ class NddsWriter:
                 return
             problem = f"{path} of other parts"
         elif foreign:
-            problem = f"{foreign[0].name} in {self._root}, which no NDDS writer prepared"
+            problem = f"{foreign[0].name} in {self._root}, which is not from an NDDS writer"
         else:
             write_whole(path, settings)
             return
@@ -175,7 +175,7 @@ def camera_data(sample: Sample) -> dict[str, Any]:
     return {
         "width": sample.size[0],
         "height": sample.size[1],
-        # A sample has no other world frame than the camera frame.
+        # The camera frame serves as the world frame, since samples have no world frame.
         "location_worldframe": [0.0, 0.0, 0.0],
         "quaternion_xyzw_worldframe": [0.0, 0.0, 0.0, 1.0],
         "intrinsics": {"fx": fx, "fy": fy, "cx": cx, "cy": cy},
@@ -190,7 +190,7 @@ def object_record(
     Args:
         number: Id of the instance, from 1, and its value in ``.seg.png``.
         instance: The instance.
-        cuboid_obj: Cuboid of its part, object frame, metres.
+        cuboid_obj: Cuboid of the part, object frame, metres.
         K: Camera matrix in pixels.
     """
     cuboid = transform(instance.T_cam_obj, cuboid_obj)
@@ -198,7 +198,7 @@ def object_record(
     w, x, y, z = matrix_to_quaternion(rotation).tolist()
     pose = np.eye(4)
     pose[:3, :3], pose[3, :3] = UNREAL_AXES @ rotation.T, location
-    # Projection through the camera's centre is finite for a corner behind it too.
+    # Projection through the camera's centre is finite even for a corner behind the camera.
     pixels = cuboid @ K.T
     depth = np.where(pixels[:, 2:] == 0, np.finfo(np.float64).tiny, pixels[:, 2:])
     with np.errstate(over="ignore"):

@@ -42,7 +42,7 @@ NORM_TOLERANCE: Final = 0.01
 """Allowed deviations of ``pose_transform`` from a rotation and of a quaternion's norm from 1."""
 
 EDGE_SHARE: Final = 0.02
-"""Allowed inequality and slant of edges; shorter edges, relative to the longest, are flat."""
+"""Allowed inequality and slant of edges; a box with a shorter edge (of the longest) is flat."""
 
 SIZE_SHARE: Final = 0.05
 """Allowed difference of edges from the class's ``cuboid_dimensions``."""
@@ -64,7 +64,7 @@ _DOCUMENTED: Final = {
 """Conventions that NDDS documents."""
 
 _MAX_MINORITY: Final = 1000
-"""Objects of each convention to keep, in case the convention loses."""
+"""Number of stored objects of each convention, for reports of minorities."""
 
 
 class Majority:
@@ -94,7 +94,7 @@ class Majority:
 
 
 class ObjectCheck:
-    """Checks one object, with lengths in the file's unknown unit; damaged fields are None."""
+    """Checks an object, with lengths in the file's unknown unit; damaged fields are None."""
 
     def __init__(self, parsed: NddsObject, item: Mapping[str, Any], majority: Majority) -> None:
         self._node, self._item, self._majority = parsed.node, item, majority
@@ -133,7 +133,7 @@ class ObjectCheck:
         self._node[field].report(message)
 
     def _numbers(self, field: str, *shape: int) -> Float[np.ndarray, "..."] | None:
-        """Read a field that readers ignore; None if it is missing or damaged."""
+        """Return a field that readers ignore; None if missing or damaged."""
         value = self._item.get(field)
         return None if value is None else _finite(self._node[field].numbers(value, *shape))
 
@@ -144,7 +144,7 @@ class ObjectCheck:
             return {}
         norm = float(np.linalg.norm(stored))
         if abs(norm - 1) > NORM_TOLERANCE:
-            message = f"no rotation: norm {norm:.4g}; allowed: 1 ± {NORM_TOLERANCE}"
+            message = f"not a rotation: norm {norm:.4g}; allowed: 1 ± {NORM_TOLERANCE}"
             self._add("quaternion_xyzw", message)
             return {}
         orders = {"x, y, z, w": np.roll(stored, 1), "w, x, y, z": stored}
@@ -171,7 +171,9 @@ class ObjectCheck:
             axes = np.asarray((means / lengths[:, None]).T)
             is_box &= np.abs(axes.T @ axes - np.eye(3)).max() <= EDGE_SHARE
         if not is_box:
-            self._add("cuboid", "no box in NDDS order: edges not parallel, equal or perpendicular")
+            self._add(
+                "cuboid", "not a box in NDDS order: edges must be parallel, equal, orthogonal"
+            )
             self._cuboid = None
             return
         lengths = np.linalg.norm(edges[:, 0], axis=1)
@@ -196,7 +198,7 @@ class ObjectCheck:
                 continue
             upright = matrix[:3, :3] * np.sign(np.linalg.det(matrix[:3, :3]))
             if not is_rotation(upright, MATRIX_TOLERANCE):
-                self._add(name, f"no rotation (mirrored or not) within {MATRIX_TOLERANCE}")
+                self._add(name, f"not a rotation (mirrored or not) within {MATRIX_TOLERANCE}")
                 continue
             distances = [
                 _quarter_turn_distance(rotation.T @ turned)
@@ -215,7 +217,7 @@ class ObjectCheck:
                     self._add(name, message)
 
     def _check_bounding_box(self, seen: Box | None) -> None:
-        """Compare the stated box, which may hold the whole object, with the visible pixels."""
+        """Compare the stated box, which may contain hidden pixels, with the visible pixels."""
         stated = mapping(self._item.get("bounding_box"))
         if not stated:
             return
@@ -232,7 +234,7 @@ class ObjectCheck:
             (a, b), (c, d) = first.tolist(), last.tolist()
             boxes = {"row, column": Box(b, a, d, c), "column, row": Box(a, b, c, d)}
             fits = {order: box.beyond(seen) <= PROJECTION_PX for order, box in boxes.items()}
-            problem = f"{boxes['row, column']} does not hold the mask's {seen}"
+            problem = f"{boxes['row, column']} does not contain the mask's box {seen}"
             self._judge("bounding_box", fits, problem)
 
     def _camera_axes(self, location: Vector, K: CameraMatrix | None) -> RotationMatrix:
@@ -258,7 +260,9 @@ class ObjectCheck:
             return True
         middle = cuboid.mean(axis=0)
         if centroid is not None and np.linalg.norm(centroid - middle) > EDGE_SHARE * diagonal:
-            self._add("cuboid_centroid", f"{_text(centroid)}; the cuboid's is {_text(middle)}")
+            self._add(
+                "cuboid_centroid", f"{_text(centroid)}; the cuboid's centre is {_text(middle)}"
+            )
         if np.linalg.norm(location - middle) <= 2 * diagonal:
             return True
         message = f"{_text(location)}, far from its cuboid at {_text(middle)}: in another unit?"
@@ -278,7 +282,7 @@ class ObjectCheck:
             points = self._cuboid @ axes.T
             self._check_projections(points, K)
         elif self._projected is not None:
-            # Points at depth 1 that project onto the stated ones.
+            # Points at depth 1 that project onto the stated points.
             points = np.column_stack([self._projected, np.ones(8)]) @ np.linalg.inv(K).T
         else:
             return
@@ -305,9 +309,9 @@ def _finite(values: Float[np.ndarray, "..."] | None) -> Float[np.ndarray, "..."]
 
 
 def _quarter_turn_distance(rotation: RotationMatrix) -> float:
-    """Return the angle to the nearest matrix that permutes and flips axes.
+    """Return the angle to the nearest matrix that permutes and flips axes, radians.
 
-    Different tools assign frames to the same object that differ by such matrices.
+    Object frames of different tools differ by these matrices.
     """
     nearest = np.where(np.abs(rotation) == np.abs(rotation).max(axis=0), np.sign(rotation), 0.0)
     if abs(np.linalg.det(nearest)) != 1:

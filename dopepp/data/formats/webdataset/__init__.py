@@ -26,7 +26,7 @@ FIELDS: Final = ("image", "depth", "camera", "gt", "gt_info", "mask_visib")
 
 MAX_MEMBER_BYTES: Final = 256_000_000
 MAX_MEMBERS: Final = 1_000_000
-"""Limit of a shard; BOP's shards have 1,000 images of seven members each."""
+"""Largest number of members in a shard; BOP's shards have 1,000 images of seven members."""
 
 KEY_FILE: Final = "key_to_shard.json"
 """File in the folder of the shards that lists the shard of every key."""
@@ -113,9 +113,9 @@ def index_shard(path: Path) -> ShardIndex:
 def members(path: Path, problems: Problems = STRICT) -> Iterator[TarMember]:
     """Yield the files of a shard, without folders and WebDataset's ``__meta__``.
 
-    A compressed, truncated or damaged archive is reported to ``problems``. So is a member that is
-    no plain file, leads out of the archive, has no extension, is repeated or is too large; it is
-    skipped.
+    A compressed, truncated or damaged archive is reported to ``problems``. A member that is not a
+    plain file, leads out of the archive, has no extension, is repeated or is too large is reported
+    and skipped.
 
     Raises:
         UserError: There is a problem, and ``problems`` is :data:`STRICT`.
@@ -124,7 +124,7 @@ def members(path: Path, problems: Problems = STRICT) -> Iterator[TarMember]:
     try:
         with path.open("rb") as file:
             if file.read(2) == b"\x1f\x8b":
-                node.report("a compressed archive, in which no member can be found", _ALLOWED)
+                node.report("a compressed archive", _ALLOWED)
                 return
             size = file.seek(0, io.SEEK_END)
             file.seek(0)

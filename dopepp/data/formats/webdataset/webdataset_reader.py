@@ -51,7 +51,7 @@ _SCHEME: Final = re.compile(r"([a-z][a-z0-9+.-]+):", re.IGNORECASE)
 class WebdatasetReader:
     """The images of some shards, in the order of the shards.
 
-    Opening reads the archives' headers; members are read and checked with their image. An image
+    The constructor reads headers; members are read and checked with their image. An image
     without ``gt.json`` has no instances. The reader leaves out objects that are none of the parts,
     and objects behind the camera. The visible fraction is ``visib_fract`` of ``gt_info.json``, or
     an estimate of :func:`~dopepp.data.formats.make_instance`.
@@ -101,7 +101,7 @@ class WebdatasetReader:
         if poses.inexact.any() and not self._logged_inexact:
             self._logged_inexact = True
             problem = f"rotations orthogonal to {bop.INEXACT:g} only"
-            _log.warning("%s: %s; the nearest are taken", records.start, problem)
+            _log.warning("%s: %s; using the nearest rotations", records.start, problem)
         instances = []
         for number in self._chosen(poses):
             mask = records.mask("mask_visib", number, shape) if has_masks else None
@@ -184,7 +184,7 @@ class ShardRecords:
 
     @cached_property
     def infos(self) -> list[bop.Record | None]:
-        """The ``gt_info`` record of each object; None for a missing one."""
+        """The ``gt_info`` record of each object; None if missing."""
         return bop.pair_infos(self.truths, self.json("gt_info"), self._member("gt_info"))
 
     def poses(self) -> bop.BopPoses:
@@ -268,10 +268,10 @@ def _local(path: Path) -> list[Path]:
     shards = sorted(file for file in path.glob("*.tar") if not file.name.startswith("."))
     if shards:
         return shards
-    lack = "a folder without *.tar" if path.is_dir() else "no such file or folder"
+    problem = "a folder without *.tar" if path.is_dir() else "no such file or folder"
     allowed = "a folder of shards (*.tar), a single shard, or a URL"
     fix = "set data.root and data.image_sets to existing shards"
-    raise UserError(f"shards {path}, {lack}", allowed, fix)
+    raise UserError(f"shards {path}, {problem}", allowed, fix)
 
 
 def _fetched(url: str, scheme: str, folder: Path | None) -> Path:
@@ -316,8 +316,8 @@ def _download(url: str, scheme: str, path: Path) -> None:
                 file.write(piece)
         draft.replace(path)
     except OSError as error:
-        problem = f"shard {url}, which cannot be fetched into {path.parent}: {error!s:.200}"
-        allowed = "a URL that can be read and enough space"
+        problem = f"shard {url}, which cannot be downloaded to {path.parent}: {error!s:.200}"
+        allowed = "a readable URL and enough disk space"
         fix = "open the URL in a browser to test it, and free space"
         raise UserError(problem, allowed, fix) from error
     finally:

@@ -44,14 +44,14 @@ def read_image_set(root: Path, image_set: str, subset: Subset) -> list[str]:
     path = root / "image_sets" / f"{image_set}.txt"
     if not path.is_file():
         lists = sorted(p.stem for p in path.parent.glob("*.txt") if p.stem != "classes")
-        fix = f"set data.image_sets to one of these, or add {path}"
+        fix = f"set data.image_sets to a name of this list, or add {path}"
         raise UserError(f"image set {image_set!r}", f"one of {lists}", fix)
     frames = []
     for line in path.read_text().split():
         scene, _, number = line.partition("/")
         if not number.isdigit() or not (scene.isdigit() or scene == "data_syn"):
             allowed = "SSSS/NNNNNN or data_syn/NNNNNN"
-            raise UserError(f"{path}: line {line!r}", allowed, "write this line as a frame")
+            raise UserError(f"{path}: line {line!r}", allowed, "correct this line")
         if (scene == "data_syn") == (subset == "synthetic"):
             frames.append(number if subset == "synthetic" else line)
     return frames
@@ -103,7 +103,7 @@ def read_meta(path: Path, problems: Problems = STRICT) -> FrameMeta:
     columns: dict[int, int] = {}
     for column, (index, pose) in enumerate(_columns(node, fields)):
         if index in poses:
-            node["cls_indexes"][column].report(f"class {index} twice", "each once")
+            node["cls_indexes"][column].report(f"class {index} twice", "each class once")
             continue
         poses[index] = _pose(pose, node["poses"][column])
         columns[index] = column
@@ -177,7 +177,7 @@ class YcbFrame:
 
     Attributes:
         image: RGB, with alpha in a synthetic frame.
-        shape: (height, width), even of a damaged image that states its size.
+        shape: (height, width), from the header if the image is damaged.
         depth: Units of ``1 / factor_depth`` metres.
         labels: Class index of each pixel; 0 is the background.
     """

@@ -1,4 +1,4 @@
-"""Invariants of YCB-Video: the frames on disk, not those that a list names and nobody unpacked.
+"""Invariants of YCB-Video, for the frames on disk; listed frames may be missing.
 
 An object without a label pixel is no defect: some releases label only some objects.
 """

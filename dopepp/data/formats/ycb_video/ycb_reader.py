@@ -93,7 +93,7 @@ class YcbVideoReader:
         absent = [frame for frame in listed if not is_there[frame]]
         if len(absent) == len(listed):
             problem = f"no frame of {where} under {folder} ({len(absent):,} listed)"
-            fix = "unpack all archives of the data set there, or set another image set"
+            fix = "unpack all archives of the data set into it, or set another image set"
             raise UserError(problem, "at least one listed frame on disk", fix)
         if absent:
             counts = f"{len(absent):,} of {len(listed):,}"

@@ -59,9 +59,9 @@ _PATHS: Final = {"type": "path", "max_depth": 6, "hide_emitters": True}
 """At most five bounces; lamps are visible in reflections only."""
 
 _GUIDES: Final = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}
-"""Surface features for the denoiser; a separate pass is far faster than one with the light."""
+"""Surface features for the denoiser; rendering them in a separate pass is far faster."""
 
-_MARGIN_PX: Final = 1  # around the objects, for partly covered pixels and the denoiser
+_MARGIN_PX: Final = 1  # margin around the objects, for partly covered pixels and the denoiser
 
 _RADIANCE_OF_CODE: Final = np.interp(
     np.arange(256), TONE_CURVE, np.arange(len(TONE_CURVE)) / CODE_STEPS
@@ -221,7 +221,7 @@ class TableTop:
         return {"type": "disk", "to_world": to_world.scale(self.radius), "bsdf": bsdf}
 
     def unshadowed(self, area: Area) -> Colours:
-        """Return the disc's radiance without objects; 0 beside it."""
+        """Return the disc's radiance without objects; 0 outside the disc."""
         return np.asarray(self.albedo * self._light[area])
 
     def faded(self, kept: Colours, area: Area) -> Colours:
@@ -260,15 +260,15 @@ def split_light(light: Colours, alpha: Depth, unshadowed: Colours) -> tuple[Colo
     Args:
         light: Radiance of objects and disc together.
         alpha: Coverage of each pixel by objects.
-        unshadowed: Radiance of the disc without objects, 0 beside it.
+        unshadowed: Radiance of the disc without objects, 0 outside the disc.
 
     Returns:
         Radiance of the objects, and the share of the light that remains on the disc.
     """
     is_disc = (alpha <= 0) & (unshadowed.min(axis=-1) > _LEAST_LIGHT)
     kept = np.where(is_disc[..., None], light / np.maximum(unshadowed, _LEAST_LIGHT), 1.0)
-    kept = np.clip(kept, 0.0, 4.0)  # over 1: light thrown on a table in deep shade
-    # An object's rim mixes both: extrapolate the shadow beside it.
+    kept = np.clip(kept, 0.0, 4.0)  # above 1: objects reflect light onto a dark table
+    # Pixels on an object's rim mix object and disc, so the shadow beside them is extrapolated.
     weight = cv2.GaussianBlur(is_disc.astype(np.float64), (0, 0), _SPREAD_PX)[..., None]
     spread = cv2.GaussianBlur(np.where(is_disc[..., None], kept, 0.0), (0, 0), _SPREAD_PX)
     carried = np.where(weight > 1e-3, spread / np.maximum(weight, 1e-3), 1.0)

@@ -103,7 +103,7 @@ def _fractions(
     for index in np.flatnonzero(visible).tolist():
         item, seen = scene.objects[index], projected[index]
         if seen.inside(scene.size):
-            # Its pixels can be hidden only where another object may be in front of it.
+            # Pixels can be hidden only where another object may be in front.
             left, top, right, bottom = _rivals(scene, projected, index) or (0, 0, 0, 0)
             covered = draw_alone(item, seen.hom, (left, top, right, bottom))[0] > 0
             hidden = int((covered & (instances[top:bottom, left:right] != index)).sum())
@@ -124,7 +124,7 @@ def _rivals(scene: Scene, projected: Sequence[Projected], index: int) -> Box | N
         offset = scene.plane.offset - float(np.dot(scene.plane.normal, item.T_cam_obj[:3, 3]))
         if (item.surface.hull @ normal).min() < offset:  # the object extends below the plane
             return whole
-    # An object that begins behind the end of this one cannot hide it.
+    # An object hides nothing if its nearest point lies behind the farthest point of this object.
     depths = [_depths(other) for other in scene.objects]
     boxes = []
     for number, seen in enumerate(projected):
@@ -146,7 +146,7 @@ def _depths(item: SceneObject) -> tuple[float, float]:
 
 
 def _whole_px(item: SceneObject, seen: Projected, K: Array) -> float:
-    """Count the pixel centres an object covers alone on a canvas as large as it needs."""
+    """Count the pixel centres of an unoccluded object on an unbounded canvas."""
     left, top, right, bottom = seen.extent
     if not math.isfinite(left):
         return math.inf  # the object surrounds the camera
@@ -162,7 +162,7 @@ def _whole_px(item: SceneObject, seen: Projected, K: Array) -> float:
 def _composite(
     samples: Samples, colour: Array, first_ids: Array, image: Array, depth: Array, instances: Array
 ) -> None:
-    """Lay a window of samples over the background and read the centre samples as labels.
+    """Composite a window of samples over the background, and read labels at the centre samples.
 
     ``colour`` sums the covered samples' sRGB values; ``first_ids`` ascend by object. ``image``,
     ``depth`` and ``instances`` are updated in place.

@@ -27,10 +27,10 @@ class Fragments(NamedTuple):
 
     Attributes:
         pixel: Index of the pixel in the window, row by row, shape (n,).
-        weight: Number of the pixel's samples that it covers, shape (n,).
-        face: Index of its triangle; its bitwise complement for a back face, shape (n,).
-        x: Column of its mean in the image, shape (n,); ``y`` is the row.
-        inverse: Inverse depth of its sample, 1/m, shape (n,).
+        weight: Number of the pixel's samples in the fragment, shape (n,).
+        face: Index of the triangle, or the bitwise complement for a back face, shape (n,).
+        x: Mean column of the samples in the image, shape (n,); ``y`` is the mean row.
+        inverse: Inverse depth of a sample, 1/m, shape (n,).
         share: Weights of the triangle's corners, shape (3, n).
         position: Camera frame, metres, shape (3, n).
         normal: Unit normal towards the camera, camera frame, shape (3, n).
@@ -76,7 +76,7 @@ def gather_fragments(
         return None
     (x, y), surface = samples.origin, item.surface
     window = (box[0] - x, box[1] - y, box[2] - x, box[3] - y)
-    # An upper bound; memory that is never touched costs nothing.
+    # The arrays have the largest possible size; unused memory costs nothing.
     bound = NUM_COLOUR_SAMPLES * (box[2] - box[0]) * (box[3] - box[1])
     groups = tuple(scratch(name, (bound,), dtype) for name, dtype in _GROUP_TYPES.items())
     count = _group(window, samples, first_id, surface.patches, PIXEL_SAMPLES, groups)
@@ -137,7 +137,7 @@ def _group(
                         dx += offsets[q, 0]
                         dy += offsets[q, 1]
                 if count == NUM_COLOUR_SAMPLES:
-                    # Their mean is the pixel's centre, which has its own triangle.
+                    # The mean of all samples is the pixel's centre, whose triangle is known.
                     other = ids[j, i, centre] - first_id
                     if 0 <= other < num_faces and patches[other] == patches[face]:
                         face, inverse = other, inverse_depth[j, i, centre]
@@ -178,8 +178,8 @@ def _interpolate(
         k0 = scale * (e[0] * x + e[1] * y + e[2])
         k1 = scale * (e[3] * x + e[4] * y + e[5])
         k2 = scale * (e[6] * x + e[7] * y + e[8])
-        # The mean may lie outside this triangle: its plane is right there as long as the depth
-        # stays near the sample's, its corners' values must not be overshot.
+        # The mean may lie outside the triangle. The triangle's plane then gives the depth if it is
+        # close to the sample's depth. Corner values are not extrapolated.
         total, inverse = k0 + k1 + k2, float(fragments.inverse[p])
         z = 1.0 / (total if abs(total - inverse) <= _DEPTH_GAP * inverse else inverse)
         k0, k1, k2 = max(k0, 0.0), max(k1, 0.0), max(k2, 0.0)
@@ -207,10 +207,10 @@ def _interpolate(
 def _corner_heights(
     vertices: Array, a: int, b: int, c: int, normals: Array
 ) -> tuple[float, float, float, float, float, float]:
-    """Return how far the other two corners lie below each corner's tangent plane, metres."""
-    # A point of the triangle lies below these planes by sums of them; weighted by its shares of the
-    # corners, that is how far it lies below the surface its normals belong to (Hanika, "Hacking the
-    # shadow terminator", Ray Tracing Gems II, 2021).
+    """Return the distances of each corner's two neighbours below its tangent plane, metres."""
+    # The depth of a point below each tangent plane is linear in these distances. The mean of the
+    # three depths, weighted by the barycentric coordinates, is the depth below the smooth surface
+    # (Hanika, "Hacking the shadow terminator", Ray Tracing Gems II, 2021).
     h0, h1, h2, h3, h4, h5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for r in range(3):
         ab = vertices[a, r] - vertices[b, r]

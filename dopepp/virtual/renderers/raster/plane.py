@@ -4,7 +4,7 @@ The background shows the plane in full light and is multiplied by the share of l
 that objects leave. Homographies map the plane to each shadow map and to the grid of its sky, so
 both are warped into the image.
 
-For the sky, points on the objects' surfaces hide it in 32 cosine-distributed directions: each point
+Points on the objects' surfaces hide the sky in 32 cosine-distributed directions: each point
 sets one bit per direction in a cell of the plane, and the share of bits is the hidden share of the
 sky. This gives the soft contact shadow of an object.
 """
@@ -34,9 +34,9 @@ from dopepp.virtual.scene import NEAR, Plane, Scene, SceneObject
 from dopepp.virtual.sensor import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
 from dopepp.virtual.triangles import NUM_COLOUR_SAMPLES, scratch
 
-_VISIBLE: Final = np.float32(0.005)  # share of hidden light that changes a picture of 256 levels
+_VISIBLE: Final = np.float32(0.005)  # smallest share of hidden light that changes an 8-bit picture
 
-_SKY_DIRECTIONS: Final = 32  # in which the sky is sampled, one bit each
+_SKY_DIRECTIONS: Final = 32  # sampled directions of the sky, one bit each
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
@@ -99,7 +99,7 @@ def darken_plane(
 def _cast(plane: Plane, shadow: ShadowMap) -> tuple[Float32[np.ndarray, "rows columns"], int]:
     """Return the shadow of every texel with its penumbra, and the margin added for it, texels."""
     P = shadow.P.astype(np.float64)
-    # In the map, too, the plane's 1/depth is linear: n · x = offset with x = M⁻¹ (depth (u, v, 1)
+    # The plane's 1/depth is linear in the map as well: n · x = offset with x = M⁻¹ (depth (u, v, 1)
     # − p), P = [M | p].
     row = np.array(plane.normal) @ np.linalg.inv(P[:, :3])
     span = plane.offset + float(row @ P[:, 3])
@@ -114,7 +114,7 @@ def _cast(plane: Plane, shadow: ShadowMap) -> tuple[Float32[np.ndarray, "rows co
     hit = (cast > 0) & (ground > 0)
     if not hit.any():
         return cast, 0
-    # Like triangles: the penumbra is as wide as the lamp seen from the object, times the gap.
+    # The penumbra's width is the lamp's angular size, seen from the object, times the gap.
     gap = float(np.median(1 / ground[hit] - 1 / drawn[hit]))
     texel = shadow.texel * float(np.median(1 / ground[hit]))
     # The plane sees the lamp 0.04 radians wide. The map's outlines are not anti-aliased: a blur of
@@ -248,7 +248,7 @@ def _darken(
     samples: Samples,
     image: Array,
 ) -> None:
-    """Multiply the picture by the share of the plane's light that is left.
+    """Multiply the picture by the remaining share of the plane's light.
 
     ``shades``, of shape (1 + lights, h, w), are the hidden shares of the sky and of every light;
     ``corner`` is their first pixel. ``decode`` and ``encode`` convert codes and linear light.

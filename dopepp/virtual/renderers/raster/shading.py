@@ -124,7 +124,7 @@ def _tint_albedo(
     position, albedo = fragments.position, fragments.albedo
     least, greatest = NOISE_LIMITS
     for p in range(position.shape[1]):
-        # Two lattice steps are the shortest wave; it needs two pixels.
+        # The shortest wave spans two lattice steps and needs two pixels.
         fade = 2.0 - position[2, p] / (focal * pitch)
         if fade <= 0.0:
             continue
@@ -221,7 +221,7 @@ def reflect_ambient(
 ) -> None:
     """Set the radiance to the reflected ambient light.
 
-    A dielectric scatters the hemisphere around its normal; its weak gloss is left out. A metal
+    A dielectric scatters the hemisphere around its normal; its weak gloss is ignored. A metal
     mirrors the hemisphere's colour in the reflected direction, tinted with its albedo; a smoother
     metal mirrors more sharply. ``opened`` is the share of the ambient light that reaches each
     point, ``ambient`` comes from :func:`ambient_row`, ``metallic`` is 1 for metals.
@@ -239,7 +239,7 @@ def reflect_ambient(
             length = math.sqrt(px * px + py * py + pz * pz)
             turn = -2.0 * (nx * px + ny * py + nz * pz) / length
             mirror = (ux * px + uy * py + uz * pz) / length + turn * height
-            # A smooth metal shows the horizon as an edge as wide as its lobe.
+            # A metal mirrors the horizon as an edge as wide as the GGX lobe.
             sharpness = 1.0 / (0.1 + 0.9 * alpha[p])
             mirrored = min(max(0.5 + 0.5 * sharpness * mirror, 0.0), 1.0)
         for c in range(3):

@@ -35,7 +35,9 @@ Extent = tuple[float, float, float, float]
 """Smallest and largest pixel coordinates (left, top, right, bottom)."""
 
 _REACH: Final = float(np.abs(PIXEL_SAMPLES).max())
-_LARGEST_TANGENT: Final = 3.0  # to the side of a light among the objects; beyond, all is lit
+_LARGEST_TANGENT: Final = (
+    3.0  # largest tangent off the axis of a light among the objects; points beyond are lit
+)
 _ZERO, _ONE = np.float32(0), np.float32(1)  # literals would turn the arithmetic into float64
 
 
@@ -46,7 +48,7 @@ class Projected:
     Attributes:
         cam: Camera frame, metres, shape (V, 3).
         hom: Homogeneous pixels ``K x_cam``, shape (V, 3).
-        extent: Bounds of its image; infinite across the camera plane, left > right behind it.
+        extent: Bounds of the object's image; infinite across the camera plane, left > right behind.
     """
 
     cam: Array
@@ -54,7 +56,7 @@ class Projected:
     extent: Extent
 
     def box(self, size: Size) -> Box | None:
-        """Return the pixels it may touch in an image of (width, height), or None."""
+        """Return the pixels that the object may touch in an image of (width, height), or None."""
         left, top, right, bottom = self.extent
         if left > right:
             return None
@@ -64,7 +66,7 @@ class Projected:
         return box if box[0] < box[2] and box[1] < box[3] else None
 
     def inside(self, size: Size) -> bool:
-        """Return whether it lies within the pixel centres of an image of (width, height)."""
+        """Return whether the object lies within the pixel centres of an image (width, height)."""
         left, top, right, bottom = self.extent
         return 0 <= left <= right <= size[0] - 1 and 0 <= top <= bottom <= size[1] - 1
 
@@ -83,7 +85,7 @@ def centres_within(extent: Extent) -> Box:
 
 
 def box_around(boxes: Iterable[Box | None]) -> Box | None:
-    """Return the box around several boxes, or None without any."""
+    """Return the bounding box of boxes, or None without boxes."""
     drawn = [box for box in boxes if box is not None]
     if not drawn:
         return None
@@ -254,7 +256,7 @@ def ambient_row(ambient: Ambient) -> Array:
 def _project_points(
     position: Array, normal: Array, bulge: Array, light: Array, P: Array, lift: Scalar, out: Array
 ) -> None:
-    """Project lifted points to u, v and 1/depth in the map; 1/depth is −1 where they face away."""
+    """Project lifted points to u, v, 1/depth in the map; 1/depth is −1 for averted points."""
     x0, y0, z0 = light[0], light[1], light[2]
     a, b, c, d = P[0, 0], P[0, 1], P[0, 2], P[0, 3]
     e, f, g, h = P[1, 0], P[1, 1], P[1, 2], P[1, 3]

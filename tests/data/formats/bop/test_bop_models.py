@@ -140,7 +140,7 @@ def test_objects_without_a_name_are_called_after_their_file(tmp_path):
             ({"symmetries_continuous": [{"axis": [0, 0, 1]}]}, "3 finite numbers"),
             ([], r"1: \[\]; .*diameter and symmetries"),
         ]),
-        ({"1": {}, "01": {}}, "'01': not an object number, or a repeated one"),
+        ({"1": {}, "01": {}}, "'01': not an object number, or a repeated number"),
         ({"1": {"name": "a"}, "2": {"name": "a"}}, r"2\.name: 'a' twice"),
         ({"a": {}}, "objects by number"),
         ([], "objects by number"),
@@ -188,7 +188,7 @@ def test_models_without_a_file_are_left_out_unless_they_are_asked_for(tmp_path, 
     write_models(tmp_path, [servoholder(), pivconnector()])
     (tmp_path / "models" / "obj_000001.ply").unlink()
     assert [part.name for part in bop_parts(tmp_path)] == ["pivconnector"]
-    assert "left out models without a file: servoholder" in caplog.text
+    assert "ignoring models without a file: servoholder" in caplog.text
     with pytest.raises(UserError, match=r"obj_000001.ply, no such file"):
         bop_parts(tmp_path, ["servoholder"])
     (tmp_path / "models" / "obj_000002.ply").unlink()

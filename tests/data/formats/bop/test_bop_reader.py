@@ -191,8 +191,8 @@ def test_absent_images_and_objects_behind_the_camera_are_counted(scene, caplog, 
     assert [len(source.sample(i).instances) for i in range(len(source))] == [1]
     assert source.sample(0).instances[0].mask is not None  # number 1 of the list
     assert "1 of 2 listed images are absent" in caplog.text
-    assert "1 images have ground truth and no camera" in caplog.text
-    assert "0 objects that are none of the parts and 1 behind the camera" in caplog.text
+    assert "ignoring 1 images with ground truth but without a camera" in caplog.text
+    assert "0 objects that are not among the parts and 1 behind the camera" in caplog.text
 
 
 def bent(by: float) -> dict[str, Any]:
@@ -208,7 +208,9 @@ def test_inexact_rotations_are_the_nearest_ones_and_said_once(scene, block, capl
     source = BopReader(scene.root, [block(2)], "test")
     source.sample(0)
     lines = [line for line in caplog.messages if "orthogonal" in line]
-    assert lines == ["bop/test: 2 rotations are orthogonal to 0.01 only; the nearest are taken"]
+    assert lines == [
+        "bop/test: 2 rotations are orthogonal to 0.01 only; using the nearest rotations"
+    ]
     got = source.sample(0).instances[0].T_cam_obj[:3, :3]
     np.testing.assert_allclose(got @ got.T, np.eye(3), atol=1e-12)
     stated = np.reshape(bent(5e-3)["cam_R_m2c"], (3, 3))
@@ -227,7 +229,7 @@ def test_missing_infos_and_models_are_coped_with_and_counted(scene, block, caplo
     (scene.root / "models").mkdir()
     (scene.root / "models" / "models_info.json").write_text('{"2": {"diameter": 46.0}}')
     source = BopReader(scene.root, [block(2)], "test")
-    assert "left out objects without a model: 9 (2)" in caplog.text
+    assert "ignoring objects without a model: 9 (2)" in caplog.text
     assert "none of the parts" not in caplog.text
     assert "1 objects' visible fractions are estimated" in caplog.text
     fractions = [source.sample(i).instances[0].visible_fraction for i in (0, 1)]

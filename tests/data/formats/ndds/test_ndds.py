@@ -107,7 +107,7 @@ def test_writer_refuses_foreign_folders(tmp_path, boxes):
         NddsWriter(tmp_path / "a", boxes[0][:1]).prepare()
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "holiday.jpg").touch()
-    with pytest.raises(UserError, match=r"holiday\.jpg in .*/b, which no NDDS writer"):
+    with pytest.raises(UserError, match=r"holiday\.jpg in .*/b, which is not from an NDDS writer"):
         NddsWriter(tmp_path / "b", boxes[0]).prepare()
 
 
@@ -338,7 +338,7 @@ def test_orders_that_cannot_be_told_apart_are_said(tmp_path):
     wild.item(0, BOX, pose=T)
     source = NddsReader(tmp_path, [BOX])
     assert_read(wild, source)
-    assert "the same poses so far with: quaternion w,x,y,z" in str(source.finding)
+    assert "equal poses under: quaternion w,x,y,z" in str(source.finding)
 
 
 def edit(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
@@ -412,11 +412,11 @@ def test_missing_camera_images_and_folders(tmp_path, caplog):
     (wild.root / "000001.png").unlink()
     with caplog.at_level(logging.WARNING):
         assert len(NddsReader(wild.root, [BOX])) == 1
-    assert "1 annotations have no image" in caplog.text
+    assert "ignoring 1 annotations without an image" in caplog.text
     for folder in (tmp_path / "nowhere", tmp_path):
         if folder == tmp_path:
             (wild.root / "000000.png").unlink()
-        with pytest.raises(UserError, match="without one annotated image"):
+        with pytest.raises(UserError, match="without an annotated image"):
             NddsReader(folder, [BOX])
 
 

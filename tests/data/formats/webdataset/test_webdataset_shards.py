@@ -85,7 +85,10 @@ def test_runs_go_down_the_columns_and_begin_with_zeros():
 @pytest.mark.parametrize(
     ("record", "message"),
     [
-        ({"counts": [6], "size": [3, 2]}, r"x: size \[3, 2\]; allowed: runs of size \[2, 3\]"),
+        (
+            {"counts": [6], "size": [3, 2]},
+            r"x: size \[3, 2\]; allowed: runs of the image's size \[2, 3\]",
+        ),
         ({"counts": [5], "size": [2, 3]}, r"counts \[5\]"),
         ({"counts": [-1, 7], "size": [2, 3]}, "counts"),
         ({"counts": [1.0, 5.0], "size": [2, 3]}, "counts"),
@@ -244,7 +247,7 @@ def test_shards_are_downloaded_once_and_within_bounds(
     with pytest.raises(UserError, match="of over 0 GB"):
         WebdatasetReader(tmp_path, [block(2)], url, download_dir=tmp_path / "small")
     missing = address + "/shard-000009.tar"
-    with pytest.raises(UserError, match="which cannot be fetched"):
+    with pytest.raises(UserError, match="which cannot be downloaded"):
         WebdatasetReader(tmp_path, [block(2)], missing, download_dir=folder)
     with pytest.raises(UserError, match=r"URLs of .*https"):
         WebdatasetReader(tmp_path, [block(2)], "nope://x/y.tar", download_dir=folder)
