@@ -47,7 +47,7 @@ def render(
     preview: Annotated[bool, Option("--preview", help="Only write OUT.preview.png.")] = False,
     shard: Annotated[str, Option(help="i/n: only shard i of n, from 0.")] = "0/1",
     engine: Annotated[str, Option(help="local or ray.")] = "local",
-    ray_address: Annotated[str | None, Option(help="Ray cluster (default: start one).")] = None,
+    ray_address: Annotated[str | None, Option(help="Ray cluster (default: a new cluster).")] = None,
     renderer: Annotated[str, Option(help="raster or photoreal.")] = "raster",
     backgrounds: Annotated[str, Option(help="procedural, skimage or a folder.")] = "procedural",
     changes: Annotated[

@@ -151,7 +151,7 @@ def parse(kind: type[T], value: object, name: str = "", fix: str = "") -> T:
         first, *others = _mistakes(kind, value, error)
         depth = len(first.location)
         deeper = (other for other in others if other.location[:depth] == first.location)
-        # The alternative of a union that fails deepest inside is probably the intended one.
+        # The alternative of a union that fails deepest inside is probably the intended alternative.
         mistake = max((first, *deeper), key=lambda candidate: len(candidate.location))
         raise _user_error(mistake, name, fix) from None
     return typed
@@ -223,7 +223,7 @@ def shown(value: object, most: int = 100) -> str:
 
 @cache
 def _adapter(kind: type[T]) -> TypeAdapter[T]:
-    # A class of an extension may have arguments that no plain value can stand for.
+    # A class of an extension may have arguments that no plain value can represent.
     config = None if dataclasses.is_dataclass(kind) else ConfigDict(arbitrary_types_allowed=True)
     return TypeAdapter(kind, config=config)
 

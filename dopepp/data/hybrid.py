@@ -56,7 +56,7 @@ class HybridSource:
     often; the number of the traversal is the epoch of the source.
 
     Args:
-        real: Real camera frames; the real share is 0 without them.
+        real: Real camera frames; None for a real share of 0.
         real_fraction: Share of ``real``, in [0, 1].
         synthetic_fraction: Share of ``synthetic`` in the remaining items, in [0, 1].
     """
@@ -146,7 +146,7 @@ class HybridSource:
 class WindowedSource:
     """Windows of another source's scaled images that contain the centre of an object.
 
-    A network that trains on windows of renders thus gets windows of photographs. Each epoch draws
+    Networks that train on windows of renders need windows of photographs as well. Each epoch draws
     object and window again, uniformly among the windows that contain the object's centre, or among
     all windows without an object. Smaller pictures are padded, as for prediction.
 

@@ -1,7 +1,7 @@
 """Choose the symmetries of the objects to learn: from the mesh, a file, a config, or none.
 
-A file is BOP's ``models_info.json``, or a single entry as printed by ``dopepp symmetries``; a
-config has such entries by name.
+A file is BOP's ``models_info.json``, or a single entry as printed by ``dopepp symmetries``. A
+config has entries of this format by name.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Define a render job from user input, record it, and claim its folder.
 
-The record holds everything that determines the job's bytes, as plain values. It is written into the
-folder first. A later job with another record is rejected with the fields that differ.
+The record holds everything that determines the job's bytes, as plain values. A job writes the
+record first. A later job with another record is rejected with the fields that differ.
 
 To add a layout, write a :class:`~dopepp.data.formats.Writer` and one line in :data:`WRITERS`.
 """
@@ -190,7 +190,7 @@ def _nested(changes: Sequence[str]) -> dict[str, Any]:
             node = node.setdefault(group, {}) if isinstance(node, dict) else None
         if not isinstance(node, dict) or field in node:
             problem = f"--set {change} after another --set of {path}"
-            raise UserError(problem, "one --set for each field", "leave out all but one")
+            raise UserError(problem, "one --set for each field", "remove the repeated --set")
         node[field] = value
     return tree
 

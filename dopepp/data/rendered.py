@@ -1,8 +1,8 @@
 """Provide virtual images as a source, rendered on demand or cached.
 
 Training, validation and test are three disjoint index ranges of a factory, so they share no image.
-Only training images change with the epoch. Cached images are those of epoch 0; masking and
-augmentation come later and still differ between epochs.
+Only training images change with the epoch. Cached images are images of epoch 0; masking and
+augmentation are applied later and differ between epochs.
 """
 
 from __future__ import annotations

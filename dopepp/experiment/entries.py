@@ -99,7 +99,7 @@ def entry(
 ) -> None:
     """Run a main function that passes ``sys.argv`` to Hydra; print user errors as one line.
 
-    The remaining arguments are those of :func:`~dopepp.experiment.command_line.prepare`.
+    The remaining arguments are as in :func:`~dopepp.experiment.command_line.prepare`.
     """
     # With this variable Hydra raises its errors instead of printing pages of text.
     os.environ["HYDRA_FULL_ERROR"] = "1"

@@ -29,7 +29,7 @@ FORMATS: Final = (
     "ROS camera_info, OpenCV FileStorage, BOP camera.json, COLMAP cameras.txt, "
     "3×3 numbers, or the four numbers fx fy cx cy"
 )
-_UNDISTORT: Final = "undistort the pictures and pass the K of the undistorted ones"
+_UNDISTORT: Final = "undistort the pictures and pass their new K"
 
 _SIDE: Final = Range(1, 65_536, "pixels")  # Side of a calibrated picture
 _COLMAP_MODELS: Final = {

@@ -93,7 +93,7 @@ def solve_pnp(
 
     Returns:
         The pose with the smallest robust cost among the refined starts: SQPnP on all points, its
-        mirror image for a plate and, in case of outliers, SQPnP on all but one and all but two.
+        mirror image for a plate and, with outliers, SQPnP on subsets without one or two points.
 
     Raises:
         ValueError: The arguments differ in length, or K is no invertible pinhole matrix.
@@ -251,7 +251,7 @@ def _concluded(
 
 
 class _Starts:
-    """Closed-form poses from all points, all but one and all but two, for every widening."""
+    """Closed-form poses from all points and from subsets without one or two points."""
 
     def __init__(
         self, object_points: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 2"]
@@ -283,7 +283,7 @@ class _Starts:
 
 @cache
 def _kept(count: int, left_out: int) -> list[NDArray[np.intp]]:
-    """Return all selections of the rows that omit ``left_out`` of them."""
+    """Return all selections of rows that omit ``left_out`` rows."""
     return [np.array(rows) for rows in combinations(range(count), count - left_out)][::-1]
 
 

@@ -58,7 +58,7 @@ def rotation_vector_to_matrix(
     vector = np.asarray(vector, np.float64)
     x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
     half = 0.5 * np.sqrt(x * x + y * y + z * z)[..., None, None]
-    # sin(x)/x is exact however small x is; (1 − cos)/x² = (sin(x/2)/x)²·2 loses no digits near 0.
+    # sin(x)/x is exact for any small x; (1 − cos)/x² = (sin(x/2)/x)²·2 loses no digits near 0.
     half = np.where(half == 0, np.finfo(np.float64).tiny, half)
     sinc_half = np.sin(half) / half
     skew = np.zeros((*vector.shape, 3))

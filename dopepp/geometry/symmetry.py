@@ -33,7 +33,7 @@ def symmetry_group(
     continuous: Sequence[ContinuousSymmetry] = (),
     max_step: float = MAX_STEP,
 ) -> Float[np.ndarray, "group 4 4"]:
-    """Return all symmetry transforms, the identity first, continuous ones in steps.
+    """Return all symmetry transforms, the identity first; continuous symmetries are sampled.
 
     As in BOP, every step of a continuous symmetry is combined with every discrete symmetry. A part
     with two axes that are not parallel is a ball, whose rotations are 0.2 rad apart.

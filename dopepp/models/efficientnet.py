@@ -204,7 +204,7 @@ def same_conv(
 ) -> nn.Sequential:
     """Return convolution, batch norm and ReLU6 with TensorFlow's padding and averaging.
 
-    A stride of 2 pads the right and bottom of even sides by one more than the left and top.
+    With a stride of 2, even sides have one more padding pixel on the right and bottom.
     """
     before, uneven = divmod(kernel_size - stride, 2)
     kind = nn.Conv2d if groups == 1 else DepthwiseConv

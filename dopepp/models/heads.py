@@ -157,7 +157,7 @@ class ChainBranch(nn.Sequential, Branch):
 
 
 class MultiScale(Head):
-    """The paper's MultiScaleDOPEstage (§3.3), 1 to 12 of them.
+    """A chain of 1 to 12 MultiScaleDOPEstages of the paper (§3.3).
 
     ``width`` is a factor on the 128 channels. If ``batch_norm``, batch norm follows every
     convolution except output convolutions. ``maps`` selects the fusion's input from each scale:

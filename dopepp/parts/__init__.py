@@ -1,4 +1,4 @@
-"""Parts: 3D objects with mesh, unit, diameter and symmetries, and the two built-in ones."""
+"""Parts: 3D objects with mesh, unit, diameter and symmetries, and the two built-in parts."""
 
 from dopepp.parts.catalogue import BUILTIN, load_part, pivconnector, servoholder
 from dopepp.parts.mesh.read import read_mesh, ycb_part

@@ -1,6 +1,6 @@
 """Parts by mesh file or by name of a built-in part.
 
-The built-in parts are those of the paper (§2.1): Servoholder, 77×77×7 mm, and PivConnector,
+The built-in parts are the paper's parts (§2.1): Servoholder, 77×77×7 mm, and PivConnector,
 105×52×7 mm. The shapes are our own: a 4 mm plate with raised features on its front (+z) and
 recesses in its back (−z), so that no rotation maps a part onto itself and every side reveals the
 orientation.
@@ -130,7 +130,7 @@ def with_meshes(
         unit: Unit of the mesh files; None for the unit of their format.
 
     Returns:
-        The parts in order. A warning is logged if a mesh is not the trained one.
+        The parts in order. A warning is logged if a mesh differs from the trained mesh.
 
     Raises:
         UserError: A part has no mesh, a name is unknown, or a file is invalid.

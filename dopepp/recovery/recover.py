@@ -230,7 +230,7 @@ def rejected_refined(detection: Detection, least: float) -> Reason:
 
 
 def furthest(reasons: Sequence[Reason]) -> list[Reason]:
-    """Return for each object the reason that rejected its best candidate, the best object last."""
+    """Return each object's reason for rejecting its best candidate, sorted by progress."""
     order = list(KINDS)
     best: dict[str, Reason] = {}
     for reason in sorted(reasons, key=lambda reason: (order.index(reason.kind), reason.best)):

@@ -185,8 +185,8 @@ class EmptyMaps(Callback):
     """Warns once, with likely causes, if all beliefs are too low for detections.
 
     Maps are empty if no belief of a centroid, or none of a corner, reaches the threshold of the
-    recovery on any validation image. The warning follows ``patience`` such validations in a row, or
-    the end of a shorter training.
+    recovery on any validation image. The warning follows ``patience`` consecutive validations with
+    empty maps, or the end of a shorter training.
     """
 
     def __init__(self, patience: int = 3) -> None:

@@ -1,7 +1,7 @@
 """Reports of a training to a hyperparameter study, and pruning of poor trials.
 
-The study is a database to which all trials write, also from other machines. Its objective is the
-value that chooses the best checkpoint.
+The study is a database to which all trials write, also from other machines. A study's objective is
+the value that selects the best checkpoint.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ def agreement(image: Picture, K: CameraMatrix, T_cam_obj: Transform, surface: Su
     profiles = _profiles(image, contour, reach)
     offsets = np.arange(-reach, reach + 1)
     total = 0.0
-    # Tolerances relative to the reach: the narrow one ranks good poses, the wide one bad poses.
+    # Widths relative to the reach: the narrow kernel ranks good poses, the wide kernel bad poses.
     for width in (0.12, 0.4):
         kernel = np.exp(-0.5 * (offsets / (width * reach)) ** 2)
         shifted = cv2.filter2D(profiles, -1, kernel[None], borderType=cv2.BORDER_CONSTANT)

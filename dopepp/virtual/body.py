@@ -90,8 +90,8 @@ class Hull:
     def rests(self) -> tuple[Float[np.ndarray, "rests 3"], Float[np.ndarray, "rests"]]:
         """Outward normals of the stable faces, and the frequency with which the body rests on each.
 
-        A face is stable if the centre of mass is above it. Its frequency is its solid angle from
-        the centre: the share of directions in which a body that does not bounce lands on it.
+        A face is stable if the centre of mass is above the face. The frequency is the face's solid
+        angle from the centre: the share of directions in which a body that does not bounce lands.
         """
         corners = self.vertices[self.triangles] - self.centre
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

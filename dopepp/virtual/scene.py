@@ -86,7 +86,7 @@ class Light:
 
 @dataclass(frozen=True)
 class Ambient:
-    """Light from everywhere: linear RGB of a hemisphere ``above`` and one ``below``.
+    """Ambient light: linear RGB of the upper hemisphere ``above`` and the lower ``below``.
 
     ``up`` is a unit vector to the upper hemisphere, camera frame.
     """
@@ -100,7 +100,7 @@ class Ambient:
 class Plane:
     """An unbounded supporting plane, the table.
 
-    The scene's background is its picture; renderers only add shadows. It has no instance.
+    The scene's background shows the plane; renderers add shadows. A plane is not an instance.
 
     Attributes:
         normal: Unit normal on the camera's side, camera frame.
@@ -207,7 +207,7 @@ class Rendered:
     Attributes:
         depth: Metres along z at pixel centres, float32; 0 on the background.
         instances: Index into ``scene.objects`` at pixel centres, −1 on plane and background.
-        visible_fractions: Visible pixels of every object over those of its whole silhouette.
+        visible_fractions: Visible share of every object's whole silhouette.
     """
 
     image: Picture

@@ -1,8 +1,8 @@
 """Objects on a table: side by side on the plane, or dropped onto a heap.
 
 The table frame has its origin on the plane and z upwards. A height map on a square grid holds the
-objects so far. A new object is lowered until its underside meets the map in some cell. It keeps its
-orientation (this is no physics), and objects overlap by at most the height change within a cell.
+objects so far. A new object is lowered until its underside meets the map in some cell. Objects keep
+their orientation (without physics) and overlap by at most the height change within a cell.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ def _in_the_middle(T_cam_table: Transform, composition: Composition) -> Transfor
 
 @dataclass(frozen=True, eq=False)
 class Footprint:
-    """Height maps of a turned object from below and above, with a border of one cell.
+    """Height maps of a rotated object from below and above, with a border of one cell.
 
     Attributes:
         bottom: Height of the underside above the lowest point, metres; the minimum of a cell and

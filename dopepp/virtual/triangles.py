@@ -96,10 +96,16 @@ def rasterise(
 ) -> None:
     """Draw triangles into a sample buffer of inverse depth (1/m, 0 = empty) and triangle ids.
 
-    ``hom`` are the vertices' homogeneous pixels, shape (V, 3); ``cull`` drops back faces
-    (watertight meshes only). Samples nearer than ``near`` metres are dropped. ``origin`` is the
-    pixel (x, y) of the buffer's first element; ``samples`` are a pixel's offsets from its centre,
-    shape (S, 2), up to 1/4. Buffers have the shape (height, width, S); ids start at ``first_id``.
+    Args:
+        hom: Homogeneous pixels of the vertices, shape (V, 3).
+        faces: Triangles.
+        cull: Whether to drop back faces (watertight meshes only).
+        near: Smallest depth of a sample, metres.
+        origin: Pixel (x, y) of the buffers' first element.
+        samples: Offsets of a pixel's samples from its centre, at most 1/4, shape (S, 2).
+        inverse_depth: Buffer of shape (height, width, S).
+        ids: Buffer of shape (height, width, S).
+        first_id: Id of the first triangle.
     """
     height, width, num_samples = inverse_depth.shape
     x0, y0 = origin
@@ -217,11 +223,14 @@ def open_share(u: Scalar, v: Scalar, inverse: Scalar, inverse_depth: Array) -> S
 
 @compiled(fastmath=True)
 def lit_share(x: Scalar, y: Scalar, z: Scalar, inverse_depth: Array, P: Array) -> Scalar:
-    """Return the share of a point's neighbourhood in a shadow map that sees the light.
+    """Return the share of the light that reaches a point, interpolated in a shadow map (float32).
 
-    The point is in metres; ``inverse_depth`` is the map, 1/m, shape (height, width, 1). ``P``
-    projects the point into it: homogeneous pixels, of which the third is the depth, shape (3, 4).
-    All are float32.
+    Args:
+        x: Coordinate of the point, metres, like y and z.
+        y: Coordinate of the point.
+        z: Coordinate of the point.
+        inverse_depth: Shadow map, 1/m, shape (height, width, 1).
+        P: Projection to homogeneous pixels of the map and depth, shape (3, 4).
     """
     depth = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3]
     if depth <= _ZERO:

@@ -80,7 +80,7 @@ def test_an_evaluation_says_when_images_are_others(run, call, tmp_path, monkeypa
         caplog.clear()
         call("evaluate.py", *measured, *overrides, code=0)
         said = [record.getMessage() for record in caplog.records]
-        return [line for line in said if line.startswith("the test images are not those of")]
+        return [line for line in said if line.startswith("the test images have changed since")]
 
     measured = (f"ckpt_path={run / 'checkpoints' / 'best.ckpt'}", f"output_dir={tmp_path / 'e'}")
     assert warnings() == []
@@ -99,4 +99,4 @@ def test_an_evaluation_says_when_images_are_others(run, call, tmp_path, monkeypa
     assert warnings("virtual.preset=table") == []
     # … and in training these are other data.
     refused = call("train.py", f"resume={run}", "trainer.max_epochs=2")
-    assert "train images: as trained on → others (pixels of the first image)" in refused.line
+    assert "train images: as trained on → changed (pixels of the first image)" in refused.line

@@ -236,7 +236,7 @@ BAD = {
     "a truth": (BOP.replace("601.25", "true"), "fx=True"),
     "endless": (f"K: 0x{'f' * 9000}", "K=int"),
     "code": ("K: !!python/object/apply:os.system [id]", "the tag"),
-    "deep in JSON": ('{"K": ' + "[" * 9000, "nested more than"),
+    "deep in JSON": ('{"K": ' + "[" * 9000, "more than 64 levels"),
     "deep in XML": ("<opencv_storage>" + "<a>" * 9000 + "</a>" * 9000 + "</opencv_storage>",
                     "without camera_matrix"),
     "entities": ('<!DOCTYPE a [<!ENTITY b "b">]><opencv_storage><K>&b;</K></opencv_storage>',
@@ -244,7 +244,7 @@ BAD = {
     "an entity": ("<opencv_storage><K>&b;</K></opencv_storage>", "undefined entity"),
     "other XML": ("<svg/>", "<svg>"),
     "no XML": ("<opencv_storage><K>", "unreadable"),
-    "cameras of NDDS": ('{"camera_settings": [{}, {}]}', "camera_settings of 2 cameras"),
+    "cameras of NDDS": ('{"camera_settings": [{}, {}]}', "camera_settings with 2 cameras"),
 }  # fmt: skip
 
 

@@ -37,7 +37,7 @@ RECORD_FILE: Final = "_dopepp_render.json"
 """A render job's record. The underscore marks a settings file, so NDDS readers skip it."""
 
 ESTIMATED: Final = (
-    "estimated: mask pixels, or without a mask those inside the image, over the hull of the points"
+    "estimated: mask pixels, or the hull's pixels inside the image, over the hull of the points"
 )
 """How :func:`make_instance` determines a visible fraction that is not annotated."""
 
@@ -155,7 +155,7 @@ def finalizing(staging: Path) -> Iterator[None]:
         descriptor = _retry(lambda: _open(path))
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX)
-            # The previous holder may have removed the file: then lock the next one.
+            # The previous holder may have removed the file; a new file is locked then.
             if not _is_same(descriptor, path):
                 continue
             yield

@@ -181,8 +181,8 @@ def encode_png(pixels: NDArray[Any]) -> bytes:
 def depth_units(depth: DepthMap, covered: Mask) -> tuple[NDArray[np.uint16], float]:
     """Convert metres into units of a 16-bit image; return the units and BOP's ``depth_scale``.
 
-    The scale is the finest that covers all objects (the pixels of ``covered``): 0.1 mm up to
-    6.5 m. Background beyond its range becomes 0, unknown.
+    The scale is the finest scale that covers all objects (pixels of ``covered``), e.g. 0.1 mm up
+    to 6.5 m. Background beyond the range is 0 (unknown).
     """
     farthest = 1000 * float(depth[covered].max(initial=0.0))
     fine, coarse = DEPTH_SCALES_MM

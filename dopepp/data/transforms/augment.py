@@ -1,6 +1,6 @@
 """Augment light, colour, focus, sensor noise and compression; poses are unchanged.
 
-Lens, sensor and file are those of the virtual camera (:mod:`dopepp.virtual.sensor`). To add a
+Lens, sensor and file effects come from the virtual camera (:mod:`dopepp.virtual.sensor`). To add a
 change, write a function of an image, add a field for its range and call it in
 :meth:`Photometric.__call__`, in the order of a camera: light and colour, lens, sensor, file.
 """

@@ -1,8 +1,8 @@
 """Random mask local processing (paper Eq. 3, 4): cover a part of the object with background.
 
 A patch is a crop of the image's background, never a solid colour, and at most 0.8 of the object's
-box high and wide; it is smaller if the background has no such window. Masks and visible fractions
-lose the covered pixels; keypoints stay, as the network must still estimate them.
+box high and wide; it is smaller if the background has no window of this size. Masks and visible
+fractions lose the covered pixels; keypoints stay, because the network must still estimate them.
 :class:`BackgroundCrops` also serves :mod:`dopepp.data.transforms.shading_protocol`.
 """
 

@@ -27,7 +27,7 @@ PAPER_OBJECTS: Final = (
 
 
 def build_parts(data: DataConfig) -> list[Part]:
-    """Build the objects to learn: those of the labelled images in ``root``, or the listed parts."""
+    """Build the objects to learn: objects of the labelled images in ``root``, or listed parts."""
     return choose_symmetries(_read_parts(data), data.symmetries)
 
 

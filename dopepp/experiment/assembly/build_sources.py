@@ -52,7 +52,7 @@ _DIVIDED: Final = ("bop", "ndds", "webdataset")  # formats whose folders `share_
 
 
 def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModule:
-    """Build training images from ``seed`` and held-out images from ``data.eval_seed``."""
+    """Build the DataModule: training images from ``seed``, others from ``data.eval_seed``."""
     backgrounds = training_backgrounds(data)
     val = held_out_source(data, parts, "val")
     if data.virtual.view is not None and isinstance(val, RenderedSource):

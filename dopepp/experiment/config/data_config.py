@@ -1,6 +1,7 @@
 """The config nodes ``data`` (images) and ``virtual`` (renders).
 
-A training states both nodes. An evaluation takes them from its checkpoint, with the user's changes.
+A training states both nodes. An evaluation reads both nodes from its checkpoint and applies the
+user's changes.
 """
 
 from __future__ import annotations
@@ -113,7 +114,7 @@ class TestConfig:
     Attributes:
         renderer: Renderer of the test images; None uses the renderer of ``virtual``. A renderer
             selects renders even with a ``data.root``.
-        cache: Cache of renders; ``disk`` keeps them for the next evaluation.
+        cache: Cache of renders; ``disk`` keeps renders for the next evaluation.
     """
 
     __pydantic_config__ = STRICT

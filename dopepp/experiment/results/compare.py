@@ -258,7 +258,7 @@ def picture_tiles(entries: Sequence[Entry], num: int = NUM_PICTURES) -> tuple[li
     The first seed of each method is shown. Networks of different parts have separate rows.
 
     Returns:
-        Tiles row by row (one row per image, one tile per method), and why images are missing.
+        Tiles row by row (a row per image, a tile per method), and the reason for missing images.
     """
     measured = [run for entry in entries for run in entry.runs if run.report]
     kinds = list(dict.fromkeys(map(_parts, measured))) or [()]

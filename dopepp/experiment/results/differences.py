@@ -297,5 +297,5 @@ def _needed(change: Value) -> str:
     if math.isnan(change.seeds_to_tell) or change.value == 0:
         return ""
     if math.isinf(change.seeds_to_tell):
-        return " (significance needs more images)"
-    return f" (significance needs about {change.seeds_to_tell:,.0f} seeds)"
+        return " (significant with more images only)"
+    return f" (significant with about {change.seeds_to_tell:,.0f} seeds)"

@@ -263,7 +263,7 @@ def measure(
 
     AP, BOP scores and files of poses include all candidates; every other measure includes the
     reported poses only. Pictures show the ground truth in green, predictions of the
-    last method in yellow and those of the other methods in blue (paper Fig. 14).
+    last method in yellow and predictions of other methods in blue (paper Fig. 14).
 
     Args:
         methods: Methods by name, the baseline first.

@@ -1,8 +1,9 @@
 """Write Markdown pages: READMEs of runs and multiruns, comparisons and the cards of releases.
 
 The texts are jinja2 templates in ``templates/``. The README of a run states the command, the
-result, the meaning of each file and the next steps. It is written when the run begins and again
-when the run ends. To describe a further file, add it to :data:`FILES`.
+result, the meaning of each file and the next steps, at the start and at the end of the run.
+
+To describe a further file, add it to :data:`FILES`.
 """
 
 from __future__ import annotations

@@ -121,7 +121,7 @@ def check_resume(
 
 
 def config_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[ConfigDifference]:
-    """Return the options in which two configs differ, except those of a single call."""
+    """Return the options in which two configs differ, except options of a single call."""
     before, after = dict(flat(old)), dict(flat(new))
     return [
         ConfigDifference(key, (str(before.get(key, _ABSENT)), str(after.get(key, _ABSENT))))
@@ -143,7 +143,7 @@ def image_differences(saved: object, present: object) -> list[ConfigDifference]:
 
 
 def trusted_overrides(stored: object, source: Path) -> list[str]:
-    """Return the overrides of a run, without those of a single call.
+    """Return the overrides of a run, without options of a single call.
 
     A run folder is not trusted. Hydra's flags and nodes could execute arbitrary code, so they are
     not read from a folder.

@@ -286,7 +286,7 @@ def _resume_path(
 
 
 def _advice(run_dir: Path) -> str:
-    """Return what an interrupted run has saved, and how to resume it."""
+    """Describe the saved state of an interrupted run, and how to resume the run."""
     step = saved_step(run_dir / LAST_CHECKPOINT)
     saved = f"saved up to step {step} in {LAST_CHECKPOINT}" if step else "nothing saved yet"
     return f"{saved}; continue with resume={run_dir}"

@@ -27,7 +27,7 @@ from dopepp.core.files import write_whole
 from dopepp.core.yaml import read_yaml
 from dopepp.experiment import program
 
-# Hydra creates its hooks before any job, even in a single run, so slow imports stand in functions.
+# Hydra creates its hooks before any job, even in a single run, so slow imports are in functions.
 
 
 LOG_FILE: Final = "job.log"

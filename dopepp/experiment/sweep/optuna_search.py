@@ -121,7 +121,7 @@ class _Trials:
             )
 
     def run(self, wanted: int, at_a_time: int) -> list[JobReturn]:
-        """Finish the trials of an earlier command, then run new ones until ``wanted`` ended."""
+        """Finish the trials of an earlier command, then run new trials until ``wanted`` ended."""
         returns: list[JobReturn] = []
         self._tell(self._running())
         left = self._running()

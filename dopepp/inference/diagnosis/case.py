@@ -76,7 +76,7 @@ class Case:
 
     @cached_property
     def stray(self) -> list[Detection]:
-        """Detections farther than half of their length on the image from every known centre."""
+        """Detections whose centre is over half a part length (pixels) from every known centre."""
         return [
             detection
             for detection in self.reported
@@ -88,7 +88,7 @@ class Case:
 
     @cached_property
     def elsewhere(self) -> Detection | None:
-        """Best detection at other distances, or None if there is one at the expected distances."""
+        """Best detection at other distances; None with a detection at the expected distances."""
         ranges = [self.estimator.depth_range(part.name) for part in self.estimator.parts]
         depths = [limits for limits in ranges if limits is not None]
         if self.expected is not None or not depths:

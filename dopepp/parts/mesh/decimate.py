@@ -32,7 +32,7 @@ def decimate(
     Float[np.ndarray, "fewer width"] | None,
     float,
 ]:
-    """Replace triangles by at most ``max_faces`` larger ones.
+    """Replace triangles by at most ``max_faces`` larger triangles.
 
     Args:
         vertices: Positions.

@@ -109,7 +109,7 @@ def read_3mf(path: Path) -> RawMesh:
 def _count_pieces(model: bytes) -> int:
     """Count the mesh instances of a 3MF build."""
     # trimesh spends hours on objects that contain themselves or are doubled twenty times, and reads
-    # all objects of another file instead of the named one.
+    # all objects of another file instead of the named object.
     from lxml import etree
 
     pieces: dict[str, int] = {}

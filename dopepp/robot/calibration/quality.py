@@ -250,7 +250,7 @@ def assess(
         f"{len(rejected)} of {len(boards)} poses contradict the others: {', '.join(rejected)}": (
             num_used < MIN_USED * len(boards)
         ),
-        f"the robot rotated about almost one direction only: {next_pose}": (
+        f"the robot rotated about nearly parallel axes only: {next_pose}": (
             diversity[1] < MIN_DIVERSITY
         ),
         f"expected error {1000 * shift:.1f} mm and {np.degrees(turn):.2f}° at the board's "

@@ -235,7 +235,7 @@ def match_pictures(poses: RobotPoses, pictures: Sequence[str]) -> list[tuple[int
 def write_calibration(
     path: Path, kind: str, values: Mapping[str, Any], findings: Sequence[str], force: bool
 ) -> None:
-    """Write a trusted calibration, or with ``force`` a doubtful calibration, marked as such.
+    """Write a calibration; with ``force``, also write a doubtful calibration, with a mark.
 
     Raises:
         UserError: There are findings and ``force`` is false, or the file cannot be written.

@@ -234,7 +234,7 @@ def by_source(records: Sequence[Record]) -> dict[str, list[Record]]:
 
 
 def table_9(records: Sequence[Record]) -> list[str]:
-    """Return the paper's Table 9 beside the trials of one source, in Markdown."""
+    """Return the trials of a source in the layout of the paper's Table 9, in Markdown."""
     lines = [
         "| grasps | recognised | caught | paper: recognised | caught |",
         "| --- | ---: | ---: | ---: | ---: |",

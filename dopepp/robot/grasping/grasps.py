@@ -75,7 +75,7 @@ APART: Final = (0.008, math.radians(20.0))
 _BUILT_IN: Final = Path(__file__).parent / "data"
 Points = Float[np.ndarray, "n 3"]
 
-FIX: Final = "correct the file, or write one with `dopepp grasp propose`"
+FIX: Final = "correct the file, or create a new file with `dopepp grasp propose`"
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +241,7 @@ def _sampled(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[Points, 
 
 
 def _pairs(mesh: Mesh, rng: np.random.Generator) -> Iterator[tuple[Vector, Vector, float]]:
-    """Yield middles, closing directions and widths of antipodal pairs."""
+    """Yield midpoints, closing directions and widths of antipodal pairs."""
     points, normals, _ = _sampled(mesh, PAIRS, rng)
     a, b, c = mesh.vertices[mesh.faces].swapaxes(0, 1)
     flat = np.cross(b - a, c - a)

@@ -244,7 +244,7 @@ def _ros_errors(source: str) -> Iterator[None]:
 
 
 class Slot(Generic[Item]):
-    """Passes pictures to a thread. While the thread is busy, a new picture replaces a waiting one.
+    """Passes pictures to a thread; a new picture replaces a picture that is still waiting.
 
     Args:
         handle: Processes a picture in the thread. An exception ends the thread and is raised again

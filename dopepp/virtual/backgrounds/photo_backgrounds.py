@@ -146,7 +146,7 @@ class PhotoBackgrounds:
             rng: Generator of the region's position; unused for the largest region.
             number: Index of the photo; a damaged photo is replaced by the next.
             size: (width, height) of the frame, pixels.
-            share: Region's side over that of the largest region of the frame's aspect ratio.
+            share: Ratio of the region's side to the largest side at the frame's aspect ratio.
             mirrored: Whether to flip left and right.
 
         Raises:

@@ -1,7 +1,7 @@
 """Drawn backgrounds: procedural textures with shapes, and clutter.
 
 Photos of landscapes and people have few sharp outlines of the size of a part. A network trained on
-such photos alone mistakes much of a real desk for the part; clutter therefore adds pieces of other
+these photos alone detects the part all over a real desk; clutter therefore adds pieces of other
 pictures. To add a pattern, write a function like ``_checker`` and name it in ``_PATTERNS``.
 """
 
@@ -50,7 +50,9 @@ def _texture(rng: Generator, width: int, height: int) -> Picture:
     """Return a random pattern in a random palette of two to five colours."""
     pattern = _PATTERNS[int(rng.integers(len(_PATTERNS)))]
     scale = 1.0
-    if width > _SHARP_WIDTH_PX:  # backgrounds are out of focus: draw large ones coarser and enlarge
+    if (
+        width > _SHARP_WIDTH_PX
+    ):  # large backgrounds are drawn coarser and enlarged, because backgrounds are out of focus
         scale = max(rng.uniform(0.35, 0.75), _SHARP_WIDTH_PX / width)
     columns, rows = round(width * scale), max(round(height * scale), 1)
     field = pattern(rng, columns, rows)

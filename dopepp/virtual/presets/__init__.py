@@ -200,14 +200,14 @@ def written_out(name: str, changes: object = None) -> tuple[str, object]:
 
 
 def _shipped(name: str) -> Any:
-    """Return the fields of a shipped preset, including those of its base."""
+    """Return the fields of a shipped preset, including the fields of its base."""
     fields: Any = read_yaml(_FOLDER / f"{name}.yaml")
     base = fields.pop("base", None)
     return fields if base is None else _merged(_shipped(base), fields)
 
 
 def _merged(values: Any, changes: Any) -> Any:
-    """Change fields of nested mappings; a group of another kind replaces the old one."""
+    """Change fields of nested mappings; a group of another kind replaces the whole group."""
     if not isinstance(values, dict) or not isinstance(changes, dict):
         return changes
     if changes.get("kind", values.get("kind")) != values.get("kind"):

@@ -1,7 +1,7 @@
 """A working camera: the scale and windows of training pictures, from lens, distances and parts.
 
-The network's input is scaled down until parts have sizes in pixels that networks learn well. It is
-trained on windows, because a part covers a small share of a large picture.
+The network's input is scaled down until parts have sizes in pixels that networks learn well.
+Training uses windows, because a part covers a small share of a large picture.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ _WIDE_RATIO: Final = 3.5
 _ROOM: Final = 1.3  # ratio of a window's shorter side to the diameter of the largest part
 _MULTIPLE: Final = 32  # both sides of a window are multiples of this number, pixels
 _MOST_BLUR: Final = 10.0  # largest factor on the blur in large pictures
-_BEYOND: Final = 1.25  # largest depth of a part on a table over that of the table's origin
+_BEYOND: Final = (
+    1.25  # ratio of a part's largest depth on a table to the depth of the table's origin
+)
 
 
 @dataclass(frozen=True, eq=False)

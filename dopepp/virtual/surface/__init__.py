@@ -149,7 +149,7 @@ def _spread_points(corners: Corners, weights: PerFace) -> Points:
 
 def _merge_vertices(vertices: Vertices) -> Int[np.ndarray, "vertices"]:
     """Number vertices so that equal positions share a number."""
-    # STL and UV seams split vertices: merge those in the same cell of a fine grid. Three
+    # STL and UV seams split vertices, so vertices in the same cell of a fine grid are merged. Three
     # coordinates of 21 bits fit into an integer of 64 bits.
     step = max(float(np.ptp(vertices, axis=0).max()), 1e-12) / (2**21 - 1)
     cells = np.round((vertices - vertices.min(axis=0)) / step).astype(np.int64)
@@ -176,8 +176,11 @@ def _corner_normals(
 ) -> Corners:
     """Return angle-weighted corner normals (Thürmer and Wüthrich 1998) with creases.
 
-    ``merged`` is the merged vertex of every corner; ``doubled`` the cross product of two ``edges``
-    of every face (its normal, twice its area long), ``length`` its length.
+    Args:
+        merged: Merged vertex of every corner.
+        doubled: Cross product of two edges of every face.
+        length: Length of ``doubled``, twice the area of a face.
+        edges: Edges of every face.
     """
     face_normals = doubled / np.maximum(length, 1e-300)[:, None]
     unit = edges / np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), 1e-300)
@@ -211,11 +214,15 @@ def _use_file_normals(
 def _average_normals(
     face_normals: Array, weights: Array, offsets: Array, corners: Array, cosine: float, out: Array
 ) -> None:
-    """Average, at every corner, the normals of the faces around its vertex within an angle.
+    """Average normals at every corner over the faces around its vertex that meet without a crease.
 
-    Degenerate faces have the normal zero; ``weights`` are the corners' angles, shape (F, 3).
-    ``corners`` are the numbers 3·face + k sorted by vertex, of which each vertex's start at
-    ``offsets``. Faces that differ by more than ``cosine`` are not averaged.
+    Args:
+        face_normals: Unit normals; zero for degenerate faces.
+        weights: Angle of each corner, shape (F, 3).
+        offsets: Index of each vertex's first entry in ``corners``.
+        corners: Numbers 3·face + k of all corners, sorted by vertex.
+        cosine: Cosine of the crease angle.
+        out: Filled with the normals of the corners.
     """
     for vertex in range(offsets.shape[0] - 1):
         for p in range(offsets[vertex], offsets[vertex + 1]):
@@ -243,10 +250,12 @@ def _average_normals(
 def _smooth_patches(
     corners: Faces, normals: Corners, usable: Bool[np.ndarray, "faces"]
 ) -> Int[np.ndarray, "faces"]:
-    """Number faces so that those connected by edges without a crease share a number.
+    """Number the smooth patches: faces connected by edges without a crease share a number.
 
-    ``corners`` are vertices; where attributes differ, vertices must too. An edge is smooth where
-    the normals of both its faces agree. Faces that are not ``usable`` connect nothing.
+    Args:
+        corners: Vertices of every face; vertices with different attributes must be distinct.
+        normals: Normals of the corners, which are equal across a smooth edge.
+        usable: Faces that may connect other faces.
     """
     count = int(corners.max()) + 1
     start, end = corners, corners[:, [1, 2, 0]]

@@ -57,8 +57,13 @@ def bake_open_sky(
 ) -> OpenSky:
     """Return the open sky of a mesh; the time grows with the number of triangles.
 
-    Results are cached, because a run prepares its parts again for every data set. ``normals``
-    belong to the corners; back sides of a ``closed`` mesh are skipped.
+    Results are cached, because a run prepares its parts again for every data set.
+
+    Args:
+        vertices: Positions.
+        faces: Triangles.
+        normals: Unit normals of the corners.
+        closed: Whether the mesh is closed, so that back sides are skipped.
     """
     digest = hashlib.sha256(str((vertices.shape, closed)).encode())
     for array in (vertices, faces, normals):
@@ -161,8 +166,7 @@ def _bake(
 ) -> None:
     """Sum cosines over directions in four rows: open front, all front, open back, all back.
 
-    The mesh lies within ``radius`` around ``centre``; depth maps along ``directions`` are sampled
-    at the texels' centres.
+    The mesh lies within ``radius`` around ``centre``. A depth map is rendered for each direction.
     """
     points, upright, ground, flat = grid
     side = _MAP_SIDE
@@ -223,7 +227,13 @@ def look_up_sky(
 ) -> None:
     """Interpolate the open sky at an object's fragments.
 
-    ``face`` and ``share`` are the fragments'; the other inputs belong to an :class:`OpenSky`.
+    Args:
+        face: Triangle of each fragment (:class:`Fragments`).
+        share: Corner weights of each fragment.
+        steps: As in :class:`OpenSky`.
+        firsts: As in :class:`OpenSky`.
+        values: As in :class:`OpenSky`.
+        out: Filled with the open share of each fragment.
     """
     for p in range(face.shape[0]):
         f, side = (face[p], 0) if face[p] >= 0 else (~face[p], 1)

@@ -145,9 +145,13 @@ def sample_texture(
 ) -> None:
     """Look up the texture at an object's fragments, filtered over a pixel.
 
-    ``points`` are the fragments' ``face``, ``share``, ``x`` and ``y``; ``hom`` the vertices'
-    homogeneous pixels; ``texture`` the texels and levels of a :class:`Texture` and the linear light
-    of every code. ``out`` is linear RGB, shape (3, n).
+    Args:
+        points: Fields ``face``, ``share``, ``x`` and ``y`` of the fragments.
+        hom: Homogeneous pixels of the vertices.
+        faces: Triangles.
+        uv: Texture coordinates of the vertices.
+        texture: Texels and levels of a :class:`Texture`, and the linear light of every code.
+        out: Filled with linear RGB, shape (3, n).
     """
     face, share, x, y = points
     texels, levels, decode = texture

@@ -143,7 +143,7 @@ def test_what_is_learnt_from_changes_only_when_that_is_said(resumed):
 @pytest.mark.parametrize("split", ["train", "val"])
 def test_images_that_changed_behind_the_same_options_are_other_data(split, resumed):
     changed: dict[str, Any] = {split: Pictures(50)}
-    with pytest.raises(UserError, match=rf"{split} images: as trained on → others \(pixels of"):
+    with pytest.raises(UserError, match=rf"{split} images: as trained on → changed \(pixels of"):
         resumed(**changed)
     assert len(resumed("resume_anyway=true", **changed)) == 1
 

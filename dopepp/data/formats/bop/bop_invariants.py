@@ -77,7 +77,7 @@ def check_bop(report: CheckReport) -> None:
 
 
 class _SceneCheck:
-    """Checks one scene: its JSON files and the files in its folders."""
+    """Checks the JSON files of a scene and the files in its folders."""
 
     def __init__(self, report: CheckReport, folder: Path, models: Models | None) -> None:
         self._report, self._folder, self._models = report, folder, models
@@ -105,7 +105,7 @@ class _SceneCheck:
         oddities = Oddities()
         images = sorted(cameras.keys() | self._pictures.keys() | truths.keys())
         for image in images:
-            # A file that cannot be read is one defect, not one for every image.
+            # An unreadable file is a single defect, not a defect of every image.
             for by_image, name in ((cameras, _CAMERA), (truths, _TRUTH)):
                 if by_image and image not in by_image:
                     report.report(folder / name, str(image), "missing")

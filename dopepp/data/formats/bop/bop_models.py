@@ -95,7 +95,7 @@ def parts_by_id(root: Path, parts: Sequence[Part]) -> dict[int, Part]:
     """Return the parts by BOP's object numbers.
 
     Raises:
-        UserError: A part is not in ``models_info.json`` or, without such a file, not named like
+        UserError: A part is not in ``models_info.json`` or, without this file, not named like
             ``obj_000001``.
     """
     names = {info.name: number for number, info in read_models(root).items()}
@@ -121,7 +121,7 @@ def number_in_name(name: str) -> int | None:
 def model_numbers(names: Sequence[str]) -> dict[str, int]:
     """Number objects by name: 1, 2, …, or as their names state if all are named like BOP's files.
 
-    Renders of a BOP data set's models thus keep the numbers of that data set.
+    Renders of a BOP data set's models therefore keep the data set's numbers.
     """
     stated = {name: number_in_name(name) for name in names}
     numbers = {name: number for name, number in stated.items() if number}
@@ -210,7 +210,7 @@ def _symmetries(node: Node, fields: Mapping[str, Any]) -> tuple[Discrete | None,
 
 
 def parse_symmetries(name: str, fields: object) -> tuple[Discrete | None, Continuous]:
-    """Return the symmetries in a config's entry, which is written as in ``models_info.json``.
+    """Return the symmetries in a config's entry, in the format of ``models_info.json``.
 
     Raises:
         UserError: The entry has other fields, or a value is not a rigid transform or axis.

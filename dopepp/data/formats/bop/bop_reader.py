@@ -1,4 +1,4 @@
-"""Read BOP data sets in their scenewise layout: LM-O, T-LESS, YCB-V, ITODD, or a rendered one.
+"""Read BOP data sets in their scenewise layout: LM-O, T-LESS, YCB-V, ITODD or renders.
 
 The folders ``SPLIT/NNNNNN/`` are scenes, see :mod:`~dopepp.data.formats.bop`.
 """

@@ -1,7 +1,7 @@
 """Write poses as a BOP challenge CSV, and read the CSV of any method.
 
 Lines are ``scene_id,im_id,obj_id,score,R,t,time``. R (row by row) and t (millimetres) are numbers
-between spaces; time is in seconds for the whole image, −1 if unknown. BOP calls such a file
+between spaces; time is in seconds for the whole image, −1 if unknown. BOP's name of the file is
 ``METHOD_DATASET-SPLIT.csv``.
 """
 
@@ -31,7 +31,7 @@ MAX_ROWS: Final = 500_000
 """Several times the largest submission; a row takes 0.8 kB of memory."""
 
 _MAX_LINE_BYTES: Final = 4096  # fourteen numbers of 25 digits take 400
-_FARTHEST: Final = 1e9  # mm; squares of such distances stay finite
+_FARTHEST: Final = 1e9  # mm; the square is finite
 
 _PLAUSIBLE_MM: Final = (10.0, 100_000.0)
 """Range of the median distance from the camera; a median outside means another unit."""

@@ -146,7 +146,7 @@ MAX_ERROR_PX: Final = 5.0
 """Largest error of most instances under the correct convention, sufficient for real photos."""
 
 _MAX_SHARE: Final = 0.05
-"""Allowed error of one instance as a share of its projected cuboid's longer side."""
+"""Allowed error of an instance as a share of its projected cuboid's longer side."""
 
 _MOST: Final = 0.75
 """Share of the instances that must fit; the others may be damaged."""

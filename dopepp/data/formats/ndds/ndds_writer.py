@@ -67,7 +67,7 @@ _DATA_SUFFIXES: Final = (".json", ".png", ".jpg", ".tar")
 
 
 class NddsWriter:
-    """Writes samples as one NDDS folder."""
+    """Writes samples into an NDDS folder."""
 
     name = "ndds"
     chunk_size = 1000

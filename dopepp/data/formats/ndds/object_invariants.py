@@ -1,6 +1,6 @@
 """Check that the fields of an NDDS object agree with each other and with the image.
 
-Tolerances in addition to those of :mod:`~dopepp.data.formats.invariants`: 2 px plus 2 % of the
+Tolerances, in addition to :mod:`~dopepp.data.formats.invariants`: 2 px plus 2 % of the
 cuboid's longer side for a stated projection; 2 % for perpendicular and equal edges of a cuboid, 5 %
 for the sides of its class; 2 degrees for an orientation.
 """

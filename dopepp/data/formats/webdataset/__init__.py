@@ -60,7 +60,7 @@ class ShardIndex:
     spans: Int64[np.ndarray, "images 6 2"]
 
     def read(self, image: int, field: str) -> bytes | None:
-        """Return the content of an image's member, or None without such a member."""
+        """Return the content of an image's member, or None if missing."""
         offset, size = self.spans[image, FIELDS.index(field)].tolist()
         return None if offset < 0 else read_span(self.path, offset, size)
 

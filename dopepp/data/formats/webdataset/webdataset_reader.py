@@ -149,7 +149,7 @@ class ShardRecords:
 
     Args:
         start: Start of the members' paths, ``SHARD/KEY``.
-        read: Returns a member's content by its name, e.g. ``gt``; None without such a member.
+        read: Returns a member's content by its name, e.g. ``gt``; None if missing.
         problems: Receiver of problems.
     """
 

@@ -42,8 +42,8 @@ class YcbVideoReader:
     The visible fraction is the number of label pixels over the area of the convex hull of the
     projected ADD points. The fraction is too small for a concave object (drill, mug), whose hull is
     larger than the silhouette. Some releases label only some objects, so a posed object without a
-    label pixel has no mask on a real frame, and only the image border counts. Labels in
-    ``data_syn`` are complete, so such an object is hidden and has fraction 0.
+    label pixel has no mask on a real frame, and its fraction accounts for the image border only.
+    Labels in ``data_syn`` are complete, so an object without a label pixel has the fraction 0.
 
     Args:
         parts: Objects to return, named as in ``classes.txt``.

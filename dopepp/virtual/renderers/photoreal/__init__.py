@@ -54,7 +54,7 @@ scene = mi.cornell_box()
 scene["small-box"]["bsdf"] = {"type": "principled", "roughness": 0.3, "metallic": 0.5}
 print("mean", float(mi.TensorXf(mi.render(mi.load_dict(scene), spp=1)).array[0]))
 """
-"""A small scene with most features of a real one."""
+"""A small scene that uses most features of Mitsuba."""
 
 
 def mitsuba() -> Any:

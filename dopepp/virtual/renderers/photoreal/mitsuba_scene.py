@@ -181,7 +181,7 @@ def _texture_level(item: SceneObject, K: CameraMatrix) -> int:
 
 
 def _sky(mi: Any, ambient: Ambient) -> dict[str, Any]:
-    """Return the environment: one colour above the horizon, one below."""
+    """Return the environment, with a colour above and a colour below the horizon."""
     pixels = np.empty((_SKY_ROWS, 2 * _SKY_ROWS, 3), np.float32)
     pixels[: _SKY_ROWS // 2], pixels[_SKY_ROWS // 2 :] = ambient.above, ambient.below
     up = np.array(ambient.up) / np.linalg.norm(ambient.up)
@@ -195,11 +195,11 @@ def _sky(mi: Any, ambient: Ambient) -> dict[str, Any]:
 class Film:
     """A film with square pixels, as Mitsuba requires, over a window of the image.
 
-    Its pixels are at least as fine as the image's; other cameras' pictures are resampled.
+    The film's pixels are at least as fine as the image's; non-square pixels are resampled.
 
     Attributes:
         size: (width, height) of the film, pixels.
-        centre_px: Its principal point; pixel (0, 0) is the centre of the film's first pixel.
+        centre_px: Principal point; pixel (0, 0) is the centre of the film's first pixel.
         film_from_window: Affine map, 2×3, from the window's pixels to the film's.
     """
 

@@ -255,7 +255,7 @@ class TableTop:
 
 
 def split_light(light: Colours, alpha: Depth, unshadowed: Colours) -> tuple[Colours, Colours]:
-    """Split radiance into that of the objects and that of the disc.
+    """Split radiance into the radiance of the objects and of the disc.
 
     Args:
         light: Radiance of objects and disc together.

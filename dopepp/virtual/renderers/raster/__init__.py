@@ -65,7 +65,7 @@ class Silhouette:
     Attributes:
         mask: Whether each image pixel shows the object.
         num_px: Number of pixels on an unbounded canvas; infinite around the camera.
-        box: Bounds of those pixels, perhaps beyond the image; None behind the camera.
+        box: Bounds of the pixels, possibly beyond the image; None behind the camera.
     """
 
     mask: Mask
@@ -97,7 +97,7 @@ def visible_fractions(scene: Scene) -> Float[np.ndarray, "objects"]:
 def _fractions(
     scene: Scene, projected: Sequence[Projected], instances: Int16[np.ndarray, "height width"]
 ) -> Float[np.ndarray, "objects"]:
-    """Divide every object's visible pixels by those of its whole silhouette."""
+    """Divide every object's visible pixels by the pixels of its whole silhouette."""
     visible = np.bincount(instances.reshape(-1) + 1, minlength=len(projected) + 1)[1:]
     fractions = np.zeros(len(projected))
     for index in np.flatnonzero(visible).tolist():
@@ -164,8 +164,13 @@ def _composite(
 ) -> None:
     """Composite a window of samples over the background, and read labels at the centre samples.
 
-    ``colour`` sums the covered samples' sRGB values; ``first_ids`` ascend by object. ``image``,
-    ``depth`` and ``instances`` are updated in place.
+    Args:
+        samples: The window's sample buffers.
+        colour: Sum of the covered samples' sRGB values.
+        first_ids: Number of each object's first triangle, ascending.
+        image: Updated in place.
+        depth: Updated in place.
+        instances: Updated in place.
     """
     origin, inverse_depth, ids = samples
     height, width, num_samples = ids.shape

@@ -250,8 +250,14 @@ def _darken(
 ) -> None:
     """Multiply the picture by the remaining share of the plane's light.
 
-    ``shades``, of shape (1 + lights, h, w), are the hidden shares of the sky and of every light;
-    ``corner`` is their first pixel. ``decode`` and ``encode`` convert codes and linear light.
+    Args:
+        corner: First pixel of ``shades``.
+        lit: The plane and its lights.
+        shades: Hidden shares of the sky and of every light, shape (1 + lights, h, w).
+        decode: Table from sRGB codes to linear light.
+        encode: Table from linear light to sRGB codes.
+        samples: The window's sample buffers.
+        image: Updated in place.
     """
     origin, _, ids = samples
     to_point, width = lit.to_point, shades.shape[2]

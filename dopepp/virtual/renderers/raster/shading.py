@@ -148,8 +148,13 @@ def _tilt_normals(
 ) -> None:
     """Tilt the normals of grooved points, or widen their alpha where grooves are fine.
 
-    ``axis`` is a unit vector across the grooves, camera frame; ``origin`` the object's origin along
-    it, metres; ``focal`` (fx, fy), pixels; ``profile`` the grooves' pitch, slope and irregularity.
+    Args:
+        noise: :data:`_NOISE`.
+        fragments: Fragments of the object, updated in place.
+        axis: Unit vector across the grooves, camera frame.
+        origin: Coordinate of the object's origin along ``axis``, metres.
+        focal: (fx, fy), pixels.
+        profile: Pitch, slope and irregularity of the grooves.
     """
     position, normal, alpha = fragments.position, fragments.normal, fragments.alpha
     ax, ay, az = axis
@@ -223,8 +228,14 @@ def reflect_ambient(
 
     A dielectric scatters the hemisphere around its normal; its weak gloss is ignored. A metal
     mirrors the hemisphere's colour in the reflected direction, tinted with its albedo; a smoother
-    metal mirrors more sharply. ``opened`` is the share of the ambient light that reaches each
-    point, ``ambient`` comes from :func:`ambient_row`, ``metallic`` is 1 for metals.
+    metal mirrors more sharply.
+
+    Args:
+        fragments: Fragments of the object.
+        opened: Share of the ambient light that reaches each point.
+        ambient: Result of :func:`ambient_row`.
+        metallic: 1 for metals, otherwise 0.
+        radiance: Filled with linear RGB.
     """
     position, normal = fragments.position, fragments.normal
     albedo, alpha = fragments.albedo, fragments.alpha
@@ -260,9 +271,13 @@ def reflect_light(
 ) -> None:
     """Add a point light: Lambert, and GGX with Smith's visibility and Schlick's Fresnel factor.
 
-    ``lit`` is the share of the light that reaches each point, ``light`` a :class:`ShadowMap`'s,
-    ``specular`` the reflectance of the dielectric part at normal incidence, ``metallic`` 1 for a
-    metal, whose reflectance is its albedo.
+    Args:
+        fragments: Fragments of the object.
+        lit: Share of the light that reaches each point.
+        light: As in :class:`ShadowMap`.
+        specular: Reflectance of a dielectric at normal incidence.
+        metallic: 1 for a metal, whose reflectance is its albedo.
+        radiance: Updated in place.
     """
     position, normal = fragments.position, fragments.normal
     albedo, alpha = fragments.albedo, fragments.alpha

@@ -98,7 +98,7 @@ class Samples(NamedTuple):
 
     Attributes:
         origin: Image pixel (x, y) of the window's first pixel.
-        inverse_depth: 1/m per sample, 0 for empty ones, float32, shape (height, width, S).
+        inverse_depth: 1/m per sample, 0 for empty samples, float32, shape (height, width, S).
         ids: Triangle per sample, numbered through all objects, −1 for none, int32, same shape.
     """
 
