@@ -37,6 +37,7 @@ from dopepp.geometry.pnp import solve_pnp
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.picture import Depth
 from dopepp.inference.refinement.depth import DepthEvidence
+from dopepp.inference.refinement.outline import OutlineMesh
 from dopepp.inference.refinement.part_surface import FEWEST_POINTS, Points, surface_points
 from dopepp.inference.refinement.region import RegionRefiner, Starts, refinement
 from dopepp.inference.refinement.region.shared_errors import SCALE_ERROR
@@ -95,6 +96,11 @@ class Refiner:
         self._cuboids = {part.name: part.cuboid for part in parts}
         self.verifies = "region" in terms
         """Whether refined poses are verified, from the same evidence as the term ``region``."""
+
+    def mesh(self, name: str) -> OutlineMesh | None:
+        """Return a part's mesh, prepared for its outline; None without the term ``region``."""
+        verifier = self._refiners[name].verifier
+        return None if verifier is None else verifier.mesh
 
     def __call__(
         self, detection: Detection, image: Picture, K: CameraMatrix, depth: Depth | None

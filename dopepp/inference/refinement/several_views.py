@@ -81,8 +81,14 @@ class PosedPicture:
 
 def turned(R: RotationMatrix, matrix: PoseMatrix) -> PoseMatrix:
     """Return a covariance or information in axes turned by R."""
-    turn = np.kron(np.eye(2), R)
+    turn = _turn(R)
     return np.asarray(turn @ matrix @ turn.T)
+
+
+def _turn(R: RotationMatrix) -> PoseMatrix:
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = R
+    return turn
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,14 +100,14 @@ class ViewTerm:
 
     def __call__(self, pose: Transform, prior: NormalEquations, /) -> NormalEquations | None:
         """Linearise the term; see :class:`~dopepp.inference.refinement.solver.Term`."""
-        T_cam_obj, R = self.view.pose(pose), self.view.T_cam_world[:3, :3]
-        error, turn = self.view.error_at(T_cam_obj[:3, 3]), np.kron(np.eye(2), R)
-        given = _widened(turned(R, prior[0]), turn @ prior[1], error)
+        T_cam_obj, turn = self.view.pose(pose), _turn(self.view.T_cam_world[:3, :3])
+        error = self.view.error_at(T_cam_obj[:3, 3])
+        given = _widened(turn @ prior[0] @ turn.T, turn @ prior[1], error)
         equations = self.term(T_cam_obj, given)
         if equations is None:
             return None
         H, g = _widened(*equations, error)
-        return turned(R.T, H), turn.T @ g
+        return turn.T @ H @ turn, turn.T @ g
 
 
 def _widened(H: PoseMatrix, g: Vector, covariance: PoseMatrix) -> NormalEquations:
@@ -163,7 +169,9 @@ def refine_views(
     agreements: list[OutlineAgreement | None] = [None] * len(views)
     for search in searches:
         agreements[search.number] = search.agreement(end.T_cam_obj)
-    disagreements = _disagreements(end, prior, searches, len(views))
+    owners = [search.number for search in searches for _ in search.terms(1)]
+    distances = _disagreements(end, prior, owners)
+    disagreements = [distances.get(number, 0.0) for number in range(len(views))]
     covariance = np.linalg.inv(end.information)
     return JointRefinement(end.T_cam_obj, covariance, agreements, disagreements)
 
@@ -226,22 +234,23 @@ class _ViewSearch:
             return None
 
 
-def _disagreements(
-    end: Solution, prior: Prior, searches: Sequence[_ViewSearch], num_views: int
-) -> list[float]:
-    """Return the distance of each view's evidence from that of the other views; 0 for one view."""
-    before = prior.information, prior.information @ prior.offset(end.T_cam_obj)
-    known = end.information, np.zeros(6)
-    sums: dict[int, NormalEquations] = {}
-    for search in searches:
-        parts = [term(end.T_cam_obj, known) for term in search.terms(1)]
-        present = [part for part in parts if part is not None]
-        sums[search.number] = sum(H for H, _ in present), sum(g for _, g in present)  # type: ignore[assignment]
-    distances = [0.0] * num_views
-    for number, (H, g) in sums.items() if len(sums) > 1 else ():
-        others = [equations for other, equations in sums.items() if other != number]
-        H_others = before[0] + sum(other[0] for other in others)
-        g_others = before[1] + sum(other[1] for other in others)
+def _disagreements(end: Solution, prior: Prior, owners: Sequence[int]) -> dict[int, float]:
+    """Return the distance of each view's evidence from that of the other views and the prior.
+
+    Args:
+        end: Pose with the equations of each term.
+        prior: Prior of the descent.
+        owners: View of each term.
+    """
+    distances: dict[int, float] = {}
+    gradient = prior.information @ prior.offset(end.T_cam_obj)
+    for owner in set(owners) if len(set(owners)) > 1 else ():
+        H, g, H_others, g_others = np.zeros((6, 6)), np.zeros(6), prior.information, gradient
+        for number, equations in zip(owners, end.equations, strict=True):
+            if number == owner:
+                H, g = H + equations[0], g + equations[1]
+            else:
+                H_others, g_others = H_others + equations[0], g_others + equations[1]
         solved = np.linalg.solve(H_others, np.column_stack([g_others, H]))
         rest, spread = g - H @ solved[:, 0], H + H @ solved[:, 1:]
         scale = 1.0 / np.sqrt(np.maximum(np.diag(spread), 1e-300))
@@ -249,5 +258,5 @@ def _disagreements(
         is_known = values > NEGLIGIBLE * values[-1]
         along = (axes.T @ (scale * rest))[is_known]
         squared = float((along**2 / values[is_known]).sum())
-        distances[number] = math.sqrt(squared / max(1, is_known.sum()))
+        distances[owner] = math.sqrt(squared / max(1, is_known.sum()))
     return distances

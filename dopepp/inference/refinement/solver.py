@@ -59,6 +59,8 @@ class Solution:
 
     T_cam_obj: Transform
     information: PoseMatrix  # inverse covariance of evidence and prior
+    # Equations of each term that `descend` got, linearised before the last step, at this pose
+    equations: Sequence[NormalEquations] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,4 +154,4 @@ def descend(
         pose = moved(pose, step)
         if step @ information @ step < ARRIVED**2:
             break
-    return Solution(pose, information)
+    return Solution(pose, information, [(H, g - H @ step) for H, g in last])

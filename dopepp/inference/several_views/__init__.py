@@ -25,7 +25,7 @@ from dopepp.geometry.camera_file import Camera
 from dopepp.geometry.rotation import is_rotation
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.picture import Depth, Distances, are_same, prepare_image
-from dopepp.inference.pose_result import PoseResult, make_shape, spent_between
+from dopepp.inference.pose_result import PoseResult, Shape, spent_between
 from dopepp.inference.refinement.several_views import PosedPicture
 from dopepp.inference.several_views.association import associate, separation, sight
 from dopepp.inference.several_views.contradictions import contradictions
@@ -103,7 +103,9 @@ def predict_views(
     agreeing, findings = contradictions(passed, sure, views, names, associated)
     weaker = [part.detection for part in kept if part.detection not in agreeing]
     passed = agreeing
-    shapes = {part.name: make_shape(part) for part in estimator.solid_parts}
+    shapes = {
+        part.name: Shape(part.diameter, refiner.mesh(part.name)) for part in estimator.solid_parts
+    }
     results = []
     for number, view in enumerate(views):
         evidence = [detection.evidence[number] for detection in passed]
