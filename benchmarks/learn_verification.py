@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
+from manifold3d import Manifold
 from sklearn.metrics import average_precision_score, brier_score_loss, log_loss
 
 from dopepp.geometry.camera import Transform, make_transform, moved
@@ -46,12 +47,16 @@ FOR_OR_AGAINST = {
     **dict.fromkeys(("contrast", "inside", "shading"), 1.0),
     **dict.fromkeys(("outside", "residual", "moved", "spread"), -1.0),
 }
+MACHINED = 0.5  # share of parts with holes and pockets
 HELD_OUT = 5  # every fifth part judges the model
 
 
 def random_part(rng: np.random.Generator, name: str) -> Part:
-    """Return a part of primitives that overlap or touch, on a lump for one part in three."""
-    is_lump = rng.random() < 0.35
+    """Return a machined part, a lump with primitives on it, or primitives that touch."""
+    if rng.random() < MACHINED:
+        solid = _machined(rng).to_mesh()
+        return _scaled(rng, name, np.asarray(solid.vert_properties, np.float64), solid.tri_verts)
+    is_lump = rng.random() < 0.5
     pieces = [_lump(rng) if is_lump else _primitive(rng, 1.0)]
     for _ in range(int(rng.integers(0, 4) if is_lump else rng.integers(1, 7))):
         piece = _primitive(rng, rng.uniform(0.15, 0.6))
@@ -63,13 +68,60 @@ def random_part(rng: np.random.Generator, name: str) -> Part:
         pieces.append(piece)
     colours = rng.integers(20, 236, (len(pieces), 3)) if rng.random() < 0.3 else None
     mesh = trimesh.util.concatenate(pieces)
-    vertices = np.asarray(mesh.vertices, np.float64)
-    vertices *= rng.uniform(0.03, 0.2) / np.ptp(vertices, axis=0).max()
-    vertices -= (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     painted = None
     if colours is not None:
         painted = np.repeat(colours, [len(p.vertices) for p in pieces], axis=0).astype(np.uint8)
-    return make_part(name, Mesh(vertices, mesh.faces.astype(np.int32), colours=painted))
+    return _scaled(rng, name, np.asarray(mesh.vertices, np.float64), mesh.faces, painted)
+
+
+def _scaled(
+    rng: np.random.Generator,
+    name: str,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    colours: np.ndarray | None = None,
+) -> Part:
+    """Return a part of random size, centred at its origin."""
+    vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    vertices *= rng.uniform(0.03, 0.2) / np.ptp(vertices, axis=0).max()
+    return make_part(name, Mesh(vertices, faces.astype(np.int32), colours=colours))
+
+
+def _machined(rng: np.random.Generator) -> Manifold:
+    """Return plates and blocks at right angles, with bosses, holes, slots and pockets."""
+    sides = np.array([1.0, rng.uniform(0.3, 1.0), rng.uniform(0.05, 0.4)])[rng.permutation(3)]
+    solid = Manifold.cube(sides, True)
+    for _ in range(int(rng.integers(0, 4))):
+        sides = np.array([*rng.uniform(0.2, 0.9, 2), rng.uniform(0.05, 0.3)])[rng.permutation(3)]
+        solid += Manifold.cube(sides, True).translate(_spot(rng, solid))
+    for _ in range(int(rng.integers(0, 4))):
+        solid += _bore(rng, rng.uniform(0.05, 0.25), rng.uniform(0.1, 0.5), solid)
+    for _ in range(int(rng.integers(1, 9))):
+        depth = 3.0 if rng.random() < 0.6 else rng.uniform(0.05, 0.4)
+        if rng.random() < 0.65:
+            solid -= _bore(rng, rng.uniform(0.02, 0.18), depth, solid)
+        else:
+            sides = np.array([*rng.uniform(0.05, 0.4, 2), depth])[rng.permutation(3)]
+            solid -= Manifold.cube(sides, True).translate(_spot(rng, solid))
+    largest = max(solid.decompose(), key=lambda piece: piece.volume())
+    return largest if largest.volume() > 1e-4 else Manifold.cube([1.0, 0.6, 0.2], True)
+
+
+def _bore(rng: np.random.Generator, radius: float, length: float, solid: Manifold) -> Manifold:
+    """Return a cylinder along an axis, at a random place of a solid's faces."""
+    turns = [[0, 0, 0], [90, 0, 0], [0, 90, 0]][int(rng.integers(3))]
+    sections = int(rng.choice([6, 32, 32, 32]))
+    bore = Manifold.cylinder(length, radius, -1.0, sections, True).rotate(turns)
+    return bore.translate(_spot(rng, solid))
+
+
+def _spot(rng: np.random.Generator, solid: Manifold) -> np.ndarray:
+    """Return a random point of the faces of a solid's bounding box."""
+    low, high = np.array(solid.bounding_box()).reshape(2, 3)
+    point = low + rng.uniform(0.05, 0.95, 3) * (high - low)
+    axis = int(rng.integers(3))
+    point[axis] = (low, high)[int(rng.integers(2))][axis]
+    return point
 
 
 def _lump(rng: np.random.Generator) -> trimesh.Trimesh:

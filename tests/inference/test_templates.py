@@ -12,9 +12,16 @@ from dopepp.geometry.rotation import rotation_angle
 from dopepp.inference.refinement.outline import make_outline_mesh
 from dopepp.inference.template_estimator import TemplateEstimator
 from dopepp.inference.templates import SMALLEST_PX, TemplateDetector, views
-from dopepp.inference.templates.matching import BANDS, NUM_TURNS, STRIDE, match
+from dopepp.inference.templates.matching import CELL, NUM_KEPT, NUM_TURNS, STRIDE, match
 from dopepp.inference.templates.responses import BINS, edge_responses
-from dopepp.inference.templates.views import DRAWN_PX, NUM_VIEWS, Templates, view_rotations
+from dopepp.inference.templates.views import (
+    DRAWN_PX,
+    NUM_NEIGHBOURS,
+    NUM_VIEWS,
+    Templates,
+    _neighbours,
+    view_rotations,
+)
 from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.part import Mesh, Part, make_part
 from dopepp.virtual.factory import Factory
@@ -153,16 +160,16 @@ def test_a_flat_image_has_no_responses_and_finite_starts(detector):
     assert all(start.score < 0.5 for start in starts)
 
 
-def test_matches_are_the_largest_sums_of_responses():
-    rng = np.random.default_rng(1)
+def test_cells_keep_the_matches_with_the_largest_sums_of_responses():
+    rng, size = np.random.default_rng(1), 41.0
     responses = rng.integers(-60, 100, (BINS, 46, 57)).astype(np.int16)
     points, normals = rng.uniform(-0.5, 0.5, (3, 8, 2)), rng.uniform(-np.pi, np.pi, (3, 8))
-    ones = np.ones((3, 8), bool)
-    templates = Templates(np.tile(np.eye(3), (3, 1, 1)), points, normals, ones, points, np.ones(3))
-    matches, size = match(responses, templates, 17.0), 17.0
+    ones, links = np.ones((3, 8), bool), np.zeros((3, 1))
+    rotations = np.tile(np.eye(3), (3, 1, 1))
+    templates = Templates(rotations, points, normals, ones, points, ones[:, 0], links, links)
     rows, columns, pad = len(range(0, 46, STRIDE)), len(range(0, 57, STRIDE)), 40
-    padded, shape = np.pad(responses, ((0, 0), (pad, pad), (pad, pad))), (3, NUM_TURNS, BANDS)
-    scores, poses = matches.scores.reshape(shape), matches.poses.reshape(*shape, 4)
+    padded = np.pad(responses, ((0, 0), (pad, pad), (pad, pad)))
+    side, cells = round(CELL * size / STRIDE), {}
     for view, turn in np.ndindex(3, NUM_TURNS):
         angle = 2 * np.pi * turn / NUM_TURNS
         turned = Rotation.from_euler("z", angle).apply(np.pad(points[view], ((0, 0), (0, 1))))
@@ -172,11 +179,31 @@ def test_matches_are_the_largest_sums_of_responses():
             plane = padded[round((normal + angle) / np.pi * BINS) % BINS]
             sums += plane[pad + dv :: STRIDE, pad + du :: STRIDE][:rows, :columns]
         standard = (sums - sums.mean()) / sums.std()
-        best = [standard[r[0] : r[-1] + 1].max() for r in np.array_split(np.arange(rows), BANDS)]
-        np.testing.assert_allclose(scores[view, turn], best)
-        u, v = poses[view, turn, :, :2].T.astype(int) // STRIDE
-        np.testing.assert_allclose(standard[v, u], best)
-        np.testing.assert_allclose(poses[view, turn, :, 2:], np.tile([angle, size], (BANDS, 1)))
+        for i, j in np.ndindex(-(-rows // side), -(-columns // side)):
+            cell = standard[i * side : (i + 1) * side, j * side : (j + 1) * side]
+            v, u = np.add(np.unravel_index(cell.argmax(), cell.shape), (i * side, j * side))
+            row = (cell.max(), view, STRIDE * u, STRIDE * v, angle, size)
+            cells.setdefault((i, j), []).append(row)
+    best = [row for rows in cells.values() for row in sorted(rows)[-NUM_KEPT:]]
+    matches = match(responses, templates, size)
+    rows = np.column_stack([matches.scores, matches.views, matches.poses])
+    assert len(cells) > 10
+    np.testing.assert_allclose(sorted(rows.tolist()), sorted(best))
+
+
+def test_neighbouring_views_differ_least_after_their_twist():
+    rotations = view_rotations(180.0)
+    neighbours, twists = _neighbours(rotations)
+    rng = np.random.default_rng(3)
+    for view in rng.integers(0, NUM_VIEWS, 20):
+        tilts = np.arccos(np.clip(rotations[:, 2] @ rotations[view, 2], -1, 1))
+        assert set(neighbours[view]) == set(np.argsort(tilts)[1 : NUM_NEIGHBOURS + 1])
+        for other, twist in zip(neighbours[view], twists[view], strict=True):
+            turns = Rotation.from_euler("z", [[twist - 0.02], [twist], [twist + 0.02]])
+            turned = turns * Rotation.from_matrix(rotations[other])
+            apart = (turned * Rotation.from_matrix(rotations[view]).inv()).magnitude()
+            assert apart.argmin() == 1
+            np.testing.assert_allclose(apart[1], tilts[other])
 
 
 def test_a_match_becomes_the_pose_at_its_pixel_size_and_turn(detector):

@@ -3,8 +3,10 @@
 1. :mod:`~dopepp.inference.templates.views` draws the part from 600 directions.
 2. :mod:`~dopepp.inference.templates.responses` finds the image's edges by orientation.
 3. :mod:`~dopepp.inference.templates.matching` compares all drawings, turned in the image plane and
-   resized to the working distances, with these edges at every fourth pixel.
-4. :mod:`~dopepp.inference.templates.ranking` moves the best matches and ranks them.
+   resized to the working distances, with these edges at every fourth pixel, and keeps the best
+   matches of each small cell of the image.
+4. :mod:`~dopepp.inference.templates.ranking` moves these matches, replaces their views by better
+   neighbours, and ranks them.
 
 The result is a list of start poses. Refinement and verification choose among them.
 """
@@ -32,7 +34,11 @@ from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.picture import MAX_PIXELS, Region
 from dopepp.inference.refinement.outline import make_outline_mesh
 from dopepp.inference.templates.matching import STRIDE, Matches, match
-from dopepp.inference.templates.ranking import describe, learned_ranking
+from dopepp.inference.templates.ranking import (
+    learned_ranking,
+    move_nearby,
+    turn_views,
+)
 from dopepp.inference.templates.responses import edge_responses
 from dopepp.inference.templates.views import NEAREST, joined, make_templates, view_rotations
 from dopepp.parts.part import Part
@@ -47,9 +53,10 @@ OCTAVE: Final = 2.0  # ratio of diameters that are ranked on one image
 COARSE_SPREAD: Final = 5  # pixels
 FINE_SPREAD: Final = 3
 
-NUM_RANKED: Final = 6000  # matches
+NUM_RANKED: Final = 16000  # matches
+NUM_TURNED: Final = 2000  # of an octave, compared with neighbouring views
 EXTENT: Final = 2.5  # standard deviations that a view one diameter long is worth
-NUM_STARTS: Final = 60  # start poses
+NUM_STARTS: Final = 100  # start poses
 
 # Poses that refinement would move to the same end.
 SAME_PLACE: Final = 0.1  # diameters
@@ -154,6 +161,8 @@ class TemplateDetector:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return views, poses on the image and features of the best matches at all distances.
 
+        Features are the means of those before and after turning.
+
         Raises:
             UserError: The part is too small on the image to be detected.
         """
@@ -175,7 +184,7 @@ class TemplateDetector:
         best = np.argsort(-promise)[:NUM_RANKED]
         matches = Matches(*(column[best] for column in matches))
         octaves = np.floor(np.log(sizes[0] / matches.poses[:, 3]) / math.log(OCTAVE) + 1e-9)
-        views, poses, features = [], [], []
+        ranked, features, weights = [], [], learned_ranking().weights
         for octave in np.unique(octaves):
             members = Matches(*(column[octaves == octave] for column in matches))
             scale = min(1.0, FINE_PX / members.poses[:, 3].max())
@@ -183,12 +192,17 @@ class TemplateDetector:
             responses = edge_responses(small, FINE_SPREAD, _odd(FINE_PX))
             reach = 1 + STRIDE / 2 * float(members.poses[:, 3].mean()) * scale / COARSE_PX
             members.poses[:, [0, 1, 3]] *= scale
-            moved, described = describe(members, self._templates, responses, small, reach)
-            moved[:, [0, 1, 3]] /= scale
-            views.append(members.views)
-            poses.append(moved)
-            features.append(described)
-        return np.concatenate(views), np.concatenate(poses), np.concatenate(features)
+            members, before = move_nearby(members, self._templates, responses, small, reach)
+            best = np.argsort(-before @ weights)[:NUM_TURNED]
+            members = Matches(*(column[best] for column in members))
+            members, after = turn_views(members, self._templates, responses, small)
+            members.poses[:, [0, 1, 3]] /= scale
+            ranked.append(members)
+            # Turning raises the responses of wrong matches, too.
+            features.append((before[best] + after) / 2)
+        views = np.concatenate([members.views for members in ranked])
+        poses = np.concatenate([members.poses for members in ranked])
+        return views, poses, np.concatenate(features)
 
     def _matches(self, image: Picture, size: float, nearness: float) -> Matches:
         """Return the best positions of all templates at a distance.

@@ -20,7 +20,8 @@ from dopepp.inference.templates.views import Templates
 
 NUM_TURNS: Final = 24  # in the image plane, 15 degrees apart
 STRIDE: Final = 4  # pixels between places
-BANDS: Final = 4  # horizontal bands of the image; each gives one match of every template
+CELL: Final = 0.2  # side of a cell, diameters
+NUM_KEPT: Final = 8  # best matches of each cell
 TOGETHER: Final = 4  # rows that are added in one pass
 
 Pose2d = Float[np.ndarray, "matches 4"]
@@ -38,7 +39,10 @@ class Matches(NamedTuple):
 
 
 def match(responses: Responses, templates: Templates, diameter_px: float) -> Matches:
-    """Return the best places of every template and turn, one in each band of the image.
+    """Return the best matches of all templates and turns in each cell of the image.
+
+    Cells keep the matches diverse: texture gives thousands of matches at the same place that all
+    have higher scores than the part elsewhere.
 
     Args:
         responses: Responses of the image.
@@ -50,27 +54,23 @@ def match(responses: Responses, templates: Templates, diameter_px: float) -> Mat
     reach = float(np.abs(templates.points).max()) * math.sqrt(2) * diameter_px
     margin = math.ceil(reach / STRIDE) + 1
     phases = _by_phase(responses, rows, columns, margin)
-    shape = (len(templates.points), NUM_TURNS, BANDS)
-    best, places = np.empty(shape, np.int16), np.empty(shape, np.int64)
-    moments = np.empty((*shape[:2], 2))
+    side = max(1, round(CELL * diameter_px / STRIDE))
+    shape = (-(-rows // side), -(-columns // side), NUM_KEPT)
+    scores, kept = np.full(shape, -np.inf), np.zeros((*shape, 3), np.int64)
+    moments = np.empty((len(templates.points), NUM_TURNS, 2))
     lines = templates.points, templates.normals
-    _match(phases, rows, columns, margin, *lines, diameter_px, best, places, moments)
-    means, deviations = np.repeat(moments.reshape(-1, 2), BANDS, axis=0).T
-    view, turn, _ = (index.ravel() for index in np.indices(shape))
-    v, u = np.divmod(places.ravel(), columns)
+    _match(phases, rows, columns, margin, *lines, diameter_px, side, scores, kept, moments)
+    filled = np.isfinite(scores)
+    views, turns, places = kept[filled].T
+    v, u = np.divmod(places, columns)
     poses = [
         STRIDE * u,
         STRIDE * v,
-        turn * (2 * math.pi / NUM_TURNS),
+        turns * (2 * math.pi / NUM_TURNS),
         np.full(u.shape, diameter_px),
     ]
-    return Matches(
-        view,
-        np.column_stack(poses),
-        (best.ravel() - means) / deviations,
-        means / templates.points.shape[1],
-        deviations / templates.points.shape[1],
-    )
+    means, deviations = moments[views, turns].T / templates.points.shape[1]
+    return Matches(views, np.column_stack(poses), scores[filled], means, deviations)
 
 
 def _by_phase(responses: Responses, rows: int, columns: int, margin: int) -> Responses:
@@ -111,17 +111,18 @@ def _match(
     points: Array,
     normals: Array,
     scale: float,
-    best: Array,
-    places: Array,
+    side: int,
+    scores: Array,
+    kept: Array,
     moments: Array,
 ) -> None:
-    """Write the best sum and place of every view, turn and band, and mean and deviation of sums."""
+    """Write score, view, turn and place of each cell's best matches, and moments of all sums."""
     bins, length = len(phases) // (STRIDE * STRIDE), phases.shape[1]
-    turns, bands = best.shape[1:]
-    across = columns + 2 * margin
+    turns, across = moments.shape[1], columns + 2 * margin
     first = margin * across + margin
     flat, starts = phases.reshape(-1), np.empty(points.shape[1], np.int64)
     total = np.empty((rows - 1) * across + columns, np.int16)
+    highest, weakest = np.empty(columns, np.int16), np.zeros(scores.shape[:2], np.int64)
     for view in range(len(points)):
         for turn in range(turns):
             angle = 2 * math.pi * turn / turns
@@ -143,18 +144,29 @@ def _match(
                 mean += row_sum
                 square += row_square
             mean /= rows * columns
-            moments[view, turn, 0] = mean
-            moments[view, turn, 1] = math.sqrt(max(square / (rows * columns) - mean * mean, 1.0))
-            for band in range(bands):
-                best[view, turn, band], places[view, turn, band] = -32768, 0
-                for r in range(rows * band // bands, rows * (band + 1) // bands):
+            deviation = math.sqrt(max(square / (rows * columns) - mean * mean, 1.0))
+            moments[view, turn, 0], moments[view, turn, 1] = mean, deviation
+            for i in range(scores.shape[0]):
+                top, bottom = i * side, min((i + 1) * side, rows)
+                highest[:] = total[top * across : top * across + columns]
+                for r in range(top + 1, bottom):
                     row = total[r * across : r * across + columns]
-                    most = row[0]
                     for k in range(columns):
-                        most = max(most, row[k])
-                    if most > best[view, turn, band]:
-                        best[view, turn, band] = most
-                        for k in range(columns):
-                            if row[k] == most:
-                                places[view, turn, band] = r * columns + k
-                                break
+                        highest[k] = max(highest[k], row[k])
+                for j in range(scores.shape[1]):
+                    left, right, slot = j * side, min((j + 1) * side, columns), weakest[i, j]
+                    most = highest[left]
+                    for k in range(left + 1, right):
+                        most = max(most, highest[k])
+                    score = (most - mean) / deviation
+                    if score <= scores[i, j, slot]:
+                        continue
+                    place = 0
+                    for r in range(top, bottom):
+                        for k in range(left, right):
+                            if total[r * across + k] == most:
+                                place = r * columns + k
+                    scores[i, j, slot] = score
+                    kept[i, j, slot, 0], kept[i, j, slot, 1] = view, turn
+                    kept[i, j, slot, 2] = place
+                    weakest[i, j] = np.argmin(scores[i, j])

@@ -1,5 +1,8 @@
 """Ranking of matches: each is moved to the best place nearby, and judged by what the image shows.
 
+The views of the best matches are then replaced by neighbouring views that fit better, because views
+are 8 degrees apart.
+
 Edges alone do not separate the part from busy texture. Colours do: the part is even inside, and its
 surroundings differ from it. A linear model of the features below ranks the matches; it was learned
 from procedural parts (``benchmarks/learn_ranking.py``), and its numbers are ``ranking.json``.
@@ -18,7 +21,7 @@ from jaxtyping import Float
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.drawing.pictures import Picture
-from dopepp.inference.templates.matching import Matches, Pose2d
+from dopepp.inference.templates.matching import Matches
 from dopepp.inference.templates.responses import Responses
 from dopepp.inference.templates.views import Templates
 
@@ -43,6 +46,12 @@ LEAST_INNER: Final = 8  # inner points on the image without which a match is rej
 ACROSS: Final = (2.5, 0.03)  # pixels and diameters between the outline and the compared colours
 TURN: Final = math.radians(5.0)
 GROWTH: Final = 0.03  # of the diameter in a step of the search
+FEW: Final = 32  # points that choose a step of the grid; a template's first points are far apart
+REACH_PX: Final = 1.5  # step between neighbouring views
+MOST_TURNS: Final = 4  # from view to view
+
+
+Features = Float[np.ndarray, "matches features"]
 
 
 class RankingModel(NamedTuple):
@@ -63,10 +72,10 @@ def learned_ranking() -> RankingModel:
     return RankingModel(np.array(list(values["weights"].values())), values["bias"], values["score"])
 
 
-def describe(
+def move_nearby(
     matches: Matches, templates: Templates, responses: Responses, image: Picture, reach: float
-) -> tuple[Pose2d, Float[np.ndarray, "matches features"]]:
-    """Move matches to the best place nearby; return their poses and :data:`FEATURES` there.
+) -> tuple[Matches, Features]:
+    """Move matches to the best place nearby; return them and their features there.
 
     Args:
         matches: Matches in pixels of the image.
@@ -75,16 +84,38 @@ def describe(
         image: RGB.
         reach: Largest distance of the first step, pixels.
     """
-    poses, features = matches.poses.copy(), np.zeros((len(matches.poses), len(FEATURES)))
+    poses, best = matches.poses.copy(), np.empty(len(matches.poses))
+    _search(responses, templates.points, templates.normals, matches.views, poses, reach, best)
+    matches = matches._replace(poses=poses)
+    return matches, _features(matches, best, templates, responses, image)
+
+
+def turn_views(
+    matches: Matches, templates: Templates, responses: Responses, image: Picture
+) -> tuple[Matches, Features]:
+    """Climb from matches over neighbouring views; see :func:`move_nearby`."""
+    views, poses, best = matches.views.copy(), matches.poses.copy(), np.empty(len(matches.poses))
     lines = templates.points, templates.normals
-    best = np.empty(len(poses))
-    _search(responses, *lines, matches.views, poses, reach, best)
-    inside = templates.is_outline, templates.inner
-    _describe(responses, image, *lines, *inside, matches.views, poses, features)
+    _turn(responses, *lines, templates.neighbours, templates.twists, views, poses, best)
+    matches = matches._replace(views=views, poses=poses)
+    return matches, _features(matches, best, templates, responses, image)
+
+
+def _features(
+    matches: Matches,
+    best: Float[np.ndarray, "matches"],
+    templates: Templates,
+    responses: Responses,
+    image: Picture,
+) -> Features:
+    """Return the features of matches with the given responses."""
+    features = np.zeros((len(best), len(FEATURES)))
+    lines = templates.points, templates.normals, templates.is_outline, templates.inner
+    _describe(responses, image, *lines, matches.views, matches.poses, features)
     features[:, 0] = matches.scores
     features[:, 1] = (best - matches.means) / matches.deviations
     features[:, 2], features[:, 9] = best, templates.extents[matches.views]
-    return poses, features
+    return features
 
 
 @compiled(fastmath=True)
@@ -104,6 +135,26 @@ def _response(
 
 
 @compiled(fastmath=True)
+def _climb(
+    maps: Array, points: Array, normals: Array, pose: Array, reach: float, rounds: int
+) -> float:
+    """Move one pose along each axis to higher responses; return the response."""
+    most = _response(maps, points, normals, pose[0], pose[1], pose[2], pose[3])
+    steps = np.array([reach, reach, TURN / 2, GROWTH * pose[3]])
+    for _ in range(rounds):
+        for axis in range(4):
+            for sign in (-1.0, 1.0):
+                pose[axis] += sign * steps[axis]
+                value = _response(maps, points, normals, pose[0], pose[1], pose[2], pose[3])
+                if value > most:
+                    most = value
+                else:
+                    pose[axis] -= sign * steps[axis]
+        steps *= 0.6
+    return most
+
+
+@compiled(fastmath=True)
 def _search(
     maps: Array,
     points: Array,
@@ -116,29 +167,51 @@ def _search(
     """Move each pose to the highest response: first on a grid, then along each axis."""
     for i in range(len(views)):
         edges, angles, scale = points[views[i]], normals[views[i]], poses[i, 3]
+        few, directions = edges[:FEW], angles[:FEW]
         u, v, turn, most = poses[i, 0], poses[i, 1], poses[i, 2], -1e9
         at_u, at_v, at_turn = u, v, turn
         for k in range(-1, 2):
             for across in range(-2, 3):
                 for down in range(-2, 3):
                     x, y, angle = u + across * reach / 2, v + down * reach / 2, turn + k * TURN
-                    value = _response(maps, edges, angles, x, y, angle, scale)
+                    value = _response(maps, few, directions, x, y, angle, scale)
                     if value > most:
                         most, at_u, at_v, at_turn = value, x, y, angle
-        u, v, turn, step = at_u, at_v, at_turn, 1.0
-        for _ in range(3):
-            for axis in range(4):
-                for sign in (-1.0, 1.0):
-                    x = u + (sign * step * reach / 4 if axis == 0 else 0.0)
-                    y = v + (sign * step * reach / 4 if axis == 1 else 0.0)
-                    angle = turn + (sign * step * TURN / 2 if axis == 2 else 0.0)
-                    size = scale * (1.0 + (sign * step * GROWTH if axis == 3 else 0.0))
-                    value = _response(maps, edges, angles, x, y, angle, size)
-                    if value > most:
-                        most, u, v, turn, scale = value, x, y, angle, size
-            step *= 0.6
-        poses[i, 0], poses[i, 1], poses[i, 2], poses[i, 3] = u, v, turn, scale
-        best[i] = most
+        poses[i, 0], poses[i, 1], poses[i, 2] = at_u, at_v, at_turn
+        best[i] = _climb(maps, edges, angles, poses[i], reach / 4, 3)
+
+
+@compiled(fastmath=True)
+def _turn(
+    maps: Array,
+    points: Array,
+    normals: Array,
+    neighbours: Array,
+    twists: Array,
+    views: Array,
+    poses: Array,
+    responses: Array,
+) -> None:
+    """Replace each view by its best neighbour, until no neighbour has a higher response."""
+    pose, best = np.empty(4), np.empty(4)
+    for i in range(len(views)):
+        best[:] = poses[i]
+        most = _climb(maps, points[views[i]], normals[views[i]], best, REACH_PX, 2)
+        for _ in range(MOST_TURNS):
+            view, chosen = views[i], views[i]
+            poses[i] = best
+            for k in range(neighbours.shape[1]):
+                other = neighbours[view, k]
+                pose[:] = poses[i]
+                pose[2] += twists[view, k]
+                value = _climb(maps, points[other], normals[other], pose, REACH_PX, 2)
+                if value > most:
+                    most, chosen = value, other
+                    best[:] = pose
+            if chosen == view:
+                break
+            views[i] = chosen
+        poses[i], responses[i] = best, most
 
 
 @compiled(fastmath=True)

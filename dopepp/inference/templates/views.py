@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import CameraMatrix, camera_matrix, make_transform
@@ -23,6 +23,7 @@ from dopepp.inference.refinement.verification import SharpEdges
 
 NUM_VIEWS: Final = 600  # directions on the sphere, about 8 degrees apart
 NUM_POINTS: Final = 64  # on the edges of a view
+NUM_NEIGHBOURS: Final = 6  # of a view
 NUM_INNER: Final = 48  # inside a view, far from its edges
 
 DRAWN_PX: Final = 96  # diameter of the part on the drawing of a view
@@ -49,6 +50,8 @@ class Templates:
     is_outline: Bool[np.ndarray, "views points"]  # False: on a crease
     inner: Float[np.ndarray, "views inner 2"]  # inside the outline
     extents: Float[np.ndarray, "views"]  # longer side of the bounding box
+    neighbours: Int[np.ndarray, "views neighbours"]  # views from the nearest directions
+    twists: Float[np.ndarray, "views neighbours"]  # turn of each neighbour that fits best, radians
 
 
 def view_rotations(
@@ -112,17 +115,32 @@ def make_templates(
         rows[..., 4] > 0,
         (np.stack(inner) - half) / DRAWN_PX,
         np.ptp(points, axis=1).max(axis=1),
+        *_neighbours(rotations),
     )
 
 
 def joined(groups: Sequence[Templates]) -> Templates:
-    """Return the templates of several groups in one, in their order."""
-    return Templates(
+    """Return the templates of several groups of equal length in one, in their order."""
+    templates = Templates(
         *(
             np.concatenate([getattr(group, field.name) for group in groups])
             for field in fields(Templates)
         )
     )
+    first = np.repeat(np.arange(len(groups)) * len(groups[0].points), len(groups[0].points))
+    return replace(templates, neighbours=templates.neighbours + first[:, None])
+
+
+def _neighbours(
+    rotations: Rotations,
+) -> tuple[Int[np.ndarray, "views neighbours"], Float[np.ndarray, "views neighbours"]]:
+    """Return the nearest views of each view, and the turns in the image plane between them."""
+    directions = rotations[:, 2]
+    count = min(NUM_NEIGHBOURS, len(rotations) - 1)
+    nearest = np.argsort(-directions @ directions.T, axis=1)[:, 1 : count + 1]
+    between = np.einsum("nij,nkmj->nkim", rotations, rotations[nearest])
+    sines = between[..., 1, 0] - between[..., 0, 1]
+    return nearest, np.arctan2(sines, between[..., 0, 0] + between[..., 1, 1])
 
 
 def _drawn(
