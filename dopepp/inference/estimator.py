@@ -34,7 +34,7 @@ from dopepp.inference.picture import (
 from dopepp.inference.pose_result import STEPS
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Part
-from dopepp.recovery.detection import CANDIDATE, Detection, RecoveryOptions, rescored
+from dopepp.recovery.detection import CANDIDATE, Detection, RecoveryOptions, recalibrated
 from dopepp.recovery.recover import Reason, explain, recover, rejected_refined
 
 if TYPE_CHECKING:
@@ -270,7 +270,8 @@ class PoseEstimator:
         detections = self._start_detections(image, K, distances, roi)
         if self.refiner is None:
             return detections
-        return self._rescored(self.refined(detections, image, K, depth))
+        by_depth = depth is not None and self.refiner.uses_depth
+        return self._recalibrated(self.refined(detections, image, K, depth), by_depth)
 
     def _start_detections(
         self, image: Picture, K: CameraMatrix, distances: Distances | None, roi: Region | None
@@ -290,9 +291,9 @@ class PoseEstimator:
             scales.append([view.to_image(it, self._cuboid_of[it.object], K) for it in detections])
         return merge_scales(scales)
 
-    def _rescored(self, refined: Sequence[Detection]) -> list[Detection]:
-        """Return refined detections with the score of refined poses, best first."""
-        return rescored(refined, self.recovery)
+    def _recalibrated(self, refined: Sequence[Detection], by_depth: bool) -> list[Detection]:
+        """Return refined detections with their scores and covariances, best first."""
+        return recalibrated(refined, self.recovery, by_depth)
 
     @property
     def min_score(self) -> float:

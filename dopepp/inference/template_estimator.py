@@ -39,8 +39,8 @@ from dopepp.parts.symmetry_finder import find_symmetries
 from dopepp.recovery.detection import (
     Detection,
     RecoveryOptions,
+    recalibrated,
     refined_features,
-    rescored,
 )
 from dopepp.recovery.recover import Reason
 
@@ -171,12 +171,13 @@ class TemplateEstimator(PoseEstimator):
             ends += poses
         return ends
 
-    def _rescored(self, refined: Sequence[Detection]) -> list[Detection]:
+    def _recalibrated(self, refined: Sequence[Detection], by_depth: bool) -> list[Detection]:
         """Return the best refined detection of each instance, best first."""
         slope, scored = self.recovery.refined_verification, []
         for detection in refined:
             bias = -slope * self.levels.get(detection.object, 0.0)
-            scored += rescored([detection], replace(self.recovery, refined_bias=bias))
+            options = replace(self.recovery, refined_bias=bias)
+            scored += recalibrated([detection], options, by_depth)
         return merge_scales([[detection] for detection in scored])
 
     def _missing(

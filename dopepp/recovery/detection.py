@@ -41,6 +41,10 @@ detection from a part that the network was unsure of."""
 
 DISTANCE_FACTORS: Final = (0.5, 2.0)  # Range; factors of trained networks are within a tenth of 1
 COVARIANCE_FACTORS: Final = (0.5, 4.0)  # Range; factors of trained networks are 0.8 to 3
+REFINED_COVARIANCE_FACTORS: Final = (0.1, 4.0)
+"""Range for refined poses. Refinement assumes errors that renders do not have, e.g. shadows and
+inaccurate meshes, so that its covariances on renders are too large."""
+
 PASSING: Final = 0.1  # ADD over the diameter below which a pose is right
 
 # Squared Mahalanobis distances in 6D that three quarters and a tenth exceed.
@@ -126,6 +130,8 @@ class RecoveryOptions:
         refined_min_score: Refined detections below this score are dropped.
         refined_bias: First weight of the score of refined poses, set by ``evaluate.py tune=true
             refine=region``; with the defaults, the score is the probability of the verification.
+        refined_covariance_factor: Factor on the covariance of poses refined on the image alone, set
+            by ``tune=true refine=region``.
     """
 
     __pydantic_config__ = STRICT
@@ -147,6 +153,7 @@ class RecoveryOptions:
     refined_bias: _Weight = 0.0
     refined_score: _Weight = 0.0
     refined_verification: _Weight = 1.0
+    refined_covariance_factor: Annotated[float, Range(*REFINED_COVARIANCE_FACTORS)] = 1.0
 
     @classmethod
     def of(cls, options: Mapping[str, float]) -> RecoveryOptions:
@@ -223,19 +230,30 @@ def calibrated(
     return replace(detection, keypoints=keypoints, score=probability, covariance=covariance)
 
 
-def rescored(refined: Sequence[Detection], options: RecoveryOptions) -> list[Detection]:
-    """Return refined detections with the score of refined poses, best first.
+def recalibrated(
+    refined: Sequence[Detection], options: RecoveryOptions, by_depth: bool = False
+) -> list[Detection]:
+    """Return refined detections with the scores and covariances of refined poses, best first.
 
-    Detections that were not verified keep the network's score.
+    Detections that were not verified keep the network's score, and those that were not refined keep
+    its covariance.
+
+    Args:
+        refined: Detections after refinement and verification.
+        options: Options with the fitted weights and the factor.
+        by_depth: Whether a depth image was used; the factor was fitted without.
     """
-    weights = np.array(options.refined_weights)
-    judged = [
-        detection
-        if detection.probability is None
-        else replace(detection, score=float(score(refined_features(detection), weights)))
-        for detection in refined
-    ]
-    return sorted(judged, key=lambda detection: -detection.score)
+    weights, factor = np.array(options.refined_weights), options.refined_covariance_factor
+    calibrated = []
+    for detection in refined:
+        changed = detection
+        if detection.probability is not None:
+            judged = float(score(refined_features(detection), weights))
+            changed = replace(changed, score=judged)
+        if detection.agreement is not None and not by_depth:  # refined on the image
+            changed = replace(changed, covariance=factor * detection.covariance)
+        calibrated.append(changed)
+    return sorted(calibrated, key=lambda detection: -detection.score)
 
 
 def refined_features(detection: Detection) -> Float[np.ndarray, "features"]:
@@ -289,7 +307,9 @@ def fit_distance_factor(
     return float(np.clip(np.median(distances[0] / distances[1]), *DISTANCE_FACTORS))
 
 
-def fit_covariance_factor(squared_distances: Float[np.ndarray, "n"]) -> float:
+def fit_covariance_factor(
+    squared_distances: Float[np.ndarray, "n"], *, refined: bool = False
+) -> float:
     """Return the factor on covariances that matches the errors of the right poses.
 
     The squared distances are a mixture of right poses, a multiple of χ² with six degrees of
@@ -299,9 +319,11 @@ def fit_covariance_factor(squared_distances: Float[np.ndarray, "n"]) -> float:
 
     Args:
         squared_distances: Squared Mahalanobis distances of true poses, with a factor of 1.
+        refined: Whether the poses were refined.
 
     Raises:
-        UserError: The factor is outside :data:`COVARIANCE_FACTORS`.
+        UserError: The factor is outside :data:`COVARIANCE_FACTORS`, or for refined poses outside
+            :data:`REFINED_COVARIANCE_FACTORS`.
     """
     squared = np.asarray(squared_distances, np.float64)
     squared = squared[np.isfinite(squared) & (squared > 0)]
@@ -318,14 +340,18 @@ def fit_covariance_factor(squared_distances: Float[np.ndarray, "n"]) -> float:
     order = np.argsort(squared)
     passed = np.cumsum(certainty[order]) / certainty.sum()
     factor = float(squared[order[np.searchsorted(passed, 0.9)]]) / _TENTH_BEYOND
-    low, high = COVARIANCE_FACTORS
+    low, high = REFINED_COVARIANCE_FACTORS if refined else COVARIANCE_FACTORS
     if not low <= factor <= high:
         lean = "confident" if factor > high else "cautious"
+        whose = "refinement" if refined else "network"
+        causes = f"train longer, because the {whose} is far too {lean}; or, if"
+        if refined:
+            causes = f"the refinement is far too {lean}; check the mesh and scale_error; if"
         raise UserError(
             f"covariances that must be multiplied by {factor:.3g} to match the poses' errors",
             f"a factor from {low:g} to {high:g}",
-            f"train longer, because the network is far too {lean}; or, if the part looks the same "
-            "in several orientations, state its symmetries with data.symmetries=auto",
+            f"{causes} the part looks the same in several orientations, state its symmetries with "
+            "data.symmetries=auto",
         )
     return factor
 

@@ -24,7 +24,7 @@ from dopepp.recovery.detection import (
     fit_covariance_factor,
     fit_distance_factor,
     fit_weights,
-    rescored,
+    recalibrated,
     score,
 )
 
@@ -114,9 +114,37 @@ def test_wrong_poses_do_not_raise_the_covariance_factor(share):
 
 
 @pytest.mark.parametrize(("factor", "lean"), [(30.0, "too confident"), (0.05, "too cautious")])
-def test_a_covariance_factor_beyond_all_experience_is_refused(factor, lean):
-    with pytest.raises(UserError, match=lean):
-        fit_covariance_factor(factor * chi2(6).rvs(500, random_state=0))
+@pytest.mark.parametrize("refined", [False, True])
+def test_a_covariance_factor_beyond_all_experience_is_refused(factor, lean, refined):
+    whose = "refinement" if refined else "network"
+    with pytest.raises(UserError, match=f"{whose} is far {lean}"):
+        fit_covariance_factor(factor * chi2(6).rvs(500, random_state=0), refined=refined)
+
+
+def test_refined_poses_may_be_far_better_than_stated():
+    drawn = 0.3 * chi2(6).rvs(20_000, random_state=0)
+    assert fit_covariance_factor(drawn, refined=True) == pytest.approx(0.3, rel=0.05)
+    with pytest.raises(UserError, match=r"a factor from 0\.5 to 4"):
+        fit_covariance_factor(drawn)
+
+
+def test_the_refined_factor_scales_poses_refined_on_the_image_and_no_others():
+    refined = detection(agreement=0.9, probability=0.8)
+    kept, by_depth_alone = detection(probability=0.7, kept="occluded"), detection()
+    options = RecoveryOptions(refined_covariance_factor=0.25)
+    found = recalibrated([refined, kept, by_depth_alone], options)
+    factors = [item.covariance[0, 0] / refined.covariance[0, 0] for item in found]
+    assert factors == [0.25, 1.0, 1.0]
+    before = recalibrated([refined, kept, by_depth_alone], RecoveryOptions())
+    assert [item.score for item in found] == [item.score for item in before]
+    with_depth = recalibrated([refined], options, by_depth=True)[0]
+    assert np.array_equal(with_depth.covariance, refined.covariance)
+
+
+@pytest.mark.parametrize("factor", [0.05, 5.0, float("nan"), "half"])
+def test_an_impossible_refined_factor_is_refused(factor):
+    with pytest.raises(UserError, match="refined_covariance_factor"):
+        RecoveryOptions.of({"refined_covariance_factor": factor})
 
 
 def test_a_refined_pose_has_the_probability_of_its_verification():
@@ -125,16 +153,16 @@ def test_a_refined_pose_has_the_probability_of_its_verification():
         replace(detection(), score=0.3, probability=0.8),
         replace(detection(), score=0.5),  # not verified
     ]
-    scores = [estimate.score for estimate in rescored(judged, RecoveryOptions())]
+    scores = [estimate.score for estimate in recalibrated(judged, RecoveryOptions())]
     assert scores == pytest.approx([0.8, 0.5, 0.2])
     fitted = RecoveryOptions(
         min_score=0.5, refined_bias=-2.0, refined_score=1.0, refined_verification=0.5
     )
     assert fitted.unrefined() == RecoveryOptions(min_score=0.5)
-    best = max(rescored(judged, fitted), key=lambda estimate: estimate.score)
+    best = max(recalibrated(judged, fitted), key=lambda estimate: estimate.score)
     assert best.score == 0.5
-    recalibrated = rescored(judged[:1], fitted)[0].score
-    assert recalibrated == pytest.approx(expit(-2 + np.log(0.9 / 0.1) + 0.5 * np.log(0.2 / 0.8)))
+    (once,) = recalibrated(judged[:1], fitted)
+    assert once.score == pytest.approx(expit(-2 + np.log(0.9 / 0.1) + 0.5 * np.log(0.2 / 0.8)))
 
 
 def test_scores_fitted_to_other_features_are_left_out():

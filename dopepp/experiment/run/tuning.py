@@ -1,7 +1,8 @@
 """Tune the factors, the scores and the thresholds of a checkpoint on validation images.
 
 - Distance: the median ratio of true to estimated distances.
-- Covariance: matches the errors of the right poses among the matched ones.
+- Covariance: matches the errors of the right poses; one factor for the network's and one for
+  refined poses.
 - Scores: the probability of "ADD(-S) below a tenth of the diameter". That of refined poses is a
   recalibration of the verification.
 - Thresholds: the lowest ones that satisfy the permitted rate of false positives on pictures without
@@ -65,6 +66,8 @@ from dopepp.recovery.detection import (
 LEAST_REFINED_SCORE: Final = 0.1
 """Lowest threshold of refined poses: a pose that is far more likely wrong than right is not
 reported, however quiet the pictures without the objects are."""
+
+FEWEST_REFINED: Final = 20  # right poses to which the covariance factor of refined poses is fitted
 
 MOST_LOST: Final = 0.01  # share of the correct refined poses that silence may cost
 SAME: Final = 0.005  # average precision that fitted options may lose
@@ -166,7 +169,9 @@ def tune(
     if estimator.refiner is not None and estimator.refiner.verifies:
         estimator.recovery = _audible(new)
         without = score_images(estimator, parts, empty)
+        factor = fit_refined_factor(estimator, parts, validation)
         new = replace(new, **choose(shown, without, rate, refined=True))  # type: ignore[arg-type]
+        new = replace(new, refined_covariance_factor=factor)
     after = _measured(estimator, parts, test, empty_test, new)
     options = {
         field.name: getattr(new, field.name)
@@ -244,16 +249,42 @@ def fit_factors(
     estimated = np.reshape([detection.T_cam_obj for detection, _ in pairs], (-1, 4, 4))
     true = np.reshape([equivalents[0] for _, equivalents in pairs], (-1, 4, 4))
     distance = fit_distance_factor(estimated, true)
-    surprises = []
+    covariance = fit_covariance_factor(squared_distances(pairs, distance))
+    return {"distance_factor": distance, "covariance_factor": covariance}
+
+
+def fit_refined_factor(estimator: PoseEstimator, parts: Parts, source: SampleSource) -> float:
+    """Fit the factor on covariances of poses refined on the image, from right poses alone.
+
+    Returns:
+        The factor; 1 with fewer than :data:`FEWEST_REFINED` right poses.
+
+    Raises:
+        UserError: The covariances are far from the errors.
+    """
+    matches = matched_poses(estimator, parts, source, only_right=True)
+    pairs = [match for match in matches if match[0].agreement is not None]
+    if len(pairs) < FEWEST_REFINED:
+        text = "covariances of refined poses keep a factor of 1: %d right poses of at least %d"
+        _log.warning(text, len(pairs), FEWEST_REFINED)
+        return 1.0
+    return fit_covariance_factor(squared_distances(pairs), refined=True)
+
+
+def squared_distances(
+    pairs: Sequence[tuple[Detection, Float[np.ndarray, "equivalents 4 4"]]],
+    distance_factor: float = 1.0,
+) -> Float[np.ndarray, "n"]:
+    """Return the squared Mahalanobis distance of each estimate to the nearest equivalent pose."""
+    squared = []
     for detection, equivalents in pairs:
         stated = np.broadcast_to(detection.covariance, (len(equivalents), 6, 6)).copy()
         T_est = np.broadcast_to(detection.T_cam_obj, equivalents.shape).copy()
-        T_est[:, :3, 3] *= distance
+        T_est[:, :3, 3] *= distance_factor
         poses = T_est[:, :3, :3], T_est[:, :3, 3], equivalents[:, :3, :3], equivalents[:, :3, 3]
         away = mahalanobis(*map(torch.from_numpy, (*poses, stated)))
-        surprises.append(float(away.min()) ** 2)
-    covariance = fit_covariance_factor(np.array(surprises))
-    return {"distance_factor": distance, "covariance_factor": covariance}
+        squared.append(float(away.min()) ** 2)
+    return np.array(squared)
 
 
 def choose(
@@ -349,15 +380,19 @@ def score_images(estimator: PoseEstimator, parts: Parts, *sources: SampleSource)
 
 
 def matched_poses(
-    estimator: PoseEstimator, parts: Parts, source: SampleSource
+    estimator: PoseEstimator, parts: Parts, source: SampleSource, *, only_right: bool = False
 ) -> list[tuple[Detection, Float[np.ndarray, "equivalents 4 4"]]]:
-    """Return matched detections with all poses equivalent to that of their instance."""
+    """Return matched detections with all poses equivalent to that of their instance.
+
+    ``only_right`` leaves out poses with ADD(-S) above a tenth of the diameter.
+    """
     matches = []
     for _, _, part, detections, instances in _by_object(estimator, parts, source):
         group = symmetry_transforms(part).numpy()
         numbers = assign(part, detections, instances)
-        for detection, number in zip(detections, numbers, strict=True):
-            if number >= 0 and counted(instances[number]):
+        right, _ = _judge(part, detections, instances)
+        for detection, number, is_right in zip(detections, numbers, right, strict=True):
+            if number >= 0 and counted(instances[number]) and (is_right or not only_right):
                 matches.append((detection, instances[number].T_cam_obj @ group))
     return matches
 

@@ -96,6 +96,8 @@ class Refiner:
         self._cuboids = {part.name: part.cuboid for part in parts}
         self.verifies = "region" in terms
         """Whether refined poses are verified, from the same evidence as the term ``region``."""
+        self.uses_depth = "depth" in terms
+        """Whether poses are refined on depth images, where there are some."""
 
     def mesh(self, name: str) -> OutlineMesh | None:
         """Return a part's mesh, prepared for its outline; None without the term ``region``."""

@@ -12,11 +12,13 @@ from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample
 from dopepp.experiment.config.run_config import FalsePositiveTarget
 from dopepp.experiment.run.tuning import (
+    FEWEST_REFINED,
     LEAST_REFINED_SCORE,
     MOST_LOST,
     Scored,
     choose,
     fit_factors,
+    fit_refined_factor,
     matched_poses,
     score_images,
     write_tuned,
@@ -165,6 +167,55 @@ def test_the_factors_of_a_network_that_is_too_near_and_too_sure():
     assert factors["distance_factor"] == pytest.approx(1 / 0.9, rel=0.01)
     assert factors["covariance_factor"] == pytest.approx(2.25, rel=0.1)
     assert fit_factors([]) == {"distance_factor": 1.0, "covariance_factor": 1.0}
+
+
+class Many:
+    """Pictures of the part on the optical axis, each with its number in the first pixel."""
+
+    name = "many"
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def __len__(self) -> int:
+        return self.count
+
+    def sample(self, index: int, epoch: int) -> Sample:
+        image = np.full((128, 128, 3), index, np.uint8)
+        keypoints = project_keypoints(PART.cuboid, POSE, K)
+        return Sample(image, K, [Instance(PART.name, POSE, keypoints, 1.0)])
+
+
+class Refining:
+    """Estimator whose errors have known covariances; every fifth pose is wrong or kept."""
+
+    def __init__(self, true: float) -> None:
+        self.true = true
+
+    def candidates(self, image: np.ndarray, K: np.ndarray, **_: object) -> list[Detection]:
+        number = int(image[0, 0, 0])
+        deviation = np.array([0.01, 0.01, 0.01, 0.001, 0.001, 0.002])
+        step = np.sqrt(self.true) * deviation * np.random.default_rng(number).normal(size=6)
+        T = make_transform(rotation_vector_to_matrix(step[:3]), POSE[:3, 3] + step[3:])
+        if number % 5 == 0:
+            return [replace(found(POSE, 0.9, 0.3), agreement=0.9)]
+        detection = replace(found(T, 0.9), covariance=np.diag(deviation**2), agreement=0.9)
+        kept = number % 5 == 1
+        return [replace(detection, agreement=None, covariance=np.eye(6)) if kept else detection]
+
+
+def test_the_factor_of_refined_poses_is_that_of_the_right_ones():
+    estimator = Refining(true=0.4)
+    factor = fit_refined_factor(estimator, [PART], Many(250))  # type: ignore[arg-type]
+    assert factor == pytest.approx(0.4, rel=0.15)
+
+
+def test_few_refined_poses_keep_their_covariances(caplog):
+    few = Refining(true=0.4)
+    assert fit_refined_factor(few, [PART], Many(FEWEST_REFINED)) == 1.0  # type: ignore[arg-type]
+    assert f"12 right poses of at least {FEWEST_REFINED}" in caplog.text
+    with pytest.raises(UserError, match="refinement is far too confident"):
+        fit_refined_factor(Refining(true=9.0), [PART], Many(250))  # type: ignore[arg-type]
 
 
 def test_refined_poses_are_scored_by_their_verification():
