@@ -166,7 +166,7 @@ def set_weight(value: Any) -> Any:
     [
         (lambda c: c.pop("dopepp"), "without 'dopepp' entry"),
         (lambda c: c.update(dopepp=[1]), "a list under 'dopepp'"),
-        (set_payload("format_version", 3), "format_version 3, .*allowed: 2; fix: read"),
+        (set_payload("format_version", 3), "format_version 3, .*allowed: 2; fix: use"),
         (set_payload("format_version", 1), "format_version 1"),
         (lambda c: c["dopepp"].pop("spec"), "no spec"),
         (set_payload("spec", "DSC"), "spec='DSC'"),

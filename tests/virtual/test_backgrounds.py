@@ -95,7 +95,7 @@ def test_half_a_photo_is_damaged(tmp_path, suffix):
         path.write_bytes(content[: int(share * len(content))])
         with pytest.raises(ValueError, match=r"\w"):
             read_picture(path)
-    message = rf"1 damaged of 2 background photos \(.*photo\.{suffix}: .*\).*; 0 damaged"
+    message = rf"1 damaged of 2 background photos \(.*photo\.{suffix}: .*\).*; .* at most 0 damaged"
     backgrounds = PhotoBackgrounds(tmp_path)
     with pytest.raises(UserError, match=message) as caught:
         [draw(backgrounds, seed) for seed in range(20)]
@@ -111,7 +111,7 @@ def test_one_bad_photo_of_many_is_replaced_whatever_came_before(tmp_path, caplog
         images = [draw(backgrounds, seed) for seed in range(400)]
     assert list(backgrounds.bad) == [bad]
     assert len(caplog.records) == 1
-    assert "skipping the damaged background photo 0100.jpg" in caplog.text
+    assert "skipping the damaged background photo" in caplog.text and "0100.jpg" in caplog.text
     assert "1 of at most 2" in caplog.text
     hits = [s for s in range(400) if int(np.random.default_rng(s).integers(200)) == 100]
     assert hits  # these drew the damaged photo first
@@ -126,7 +126,7 @@ def test_damage_is_capped(tmp_path, count, allowed):
     backgrounds = PhotoBackgrounds(tmp_path)
     (tmp_path / "0.jpg").unlink()  # one that vanishes counts as damaged
     with pytest.raises(
-        UserError, match=rf"^got {allowed + 1} damaged of {count} .*; {allowed} dam"
+        UserError, match=rf"^got {allowed + 1} damaged of {count} .* at most {allowed} dam"
     ):
         draw(backgrounds, 0)
 
