@@ -289,7 +289,7 @@ def _stream_sightings(source: str, board: Board) -> tuple[list[Sighting], Size]:
 
 
 def _find_board(board: Board, picture: Picture, name: str, quiet: bool) -> Sighting | None:
-    """Find the board in a picture; print a missing board (unless quiet) or a second board."""
+    """Find the board in a picture; report a missing (unless quiet) or second board."""
     try:
         sighting = board.find(picture, name)
     except UserError as error:

@@ -131,7 +131,7 @@ class JsonLines:
         self._file: FileIO | None = None
 
     def begin(self, source: FrameSource) -> None:
-        """Open the file with the first source."""
+        """Open the file at the first source."""
         self._file = self._file or self._partial.open("wb", buffering=0)
 
     def take(self, result: PoseResult) -> None:

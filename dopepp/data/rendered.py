@@ -112,7 +112,7 @@ _FILLED: Final = 1 << 32
 
 
 def _in_memory(dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndarray, " items"]:
-    """Return zeros that forked processes share; only written pages take memory."""
+    """Return zeros in memory shared with forked processes; only written pages take memory."""
     return np.frombuffer(mmap.mmap(-1, dtype.itemsize * num_items), dtype)
 
 

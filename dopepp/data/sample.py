@@ -215,7 +215,7 @@ def resize_sample(sample: Sample, input_size: Size) -> Sample:
 
 
 def pad_sample(sample: Sample, input_size: Size) -> Sample:
-    """Pad with zeros on the right and at the bottom; K and keypoints stay as they are."""
+    """Pad with zeros on the right and at the bottom; K and keypoints do not change."""
     width, height = sample.size
     if (width, height) == tuple(input_size):
         return sample

@@ -281,8 +281,9 @@ def _spreads(
 ) -> tuple[float, float, float, float, float, float, float]:
     """Return the spreads that :func:`degenerate` compares.
 
-    These are the object's extent (metres), its two largest singular values divided by the extent,
-    the number of distinct pixels, their singular values, and the median deviation (det W)^(−1/2).
+    The values are the object's extent (metres), the object's two largest singular values divided
+    by the extent, the number of distinct pixels, the pixels' two singular values, and the median
+    deviation (det W)^(−1/2).
     """
     n = len(object_points)
     extent = 0.0

@@ -85,7 +85,7 @@ def compare_export(
 ) -> ExportAgreement:
     """Compare maps, and the best-scored pose of each object on each image.
 
-    Other poses are left out: clutter may be equally likely at two poses, and rounding decides.
+    Poses with lower scores are ignored, because rounding decides between equal scores in clutter.
     """
     maps, differences, num_single = [0.0], [(0.0, 0.0)], 0
     for picture, K in pictures:

@@ -153,7 +153,7 @@ def _image(label: str, name: str, is_visible: bool = True) -> gr.Image:
 
 
 def _camera_inputs() -> list[Any]:
-    """Return the input fields of all camera types; only those of the chosen type are visible."""
+    """Return the input fields of all camera types, and show only the chosen type's fields."""
     kind = gr.Radio([VIEW, NUMBERS, FILE], value=VIEW, label="Camera")
     view = gr.Number(label="Degrees across the picture's width", placeholder="60")
     with gr.Row(visible=False) as row:

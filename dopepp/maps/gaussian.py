@@ -125,7 +125,7 @@ def mean_vectors(
     """Write the weighted mean of the vectors in each corner's disc.
 
     Where discs overlap, cells hold the vector of the nearest corner. The weights 1 − (d/radius)²
-    fall to 0 at the edges of discs, which inexact positions blur.
+    fall to 0 at the edges of discs, where inexact positions make the vectors uncertain.
     """
     height, width = vectors.shape[1:]
     half = math.ceil(radius)
@@ -170,7 +170,7 @@ def _own_cells(
     margin: float,
     usable: Array,
 ) -> None:
-    """Mark the finite cells of a window that no other peak dominates and no plateau clamps.
+    """Mark a window's finite cells where no other peak is higher, except clamped plateaus.
 
     Of Gaussians s·exp(−d²/2σ²), the highest in a cell has the smallest d² − 2σ² log s.
     """

@@ -70,7 +70,7 @@ class Seen(NamedTuple):
             UserError: The values are not four numbers, or a number is out of range.
         """
         if not isinstance(values, list | tuple) or len(values) != len(cls._fields):
-            fix = "use a checkpoint that training wrote"
+            fix = "use a checkpoint written by train.py"
             raise UserError(f"seen sizes {values!r:.100}", ", ".join(cls._fields), fix)
         sizes = check("sizes of a part", values[:2], tuple[float, float], Span(0.1, 1e5, "pixels"))
         depths = check(

@@ -103,9 +103,9 @@ def make_instance(
 ) -> Instance:
     """Return an annotated object as an instance.
 
-    If the visible fraction is NaN, it is estimated: mask pixels or, without a mask, the hull's area
-    inside the image, over the area of the convex hull of the projected ADD points. The estimate is
-    too small for a concave object.
+    A visible fraction of NaN is replaced by an estimate: the number of mask pixels (without a mask,
+    the hull's area inside the image) divided by the area of the convex hull of the projected ADD
+    points. The estimate is too small for a concave object.
     """
     if math.isnan(visible_fraction):
         inside, whole = hull_areas(project(transform(T_cam_obj, part.points), K), shape)

@@ -68,7 +68,7 @@ class Box(NamedTuple):
 
 
 def rotation_problem(rotation: RotationMatrix, tolerance: float = 1e-3) -> str | None:
-    """Return why a matrix is no rotation; None for a rotation, and for NaN."""
+    """Return why a matrix is not a rotation, or None for a rotation and for NaN."""
     if is_rotation(rotation, tolerance) or not np.isfinite(rotation).all():
         return None
     deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()

@@ -61,7 +61,10 @@ class BackgroundCrops:
         return None
 
     def search(self, size: Size, rng: Generator) -> Picture | None:
-        """Return a crop of (height, width) with contrast, or with two colours, or None."""
+        """Return a random crop of (height, width) that has contrast.
+
+        Without such a crop, return one with two colours, else None.
+        """
         free = self._is_free(size)
         if not free.any():
             return None

@@ -76,8 +76,8 @@ def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModul
 def held_out_source(data: DataConfig, parts: Parts, split: Split) -> DescribedSource:
     """Build the validation or test images at their native resolution.
 
-    They are labelled images if there is a root, else renders. Validation falls back to renders,
-    with a warning, if the labelled images show none of the objects.
+    The images are labelled images if the data set has a root, else renders. Validation falls back
+    to renders, with a warning, if the labelled images show none of the objects.
     """
     if data.is_rendered(split):
         return held_out_renders(data, parts, split)

@@ -90,7 +90,7 @@ def validation_renders(
 def kept(
     source: DescribedSource, data: DataConfig, cache: Cache, input_size: tuple[int, int] | None
 ) -> DescribedSource:
-    """Wrap a source in the chosen cache.
+    """Add the configured cache to a source.
 
     Raises:
         UserError: The cache does not fit.

@@ -218,7 +218,7 @@ def image_id(sample: Sample, index: int) -> ImageId:
     """Return the BOP scene and image number of an image.
 
     The numbers come from the key (such as ``000001/000017``) in BOP data sets and YCB-Video.
-    Otherwise they are scene 0 and the index of the image in the test set.
+    Other data sets have scene 0, and the image number is the index in the test set.
     """
     match = _BOP_KEY.fullmatch(sample.key)
     if match is None or sample.source.partition("/")[0] not in _NUMBERED_SOURCES:

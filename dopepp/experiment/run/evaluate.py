@@ -79,7 +79,7 @@ def _show(tuning: Tuning, path: Path) -> None:
 
 
 def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part]:
-    """Return the test data's parts: those of the last estimator, or all without estimators."""
+    """Return the last estimator's parts, or all parts of the test data without estimators."""
     if not estimators:
         return build_parts(data)
     names = [part.name for part in estimators[-1].parts]
@@ -168,8 +168,8 @@ def _check_combination(asked: EvaluationConfig) -> None:
     if asked.ckpt_path is None and asked.results is None and asked.templates is None:
         fix = "add ckpt_path=FILE for a checkpoint, results=FILE for a file of poses, or "
         fix += "templates=[0.3,0.5] for the meshes alone"
-        allowed = "ckpt_path=…, results=…, templates=… or several"
-        raise UserError("neither ckpt_path nor results", allowed, fix)
+        allowed = "one or more of ckpt_path=…, results=… and templates=…"
+        raise UserError("no method to measure", allowed, fix)
     if asked.refine is not None and not has_network:
         allowed = "refine=… together with ckpt_path=… (poses from a file are not refined)"
         fix = "leave out refine, or add ckpt_path"

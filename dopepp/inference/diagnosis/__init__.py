@@ -267,7 +267,7 @@ def diagnose(case: Case) -> list[Diagnosis]:
 
 
 def _lens_ratio(case: Case) -> float | None:
-    """Return the ratio of K's focal length to that of training, if it explains a wrong distance.
+    """Return the ratio of K's and training's focal lengths if it explains a wrong distance.
 
     None if the part's distance lies within the training range, if its size on the image does not,
     or if the focal lengths hardly differ.

@@ -38,8 +38,8 @@ _OPSET: Final = re.compile(r"opset\d{1,2}", re.ASCII)  # versions of OpenVINO's 
 def load_openvino(choice: str) -> Any:
     """Import OpenVINO without its telemetry.
 
-    OpenVINO reports every import to its makers, and NNCF every call, unless the telemetry package
-    is missing. It is therefore hidden from them.
+    OpenVINO reports every import to its makers, and NNCF every call, if the telemetry package is
+    installed. This function therefore hides the package from OpenVINO and NNCF.
 
     Args:
         choice: The user's choice that requires OpenVINO, for messages.

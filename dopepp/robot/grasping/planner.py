@@ -195,7 +195,7 @@ class Planner:
     def plan(
         self, poses: Sequence[Transform], grasps: Sequence[Grasp], start: Joints
     ) -> Plan | None:
-        """Plan a motion.
+        """Plan a motion that grasps one of the poses.
 
         Args:
             poses: Poses T_base_obj of parts; the first is the part to grasp.

@@ -206,7 +206,7 @@ def black_body_rgb(temperature_k: float) -> Vector:
 
     The chromaticity is the cubic approximation of the Planckian locus by Kim et al., "Design of
     advanced color temperature control system", US patent 7024034 (2002), for 1667 to 25000 K.
-    Colours outside of sRGB's gamut lose their negative part.
+    Negative components (colours outside sRGB's gamut) are clipped to 0.
     """
     t = 1e3 / temperature_k
     if temperature_k <= 4000:

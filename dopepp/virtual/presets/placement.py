@@ -107,7 +107,7 @@ Turning = Annotated[FreeTurning | FacingTurning | UprightTurning, Discriminator(
 
 
 def looking_down(elevation: float) -> RotationMatrix:
-    """Return the rotation from a z-up frame to a level camera that looks along its +y.
+    """Return the rotation from a z-up frame to a camera that looks along +y and downwards.
 
     The elevation is the angle of the line of sight below the horizontal, radians.
     """

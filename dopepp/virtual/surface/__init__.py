@@ -135,7 +135,7 @@ def make_surface(mesh: Mesh) -> Surface:
 
 
 def _spread_points(corners: Corners, weights: PerFace) -> Points:
-    """Return points spread evenly over triangles by area; the corners of a mesh without area."""
+    """Return points spread evenly over the mesh's area, or its corners if the area is 0."""
     if weights.sum() <= 0.0:
         return corners.reshape(-1, 3)[:_NUM_POINTS]
     levels = (np.arange(_NUM_POINTS) + 0.5) / _NUM_POINTS * weights.sum()

@@ -119,9 +119,10 @@ def number_in_name(name: str) -> int | None:
 
 
 def model_numbers(names: Sequence[str]) -> dict[str, int]:
-    """Number objects by name: 1, 2, …, or as their names state if all are named like BOP's files.
+    """Number objects 1, 2, … in the order of names.
 
-    Renders of a BOP data set's models therefore keep the data set's numbers.
+    If all names are like BOP's file names (``obj_000005``), use the numbers in the names, so that
+    renders of a BOP data set's models keep the data set's numbers.
     """
     stated = {name: number_in_name(name) for name in names}
     numbers = {name: number for name, number in stated.items() if number}

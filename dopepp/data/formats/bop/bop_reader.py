@@ -77,8 +77,8 @@ class BopReader:
     """The images of a split, by scene and number.
 
     The constructor reads the scenes' JSON files and checks every record; images are read singly. An
-    image without ground truth has no instances. The reader leaves out and counts objects that are
-    none of the parts, and objects behind the camera (rendered sets have some). The visible fraction
+    image without ground truth has no instances. The reader ignores and counts objects that are not
+    among the parts or lie behind the camera (rendered sets have some). The visible fraction
     is ``visib_fract`` of ``scene_gt_info.json``, or an estimate of
     :func:`~dopepp.data.formats.make_instance`.
 

@@ -277,7 +277,7 @@ class ObjectCheck:
         seen: Box | None,
         fraction: float | None,
     ) -> None:
-        """Compare projections and visible pixels with the cuboid or, without it, each other."""
+        """Compare projections and visible pixels with the cuboid (if any) or each other."""
         if self._cuboid is not None:
             points = self._cuboid @ axes.T
             self._check_projections(points, K)

@@ -66,10 +66,10 @@ class ShardIndex:
 
 
 def read_span(path: Path, offset: int, size: int) -> bytes:
-    """Read a part of a shard.
+    """Read bytes of a shard.
 
     Raises:
-        UserError: The file is missing or has become shorter.
+        UserError: The file is missing or truncated.
     """
     problem = f"cut short within the member at byte {offset}"
     try:

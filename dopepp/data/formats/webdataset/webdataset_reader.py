@@ -52,8 +52,8 @@ class WebdatasetReader:
     """The images of some shards, in the order of the shards.
 
     The constructor reads headers; members are read and checked with their image. An image
-    without ``gt.json`` has no instances. The reader leaves out objects that are none of the parts,
-    and objects behind the camera. The visible fraction is ``visib_fract`` of ``gt_info.json``, or
+    without ``gt.json`` has no instances. The reader ignores objects that are not among the parts
+    or lie behind the camera. The visible fraction is ``visib_fract`` of ``gt_info.json``, or
     an estimate of :func:`~dopepp.data.formats.make_instance`.
 
     Args:

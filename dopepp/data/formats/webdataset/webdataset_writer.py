@@ -107,7 +107,7 @@ class WebdatasetWriter(BopFolder):
 
 
 def _merged(paths: Sequence[Path], chunk: int) -> Iterator[tuple[str, Content]]:
-    """Yield the images of some archives in order, one in memory at a time; later archives win."""
+    """Yield archives' images by number, one in memory at a time; later archives replace images."""
     images: dict[int, tuple[Path, list[TarMember]]] = {}
     for path in paths:
         if path.exists():

@@ -143,7 +143,7 @@ def _is_complete(content: bytes) -> bool:
 
 
 def _columns(node: Node, fields: Mapping[str, NDArray[Any]]) -> list[tuple[int, NDArray[Any]]]:
-    """Return each object's class index and 3×4 pose; none if the two fields do not match."""
+    """Return each object's class index and 3×4 pose, or [] if the two fields do not match."""
     if "cls_indexes" not in fields or "poses" not in fields:
         return []
     stored = np.asarray(fields["cls_indexes"])

@@ -222,7 +222,7 @@ def hidden_sky(
 
 @compiled()
 def _splat(points: Array, reach: float, slopes: Array, grid: Array, bits: Array) -> None:
-    """Set the direction's bit in all cells within ``reach`` from which a point hides it."""
+    """Set a direction's bit in the cells around each point's shadow in this direction."""
     rows, columns = bits.shape
     for p in range(points.shape[0]):
         for k in range(slopes.shape[0]):
