@@ -113,7 +113,7 @@ def wilson_interval(passed: int, num: int, confidence: float = 0.95) -> tuple[fl
 
 
 def region_levels(distances: Errors) -> Errors:
-    """Return the smallest level in [0, 1] whose covariance region contains the true pose, for each pose.
+    """Return each pose's smallest level in [0, 1] whose region contains the true pose.
 
     The squared Mahalanobis distance x of a true pose from its estimate follows χ² with six degrees
     of freedom if the covariance is right. The level is that distribution's value at x,
