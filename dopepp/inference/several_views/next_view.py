@@ -1,0 +1,150 @@
+"""The next best view: the camera pose from which a picture reduces a pose's covariance most.
+
+The information that a view would add is that of the part's outline there, as if every point of it
+were measured with a usual precision (:data:`USUAL_PX`), with the errors of offset and scale that
+refinement allows for. The part's own occlusions count, other objects are unknown.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from dopepp.core.errors import UserError
+from dopepp.geometry.camera import (
+    CameraMatrix,
+    Transform,
+    crop_camera,
+    invert_transform,
+    resize_camera,
+    transform,
+)
+from dopepp.geometry.camera_formats import Size
+from dopepp.inference.refinement.outline import (
+    OutlineMesh,
+    filled_mask,
+    find_contour,
+    outline_rows,
+    posed,
+)
+from dopepp.inference.refinement.region.shared_errors import SCALE_ERROR, region_terms
+from dopepp.inference.refinement.region.shifts import Shifts
+from dopepp.inference.refinement.several_views import turned
+from dopepp.inference.refinement.solver import PoseMatrix
+
+USUAL_PX: Final = 0.7
+"""Standard deviation of a point of the outline, pixels."""
+
+LONGEST_PX: Final = 200  # length of the drawn part above which the picture is shrunk
+NUM_POINTS: Final = 100  # approximate number of points on the outline
+
+
+@dataclass(frozen=True)
+class NextView:
+    """The best of several camera poses."""
+
+    number: int  # index of the camera pose
+    before: float  # expected error of the part's points now, metres
+    expected: Sequence[
+        float
+    ]  # expected error after each view; infinite if it does not show the part
+    reason: str  # why this view
+
+
+def next_best_view(
+    mesh: OutlineMesh,
+    T_world_obj: Transform,
+    covariance: PoseMatrix,
+    candidates: Sequence[Transform],
+    K: CameraMatrix,
+    size: Size,
+    T_world_bench: Transform | None = None,
+    scale_error: float = SCALE_ERROR,
+) -> NextView:
+    """Choose the camera pose whose picture is expected to reduce a pose's error most.
+
+    Args:
+        mesh: Mesh of the part, as :func:`~dopepp.inference.refinement.outline.make_outline_mesh`
+            prepares it.
+        T_world_obj: Pose of the part, metres.
+        covariance: Its covariance, world axes; see :class:`WorldDetection`.
+        candidates: Camera poses that can be reached, ``T_world_cam``.
+        K: Camera matrix, pixels.
+        size: (width, height) of the picture, pixels.
+        T_world_bench: Plane z = 0 that cameras must be above; None without a bench.
+        scale_error: Largest relative error of the part's size or of the focal length.
+
+    Raises:
+        UserError: No candidate shows the whole part.
+    """
+    prior, expected = np.linalg.inv(covariance), []
+    for T_world_cam in candidates:
+        information = None
+        if T_world_bench is None or _height(T_world_bench, T_world_cam) > 0:
+            T_cam_world = invert_transform(T_world_cam)
+            given = turned(T_cam_world[:3, :3], prior)
+            seen = _information(mesh, T_cam_world @ T_world_obj, K, size, given, scale_error)
+            information = None if seen is None else turned(T_world_cam[:3, :3], seen)
+        expected.append(
+            math.inf
+            if information is None
+            else point_error(mesh, T_world_obj, np.linalg.inv(prior + information))
+        )
+    if not candidates or min(expected) == math.inf:
+        problem = f"no view of {len(candidates)} shows the whole part"
+        fix = "pass more camera poses, or poses farther away that look at the part"
+        raise UserError(problem, "at least one camera pose that shows the part", fix)
+    best, before = int(np.argmin(expected)), point_error(mesh, T_world_obj, covariance)
+    reason = f"reduces the expected error from {1e3 * before:.2g} to {1e3 * expected[best]:.2g} mm"
+    return NextView(best, before, expected, reason)
+
+
+def point_error(mesh: OutlineMesh, T_world_obj: Transform, covariance: PoseMatrix) -> float:
+    """Return the expected error of a part's points under a pose's covariance (RMS), metres."""
+    arms = mesh.vertices @ T_world_obj[:3, :3].T
+    moment = arms.T @ arms / len(arms)
+    turning = np.trace(moment) * np.eye(3) - moment  # mean of |ω × arm|² as a form of ω
+    cross = np.cross(np.eye(3), arms.mean(axis=0))  # mean of ω × arm as a map of ω
+    variance = np.trace(covariance[3:, 3:]) + (turning * covariance[:3, :3]).sum()
+    return math.sqrt(max(0.0, float(variance + 2 * (cross * covariance[:3, 3:]).sum())))
+
+
+def _height(T_world_bench: Transform, T_world_cam: Transform) -> float:
+    """Return the height of a camera above the bench, metres."""
+    return float(transform(invert_transform(T_world_bench), T_world_cam[:3, 3])[2])
+
+
+def _information(
+    mesh: OutlineMesh,
+    T_cam_obj: Transform,
+    K: CameraMatrix,
+    size: Size,
+    prior: PoseMatrix,
+    scale_error: float,
+) -> PoseMatrix | None:
+    """Return the information of a part's outline; None if the part is not wholly on the picture."""
+    at = posed(mesh, T_cam_obj, K)
+    if at is None:
+        return None
+    low, high = at.pixels.min(axis=0), at.pixels.max(axis=0)
+    if low.min() < 0 or (high > np.array(size) - 1).any():
+        return None
+    scale = min(1.0, LONGEST_PX / float((high - low).max()))
+    corner = np.floor(scale * low) - 4
+    K = crop_camera(resize_camera(K, scale, scale), *corner)
+    width, height = (np.ceil(scale * high) - corner + 5).astype(int).tolist()
+    at = posed(mesh, T_cam_obj, K)
+    assert at is not None
+    extent = scale * float((high - low).max())
+    spacing = max(1.5, 3.0 * extent / NUM_POINTS)
+    contour = find_contour(mesh, at, filled_mask(mesh, at, (width, height)), spacing)
+    precision = np.full(len(contour), 1.0 / USUAL_PX**2)
+    shifts = Shifts(np.zeros(len(contour)), precision)
+    rows, nothing = outline_rows(contour, T_cam_obj, K), np.zeros(6)
+    position = T_cam_obj[:3, 3].copy()
+    equations = region_terms(rows, shifts, (prior, nothing), spacing, extent, position, scale_error)
+    return equations[0]
