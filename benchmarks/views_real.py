@@ -5,9 +5,9 @@
 The relative poses of the cameras come from the published poses of all objects but the evaluated
 one: their cuboids in two frames are aligned. LM-O's objects were moved several times, so frames
 belong together if all other objects agree within 8 mm; whether the evaluated object was moved is
-not looked up. Without a network, detections are drawn around the published poses, 5° and 10 mm off,
-in every frame independently. The table gives ADD(-S)-0.1d of objects that are at least a tenth
-visible in the first frame, refined on this frame and on all.
+not looked up. Without a network, detections are drawn around the published poses, 5° and 10 mm off
+(times ``--spread``), in every frame independently. The table gives ADD(-S)-0.1d of objects that are
+at least a tenth visible in the first frame, refined on this frame and on all.
 """
 
 from __future__ import annotations
@@ -112,7 +112,8 @@ class Frames:
 class DrawnEstimator:
     """Stands for a network: its detections are drawn around the published poses."""
 
-    def __init__(self, part: Part) -> None:
+    def __init__(self, part: Part, spread: float) -> None:
+        self.covariance = spread**2 * COVARIANCE
         self.refine, self.solid_parts = "region", (part,)
         self.refiner, self.recovery = Refiner("region", [part]), RecoveryOptions()
         self.min_score, self.spent_ms = (
@@ -127,7 +128,7 @@ class DrawnEstimator:
             return []
         part, nothing = self.solid_parts[0], np.full((9, 2), np.nan)
         keypoints = project_keypoints(part.cuboid, T, K)
-        start = Detection(part.name, 0.5, 0.5, T, keypoints, nothing, 0.0, COVARIANCE)
+        start = Detection(part.name, 0.5, 0.5, T, keypoints, nothing, 0.0, self.covariance)
         return rescored([self.refiner(start, image, K, None)], self.recovery)
 
 
@@ -153,6 +154,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=4, help="frames of each scene")
     parser.add_argument("--angles", type=float, nargs=2, default=[20.0, 40.0], help="degrees")
     parser.add_argument("--stride", type=int, default=1, help="use every n-th frame as the first")
+    parser.add_argument("--spread", type=float, default=1.0, help="factor on the drawn errors")
     options = parser.parse_args()
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
@@ -172,7 +174,7 @@ def main() -> None:
     for number, part in parts.items():
         if network is not None and part.name not in {it.name for it in network.solid_parts}:
             continue
-        estimator = network or DrawnEstimator(part)
+        estimator = network or DrawnEstimator(part, options.spread)
         rows, shown = [], []
         for first in names[:: options.stride]:
             if number not in frames.visible[first]:
@@ -187,8 +189,8 @@ def main() -> None:
                 for name, image in zip(chosen, images, strict=True):
                     if number in frames.visible[name]:
                         step = rng.normal(size=6)
-                        step[:3] *= TURN / np.linalg.norm(step[:3])
-                        step[3:] *= SHIFT / np.linalg.norm(step[3:])
+                        step[:3] *= options.spread * TURN / np.linalg.norm(step[:3])
+                        step[3:] *= options.spread * SHIFT / np.linalg.norm(step[3:])
                         pose = moved(frames.poses[name][number], step)
                         estimator.starts[image.tobytes()] = pose
             cameras = [frames.K[name] for name in chosen]

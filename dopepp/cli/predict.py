@@ -103,7 +103,7 @@ def predict(
     gc.disable()  # imported objects stay alive: searching them takes a fifth of the start
     with resumable("the written files are complete"):
         from dopepp.cli.outputs import Outputs
-        from dopepp.cli.several_views import predict_scene, refuse_options
+        from dopepp.cli.predict_scene import predict_scene, refuse_options
         from dopepp.geometry.camera import camera_matrix
         from dopepp.inference.frames import open_sources
         from dopepp.inference.frames.source import choose_camera, given_camera

@@ -37,15 +37,15 @@ from dopepp.geometry.pnp import solve_pnp
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.picture import Depth
 from dopepp.inference.refinement.depth import DepthEvidence
-from dopepp.inference.refinement.outline import OutlineMesh
-from dopepp.inference.refinement.part_surface import FEWEST_POINTS, Points, surface_points
-from dopepp.inference.refinement.region import RegionRefiner, Starts, refinement
-from dopepp.inference.refinement.region.shared_errors import SCALE_ERROR
-from dopepp.inference.refinement.several_views import (
+from dopepp.inference.refinement.joint_refinement import (
     JointRefinement,
     PosedPicture,
     refine_views,
 )
+from dopepp.inference.refinement.outline import OutlineMesh
+from dopepp.inference.refinement.part_surface import FEWEST_POINTS, Points, surface_points
+from dopepp.inference.refinement.region import RegionRefiner, Starts, refinement
+from dopepp.inference.refinement.region.shared_errors import SCALE_ERROR
 from dopepp.inference.refinement.solver import (
     PoseMatrix,
     Prior,

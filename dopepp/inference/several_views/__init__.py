@@ -1,7 +1,7 @@
 """Poses of parts from several pictures of a static scene with known camera poses.
 
 Each view is searched alone. Detections that agree in the world form a part
-(:mod:`~dopepp.inference.several_views.association`), whose pose is refined on all views together
+(:mod:`~dopepp.inference.several_views.sightings`), whose pose is refined on all views together
 and verified in each of them (:mod:`~dopepp.inference.several_views.joint`). Of parts at one place,
 the most probable remains. Views that contradict each other are named
 (:mod:`~dopepp.inference.several_views.contradictions`).
@@ -26,10 +26,10 @@ from dopepp.geometry.rotation import is_rotation
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.picture import Depth, Distances, are_same, prepare_image
 from dopepp.inference.pose_result import PoseResult, Shape, spent_between
-from dopepp.inference.refinement.several_views import PosedPicture
-from dopepp.inference.several_views.association import associate, separation, sight
+from dopepp.inference.refinement.joint_refinement import PosedPicture
 from dopepp.inference.several_views.contradictions import contradictions
 from dopepp.inference.several_views.joint import CONSISTENT, JointEstimator, JointPart
+from dopepp.inference.several_views.sightings import associate, separation, sight
 from dopepp.inference.several_views.views_result import ViewsResult
 
 if TYPE_CHECKING:

@@ -17,17 +17,17 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from dopepp.geometry.rotation import rotation_angle
-from dopepp.inference.refinement.several_views import PosedPicture
-from dopepp.inference.several_views.association import Sighting, separation, sight
+from dopepp.inference.refinement.joint_refinement import PosedPicture
 from dopepp.inference.several_views.joint import CONSISTENT
+from dopepp.inference.several_views.sightings import PartSighting, separation, sight
 from dopepp.inference.several_views.views_result import WorldDetection
 
 DISAGREEING: Final = 1.2
 """Disagreement of views on a part from which a finding states it. On rendered scenes with cameras
 as calibrated, the largest of 30 was 0.9."""
 
-Views = Sequence[Sequence[Sighting]]  # sightings of each view
-Associate = Callable[[Views], list[list[Sighting]]]
+Views = Sequence[Sequence[PartSighting]]  # sightings of each view
+Associate = Callable[[Views], list[list[PartSighting]]]
 
 
 class _Conflict(NamedTuple):

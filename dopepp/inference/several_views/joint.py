@@ -17,13 +17,13 @@ from jaxtyping import Float
 
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID, Cuboid
+from dopepp.inference.refinement.joint_refinement import PosedPicture
 from dopepp.inference.refinement.refiner import LOOSER, Refiner
 from dopepp.inference.refinement.region.round import OutlineAgreement
-from dopepp.inference.refinement.several_views import PosedPicture
 from dopepp.inference.refinement.solver import Prior, UndecidedError
-from dopepp.inference.several_views.association import (
+from dopepp.inference.several_views.sightings import (
     Group,
-    Sighting,
+    PartSighting,
     fused,
     nearest_equivalent,
     separation,
@@ -57,7 +57,7 @@ USUAL_MOVE: Final = 1.0
 class JointPart:
     """A part in the world, with the sightings that belong to it."""
 
-    sightings: Sequence[Sighting]
+    sightings: Sequence[PartSighting]
     detection: WorldDetection
 
 
@@ -76,7 +76,9 @@ class JointEstimator:
     ) -> None:
         self._refiner, self._views, self._names, self._slope = refiner, views, names, slope
 
-    def estimate(self, sightings: Sequence[Sighting], group: Group, cuboid: Cuboid) -> JointPart:
+    def estimate(
+        self, sightings: Sequence[PartSighting], group: Group, cuboid: Cuboid
+    ) -> JointPart:
         """Return the joint pose of the sightings of one part, with those that agree with it."""
         name, everything = sightings[0].detection.object, set(range(len(self._views)))
         start = fused([sighting.pose for sighting in sightings], group, cuboid)
@@ -125,7 +127,7 @@ class JointEstimator:
         self,
         number: int,
         pose: Prior,
-        sightings: Sequence[Sighting],
+        sightings: Sequence[PartSighting],
         group: Group,
         cuboid: Cuboid,
         agreement: OutlineAgreement | None,
@@ -161,7 +163,7 @@ class JointEstimator:
 
     def _part(
         self,
-        sightings: Sequence[Sighting],
+        sightings: Sequence[PartSighting],
         pose: Prior,
         evidence: Sequence[ViewEvidence],
         disagreement: float = 0.0,
@@ -183,7 +185,7 @@ class JointEstimator:
         return JointPart(sightings, WorldDetection(*given, evidence, disagreement))
 
 
-def _separation(sighting: Sighting, pose: Prior, group: Group, cuboid: Cuboid) -> float:
+def _separation(sighting: PartSighting, pose: Prior, group: Group, cuboid: Cuboid) -> float:
     """Return the Mahalanobis distance of a sighting's own pose from a pose."""
     nearest = nearest_equivalent(sighting.pose.T_cam_obj, pose.T_cam_obj, group, cuboid)
     return separation(pose, Prior(nearest, sighting.pose.information))

@@ -24,6 +24,7 @@ from dopepp.geometry.camera import (
     transform,
 )
 from dopepp.geometry.camera_formats import Size
+from dopepp.inference.refinement.joint_refinement import turned
 from dopepp.inference.refinement.outline import (
     OutlineMesh,
     filled_mask,
@@ -33,7 +34,6 @@ from dopepp.inference.refinement.outline import (
 )
 from dopepp.inference.refinement.region.shared_errors import SCALE_ERROR, region_terms
 from dopepp.inference.refinement.region.shifts import Shifts
-from dopepp.inference.refinement.several_views import turned
 from dopepp.inference.refinement.solver import PoseMatrix
 
 USUAL_PX: Final = 0.7

@@ -19,7 +19,7 @@ from dopepp.geometry.camera import (
     transform,
 )
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
-from dopepp.inference.refinement.several_views import PosedPicture, ViewTerm, turned
+from dopepp.inference.refinement.joint_refinement import PosedPicture, ViewTerm, turned
 from dopepp.inference.refinement.solver import Prior, descend
 
 K = camera_matrix(600.0, 600.0, 319.5, 239.5)

@@ -17,8 +17,8 @@ from jaxtyping import Float
 
 from dopepp.geometry.camera import Transform, moved, transform
 from dopepp.geometry.cuboid import Cuboid
+from dopepp.inference.refinement.joint_refinement import PosedPicture
 from dopepp.inference.refinement.refiner import LOOSER
-from dopepp.inference.refinement.several_views import PosedPicture
 from dopepp.inference.refinement.solver import PoseMatrix, Prior
 from dopepp.recovery.detection import Detection
 
@@ -30,7 +30,7 @@ Group = Float[np.ndarray, "group 4 4"]  # transforms that map the part onto itse
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class PartSighting:
     """A detection of one view, in the world."""
 
     view: int
@@ -39,13 +39,13 @@ class Sighting:
     start: Prior  # pose before refinement, weak enough to admit the refined pose
 
 
-def sight(view: int, detection: Detection, picture: PosedPicture) -> Sighting:
+def sight(view: int, detection: Detection, picture: PosedPicture) -> PartSighting:
     """Express a detection in the world."""
     pose = _in_world(picture, detection.T_cam_obj, detection.covariance)
     assert detection.start is not None
     start = _in_world(picture, *detection.start)
     surprise = max(1.0, start.squared_distance(pose.T_cam_obj) / 6)
-    return Sighting(view, detection, pose, Prior(start.T_cam_obj, start.information / surprise))
+    return PartSighting(view, detection, pose, Prior(start.T_cam_obj, start.information / surprise))
 
 
 def _in_world(picture: PosedPicture, T_cam_obj: Transform, covariance: PoseMatrix) -> Prior:
@@ -69,17 +69,17 @@ def nearest_equivalent(
     return np.asarray(equal[distances.argmin()])
 
 
-def distance(first: Sighting, second: Sighting, group: Group, cuboid: Cuboid) -> float:
+def distance(first: PartSighting, second: PartSighting, group: Group, cuboid: Cuboid) -> float:
     """Return the Mahalanobis distance between two sightings."""
     pose = nearest_equivalent(second.pose.T_cam_obj, first.pose.T_cam_obj, group, cuboid)
     return separation(first.pose, Prior(pose, second.pose.information))
 
 
 def associate(
-    views: Sequence[Sequence[Sighting]],
+    views: Sequence[Sequence[PartSighting]],
     groups: Mapping[str, Group],
     cuboids: Mapping[str, Cuboid],
-) -> list[list[Sighting]]:
+) -> list[list[PartSighting]]:
     """Return the sightings of each possible part, those of the best detection first.
 
     Args:
@@ -90,7 +90,7 @@ def associate(
     free = sorted(
         (sighting for view in views for sighting in view), key=lambda item: -item.detection.score
     )
-    clusters: list[list[Sighting]] = []
+    clusters: list[list[PartSighting]] = []
     while free:
         seed, *free = free
         name, cluster = seed.detection.object, [seed]
