@@ -52,7 +52,7 @@ def test_the_documented_format_works(monkeypatch, tmp_path):
     np.testing.assert_array_equal(sample.instances[0].T_cam_obj, T_cam_obj)
     assert (sample.image == 7).all()
     (tmp_path / "a.json").write_text(json.dumps(record | {"T_cam_obj": [2.0] * 16}))
-    with pytest.raises(UserError, match=r"a\.json: T_cam_obj: no rotation"):
+    with pytest.raises(UserError, match=r"a\.json: T_cam_obj: not a rotation"):
         module.PosedReader(tmp_path, [part])
 
 

@@ -151,7 +151,7 @@ def read_image(path: Path) -> NDArray[Any]:
     if _is_deep_colour(content):
         # Pillow would silently drop the lower half of the bits.
         fix = f"convert it: magick {path.name} -depth 8 picture.png"
-        raise UserError(f"image {path} of 16-bit colours", "8 bits a channel", fix)
+        raise UserError(f"image {path} of 16-bit colours", "8 bits per channel", fix)
     if image.mode.startswith("I"):
         return np.asarray(image, np.uint16)
     if image.mode not in ("L", "RGB", "RGBA"):
@@ -170,7 +170,7 @@ def read_rgb(path: Path) -> Picture:
     image = read_image(path)
     if image.dtype != np.uint8:
         fix = f"convert it: magick {path.name} -depth 8 picture.png"
-        raise UserError(f"image {path} of type {image.dtype}", "8 bits a channel", fix)
+        raise UserError(f"image {path} of type {image.dtype}", "8 bits per channel", fix)
     if image.ndim == 2:
         image = np.repeat(image[..., None], 3, axis=2)
     return np.ascontiguousarray(image[..., :3])

@@ -49,8 +49,8 @@ def refine_pose(
 ) -> None:
     """Minimise the Geman–McClure cost Σ r²/(r² + g²) from a pose, in place.
 
-    A step that does not reduce the cost is undone and damped more (Levenberg–Marquardt). A pose
-    with points behind the camera remains unchanged.
+    Steps are damped, and a step that does not reduce the cost is repeated with more damping
+    (Levenberg–Marquardt). A pose with points behind the camera remains unchanged.
 
     Args:
         object_points: Points, centred and of unit size.

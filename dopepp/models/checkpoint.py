@@ -281,7 +281,7 @@ def find(path: Path) -> Path:
     if path.name not in released:
         names = ", ".join(f"{FOLDER}/{name}" for name in released) or "none"
         raise UserError(
-            f"checkpoint {path}", f"a file, or one of {names}", "write one of these names"
+            f"checkpoint {path}", f"an existing file, or one of {names}", "use one of these names"
         )
     return released[path.name]
 

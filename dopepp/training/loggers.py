@@ -178,7 +178,7 @@ class GuardedLogger(Logger):
 
 
 def _finish_wandb(failed: bool) -> None:
-    """End the open run of Weights & Biases; the next run replaces a dead service."""
+    """End the open run of Weights & Biases; stop the service if the service does not respond."""
     import wandb  # Weights & Biases is slow to import
 
     try:

@@ -96,7 +96,7 @@ def test_entries_by_name_are_of_the_parts_they_name(stl):
     [
         ([HALF_TURN], r"data.symmetries.block: .*symmetries_discrete and symmetries_continuous"),
         ({"half_turns": 1}, r"data.symmetries.block: .*symmetries_discrete and"),
-        ({"symmetries_discrete": [[1] * 16]}, r"block: symmetries_discrete\[0\]: no rotation"),
+        ({"symmetries_discrete": [[1] * 16]}, r"block: symmetries_discrete\[0\]: not a rotation"),
     ],
 )
 def test_entries_that_are_none_are_named(stl, entry, message):

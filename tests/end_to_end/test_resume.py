@@ -73,7 +73,7 @@ def test_an_interrupted_run_ends_as_a_whole_one(call, find_run, tiny, tmp_path, 
     assert not (run / "metrics.json").exists()
     readme = (run / "README.md").read_text()
     assert readme.startswith(f"# dopepp on virtual: interrupted\n\n{saved}; continue with")
-    assert f"python train.py resume={run}  # go on" in readme
+    assert f"python train.py resume={run}  # continue" in readme
 
     call("train.py", f"resume={run}", code=0)
     whole, resumed = (rows(folder) for folder in (find_run(tmp_path / "whole"), run))

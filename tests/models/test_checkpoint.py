@@ -253,7 +253,7 @@ def test_weights_beyond_half_precision_are_refused(checkpoint, tmp_path):
 def test_a_name_stands_for_a_file_of_the_package(released, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "released_paths", lambda: {"bracket": released})
     assert read(Path("pretrained/bracket")).input_size == (128, 96)
-    with pytest.raises(UserError, match="pretrained/other; allowed: a file, or one of pret"):
+    with pytest.raises(UserError, match="pretrained/other; allowed: an existing file, or one of"):
         read(Path("pretrained/other"))
     monkeypatch.chdir(tmp_path)  # a file of the user's own goes first
     (tmp_path / "pretrained").mkdir()

@@ -209,7 +209,7 @@ def _without(config: Mapping[str, Any], *keys: str) -> dict[str, Any]:
 
 
 def _read_result(run: Run) -> None:
-    """Set the result and cost of a run, or its failure; ``job=cost`` leaves only a cost."""
+    """Set the result and cost of a run (only the cost for ``job=cost``), or the failure."""
     names = (FAILURE_FILE, PRUNED_FILE, METRICS_FILE, COST_FILE)
     name = next((name for name in names if (run.folder / name).is_file()), None)
     if name is None:

@@ -213,7 +213,7 @@ class SurfaceTree:
         self._owners = np.concatenate([self._owners, *[np.arange(len(a))] * 4])
 
     def spread(self, num_points: int, seed: int) -> tuple[Points, Int[np.ndarray, " points"]]:
-        """Return points spread evenly along the cumulative area, and their triangles."""
+        """Return random points of nearly uniform density on the surface, and their triangles."""
         rng = np.random.default_rng(seed)
         cumulative = np.cumsum(self.areas)
         positions = (np.arange(num_points) + rng.random()) / num_points * cumulative[-1]

@@ -271,7 +271,7 @@ def expected_error(covariance: Float[np.ndarray, "6 6"], distance: float) -> tup
     """Return the standard deviations of a point's position (metres) and of a rotation (radians).
 
     Args:
-        covariance: The camera's, as in :class:`HandEye`.
+        covariance: Covariance of the camera's pose, as in :class:`HandEye`.
         distance: Distance of the point in front of the camera, metres.
     """
     across = np.array([[0, distance, 0], [-distance, 0, 0], [0, 0, 0]])

@@ -187,14 +187,14 @@ BOP = {
         GT, instead(b'"1": [', b'"1": [], "1": ['), "scene_gt.json: JSON: key '1' twice"
     ),
     "not an image number": Case(f"{GT}:x", [], "scene_gt.json: 'x': not an image number"),
-    "rotation scaled": Case(f"{GT}:0.0.cam_R_m2c", times(1.01), "0[0].cam_R_m2c: no rotation"),
-    "rotation mirrored": Case(f"{GT}:0.0.cam_R_m2c", times(-1), "0[0].cam_R_m2c: no rotation"),
+    "rotation scaled": Case(f"{GT}:0.0.cam_R_m2c", times(1.01), "0[0].cam_R_m2c: not a rotation"),
+    "rotation mirrored": Case(f"{GT}:0.0.cam_R_m2c", times(-1), "0[0].cam_R_m2c: not a rotation"),
     "rotation short": Case(f"{GT}:0.0.cam_R_m2c", [1.0] * 8, "0[0].cam_R_m2c: [1.0"),
     "rotation gone": Case(f"{GT}:0.0.cam_R_m2c", None, "0[0].cam_R_m2c: missing"),
     "rotation of words": Case(f"{GT}:0.0.cam_R_m2c", ["a"] * 9, "0[0].cam_R_m2c: ['a'"),
     "behind": read(f"{GT}:0.1.cam_t_m2c", [0.0, 0, -400], "0[1].cam_t_m2c.z: behind the camera"),
     "metres": read(f"{GT}:2.0.cam_t_m2c", times(0.001), "2[0].cam_t_m2c.unit:"),
-    "moved": read(f"{GT}:0.1.cam_t_m2c", [90.0, 0.0, 340.0], "0[1].box: seen at"),
+    "moved": read(f"{GT}:0.1.cam_t_m2c", [90.0, 0.0, 340.0], "0[1].box: visible at"),
     "too near": read(f"{GT}:0.1.cam_t_m2c", times(0.25), "0[1].box: "),
     "object of words": Case(f"{GT}:0.0.obj_id", "9", "0[0].obj_id: '9'"),
     "huge number": Case(f"{GT}:0.0.cam_t_m2c", [10**400, 0, 0], "0[0].cam_t_m2c:"),
@@ -214,7 +214,7 @@ BOP = {
     "diameter in m": read(f"{MODELS}:1.diameter", times(0.001), "1.unit: 0.0"),
     "diameter and box": read(f"{MODELS}:1.diameter", times(2), "1.diameter: 1"),
     "symmetry": Case(
-        f"{MODELS}:1.symmetries_discrete.0", times(2), "1.symmetries_discrete[0]: no rotation"
+        f"{MODELS}:1.symmetries_discrete.0", times(2), "1.symmetries_discrete[0]: not a rotation"
     ),
     "axis": Case(
         f"{MODELS}:2.symmetries_continuous.0.axis", times(0),
@@ -233,7 +233,7 @@ WEBDATASET = {
     "no image": read("rgb.png", None, f"{FIRST}.rgb.png: member: missing"),
     "no camera": read("camera.json", None, f"{FIRST}.camera.json: member: missing"),
     "depth size": read("depth.png", SMALL, f"{FIRST}.depth.png: size"),
-    "rotation": Case("gt.json:0.cam_R_m2c", times(1.1), "gt.json: [0].cam_R_m2c: no rotation"),
+    "rotation": Case("gt.json:0.cam_R_m2c", times(1.1), "gt.json: [0].cam_R_m2c: not a rotation"),
     "behind": read("gt.json:0.cam_t_m2c", [0, 0, -1], f"{FIRST}.gt.json: [0].cam_t_m2c.z: behind"),
     "moved": read("gt.json:1.cam_t_m2c", [90.0, 0.0, 340.0], "[1].box: "),
     "gt of no list": Case("gt.json", b'{"a": 1}', f"{FIRST}.gt.json: "),
@@ -299,7 +299,7 @@ NDDS = {
         f"{OBJECT}.projected_cuboid_centroid", [0, 0], "objects[0].projected_cuboid_centroid: "
     ),
     "pose transform": read(
-        f"{OBJECT}.pose_transform.0.0", 5.0, "objects[0].pose_transform: no rotation"
+        f"{OBJECT}.pose_transform.0.0", 5.0, "objects[0].pose_transform: not a rotation"
     ),
     "pose transform place": read(
         f"{OBJECT}.pose_transform.3.0", 5.0, "objects[0].pose_transform: translation"
@@ -317,7 +317,7 @@ NDDS = {
     "bounding box order": read(
         f"{OBJECT}.bounding_box", flip_box, "objects[0].bounding_box: column, row; 5 objects"
     ),
-    "mask of another": read("000000.json:objects", other_masks, "objects[0].box: seen at"),
+    "mask of another": read("000000.json:objects", other_masks, "objects[0].box: visible at"),
     "ids twice": read(f"{OBJECT}.segmentation_id", 2, "objects.segmentation_id: 2 twice"),
     "instances twice": read(f"{OBJECT}.instance_id", 2, "objects.instance_id: 2 twice"),
     "principal point": read(f"{RECORD}.intrinsics.cx", 999, "camera_data.intrinsics: K with"),
@@ -621,7 +621,7 @@ YCB_VIDEO = {
     "label size": (file("label.png", np.zeros((9, 9), np.uint8)), "label.png: size: 9×9"),
     "depth size": (file("depth.png", np.zeros((9, 9), np.uint16)), "depth.png: size: 9×9"),
     "label colour": (file("label.png", np.zeros((72, 96, 3), np.uint8)), "label.png: channels: "),
-    "no rotation": (poses(R00=1.1), "meta.mat: poses[0].R: no rotation"),
+    "no rotation": (poses(R00=1.1), "meta.mat: poses[0].R: not a rotation"),
     "NaN": (poses(R00=np.nan), "meta.mat: poses[0]: not finite"),
     "behind": (poses(tz=-0.3), "meta.mat: poses[0].z: behind the camera"),
     "class twice": (meta(classes=(2, 3), cls_indexes=[[2], [2]]), "cls_indexes[1]: class 2 twice"),
@@ -646,7 +646,7 @@ YCB_VIDEO_READ = {
     ),
     "mirrored": (poses(R22=-1), "determinant -1"),
     "millimetres": (poses(tz=300.0), "meta.mat: poses[0].unit: "),
-    "moved": (poses(tx=0.1), "meta.mat: poses[0].box: seen at"),
+    "moved": (poses(tx=0.1), "meta.mat: poses[0].box: visible at"),
     "unknown class": (meta(cls_indexes=[[9]]), "cls_indexes[0]: unknown class 9"),
     "K": (
         meta(intrinsic_matrix=camera_matrix(100.0, 100.0, 999.0, 35.0)),

@@ -39,7 +39,7 @@ def test_nothing_is_written_before_a_run_has_begun(run, monkeypatch):
     assert not path.exists()
     page.begin()
     assert path.read_text().startswith("# dopepp on hybrid: running\n\nSince ")
-    assert f"\ndopepp train resume='{run}'  # go on" in path.read_text()
+    assert f"\ndopepp train resume='{run}'  # continue" in path.read_text()
 
 
 def test_paths_are_typed_as_from_here(run, monkeypatch):

@@ -62,7 +62,7 @@ WRONG: dict[str, tuple[str | bytes, int, int | str]] = {
     "cut.stl": (export_stl_ascii(BOX) + export_stl_ascii(BOX)[:900], 12, "begun and 12 ended"),
     "cut.off": (OFF.rsplit("\n", 2)[0], 10, "13 lines"),
     "pentagon.off": (OFF.replace("4 1 5 7 3", "5 1 5 7 3 1"), -1, 12),
-    "short.off": (OFF.replace("4 0 1 3 2", "4 0 1 3"), 11, "face 0 of 4 corners"),
+    "short.off": (OFF.replace("4 0 1 3 2", "4 0 1 3"), 11, "face 0 with 3 instead of 4 corners"),
 }
 
 

@@ -278,7 +278,7 @@ def split_light(light: Colours, alpha: Depth, unshadowed: Colours) -> tuple[Colo
 
 
 def shadowed(picture: Picture, kept: Colours) -> Picture:
-    """Multiply a picture's linear light by the remaining shares."""
+    """Multiply a picture's linear light by the shares ``kept`` in shadows."""
     steps = np.minimum(SRGB_TO_LINEAR[picture] * kept * CODE_STEPS + 0.5, CODE_STEPS)
     changed = (LINEAR_TO_SRGB[steps.astype(np.int32)] + 0.5).astype(np.uint8)
     return np.where(kept == 1.0, picture, changed)

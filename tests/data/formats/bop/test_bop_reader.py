@@ -218,7 +218,7 @@ def test_inexact_rotations_are_the_nearest_ones_and_said_once(scene, block, capl
     almost = source.sample(1).instances[1].T_cam_obj[:3, :3]
     np.testing.assert_array_equal(almost.ravel(), bent(9e-4)["cam_R_m2c"])  # as it is
     scene.json("scene_gt", {"3": [bent(1.2e-2)]})
-    with pytest.raises(UserError, match=r"cam_R_m2c: no rotation: .*0\.012 \(allowed 1e-02\)"):
+    with pytest.raises(UserError, match=r"cam_R_m2c: not a rotation: .*0\.012 \(allowed 1e-02\)"):
         BopReader(scene.root, [block(2)], "test")
 
 
