@@ -238,13 +238,13 @@ SCENES = {
     "q.3mf|an archive of names|instead of one": archive(
         **{f"../../{n}": b"" for n in range(20_000)}
     ),
-    "a.off|a billion vertices|promises 1000000000": b"OFF\n1000000000 1 0\n0 0 0\n",
-    "b.off|a negative count|promises -1": TRIANGLE_OFF.replace(b"3 1 0", b"-1 5 0"),
+    "a.off|a billion vertices|states 1000000000": b"OFF\n1000000000 1 0\n0 0 0\n",
+    "b.off|a negative count|states -1": TRIANGLE_OFF.replace(b"3 1 0", b"-1 5 0"),
     "c.off|vertices beyond any number|digits": b"OFF\n" + b"9" * 5000 + b" 1 0\n",
     "d.off|a face of four billion corners|4294967295 corners": TRIANGLE_OFF.replace(
         b"3 0 1 2", b"4294967295 0 1 2"
     ),
-    "e.off|a face of a googol of corners|corners, 2": TRIANGLE_OFF.replace(
+    "e.off|a face of a googol of corners|with 2 instead": TRIANGLE_OFF.replace(
         b"3 0 1 2", b"9" * 100 + b" 0 1"
     ),
     "f.off|a number of a million digits|finite": TRIANGLE_OFF.replace(b"9", b"9" * 1_000_000, 1),

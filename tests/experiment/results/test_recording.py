@@ -115,7 +115,7 @@ def test_poses_beside_the_test_set_are_left_out(root, composed, tmp_path, caplog
     (report,) = run_evaluation(composed(*arguments, config="evaluate"), tmp_path / "run")
     assert list(report.rows) == ["pivconnector", "mean"]
     others = sum(pose.obj_id == 1 for pose in poses)
-    assert f"ignoring 1 poses on images outside the test set and {others} of" in caplog.text
+    assert f"ignoring 1 poses on images outside the test set and {others} poses" in caplog.text
 
 
 def test_a_file_that_does_not_fit_the_data(root, composed, tmp_path):
