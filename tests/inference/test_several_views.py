@@ -195,6 +195,21 @@ def test_views_may_have_different_sizes_and_lenses(estimator, scene, views, true
     assert max(along, across) < 0.6
 
 
+def test_depth_images_are_used(estimator, scene, views, true):
+    images, poses = views
+    depths = [render(scene.seen_from(invert_transform(T))).depth for T in poses[:2]]
+    both = estimator.refining(("region", "depth"))
+    given = images[:2], [scene.K] * 2, poses[:2]
+    (without,) = both.predict_views(*given).detections
+    (detection,) = both.predict_views(*given, depths=depths).detections
+    turn, along, across = errors(detection.T_world_obj, true)
+    assert max(along, across) < 0.3
+    assert turn < 0.4
+    volumes = [np.linalg.slogdet(item.covariance)[1] for item in (detection, without)]
+    assert volumes[0] < volumes[1]
+    assert detection.views == ["view 0", "view 1"]
+
+
 def test_wrong_arguments_are_refused(estimator, scene, views):
     images, poses = views
     with pytest.raises(UserError, match="1 T_world_cam for 2 images"):
