@@ -174,8 +174,10 @@ class TemplateEstimator(PoseEstimator):
     def _recalibrated(self, refined: Sequence[Detection], by_depth: bool) -> list[Detection]:
         """Return the best refined detection of each instance, best first."""
         slope, scored = self.recovery.refined_verification, []
+        detectors = {detector.part.name: detector for detector in self.detectors}
         for detection in refined:
-            bias = -slope * self.levels.get(detection.object, 0.0)
+            plainness = _plainness(detectors[detection.object], detection)
+            bias = -slope * (plainness + self.levels.get(detection.object, 0.0))
             options = replace(self.recovery, refined_bias=bias)
             scored += recalibrated([detection], options, by_depth)
         return merge_scales([[detection] for detection in scored])
@@ -220,6 +222,14 @@ class TemplateEstimator(PoseEstimator):
         raise _networks_only("belief maps")
 
 
+def _plainness(detector: TemplateDetector, detection: Detection) -> float:
+    """Return the log odds that a pose needs in addition, because its silhouette is small.
+
+    A plate seen edge-on resembles every stick, and fits it well.
+    """
+    return -math.log(detector.silhouette(detection.T_cam_obj))
+
+
 def _loudest(
     detector: TemplateDetector,
     distances: tuple[float, float],
@@ -234,7 +244,8 @@ def _loudest(
     levels = []
     for image in images:
         ends = estimator.refined(detector.detect(image, K, depths), image, K)
-        levels.append(max((float(refined_features(end)[2]) for end in ends), default=0.0))
+        odds = [float(refined_features(end)[2]) - _plainness(detector, end) for end in ends]
+        levels.append(max(odds, default=0.0))
     return levels
 
 

@@ -25,6 +25,7 @@ from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import (
     CameraMatrix,
     Transform,
+    camera_matrix,
     crop_camera,
     focal_length,
     project_keypoints,
@@ -32,7 +33,7 @@ from dopepp.geometry.camera import (
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.picture import MAX_PIXELS, Region
-from dopepp.inference.refinement.outline import make_outline_mesh
+from dopepp.inference.refinement.outline import filled_mask, make_outline_mesh, posed
 from dopepp.inference.templates.matching import STRIDE, Matches, match
 from dopepp.inference.templates.ranking import (
     learned_ranking,
@@ -63,6 +64,8 @@ SAME_PLACE: Final = 0.1  # diameters
 SAME_DEPTH: Final = 0.05  # relative
 SAME_TURN: Final = math.radians(10.0)
 
+SILHOUETTE_PX: Final = 64  # diameter of the part where its area is measured
+
 # Standard deviations of a start pose.
 TURN_ERROR: Final = math.radians(6.0)
 PLACE_ERROR: Final = 0.02  # diameters
@@ -90,7 +93,7 @@ class TemplateDetector:
                 f"templates of {part.name}, which has no mesh", "a part with a mesh", fix
             )
         self.part, self._distances = part, working_distance
-        mesh = make_outline_mesh(part.mesh.vertices, part.mesh.faces)
+        self._mesh = mesh = make_outline_mesh(part.mesh.vertices, part.mesh.faces)
         self._centre = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
         group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous, max_step=0.1)
         rotations = view_rotations(tilt_deg, group[:, :3, :3])
@@ -156,6 +159,16 @@ class TemplateDetector:
             covariance=np.diag(np.square(deviations)),
         )
 
+    def silhouette(self, T_cam_obj: Transform) -> float:
+        """Return the area of the part's silhouette at a pose, squared diameters."""
+        x, y, z = T_cam_obj[:3, :3] @ self._centre + T_cam_obj[:3, 3]
+        focal = SILHOUETTE_PX * z / self.part.diameter
+        u, v = SILHOUETTE_PX - focal * np.array([x, y]) / z
+        at = posed(self._mesh, T_cam_obj, camera_matrix(focal, focal, u, v))
+        size = 2 * SILHOUETTE_PX, 2 * SILHOUETTE_PX
+        area = 0 if at is None else int(filled_mask(self._mesh, at, size).sum())
+        return max(area, 1) / SILHOUETTE_PX**2
+
     def ranked(
         self, image: Picture, K: CameraMatrix, distances: tuple[float, float]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -195,11 +208,12 @@ class TemplateDetector:
             members, before = move_nearby(members, self._templates, responses, small, reach)
             best = np.argsort(-before @ weights)[:NUM_TURNED]
             members = Matches(*(column[best] for column in members))
-            members, after = turn_views(members, self._templates, responses, small)
-            members.poses[:, [0, 1, 3]] /= scale
-            ranked.append(members)
+            turned, after = turn_views(members, self._templates, responses, small)
+            for group in (members, turned):
+                group.poses[:, [0, 1, 3]] /= scale
+            ranked += [members, turned]
             # Turning raises the responses of wrong matches, too.
-            features.append((before[best] + after) / 2)
+            features += [before[best], (before[best] + after) / 2]
         views = np.concatenate([members.views for members in ranked])
         poses = np.concatenate([members.poses for members in ranked])
         return views, poses, np.concatenate(features)

@@ -32,7 +32,7 @@ SIZE: Final = (480, 360)  # of a photo, pixels
 PART_PX: Final = 120.0  # diameter of the part at the middle of its distances
 MARGIN: Final = 1.5  # standard deviations of the photos' levels above their mean
 LOWEST: Final = 0.0  # log odds
-VERSION: Final = 4  # changes when the search or the verification does
+VERSION: Final = 5  # changes when the search or the verification does
 
 Loudest = Callable[[Iterable[Picture], CameraMatrix], list[float]]
 """Returns the largest log odds of the verified poses on each picture."""
