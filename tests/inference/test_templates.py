@@ -1,5 +1,7 @@
 """Templates: closed forms of views, responses and matches; detection on rendered pictures."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -273,3 +275,32 @@ def test_impossible_requests_are_refused(detector):
     image, K = np.zeros((480, 640, 3), np.uint8), camera_matrix(600, 600, 319.5, 239.5)
     with pytest.raises(UserError, match=rf"\d pixels long .* at least {SMALLEST_PX:.0f} pixels"):
         detector.detect(image, K, distances=(10.0, 20.0))
+
+
+def test_the_silhouette_of_a_ball_has_the_area_of_its_disc():
+    ball = trimesh.creation.icosphere(3, 0.03)
+    part = make_part("ball", Mesh(np.asarray(ball.vertices), ball.faces.astype(np.int32)))
+    T = np.eye(4)
+    T[2, 3] = 0.1
+    disc = np.pi / 4 / (1 - 0.3**2)  # the sine of half the angle that it covers is 0.3
+    assert TemplateDetector(part, DISTANCES).silhouette(T) == pytest.approx(disc, rel=0.02)
+
+
+def test_a_thin_silhouette_needs_more_evidence(detector, rendered):
+    estimator = TemplateEstimator([detector], DISTANCES)
+    image, K, T = rendered
+    edge_on = T.copy()
+    edge_on[:3, :3] = np.eye(3)[[0, 2, 1]] * [1, 1, -1]
+    seen, thin = (
+        replace(detector.start(pose, 0.5, K), probability=0.9, agreement=0.9, support=0.9)
+        for pose in (T, edge_on)
+    )
+    scores = [
+        float(np.log(it.score / (1 - it.score)))
+        for end in (seen, thin)
+        for it in estimator._recalibrated([end], False)
+    ]
+    ratio = detector.silhouette(T) / detector.silhouette(edge_on)
+    assert ratio > 2
+    slope = estimator.recovery.refined_verification
+    assert scores[0] - scores[1] == pytest.approx(slope * np.log(ratio))

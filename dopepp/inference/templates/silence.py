@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 NUM_PHOTOS: Final = 8
 SIZE: Final = (480, 360)  # of a photo, pixels
 PART_PX: Final = 120.0  # diameter of the part at the middle of its distances
-MARGIN: Final = 1.5  # standard deviations of the photos' levels above their mean
+MARGIN: Final = 2.0  # standard deviations of the photos' levels above their mean
 LOWEST: Final = 0.0  # log odds
 VERSION: Final = 5  # changes when the search or the verification does
 
