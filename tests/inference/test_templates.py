@@ -288,7 +288,7 @@ def test_the_silhouette_of_a_ball_has_the_area_of_its_disc():
 
 def test_a_thin_silhouette_needs_more_evidence(detector, rendered):
     estimator = TemplateEstimator([detector], DISTANCES)
-    image, K, T = rendered
+    _, K, T = rendered
     edge_on = T.copy()
     edge_on[:3, :3] = np.eye(3)[[0, 2, 1]] * [1, 1, -1]
     seen, thin = (
