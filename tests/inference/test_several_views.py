@@ -125,7 +125,7 @@ def test_views_that_disagree_are_named(estimator, scene, views):
     """An error along the baseline changes the distance only, and a consistent pose remains."""
     _, poses = views
     wrong = poses[1].copy()
-    wrong[0, 3] += 0.008
+    wrong[0, 3] += 0.004
     result = predicted(estimator, scene, views, poses=[poses[0], wrong])
     (finding,) = result.findings
     assert "view 0 and view 1 disagree on pivconnector" in finding
