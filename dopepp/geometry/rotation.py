@@ -115,6 +115,16 @@ def nearest_rotation(matrices: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndar
     return np.asarray((left * scales[..., None, :]) @ right)
 
 
+def is_rigid(T: Float[np.ndarray, "4 4"]) -> bool:
+    """Return whether a matrix is 4×4 and finite: a rotation, a shift and the row 0, 0, 0, 1."""
+    return (
+        T.shape == (4, 4)
+        and bool(np.isfinite(T).all())
+        and is_rotation(T[:3, :3])
+        and T[3].tolist() == [0, 0, 0, 1]
+    )
+
+
 def is_rotation(rotation: RotationMatrix, tolerance: float = 1e-3) -> bool:
     """Return whether a matrix is 3×3, finite, orthogonal within a tolerance and right-handed."""
     rotation = np.asarray(rotation, np.float64)

@@ -39,8 +39,8 @@ from dopepp.parts.symmetry_finder import find_symmetries
 from dopepp.recovery.detection import (
     Detection,
     RecoveryOptions,
+    log_odds,
     recalibrated,
-    refined_features,
 )
 from dopepp.recovery.recover import Reason
 
@@ -244,7 +244,7 @@ def _loudest(
     levels = []
     for image in images:
         ends = estimator.refined(detector.detect(image, K, depths), image, K)
-        odds = [float(refined_features(end)[2]) - _plainness(detector, end) for end in ends]
+        odds = [log_odds(end.probability or 0.0) - _plainness(detector, end) for end in ends]
         levels.append(max(odds, default=0.0))
     return levels
 

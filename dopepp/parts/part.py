@@ -20,7 +20,7 @@ from dopepp.core.errors import UserError
 from dopepp.core.validation import STRICT, parse
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.cuboid import cuboid_keypoints
-from dopepp.geometry.rotation import is_rotation
+from dopepp.geometry.rotation import is_rigid
 from dopepp.geometry.symmetry import ContinuousSymmetry
 from dopepp.parts.mesh import (
     Colours,
@@ -230,7 +230,7 @@ def _checked_transforms(
         return None
     transforms = np.array(matrices, np.float64).reshape(-1, 4, 4)
     for matrix in transforms:
-        if not is_rotation(matrix[:3, :3]) or (matrix[3] != [0, 0, 0, 1]).any():
+        if not is_rigid(matrix):
             problem = "part.symmetries_discrete with a matrix that is not a rigid transform"
             raise UserError(problem, "[R t; 0 0 0 1] with a rotation R", _FIX)
     return transforms

@@ -7,6 +7,7 @@ from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
 from dopepp.geometry.rotation import (
+    is_rigid,
     is_rotation,
     matrix_to_quaternion,
     matrix_to_rotation_vector,
@@ -136,3 +137,22 @@ def test_the_nearest_rotation_is_the_polar_factor(seed):
     beside = Rotation.from_rotvec(rng.normal(scale=0.05, size=(50, 3))).as_matrix() @ nearest
     distances = np.linalg.norm(beside - mirrored, axis=(1, 2))
     assert (distances >= np.linalg.norm(nearest - mirrored)).all()
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "value", "expected"),
+    [
+        (0, 3, 0.5, True),
+        (0, 3, np.nan, False),
+        (0, 0, 1.1, False),
+        (2, 2, -1.0, False),
+        (3, 0, 0.1, False),
+    ],
+)
+def test_a_rigid_transform_is_a_rotation_a_finite_shift_and_a_last_row(
+    row, column, value, expected
+):
+    T = np.eye(4)
+    T[row, column] = value
+    assert is_rigid(T) is expected
+    assert not is_rigid(T[:3])

@@ -390,9 +390,11 @@ def matched_poses(
     for _, _, part, detections, instances in _by_object(estimator, parts, source):
         group = symmetry_transforms(part).numpy()
         numbers = assign(part, detections, instances)
-        right, _ = _judge(part, detections, instances)
-        for detection, number, is_right in zip(detections, numbers, right, strict=True):
-            if number >= 0 and counted(instances[number]) and (is_right or not only_right):
+        chosen = np.ones(len(detections), bool)
+        if only_right:
+            chosen, _ = _judge(part, detections, instances)
+        for detection, number, is_chosen in zip(detections, numbers, chosen, strict=True):
+            if number >= 0 and counted(instances[number]) and is_chosen:
                 matches.append((detection, instances[number].T_cam_obj @ group))
     return matches
 

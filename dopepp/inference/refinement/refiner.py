@@ -111,13 +111,11 @@ class Refiner:
         refiner, cuboid = self._refiners[detection.object], self._cuboids[detection.object]
         T_cam_obj, covariance = detection.T_cam_obj, detection.covariance
         is_tracked = detection.agreement is not None  # set by refinement only
-        starts, prior = None, covariance
+        prior, starts = covariance, None
         if not is_tracked and np.isfinite(detection.peaks).any():  # of a network, not a template
             # A tracker knows how far a part may have moved; a network's covariance may be wrong.
-            starts, prior = (
-                partial(poses_of_four, cuboid, detection.peaks, K),
-                LOOSER**2 * covariance,
-            )
+            starts = partial(poses_of_four, cuboid, detection.peaks, K)
+            prior = LOOSER**2 * covariance
         refined = refiner.refine(image, K, T_cam_obj, prior, depth, is_tracked, starts)
         detection = replace(detection, start=(T_cam_obj, prior))
         if refined.covariance is None:

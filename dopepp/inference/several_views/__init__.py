@@ -22,7 +22,7 @@ from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix, Transform, invert_transform
 from dopepp.geometry.camera_file import Camera
-from dopepp.geometry.rotation import is_rotation
+from dopepp.geometry.rotation import is_rigid
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.picture import Depth, Distances, are_same, prepare_image
 from dopepp.inference.pose_result import PoseResult, Shape, spent_between
@@ -132,7 +132,7 @@ def _posed(
         distortion, camera = camera.coefficients, camera.K
     image, K, depth = prepare_image(image, camera, distortion, depth)
     T = np.asarray(T_world_cam, np.float64)
-    if T.shape != (4, 4) or not is_rotation(T[:3, :3]) or T[3].tolist() != [0, 0, 0, 1]:
+    if not is_rigid(T):
         problem = f"T_world_cam of {name}: {T.tolist()!s:.200}"
         raise UserError(problem, "a rigid 4×4 transform", "pass the camera's pose in the world")
     return PosedPicture(image, K, invert_transform(T), error, depth)

@@ -88,8 +88,8 @@ class JointEstimator:
         while len(chosen) > 1 and chosen not in tried:
             tried.append(chosen)
             numbers = sorted(chosen)
-            known = [item.start for item in sightings if item.view in chosen]
-            prior = fused(known or [sightings[0].start], group, cuboid)
+            starts = [item.start for item in sightings if item.view in chosen]
+            prior = fused(starts or [sightings[0].start], group, cuboid)
             try:
                 views = [self._views[number] for number in numbers]
                 joint = self._refiner.refine_views(name, views, limit, prior)
@@ -103,14 +103,14 @@ class JointEstimator:
             ]
             supporting = {n for n in everything if evidence[n].status == "supports"}
             if supporting >= chosen:
-                own = [sighting for sighting in sightings if sighting.view in chosen] or sightings
+                agreeing = [item for item in sightings if item.view in chosen] or sightings
                 disagreement = max(joint.disagreements)
-                if len(own) > 1:
-                    apart = [_separation(sighting, pose, group, cuboid) for sighting in own]
+                if len(agreeing) > 1:
+                    apart = [_separation(item, pose, group, cuboid) for item in agreeing]
                     disagreement = max(disagreement, min(apart) / math.sqrt(6))
                 # Views that disagree more than they should have larger errors than stated.
                 looser = Prior(pose.T_cam_obj, pose.information / max(1.0, disagreement) ** 2)
-                return self._part(own, looser, evidence, disagreement)
+                return self._part(agreeing, looser, evidence, disagreement)
             several = len(supporting & chosen) > 1
             chosen = supporting & chosen if several else members
         best = max(sightings, key=lambda sighting: sighting.detection.score)
@@ -134,14 +134,14 @@ class JointEstimator:
     ) -> ViewEvidence:
         """Return what a view shows at a pose in the world."""
         view = self._views[number]
-        own = next((sighting for sighting in sightings if sighting.view == number), None)
+        sighting = next((item for item in sightings if item.view == number), None)
         at = view.to_camera(pose.T_cam_obj, np.linalg.inv(pose.information))
-        found = sightings[0].detection if own is None else own.detection
+        original = sightings[0].detection if sighting is None else sighting.detection
         detection = replace(
-            found,
+            original,
             T_cam_obj=at.T_cam_obj,
             keypoints=project_keypoints(cuboid, at.T_cam_obj, view.K),
-            peaks=np.full_like(found.peaks, np.nan) if own is None else found.peaks,
+            peaks=np.full_like(original.peaks, np.nan) if sighting is None else original.peaks,
             covariance=np.linalg.inv(at.information),
             agreement=None if agreement is None else agreement.share,
             support=None if agreement is None else agreement.support,
@@ -149,13 +149,13 @@ class JointEstimator:
         detection = self._refiner.verified(detection, view.image, view.K, USUAL_MOVE)
         probability, share = detection.probability or 0.0, detection.agreement or 0.0
         least, least_share = SUPPORTING, AGREEING
-        if own is not None:
+        if sighting is not None:
             factor, decrease = WEAKER
-            least = min(least, factor * (found.probability or 0.0))
-            least_share = min(least_share, (found.agreement or 0.0) - decrease)
+            least = min(least, factor * (original.probability or 0.0))
+            least_share = min(least_share, (original.agreement or 0.0) - decrease)
         is_shown = agreement is not None and probability >= least and share >= least_share
-        if own is not None and found.kept:
-            is_shown = _separation(own, pose, group, cuboid) <= CONSISTENT
+        if sighting is not None and original.kept:
+            is_shown = _separation(sighting, pose, group, cuboid) <= CONSISTENT
         status: Status = "supports" if is_shown else "hidden"
         if not _is_inside(detection.keypoints[CENTROID], view):
             status = "outside"

@@ -27,7 +27,7 @@ from dopepp.core.validation import Range, check, shown
 from dopepp.core.yaml import read_yaml
 from dopepp.geometry.camera import Transform, invert_transform, make_transform
 from dopepp.geometry.camera_file import Camera, camera_of_fields, camera_of_text, read_camera
-from dopepp.geometry.rotation import is_rotation, nearest_rotation, quaternion_to_matrix
+from dopepp.geometry.rotation import is_rigid, nearest_rotation, quaternion_to_matrix
 
 FORMATS: Final = (
     "YAML with `views: {a.png: {T_world_cam: …}}`, BOP's scene_camera.json, or COLMAP's images.txt"
@@ -142,7 +142,7 @@ def transform_of(value: object, where: str) -> Transform:
             T = make_transform(R, np.array(position, np.float64).reshape(3))
     except (KeyError, IndexError, TypeError, ValueError):
         raise UserError(problem, _FORMS, _POSE_FIX) from None
-    if not np.isfinite(T).all() or not is_rotation(T[:3, :3]) or T[3].tolist() != [0, 0, 0, 1]:
+    if not is_rigid(T):
         raise UserError(problem, "a rigid transform", _POSE_FIX)
     return make_transform(nearest_rotation(T[:3, :3]), T[:3, 3])
 

@@ -194,12 +194,11 @@ class TemplateDetector:
         groups = [self._matches(image, size, size / focal_length(K)) for size in sizes]
         matches = Matches(*(np.concatenate(columns) for columns in zip(*groups, strict=True)))
         promise = matches.scores + EXTENT * self._templates.extents[matches.views]
-        best = np.argsort(-promise)[:NUM_RANKED]
-        matches = Matches(*(column[best] for column in matches))
+        matches = matches.at(np.argsort(-promise)[:NUM_RANKED])
         octaves = np.floor(np.log(sizes[0] / matches.poses[:, 3]) / math.log(OCTAVE) + 1e-9)
         ranked, features, weights = [], [], learned_ranking().weights
         for octave in np.unique(octaves):
-            members = Matches(*(column[octaves == octave] for column in matches))
+            members = matches.at(octaves == octave)
             scale = min(1.0, FINE_PX / members.poses[:, 3].max())
             small = _resized(image, scale)
             responses = edge_responses(small, FINE_SPREAD, _odd(FINE_PX))
@@ -207,7 +206,7 @@ class TemplateDetector:
             members.poses[:, [0, 1, 3]] *= scale
             members, before = move_nearby(members, self._templates, responses, small, reach)
             best = np.argsort(-before @ weights)[:NUM_TURNED]
-            members = Matches(*(column[best] for column in members))
+            members = members.at(best)
             turned, after = turn_views(members, self._templates, responses, small)
             for group in (members, turned):
                 group.poses[:, [0, 1, 3]] /= scale

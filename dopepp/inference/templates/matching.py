@@ -12,7 +12,7 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.inference.templates.responses import Responses
@@ -36,6 +36,10 @@ class Matches(NamedTuple):
     scores: Float[np.ndarray, "matches"]  # standard deviations above the template's mean
     means: Float[np.ndarray, "matches"]  # mean response of the template over the image
     deviations: Float[np.ndarray, "matches"]  # its standard deviation
+
+    def at(self, rows: Int[np.ndarray, "rows"] | Bool[np.ndarray, "matches"]) -> Matches:
+        """Return the matches of these indices or of this mask."""
+        return Matches(*(column[rows] for column in self))
 
 
 def match(responses: Responses, templates: Templates, diameter_px: float) -> Matches:
