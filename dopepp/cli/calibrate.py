@@ -1,4 +1,4 @@
-"""``dopepp calibrate``: calibrate a camera, a tool, a bench, and the camera's pose on the robot."""
+"""``dopepp calibrate``: calibrate cameras, a tool, a bench, and the camera's pose on the robot."""
 
 from __future__ import annotations
 
@@ -17,11 +17,13 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from dopepp.drawing.pictures import Picture, Size
+    from dopepp.geometry.camera import Transform
     from dopepp.robot.calibration.board import Board, BoardPose, Sighting
     from dopepp.robot.calibration.hand_eye import HandEye
     from dopepp.robot.calibration.lens import LensCalibration
     from dopepp.robot.calibration.quality import CalibrationQuality
     from dopepp.robot.calibration.records import PoseFormat
+    from dopepp.robot.calibration.rig import Rig
     from dopepp.robot.calibration.tool import Bench
 
 BOARD: Final = "charuco:8x11:20:15, chess:7x10:25 or circles:4x11:40 (columns × rows, mm)."
@@ -39,7 +41,7 @@ Quaternion = Annotated[str, Option(help="Order of a quaternion: wxyz or xyzw.")]
 Direction = Annotated[str, Option(help="flange-to-base (usual) or base-to-flange.")]
 
 app = typer.Typer(
-    no_args_is_help=True, help="Calibrate a camera, a tool, a bench, or the camera on the robot."
+    no_args_is_help=True, help="Calibrate cameras, a tool, a bench, or the camera on the robot."
 )
 
 
@@ -207,6 +209,49 @@ def handeye(
         _show_hand_eye(boards, calibration, quality)
         record = _hand_eye_record(calibration, quality)
         write_calibration(out, "hand-eye", record, quality.findings, force)
+    typer.echo(f"written: {out}")
+
+
+@app.command()
+def rig(
+    folder: Annotated[
+        Path,
+        Argument(
+            help="For each camera NAME, a folder NAME with pictures of the board and a camera file "
+            "NAME.yaml. Pictures of one name show the same moment."
+        ),
+    ],
+    board: BoardSpec,
+    out: Out,
+    hand_eye: Annotated[
+        Path | None,
+        Option(help="Of the first camera, by handeye --mount bench (default: its own frame)."),
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Calibrate the poses of two to eight fixed cameras, and write the file for predict --views."""
+    import numpy as np
+
+    from dopepp.core.files import check_target
+    from dopepp.geometry.camera_file import read_camera
+    from dopepp.robot.calibration.board import parse_board
+    from dopepp.robot.calibration.records import read_transform, write_calibration
+    from dopepp.robot.calibration.rig import calibrate_rig
+
+    with report_errors():
+        check_target(out, (".yaml", ".yml"))
+        target = parse_board(board)
+        T_base_first = np.eye(4) if hand_eye is None else read_transform(hand_eye, "T_base_cam")
+        boards, cameras = {}, {}
+        for pictures in sorted(path for path in folder.glob("*") if path.is_dir()):
+            sightings, size = _folder_sightings(pictures, target)
+            boards[pictures.name] = {sighting.name: sighting for sighting in sightings}
+            lens = read_camera(pictures.with_name(f"{pictures.name}.yaml"))
+            cameras[pictures.name] = lens.for_picture(size)
+        calibration = calibrate_rig(boards, cameras)
+        _show_rig(calibration)
+        record = _rig_record(calibration, T_base_first, folder, out)
+        write_calibration(out, "rig", record, calibration.findings, force)
     typer.echo(f"written: {out}")
 
 
@@ -395,6 +440,43 @@ def _show_hand_eye(
         f"expected error at the board's distance: {1000 * quality.shift:.2f} mm, "
         f"{degrees(quality.turn):.3f}°"
     )
+
+
+def _show_rig(calibration: Rig) -> None:
+    from math import degrees, hypot
+
+    for moment in calibration.outliers:
+        typer.echo(f"{moment}: rejected, because it contradicts the other pictures")
+    for number, name in enumerate(calibration.names):
+        seen = f"{name}: {calibration.shared[number]} pictures with another camera, "
+        seen += f"{calibration.errors_px[number]:.3f} px"
+        if number:
+            away = 1000 * hypot(*calibration.T_world_cam[number][:3, 3])
+            shift, turn = calibration.deviations[number]
+            seen += f", {away:.1f} mm from {calibration.names[0]}, standard deviations "
+            seen += f"{1000 * shift:.2f} mm and {degrees(turn):.3f}°"
+        typer.echo(seen)
+
+
+def _rig_record(
+    calibration: Rig, T_base_first: Transform, folder: Path, out: Path
+) -> dict[str, object]:
+    from math import degrees
+    from os.path import relpath
+
+    from dopepp.robot.calibration.records import transform_record
+
+    shift, turn = calibration.deviations.max(axis=0)
+    views = {
+        name: {
+            "camera": relpath(folder / f"{name}.yaml", out.parent),
+            "T_world_cam": transform_record(T_base_first @ calibration.T_world_cam[number]),
+            "covariance": calibration.covariances[number].tolist(),
+            "error_px": float(calibration.errors_px[number]),
+        }
+        for number, name in enumerate(calibration.names)
+    }
+    return {"camera_error": [float(shift), degrees(turn)], "views": views}
 
 
 def _hand_eye_record(calibration: HandEye, quality: CalibrationQuality) -> dict[str, object]:

@@ -1,6 +1,8 @@
 """The commands as they are typed, on drawn pictures."""
 
 import csv
+import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from dopepp.core.files import write_png
 from dopepp.geometry.camera import camera_matrix, invert_transform, make_transform
 from dopepp.geometry.camera_file import Camera, read_camera
+from dopepp.inference.several_views.view_files import read_camera_poses
 from dopepp.robot.calibration.board import draw_view, parse_board
 from dopepp.robot.calibration.lens import write_camera
 from dopepp.robot.calibration.records import read_transform, transform_record, write_calibration
@@ -183,3 +186,58 @@ def test_pictures_without_the_board_are_told(run, cell, tmp_path):
         code=2,
     )
     assert "no board in any of 10 pictures" in done.output
+
+
+@pytest.fixture(scope="module")
+def rig_folder(tmp_path_factory):
+    """Pictures of two cameras at five moments, their camera files, and the second's true pose."""
+    folder, rng = tmp_path_factory.mktemp("rig"), np.random.default_rng(1)
+    camera = Camera((640, 480), camera_matrix(560, 560, 322, 236), (0.05, -0.1, 0, 0, 0), "true")
+    board, names = parse_board(BOARD), ("left", "right")
+    turn = Rotation.from_euler("y", -0.5).as_matrix()
+    T_left_right = make_transform(turn, [0.16, 0.0, 0.04])
+    for name in names:
+        (folder / name).mkdir()
+        write_camera(folder / f"{name}.yaml", camera)
+    for moment in range(5):
+        tilt = Rotation.from_euler("xyz", rng.uniform(-0.3, 0.3, 3)).as_matrix()
+        near = np.append(rng.uniform(-0.02, 0.02, 2), rng.uniform(0.3, 0.34))
+        T_left_board = make_transform(tilt, near - tilt @ board.points.mean(axis=0))
+        T_right_board = invert_transform(T_left_right) @ T_left_board
+        for name, T in zip(names, (T_left_board, T_right_board), strict=True):
+            write_png(folder / name / f"{moment}.png", draw_view(board, T, camera, rng))
+    return folder, T_left_right
+
+
+def test_a_rig_is_calibrated_for_several_views(run, rig_folder, tmp_path):
+    folder, T_left_right = rig_folder
+    T_base_left = make_transform(Rotation.random(rng=0).as_matrix(), [0.5, 0.1, 0.7])
+    hand_eye = {"T_base_cam": transform_record(T_base_left)}
+    write_calibration(tmp_path / "hand_eye.yaml", "hand-eye", hand_eye, (), False)
+    words = ("--board", BOARD, "--out", tmp_path / "rig.yaml")
+    done = run("calibrate", "rig", folder, *words, "--hand-eye", tmp_path / "hand_eye.yaml")
+    assert "right: 5 pictures with another camera" in done.output
+    poses = read_camera_poses(tmp_path / "rig.yaml")
+    left, right = (poses.of(Path(f"{name}.png")) for name in ("left", "right"))
+    np.testing.assert_allclose(left.T_world_cam, T_base_left, atol=1e-9)
+    T = invert_transform(left.T_world_cam) @ right.T_world_cam
+    assert np.linalg.norm(T[:3, 3] - T_left_right[:3, 3]) < 0.001
+    assert right.camera.size == (640, 480)
+    assert 1e-6 < poses.error[0] < 1e-3
+
+
+def test_a_faulty_rig_is_refused_with_the_name_of_its_camera(run, refused, rig_folder, tmp_path):
+    folder, _ = rig_folder
+    shutil.copytree(folder, tmp_path / "rig")
+    words = ("calibrate", "rig", tmp_path / "rig", "--board", BOARD, "--out", tmp_path / "rig.yaml")
+    for path in sorted((tmp_path / "rig" / "right").iterdir())[2:]:
+        path.unlink()
+    assert "right sees the board with another camera 2 times" in refused(*words)
+    assert not (tmp_path / "rig.yaml").exists()
+    for path in (tmp_path / "rig" / "right").iterdir():
+        path.rename(path.with_stem(f"other_{path.stem}"))
+    assert "right without a picture of the board together with left" in refused(*words)
+    (tmp_path / "rig" / "right.yaml").unlink()
+    assert "right.yaml" in refused(*words)
+    shutil.rmtree(tmp_path / "rig" / "right")
+    assert "a rig of 1 cameras" in refused(*words)

@@ -1,0 +1,256 @@
+"""Calibration of a rig: the poses of several fixed cameras that look at one moving board.
+
+Pictures of one name show the board at the same moment. The poses of cameras and boards are refined
+together on all points (bundle adjustment). The world is the frame of the first camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import least_squares
+from scipy.sparse import lil_matrix
+
+from dopepp.core.errors import UserError
+from dopepp.geometry.camera import Transform, invert_transform, transform
+from dopepp.geometry.camera_file import Camera
+from dopepp.robot.calibration.board import (
+    PIXEL_NOISE,
+    BoardPose,
+    Sighting,
+    Transforms,
+    board_pose,
+    displaced,
+)
+from dopepp.robot.calibration.lens import LEAST_OUTLIER_PX, MAX_ERROR_PX, OUTLIER
+
+MIN_CAMERAS, MAX_CAMERAS = 2, 8
+MIN_SHARED: Final = 5  # moments at which a camera of a reliable rig sees the board with another
+SOFT_PX: Final = 1.0  # error from which a point loses weight, pixels
+START_PX: Final = 5.0  # smallest error of a moment that is rejected before refinement, pixels
+MAX_STEPS: Final = 30  # a solution takes about ten
+
+Boards = Mapping[str, Mapping[str, Sighting]]
+"""Sightings of the board by camera and moment, the name of a picture."""
+
+BoardPoses = Mapping[str, Mapping[str, BoardPose]]  # by camera and moment
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Poses of the cameras of a rig, and their quality."""
+
+    names: tuple[str, ...]  # of the cameras; the first is the world's frame
+    T_world_cam: Transforms
+    # Covariance of each camera's rotation about its centre (radians) and shift (metres), world axes
+    covariances: Float[np.ndarray, "cameras 6 6"]
+    errors_px: Float[np.ndarray, "cameras"]  # RMS reprojection error of each camera, pixels
+    shared: tuple[int, ...]  # moments at which each camera sees the board with another camera
+    outliers: tuple[str, ...]  # moments that contradict the others
+    findings: tuple[str, ...]  # reasons not to trust the rig, with remedies
+
+    @property
+    def deviations(self) -> Float[np.ndarray, "cameras 2"]:
+        """Standard deviations of each camera along and about an axis, metres and radians (RMS)."""
+        variances = np.diagonal(self.covariances, axis1=1, axis2=2)
+        turns, shifts = variances[:, :3].mean(axis=1), variances[:, 3:].mean(axis=1)
+        return np.asarray(np.sqrt(np.stack([shifts, turns], axis=1)))
+
+
+def calibrate_rig(boards: Boards, cameras: Mapping[str, Camera]) -> Rig:
+    """Estimate the poses of cameras from pictures of a board that they see together.
+
+    Args:
+        boards: Sightings of the board by each camera.
+        cameras: Calibrated camera of the same names.
+
+    Raises:
+        UserError: The number of cameras is out of range, or a camera never sees the board together
+            with the others.
+    """
+    names = tuple(boards)
+    if not MIN_CAMERAS <= len(names) <= MAX_CAMERAS:
+        allowed = f"{MIN_CAMERAS} to {MAX_CAMERAS} cameras"
+        raise UserError(f"a rig of {len(names)} cameras", allowed, "pass a folder for each camera")
+    counts: dict[str, int] = {}
+    for moment in (moment for sightings in boards.values() for moment in sightings):
+        counts[moment] = counts.get(moment, 0) + 1
+    shared = {moment for moment, count in counts.items() if count > 1}
+    poses = {
+        name: {
+            moment: board_pose(sighting, cameras[name])
+            for moment, sighting in boards[name].items()
+            if moment in shared
+        }
+        for name in names
+    }
+    adjustment, outliers = _Adjustment(boards, cameras, poses), list[str]()
+    for limit_px in (START_PX, LEAST_OUTLIER_PX):
+        worst = adjustment.outliers(limit_px)
+        outliers += worst
+        if worst:
+            poses = {
+                name: {moment: pose for moment, pose in seen.items() if moment not in worst}
+                for name, seen in poses.items()
+            }
+            adjustment = _Adjustment(boards, cameras, poses)
+        if worst or limit_px == START_PX:
+            adjustment.solve()
+    counts_shared = tuple(len(poses[name]) for name in names)
+    errors_px = adjustment.camera_errors_px()
+    findings = [
+        f"{name} sees the board with another camera {count} times: take at least {MIN_SHARED} "
+        "pictures"
+        for name, count in zip(names, counts_shared, strict=True)
+        if count < MIN_SHARED
+    ]
+    if errors_px.max() > MAX_ERROR_PX:
+        name = names[int(errors_px.argmax())]
+        findings.append(
+            f"the reprojection error of {name} is {errors_px.max():.2f} px: check that pictures of "
+            "one name show the same moment, and calibrate the cameras again"
+        )
+    solution = adjustment.T_world_cam, adjustment.covariances
+    return Rig(names, *solution, errors_px, counts_shared, tuple(outliers), tuple(findings))
+
+
+def _linked(poses: BoardPoses) -> dict[str, Transform]:
+    """Return T_world_cam of every camera, linked to the first by moments that two cameras share.
+
+    Raises:
+        UserError: A camera shares no moment with the linked cameras.
+    """
+    first, *others = poses
+    linked = {first: np.eye(4)}
+    while others:
+        shared = {
+            (anchor, name): [moment for moment in poses[name] if moment in poses[anchor]]
+            for anchor in linked
+            for name in others
+        }
+        anchor, name = max(shared, key=lambda pair: len(shared[pair]))
+        if not shared[anchor, name]:
+            problem = f"{', '.join(others)} without a picture of the board together with "
+            problem += ", ".join(linked)
+            allowed = "pictures of the same name that show the board to both cameras"
+            fix = "hold the board where a calibrated camera sees it too, and take pictures again"
+            raise UserError(problem, allowed, fix)
+        steps = np.stack(
+            [
+                poses[anchor][moment].T_cam_board
+                @ invert_transform(poses[name][moment].T_cam_board)
+                for moment in shared[anchor, name]
+            ]
+        )
+        linked[name] = linked[anchor] @ _most_central(steps)
+        others.remove(name)
+    return {name: linked[name] for name in poses}
+
+
+def _most_central(steps: Transforms) -> Transform:
+    """Return the transform with the smallest sum of distances from the others."""
+    flat = steps[:, :3].reshape(len(steps), -1)
+    distances = np.linalg.norm(flat[:, None] - flat[None], axis=2).sum(axis=1)
+    return np.asarray(steps[distances.argmin()])
+
+
+class _Adjustment:
+    """Bundle adjustment of cameras and boards.
+
+    Unanchors are a rotation and a shift of every camera but the first, then of every board.
+    """
+
+    def __init__(self, boards: Boards, cameras: Mapping[str, Camera], poses: BoardPoses) -> None:
+        start = _linked(poses)
+        moments = sorted({moment for seen in poses.values() for moment in seen})
+        views = [(name, moment) for name, seen in poses.items() for moment in seen]
+        names = list(start)
+        self._moments, self._num_cameras = moments, len(names)
+        self._views = [(names.index(name), moments.index(moment)) for name, moment in views]
+        self._cameras = [cameras[name] for name in names]
+        self._sightings = [boards[name][moment] for name, moment in views]
+        placed = []
+        for moment in moments:
+            spreads = [
+                (float(np.trace(poses[name][moment].covariance)), name)
+                for name in names
+                if moment in poses[name]
+            ]
+            name = min(spreads)[1]
+            placed.append(start[name] @ poses[name][moment].T_cam_board)
+        self._transforms = np.stack([*start.values(), *placed])
+        self._errors = self._residuals(self._transforms)
+
+    def solve(self) -> None:
+        """Refine all poses, and estimate the covariances of the cameras."""
+        start = self._transforms
+        num_unanchor = 6 * (len(start) - 1)
+        ends = np.cumsum([0, *(2 * len(sighting.points) for sighting in self._sightings)])
+        sparsity = lil_matrix((ends[-1], num_unanchor), dtype=np.int8)
+        for number, (camera, moment) in enumerate(self._views):
+            for unanchor in (camera - 1, self._num_cameras - 1 + moment):
+                if unanchor >= 0:
+                    sparsity[ends[number] : ends[number + 1], 6 * unanchor : 6 * unanchor + 6] = 1
+
+        def placed(step: Float[np.ndarray, "numbers"]) -> Transforms:
+            return np.concatenate([start[:1], displaced(start[1:], step.reshape(-1, 6))])
+
+        def errors(step: Float[np.ndarray, "numbers"]) -> Float[np.ndarray, "numbers"]:
+            return np.concatenate(self._residuals(placed(step))).ravel()
+
+        solution = least_squares(
+            errors,
+            np.zeros(num_unanchor),
+            jac_sparsity=sparsity,
+            x_scale="jac",
+            max_nfev=MAX_STEPS,
+            loss="soft_l1",
+            f_scale=SOFT_PX,
+        )
+        self._transforms = placed(solution.x)
+        self.T_world_cam = self._transforms[: self._num_cameras]
+        self._errors = self._residuals(self._transforms)
+        squares = sum(float(np.square(error).sum()) for error in self._errors)
+        noise = max(PIXEL_NOISE**2, squares / max(1, int(ends[-1]) - num_unanchor))
+        jacobian: Any = solution.jac
+        information = (jacobian.T @ jacobian).toarray()
+        num_camera = 6 * (self._num_cameras - 1)
+        whole = np.linalg.pinv(information, rcond=1e-14, hermitian=True)[:num_camera, :num_camera]
+        self.covariances = np.zeros((self._num_cameras, 6, 6))
+        for number in range(1, self._num_cameras):
+            rows = slice(6 * number - 6, 6 * number)
+            self.covariances[number] = noise * whole[rows, rows]
+
+    def _residuals(self, transforms: Transforms) -> list[Float[np.ndarray, "points 2"]]:
+        """Return the reprojection errors of every view, pixels."""
+        errors = []
+        for (camera, moment), sighting in zip(self._views, self._sightings, strict=True):
+            T_world_board = transforms[self._num_cameras + moment]
+            points = transform(
+                invert_transform(transforms[camera]) @ T_world_board, sighting.points
+            )
+            lens = self._cameras[camera]
+            given = points, np.zeros(3), np.zeros(3), lens.K, lens.coefficients
+            errors.append(cv2.projectPoints(*given)[0][:, 0] - sighting.pixels)
+        return errors
+
+    def outliers(self, limit_px: float) -> list[str]:
+        """Return the moments whose error is far above the median and above a limit, pixels."""
+        errors = self._rms([moment for _, moment in self._views], len(self._moments))
+        limit = max(limit_px, OUTLIER * float(np.median(errors)))
+        return [it for it, error in zip(self._moments, errors, strict=True) if error > limit]
+
+    def camera_errors_px(self) -> Float[np.ndarray, "cameras"]:
+        """Return the RMS reprojection error of every camera."""
+        return self._rms([camera for camera, _ in self._views], self._num_cameras)
+
+    def _rms(self, groups: Sequence[int], count: int) -> Float[np.ndarray, "groups"]:
+        squares = [float(np.square(error).sum()) for error in self._errors]
+        points = [len(error) for error in self._errors]
+        sums = np.bincount(groups, squares, count) / np.bincount(groups, points, count)
+        return np.asarray(np.sqrt(sums))
