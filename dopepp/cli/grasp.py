@@ -47,6 +47,9 @@ def grasp(
     renderer: Annotated[str, Option(help="raster, raster-shadows or mujoco.")] = "raster",
     yaw: Annotated[float | None, Option(help="Largest yaw of a part, degrees.")] = None,
     rest: Annotated[str, Option(help="Faces that point upwards: front or any.")] = "front",
+    views: Annotated[
+        int, Option(help="Pictures of the camera: for a second, the arm moves it.")
+    ] = 1,
     seed: Annotated[int, Option(min=0, help="Random seed.")] = 0,
     workers: Annotated[int | None, Option(min=1, help="Processes (default: all cores).")] = None,
     out: Annotated[Path, Option(help="Folder of the results.")] = Path("outputs/grasps"),
@@ -64,7 +67,7 @@ def grasp(
         released, largest_yaw = NETWORKS.get(part, (None, 180.0))
         network, yaw = network or released, largest_yaw if yaw is None else yaw
         task = GraspTask(
-            part, unit, grasps, network, not no_refine, layout, renderer, yaw, rest, seed
+            part, unit, grasps, network, not no_refine, layout, renderer, yaw, rest, seed, views
         )
         task = check_task(task, poses, count)
         report = make_experiment(task, count, workers, out, video, rerun, typer.echo)

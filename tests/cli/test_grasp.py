@@ -50,6 +50,15 @@ def test_other_layouts_end_in_a_report(grasped, tmp_path, layout):
     assert content["layout"] == layout
 
 
+def test_the_arm_takes_a_second_picture_and_states_why(grasped):
+    content, output = grasped("-n", 1, "--views", 2, "--poses", "network,exact", "--workers", 1)
+    first, exact = content["trials"]
+    assert first["caught"]
+    assert "reduces the expected error" in first["second_view"]
+    assert first["second_view"] in output
+    assert exact["second_view"] == ""
+
+
 def test_templates_grip_a_part_without_training(grasped, tmp_path):
     content, output = grasped("-n", 1, "--poses", "templates", "--workers", 1)
     assert content["sources"]["templates"]["caught"] == 1
@@ -78,6 +87,8 @@ def test_proposed_grasps_hold_a_part_of_ones_own(grasped, run, tmp_path):
         (["--rest", "back"], "--rest back"),
         (["--poses", "truth"], "--poses truth"),
         (["-n", "0"], "-n=0"),
+        (["--views", "3"], "--views=3"),
+        (["--views", "2", "--no-refine"], "--views 2 with --no-refine"),
         (["--yaw", "270"], "--yaw=270"),
         (["--part", "gearbox"], "gearbox"),
         (["--network", "pretrained/servoholder"], "was not trained on pivconnector"),

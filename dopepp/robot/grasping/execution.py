@@ -71,9 +71,7 @@ class Execution:
         before = self._heights()
         self._command = self._gripper.command(plan.opening)
         for path in (plan.approach, plan.descent):
-            for joints in _timed(path):
-                self._advance(*joints)
-                self.outcome.collided |= self._is_hit()
+            self.move(path)
         here = plan.descent[-1]
         for share in np.linspace(0, 1, round(CLOSING_S / STEP)):
             self._command = (1 - share) * self._gripper.command(plan.opening) + share * CLOSED
@@ -86,6 +84,12 @@ class Execution:
         if len(risen) and risen.max() > HELD_HEIGHT:
             self.outcome.held = int(risen.argmax())
         return self.outcome
+
+    def move(self, path: Path) -> None:
+        """Move the arm along a path, from rest to rest."""
+        for joints in _timed(path):
+            self._advance(*joints)
+            self.outcome.collided |= self._is_hit()
 
     def _heights(self) -> Float[np.ndarray, "solids"]:
         cell, state = self._cell, self._state

@@ -85,6 +85,7 @@ def check_task(task: GraspTask, poses: str, count: int) -> GraspTask:
     _check_choice("--renderer", task.renderer, RENDERERS)
     _check_choice("--rest", task.rest, ("front", "any"))
     check("-n", count, int, Range(1, MAX_TRIALS))
+    check("--views", task.views, int, Range(1, 2))
     check("--yaw", task.yaw_deg, float, Range(0, 180, "degrees"))
     sources = parse_sources(poses)
     needs_network = any(source.kind == "network" for source in sources)
@@ -92,6 +93,9 @@ def check_task(task: GraspTask, poses: str, count: int) -> GraspTask:
         allowed = "a checkpoint of the part, or poses by templates, exact or random"
         fix = "pass --network CHECKPOINT, or --poses templates"
         raise UserError(f"part {task.part} without a network", allowed, fix)
+    if task.views > 1 and not task.refine:
+        allowed = "refined poses, which several views need"
+        raise UserError("--views 2 with --no-refine", allowed, "leave out --no-refine")
     part = load_part(task.part, task.unit)
     find_grasps(part, task.grasps)
     convex_pieces(part)  # cached for all processes: a new mesh takes a minute
@@ -157,6 +161,9 @@ def _facts(task: GraspTask, records: Sequence[Record], seconds: float) -> dict[s
         "network": task.network and f"{task.network}, {'' if task.refine else 'not '}refined",
         "layout": task.layout,
         "pictures": task.renderer,
+        "second view, first trial": next(
+            (it.second_view for it in records if it.second_view), None
+        ),
         "seed": task.seed,
         "hand-eye, worst": f"{shift:.2f} mm, {turn:.3f}°",
         "MuJoCo": version("mujoco"),

@@ -10,7 +10,7 @@ from copy import copy
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 from numpy.random import Generator
@@ -34,10 +34,21 @@ from dopepp.robot.grasping.rehearsal import (
     draw_robot,
     looking_at,
 )
-from dopepp.robot.grasping.workbench import Layout, MujocoView, PlacedSolid, RasterView
+from dopepp.robot.grasping.viewpoint import ViewpointPlanner
+from dopepp.robot.grasping.workbench import (
+    Layout,
+    MujocoView,
+    Photographer,
+    PlacedSolid,
+    RasterView,
+)
 
 if TYPE_CHECKING:
     from dopepp.inference.estimator import PoseEstimator
+    from dopepp.inference.several_views.views_result import WorldDetection
+    from dopepp.recovery.detection import Detection
+
+AnyDetection = TypeVar("AnyDetection", "Detection", "WorldDetection")
 
 BLOCK: Final = 50  # trials with one calibration, as in Table 9
 EXACT: Final = "exact poses"
@@ -88,6 +99,7 @@ class GraspTask:
     yaw_deg: float = 180.0  # largest rotation of parts to either side
     rest: str = "front"  # faces that point upwards; see `Layout`
     seed: int = 0
+    views: int = 1  # pictures of the network or templates, 1 or 2
     sources: tuple[PoseSource, ...] = (PoseSource(),)
 
 
@@ -109,6 +121,16 @@ class Record:
     failure: str  # one of `FAILURES`, or empty
     hand_eye_mm: float  # error of the hand-eye calibration at the part's distance
     hand_eye_deg: float  # rotation error of the hand-eye calibration, degrees
+    second_view: str = ""  # where the camera took a second picture, and why
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What the controller saw, and where the arm ended."""
+
+    poses: list[Transform]  # T_base_obj of the parts, the highest first
+    joints: Joints  # joints of the arm at the last picture, radians
+    second_view: str = ""  # as of :class:`Record`
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +147,7 @@ class TrialScene:
     joints: Joints  # measured joint angles at the time of the picture, radians
     T_base_cam: Transform  # the true pose of the camera
     picture: Picture
+    photograph: Photographer  # takes further pictures
 
     @property
     def targets(self) -> list[Transform]:
@@ -217,68 +240,96 @@ class Trials:
         view: RasterView | MujocoView = self._raster
         if self.task.renderer == "mujoco":
             view = self._parts_view(count) if is_parts_only else MujocoView(solids)
-        picture = view.take([item.body for item in placed], poses, T_base_cam, rng)
-        return TrialScene(
-            number, cell, placed, state, poses, robot, calibrated, joints, T_base_cam, picture
-        )
+        photograph = view.arrange([item.body for item in placed], poses, T_base_cam, rng)
+        camera = joints, T_base_cam, photograph(T_base_cam, rng), photograph
+        return TrialScene(number, cell, placed, state, poses, robot, calibrated, *camera)
 
     def attempt(self, scene: TrialScene, source: PoseSource) -> Attempt:
         """Grasp a part of a scene by the poses of a source."""
-        poses = self._poses(scene, source)
-        if not poses:
-            return Attempt(self._record(scene, source, None, None))
+        look = self._look(scene, source)
+        if not look.poses:
+            return Attempt(self._record(scene, source, look, None, None))
         bench, hull = scene.calibrated.knowledge.T_base_bench, self.layout.body.hull
-        flat = [laid_flat(pose, hull, bench) for pose in poses][:MAX_OBSTACLES]
-        planner, estimate, outcome = self._planner(scene), poses[0], None
+        flat = [laid_flat(pose, hull, bench) for pose in look.poses][:MAX_OBSTACLES]
+        planner, estimate, outcome = self._planner(scene), look.poses[0], None
         for number, target in enumerate(flat):
             others = [*flat[:number], *flat[number + 1 :]]
-            plan = planner.plan([target, *others], self.grasps, scene.joints)
+            plan = planner.plan([target, *others], self.grasps, look.joints)
             if plan is not None:
-                estimate, state = poses[number], copy(scene.start)
-                outcome = Execution(scene.cell, state, self.gripper, scene.robot.zero).run(plan)
+                estimate, state = look.poses[number], copy(scene.start)
+                execution = Execution(scene.cell, state, self.gripper, scene.robot.zero)
+                if look.second_view:
+                    execution.move(np.stack([scene.joints, look.joints]))
+                outcome = execution.run(plan)
                 break
-        record = self._record(scene, source, estimate, outcome)
+        record = self._record(scene, source, look, estimate, outcome)
         return Attempt(record, outcome or Outcome(), estimate)
+
+    def _viewpoints(self, scene: TrialScene) -> ViewpointPlanner:
+        robot = scene.calibrated
+        return ViewpointPlanner(self.arm, self._planner(scene), robot.knowledge, robot.camera)
 
     def _planner(self, scene: TrialScene) -> Planner:
         count = 1 if self.task.layout == "single" else MAX_OBSTACLES
         return Planner(self.arm, self.gripper, self._parts_cell(count), scene.calibrated.knowledge)
 
-    def _poses(self, scene: TrialScene, source: PoseSource) -> list[Transform]:
-        """Return the poses of parts for the controller, T_base_obj, the highest first."""
+    def _look(self, scene: TrialScene, source: PoseSource) -> Look:
+        """Return the poses of parts for the controller, from one picture or two."""
         rng = np.random.default_rng([self.task.seed, scene.number, 2])
         if source.kind == "random":
-            return [self.layout.draw_pose(rng)]
+            return Look([self.layout.draw_pose(rng)], scene.joints)
         if source.kind == "exact":
-            return [_perturbed(pose, source.error, rng) for pose in scene.targets]
-        T_base_cam = scene.T_base_cam
-        if source.matrices != "true":
-            T_flange_cam = scene.calibrated.knowledge.T_flange_cam
-            T_base_cam = self.arm.flange(scene.joints) @ T_flange_cam
-        lens = scene.calibrated.camera
+            poses = [_perturbed(pose, source.error, rng) for pose in scene.targets]
+            return Look(poses, scene.joints)
         estimator = self.templates if source.kind == "templates" else self.estimator
-        detections = estimator.predict(scene.picture, lens.K, lens.coefficients)
+        lens, T_base_cam = scene.calibrated.camera, self._camera_pose(scene, source, scene.joints)
+        if self.task.views == 1:
+            detections = estimator.predict(scene.picture, lens.K, lens.coefficients)
+            poses = [T_base_cam @ item.T_cam_obj for item in self._likely(detections)]
+            return Look(sorted(poses, key=_height, reverse=True), scene.joints)
+        result = estimator.predict_views([scene.picture], [lens], [T_base_cam])
+        likely = self._likely(result.detections) or self._likely(result.weaker)[:1]
+        likely.sort(key=lambda part: _height(part.T_world_obj), reverse=True)
+        assert estimator.refiner is not None
+        mesh = estimator.refiner.mesh(self.part.name)
+        assert mesh is not None
+        view = self._viewpoints(scene).choose(scene.joints, likely, mesh)
+        joints, reason = (scene.joints, "none in reach") if view is None else view
+        if view is not None:
+            picture = scene.photograph(self._true_camera_pose(scene.robot, joints), rng)
+            cameras = [T_base_cam, self._camera_pose(scene, source, joints)]
+            result = estimator.predict_views([scene.picture, picture], [lens] * 2, cameras)
+        poses = [part.T_world_obj for part in self._likely(result.detections)]
+        return Look(sorted(poses, key=_height, reverse=True), joints, reason)
+
+    def _likely(self, detections: Sequence[AnyDetection]) -> list[AnyDetection]:
+        """Return the detections of the part with at least half the best score."""
         parts = [detection for detection in detections if detection.object == self.part.name]
-        # Keep the parts with at least half the best score.
-        poses = [
-            T_base_cam @ detection.T_cam_obj
-            for detection in parts
-            if detection.score >= parts[0].score / 2
-        ]
-        return sorted(poses, key=_height, reverse=True)
+        return [part for part in parts if part.score >= parts[0].score / 2]
+
+    def _camera_pose(self, scene: TrialScene, source: PoseSource, joints: Joints) -> Transform:
+        """Return T_base_cam for the controller."""
+        if source.matrices == "true":
+            return self._true_camera_pose(scene.robot, joints)
+        return np.asarray(self.arm.flange(joints) @ scene.calibrated.knowledge.T_flange_cam)
+
+    def _true_camera_pose(self, robot: TrueRobot, joints: Joints) -> Transform:
+        return np.asarray(self.arm.flange(joints + robot.zero) @ robot.T_flange_cam)
 
     def _record(
         self,
         scene: TrialScene,
         source: PoseSource,
+        look: Look,
         estimate: Transform | None,
         outcome: Outcome | None,
     ) -> Record:
-        errors = (scene.calibrated.hand_eye_mm, scene.calibrated.hand_eye_deg)
+        robot = scene.calibrated
+        ends = (robot.hand_eye_mm, robot.hand_eye_deg, look.second_view)
         trial = (scene.number, source.name, source.error[0])
         if estimate is None:
             nan = float("nan")
-            return Record(*trial, False, False, nan, nan, nan, False, "not seen", *errors)
+            return Record(*trial, False, False, nan, nan, nan, False, "not seen", *ends)
         adds = [self._add(estimate, target) for target in scene.targets]
         add, target = min(adds), scene.targets[int(np.argmin(adds))]
         shift = float(np.linalg.norm(estimate[:3, 3] - target[:3, 3]))
@@ -295,7 +346,7 @@ class Trials:
         else:
             failure = "collided" if outcome.collided else "slipped"
         pose = (1000 * add, 1000 * shift, turn)
-        return Record(*trial, True, is_recognised, *pose, is_caught, failure, *errors)
+        return Record(*trial, True, is_recognised, *pose, is_caught, failure, *ends)
 
     def _add(self, estimate: Transform, target: Transform) -> float:
         """Return the ADD to the nearest symmetric pose, metres."""
@@ -314,7 +365,7 @@ class Trials:
             flange = looking_at(point, distance, tilt, roll) @ invert_transform(MOUNT)
             joints = self.arm.joints(flange, HOME)
             if joints is not None:
-                return joints, self.arm.flange(joints + robot.zero) @ robot.T_flange_cam
+                return joints, self._true_camera_pose(robot, joints)
         raise UserError(
             f"--network {self.task.network}, trained for distances of "
             f"{self.distance[0]:.2f} to {self.distance[1]:.2f} m",

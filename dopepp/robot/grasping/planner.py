@@ -205,15 +205,24 @@ class Planner:
         Returns:
             The motion for the first reachable grasp, or None.
         """
-        for number in range(self._cell.count):
-            pose = make_transform(np.eye(3), np.array([2.0, number, 0.5]))  # out of the way
-            self._cell.put(self._state, number, poses[number] if number < len(poses) else pose)
+        self._place(poses)
         for grasp in grasps:
             for tool in self._tools(poses[0], grasp):
                 motion = self._motion(tool, grasp, start)
                 if motion is not None:
                     return motion
         return None
+
+    def can_move(self, poses: Sequence[Transform], start: Joints, end: Joints) -> bool:
+        """Return whether the open hand can move between parts at poses T_base_obj."""
+        self._place(poses)
+        return self._is_free(np.stack([start, end]), self._gripper.widest)
+
+    def _place(self, poses: Sequence[Transform]) -> None:
+        """Place parts in the model, and the other parts out of the way."""
+        for number in range(self._cell.count):
+            pose = make_transform(np.eye(3), np.array([2.0, number, 0.5]))
+            self._cell.put(self._state, number, poses[number] if number < len(poses) else pose)
 
     def _tools(self, T_base_obj: Transform, grasp: Grasp) -> Iterator[Transform]:
         """Yield poses of the closed pads' ends, T_base_tool, that grip the part."""

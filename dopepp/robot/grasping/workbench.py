@@ -6,9 +6,9 @@ To add a layout, write a method of :class:`Layout` and add its name to :data:`LA
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import Any, Final
 
 import mujoco
@@ -51,6 +51,10 @@ STYLE: Final = PRESETS["wide"]
 
 UPRIGHT: Final = np.radians([90.0, -90.0, 0.0, -90.0, 0.0, 0.0])
 """Joints of an arm that points at the ceiling, outside the picture."""
+
+Photographer = Callable[[Transform, Generator], Picture]
+"""Takes a picture of objects at rest by a camera at T_base_cam; the generator draws the errors of
+the camera's sensor."""
 
 _log = logging.getLogger(__name__)
 
@@ -165,14 +169,21 @@ class RasterView:
         # The preset's blur and motion are for pictures of the preset's height.
         self._sensors = STYLE.sensors.resized(SIZE[1] / STYLE.height)
 
-    def take(
+    def arrange(
         self,
         bodies: Sequence[Body],
         poses: Sequence[Transform],
         T_base_cam: Transform,
         rng: Generator,
-    ) -> Picture:
-        """Render bodies at poses T_base_obj on the bench."""
+    ) -> Photographer:
+        """Draw the materials of objects on the bench, the lights and the bench's picture.
+
+        Args:
+            bodies: Objects on the bench.
+            poses: T_base_obj of each object.
+            T_base_cam: Pose of the first camera, to which the lights are relative.
+            rng: Draws the scene.
+        """
         T_cam_base = invert_transform(T_base_cam)
         objects = []
         materials: dict[str, Any] = {}
@@ -185,10 +196,16 @@ class RasterView:
         lights, ambient = STYLE.lighting.draw(rng, T_cam_table[:3, 3], T_cam_table[:3, 2])
         picture = Table().draw_picture(rng, self._backgrounds, TRUE_K, SIZE, T_cam_table)
         background = picture.seen(TRUE_K, SIZE, T_cam_table)
-        plane = plane_of(T_cam_table) if self._shadows else None
-        sensor = self._sensors.draw(rng)
-        scene = Scene(TRUE_K, background, tuple(objects), lights, ambient, plane, sensor)
-        return capture(self._render(scene).image, scene.sensor)
+        plane = plane_of(T_cam_table)
+        scene = Scene(TRUE_K, background, tuple(objects), lights, ambient, plane)
+        return partial(self._take, scene, T_base_cam)
+
+    def _take(
+        self, scene: Scene, T_base_first: Transform, T_base_cam: Transform, rng: Generator
+    ) -> Picture:
+        seen = scene.seen_from(invert_transform(T_base_cam) @ T_base_first)
+        seen = seen if self._shadows else replace(seen, plane=None)
+        return capture(self._render(seen).image, self._sensors.draw(rng))
 
 
 class MujocoView:
@@ -201,14 +218,17 @@ class MujocoView:
         self._sensors = STYLE.sensors.resized(SIZE[1] / STYLE.height)
         self._cell.model.cam_fovy[:] = np.degrees(2 * np.arctan(SIZE[1] / 2 / TRUE_K[1, 1]))
 
-    def take(
+    def arrange(
         self,
         bodies: Sequence[Body],
         poses: Sequence[Transform],
         T_base_cam: Transform,
         rng: Generator,
-    ) -> Picture:
-        """Render the solids at poses T_base_obj on the bench."""
+    ) -> Photographer:
+        """Like :meth:`RasterView.arrange`; nothing is drawn at random."""
+        return partial(self._take, poses)
+
+    def _take(self, poses: Sequence[Transform], T_base_cam: Transform, rng: Generator) -> Picture:
         model, state = self._cell.model, self._state
         for number, pose in enumerate(poses):
             self._cell.put(state, number, pose)

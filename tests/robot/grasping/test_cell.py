@@ -9,10 +9,15 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import make_transform
+from dopepp.geometry.camera import (
+    invert_transform,
+    make_transform,
+    project_keypoints,
+    transform,
+)
 from dopepp.parts.catalogue import BUILTIN, load_part
 from dopepp.robot.grasping.cell import TRAY, Cell, Solid, convex_pieces
-from dopepp.robot.grasping.rehearsal import SIZE
+from dopepp.robot.grasping.rehearsal import SIZE, TRUE_K, looking_at
 from dopepp.robot.grasping.workbench import HEAP, LAYOUTS, SPREAD, Layout, RasterView
 
 
@@ -84,7 +89,9 @@ def test_a_picture_shows_the_part_and_repeats_with_its_seed(trials, scene, shado
     view, bodies = RasterView(shadows), [item.body for item in scene.placed]
 
     def take(poses):
-        return view.take(bodies, poses, scene.T_base_cam, np.random.default_rng(1))
+        rng = np.random.default_rng(1)
+        photograph = view.arrange(bodies, poses, scene.T_base_cam, rng)
+        return photograph(scene.T_base_cam, rng)
 
     picture = take(scene.poses)
     assert picture.shape == (SIZE[1], SIZE[0], 3)
@@ -92,3 +99,23 @@ def test_a_picture_shows_the_part_and_repeats_with_its_seed(trials, scene, shado
     aside = [pose @ make_transform(np.eye(3), [0.0, 0.02, 0.0]) for pose in scene.poses]
     changed = (take(aside).astype(int) - picture).any(axis=2).mean()
     assert 0.005 < changed < 0.9
+
+
+@pytest.mark.parametrize("shadows", [False, True])
+def test_a_second_camera_shows_the_part_at_its_place(trials, scene, shadows):
+    view, bodies = RasterView(shadows), [item.body for item in scene.placed]
+    middle = transform(scene.poses[0], trials.part.cuboid[-1])
+    T_base_cam = looking_at(
+        middle + np.array([0.03, 0.02, 0.0]), 0.2, np.radians([20.0, -15.0]), 0.3
+    )
+    away = [make_transform(np.eye(3), [5.0, 5.0, 0.0])]
+    pictures = []
+    for poses in (scene.poses, away):
+        rng = np.random.default_rng(1)
+        photograph = view.arrange(bodies, poses, scene.T_base_cam, rng)
+        pictures.append(photograph(T_base_cam, rng).astype(int))
+    changed = np.abs(pictures[0] - pictures[1]).max(axis=2) > 40
+    rows, columns = np.nonzero(changed)
+    T_cam_base = invert_transform(T_base_cam)
+    expected = project_keypoints(trials.part.cuboid, T_cam_base @ scene.poses[0], TRUE_K)[-1]
+    np.testing.assert_allclose([columns.mean(), rows.mean()], expected, atol=25)
