@@ -145,7 +145,11 @@ def two_numbers(option: str, text: str, allowed: str, fix: str) -> tuple[float, 
 
 
 def check_region(refine: str | None) -> None:
-    """Raise a UserError for any refinement other than ``region``."""
+    """Check that the refinement is ``region`` or none.
+
+    Raises:
+        UserError: It is another one.
+    """
     if refine not in (None, "region"):
         raise UserError(f"--refine {refine}", "region", "pass --refine region, or leave it out")
 

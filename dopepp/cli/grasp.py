@@ -100,7 +100,11 @@ def propose(
 
 
 def _require_extra() -> None:
-    """Raise a UserError for a missing extra, without importing its packages."""
+    """Check that the packages of the extra are installed, without importing them.
+
+    Raises:
+        UserError: A package is missing.
+    """
     from dopepp.core.errors import require
 
     for package in EXTRA:

@@ -75,7 +75,7 @@ def predict(
     views: Annotated[
         Path | None,
         Option(
-            help="Camera poses of pictures of one static scene: views.yaml, BOP's "
+            help="Camera poses, if all pictures show one static scene: views.yaml, BOP's "
             "scene_camera.json or COLMAP's images.txt."
         ),
     ] = None,
@@ -97,10 +97,10 @@ def predict(
 ) -> None:
     """Estimate poses in pictures and print one line of JSON per detection.
 
-    Stderr shows the progress, and the reason where nothing was detected. Exit codes: 0 done; 1
+    Progress goes to stderr, with the reason if nothing was detected. Exit codes: 0 success; 1
     stopped (the camera stream ended, the disk is full); 2 wrong input; 130 or 143 interrupted.
     """
-    gc.disable()  # imported objects stay alive: searching them takes a fifth of the start
+    gc.disable()  # all imported objects stay alive; collecting them would slow down the start
     with resumable("the written files are complete"):
         from dopepp.cli.outputs import Outputs
         from dopepp.cli.predict_scene import predict_scene, refuse_options
@@ -164,7 +164,11 @@ def predict(
 def _check_options(
     refine: Sequence[str], depth: Path | None, track: bool, verify: bool, where: object
 ) -> None:
-    """Refuse options that exclude each other."""
+    """Check for options that exclude each other.
+
+    Raises:
+        UserError: Two options exclude each other.
+    """
     if ("depth" in refine) != (depth is not None):
         raise UserError(
             "--depth without --refine depth" if depth else "--refine depth without --depth",
@@ -180,7 +184,7 @@ def _check_options(
 def _file_outputs(
     save: Path | None, json_file: Path | None, csv: Path | None, stride: int
 ) -> list[tuple[Path, Output]]:
-    """Return the requested files, and refuse those that cannot be written."""
+    """Return the outputs that are written to files or folders, with their paths."""
     from dopepp.cli.outputs import BopCsv, JsonLines, OverlayFolder
 
     requests: tuple[tuple[Path | None, Callable[[Path], Output]], ...] = (
@@ -232,7 +236,11 @@ class _Session:
             outputs.take(result)
 
     def _search_again(self, result: PoseResult, camera: Camera) -> tuple[PoseResult, str]:
-        """Search at all distances after an empty result; return the reason if that fails too."""
+        """Search at all distances after an empty result.
+
+        Returns:
+            The new result, and the reason if it is empty as well.
+        """
         if not self._estimator.has_network:
             return result, "no pose at these distances passes the verification"
         from dopepp.inference.frames.source import Lens
@@ -248,13 +256,14 @@ class _Session:
             candidates = self._estimator.candidates(image, K, None, metres, "any", *region)
             detections, weaker = self._estimator.split(candidates)
             if detections:
-                typer.echo("nothing at the trained sizes; found in a search at all sizes", err=True)
+                text = "nothing detected at the trained sizes; searched at all sizes"
+                typer.echo(text, err=True)
                 return replace(result, detections=detections, weaker=weaker), ""
         reason = self._estimator.explain(image, K, metres, options["distances"], *region)
         return result, explained(reason)
 
     def _records(self, result: PoseResult) -> list[dict[str, object]]:
-        """Return the detections as plain values, with their agreement if they are verified."""
+        """Return the detections as plain values; with ``--verify``, with their agreement."""
         records = result.records()
         if self._verified is None:
             return records

@@ -19,7 +19,14 @@ if TYPE_CHECKING:
 
 
 def refuse_options(options: dict[str, object]) -> None:
-    """Refuse options of ``dopepp predict`` that several views do not have, by name and value."""
+    """Refuse options of ``dopepp predict`` that cannot be combined with ``--views``.
+
+    Args:
+        options: Values of these options by name; a false value means that the option is not given.
+
+    Raises:
+        UserError: One of the options is given.
+    """
     if given := [name for name, value in options.items() if value]:
         problem = f"--views with {', '.join(given)}"
         raise UserError(problem, "--views without them", f"leave out {', '.join(given)}")
@@ -34,16 +41,19 @@ def predict_scene(
     save: Path | None,
     json_file: Path | None,
 ) -> None:
-    """Print and write the parts in a static scene.
+    """Estimate the poses of parts in a static scene; print and write them.
 
     Args:
         estimator: Estimator that refines by region.
         sources: Pictures of the scene.
         views: File of the camera poses.
-        camera: Camera of the pictures for which the file names none.
-        distances: Expected depths of the parts.
-        save: Folder for drawn pictures.
-        json_file: File for a line of JSON.
+        camera: Camera of the pictures for which ``views`` names no camera.
+        distances: Nearest and farthest depth of the parts, metres, or ``any``.
+        save: Folder for drawn pictures; None writes none.
+        json_file: File for a line of JSON; None writes none.
+
+    Raises:
+        UserError: There are fewer than two pictures, or a picture has no pose or no camera.
     """
     from dopepp.core.files import write_whole
     from dopepp.inference.several_views.view_files import read_camera_poses
@@ -51,7 +61,9 @@ def predict_scene(
     poses = read_camera_poses(views)
     frames = [frame for source in sources for frame in source.frames()]
     if len(frames) < 2 or any(source.rate is not None for source in sources):
-        problem = f"--views with {len(frames)} pictures"
+        problem = f"--views with {len(frames)} picture{'s' * (len(frames) != 1)}"
+        if any(source.rate is not None for source in sources):
+            problem = "--views with a video, a recording or a camera"
         raise UserError(problem, "two pictures or more", "pass the pictures of one static scene")
     shots = [poses.of(Path(frame.name)) for frame in frames]
     cameras: list[Camera] = []

@@ -206,6 +206,7 @@ class ProcessPool(Pool):
         return self._threads.submit(self._apply, item)
 
     def _apply(self, item: object) -> Any:
+        """Apply the function to an item in this thread's worker process; start it if needed."""
         worker = self._worker
         is_new = worker.process is None
         process = worker.process = worker.process or self._start()

@@ -242,6 +242,7 @@ def _json(value: object, name: str) -> str:
 
 
 def _user_error(mistake: _Mistake, root: str, fix: str) -> UserError:
+    """Return the message for a mistake, with the most similar name if a name is unknown."""
     name = mistake.name(root)
     if mistake.is_unknown:
         fields = mistake.allowed.split(", ")
@@ -291,6 +292,7 @@ def _cause(detail: ErrorDetails) -> UserError | None:
 
 
 def _allowed(detail: ErrorDetails) -> str:
+    """Return the allowed values in pydantic's description of an error."""
     context = detail.get("ctx", {})
     if cause := _cause(detail):
         return cause.allowed

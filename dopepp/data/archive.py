@@ -144,6 +144,7 @@ def _problem(member: tarfile.TarInfo, path: PurePosixPath) -> str:
 
 
 def _unpack(tar: tarfile.TarFile, member: tarfile.TarInfo, path: Path) -> None:
+    """Write a member to a new file, or make its folder."""
     if member.isdir():
         path.mkdir(parents=True, exist_ok=True)
         return

@@ -109,6 +109,7 @@ class PoseDataModule(LightningDataModule):
         return self._loader(SampleDataset(self.val_item, len(self.val_source)), shuffle=False)
 
     def _loader(self, dataset: SampleDataset, shuffle: bool) -> PoseLoader:
+        """Return the loader of this process's share of a data set."""
         rank = self.trainer.global_rank if self.trainer is not None else 0
         world_size = self.trainer.world_size if self.trainer is not None else 1
         return PoseLoader(
@@ -169,11 +170,18 @@ class PoseDataModule(LightningDataModule):
 
 
 Item = Callable[[int, int], Sample]
-"""Makes item ``index`` of ``epoch``: ``item(epoch, index)``."""
+"""Function of epoch and index that makes a sample."""
 
 
 class SampleDataset(Dataset[Sample | UserError]):
-    """Items by (epoch, index); an item is a sample or a UserError, see :class:`PoseLoader`."""
+    """Dataset indexed by (epoch, index).
+
+    A ``UserError`` is returned instead of raised; :class:`PoseLoader` raises it.
+
+    Args:
+        item: Makes the samples.
+        num_items: Samples in an epoch.
+    """
 
     def __init__(self, item: Item, num_items: int) -> None:
         self._item, self._num_items = item, num_items
@@ -182,7 +190,7 @@ class SampleDataset(Dataset[Sample | UserError]):
         return self._num_items
 
     def __getitem__(self, key: tuple[int, int]) -> Sample | UserError:
-        """Return the item of (epoch, index)."""
+        """Return the sample of (epoch, index), or the error that it raised."""
         try:
             return self._item(*key)
         except UserError as error:
@@ -226,8 +234,14 @@ class EpochSampler(DistributedSampler[tuple[int, int]]):
 class PoseLoader(DataLoader[Any]):
     """A ``DataLoader`` that resumes inside an epoch and raises a worker's ``UserError``.
 
-    A worker's exception would arrive with its stack as text, so the error travels as a value.
-    ``object_names`` are in the network's order.
+    An exception of a worker would arrive with its stack as text. Therefore workers return the error
+    as a value.
+
+    Args:
+        dataset: Samples.
+        sampler: Order of the samples.
+        object_names: Names of the objects, in the network's order.
+        **options: Options of ``DataLoader``.
     """
 
     def __init__(

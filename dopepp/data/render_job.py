@@ -242,6 +242,11 @@ def begin(root: Path, record: Mapping[str, Any]) -> None:
 
 
 def _claim(root: Path, record: Mapping[str, Any]) -> None:
+    """Write the record of a job to a new folder, or compare it with that of the folder.
+
+    Raises:
+        UserError: The folder contains other files, or belongs to a job with other settings.
+    """
     path = root / RECORD_FILE
     # Listed before the check for a record, because other shards write after their record.
     names = sorted(entry.name for entry in root.iterdir())

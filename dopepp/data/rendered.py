@@ -216,6 +216,7 @@ class CachedSource:
         return zlib.crc32(self._slots[index : index + 1].view("u1").data) | _FILLED
 
     def _store(self, index: int, sample: Sample) -> None:
+        """Write a sample to its slot in the cache."""
         self._check(sample)
         slot = self._slots[index]
         slot["image"], slot["K"], slot["key"] = sample.image, sample.K, sample.key
@@ -245,6 +246,7 @@ class CachedSource:
             raise ValueError(f"one of {texts} has more than {_TEXT_LENGTH} characters")
 
     def _load(self, index: int) -> Sample:
+        """Read a sample from its slot in the cache."""
         slot = self._slots[index]
         instances = [
             Instance(

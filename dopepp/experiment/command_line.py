@@ -65,9 +65,12 @@ def _spelled_out(argument: str, short_names: Mapping[str, str], open_nodes: Sequ
 
 
 def _refuse_used_folder(arguments: Sequence[str]) -> None:
-    """Raise a user error for a folder that holds a run, before Hydra writes there.
+    """Check that the folder of a new run contains no other run, before Hydra writes there.
 
     Further processes of a run receive the folder of the first process and are not checked.
+
+    Raises:
+        UserError: The folder contains a run.
     """
     words = dict(text.partition("=")[::2] for text in arguments)
     folder = words.get("hydra.run.dir", "")

@@ -106,7 +106,7 @@ def focal_length(K: CameraMatrix) -> float:
 
 
 def resize_points(points_px: Pixels, scale_x: float, scale_y: float) -> Pixels:
-    """Map pixel coordinates to the resized image, as :func:`resize_camera`."""
+    """Map pixel coordinates to the resized image; see :func:`resize_camera`."""
     scale = np.array([scale_x, scale_y])
     return np.asarray(scale * (np.asarray(points_px) + 0.5) - 0.5)
 

@@ -201,6 +201,11 @@ def _key(name: str) -> str:
 
 
 def _size(fields: _Fields) -> Size | None:
+    """Return the picture's size in the fields of a file; None if there is none.
+
+    Raises:
+        UserError: The size is incomplete or invalid.
+    """
     both = fields.find("image_size", "resolution")
     if both is not None:
         name, sides = both[0], _numbers(*both)

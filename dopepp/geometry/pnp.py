@@ -358,6 +358,7 @@ def _truncated_cost(residuals: Array) -> float:
 
 @compiled()
 def _is_plausible(object_points: Array, R: Array, t: Array) -> bool:
+    """Return whether R is a rotation, t is not too long, and all points are before the camera."""
     for i in range(len(object_points)):
         x, y, z = object_points[i, 0], object_points[i, 1], object_points[i, 2]
         if not R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2] > 0.0:

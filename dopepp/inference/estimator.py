@@ -1,4 +1,4 @@
-"""PoseEstimator: an image and a camera matrix in, poses out; needs neither Hydra nor a config."""
+"""PoseEstimator: estimates poses from an image and its camera matrix, without Hydra or a config."""
 
 from __future__ import annotations
 
@@ -55,16 +55,16 @@ class PoseEstimator:
 
     Args:
         network: Trained PyTorch network, or exported network.
-        checkpoint: Description of what the network was trained for.
+        checkpoint: Parts, input size and thresholds of the network.
         device: Device that runs the network, e.g. ``cpu`` or ``cuda``.
         refine: Evidence that refines poses: ``region`` (the image), ``depth`` (the depth image
             passed to :meth:`predict`), or both, ``("region", "depth")``. None: no refinement.
-        parts: The checkpoint's parts with other meshes, or with meshes that it lacks.
-        max_ms: Time limit for the refinement of an image, milliseconds. Detections beyond the limit
-            keep the network's pose; the best scores are refined first.
+        parts: The checkpoint's parts with other meshes (default: those in the checkpoint).
+        max_ms: Time limit for the refinement of an image, milliseconds. The best detections are
+            refined first; detections beyond the limit keep the network's pose.
         scale_error: Largest relative error of the parts' size or of the focal length (default:
-            0.01). While network and image differ by less, the distance stays the network's. A
-            small value suits a calibrated camera and a measured part.
+            0.01). Refinement keeps the network's distance if the image's differs by less. Choose a
+            small value for a calibrated camera and a measured part.
 
     Raises:
         UserError: The refinement is unknown, or a part has no mesh.
@@ -93,7 +93,7 @@ class PoseEstimator:
     def _refine_by(self, refine: Refine | None, parts: Sequence[Part]) -> None:
         """Set the refinement, and reset the spent time."""
         self.refine, self.refiner = refine, None
-        if refine is not None:  # its solvers take as long to import as everything else but torch
+        if refine is not None:  # imported on demand, because its solvers are slow to import
             from dopepp.inference.refinement.refiner import Refiner
 
             limits = {} if self.scale_error is None else {"scale_error": self.scale_error}
@@ -101,7 +101,7 @@ class PoseEstimator:
         for function in ("rehearse_pose", "rehearse_refinement"):
             compile_beside(f"dopepp.inference.refinement.refiner:{function}")
         self.solid_parts = tuple(parts)
-        """Parts with the meshes that were passed."""
+        """Parts with the meshes that refinement uses."""
         self.spent_ms = dict.fromkeys(STEPS, 0.0)
         """Total milliseconds by step of :data:`~dopepp.inference.pose_result.STEPS`."""
 
@@ -116,14 +116,21 @@ class PoseEstimator:
         scale_error: float | None = None,
         extensions: Sequence[str] = (),
     ) -> PoseEstimator:
-        """Load a checkpoint, or a network that ``dopepp export`` wrote; see the class for options.
+        """Load a checkpoint, or a network that ``dopepp export`` wrote.
 
-        ``extensions`` lists your packages whose classes a checkpoint may name
-        (:mod:`dopepp.core.extensions`). They stay enabled in this process.
+        Args:
+            path: Checkpoint, or exported network.
+            device: See the class.
+            refine: See the class.
+            parts: See the class.
+            max_ms: See the class.
+            scale_error: See the class.
+            extensions: Packages whose classes the checkpoint may name
+                (:mod:`dopepp.core.extensions`). They stay enabled in this process.
 
         Raises:
-            UserError: The file is missing, of another kind or not safe to load, its extra is
-                missing, or the refinement is not possible.
+            UserError: The file is missing, has another format or is not safe to load, an optional
+                dependency is missing, or the refinement is not possible.
         """
         enable(extensions)
         chosen = checked_device(device)
@@ -147,12 +154,13 @@ class PoseEstimator:
             mesh: Mesh file, or name of a built-in part.
             unit: Unit of the file: mm, cm, m or inch (default: that of its format, otherwise mm).
             working_distance: Nearest and farthest depth of the part, metres; required.
-            tilt_deg: Largest angle between the part's z axis and the direction to the camera.
+            tilt_deg: Largest angle between the part's z axis and the direction to the camera,
+                degrees.
             name: Name of the part (default: that of the file).
             symmetries: ``auto`` finds them on the mesh; None: the part has none.
-            refine: As of the class, with ``region``, which verifies the poses.
-            max_ms: As of the class.
-            scale_error: As of the class.
+            refine: See the class; must include ``region``, which also verifies the poses.
+            max_ms: See the class.
+            scale_error: See the class (default: 0.001).
 
         Raises:
             UserError: The mesh or an option is invalid, or the working distance is missing.
@@ -181,12 +189,15 @@ class PoseEstimator:
         return True
 
     def depth_range(self, name: str) -> tuple[float, float] | None:
-        """Return the depths at which a part is searched by default, metres; None if unknown."""
+        """Return the nearest and farthest depth that are searched by default; None if unknown.
+
+        Depths are metres. A network's are those of training.
+        """
         seen = self.checkpoint.seen.get(name)
         return None if seen is None else (seen.nearest, seen.farthest)
 
     def __repr__(self) -> str:
-        """Describe network, parts with their distances in training, and thresholds."""
+        """Describe the network, the parts with their depths, and the thresholds."""
         lines = [f"PoseEstimator({self._detector}, {self.device}, refine={self.refine})"]
         for part in self.parts:
             size = " × ".join(f"{1000 * side:.0f}" for side in np.ptp(part.cuboid, axis=0))
@@ -219,9 +230,9 @@ class PoseEstimator:
         roi: Region | None = None,
         cropped: bool = False,
     ) -> list[Detection]:
-        """Detect all trained parts on an image whose score is at least :attr:`min_score`.
+        """Detect the parts on an image; leave out detections with a score below :attr:`min_score`.
 
-        The image is resized until parts have the size that they had in training
+        The image is resized so that parts have the same size as in training
         (:mod:`dopepp.inference.picture`).
 
         Args:
@@ -231,22 +242,22 @@ class PoseEstimator:
                 same K; pixels of the result refer to the undistorted image.
             depth: Metres along z, aligned to the image (and equally distorted), 0 or NaN where
                 unknown; used if the estimator refines with depth.
-            distances: Nearest and farthest depth of the parts, metres. None: distances of training;
-                ``any``: all distances at which the network can see a part. A larger range takes
-                more runs of the network.
+            distances: Nearest and farthest depth of the parts, metres (default: distances in
+                training). ``any``: all distances at which the network can detect a part. The
+                network runs more often for a larger range.
             roi: Region to process: (x, y, width, height), pixels.
-            cropped: Whether the image may be cropped from the camera's, so that the principal point
-                may lie anywhere. Otherwise an off-centre K is rejected as that of another size.
+            cropped: Whether the image may be a crop, with the principal point anywhere. Otherwise
+                an off-centre principal point is rejected, because K probably belongs to another
+                image size.
 
         Returns:
-            Detections, best score first, in metres and pixels of the given size. A refined
-            detection has the refined pose with its keypoints and covariance, and the score that
-            tuning has fitted to refined poses. ``kept`` is the reason if refinement kept the
-            network's pose.
+            Detections, best score first, in metres and pixels of the given image. A refined
+            detection has the refined pose with its keypoints and covariance, and a score that
+            belongs to refined poses. If refinement kept the network's pose, ``kept`` is the reason.
 
         Raises:
-            UserError: The image is no RGB image, K does not belong to it, the distortion has no
-                OpenCV lens model, or the depth is not aligned or not in metres.
+            UserError: The image is not RGB, K does not belong to it, the distortion fits no OpenCV
+                lens model, or the depth is not aligned or not in metres.
         """
         candidates = self.candidates(image, K, distortion, depth, distances, roi, cropped)
         return self.split(candidates)[0]
@@ -261,10 +272,10 @@ class PoseEstimator:
         roi: Region | None = None,
         cropped: bool = False,
     ) -> list[Detection]:
-        """Return every detection, best score first; arguments and errors are those of predict.
+        """Return all detections regardless of their score, best first; see :meth:`predict`.
 
-        Most candidates below :attr:`min_score` are false detections. An estimator that refines
-        leaves out those with a network score below :data:`~dopepp.recovery.detection.CANDIDATE`.
+        Most candidates below :attr:`min_score` are false detections. With refinement, candidates
+        with a network score below :data:`~dopepp.recovery.detection.CANDIDATE` are left out.
         """
         image, K, depth = prepare_image(image, K, distortion, depth, cropped)
         detections = self._start_detections(image, K, distances, roi)
@@ -300,7 +311,7 @@ class PoseEstimator:
         """Minimum score of a detection.
 
         It is the checkpoint's threshold unless :meth:`reporting` has replaced it. Verified poses
-        have a threshold of their own.
+        have a separate threshold.
         """
         is_verified = self.refiner is not None and self.refiner.verifies
         return self.recovery.refined_min_score if is_verified else self.recovery.min_score
@@ -334,9 +345,13 @@ class PoseEstimator:
         K: CameraMatrix,
         depth: Depth | None = None,
     ) -> list[Detection]:
-        """Refine detections of any origin; return them unchanged if the estimator does not refine.
+        """Refine detections; return them unchanged if the estimator has no refinement.
 
-        Image, K and depth are as in :meth:`predict`, checked and without distortion.
+        Args:
+            detections: Detections of these parts, from any source.
+            image: RGB, without distortion.
+            K: Camera matrix, pixels.
+            depth: Metres along z, aligned to the image, 0 or NaN where unknown.
         """
         if self.refiner is None:
             return list(detections)
@@ -386,8 +401,8 @@ class PoseEstimator:
             images: RGB, uint8, of any sizes.
             cameras: Camera of each image, or its K in pixels of an undistorted image.
             T_world_cam: Pose of each camera, metres; any frame that does not move is the world.
-            depths: Depth of each image; as in :meth:`predict`.
-            distances: As in :meth:`predict`.
+            depths: Depth of each image; see :meth:`predict`.
+            distances: See :meth:`predict`.
             camera_error: Standard deviations of each camera's pose along and about each axis,
                 metres and radians (default: 0.2 mm and 0.02°, those of a hand-eye calibration).
             names: Name of each image, for findings and files.
@@ -403,8 +418,7 @@ class PoseEstimator:
         from dopepp.inference.several_views import CAMERA_ERROR, predict_views
 
         error = CAMERA_ERROR if camera_error is None else camera_error
-        places = images, cameras, T_world_cam, depths
-        return predict_views(self, *places, distances, error, names)
+        return predict_views(self, images, cameras, T_world_cam, depths, distances, error, names)
 
     def explain(
         self,
@@ -415,12 +429,12 @@ class PoseEstimator:
         roi: Region | None = None,
         cropped: bool = False,
     ) -> list[Reason]:
-        """Explain why :meth:`predict` rejects each object or centroid candidate of an image.
+        """Explain why :meth:`predict` detects no part, or no further part, on an image.
 
-        The arguments are those of :meth:`predict`; the image is without distortion.
+        The arguments and errors are those of :meth:`predict`; the image has no distortion.
 
-        Raises:
-            UserError: As for :meth:`predict`.
+        Returns:
+            A reason for each part without a candidate, and for each rejected candidate.
         """
         image, K, depth = prepare_image(image, K, None, depth, cropped)
         reasons = self._missing(image, K, distances, roi)
@@ -433,7 +447,7 @@ class PoseEstimator:
     def _missing(
         self, image: Picture, K: CameraMatrix, distances: Distances | None, roi: Region | None
     ) -> list[Reason]:
-        """Return why there are no more start detections."""
+        """Return the reasons why there are no further start detections."""
         stride, options = self.network.stride, self._recovery_options(self.min_score)
         reasons: list[Reason] = []
         for view in self.views(image, K, distances, roi):
@@ -448,25 +462,25 @@ class PoseEstimator:
         distances: Distances | None = None,
         roi: Region | None = None,
     ) -> list[NetworkView]:
-        """Return the inputs that the network is run on; the arguments are those of predict."""
+        """Return the inputs of the network for an image; see :meth:`predict` for the arguments."""
         multiple = self.network.size_multiple
         return network_views(self.checkpoint, multiple, image, K, distances, roi)
 
     def maps(self, image: Picture) -> Maps:
-        """Run the network on an image whose sides are multiples of its size multiple."""
+        """Run the network on an RGB image; its sides must be multiples of ``size_multiple``."""
         pixels = torch.from_numpy(image).to(self.device).permute(2, 0, 1)[None]
         with torch.inference_mode():
             belief, field = self.network.maps(pixels)
         return belief[0].float(), field[0].float()
 
     def _recovery_options(self, min_score: float) -> dict[str, float]:
-        """Return the options of the recovery; all candidates that can be refined pass."""
+        """Return the options of the recovery; with refinement, all candidates pass."""
         least = min_score if self.refiner is None else CANDIDATE
         return vars(replace(self.recovery, min_score=least))
 
     @contextmanager
     def _timed(self, step: str) -> Iterator[None]:
-        """Add the time of a step, including its pending work on a GPU."""
+        """Measure the time of a step, including its pending work on a GPU."""
         start = time.perf_counter()
         yield
         if self.device.type == "cuda":
@@ -475,14 +489,14 @@ class PoseEstimator:
 
 
 def checked_device(device: str | torch.device) -> torch.device:
-    """Return the device after a test allocation.
+    """Return a device after a test allocation on it.
 
     Raises:
-        UserError: There is no such device.
+        UserError: The device does not exist or does not work.
     """
     try:
         chosen = torch.device(device)
-        torch.zeros(1, device=chosen).item()  # asks the driver
+        torch.zeros(1, device=chosen).item()
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         allowed = "cpu or cuda" if torch.cuda.is_available() else "cpu (this PyTorch has no cuda)"
         reason = str(error).partition("\n")[0]

@@ -34,10 +34,12 @@ Save = Callable[[Path, Checkpoint, Export], None]
 """Writes a graph with its description to a new file or folder."""
 
 Exporter = Callable[[PoseNetwork, str, Sequence[Pixels]], Save]
-"""Converts a network to a graph of a precision; int8 is calibrated on inputs of the network.
+"""Function that converts a network to a graph of a precision; int8 is calibrated on its inputs.
 
-Raises a UserError if the format or precision does not support the network. :func:`check_possible`
-detects missing packages beforehand."""
+Raises:
+    UserError: The format or precision does not support the network. (:func:`check_possible` has
+        already detected missing packages.)
+"""
 
 _PACKAGES: Final = {
     "onnx": ("onnx", "onnxscript", "onnxruntime"),

@@ -1,6 +1,7 @@
-"""Estimator whose start poses come from templates of a mesh, so that it needs no training.
+"""Estimator without a network: its start poses come from templates of a mesh.
 
-Everything after the start poses is that of a network's estimator: refinement, verification, score.
+The steps after the start poses are those of :class:`PoseEstimator`: refinement, verification and
+score.
 """
 
 from __future__ import annotations
@@ -44,12 +45,12 @@ from dopepp.recovery.detection import (
 )
 from dopepp.recovery.recover import Reason
 
-NUM_REPEATED: Final = 10  # refined poses that are refined again
-
-REPEATS: Final = 2
+NUM_REPEATED: Final = 10  # most probable refined poses that are refined again
+REPEATS: Final = 2  # how often they are refined again
 
 SCALE_ERROR: Final = 0.001
-"""Relative error of size and focal length: a template's distance is too rough to be kept."""
+"""Default of ``scale_error``. It is small, so that refinement corrects the distance. Templates
+determine it only roughly."""
 
 
 class TemplateEstimator(PoseEstimator):
@@ -58,9 +59,9 @@ class TemplateEstimator(PoseEstimator):
     Args:
         detectors: A detector for each part.
         distances: Nearest and farthest depth of the parts, metres.
-        refine: As of :class:`PoseEstimator`, with ``region``.
-        max_ms: As of :class:`PoseEstimator`.
-        scale_error: As of :class:`PoseEstimator`.
+        refine: See :class:`PoseEstimator`; must include ``region``.
+        max_ms: See :class:`PoseEstimator`.
+        scale_error: See :class:`PoseEstimator` (default: 0.001).
 
     Raises:
         UserError: The refinement is unknown or does not include ``region``.
@@ -93,7 +94,11 @@ class TemplateEstimator(PoseEstimator):
         max_ms: float | None = None,
         scale_error: float | None = None,
     ) -> TemplateEstimator:
-        """Make templates of parts; the arguments are those of :meth:`PoseEstimator.from_mesh`."""
+        """Make an estimator of several parts; see :meth:`PoseEstimator.from_mesh`.
+
+        Raises:
+            UserError: A part has no mesh, or an option is invalid or missing.
+        """
         checked = _checked_distances(distances)
         tilt = check("tilt_deg", tilt_deg, float, Range(0, 180, "degrees"))
         detectors = [TemplateDetector(part, checked, tilt) for part in parts]
@@ -118,7 +123,7 @@ class TemplateEstimator(PoseEstimator):
 
     @property
     def has_network(self) -> bool:
-        """False."""
+        """False: templates detect the parts."""
         return False
 
     def depth_range(self, name: str) -> tuple[float, float] | None:
@@ -132,6 +137,7 @@ class TemplateEstimator(PoseEstimator):
     def _start_detections(
         self, image: Picture, K: CameraMatrix, distances: Distances | None, roi: Region | None
     ) -> list[Detection]:
+        """Return start poses of all parts, best score first."""
         with self._timed("decode"):
             roi, depths = checked_region(roi, image), self._range(distances)
             starts = [
@@ -148,10 +154,10 @@ class TemplateEstimator(PoseEstimator):
         K: CameraMatrix,
         depth: Depth | None = None,
     ) -> list[Detection]:
-        """Refine detections; the most probable ends of start poses are refined again from there.
+        """Refine detections; the most probable results are refined again.
 
-        A start pose is off by so much that a single refinement may stop too early. With a time
-        limit, poses are refined once.
+        Start poses are so inaccurate that a single refinement may stop too early. Poses are refined
+        only once if they are tracked or if there is a time limit.
         """
         refined = super().refined(detections, image, K, depth)
         if any(detection.agreement is not None for detection in detections):
@@ -186,25 +192,26 @@ class TemplateEstimator(PoseEstimator):
         self, image: Picture, K: CameraMatrix, distances: Distances | None, roi: Region | None
     ) -> list[Reason]:
         near, far = self._range(distances)
-        text = f"no view of it fits the image at {near:.2g} – {far:.2g} m"
-        fitting = {it.object for it in self._start_detections(image, K, distances, roi)}
-        names = [part.name for part in self.parts if part.name not in fitting]
+        text = f"no view of the part fits the image at {near:.2g} – {far:.2g} m"
+        starts = self._start_detections(image, K, distances, roi)
+        detected = {start.object for start in starts}
+        names = [part.name for part in self.parts if part.name not in detected]
         return [Reason(name, "empty", 0.0, text) for name in names]
 
     def _range(self, distances: Distances | None) -> tuple[float, float]:
-        """Return depths to search; templates are searched at the working distance by default."""
+        """Return the depths to search: the given ones, or else the working distance."""
         if distances is None or distances == "any":
             return self.distances
         return check("distances", distances, tuple[float, float], METRES)
 
     @property
     def network(self) -> NoReturn:  # type: ignore[override]
-        """Raise, because there is no network."""
+        """Raise a UserError: templates have no network."""
         raise _networks_only("a network")
 
     @property
     def checkpoint(self) -> Checkpoint:  # type: ignore[override]
-        """Raise, because there is no checkpoint."""
+        """Raise a UserError: templates have no checkpoint."""
         raise _networks_only("a checkpoint")
 
     def views(
@@ -214,18 +221,18 @@ class TemplateEstimator(PoseEstimator):
         distances: Distances | None = None,
         roi: Region | None = None,
     ) -> list[NetworkView]:
-        """Raise, because there is no network."""
+        """Raise a UserError: templates have no network."""
         raise _networks_only("inputs of a network")
 
     def maps(self, image: Picture) -> NoReturn:
-        """Raise, because there is no network."""
+        """Raise a UserError: templates have no belief maps."""
         raise _networks_only("belief maps")
 
 
 def _plainness(detector: TemplateDetector, detection: Detection) -> float:
-    """Return the log odds that a pose needs in addition, because its silhouette is small.
+    """Return the log odds that a pose with a small silhouette must have in addition.
 
-    A plate seen edge-on resembles every stick, and fits it well.
+    Small silhouettes resemble many objects: a plate seen edge-on fits every stick.
     """
     return -math.log(detector.silhouette(detection.T_cam_obj))
 
@@ -236,7 +243,10 @@ def _loudest(
     images: Iterable[Picture],
     K: CameraMatrix,
 ) -> list[float]:
-    """Return the largest log odds of verified poses on each image, within a depth ratio of 4."""
+    """Return the largest log odds of verified poses on each image.
+
+    The searched depths are limited to a ratio of 4 around the geometric mean of ``distances``.
+    """
     estimator = TemplateEstimator([detector], distances)
     near, far = distances
     middle = math.sqrt(near * far)
@@ -250,15 +260,15 @@ def _loudest(
 
 
 def _checked_distances(distances: object) -> tuple[float, float]:
-    """Return the working distance of templates.
+    """Return a working distance after checking it.
 
     Raises:
-        UserError: The distance is missing, or is not a range of metres.
+        UserError: The working distance is missing, or no range of metres.
     """
     if distances is None:
         raise UserError(
             "a mesh without a working distance",
-            "nearest and farthest distance of the part from the camera, metres",
+            "the nearest and farthest distance of the part from the camera, metres",
             "state it: --working-distance 0.3,0.5 (working_distance=(0.3, 0.5) in Python)",
         )
     return check("working_distance", distances, tuple[float, float], METRES)
@@ -267,7 +277,7 @@ def _checked_distances(distances: object) -> tuple[float, float]:
 def load_solid_part(
     mesh: str | Path, unit: str | None, name: str | None, symmetries: Literal["auto"] | None
 ) -> Part:
-    """Load a part for templates; see :meth:`PoseEstimator.from_mesh`."""
+    """Load a part and find its symmetries; see :meth:`PoseEstimator.from_mesh`."""
     part = load_part(mesh, unit)
     part = part if name is None else replace(part, name=check_name(name))
     if symmetries is None or part.mesh is None:
@@ -277,5 +287,6 @@ def load_solid_part(
 
 
 def _networks_only(noun: str) -> UserError:
+    """Return the error about a feature that only networks have."""
     fix = "train the part (python train.py experiment=my_part), and pass the checkpoint"
     return UserError(f"{noun} of templates", "a trained network", fix)

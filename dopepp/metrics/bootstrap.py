@@ -179,6 +179,11 @@ STATISTICS: Final[dict[StatisticName, _Statistic]] = {
 
 
 def _check(mine: Numbers, baseline: Numbers, statistic: str, same_seeds: bool) -> None:
+    """Check the shapes of the compared values.
+
+    Raises:
+        UserError: The shapes do not match, or a mean has values that are not finite.
+    """
     shapes = [[values.shape for values in method] for method in (mine, baseline)]
     plain = all(len(shape) == 2 and min(shape) > 0 for shape in [*shapes[0], *shapes[1]])
     seeds = [{shape[0] for shape in method} for method in shapes]

@@ -125,6 +125,7 @@ class EfficientNetLite(Backbone):
         return self
 
     def _load(self, path: str) -> None:
+        """Load the weights of a file, and adapt them to this network's normalisation."""
         weights = read_mapping(Path(path), "a state_dict of EfficientNet-Lite0 (.pth)")
         kinds = (nn.Conv2d, nn.BatchNorm2d)
         layers = [layer for layer in self.down.modules() if isinstance(layer, kinds)]

@@ -129,6 +129,11 @@ class Registry(Generic[T]):
             ) from error
 
     def _load(self, dotted: str) -> type[T]:
+        """Import a class and check it.
+
+        Raises:
+            UserError: It cannot be imported, or is not a subclass of the base class.
+        """
         module_name, _, name = dotted.rpartition(".")
         try:
             value = getattr(import_module(module_name), name)
@@ -160,6 +165,11 @@ class Registry(Generic[T]):
         arguments: Mapping[Any, object],
         provided: Mapping[str, object],
     ) -> None:
+        """Check the arguments of a class before it is instantiated.
+
+        Raises:
+            UserError: An argument is unknown, missing or set by the program.
+        """
         parameters = inspect.signature(target).parameters
         named = {
             name: parameter

@@ -211,6 +211,11 @@ class _Record:
 
 
 def _checked_cuboid(rows: Sequence[_Point]) -> Float[np.ndarray, "9 3"]:
+    """Return the cuboid of a record.
+
+    Raises:
+        UserError: The corners are no axis-aligned box, or in another order.
+    """
     cuboid = np.array(rows, np.float64)
     expected = cuboid_keypoints(cuboid.min(axis=0), cuboid.max(axis=0))
     # Another order of corners would silently give wrong poses; 1e-6 is float32's rounding.
@@ -226,6 +231,11 @@ def _checked_cuboid(rows: Sequence[_Point]) -> Float[np.ndarray, "9 3"]:
 def _checked_transforms(
     matrices: Sequence[Sequence[_Row]] | None,
 ) -> Float[np.ndarray, "symmetries 4 4"] | None:
+    """Return the discrete symmetries of a record.
+
+    Raises:
+        UserError: A matrix is no rigid transform.
+    """
     if matrices is None:
         return None
     transforms = np.array(matrices, np.float64).reshape(-1, 4, 4)

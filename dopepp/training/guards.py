@@ -248,6 +248,7 @@ class EmptyMaps(Callback):
             self._warn(trainer, pl_module)
 
     def _warn(self, trainer: Trainer, system: PoseSystem) -> None:
+        """Log once that all maps are empty, with the likely causes."""
         if self._warned or not trainer.is_global_zero:
             return
         self._warned = True

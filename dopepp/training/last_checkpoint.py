@@ -155,6 +155,7 @@ class LastCheckpoint(Checkpoint):
             raise Interruption(stop or signal.SIGTERM)
 
     def _save(self, trainer: Trainer, cut: Cut) -> None:
+        """Save the checkpoint, and measure how long it takes."""
         folder = Path(trainer.default_root_dir) / files.FOLDER
         self._cut, start = cut, time.monotonic()
         options = {"previous": folder / files.PREVIOUS}

@@ -60,7 +60,7 @@ def test_the_given_distances_replace_the_working_distance(estimator, rendered):
 def test_an_empty_image_is_explained(near_truth, estimator, rendered):
     image, K = rendered.image, rendered.scene.K
     assert estimator.predict(image, K) == []
-    text = "pivconnector: no view of it fits the image at 0.08 – 0.2 m"
+    text = "pivconnector: no view of the part fits the image at 0.08 – 0.2 m"
     assert explained(estimator.explain(image, K)) == text
     T = true_pose(rendered).copy()
     T[:3, 3] += [0.03, 0.03, 0.05]  # beside the part

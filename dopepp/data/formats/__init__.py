@@ -116,7 +116,11 @@ def make_instance(
 
 
 def read_object(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
-    """Read a JSON object that a writer extends; empty without a file."""
+    """Read the JSON object that a writer extends; return an empty one if there is no file.
+
+    Raises:
+        UserError: The file is no JSON object.
+    """
     content = read_json(path, max_bytes) if path.exists() else {}
     if not isinstance(content, dict):
         fix = "restore the file from a copy, or choose another folder"

@@ -39,13 +39,23 @@ class Problems:
     """Raises the first problem."""
 
     def report(self, path: Path | str, where: str, message: str, allowed: str = "") -> None:
-        """Raise a problem; ``allowed`` is empty if ``message`` implies it."""
+        """Report a problem.
+
+        Args:
+            path: File with the problem.
+            where: Field in the file, or an empty string.
+            message: What is wrong.
+            allowed: What would be right; empty if the message implies it.
+
+        Raises:
+            UserError: In this class, always.
+        """
         fix = "correct the file, or copy it again; `dopepp check` lists all problems of a data set"
         parts = str(path), where.lstrip("."), message
         raise UserError(": ".join(filter(None, parts)), allowed, fix)
 
     def take(self, path: Path | str, where: str, error: UserError) -> None:
-        """Raise an error of another package's function."""
+        """Report the error that another package raised; see :meth:`report`."""
         raise error
 
 

@@ -85,6 +85,7 @@ def _can_be_shaded(instance: Instance) -> bool:
 def _shaded(
     sample: Sample, silhouettes: Sequence[Mask], covers: Sequence[_Cover], share: float
 ) -> Shaded:
+    """Cover a share of each object."""
     image, covered = sample.image.copy(), np.zeros(sample.image.shape[:2], bool)
     for cover in covers:
         laid = cover.laid(share)

@@ -32,6 +32,7 @@ def build_parts(data: DataConfig) -> list[Part]:
 
 
 def _read_parts(data: DataConfig) -> list[Part]:
+    """Read the parts of the data set, or the mesh files of ``data.parts``."""
     if data.root is None:
         for option, value in (("objects", data.objects), ("frames", data.frames)):
             if value is not None:

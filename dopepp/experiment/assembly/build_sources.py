@@ -198,22 +198,37 @@ Opener = Callable[[DataConfig, Path, Parts, int, Split], DescribedSource]
 FORMATS: Final[dict[str, Opener]] = {
     # The images are an image set, or the listed frames, which all splits share.
     "ycb_video": lambda data, root, parts, seed, split: YcbVideoReader(
-        root, parts, data.image_set(split) if data.frames is None else None,
-        frames=data.frames, seed=seed, read_depth=split == "test",
+        root,
+        parts,
+        data.image_set(split) if data.frames is None else None,
+        frames=data.frames,
+        seed=seed,
+        read_depth=split == "test",
     ),
     "bop": lambda data, root, parts, seed, split: BopReader(
-        root, parts, data.image_set(split), part_of=share_of(data.image_sets, split),
-        targets=data.targets if split == "test" else None, read_depth=split == "test",
+        root,
+        parts,
+        data.image_set(split),
+        part_of=share_of(data.image_sets, split),
+        targets=data.targets if split == "test" else None,
+        read_depth=split == "test",
     ),
     "ndds": lambda data, root, parts, seed, split: NddsReader(
-        root / data.image_set(split), parts, part_of=share_of(data.image_sets, split),
-        classes=data.classes, read_depth=split == "test",
+        root / data.image_set(split),
+        parts,
+        part_of=share_of(data.image_sets, split),
+        classes=data.classes,
+        read_depth=split == "test",
     ),
     "webdataset": lambda data, root, parts, seed, split: WebdatasetReader(
-        root, parts, data.image_set(split), part_of=share_of(data.image_sets, split),
-        download_dir=data.download_dir, read_depth=split == "test",
+        root,
+        parts,
+        data.image_set(split),
+        part_of=share_of(data.image_sets, split),
+        download_dir=data.download_dir,
+        read_depth=split == "test",
     ),
-}  # fmt: skip
+}
 """Functions that open the images of each format."""
 
 

@@ -174,7 +174,11 @@ def _start_from(network: torch.nn.Module, path: Path) -> None:
 
 
 def build_trainer(config: RunConfig, run_dir: Path, trackers: Sequence[Logger] = ()) -> Trainer:
-    """Build Lightning's trainer with the callbacks, the CSV table and the trackers."""
+    """Build Lightning's trainer with the callbacks, the CSV table and the trackers.
+
+    Raises:
+        UserError: An option of the trainer or of a callback is wrong.
+    """
     options, accelerator = config.trainer, config.trainer.accelerator
     if accelerator in ("auto", "gpu") and torch.cuda.is_available():
         accelerator = "cuda"

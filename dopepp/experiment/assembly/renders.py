@@ -55,7 +55,11 @@ def held_out_renders(
 
 
 def scaled_test_renders(data: DataConfig, parts: Parts, scale: float) -> DescribedSource:
-    """Render the test scenes with the camera closer to the parts by a factor."""
+    """Render the test scenes with the camera closer to the parts by a factor.
+
+    Raises:
+        UserError: The test images are not renders.
+    """
     if not data.is_rendered("test"):
         raise UserError(
             f"scale={scale:g} on the images in data.root={data.root}",
@@ -120,6 +124,7 @@ def _factory(
     backgrounds: Backgrounds,
     renderer: str | None = None,
 ) -> Factory:
+    """Return the factory of the rendered images."""
     return Factory(
         parts,
         preset,

@@ -184,6 +184,7 @@ def record_breakdown(
     by_middle = {each.middle: each for each in bins}
 
     def cells(value: Value) -> Row:
+        """Return the cells of the table that show a value."""
         limits = by_middle[value.condition]
         ends = dict.fromkeys(f"{end:.{decimals}f}" for end in (limits.low, limits.high))
         row = {title: " … ".join(ends)}

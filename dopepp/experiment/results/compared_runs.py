@@ -141,6 +141,11 @@ def find_runs(paths: Sequence[Path]) -> list[Run]:
 
 
 def _folders(path: Path) -> list[Path]:
+    """Return the run folders in a folder, which may be a run or a multirun.
+
+    Raises:
+        UserError: It is neither.
+    """
     if any((path / trace).exists() for trace in _TRACES):
         return [path]
     jobs = [job for job in path.iterdir() if job.name.isdigit()] if path.is_dir() else []

@@ -107,7 +107,11 @@ class Condition:
         return self.form.format(self.per_unit * level)
 
     def check_methods(self, methods: Mapping[str, Method]) -> None:
-        """Raise a user error for files of poses, which have no poses on other images."""
+        """Check that all methods are networks: a file has no poses on the changed images.
+
+        Raises:
+            UserError: A method is a file of poses.
+        """
         for name, method in methods.items():
             if isinstance(method, FileMethod):
                 raise UserError(

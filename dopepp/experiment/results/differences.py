@@ -130,6 +130,7 @@ def compared(entries: Sequence[Entry]) -> pd.DataFrame:
 
 
 def _values(entries: Sequence[Entry]) -> Iterator[Value]:
+    """Yield the values of the frame, entry by entry."""
     baseline = next((entry for entry in entries if entry.reports), None)
     for entry in entries:
         if entry.failure:
@@ -181,6 +182,7 @@ def headline(table: pd.DataFrame, symmetric: bool = False) -> list[Row]:
     several = _has_seeds(table)
 
     def cells(value: Value) -> Row:
+        """Return the cells of a value: text, deviation, interval and verdict."""
         return _labels(value, several) | ({value.heading: value.summary} if value.measure else {})
 
     return pivot(values_of(table[table["measure"].isin(chosen)]), ("method", "object"), cells)

@@ -142,6 +142,7 @@ class RunReadme:
         write_run_readme(self._folder, title, report, reason, commands, is_trial)
 
     def _next_commands(self, state: str, report: Report | None) -> list[str]:
+        """Return the commands that a user may want to run after this state."""
         run = shlex.quote(program.shown(self._folder))
         checkpoint = {} if report is None else report.details
         best = self._folder / checkpoint.get("checkpoint", BEST_CHECKPOINT)

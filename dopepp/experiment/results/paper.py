@@ -183,6 +183,7 @@ def _recipe(entries: Sequence[Entry]) -> list[str]:
 
 
 def _notes(table: PaperTable, entries: Sequence[Entry]) -> list[str]:
+    """Return the notes below a table of the paper."""
     notes = [*table.notes, *([NOTE] if table.kind == "time" else [])]
     if table.kind in _MEASURED:
         notes.append(f"The paper's pass rate is ADD < {table.threshold:g} m.")

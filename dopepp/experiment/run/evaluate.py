@@ -79,7 +79,11 @@ def _show(tuning: Tuning, path: Path) -> None:
 
 
 def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part]:
-    """Return the last estimator's parts, or all parts of the test data without estimators."""
+    """Return the last estimator's parts, or all parts of the test data without estimators.
+
+    Raises:
+        UserError: The test data lacks one of the estimator's parts.
+    """
     if not estimators:
         return build_parts(data)
     names = [part.name for part in estimators[-1].parts]
@@ -163,7 +167,11 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
 
 
 def _check_combination(asked: EvaluationConfig) -> None:
-    """Raise a UserError for options that exclude or require each other."""
+    """Check for options that exclude or require each other.
+
+    Raises:
+        UserError: Two options exclude each other, or a required option is missing.
+    """
     has_network = asked.ckpt_path is not None or asked.baseline is not None
     if asked.ckpt_path is None and asked.results is None and asked.templates is None:
         fix = "add ckpt_path=FILE for a checkpoint, results=FILE for a file of poses, or "
@@ -204,7 +212,11 @@ def _tune_only(
     data: DataConfig,
     run_dir: Path,
 ) -> None:
-    """Tune the checkpoint without measuring it further."""
+    """Tune the checkpoint without measuring it further.
+
+    Raises:
+        UserError: Other options are given, or there is not exactly one checkpoint.
+    """
     if asked.protocols:
         raise UserError(
             "tune=true with shading, scale or by",

@@ -98,7 +98,11 @@ def export(
 
 @contextmanager
 def _written(target: Path) -> Iterator[Path]:
-    """Yield a temporary path that is moved to the target; a failure becomes a run error."""
+    """Yield a temporary path, which is moved to the target at the end.
+
+    Raises:
+        RunError: The target cannot be written.
+    """
     try:
         with draft(target) as draft_path:
             yield draft_path
@@ -108,7 +112,11 @@ def _written(target: Path) -> Iterator[Path]:
 
 
 def _target(path: Path, layout: str, precision: str, out: Path | None) -> Path:
-    """Return the path of the export, or raise a user error if an option or the path is wrong."""
+    """Return the path of the export.
+
+    Raises:
+        UserError: An option or the path is wrong.
+    """
     choices = {"format": (layout, EXPORTERS), "precision": (precision, PRECISIONS)}
     for name, (value, allowed) in choices.items():
         if value not in allowed:

@@ -86,7 +86,11 @@ def do_job(config: Mapping[str, Any], run_dir: Path) -> object:
 
 
 def _refuse_parallel_multirun(trainer: TrainerConfig) -> None:
-    """Raise for several processes in a multirun, because each would start the sweep again."""
+    """Check that a multirun uses one process, because each process would start the sweep again.
+
+    Raises:
+        UserError: It would use several.
+    """
     if not HydraConfig.initialized() or HydraConfig.get().mode != RunMode.MULTIRUN:
         return
     if trainer.num_processes > 1:
@@ -131,6 +135,7 @@ def _train(
     explanation: pages.RunReadme,
     trackers: Sequence[GuardedLogger],
 ) -> Report:
+    """Train and measure the best checkpoint; see :func:`run_training`."""
     if not config.keep_checkpoints and config.resume is not None:
         raise UserError(
             f"resume={config.resume} with keep_checkpoints=false",

@@ -1,15 +1,15 @@
-"""Tune the factors, the scores and the thresholds of a checkpoint on validation images.
+"""Tune the factors, scores and thresholds of a checkpoint on validation images.
 
-- Distance: the median ratio of true to estimated distances.
-- Covariance: matches the errors of the right poses; one factor for the network's and one for
-  refined poses.
-- Scores: the probability of "ADD(-S) below a tenth of the diameter". That of refined poses is a
+- Distance factor: median ratio of true to estimated distances.
+- Covariance factors: make the covariances match the errors of right poses. Network poses and
+  refined poses have separate factors.
+- Score: probability that ADD(-S) is below a tenth of the diameter. The score of refined poses is a
   recalibration of the verification.
-- Thresholds: the lowest ones that satisfy the permitted rate of false positives on pictures without
-  the objects.
+- Thresholds: the lowest scores with at most the permitted rate of false positives on pictures
+  without the objects.
 
-Factors and scores that rank the validation poses worse than those of the checkpoint are not taken.
-Test images check the result, which is written to a new checkpoint.
+The old factors are kept if the new ones rank the validation poses worse. The result is measured on
+test images and written to a new checkpoint.
 """
 
 from __future__ import annotations
@@ -64,18 +64,18 @@ from dopepp.recovery.detection import (
 )
 
 LEAST_REFINED_SCORE: Final = 0.1
-"""Lowest threshold of refined poses: a pose that is far more likely wrong than right is not
-reported, however quiet the pictures without the objects are."""
+"""Lowest threshold of refined poses. Poses that are far more likely wrong than right are never
+reported, even if the pictures without the objects would permit it."""
 
-FEWEST_REFINED: Final = 20  # right poses to which the covariance factor of refined poses is fitted
+FEWEST_REFINED: Final = 20  # least number of right refined poses that a covariance factor is fit to
 
-MOST_LOST: Final = 0.01  # share of the correct refined poses that silence may cost
-SAME: Final = 0.005  # average precision that fitted options may lose
+MOST_LOST: Final = 0.01  # largest share of correct refined poses below the threshold
+SAME: Final = 0.005  # largest decrease of the average precision with fitted factors
 
 HELD_OUT: Final[tuple[Literal["val"], Literal["test"]]] = ("val", "test")
 
 MOST_BYTES: Final = 2**30
-"""Limit of the cache: 1,400 pictures of 400×400 pixels with the maps of one part."""
+"""Size of the cache, bytes: 1,400 pictures of 400×400 pixels with the maps of one part."""
 
 _WEIGHTS: Final = ("score_", "refined_")
 
@@ -86,14 +86,14 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class Scored:
-    """Detections in a set of images, and the number of images and instances."""
+    """Detections on a set of images."""
 
-    features: Float[np.ndarray, "n features"]
+    features: Float[np.ndarray, "n features"]  # features of the score
     scores: Float[np.ndarray, "n"]
-    correct: Bool[np.ndarray, "n"]
-    image: np.ndarray
-    kinds: Sequence[str]  # kind of each image's source
-    num_instances: int
+    correct: Bool[np.ndarray, "n"]  # whether ADD(-S) is below a tenth of the diameter
+    image: np.ndarray  # (n,) index of each detection's image
+    kinds: Sequence[str]  # source of each image
+    num_instances: int  # instances on all images that count
 
     @property
     def num_images(self) -> int:
@@ -101,7 +101,7 @@ class Scored:
         return len(self.kinds)
 
     def shows_lookalikes(self) -> Bool[np.ndarray, "images"]:
-        """Return which images show look-alikes of the objects."""
+        """Return which images show objects that resemble the parts."""
         return np.array([kind == LOOKALIKES for kind in self.kinds], bool)
 
     def loudest(self, scores: Float[np.ndarray, "n"]) -> Float[np.ndarray, "images"]:
@@ -118,31 +118,24 @@ class Scored:
 
 @dataclass(frozen=True)
 class Figures:
-    """Quality of scores and threshold; recall and precision are those of the reported poses.
+    """Quality of scores and threshold."""
 
-    The rates are shares of the images without objects, and of those with look-alikes, on which
-    something is reported.
-    """
-
-    calibration_error: float
-    false_positive_rate: float
-    lookalike_rate: float
-    recall: float
-    precision: float
+    calibration_error: float  # expected calibration error of the scores
+    false_positive_rate: float  # share of the images without objects on which a pose is reported
+    lookalike_rate: float  # the same of images with look-alikes of the objects
+    recall: float  # share of the instances with a correct reported pose
+    precision: float  # share of the reported poses that are correct
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """Tuned recovery options, and their effect on test images with and without objects.
+    """Tuned recovery options, and their effect on test images."""
 
-    ``before`` is the untuned network. ``kept`` is the reason for keeping the old factors.
-    """
-
-    options: dict[str, float]
-    before: Figures
-    after: Figures
-    num_images: tuple[int, int]
-    kept: str = ""
+    options: dict[str, float]  # changed RecoveryOptions
+    before: Figures  # network with the old options, without refinement
+    after: Figures  # estimator with the tuned options
+    num_images: tuple[int, int]  # test images with and without objects
+    kept: str = ""  # why the old factors were kept; empty if they were replaced
 
 
 def tune(
@@ -150,11 +143,17 @@ def tune(
 ) -> Tuning:
     """Choose factors, weights and thresholds on validation images and measure them on test images.
 
-    For an estimator that refines, the network is tuned first, then the refined poses.
+    The score of network poses is tuned first, then that of refined poses.
+
+    Args:
+        estimator: Estimator of the checkpoint.
+        data: Data sources.
+        parts: Parts of the checkpoint.
+        target: Number of pictures without objects, and permitted rate of false positives.
 
     Raises:
-        UserError: There are no detections, all of them are correct or wrong, or the covariances
-            are far from the errors.
+        UserError: There are no detections, all of them are correct or all wrong, or the covariances
+            differ too much from the errors.
     """
     old, memory = estimator.recovery, Memory()
     estimator = memory.behind(estimator)
@@ -189,13 +188,14 @@ def _chosen_factors(
     rate: float,
     old: RecoveryOptions,
 ) -> tuple[RecoveryOptions, Scored, str]:
-    """Choose between the fitted factors and the old ones, each with the network's score for them.
+    """Fit the factors of network poses, and keep the old factors if they give better poses.
 
-    The factors are those of network poses. They are judged by the poses that the estimator reports,
-    because a wrong covariance misleads the refinement.
+    The average precision of the estimator's final poses decides, because a wrong covariance of the
+    network's poses misleads the refinement. The score of network poses is fitted for both.
 
     Returns:
-        Options, their detections on the validation images, and why the old factors were kept.
+        Options, their detections on the validation images, and why the old factors were kept (an
+        empty string if they were replaced).
     """
     plain = _without_refinement(estimator)
     plain.recovery = replace(_audible(old), distance_factor=1.0, covariance_factor=1.0)
@@ -203,8 +203,10 @@ def _chosen_factors(
     results: list[tuple[RecoveryOptions, Scored, float]] = []
     for base in (replace(old, **factors), old):  # type: ignore[arg-type]
         plain.recovery = _audible(base)
-        with_objects, without = (score_images(plain, parts, it) for it in (validation, empty))
-        # The verification as it was learned is what the score of refined poses is fitted to.
+        with_objects, without = (
+            score_images(plain, parts, source) for source in (validation, empty)
+        )
+        # Undo former tuning of refined poses: their score is fitted to the untuned verification.
         options = replace(base.unrefined(), **choose(with_objects, without, rate))  # type: ignore[arg-type]
         estimator.recovery = _audible(options)
         shown = score_images(estimator, parts, validation)
@@ -212,13 +214,13 @@ def _chosen_factors(
     (new, shown_new, fitted), (same, shown_same, former) = results
     if fitted >= former - SAME:
         return new, shown_new, ""
-    named = ", ".join(f"{name}={value:.3g}" for name, value in factors.items())
-    kept = f"AP {former:.3f} on validation images with the old factors, {fitted:.3f} with {named}"
+    text = ", ".join(f"{name}={value:.3g}" for name, value in factors.items())
+    kept = f"AP {former:.3f} on validation images with the old factors, {fitted:.3f} with {text}"
     return same, shown_same, kept
 
 
 def _audible(options: RecoveryOptions) -> RecoveryOptions:
-    """Return options under which every detection counts, regardless of its score."""
+    """Return options without thresholds, under which every detection is reported."""
     return replace(options, min_score=0.0, refined_min_score=0.0)
 
 
@@ -237,6 +239,7 @@ def _measured(
 
 
 def _without_refinement(estimator: PoseEstimator) -> PoseEstimator:
+    """Return a copy of an estimator that reports network poses."""
     plain = copy.copy(estimator)
     plain.refiner = None
     return plain
@@ -254,18 +257,18 @@ def fit_factors(
 
 
 def fit_refined_factor(estimator: PoseEstimator, parts: Parts, source: SampleSource) -> float:
-    """Fit the factor on covariances of poses refined on the image, from right poses alone.
+    """Fit the covariance factor of refined poses to the errors of right poses.
 
     Returns:
-        The factor; 1 with fewer than :data:`FEWEST_REFINED` right poses.
+        The factor; 1 if there are fewer than :data:`FEWEST_REFINED` right poses.
 
     Raises:
-        UserError: The covariances are far from the errors.
+        UserError: The covariances differ too much from the errors.
     """
     matches = matched_poses(estimator, parts, source, only_right=True)
     pairs = [match for match in matches if match[0].agreement is not None]
     if len(pairs) < FEWEST_REFINED:
-        text = "covariances of refined poses keep a factor of 1: %d right poses of at least %d"
+        text = "covariances of refined poses keep a factor of 1: %d right poses, fewer than %d"
         _log.warning(text, len(pairs), FEWEST_REFINED)
         return 1.0
     return fit_covariance_factor(squared_distances(pairs), refined=True)
@@ -294,15 +297,24 @@ def choose(
     *,
     refined: bool = False,
 ) -> dict[str, float]:
-    """Choose weights and threshold from detections in images with and without objects.
+    """Choose the weights and the threshold of a score.
 
-    Look-alikes teach the weights, but do not raise the threshold: it would have to exclude most
-    poses of the objects.
+    Look-alikes contribute to the weights, but not to the threshold, which would otherwise exclude
+    most poses of the objects.
 
-    Few refined poses change the verification little, and poses that are all correct not at all.
+    Args:
+        shown: Detections on images with objects.
+        empty: Detections on images without objects.
+        false_positive_rate: Permitted share of the images without objects with a reported pose.
+        refined: Whether the score of refined poses is chosen. The fewer refined poses there are,
+            the closer its weights stay to those of the verification. They stay equal if all poses
+            are correct or all wrong.
+
+    Returns:
+        Values of :class:`RecoveryOptions`.
 
     Raises:
-        UserError: There are no detections, or all of them are correct or wrong.
+        UserError: There are no detections of the network, or all are correct or all wrong.
     """
     features = np.concatenate([shown.features, empty.features])
     correct = np.concatenate([shown.correct, empty.correct])
@@ -315,7 +327,7 @@ def choose(
             f"{len(correct)} validation detections, all of them {what}"
             if len(correct)
             else "no detection on any validation image",
-            "right and wrong ones to learn from",
+            "right and wrong detections to learn from",
             "train longer, or raise data.num_val and num_empty",
         )
     else:
@@ -337,23 +349,25 @@ def _refined_threshold(
 ) -> float:
     """Return the threshold of refined poses.
 
-    It is the one that is silent on frames without the objects, within :data:`LEAST_REFINED_SCORE`
-    and the score that all but the share :data:`MOST_LOST` of the correct poses have. A single frame
-    that deceives the verification must not cost most poses.
+    It is the threshold that satisfies the rate of false positives (``silent``), but it rejects at
+    most the share :data:`MOST_LOST` of the correct poses and is at least
+    :data:`LEAST_REFINED_SCORE`. Otherwise a single frame with a high score could cost most poses.
     """
     correct = score(shown.features, weights)[shown.correct]
     most = float(np.quantile(correct, MOST_LOST)) if len(correct) else 1.0
     if silent > most:
-        text = (
-            "frames without the objects deceive scores up to %.2f; the threshold is %.2f, because "
+        _log.warning(
+            "poses on frames without the objects have scores up to %.2f; the threshold is %.2f, "
+            "because a higher threshold would lose over %.0f %% of the correct poses",
+            silent,
+            max(most, LEAST_REFINED_SCORE),
+            100 * MOST_LOST,
         )
-        text += "a higher one would lose over %.0f %% of the correct poses"
-        _log.warning(text, silent, max(most, LEAST_REFINED_SCORE), 100 * MOST_LOST)
     return max(min(silent, most), LEAST_REFINED_SCORE)
 
 
 def score_images(estimator: PoseEstimator, parts: Parts, *sources: SampleSource) -> Scored:
-    """Run an estimator over sources and judge every detection."""
+    """Run an estimator on all images of sources, and judge every detection."""
     refined = estimator.refiner is not None and estimator.refiner.verifies
     names = REFINED_FEATURES if refined else FEATURES
     rows: list[tuple[np.ndarray, float, bool, int]] = []
@@ -382,9 +396,16 @@ def score_images(estimator: PoseEstimator, parts: Parts, *sources: SampleSource)
 def matched_poses(
     estimator: PoseEstimator, parts: Parts, source: SampleSource, *, only_right: bool = False
 ) -> list[tuple[Detection, Float[np.ndarray, "equivalents 4 4"]]]:
-    """Return matched detections with all poses equivalent to that of their instance.
+    """Match detections with instances.
 
-    ``only_right`` leaves out poses with ADD(-S) above a tenth of the diameter.
+    Args:
+        estimator: Estimator.
+        parts: Parts.
+        source: Images.
+        only_right: Leave out poses with ADD(-S) above a tenth of the diameter.
+
+    Returns:
+        Matched detections, each with the poses equivalent to that of its instance.
     """
     matches = []
     for _, _, part, detections, instances in _by_object(estimator, parts, source):
@@ -402,7 +423,7 @@ def matched_poses(
 def _by_object(
     estimator: PoseEstimator, parts: Parts, *sources: SampleSource
 ) -> Iterator[tuple[int, Sample, Part, list[Detection], list[Instance]]]:
-    """Yield the detections and instances of every image and part, with the image number."""
+    """Yield image number, sample, part, detections and instances for every image and part."""
     images = ((source, index) for source in sources for index in range(len(source)))
     for number, (source, index) in enumerate(images):
         sample = source.sample(index, 0)
@@ -425,9 +446,9 @@ def write_tuned(checkpoint: Checkpoint, path: Path, options: Mapping[str, float]
 def _judge(
     part: Part, detections: Sequence[Detection], true: Sequence[Instance]
 ) -> tuple[Bool[np.ndarray, "found"], Bool[np.ndarray, "found"]]:
-    """Return which detections are correct (ADD(-S) below 0.1 d), and which are judged at all.
+    """Return which detections are correct (ADD(-S) below 0.1 d), and which count.
 
-    As in every evaluation, detections of heavily occluded instances are not judged.
+    As in every evaluation, detections of heavily occluded instances do not count.
     """
     numbers = assign(part, detections, true)
     counts = np.array([number < 0 or counted(true[number]) for number in numbers], bool)
@@ -444,6 +465,7 @@ def _judge(
 
 
 def _figures(test: Scored, empty: Scored, threshold: float) -> Figures:
+    """Return the figures of detections on test images with and without objects."""
     scores, correct = torch.from_numpy(test.scores), torch.from_numpy(test.correct)
     error = expected_calibration_error(scores, correct)
     loud = empty.loudest(np.where(empty.scores >= threshold, 1.0, 0.0))
@@ -458,9 +480,10 @@ def _figures(test: Scored, empty: Scored, threshold: float) -> Figures:
 
 
 class Memory:
-    """Cache for pictures and maps, which tuning needs several times.
+    """Cache for pictures and maps, which tuning uses several times.
 
-    Items are stored until the limit is reached; further items are computed each time.
+    Args:
+        most_bytes: Size of the cache. Items that do not fit are computed each time.
     """
 
     def __init__(self, most_bytes: int = MOST_BYTES) -> None:
@@ -492,6 +515,8 @@ class Memory:
 
 @dataclass
 class _RememberedSource:
+    """Source whose items of epoch 0 are cached."""
+
     source: SampleSource
     memory: Memory
     name: str
@@ -507,6 +532,8 @@ class _RememberedSource:
 
 @dataclass
 class _RememberedNetwork:
+    """Network whose maps are cached by the pixels of the input."""
+
     network: Runtime
     memory: Memory
     stride: int
@@ -516,10 +543,11 @@ class _RememberedNetwork:
         pixels = images.permute(0, 2, 3, 1).contiguous().cpu().numpy()
         key = (id(self), pixels.shape, hashlib.blake2b(pixels.tobytes()).digest())
         return self.memory.recall(
-            key, lambda: self.network.maps(images), lambda maps: sum(each.nbytes for each in maps)
+            key, lambda: self.network.maps(images), lambda maps: sum(part.nbytes for part in maps)
         )
 
 
 def _num_bytes(sample: Sample) -> int:
-    arrays = [sample.image, sample.depth, *(each.mask for each in sample.instances)]
-    return sum(each.nbytes for each in arrays if each is not None)
+    """Return the size of a sample's arrays."""
+    arrays = [sample.image, sample.depth, *(instance.mask for instance in sample.instances)]
+    return sum(array.nbytes for array in arrays if array is not None)

@@ -319,7 +319,11 @@ def open_study(options: Mapping[str, Any], facts: Mapping[str, str], seed: int) 
 
 
 def _check_same(before: Mapping[str, str], now: Mapping[str, str], study: str) -> None:
-    """Raise a user error if the trials of a study could not be compared."""
+    """Check that the trials of a study can be compared.
+
+    Raises:
+        UserError: The configurations differ in more than the searched options.
+    """
     keys = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
     if not keys:
         return

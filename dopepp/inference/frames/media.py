@@ -245,6 +245,7 @@ class _NewestFrame:
         self._stopped.set()
 
     def _read(self) -> None:
+        """Read pictures in a thread, of which only the newest is kept."""
         number = 0
         while not self._stopped.is_set():
             delivered, image = False, None

@@ -1,9 +1,10 @@
 """Colours of the part and its surroundings: the log odds that a pixel shows the part.
 
-Colours inside and around the outline are counted in histograms with 16 bins per channel, blurred a
-little. The log odds are the logarithm of their ratio at a pixel's colour, 0 for a colour in neither
-of them. Part and background may have several colours: each tile of the part's box has histograms
-of its own, with a small weight of the other tiles (Lankton and Tannenbaum 2008; RBOT).
+Colours inside and around the outline are counted in two slightly blurred histograms with 16 bins
+per channel. The log odds of a pixel are the logarithm of their ratio at the pixel's colour, and 0
+if neither histogram contains the colour. Part and background may have several colours. Therefore
+each tile of the part's box has its own histograms, in which the other tiles have a small weight
+(Lankton and Tannenbaum 2008; RBOT).
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ STEPS: Final = 16  # bins per channel
 UNSEEN: Final = 0.3  # initial count of each colour in both histograms
 
 KNOWN: Final = 100.0
-"""Pixels by which the colours of all tiles count in each tile."""
+"""Weight of the colours of all tiles in each tile's histogram, pixels."""
 
 MOST: Final = 3.0
-"""Bound of the log odds, 20 to 1: pixels of a patch are not independent."""
+"""Bound of the log odds (20 to 1), because neighbouring pixels are not independent."""
 
-LONGEST_PX: Final = 250  # pixels of larger crops are subsampled
-FEWEST: Final = 60  # pixels of a histogram, at least
+LONGEST_PX: Final = 250  # length above which the pixels of a crop are subsampled
+FEWEST: Final = 60  # least number of pixels of a histogram
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +119,7 @@ def log_odds(
     Args:
         bins: Colour bins.
         mask: 1 at the assumed pose of the part.
-        unsure: Width on both sides of the outline that counts for neither, pixels.
+        unsure: Width of the band on each side of the outline that neither histogram counts, pixels.
         ring: Width of the surroundings, pixels.
         tiles: Tiles along each side of the part's box.
 

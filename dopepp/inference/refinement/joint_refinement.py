@@ -2,11 +2,10 @@
 
 The unknown is the part's pose in the world. Every view contributes the terms of a single picture,
 with its own errors of offset and scale. A step of the solver is a rotation about the object's
-origin and a shift of the origin, so it only has to be turned into the axes of each camera.
+origin and a shift of the origin. To apply it in a camera, only its axes are turned.
 
 The error of a camera's pose moves the part in this camera alone. It is normally distributed with a
-stated covariance and eliminated from the view's equations: their covariance grows by that of the
-error.
+stated covariance. Eliminating the error from the view's equations adds its covariance to theirs.
 """
 
 from __future__ import annotations
@@ -53,11 +52,14 @@ class PosedPicture:
     depth: Depth | None = None  # metres along z
 
     def pose(self, T_world_obj: Transform) -> Transform:
-        """Return a pose in the camera."""
+        """Transform a pose from the world to the camera."""
         return np.asarray(self.T_cam_world @ T_world_obj)
 
     def error_at(self, position: Vector) -> PoseMatrix:
-        """Return the covariance by which the camera's error moves a part at a position (camera)."""
+        """Return the covariance of a part's pose due to the camera's error.
+
+        ``position`` is the object's origin in the camera frame, metres.
+        """
         x, y, z = position
         lever = np.eye(6)  # a rotation about the camera's centre shifts the object's origin
         lever[3:, :3] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
@@ -80,7 +82,7 @@ class PosedPicture:
 
 
 def turned(R: RotationMatrix, matrix: PoseMatrix) -> PoseMatrix:
-    """Return a covariance or information in axes turned by R."""
+    """Rotate the axes of a covariance or information by R."""
     turn = _turn(R)
     return np.asarray(turn @ matrix @ turn.T)
 
@@ -111,7 +113,7 @@ class ViewTerm:
 
 
 def _widened(H: PoseMatrix, g: Vector, covariance: PoseMatrix) -> NormalEquations:
-    """Return normal equations of the same mean, with a covariance added: (H⁻¹ + C)⁻¹."""
+    """Add a covariance C to normal equations without moving their mean: H becomes (H⁻¹ + C)⁻¹."""
     solved = np.linalg.solve(np.eye(6) + H @ covariance, np.column_stack([H, g]))
     return (solved[:, :6] + solved[:, :6].T) / 2, solved[:, 6]
 
@@ -140,7 +142,7 @@ def refine_views(
         region: Refiner of the part.
         views: Pictures.
         start: Pose in the world from which the search starts; its information limits the search.
-        prior: What is known of the pose without the pictures' outlines.
+        prior: Distribution of the pose before the pictures' outlines are used.
         surface: Surface points of the part, for views with depth.
 
     Raises:

@@ -49,7 +49,7 @@ class OutlineMesh:
     sides: Int[np.ndarray, "edges 2"]
     # 1 if both triangles run along the edge in the same direction, else 0
     opposed: UInt8[np.ndarray, "edges"]
-    is_closed: bool  # whether triangles that face the camera hide all others
+    is_closed: bool  # whether the mesh is closed: front triangles hide all others
 
 
 def make_outline_mesh(
@@ -94,7 +94,7 @@ class PosedMesh:
 
 
 def posed(mesh: OutlineMesh, T_cam_obj: Transform, K: CameraMatrix) -> PosedMesh | None:
-    """Project a mesh; None if some of it is not in front of the camera."""
+    """Project a mesh; return None if a vertex is not in front of the camera."""
     arms, pixels = np.empty_like(mesh.vertices), np.empty((len(mesh.vertices), 2))
     front = np.empty(len(mesh.faces), np.bool_)
     if not _pose(mesh.vertices, mesh.planes, T_cam_obj, K, arms, pixels, front):
@@ -147,7 +147,7 @@ def find_contour(
 def outline_rows(
     contour: Contour, T_cam_obj: Transform, K: CameraMatrix
 ) -> Float[np.ndarray, "points 6"]:
-    """Return the derivative of each point's motion along its normal, pixels, by the pose."""
+    """Return the derivative of each point's motion along its normal (pixels) by the pose."""
     rows = np.empty((len(contour), 6))
     _rows(contour.arms, contour.normals, T_cam_obj, K, rows)
     return rows
@@ -322,7 +322,11 @@ def _outward(
 
 @compiled()
 def _rows(arms: Array, normals: Array, T: Array, K: Array, rows: Array) -> None:
-    """Write a point's move: along n·du with du = f (dX/Z − X dZ/Z²), and arm × that for a turn."""
+    """Write the derivatives of each point's motion along its normal.
+
+    By the shift, it is n·du with du = f (dX/Z − X dZ/Z²). By the rotation, it is the cross product
+    of the arm and this vector.
+    """
     for i in range(len(arms)):
         x, y, z = arms[i, 0], arms[i, 1], arms[i, 2]
         inverse = 1.0 / (z + T[2, 3])

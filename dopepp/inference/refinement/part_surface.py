@@ -1,7 +1,8 @@
-"""A part's surface as points, and its comparison with a region of a depth image.
+"""Surface of a part as points, and its comparison with a depth image.
 
-Checkpoints of parts without a mesh have surface points only. Every point represents a disc of the
-surface around it. A point is hidden if the discs of other points lie in front of it on its ray.
+Points are used because checkpoints of parts without a mesh contain nothing else. Every point
+represents a disc of the surface around it. A point is hidden if discs of other points lie in front
+of it on its ray.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ NEIGHBOURS: Final = 12  # points that a normal is estimated from
 FLAT: Final = 0.3  # neighbours farther from a plane belong to another face
 SLIVER: Final = 0.3  # twice the area (squared spacings) of a triangle that determines a plane
 DISC: Final = 1.5  # radius of a disc: of random points, fewer than 1 in 1,000 discs is empty
-CLEARANCE: Final = 0.4  # distance in front of a point that hides it: the error of a disc's plane
+CLEARANCE: Final = 0.4  # least distance between a point and a disc that hides it
 STEEPEST: Final = 0.2  # cosine between ray and normal below which a disc counts as a point
 LONGEST_PX: Final = 112  # longer crops are subsampled: 10,000 pixels determine six numbers
 MARGIN: Final = 0.3  # margin of a crop, share of the part's extent
@@ -89,7 +90,7 @@ def surface_points(points: Points) -> SurfacePoints:
 
 
 def visible(surface: SurfacePoints, T_cam_obj: Transform) -> Visible:
-    """Return which points are not hidden by the part itself; all are in front of the camera."""
+    """Return which points the part itself does not hide; all must be in front of the camera."""
     points = surface.points @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
     normals = surface.normals @ T_cam_obj[:3, :3].T
     rays = points / points[:, 2:]
@@ -161,8 +162,8 @@ class SurfaceOverlay:
     def continues(self, noise: float, reach: float) -> Mask:
         """Return the pixels beside the part whose depth continues the part's surface.
 
-        Pixels are compared with the offset of the adjacent surface, so that the table is not taken
-        for the part while the pose is still tilted.
+        Pixels are compared with the offset of the adjacent surface. Otherwise the table could look
+        like a continuation of the part while the pose is still tilted.
 
         Args:
             noise: Standard deviation of the depth, metres.
@@ -222,7 +223,7 @@ def _hide(
     spacing: float,
     is_visible: Array,
 ) -> None:
-    """Write which points are visible; two discs that hide a point have to agree.
+    """Write which points are visible: those that fewer than two discs hide.
 
     Points are sorted into a grid over the image: ``keys`` are the column and row of each point's
     cell, ``order`` the points by cell, and ``starts`` the index of each cell's first point.

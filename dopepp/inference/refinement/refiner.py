@@ -1,10 +1,14 @@
 """Refinement of poses by one solver; ``refine=`` selects the evidence (terms).
 
-``region`` is the outline on the image, ``depth`` a depth image. With both, the image alone is
-refined first. If it does not determine the pose, or ends too far from the measured surface, depth
-alone provides the start. From there both terms are used. Evidence that does not determine the pose
-is left out: without depth the image refines alone, and depth alone if part and background have the
-same colour.
+``region`` uses the outline on the image, ``depth`` a depth image. With both terms:
+
+1. The pose is refined on the image alone.
+2. If the image does not determine the pose, or moves it too far from the measured surface, the pose
+   is refined on depth alone instead.
+3. The result is refined on both.
+
+A term that does not determine the pose is left out. Without depth, the image refines alone. If part
+and background have the same colour, depth refines alone.
 """
 
 from __future__ import annotations
@@ -63,10 +67,10 @@ if TYPE_CHECKING:
 TERMS: Final = ("region", "depth")
 
 LOOSER: Final = 3.0
-"""Factor on the deviations of a network's pose: its covariance was fitted to images like those of
-training, and errors are larger on others."""
+"""Factor on the deviations of a network's pose. Its covariance was fitted to images like those of
+training; errors are larger on other images."""
 
-FEW: Final = 4  # keypoints that determine a pose
+FEW: Final = 4  # number of keypoints that determine a pose
 NUM_QUADRUPLES: Final = 40  # nine keypoints have 126 quadruples
 
 Refine = str | Sequence[str]  # name or names in TERMS
@@ -97,7 +101,7 @@ class Refiner:
         self.verifies = "region" in terms
         """Whether refined poses are verified, from the same evidence as the term ``region``."""
         self.uses_depth = "depth" in terms
-        """Whether poses are refined on depth images, where there are some."""
+        """Whether poses are refined on depth images, if available."""
 
     def mesh(self, name: str) -> OutlineMesh | None:
         """Return a part's mesh, prepared for its outline; None without the term ``region``."""
@@ -161,7 +165,7 @@ class PartRefiner:
     Args:
         part: Part.
         terms: Evidence, some of :data:`TERMS`.
-        scale_error: As of :class:`Refiner`.
+        scale_error: See :class:`Refiner`.
 
     Raises:
         UserError: The term ``region`` requires a mesh, and the part has none.
@@ -194,7 +198,7 @@ class PartRefiner:
             views: Pictures with the poses of their cameras.
             start: Pose in the world from which the search starts; its information limits the
                 search.
-            prior: What is known of the pose without the pictures' outlines.
+            prior: Distribution of the pose before the pictures' outlines are used.
 
         Raises:
             UndecidedError: The pictures do not determine the pose.
@@ -290,10 +294,10 @@ def _refine_with_both(
 def poses_of_four(
     cuboid: Cuboid, peaks: Float[np.ndarray, "9 2"], K: CameraMatrix
 ) -> list[Transform]:
-    """Return the poses of several quadruples of measured keypoints, equal in every call.
+    """Solve for the pose from each of several sets of four keypoints; equal in every call.
 
     An occluder or a similar object displaces several keypoints together, which their covariances do
-    not show; the other keypoints are right.
+    not show. Sets without these keypoints give the right pose.
 
     Args:
         cuboid: Keypoints of the part, metres.

@@ -31,8 +31,8 @@ UNKNOWN_TURN: Final = math.radians(8.0)
 UNKNOWN_ACROSS: Final = 0.07
 UNKNOWN_ALONG: Final = 0.30
 
-# Lower bounds, in the same units: calibration and CAD have errors that no image shows, and an error
-# of the focal length is an error of the distance.
+# Lower bounds, in the same units. Errors of calibration and CAD do not show on the image, and an
+# error of the focal length causes an error of the distance.
 LEAST_TURN: Final = math.radians(2.0)
 LEAST_ACROSS: Final = 0.03
 LEAST_ALONG: Final = 0.15
@@ -59,7 +59,7 @@ class Solution:
 
     T_cam_obj: Transform
     information: PoseMatrix  # inverse covariance of evidence and prior
-    # Equations of each term that `descend` got, linearised before the last step, at this pose
+    # Equations of each term of `descend` at this pose, linearised before the last step
     equations: Sequence[NormalEquations] = ()
 
 
@@ -118,10 +118,10 @@ class Term(Protocol):
     """Evidence about a pose."""
 
     def __call__(self, pose: Transform, prior: NormalEquations, /) -> NormalEquations | None:
-        """Linearise the evidence at a pose; None without evidence.
+        """Linearise the evidence at a pose; return None if there is none.
 
-        ``prior`` is the prior of the step with the other terms: of this iteration before this
-        term, of the last iteration after it.
+        ``prior`` contains the prior and all other terms. Earlier terms are linearised in this
+        iteration, later terms in the last one.
         """
 
 
@@ -137,7 +137,7 @@ def descend(
     step = np.zeros(6)
     last: list[NormalEquations] = []
     for _ in range(steps):
-        # A step changes what a term still asks for.
+        # Move the equations of the last iteration to the present pose.
         later = [(H, g - H @ step) for H, g in last]
         last, information = [], prior.information
         gradient = information @ prior.offset(pose)

@@ -1,10 +1,10 @@
 """Verification: the probability that a pose is right, from the image at that pose.
 
 A pose is right if ADD(-S) is below a tenth of the part's diameter. The features describe how well
-the part, drawn at the pose, explains the image: its outline, its creases, its colours and its
-shading. None of them depends on a network, so that one small model serves all parts. It was learned
-from refined poses of procedural parts (``benchmarks/learn_verification.py``), and its numbers are
-the file ``verification.json``.
+the part, drawn at the pose, explains the image: its outline, creases, colours and shading. No
+feature depends on a network, so a single small model serves all parts. It was learned from refined
+poses of procedural parts (``benchmarks/learn_verification.py``), and its numbers are in
+``verification.json``.
 
 To add a feature, name it in :data:`EVIDENCE`, compute it in :meth:`Verifier.evidence`, and learn
 the model again.
@@ -92,7 +92,7 @@ class VerificationModel(NamedTuple):
 
 @cache
 def learned_model() -> VerificationModel:
-    """Return the model in the package."""
+    """Return the model that ships with the package."""
     path = files("dopepp.inference.refinement").joinpath("verification.json")
     values: dict[str, Any] = json.loads(path.read_text("utf-8"))
     if tuple(values["evidence"]) != EVIDENCE:
@@ -235,7 +235,7 @@ class Verifier:
         ring: UInt8[np.ndarray, "height width"],
         T_cam_obj: Transform,
     ) -> tuple[float, float]:
-        """Fit the colours inside by their normals; return explained share and log residual."""
+        """Fit the colours inside by the surface normals; return ``shading`` and ``residual``."""
         inside = np.flatnonzero(ids >= 0)
         inside = inside[:: math.ceil(len(inside) / MOST_PIXELS)]
         normals = self._normals[ids.ravel()[inside]] @ T_cam_obj[:3, :3].T
@@ -249,7 +249,7 @@ class Verifier:
         return float(1 - unexplained / (total + NOISE**2)), residual
 
     def _spread(self, covariance: PoseMatrix, T_cam_obj: Transform) -> float:
-        """Return the logarithm of the stated deviation of points over a tenth of the diameter."""
+        """Return the feature ``spread``."""
         R = T_cam_obj[:3, :3]
         moment = R @ self._moment @ R.T
         arms = np.trace(moment) * np.eye(3) - moment  # mean of |ω × p|² as a form of ω

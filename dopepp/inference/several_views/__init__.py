@@ -1,10 +1,13 @@
 """Poses of parts from several pictures of a static scene with known camera poses.
 
-Each view is searched alone. Detections that agree in the world form a part
-(:mod:`~dopepp.inference.several_views.sightings`), whose pose is refined on all views together
-and verified in each of them (:mod:`~dopepp.inference.several_views.joint`). Of parts at one place,
-the most probable remains. Views that contradict each other are named
-(:mod:`~dopepp.inference.several_views.contradictions`).
+1. Each view is searched alone.
+2. Detections of several views that agree in the world are joined to a part
+   (:mod:`~dopepp.inference.several_views.sightings`).
+3. The pose of each part is refined on all views together and verified in each view
+   (:mod:`~dopepp.inference.several_views.joint`).
+4. Of several parts with the same pose, the most probable remains.
+5. Contradictions between views are reported
+   (:mod:`~dopepp.inference.several_views.contradictions`).
 """
 
 from __future__ import annotations
@@ -37,7 +40,7 @@ if TYPE_CHECKING:
 
 CAMERA_ERROR: Final = (2e-4, math.radians(0.02))
 """Default standard deviations of a camera's pose along and about each axis: metres and radians.
-A hand-eye calibration reaches them."""
+These are the errors after a hand-eye calibration."""
 
 
 def predict_views(
@@ -95,14 +98,16 @@ def predict_views(
     parts.sort(key=lambda part: -part.detection.score)
     kept: list[JointPart] = []
     for part in parts:
-        if not any(_are_one(part, other) for other in kept):
+        if not any(_is_duplicate(part, other) for other in kept):
             kept.append(part)
     joint_ms = 1000 * (time.perf_counter() - start)
     passed = [part.detection for part in kept if part.detection.score >= estimator.min_score]
-    sure = [[it for it in view if it.detection.score >= estimator.min_score] for view in sightings]
-    agreeing, findings = contradictions(passed, sure, views, names, associated)
-    weaker = [part.detection for part in kept if part.detection not in agreeing]
-    passed = agreeing
+    strong = [
+        [sighting for sighting in view if sighting.detection.score >= estimator.min_score]
+        for view in sightings
+    ]
+    passed, findings = contradictions(passed, strong, views, names, associated)
+    weaker = [part.detection for part in kept if part.detection not in passed]
     shapes = {
         part.name: Shape(part.diameter, refiner.mesh(part.name)) for part in estimator.solid_parts
     }
@@ -138,16 +143,17 @@ def _posed(
     return PosedPicture(image, K, invert_transform(T), error, depth)
 
 
-def _are_one(part: JointPart, better: JointPart) -> bool:
-    """Return whether a part is a better one: at its place in all views, as far as they show it.
+def _is_duplicate(part: JointPart, better: JointPart) -> bool:
+    """Return whether two parts are the same instance, detected twice.
 
-    A pose that only its own view shows, and that is farther away than the covariances explain,
-    contradicts the other views.
+    Both must be at the same position in every view. If a view supports only the first part, the
+    covariances must also explain the difference of the poses. Otherwise the views contradict each
+    other.
     """
-    found, other = part.detection, better.detection
+    detection, other = part.detection, better.detection
     shared = {item.view for item in part.sightings} & {item.view for item in better.sightings}
-    pairs = zip(found.evidence, other.evidence, strict=True)
+    pairs = zip(detection.evidence, other.evidence, strict=True)
     if shared or not all(are_same(a.detection, b.detection) for a, b in pairs):
         return False
-    is_shown = set(found.views) <= set(other.views)
-    return is_shown or separation(found.pose, other.pose) <= CONSISTENT
+    is_supported = set(detection.views) <= set(other.views)
+    return is_supported or separation(detection.pose, other.pose) <= CONSISTENT

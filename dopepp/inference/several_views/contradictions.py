@@ -1,9 +1,9 @@
 """Contradictions between views: wrong or swapped camera poses, and moved parts.
 
-Two views contradict each other if either shows a part where the other shows something else, while
-the other shows a part of the same kind elsewhere, farther than the covariances explain. If the
-views agree on no part, a camera pose is wrong, and detections that depend on the pose are rejected.
-If the views agree on another part, the part was moved.
+Two views contradict each other if each shows the same kind of part at a different pose, the
+covariances do not explain the difference, and one of them shows something else at the other's pose.
+If the two views agree on no part, a camera pose is wrong, and the detections that depend on it are
+rejected. If they agree on another part, the contradicting part was moved.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from dopepp.inference.several_views.sightings import PartSighting, separation, s
 from dopepp.inference.several_views.views_result import WorldDetection
 
 DISAGREEING: Final = 1.2
-"""Disagreement of views on a part from which a finding states it. On rendered scenes with cameras
-as calibrated, the largest of 30 was 0.9."""
+"""Disagreement of views on a part above which it is reported. With exact camera poses, the largest
+of 30 on rendered scenes was 0.9."""
 
 Views = Sequence[Sequence[PartSighting]]  # sightings of each view
 Associate = Callable[[Views], list[list[PartSighting]]]
 
 
 class _Conflict(NamedTuple):
-    """Two detections of one part, either in a view that does not show the other."""
+    """Two detections of the same kind of part, of which a view supports one only."""
 
-    views: tuple[int, int]
+    views: tuple[int, int]  # a view that supports the first detection, and one for the second
     detections: tuple[WorldDetection, WorldDetection]
-    is_mutual: bool  # whether both places are on the pictures of both views
+    is_mutual: bool  # whether both views show something else at the other's pose
 
     def describe(self, names: Sequence[str]) -> str:
         """Return the views, the part and the difference of its poses."""
@@ -53,14 +53,17 @@ def contradictions(
     names: Sequence[str],
     associated: Associate,
 ) -> tuple[list[WorldDetection], list[str]]:
-    """Return the detections that no contradiction rejects, and the contradictions in words.
+    """Find contradictions between views, and reject detections that depend on a wrong camera pose.
 
     Args:
         detections: Detections that pass the threshold.
-        sightings: Passing sightings of each view.
+        sightings: Sightings of each view that pass the threshold.
         pictures: Pictures with the poses of their cameras.
         names: Name of each view.
-        associated: Associates the sightings of the views.
+        associated: Function that joins the sightings of several views.
+
+    Returns:
+        Detections that no contradiction rejects, and a message for each contradiction.
     """
     supports = [_support(detection) for detection in detections]
     confirmed = {pair for views in supports for pair in combinations(views, 2)}
@@ -106,7 +109,7 @@ def _support(detection: WorldDetection) -> list[int]:
 
 
 def _conflict(first: WorldDetection, second: WorldDetection) -> _Conflict | None:
-    """Return the conflict of two detections, if a view of one does not show the other."""
+    """Return the conflict between two detections, or None if there is none."""
     if first.object != second.object or separation(first.pose, second.pose) <= CONSISTENT:
         return None
     conflicts = []
@@ -121,7 +124,11 @@ def _conflict(first: WorldDetection, second: WorldDetection) -> _Conflict | None
 def _swapped(
     sightings: Views, pictures: Sequence[PosedPicture], associated: Associate
 ) -> tuple[int, int] | None:
-    """Return the two views whose exchanged poses make more detections agree, if any."""
+    """Return the two views whose detections agree better if their camera poses are exchanged.
+
+    Returns:
+        None if no exchange makes more detections agree.
+    """
 
     def agreeing(order: Sequence[int]) -> int:
         views = [

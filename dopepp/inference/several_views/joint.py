@@ -1,8 +1,8 @@
 """Joint pose of the sightings of one part: refinement on all views, and verification in each.
 
 Views that do not show the part at the joint pose are left out, and the pose is refined again
-without them. A part that fewer than two views show keeps its best single-view pose; its other
-sightings are no longer sightings of this part.
+without them. A part that fewer than two views show keeps its best single-view pose, and loses its
+other sightings.
 """
 
 from __future__ import annotations
@@ -32,25 +32,27 @@ from dopepp.inference.several_views.views_result import Status, ViewEvidence, Wo
 from dopepp.recovery.detection import log_odds
 
 SUPPORTING: Final = 0.2
+"""Least probability at which a view supports a pose."""
+
 AGREEING: Final = 0.7
-"""Probability, and share of the image's evidence about the outline that must agree with it, from
-which a view supports a pose. At right poses the share is above 0.9; if a camera is off by 4 mm at
-20 cm, it is below 0.7 in one view."""
+"""Least agreement of the outline (:class:`OutlineAgreement`) at which a view supports a pose. At
+right poses it is above 0.9. If a camera is off by 4 mm at 20 cm, it is below 0.7 in one view."""
 
 WEAKER: Final = (0.5, 0.15)
-"""Factor on the probability, and decrease of the share, that a view's own detection may lose."""
+"""A view with its own detection also supports a pose that is a little worse than the detection:
+factor on the detection's probability, and decrease of its agreement."""
 
 CONSISTENT: Final = 4.5
 """Largest Mahalanobis distance of a joint pose from a detection that the image did not refine."""
 
 AGAINST: Final = -1.5
-"""Lower bound of the log odds of a view: the part may be hidden or hardly visible there."""
+"""Lower bound of a view's log odds, because the part may be occluded or hardly visible there."""
 
 COINCIDENCE: Final = 1.5
-"""Log odds that each further detection at the same pose adds: wrong detections differ."""
+"""Log odds that each further detection at the same pose adds: wrong detections rarely agree."""
 
 USUAL_MOVE: Final = 1.0
-"""Mahalanobis distance from the network's pose, where the network has not found the part."""
+"""Assumed Mahalanobis distance between start and refined pose, which the verification asks for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +81,17 @@ class JointEstimator:
     def estimate(
         self, sightings: Sequence[PartSighting], group: Group, cuboid: Cuboid
     ) -> JointPart:
-        """Return the joint pose of the sightings of one part, with those that agree with it."""
+        """Refine the pose of a part on all views that show it.
+
+        Args:
+            sightings: Sightings of the part, best first.
+            group: Symmetry group of the part.
+            cuboid: Cuboid of the part, metres.
+
+        Returns:
+            The part with the sightings that agree with the joint pose. If no two views agree, the
+            pose is that of the best sighting.
+        """
         name, everything = sightings[0].detection.object, set(range(len(self._views)))
         start = fused([sighting.pose for sighting in sightings], group, cuboid)
         limit = Prior(start.T_cam_obj, start.information / LOOSER**2)
@@ -132,7 +144,7 @@ class JointEstimator:
         cuboid: Cuboid,
         agreement: OutlineAgreement | None,
     ) -> ViewEvidence:
-        """Return what a view shows at a pose in the world."""
+        """Return whether a view shows the part at a pose in the world."""
         view = self._views[number]
         sighting = next((item for item in sightings if item.view == number), None)
         at = view.to_camera(pose.T_cam_obj, np.linalg.inv(pose.information))
@@ -168,7 +180,7 @@ class JointEstimator:
         evidence: Sequence[ViewEvidence],
         disagreement: float = 0.0,
     ) -> JointPart:
-        """Return the detection of a part with the probability and score of all views."""
+        """Combine the evidence of all views to the probability and score of a part."""
         best = max((item.detection for item in sightings), key=lambda detection: detection.score)
         alone, odds = log_odds(best.probability or 0.0), 0.0
         for item in evidence:
@@ -186,7 +198,7 @@ class JointEstimator:
 
 
 def _separation(sighting: PartSighting, pose: Prior, group: Group, cuboid: Cuboid) -> float:
-    """Return the Mahalanobis distance of a sighting's own pose from a pose."""
+    """Return the Mahalanobis distance between a sighting's pose and another pose."""
     nearest = nearest_equivalent(sighting.pose.T_cam_obj, pose.T_cam_obj, group, cuboid)
     return separation(pose, Prior(nearest, sighting.pose.information))
 

@@ -1,8 +1,8 @@
 """The next best view: the camera pose from which a picture reduces a pose's covariance most.
 
-The information that a view would add is that of the part's outline there, as if every point of it
-were measured with a usual precision (:data:`USUAL_PX`), with the errors of offset and scale that
-refinement allows for. The part's own occlusions count, other objects are unknown.
+The information that a view would add is that of the part's outline in this view. Every point of the
+outline counts as measured with a usual precision (:data:`USUAL_PX`), and the outline has the errors
+of offset and scale that refinement assumes. The part may hide itself; other objects are ignored.
 """
 
 from __future__ import annotations
@@ -48,11 +48,10 @@ class NextView:
     """The best of several camera poses."""
 
     number: int  # index of the camera pose
-    before: float  # expected error of the part's points now, metres
-    expected: Sequence[
-        float
-    ]  # expected error after each view; infinite if it does not show the part
-    reason: str  # why this view
+    before: float  # present expected error of the part's points, metres
+    # Expected error after each view; infinite if the view does not show the whole part
+    expected: Sequence[float]
+    reason: str  # expected gain, in words
 
 
 def next_best_view(
@@ -75,7 +74,8 @@ def next_best_view(
         candidates: Camera poses that can be reached, ``T_world_cam``.
         K: Camera matrix, pixels.
         size: (width, height) of the picture, pixels.
-        T_world_bench: Plane z = 0 that cameras must be above; None without a bench.
+        T_world_bench: Pose of a bench, whose plane z = 0 must be below the cameras; None without a
+            bench.
         scale_error: Largest relative error of the part's size or of the focal length.
 
     Raises:
@@ -126,7 +126,7 @@ def _information(
     prior: PoseMatrix,
     scale_error: float,
 ) -> PoseMatrix | None:
-    """Return the information of a part's outline; None if the part is not wholly on the picture."""
+    """Return the information of a part's outline; None if the picture does not show all of it."""
     at = posed(mesh, T_cam_obj, K)
     if at is None:
         return None

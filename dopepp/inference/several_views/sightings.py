@@ -1,8 +1,9 @@
 """Association of the detections of several views, in the world.
 
-Two detections can show the same part if their poses differ by less than :data:`GATE` standard
-deviations of both, at the nearest of the part's equivalent poses. Every detection, best first,
-gathers the nearest free detection of each other view.
+Two detections can show the same part if the Mahalanobis distance between their poses is at most
+:data:`GATE`. A symmetric part has several equivalent poses, of which the nearest counts. Detections
+are taken in the order of their scores. Each is joined with the nearest free detection of every
+other view.
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ Group = Float[np.ndarray, "group 4 4"]  # transforms that map the part onto itse
 
 @dataclass(frozen=True, eq=False)
 class PartSighting:
-    """A detection of one view, in the world."""
+    """A detection of one view, expressed in the world."""
 
-    view: int
-    detection: Detection  # in the camera
+    view: int  # index of the view
+    detection: Detection  # detection in the camera
     pose: Prior  # refined pose in the world, with the error of the camera's pose
-    start: Prior  # pose before refinement, weak enough to admit the refined pose
+    start: Prior  # pose before refinement, with a covariance that admits the refined pose
 
 
 def sight(view: int, detection: Detection, picture: PosedPicture) -> PartSighting:
@@ -62,7 +63,7 @@ def separation(first: Prior, second: Prior) -> float:
 def nearest_equivalent(
     T_world_obj: Transform, to: Transform, group: Group, cuboid: Cuboid
 ) -> Transform:
-    """Return the pose in which a symmetric part looks the same that is nearest to another pose."""
+    """Return that of a symmetric part's equivalent poses which is nearest to another pose."""
     equal = T_world_obj @ group
     points = cuboid @ equal[:, :3, :3].swapaxes(1, 2) + equal[:, None, :3, 3]
     distances = ((points - transform(to, cuboid)) ** 2).sum(axis=(1, 2))
@@ -80,12 +81,16 @@ def associate(
     groups: Mapping[str, Group],
     cuboids: Mapping[str, Cuboid],
 ) -> list[list[PartSighting]]:
-    """Return the sightings of each possible part, those of the best detection first.
+    """Join the sightings that can show the same part.
 
     Args:
         views: Sightings of each view.
         groups: Symmetry group of each part.
         cuboids: Cuboid of each part, metres.
+
+    Returns:
+        Sightings of each possible part, at most one of each view. The part with the best detection
+        is first.
     """
     free = sorted(
         (sighting for view in views for sighting in view), key=lambda item: -item.detection.score

@@ -1,11 +1,11 @@
 """Files of camera poses: which camera took which picture from where.
 
-- YAML of this project, with a mapping ``views`` from each picture to its pose. A pose has the name
-  ``T_world_cam``, or ``T_base_flange`` with ``hand_eye`` (a file that ``dopepp calibrate handeye``
-  wrote), and one of the forms of :func:`transform_of`. ``camera`` names a camera file, for all
-  views or for one.
+- YAML with a mapping ``views`` from each picture to its pose ``T_world_cam``, in one of the forms
+  that :func:`transform_of` reads. With ``hand_eye``, a file that ``dopepp calibrate handeye``
+  wrote, pictures have the robot's pose ``T_base_flange`` instead. ``camera`` is a camera file, for
+  all views or for a single view.
 - BOP's ``scene_camera.json``, with ``cam_R_w2c`` and ``cam_t_w2c``.
-- COLMAP's ``images.txt``, with ``cameras.txt`` beside it.
+- COLMAP's ``images.txt``, with ``cameras.txt`` in the same folder.
 
 To read another format, write a function that returns :data:`CameraPoses`, and call it in
 :func:`read_camera_poses`.
@@ -54,8 +54,8 @@ class CameraPoses:
 
     Attributes:
         poses: Camera of each picture, by the picture's name without folder (BOP: by its number).
-        error: Standard deviations of the poses, metres and radians; None if the file has none.
-        source: The file.
+        error: Standard deviations of the poses, metres and radians; None if the file states none.
+        source: Path of the file.
     """
 
     poses: Mapping[str, CameraPose]
@@ -66,7 +66,7 @@ class CameraPoses:
         """Return the camera of a picture.
 
         Raises:
-            UserError: The file does not name the picture.
+            UserError: The file has no pose of the picture.
         """
         number = picture.stem.lstrip("0") or "0"
         for name in (picture.name, picture.stem, number):
@@ -81,7 +81,7 @@ def read_camera_poses(path: Path) -> CameraPoses:
     """Read a file of camera poses.
 
     Raises:
-        UserError: The file is missing, of another format, or has an invalid pose or camera.
+        UserError: The file is missing, has another format, or has an invalid pose or camera.
     """
     if path.name == "scene_camera.json":
         return _bop(path)
@@ -111,16 +111,16 @@ def read_camera_poses(path: Path) -> CameraPoses:
 
 
 def transform_of(value: object, where: str) -> Transform:
-    """Return the rigid transform in the fields of a file.
+    """Parse a rigid transform.
 
     Args:
-        value: ``matrix`` of 4×4 numbers; ROS's ``translation`` {x, y, z} and ``rotation``
-            {x, y, z, w}; or lists ``position`` and ``quaternion_wxyz`` or ``quaternion_xyzw``.
-            Metres.
-        where: Origin of the fields, for messages.
+        value: Mapping with ``matrix`` (4×4 numbers); with ROS's ``translation`` {x, y, z} and
+            ``rotation`` {x, y, z, w}; or with ``position`` and either ``quaternion_wxyz`` or
+            ``quaternion_xyzw``. Lengths are metres.
+        where: File and field, for error messages.
 
     Raises:
-        UserError: The fields are others, or no rigid transform.
+        UserError: The value has none of these forms, or is no rigid transform.
     """
     fields = value if isinstance(value, Mapping) else {}
     problem = f"{where}={shown(value)}"
@@ -171,7 +171,7 @@ def _bop(path: Path) -> CameraPoses:
 
 
 def _colmap(path: Path) -> CameraPoses:
-    """Read ``images.txt``: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, in every second line."""
+    """Read ``images.txt``; every second line is IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME."""
     lines = _lines(path)
     cameras = {
         line.split()[0]: camera_of_text(line, f"{path.with_name('cameras.txt')}")
@@ -192,7 +192,7 @@ def _colmap(path: Path) -> CameraPoses:
 
 
 def _lines(path: Path) -> list[str]:
-    """Return the lines of a COLMAP file without comments; a line of points may be empty."""
+    """Return the lines of a COLMAP file without comments, but with empty lines."""
     try:
         if path.stat().st_size > MAX_COLMAP_BYTES:
             raise ValueError(f"more than {MAX_COLMAP_BYTES / 1e6:g} MB")

@@ -19,34 +19,35 @@ WORLD_FRAME: Final = "world, the frame of the camera poses; metres"
 """Frame of ``T_world_obj``, which maps from the mesh's frame to this frame."""
 
 Status = Literal["supports", "hidden", "outside"]
-"""What a view shows at a part's pose: the part, something else, or nothing, for the pose is not on
-the picture."""
+"""Whether a view shows the part at its pose (``supports``) or something else (``hidden``), or the
+pose is not on the picture (``outside``)."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewEvidence:
-    """A part as one view shows it."""
+    """Evidence of one view about a part."""
 
     view: str  # name of the view
     status: Status
-    probability: float  # that the pose is right, from this view alone
+    probability: float  # probability that the pose is right, from this view alone
     detection: Detection  # the part's pose in this camera, for drawing
 
 
 @dataclass(frozen=True, eq=False)
 class WorldDetection:
-    """A part found by several views."""
+    """A part detected in several views of a scene."""
 
-    object: str  # the part's name
-    score: float  # confidence in the pose, in [0, 1]; as of Detection
-    probability: float  # that ADD(-S) is below a tenth of the diameter, from all views
+    object: str  # name of the part
+    score: float  # confidence in the pose, in [0, 1]; see Detection
+    probability: float  # probability that ADD(-S) is below a tenth of the diameter, from all views
     T_world_obj: Transform
     # Covariance of a rotation vector about the object's origin (radians) and a shift (metres), in
-    # world axes; it contains the errors of the camera poses
+    # world axes; it includes the errors of the camera poses
     covariance: PoseMatrix
-    evidence: Sequence[ViewEvidence]  # of each view
-    # Largest distance of a view's evidence from the others', or least distance of the joint pose
-    # from a view's own, whichever is larger; standard deviations per √degree of freedom
+    evidence: Sequence[ViewEvidence]  # evidence of each view
+    # Mahalanobis distance per √degree of freedom: the larger of the largest distance between the
+    # evidence of one view and that of the others, and the least distance between the joint pose and
+    # the pose of a single view
     disagreement: float = 0.0
 
     @property
@@ -85,14 +86,15 @@ class ViewsResult:
     """The parts in a static scene."""
 
     detections: Sequence[WorldDetection]  # best score first
-    findings: Sequence[str]  # contradictions between the views, and what to do about them
-    views: Sequence[PoseResult]  # each view, with the detections that it shows
-    weaker: Sequence[WorldDetection] = ()  # below the threshold, or contradicted; best score first
+    findings: Sequence[str]  # contradictions between the views, and how to resolve them
+    views: Sequence[PoseResult]  # result of each view, with the detections that it supports
+    # Detections below the threshold or rejected by a contradiction, best score first
+    weaker: Sequence[WorldDetection] = ()
     joint_ms: float = 0.0  # time of association, joint refinement and verification, milliseconds
 
     @property
     def summary(self) -> str:
-        """Number of parts, and in how many of the views each is."""
+        """Number of parts, and the number of views that show each of them."""
         count, shares = len(self.detections), [len(item.views) for item in self.detections]
         shown = ", ".join(f"{share} of {len(self.views)} views" for share in shares)
         return f"{count} part{'s' * (count > 1)}: {shown}" if count else "nothing found"
@@ -108,7 +110,7 @@ class ViewsResult:
         return json.dumps(content, ensure_ascii=False, allow_nan=False)
 
     def save(self, folder: Path | str) -> None:
-        """Write a picture with the drawn poses for each view, named like the view.
+        """Draw the poses on the picture of each view, and write the pictures to a folder.
 
         Raises:
             UserError: A picture cannot be written.

@@ -2,11 +2,11 @@
 
 1. :mod:`~dopepp.inference.templates.views` draws the part from 600 directions.
 2. :mod:`~dopepp.inference.templates.responses` finds the image's edges by orientation.
-3. :mod:`~dopepp.inference.templates.matching` compares all drawings, turned in the image plane and
-   resized to the working distances, with these edges at every fourth pixel, and keeps the best
-   matches of each small cell of the image.
+3. :mod:`~dopepp.inference.templates.matching` compares the drawings with these edges at every
+   fourth pixel. The drawings are turned in the image plane and resized to the working distances.
+   Each small cell of the image keeps its best matches.
 4. :mod:`~dopepp.inference.templates.ranking` moves these matches, replaces their views by better
-   neighbours, and ranks them.
+   neighbouring views, and ranks them.
 
 The result is a list of start poses. Refinement and verification choose among them.
 """
@@ -45,21 +45,21 @@ from dopepp.inference.templates.views import NEAREST, joined, make_templates, vi
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 
-COARSE_PX: Final = 80.0  # diameter of the part on the image that all places are compared on
-FINE_PX: Final = 140.0  # largest diameter on the image that the best matches are ranked on
+COARSE_PX: Final = 80.0  # largest diameter of the part on the image that is searched everywhere
+FINE_PX: Final = 140.0  # largest diameter of the part on the image that matches are ranked on
 SMALLEST_PX: Final = 12.0  # least diameter that templates can detect
 SCALE_STEP: Final = 1.13  # ratio of neighbouring distances
-PERSPECTIVE: Final = 0.15  # difference of diameter over distance between drawings of a view
-OCTAVE: Final = 2.0  # ratio of diameters that are ranked on one image
-COARSE_SPREAD: Final = 5  # pixels
-FINE_SPREAD: Final = 3
+PERSPECTIVE: Final = 0.15  # step of diameter over distance between two sets of drawings
+OCTAVE: Final = 2.0  # ratio of the diameters that are ranked on one image
+COARSE_SPREAD: Final = 5  # `spread` of the edges in the search, pixels
+FINE_SPREAD: Final = 3  # `spread` of the edges in the ranking, pixels
 
-NUM_RANKED: Final = 16000  # matches
-NUM_TURNED: Final = 2000  # of an octave, compared with neighbouring views
-EXTENT: Final = 2.5  # standard deviations that a view one diameter long is worth
+NUM_RANKED: Final = 16000  # best matches that are ranked
+NUM_TURNED: Final = 2000  # best matches of each octave that are compared with neighbouring views
+EXTENT: Final = 2.5  # added to the score per diameter of a view's extent, standard deviations
 NUM_STARTS: Final = 100  # start poses
 
-# Poses that refinement would move to the same end.
+# Two start poses that differ by less are duplicates: refinement would move both to the same pose.
 SAME_PLACE: Final = 0.1  # diameters
 SAME_DEPTH: Final = 0.05  # relative
 SAME_TURN: Final = math.radians(10.0)
@@ -115,13 +115,16 @@ class TemplateDetector:
         distances: tuple[float, float] | None = None,
         roi: Region | None = None,
     ) -> list[Detection]:
-        """Return start poses, best score first; several may belong to the same instance.
+        """Search an image for the part.
 
         Args:
             image: RGB, without distortion.
             K: Camera matrix, pixels.
             distances: Nearest and farthest depth, metres (default: the working distance).
             roi: Region to search: (x, y, width, height), pixels.
+
+        Returns:
+            Start poses, best score first. Several may belong to the same instance.
 
         Raises:
             UserError: The part is too small on the image to be detected.
@@ -142,7 +145,7 @@ class TemplateDetector:
         return [self.start(transforms[i], float(scores[i]), K) for i in chosen]
 
     def start(self, T_cam_obj: Transform, score: float, K: CameraMatrix) -> Detection:
-        """Return a start pose with the covariance of a match."""
+        """Return a detection at a pose, with the covariance of start poses."""
         depth = float(T_cam_obj[2, 3])
         deviations = (
             [TURN_ERROR] * 3 + [PLACE_ERROR * self.part.diameter] * 2 + [DEPTH_ERROR * depth]
@@ -172,9 +175,16 @@ class TemplateDetector:
     def ranked(
         self, image: Picture, K: CameraMatrix, distances: tuple[float, float]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return views, poses on the image and features of the best matches at all distances.
+        """Find the best matches at all distances.
 
-        Features are the means of those before and after turning.
+        Args:
+            image: RGB.
+            K: Camera matrix, pixels.
+            distances: Nearest and farthest depth, metres.
+
+        Returns:
+            Index of the template, pose on the image and features of each match. A match with a
+            replaced view has the mean of the features before and after the replacement.
 
         Raises:
             UserError: The part is too small on the image to be detected.
@@ -211,16 +221,19 @@ class TemplateDetector:
             for group in (members, turned):
                 group.poses[:, [0, 1, 3]] /= scale
             ranked += [members, turned]
-            # Turning raises the responses of wrong matches, too.
+            # Better neighbouring views exist for wrong matches, too: half of the gain counts.
             features += [before[best], (before[best] + after) / 2]
         views = np.concatenate([members.views for members in ranked])
         poses = np.concatenate([members.poses for members in ranked])
         return views, poses, np.concatenate(features)
 
     def _matches(self, image: Picture, size: float, nearness: float) -> Matches:
-        """Return the best positions of all templates at a distance.
+        """Return the best matches of all templates at one distance.
 
-        ``size`` is the projected diameter, pixels; ``nearness`` the diameter over the distance.
+        Args:
+            image: RGB.
+            size: Projected diameter of the part at this distance, pixels.
+            nearness: Diameter of the part over this distance.
         """
         most = math.sqrt(MAX_PIXELS / (image.shape[0] * image.shape[1]))
         scale = min(1.0, most, COARSE_PX / size)
@@ -240,7 +253,7 @@ class TemplateDetector:
         rays = np.column_stack(
             [(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(len(poses))]
         )
-        # A template shows the part on the optical axis, which turns to the ray.
+        # Templates show the part on the optical axis: turn this axis to the ray of the match.
         sines = np.linalg.norm(rays[:, :2], axis=1) / np.linalg.norm(rays, axis=1)
         axes = np.column_stack([-rays[:, 1], rays[:, 0], np.zeros(len(rays))])
         axes *= (np.arcsin(sines) / np.maximum(np.linalg.norm(axes, axis=1), 1e-12))[:, None]
@@ -255,7 +268,7 @@ class TemplateDetector:
 def _distinct(
     transforms: Float[np.ndarray, "matches 4 4"], centre: np.ndarray, diameter: float
 ) -> list[int]:
-    """Return the indices of the first poses that differ from all poses before them."""
+    """Return the indices of the first poses that are no duplicates of earlier poses."""
     centres = transforms[:, :3, :3] @ centre + transforms[:, :3, 3]
     free, chosen = np.ones(len(transforms), bool), []
     for index in range(len(transforms)):
@@ -275,7 +288,7 @@ def _distinct(
 
 
 def _resized(image: Picture, scale: float) -> Picture:
-    """Return an image that is not larger."""
+    """Shrink an image by a factor; factors of 1 and above leave it unchanged."""
     if scale >= 1.0:
         return image
     size = [max(8, round(scale * side)) for side in image.shape[1::-1]]

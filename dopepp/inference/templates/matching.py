@@ -1,9 +1,11 @@
-"""Matching of all templates at all places of an image.
+"""Matching of all templates at all positions of an image.
 
 The score of a template is the sum of the responses at its points. Responses are rearranged so that
-the responses of one point at all places of a grid are contiguous in memory, and a sum over places
-is a sum of rows (Hinterstoisser et al. 2012). A score counts in standard deviations of the same
-template over the image, because a template of a few straight lines scores high at many places.
+those of one point at all positions of a grid are contiguous in memory. The scores at all positions
+are then a sum of rows (Hinterstoisser et al. 2012).
+
+Scores are normalised by the mean and standard deviation of the template's scores over the image,
+because a template of a few straight lines scores high at many positions.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from dopepp.inference.templates.responses import Responses
 from dopepp.inference.templates.views import Templates
 
 NUM_TURNS: Final = 24  # in the image plane, 15 degrees apart
-STRIDE: Final = 4  # pixels between places
+STRIDE: Final = 4  # pixels between positions
 CELL: Final = 0.2  # side of a cell, diameters
 NUM_KEPT: Final = 8  # best matches of each cell
 TOGETHER: Final = 4  # rows that are added in one pass
@@ -29,7 +31,7 @@ Pose2d = Float[np.ndarray, "matches 4"]
 
 
 class Matches(NamedTuple):
-    """Templates at places of an image."""
+    """Templates at positions of an image."""
 
     views: Int[np.ndarray, "matches"]  # index of each template
     poses: Pose2d
@@ -38,15 +40,15 @@ class Matches(NamedTuple):
     deviations: Float[np.ndarray, "matches"]  # its standard deviation
 
     def at(self, rows: Int[np.ndarray, "rows"] | Bool[np.ndarray, "matches"]) -> Matches:
-        """Return the matches of these indices or of this mask."""
+        """Return the matches that indices or a mask select."""
         return Matches(*(column[rows] for column in self))
 
 
 def match(responses: Responses, templates: Templates, diameter_px: float) -> Matches:
     """Return the best matches of all templates and turns in each cell of the image.
 
-    Cells keep the matches diverse: texture gives thousands of matches at the same place that all
-    have higher scores than the part elsewhere.
+    Cells keep the matches diverse: a textured area can have thousands of matches with scores above
+    that of the part.
 
     Args:
         responses: Responses of the image.
@@ -65,8 +67,8 @@ def match(responses: Responses, templates: Templates, diameter_px: float) -> Mat
     lines = templates.points, templates.normals
     _match(phases, rows, columns, margin, *lines, diameter_px, side, scores, kept, moments)
     filled = np.isfinite(scores)
-    views, turns, places = kept[filled].T
-    v, u = np.divmod(places, columns)
+    views, turns, positions = kept[filled].T
+    v, u = np.divmod(positions, columns)
     poses = [
         STRIDE * u,
         STRIDE * v,
@@ -78,7 +80,7 @@ def match(responses: Responses, templates: Templates, diameter_px: float) -> Mat
 
 
 def _by_phase(responses: Responses, rows: int, columns: int, margin: int) -> Responses:
-    """Rearrange responses by orientation and by the remainders of row and column."""
+    """Rearrange responses by orientation and by row and column modulo the stride."""
     bins, height, width = responses.shape
     shape = bins, rows + 2 * margin, STRIDE, columns + 2 * margin, STRIDE
     padded = np.zeros((bins, shape[1] * STRIDE, shape[3] * STRIDE), np.int16)
@@ -120,7 +122,10 @@ def _match(
     kept: Array,
     moments: Array,
 ) -> None:
-    """Write score, view, turn and place of each cell's best matches, and moments of all sums."""
+    """Write score, view, turn and position of each cell's best matches.
+
+    ``moments`` receives mean and standard deviation of each template's sums.
+    """
     bins, length = len(phases) // (STRIDE * STRIDE), phases.shape[1]
     turns, across = moments.shape[1], columns + 2 * margin
     first = margin * across + margin
@@ -165,12 +170,12 @@ def _match(
                     score = (most - mean) / deviation
                     if score <= scores[i, j, slot]:
                         continue
-                    place = 0
+                    position = 0
                     for r in range(top, bottom):
                         for k in range(left, right):
                             if total[r * across + k] == most:
-                                place = r * columns + k
+                                position = r * columns + k
                     scores[i, j, slot] = score
                     kept[i, j, slot, 0], kept[i, j, slot, 1] = view, turn
-                    kept[i, j, slot, 2] = place
+                    kept[i, j, slot, 2] = position
                     weakest[i, j] = np.argmin(scores[i, j])

@@ -1,11 +1,12 @@
-"""Ranking of matches: each is moved to the best place nearby, and judged by what the image shows.
+"""Ranking of matches by edges and colours of the image.
 
-The views of the best matches are then replaced by neighbouring views that fit better, because views
-are 8 degrees apart.
+Each match first moves to the best position nearby. Because views are 8 degrees apart, the views of
+the best matches are then replaced by neighbouring views that fit better.
 
-Edges alone do not separate the part from busy texture. Colours do: the part is even inside, and its
-surroundings differ from it. A linear model of the features below ranks the matches; it was learned
-from procedural parts (``benchmarks/learn_ranking.py``), and its numbers are ``ranking.json``.
+Edges alone do not separate the part from busy texture. Colours do: the part has even colours, and
+its surroundings differ from them. A linear model of :data:`FEATURES` ranks the matches. It was
+learned from procedural parts (``benchmarks/learn_ranking.py``), and its numbers are in
+``ranking.json``.
 """
 
 from __future__ import annotations
@@ -27,44 +28,44 @@ from dopepp.inference.templates.views import Templates
 
 FEATURES: Final = (
     "place",  # score of the match on the coarse image, standard deviations
-    "edges",  # score at the best place nearby, standard deviations
-    "response",  # mean response of the template's points there
+    "edges",  # score at the best position nearby, standard deviations
+    "response",  # mean response of the template's points at this position
     "supported",  # share of points with a response above SUPPORT
     "texture",  # mean of the strongest response at inner points
     "evenness",  # logarithm of the variance of the colours inside
     "contrast",  # difference of the colours on both sides of the outline, in [0, 1]
-    "separation",  # difference of the colours outside from those inside, in [0, 1]
-    "shown",  # share of the template's points on the image
+    "separation",  # difference between the colours outside and the mean colour inside, in [0, 1]
+    "shown",  # share of the template's points that lie on the image
     "extent",  # length of the view, diameters
 )
 """Features of a match, in this order."""
 
-SUPPORT: Final = 30
-LEVEL: Final = 16.0  # difference, grey levels, at which a contrast is 0.5
-EVEN: Final = 64.0  # variance of colours that counts as even
-LEAST_INNER: Final = 8  # inner points on the image without which a match is rejected
+SUPPORT: Final = 30  # response above which a point counts as supported
+LEVEL: Final = 16.0  # difference of colours, grey levels, at which the contrast is 0.5
+EVEN: Final = 64.0  # added to the variance of colours, so that noise counts as even
+LEAST_INNER: Final = 8  # least number of inner points on the image; other matches get no features
 ACROSS: Final = (2.5, 0.03)  # pixels and diameters between the outline and the compared colours
-TURN: Final = math.radians(5.0)
-GROWTH: Final = 0.03  # of the diameter in a step of the search
-FEW: Final = 32  # points that choose a step of the grid; a template's first points are far apart
-REACH_PX: Final = 1.5  # step between neighbouring views
-MOST_TURNS: Final = 4  # from view to view
+TURN: Final = math.radians(5.0)  # step of the turn in the grid search
+GROWTH: Final = 0.03  # first relative step of the size
+FEW: Final = 32  # first points of a template, used in the grid search; they are far apart
+REACH_PX: Final = 1.5  # first step of the position after a change of view
+MOST_TURNS: Final = 4  # largest number of changes of a match's view
 
 
 Features = Float[np.ndarray, "matches features"]
 
 
 class RankingModel(NamedTuple):
-    """What was learned about matches, and about the poses that refinement makes of them."""
+    """Learned model that ranks matches, and learned score of the poses refined from them."""
 
-    weights: Float[np.ndarray, "features"]  # of FEATURES
-    bias: float  # makes the weighted sum the log odds that a picture's best match is right
+    weights: Float[np.ndarray, "features"]  # weight of each of FEATURES
+    bias: float  # weighted sum + bias: log odds that the best match of a picture is right
     score: dict[str, float]  # RecoveryOptions of refined poses
 
 
 @cache
 def learned_ranking() -> RankingModel:
-    """Return the model in the package."""
+    """Return the model that ships with the package."""
     path = files("dopepp.inference.templates").joinpath("ranking.json")
     values: dict[str, Any] = json.loads(path.read_text("utf-8"))
     if tuple(values["weights"]) != FEATURES:
@@ -75,14 +76,17 @@ def learned_ranking() -> RankingModel:
 def move_nearby(
     matches: Matches, templates: Templates, responses: Responses, image: Picture, reach: float
 ) -> tuple[Matches, Features]:
-    """Move matches to the best place nearby; return them and their features there.
+    """Move matches to the best position nearby.
 
     Args:
         matches: Matches in pixels of the image.
         templates: Templates of the part.
         responses: Responses of the image.
         image: RGB.
-        reach: Largest distance of the first step, pixels.
+        reach: Distance from the match to the border of the searched grid, pixels.
+
+    Returns:
+        Moved matches, and their features.
     """
     poses, best = matches.poses.copy(), np.empty(len(matches.poses))
     _search(responses, templates.points, templates.normals, matches.views, poses, reach, best)
@@ -93,7 +97,10 @@ def move_nearby(
 def turn_views(
     matches: Matches, templates: Templates, responses: Responses, image: Picture
 ) -> tuple[Matches, Features]:
-    """Climb from matches over neighbouring views; see :func:`move_nearby`."""
+    """Replace the views of matches by better neighbouring views.
+
+    Arguments and results are those of :func:`move_nearby`.
+    """
     views, poses, best = matches.views.copy(), matches.poses.copy(), np.empty(len(matches.poses))
     lines = templates.points, templates.normals
     _turn(responses, *lines, templates.neighbours, templates.twists, views, poses, best)
@@ -108,7 +115,7 @@ def _features(
     responses: Responses,
     image: Picture,
 ) -> Features:
-    """Return the features of matches with the given responses."""
+    """Return the features of matches; ``best`` are the mean responses of their points."""
     features = np.zeros((len(best), len(FEATURES)))
     lines = templates.points, templates.normals, templates.is_outline, templates.inner
     _describe(responses, image, *lines, matches.views, matches.poses, features)
@@ -138,7 +145,7 @@ def _response(
 def _climb(
     maps: Array, points: Array, normals: Array, pose: Array, reach: float, rounds: int
 ) -> float:
-    """Move one pose along each axis to higher responses; return the response."""
+    """Change the numbers of a pose in turn while the response rises; return the response."""
     most = _response(maps, points, normals, pose[0], pose[1], pose[2], pose[3])
     steps = np.array([reach, reach, TURN / 2, GROWTH * pose[3]])
     for _ in range(rounds):
@@ -164,7 +171,7 @@ def _search(
     reach: float,
     best: Array,
 ) -> None:
-    """Move each pose to the highest response: first on a grid, then along each axis."""
+    """Move each pose to the highest response: first on a grid, then by :func:`_climb`."""
     for i in range(len(views)):
         edges, angles, scale = points[views[i]], normals[views[i]], poses[i, 3]
         few, directions = edges[:FEW], angles[:FEW]

@@ -1,8 +1,8 @@
-"""Responses of an image's edges, by orientation.
+"""Responses of an image's edges, one map for each orientation.
 
-A response is high where the image has an edge of that orientation nearby (the spread orientations
-of LINE-2D, Hinterstoisser et al. 2012). The mean response of the surroundings is subtracted,
-because in busy texture an edge of any orientation is near every pixel.
+A response is high near an edge of the map's orientation (spread orientations as in LINE-2D,
+Hinterstoisser et al. 2012). The mean response of the surroundings is subtracted, because in busy
+texture every pixel is near edges of all orientations.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from dopepp.drawing.pictures import Picture
 BINS: Final = 16  # orientations, modulo 180 degrees
 NOISE: Final = 8.0  # gradient, grey levels per pixel, at which an edge has half its response
 FULL: Final = 127.0  # response of a strong edge of the same orientation
-FAINT: Final = 12.0  # strength below which a pixel is no edge
+FAINT: Final = 12.0  # response below which a pixel does not count as an edge
 
 Responses = Int16[np.ndarray, "bins height width"]
 
 
 def edge_responses(image: Picture, spread: int, surroundings: int) -> Responses:
-    """Return the response at each pixel to edges of each orientation, minus the mean around.
+    """Return the response of each pixel to edges of each orientation.
 
     Args:
         image: RGB.
@@ -48,7 +48,7 @@ def edge_responses(image: Picture, spread: int, surroundings: int) -> Responses:
 
 @compiled()
 def _orient(gx: Array, gy: Array, maps: Array) -> None:
-    """Write the responses of each pixel, from the channel with the longest gradient."""
+    """Write the response of each pixel to its own gradient, that of the strongest channel."""
     bins, height, width = maps.shape
     cosines, sines = np.empty(bins), np.empty(bins)
     for b in range(bins):

@@ -1,8 +1,8 @@
-"""Score of a part's poses, from what templates find on photos without the part.
+"""Level of verification that the poses of a part must exceed, measured on photos without the part.
 
 The best of many start poses can fit an ordinary edge well, and a plain part fits more edges than an
-intricate part. Therefore the verification of the best pose on each of a few photos, which ship with
-the package, sets the level that a pose must exceed. The level is kept in the user's cache folder.
+intricate part. Therefore a few photos that ship with the package are searched for the part. The
+verification of the best pose on each photo sets the level, which the user's cache folder keeps.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ logger = logging.getLogger(__name__)
 NUM_PHOTOS: Final = 8
 SIZE: Final = (480, 360)  # of a photo, pixels
 PART_PX: Final = 120.0  # diameter of the part at the middle of its distances
-MARGIN: Final = 2.0  # standard deviations of the photos' levels above their mean
-LOWEST: Final = 0.0  # log odds
-VERSION: Final = 5  # changes when the search or the verification does
+MARGIN: Final = 2.0  # distance of the level from the photos' mean, standard deviations
+LOWEST: Final = 0.0  # lower bound of the level, log odds
+VERSION: Final = 5  # part of the cache's key; increase it when search or verification change
 
 Loudest = Callable[[Iterable[Picture], CameraMatrix], list[float]]
-"""Returns the largest log odds of the verified poses on each picture."""
+"""Function that returns the largest log odds of the verified poses on each picture."""
 
 
 def silent_level(
     part: Part, distances: tuple[float, float], tilt: float, loudest: Loudest
 ) -> float:
-    """Return the log odds of verification that poses on pictures without the part hardly reach.
+    """Return the log odds that verified poses on pictures without the part rarely exceed.
 
     Args:
         part: Part.
         distances: Nearest and farthest depth, metres.
-        tilt: Largest angle of the part's z axis to the camera, degrees.
-        loudest: Measurement of pictures; called if the cache has no level of the part.
+        tilt: Largest angle between the part's z axis and the direction to the camera, degrees.
+        loudest: Measures pictures without the part; called if the cache has no level of the part.
     """
     symmetries = [part.symmetries_discrete, part.symmetries_continuous]
     key = repr((VERSION, MARGIN, part.mesh_hash, part.diameter, distances, tilt, symmetries))
@@ -57,8 +57,8 @@ def silent_level(
         if isinstance(level, float):
             return level
     except (OSError, UserError):
-        pass  # not measured yet, or damaged
-    logger.info("%s: measuring what resembles the part on photos, once", part.name)
+        pass  # the level was not measured yet, or its file is damaged
+    logger.info("%s: measuring false detections on photos; the result is cached", part.name)
     focal = PART_PX * float(np.sqrt(distances[0] * distances[1])) / part.diameter
     K = camera_matrix(focal, focal, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
     levels = loudest(_photos(), K)
@@ -67,12 +67,12 @@ def silent_level(
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, json.dumps(level).encode())
     except OSError as error:
-        logger.warning("the level of %s is not kept: %s", part.name, error)
+        logger.warning("%s: cannot cache the measured level: %s", part.name, error)
     return level
 
 
 def _photos() -> Iterator[Picture]:
-    """Yield photos of the package, cut to the same size."""
+    """Yield photos that ship with the package, resized and cropped to SIZE."""
     folder = Path(str(files("dopepp").joinpath("virtual", "backgrounds", "photos")))
     paths = sorted(folder.glob("*.jpg"))
     for path in paths[:: max(1, len(paths) // NUM_PHOTOS)][:NUM_PHOTOS]:

@@ -1,7 +1,7 @@
 """Templates of a part: the edges that a camera sees from many directions.
 
-A template is drawn once for each direction of view. Turns in the image plane, distances and places
-on the image follow from it by rotating, scaling and shifting its points.
+A template is drawn once for each direction of view. Its points are rotated, scaled and shifted for
+turns in the image plane, distances and positions on the image.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from dopepp.inference.refinement.outline import OutlineMesh, find_contour, posed
 from dopepp.inference.refinement.verification import SharpEdges
 
 NUM_VIEWS: Final = 600  # directions on the sphere, about 8 degrees apart
-NUM_POINTS: Final = 64  # on the edges of a view
-NUM_NEIGHBOURS: Final = 6  # of a view
-NUM_INNER: Final = 48  # inside a view, far from its edges
+NUM_POINTS: Final = 64  # points on the edges of a view
+NUM_NEIGHBOURS: Final = 6  # neighbouring views of a view
+NUM_INNER: Final = 48  # points inside a view, far from its edges
 
 DRAWN_PX: Final = 96  # diameter of the part on the drawing of a view
-MARGIN_PX: Final = 4
-SPACING_PX: Final = 1.5
-INNER_PX: Final = 4.0  # distance from edges, where the view has such pixels
+MARGIN_PX: Final = 4  # margin of the drawing
+SPACING_PX: Final = 1.5  # distance between the edge points that a template's points are chosen from
+INNER_PX: Final = 4.0  # distance of inner points from edges; smaller in views without such pixels
 MOST_INNER: Final = 400  # pixels that the inner points are chosen from
-SLACK: Final = 0.02  # overlap of the regions that symmetries map to each other
+SLACK: Final = 0.02  # overlap of the regions that symmetries map to each other, cosine
 NEAREST: Final = 1.1  # least distance of a drawing, diameters
 
 Rotations = Float[np.ndarray, "views 3 3"]
@@ -47,11 +47,12 @@ class Templates:
     rotations: Rotations  # object to camera
     points: Float[np.ndarray, "views points 2"]  # on the outline and on visible creases
     normals: Float[np.ndarray, "views points"]  # direction of the normal, radians; outwards
-    is_outline: Bool[np.ndarray, "views points"]  # False: on a crease
+    is_outline: Bool[np.ndarray, "views points"]  # False for points on creases
     inner: Float[np.ndarray, "views inner 2"]  # inside the outline
     extents: Float[np.ndarray, "views"]  # longer side of the bounding box
     neighbours: Int[np.ndarray, "views neighbours"]  # views from the nearest directions
-    twists: Float[np.ndarray, "views neighbours"]  # turn of each neighbour that fits best, radians
+    # Turn in the image plane that aligns each neighbour with the view, radians
+    twists: Float[np.ndarray, "views neighbours"]
 
 
 def view_rotations(
@@ -61,8 +62,8 @@ def view_rotations(
 
     Args:
         tilt_deg: Largest angle between the part's z axis and the direction to the camera, degrees.
-        group: Rotations that leave the part unchanged. Directions that it maps to each other give
-            one view.
+        group: Rotations that leave the part unchanged. Only one of the directions that they map to
+            each other is used.
     """
     number = np.arange(NUM_VIEWS) + 0.5
     z = 1 - 2 * number / NUM_VIEWS
@@ -120,7 +121,7 @@ def make_templates(
 
 
 def joined(groups: Sequence[Templates]) -> Templates:
-    """Return the templates of several groups of equal length in one, in their order."""
+    """Concatenate groups of templates, which have equal lengths."""
     templates = Templates(
         *(
             np.concatenate([getattr(group, field.name) for group in groups])
@@ -134,7 +135,7 @@ def joined(groups: Sequence[Templates]) -> Templates:
 def _neighbours(
     rotations: Rotations,
 ) -> tuple[Int[np.ndarray, "views neighbours"], Float[np.ndarray, "views neighbours"]]:
-    """Return the nearest views of each view, and the turns in the image plane between them."""
+    """Return neighbours and twists of each view; see :class:`Templates`."""
     directions = rotations[:, 2]
     count = min(NUM_NEIGHBOURS, len(rotations) - 1)
     nearest = np.argsort(-directions @ directions.T, axis=1)[:, 1 : count + 1]
@@ -171,7 +172,7 @@ def _drawn(
 def _spread(
     points: Float[np.ndarray, "points columns"], count: int
 ) -> Float[np.ndarray, "count columns"]:
-    """Return ``count`` points that are far from each other; too few points are repeated."""
+    """Choose ``count`` points that are far from each other, with repetitions if there are fewer."""
     chosen = np.empty(count, np.int64)
     _farthest(points, chosen)
     return points[chosen]

@@ -65,7 +65,7 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
 
 
 def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
-    """Read a mesh like :func:`read_mesh`, and return the mesh and the file's unit."""
+    """Return a mesh and the unit of its file; see :func:`read_mesh`."""
     path = Path(path)
     if unit is not None and unit not in UNITS:
         fix = "set the unit in which the file was exported, e.g. unit=mm"
@@ -132,6 +132,11 @@ def ycb_part(root: str | Path, name: str) -> Part:
 
 
 def _read_points(path: Path) -> Points:
+    """Read a file of points.
+
+    Raises:
+        UserError: The file is missing, too large or no table of three columns.
+    """
     allowed = "lines of three finite numbers"
     try:
         if path.stat().st_size > MAX_POINTS_BYTES:

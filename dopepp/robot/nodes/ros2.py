@@ -199,6 +199,7 @@ class _Node:
             logger.warning(text, self._topic, others)
 
     def _diagnosis(self) -> Message:
+        """Return the message about the state of the node."""
         self.slot.check()
         counts = {"received": self.slot.received, "replaced by newer": self.slot.replaced}
         values = {key: str(value) for key, value in counts.items()} | self._pace.values()
@@ -234,7 +235,14 @@ class _Node:
 
 @contextmanager
 def _ros_errors(source: str) -> Iterator[None]:
-    """Turn an error of ROS into a :class:`UserError`."""
+    """Report errors of ROS in one line.
+
+    Args:
+        source: Setting that probably caused an error.
+
+    Raises:
+        UserError: ROS raised an error.
+    """
     try:
         yield
     except Exception as error:  # rclpy raises many types
@@ -282,6 +290,7 @@ class Slot(Generic[Item]):
         self._thread.join(wait_s)
 
     def _run(self) -> None:
+        """Process the newest picture until the slot is stopped."""
         try:
             while True:
                 with self._fresh:

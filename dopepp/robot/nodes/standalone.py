@@ -55,6 +55,7 @@ def send_lines(
 
 @contextmanager
 def _datagrams(address: str) -> Iterator[Callable[[str], None]]:
+    """Open a socket; yield a function that sends a line to an address."""
     target, has_warned = _parse_address(address), False
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
 

@@ -172,7 +172,9 @@ class Worker:
             is_cropped = self._camera is None and lens is not None and lens.roi is not None
             frame = CameraFrame(image, topic, self._number, stamp.seconds)
             result = self.result(frame, camera, is_cropped)
-        except ValueError as error:  # a UserError, or fields of wrong lengths
+        except (
+            ValueError
+        ) as error:  # includes UserError; numpy raises it for fields of wrong length
             self._reject("camera", str(error))
             return None
         self.problem = ""

@@ -197,7 +197,11 @@ class PhotoBackgrounds:
         return sizes
 
     def _quarantine(self, path: Path, damage: str) -> None:
-        """Record a damaged photo; raise a UserError if there are too many."""
+        """Record a damaged photo.
+
+        Raises:
+            UserError: Too many photos are damaged.
+        """
         self.bad[path] = damage
         most = min(10, int(0.01 * len(self.paths)))
         if len(self.bad) > most:

@@ -96,6 +96,7 @@ class _SceneCheck:
         return files
 
     def check(self) -> None:
+        """Check all images of the scene."""
         report, folder, (cameras, truths, infos) = self._report, self._folder, self._records
         if not self._has_truth:
             if (folder / _INFO).is_file() or any(self._masks.values()):
@@ -119,6 +120,7 @@ class _SceneCheck:
             report.note(f"{folder}: {staged} images written and not yet finalized")
 
     def _check_image(self, image: int) -> BopPoses:
+        """Check the files and annotations of an image; return its poses."""
         report, folder, (cameras, truths, infos) = self._report, self._folder, self._records
         path = self._pictures.get(image, folder / "rgb" / f"{image:06d}.png")
         shape = picture_shape(Node(report, path), modes=COLOUR_MODES)
@@ -228,6 +230,7 @@ def load_models(report: CheckReport, roots: Sequence[Path]) -> Models | None:
 
 
 def _model(node: Node, record: object, stated: float) -> Model:
+    """Check the diameter and the bounding box in a record of ``models_info.json``."""
     fields, diameter = mapping(record), None if np.isnan(stated) else stated
     if fields and "diameter" not in fields:
         node["diameter"].report("missing")

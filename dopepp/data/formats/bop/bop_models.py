@@ -190,6 +190,7 @@ def parse_models(path: Path, records: object, problems: Problems = STRICT) -> di
 
 
 def _info(node: Node, model: Path, record: object) -> ModelInfo:
+    """Read a model's record in ``models_info.json``."""
     if not isinstance(record, dict):
         node.report(f"{record!r:.60}", "an object with diameter and symmetries")
     fields, diameter = mapping(record), math.nan
@@ -223,6 +224,7 @@ def parse_symmetries(name: str, fields: object) -> tuple[Discrete | None, Contin
 
 
 def _discrete(node: Node, value: object) -> Discrete | None:
+    """Read discrete symmetries without the identity; report invalid transforms."""
     transforms = []
     for number, row in enumerate(_rows(node, value)):
         matrix = node[number].numbers(row, 4, 4)

@@ -167,9 +167,9 @@ def make_labels(
 ) -> Labels:
     """Annotate a sample as BOP's toolkit does.
 
-    A box is (x, y, width, height), where the sides are differences of the outermost pixels'
-    coordinates (a single pixel has width 0); −1 for an object without a visible pixel. The
-    silhouette includes pixels beyond the image's border.
+    A box is (x, y, width, height). Width and height are differences between the coordinates of the
+    outermost pixels, so that a single pixel has width 0. The box of an object without a visible
+    pixel consists of −1. The silhouette includes pixels beyond the image's border.
 
     Args:
         sample: A rendered image, with depth and a mask of each instance.
@@ -197,6 +197,7 @@ def make_labels(
 def _info(
     instance: Instance, visible: Mask, whole: Silhouette, depth: UInt16[np.ndarray, "height width"]
 ) -> Record:
+    """Return an instance's record in ``scene_gt_info.json``."""
     seen, inside = Box.of_mask(visible), Box.of_mask(whole.mask)
     return {
         "bbox_obj": _bop_box(None if seen is None else _beyond_the_border(inside, whole)),

@@ -50,6 +50,7 @@ def check_ndds(report: CheckReport) -> None:
 
 
 def _check_settings(report: CheckReport, settings: NddsSettings, folder: Path) -> None:
+    """Check the settings files for missing and repeated names."""
     content = settings.read(folder / ndds.OBJECT_SETTINGS) or {}
     listed = content.get("exported_object_classes")
     node = Node(report, folder / ndds.OBJECT_SETTINGS, "exported_objects")

@@ -83,6 +83,11 @@ class NddsReader:
         _log.info("%s: %s items; found: %s", self.name, f"{len(self.items):,}", self.finding)
 
     def _find_convention(self, items: Sequence[Path]) -> NddsFinding:
+        """Determine the convention of the poses from evenly spread items.
+
+        Raises:
+            UserError: No item shows one of the parts, or the convention is ambiguous.
+        """
         seen: list[Observation] = []
         hidden: list[Observation] = []
         others: Counter[str] = Counter()
@@ -166,6 +171,7 @@ class NddsReader:
     def _instance(
         self, observation: Observation, shape: Shape, counts_truncation: bool
     ) -> Instance:
+        """Return the instance of an observation, in the conventions of this project."""
         T_cam_obj = conventions.check_observation(observation, self.finding.convention)
         part, fraction = observation.part, observation.item.visibility
         keypoints = project_keypoints(part.cuboid, T_cam_obj, observation.K)
@@ -209,6 +215,11 @@ class NddsReader:
 
 
 def _find(folder: Path) -> list[Path]:
+    """Return the annotation files with an image.
+
+    Raises:
+        UserError: The folder has none.
+    """
     items, lonely = ndds.find_items(folder) if folder.is_dir() else ([], [])
     if not items:
         counts = f"({len(lonely)} JSON files without an image)"

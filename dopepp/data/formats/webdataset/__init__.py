@@ -138,6 +138,7 @@ def members(path: Path, problems: Problems = STRICT) -> Iterator[TarMember]:
 
 
 def _walk(node: Node, file: io.BufferedReader, size: int) -> Iterator[TarMember]:
+    """Yield the members of a shard; report members that are repeated, unsafe or too large."""
     names: set[str] = set()
     with tarfile.open(fileobj=Bounded(file), mode="r:") as archive:
         while (info := archive.next()) is not None:

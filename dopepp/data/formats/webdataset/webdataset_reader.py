@@ -244,6 +244,11 @@ def find_shards(root: Path, shards: str, download_dir: Path | None = None) -> li
 
 
 def _expanded(text: str) -> list[str]:
+    """Expand the braces in a name of shards.
+
+    Raises:
+        UserError: The braces are wrong, or give more than MAX_SHARDS names.
+    """
     from braceexpand import braceexpand  # comes with the webdataset library
 
     # The library builds a whole range at once and does not limit the product of braces.
@@ -275,6 +280,11 @@ def _local(path: Path) -> list[Path]:
 
 
 def _fetched(url: str, scheme: str, folder: Path | None) -> Path:
+    """Download a shard unless the folder contains it; return its path.
+
+    Raises:
+        UserError: The shard cannot be downloaded, or no folder was given.
+    """
     problem = f"shards {url!r:.100}"
     if scheme == "pipe":  # an untrusted config must not run commands
         allowed = "files, folders and URLs of shards"

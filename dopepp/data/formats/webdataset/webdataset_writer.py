@@ -76,6 +76,7 @@ class WebdatasetWriter(BopFolder):
                 self._staging(chunk).rmdir()
 
     def _write_shard(self, chunk: int, staged: dict[int, Path]) -> None:
+        """Write a shard from the images that it has and the staged files."""
         # The webdataset library's TarWriter writes the same archive but imports torch.
         path = self._shard(chunk)
         partial = partial_path(path)

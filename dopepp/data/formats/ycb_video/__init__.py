@@ -25,7 +25,11 @@ FOLDERS: Final[dict[Subset, str]] = {"real": "data", "synthetic": "data_syn"}
 
 
 def read_classes(root: Path) -> list[str]:
-    """Return the names in ``image_sets/classes.txt``; a class index is the line number from 1."""
+    """Return the names in ``image_sets/classes.txt``; a class index is the line number from 1.
+
+    Raises:
+        UserError: The folder is not one of YCB-Video.
+    """
     path = root / "image_sets" / "classes.txt"
     for is_there, lack in (
         (root.is_dir(), "is not a folder"),
@@ -40,7 +44,11 @@ def read_classes(root: Path) -> list[str]:
 
 
 def read_image_set(root: Path, image_set: str, subset: Subset) -> list[str]:
-    """Return a subset's frames in ``image_sets/NAME.txt``, e.g. ``0050/000003`` or ``000000``."""
+    """Return a subset's frames in ``image_sets/NAME.txt``, e.g. ``0050/000003`` or ``000000``.
+
+    Raises:
+        UserError: There is no such file, or a line does not name a frame.
+    """
     path = root / "image_sets" / f"{image_set}.txt"
     if not path.is_file():
         lists = sorted(p.stem for p in path.parent.glob("*.txt") if p.stem != "classes")
@@ -113,6 +121,7 @@ def read_meta(path: Path, problems: Problems = STRICT) -> FrameMeta:
 
 
 def _load(path: Path, node: Node) -> dict[str, NDArray[Any]] | None:
+    """Read the fields of a ``-meta.mat`` file; report a damaged file and return None."""
     try:
         size = path.stat().st_size
         content = path.read_bytes() if size <= _MAX_META_BYTES else None

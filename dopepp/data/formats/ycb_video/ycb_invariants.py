@@ -44,6 +44,7 @@ def check_ycb(report: CheckReport) -> None:
 
 
 def _check_lists(report: CheckReport) -> None:
+    """Check the image sets, and note listed frames that are not on disk."""
     for path in sorted((report.root / "image_sets").glob("*.txt")):
         if path.stem == "classes":
             continue
@@ -111,6 +112,7 @@ class _FrameCheck:
     def _check_pose(
         self, node: Node, meta: FrameMeta, index: int, K: CameraMatrix | None, seen: Box | None
     ) -> None:
+        """Check the class and the pose of an object in a frame."""
         column, T_cam_obj = meta.columns[index], meta.poses[index]
         if not 1 <= index <= len(self._classes):
             allowed = f"1 … {len(self._classes)}, the lines of classes.txt"

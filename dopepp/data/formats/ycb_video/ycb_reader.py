@@ -88,6 +88,11 @@ class YcbVideoReader:
         self._backgrounds, self._seed, self._read_depth = backgrounds, seed, read_depth
 
     def _present(self, listed: list[str], where: str) -> list[str]:
+        """Return the listed frames that are on disk.
+
+        Raises:
+            UserError: None of them is.
+        """
         folder = self.root / ycb_video.FOLDERS[self.subset]
         is_there = {frame: Path(f"{self._start(frame)}-color.png").is_file() for frame in listed}
         absent = [frame for frame in listed if not is_there[frame]]

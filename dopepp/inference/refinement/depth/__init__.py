@@ -1,11 +1,13 @@
 """Depth term of refinement: the evidence of a depth image about a pose, and its acceptance.
 
-The part is represented by its surface points, so a checkpoint is sufficient. A search over shifts
-finds the measured surface: a descent needs a start from which the nearest surface is the right one,
-and a plate that is 14 mm away, or 10 mm aside on a table, is no such start. Then two kinds of terms
-are minimised (:mod:`~dopepp.inference.refinement.depth.terms`): the planes of the part's points,
-which determine what the surface's shape determines, and the outline in the depth, which keeps a
-plate from sliding in its plane. The image's pose and covariance determine the rest.
+The part is represented by its surface points, which every checkpoint contains.
+
+1. A search over shifts finds the measured surface. A descent alone would converge to the nearest
+   surface, which is wrong for a plate that is 14 mm away, or 10 mm aside on a table.
+2. Two kinds of terms are minimised (:mod:`~dopepp.inference.refinement.depth.terms`). The planes of
+   the part's points determine the pose as far as the shape of the surface does. The outline in the
+   depth image keeps a plate from sliding in its plane. The image's pose and covariance determine
+   the rest.
 """
 
 from __future__ import annotations
@@ -42,21 +44,20 @@ FARTHEST: Final = 3.0
 LEAST_INLIERS: Final = 0.5  # share of the unobstructed points with depth that must agree
 LEAST_SEEN: Final = 0.25  # share of the visible points that must have agreeing depth
 MOST_RMS: Final = 2.0  # RMS offset in standard deviations of the depth; about 1 at a right pose
-CLOSE: Final = 5.0  # spacings in front of a part in which no other object is expected
+CLOSE: Final = 5.0  # distance in front of a part without other objects, spacings
 BESIDE: Final = 3.0  # spacings around the part in which its surface must not continue
 SEARCHED_POINTS: Final = 400  # points in the search
 ACROSS: Final = 6  # steps of the search to each side, along x and y
 REACH: Final = 2.5  # standard deviations of the prior that are searched along the viewing axis
 
-# Costs of a point in the search, where a point behind the surface costs 1: without depth; occluded,
-# or with depth that agrees in part.
-MISSING: Final = 0.5
-HIDDEN: Final = 0.5
+# Costs of a point in the search; a point behind the surface costs 1.
+MISSING: Final = 0.5  # point without measured depth
+HIDDEN: Final = 0.5  # point that is occluded, or whose depth agrees only in part
 
 PENALTY: Final = 0.03
-"""Share of the points that a shift by one standard deviation of the prior must gain."""
+"""Share of the points that must gain by a shift of one standard deviation of the prior."""
 
-LEAST_FOUND: Final = 20  # points that must find their depth
+LEAST_FOUND: Final = 20  # least number of points that agree with their depth
 
 
 @dataclass(frozen=True)
@@ -187,7 +188,7 @@ class DepthEvidence:
         )
 
     def _shifted(self, pose: Transform, is_visible: Visible, stage: DepthStage) -> Transform | None:
-        """Shift a pose to where most points find their depth; None if too few have depth."""
+        """Shift a pose so that most points agree with their depth; None if too few agree."""
         if not stage.search:
             return pose
         view = self._view
@@ -245,10 +246,10 @@ def _search(
     tolerance: float,
     best: Array,
 ) -> int:
-    """Write the shift in camera axes that most points agree on; return their number.
+    """Write the shift in camera axes at which most points agree; return their number.
 
-    All shifts across the viewing axis are tried, and points vote on the shift along it: their votes
-    fall into ``half`` bins of ``bin_size`` metres to each side of the present depth. All lengths
+    All shifts across the viewing axis are tried. For each of them, the points vote on the shift
+    along the axis, in ``half`` bins of ``bin_size`` on each side of the present depth. All lengths
     are metres.
 
     Args:

@@ -4,8 +4,8 @@ Point-to-plane terms: a pixel's residual is its distance from the plane of the v
 shows. Weights decrease to 0 at a limit, so occluders, background and outliers have no effect.
 
 Outline terms: a point with depth behind it, or a pixel beside the part that continues its surface,
-moves the part across the viewing ray. Where both outlines agree there is no term, so the inside of
-a surface does not hold the pose.
+moves the part across the viewing ray. Points inside both outlines have no such term, because they
+would hold the part in place.
 """
 
 from __future__ import annotations

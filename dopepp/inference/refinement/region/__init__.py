@@ -1,17 +1,19 @@
 """Refinement on the image: move the outline to the border between part and background colours.
 
-Colours inside the part's outline and around it are learned at the pose to refine. Along the normals
-of the outline, they and the image's edges show where the part ends
-(:mod:`~dopepp.inference.refinement.region.shifts`). A few Gauss–Newton steps follow, from coarse to
-fine, with the given pose and its covariance as prior. If the image does not agree with the result,
-the descent is repeated from other starts with a weaker prior, and the end that agrees best is
-returned. This is for poses whose covariance may be wrong, as a network's of an occluded part. If
-the image does not determine the pose, the given pose is kept.
+1. Colours inside the part's outline and around it are learned at the pose to refine.
+2. Colours and edges along the normals of the outline show where the part ends
+   (:mod:`~dopepp.inference.refinement.region.shifts`).
+3. A few Gauss–Newton steps follow, from coarse to fine, with the given pose and its covariance as
+   prior.
+4. If the image does not agree with the result, the descent is repeated from other starts with a
+   weaker prior, and the result that agrees best is returned. The covariance of a network's pose can
+   be too small, for instance if the part is occluded.
+5. If the image does not determine the pose, the given pose is kept.
 
 Errors of neighbouring points are correlated, and all points share errors of offset and scale
-(:mod:`~dopepp.inference.refinement.region.shared_errors`): with independent errors, a blurred edge
-or a print that is off by a percent would overrule the network's distance. The idea of regions is
-that of PWP3D and RBOT, probabilistic lines are those of SRT3D (Stoiber et al. 2022).
+(:mod:`~dopepp.inference.refinement.region.shared_errors`). If errors were independent, a blurred
+edge or a print that is off by a percent would overrule the network's distance. Regions are used as
+in PWP3D and RBOT, and probabilistic lines as in SRT3D (Stoiber et al. 2022).
 """
 
 from __future__ import annotations
@@ -48,14 +50,13 @@ FINE: Final = RegionStage(300, reach=0.25, steps=3, points=160, tiles=3)
 """The coarse stage is run from every start, the others from the best one only."""
 
 WIDENED: Final = 2.0
-"""Factor on the prior's deviations in the coarse round: far from the right pose, the image does not
-agree with itself enough to overrule the prior."""
+"""Factor on the prior's deviations in the coarse round. Far from the right pose, the points of the
+outline contradict each other, so the image has too little weight against the prior."""
 
 SURE: Final = 0.85
-"""Agreement below which the search is extended, and that a pose of the extended search needs."""
+"""Agreement below which the search is extended, and least agreement of a pose that it accepts."""
 
-# Share of the whole outline that must agree at a pose of the extended search, and by how much it
-# must exceed that of the first pose.
+# Support that the extended search requires of a pose, and least gain over that of the first pose.
 SUPPORTED: Final = 0.35
 MORE: Final = 0.02
 
@@ -108,8 +109,9 @@ class RegionRefiner:
     ) -> Refinement:
         """Refine one pose; see :meth:`~dopepp.inference.refinement.refiner.PartRefiner.refine`.
 
-        ``starts`` returns further start poses if the image does not agree with poses near the given
-        one. Randomly drawn poses are added. Without ``starts``, the search is not extended.
+        If the image does not agree with poses near the given pose, the search is extended to the
+        poses that ``starts`` returns and to randomly drawn poses. Without ``starts``, the search is
+        not extended.
         """
         given = np.asarray(T_cam_obj, np.float64)
         try:
@@ -170,7 +172,7 @@ class RegionRefiner:
 
 
 def refinement(end: Solution, agreement: OutlineAgreement) -> Refinement:
-    """Return the result of a descent."""
+    """Return the result of a descent as a :class:`Refinement`."""
     covariance = np.linalg.inv(end.information)
     return Refinement(end.T_cam_obj, covariance, "", agreement.share, agreement.support)
 
@@ -205,9 +207,11 @@ def _search_far(
     starts: Sequence[Transform],
     near: Outcome | None,
 ) -> Outcome | None:
-    """Descend from the most likely starts; return the end that agrees best.
+    """Descend from the most likely starts; return the result that agrees best.
 
-    None if no end agrees well, or with more of the outline than ``near`` or the given pose.
+    Returns:
+        None if no result agrees well, or if none has more support than ``near``, or than the given
+        pose if ``near`` is None.
     """
     best: Outcome | None = None
     given, first, last = prior.T_cam_obj, rounds[0], rounds[-1]

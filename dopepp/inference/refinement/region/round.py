@@ -44,14 +44,13 @@ SAMPLES: Final = 7  # steps on each side of a normal, which are 1 to 4 pixels
 FEWEST_POINTS: Final = 24  # least outline points that determine a pose
 
 LEAST_GAIN: Final = 2.0
-"""Decrease in the logarithm of the covariance's volume below which the image is uninformative."""
+"""Least increase of the information's log determinant; below it, the image is uninformative."""
 
 FIRM: Final = (math.radians(1.0), 5e-3)
 """Standard deviations of a precise pose: radians, and metres per metre of distance."""
 
-# A refined outline is accepted if this share of it, by information, is so near to the image's.
-LEAST_AGREEING: Final = 0.3
-AGREE_PX: Final = 2.0
+LEAST_AGREEING: Final = 0.3  # least agreement of a refined outline that is accepted
+AGREE_PX: Final = 2.0  # largest distance from the image's outline of a point that agrees
 
 INFORMATIVE: Final = 0.1  # pixels⁻²: information of a point that counts as support
 
@@ -113,7 +112,7 @@ class Round:
         self._last: tuple[Transform, Silhouette | None] = np.empty((0, 0)), None
 
     def learn(self, pose: Transform, reach: float) -> None:
-        """Learn the colours at a pose whose outline may be off by the stage's share of ``reach``.
+        """Learn the colours at a pose; ``reach`` is the search distance, pixels of the image.
 
         Raises:
             UndecidedError: Too few pixels are visible.
@@ -208,8 +207,8 @@ class Round:
             raise UndecidedError(f"{distance:.1f} standard deviations from the given pose, {limit}")
         rows = outline_rows(contour, end.T_cam_obj, self.crop.K)
         is_near = self._is_followed and np.mean((rows @ prior.offset(end.T_cam_obj)) ** 2) < 1.0
-        # For a tracked part within a pixel, single pixels would decide. Additional terms may move a
-        # pose to where the image alone fits less.
+        # Compare with the prior's pose, except where noise would decide (a tracked part that moved
+        # less than a pixel) and where further terms may move the pose against the image.
         if not is_near and not self._more:
             after = self.log_likelihood(end.T_cam_obj, prior)
             if after <= self.log_likelihood(prior.T_cam_obj, prior):
@@ -239,7 +238,7 @@ class Round:
         return OutlineAgreement(share, float((agrees & (weights > INFORMATIVE)).mean()))
 
     def _gain(self, end: Solution, prior: Prior, information: PoseMatrix) -> float:
-        """Return the logarithm by which the outline reduces the prior's volume.
+        """Return the increase of the information's log determinant due to the outline.
 
         For a tracked part, whose pose is precise, the gain is relative to a weaker prior.
         """

@@ -3,12 +3,12 @@
 All points share two errors, which are unknowns with a prior:
 
 - Offset: blur, a halo or a mesh that is too thick move every point outwards by the same distance.
-  It has a normal distribution.
-- Scale: enlarging the part, or the focal length, moves the outline exactly as bringing the part
-  nearer does. Errors up to a limit are equally likely. The distance therefore stays that of the
-  prior while both differ by less than the limit. Beyond it, the distance follows the outline up to
-  the limit. As a normal distribution, the error would move every distance part of the way to that
-  of the image, right ones too.
+  The offset is normally distributed.
+- Scale: a larger part or focal length has the same effect on the outline as a nearer part. All
+  errors up to a limit are equally likely. While the distances of prior and outline differ by less
+  than the limit, the prior's distance is kept. Otherwise the outline moves it, except for the
+  limit. A normally distributed error would move every distance, even a right one, part of the way
+  to that of the outline.
 
 Neighbouring points have errors in common, and outliers get a small weight.
 """
@@ -26,7 +26,7 @@ from dopepp.geometry.rotation import Vector
 from dopepp.inference.refinement.region.shifts import Shifts
 from dopepp.inference.refinement.solver import DAMPING, NormalEquations
 
-INDEPENDENT_PX: Final = 4.0  # length of the outline within which errors are equal
+INDEPENDENT_PX: Final = 4.0  # length of the outline within which small errors are equal
 LEAST_INFORMATION: Final = 1e-3  # pixels⁻²; smaller information is ignored
 
 REWEIGHTINGS: Final = 2
@@ -167,7 +167,8 @@ def _terms(
                 k += 1
         # The median of a squared normal variable is 0.455 of its variance.
         spread = _median(valid[:num_valid]) / 0.455
-        # Below a pixel it is noise; above it is a shadow, a highlight or an error of the mesh.
+        # A spread below a pixel is noise. A larger one has a cause that neighbouring points share:
+        # a shadow, a highlight or an error of the mesh.
         share = min(independent, 1.0 / max(alike * min(1.0, spread), 1.0))
         for i in range(len(rows)):
             if information[i] > LEAST_INFORMATION:

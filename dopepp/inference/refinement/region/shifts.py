@@ -2,11 +2,13 @@
 
 Along a normal, pixels have the part's colours up to the shift d at which the part ends, and those
 of its surroundings beyond. The sum of the pixels' log odds up to d is therefore the logarithm of
-the likelihood of d, up to a constant. The likelihood is also higher where the image changes more
-than on average: edges separate a part from surroundings of its own colour, and locate its end to
-better than a pixel. The result is mean and variance of the shift. A normal whose shifts are all
-equally likely has no information: the inverse of its variance minus that of a uniform distribution
-is zero.
+the likelihood of d, up to a constant.
+
+Edges also increase the likelihood: it is higher where the image changes more than on average. They
+separate a part from surroundings of its own colour, and locate its end with subpixel accuracy.
+
+The result is the mean of the shift and its information: the inverse of its variance, minus that of
+a uniform distribution. If all shifts are equally likely, the information is zero.
 """
 
 from __future__ import annotations
@@ -40,8 +42,8 @@ FOUND: Final = Weights(colour=0.5, edge=1.0)
 """For a start that may be far off: colours decide which of many edges is the part's."""
 
 FOLLOWED: Final = Weights(colour=0.12, edge=4.0)
-"""For a tracked part: the nearest edge is the part's, and its centre is robust to blur. From far
-starts on real images, 9 % of poses get worse with these weights, instead of 7 %."""
+"""For a tracked part: the nearest edge is the part's, and its centre is robust to blur. For starts
+that are far off, these weights are worse than :data:`FOUND`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +86,8 @@ def _changes(
 ) -> float:
     """Write the change of the image between neighbouring samples; return the mean change.
 
-    It is the difference between two samples before and two after, in the channel with the largest.
+    The change is the difference between the means of two samples before and two samples after, in
+    the channel in which it is largest.
     """
     height, width = colours.shape[:2]
     samples = np.empty((2 * count + 5, 3))
