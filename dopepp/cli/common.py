@@ -148,7 +148,7 @@ def check_region(refine: str | None) -> None:
     """Check that the refinement is ``region`` or none.
 
     Raises:
-        UserError: It is another one.
+        UserError: The refinement is another.
     """
     if refine not in (None, "region"):
         raise UserError(f"--refine {refine}", "region", "pass --refine region, or leave it out")

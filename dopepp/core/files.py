@@ -136,7 +136,7 @@ _ABANDONED_S: Final = 600.0  # age of an abandoned partial file of another machi
 
 
 def partial_path(path: Path) -> Path:
-    """Return a path beside a file that no other process uses, on any machine."""
+    """Return a temporary path in a file's folder, which no other process uses on any machine."""
     return path.with_name(f".{path.name}.{_machine()}-{os.getpid()}{PARTIAL_SUFFIX}")
 
 

@@ -5,7 +5,7 @@ whose numbers have a :class:`Range`. :func:`check` validates an argument, and :c
 fields of a dataclass. The first mistake raises :class:`~dopepp.core.errors.UserError`.
 
 Values are never coerced: ``"1"`` is not a number and ``true`` is not an integer. As in JSON, a list
-stands for a tuple and text for a path. To refuse unknown fields, a dataclass has the line
+represents a tuple, and text represents a path. To refuse unknown fields, a dataclass has the line
 ``__pydantic_config__ = STRICT``.
 """
 

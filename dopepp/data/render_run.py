@@ -183,9 +183,8 @@ class RenderTasks:
         factory, writer = self._open()
         if task.finalizes:
             written = writer.written(task.chunk)
-            if written.issuperset(
-                task.indices
-            ):  # otherwise other shards still render images of the chunk
+            # Otherwise other shards still render images of the chunk.
+            if written.issuperset(task.indices):
                 writer.finalize(task.chunk, sorted(written))
             return 0.0, 0.0
         render_s = write_s = 0.0

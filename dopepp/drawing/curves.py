@@ -31,13 +31,13 @@ _SMOOTHING: Final = 50
 
 
 def accuracy_curve(
-    errors: Float[np.ndarray, "n"], max_threshold: float = MAX_THRESHOLD
+    errors: Float[np.ndarray, "n"],
 ) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]:
-    """Return thresholds from 0 to ``max_threshold`` and the share of errors strictly below each.
+    """Return thresholds from 0 to 0.1 m and the share of errors strictly below each.
 
     NaN and infinite errors are misses; without errors every share is 0.
     """
-    thresholds = np.linspace(0.0, max_threshold, _NUM_STEPS + 1)
+    thresholds = np.linspace(0.0, MAX_THRESHOLD, _NUM_STEPS + 1)
     errors = np.asarray(errors, np.float64)
     # NaN sorts last, behind infinity; searchsorted on the left counts what is strictly below.
     below = np.searchsorted(np.sort(errors), thresholds, side="left")
@@ -46,7 +46,6 @@ def accuracy_curve(
 
 def accuracy_figure(
     curves: Mapping[str, Float[np.ndarray, "n"]],
-    max_threshold: float = MAX_THRESHOLD,
     title: str = "",
     colours: Mapping[str, str] | None = None,
 ) -> Figure:
@@ -54,17 +53,16 @@ def accuracy_figure(
 
     Args:
         curves: Errors in metres by method; infinite for a miss.
-        max_threshold: Largest threshold, metres.
         title: Title of the figure.
         colours: Matplotlib colours by method; the default cycle if None.
     """
     figure, axes = figure_with_axes("error threshold (m)", "share of instances below (%)", title)
     for name, errors in curves.items():
-        thresholds, accuracy = accuracy_curve(errors, max_threshold)
-        area = 100 * _area(np.asarray(errors, np.float64), max_threshold)
+        thresholds, accuracy = accuracy_curve(errors)
+        area = 100 * _area(np.asarray(errors, np.float64))
         colour = None if colours is None else colours[name]
         axes.plot(thresholds, 100 * accuracy, label=f"{name} (AUC {area:.1f} %)", color=colour)
-    axes.set(xlim=(0, max_threshold), ylim=(0, 101))
+    axes.set(xlim=(0, MAX_THRESHOLD), ylim=(0, 101))
     if curves:
         axes.legend(loc="lower right", fontsize="small")
     return figure
@@ -73,7 +71,6 @@ def accuracy_figure(
 def save_accuracy_curves(
     path: Path | str,
     curves: Mapping[str, Float[np.ndarray, "n"]],
-    max_threshold: float = MAX_THRESHOLD,
     title: str = "",
 ) -> Figure:
     """Write the curves as ``<path>.png`` and ``<path>.csv`` and return the figure.
@@ -81,14 +78,14 @@ def save_accuracy_curves(
     The CSV has a column ``threshold_m`` and, for each method, a column with the share in [0, 1].
     """
     path = Path(path)
-    columns = {"threshold_m": np.linspace(0.0, max_threshold, _NUM_STEPS + 1)}
-    columns |= {name: accuracy_curve(errors, max_threshold)[1] for name, errors in curves.items()}
+    columns = {"threshold_m": np.linspace(0.0, MAX_THRESHOLD, _NUM_STEPS + 1)}
+    columns |= {name: accuracy_curve(errors)[1] for name, errors in curves.items()}
     rows = [
         {name: f"{value:.6g}" for name, value in zip(columns, values, strict=True)}
         for values in zip(*columns.values(), strict=True)
     ]
     write_csv(path.with_name(path.name + ".csv"), rows)
-    figure = accuracy_figure(curves, max_threshold, title)
+    figure = accuracy_figure(curves, title)
     write_png(path.with_name(path.name + ".png"), figure_image(figure))
     return figure
 
@@ -110,12 +107,12 @@ def figure_image(figure: Figure) -> Picture:
     return np.ascontiguousarray(pixels[..., :3])
 
 
-def _area(errors: Float[np.ndarray, "n"], max_threshold: float) -> float:
+def _area(errors: Float[np.ndarray, "n"]) -> float:
     """Return the exact area under the curve (``metrics.auc`` is in a higher layer)."""
     if len(errors) == 0:
         return 0.0
     # fmin ignores NaN, so NaN is a miss.
-    return float(np.mean(1 - np.fmin(errors, max_threshold) / max_threshold))
+    return float(np.mean(1 - np.fmin(errors, MAX_THRESHOLD) / MAX_THRESHOLD))
 
 
 @dataclass(frozen=True)
@@ -173,7 +170,7 @@ def rates_figure(
 
 
 def coverage_figure(curves: Mapping[str, RateCurve]) -> Figure:
-    """Draw the observed over the nominal coverage of covariance regions, beside the diagonal."""
+    """Draw the observed over the nominal coverage of covariance regions, with the diagonal."""
     percent = {name: replace(curve, x=100 * curve.x) for name, curve in curves.items()}
     figure = rates_figure({"coverage of the covariances": percent}, "nominal (%)", columns=1)
     axes = figure.axes[0]

@@ -201,7 +201,7 @@ def _key(name: str) -> str:
 
 
 def _size(fields: _Fields) -> Size | None:
-    """Return the picture's size in the fields of a file; None if there is none.
+    """Return the picture's size in the fields of a file; None if the file has no size.
 
     Raises:
         UserError: The size is incomplete or invalid.

@@ -80,7 +80,10 @@ def rotations_about(
 
 
 def _ball_rotations(step: float) -> Float[np.ndarray, "rotations 3 3"]:
-    """Return rotations about ``step`` radians apart, from a spiral of directions with turns."""
+    """Return rotations that cover all orientations, about ``step`` radians apart.
+
+    They turn the z axis to directions on a spiral, each with several turns about the axis.
+    """
     number = np.arange(math.ceil(4 * math.pi / step**2))
     z = 1 - 2 * number / number[-1]  # the first direction is z
     polar, around = np.arccos(z), np.pi * (3 - math.sqrt(5)) * number

@@ -97,7 +97,10 @@ def compare_export(
                 maps.append(largest if math.isfinite(largest) else math.inf)
         # Detections are sorted by score: the best of an object overwrites the others.
         poses, expected_poses = (
-            {it.object: it.T_cam_obj for it in reversed(network.predict(picture, K, cropped=True))}
+            {
+                detection.object: detection.T_cam_obj
+                for detection in reversed(network.predict(picture, K, cropped=True))
+            }
             for network in (exported, original)
         )
         for name in poses.keys() & expected_poses.keys():

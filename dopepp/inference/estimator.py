@@ -299,7 +299,12 @@ class PoseEstimator:
                 detections = recover(
                     belief, field, self.cuboids, view.K, stride, self._names, **options
                 )
-            scales.append([view.to_image(it, self._cuboid_of[it.object], K) for it in detections])
+            scales.append(
+                [
+                    view.to_image(detection, self._cuboid_of[detection.object], K)
+                    for detection in detections
+                ]
+            )
         return merge_scales(scales)
 
     def _recalibrated(self, refined: Sequence[Detection], by_depth: bool) -> list[Detection]:

@@ -1,9 +1,9 @@
 """From a caller's image to the network's input: checks, lens distortion, and image sizes.
 
 A network detects a part in a limited range of sizes. A part of diameter d at depth z is d·f/z
-pixels long in an image of focal length f. Training showed it from ``smallest_px`` to ``largest_px``
-long, so the image is resized until parts at the expected distances have such sizes. Several sizes
-are used if the distances vary more than in training.
+pixels long in an image of focal length f; in training, from ``smallest_px`` to ``largest_px``. The
+image is resized so that parts at the expected distances have such sizes. Several sizes are used if
+the distances vary more than in training.
 """
 
 from __future__ import annotations

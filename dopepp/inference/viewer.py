@@ -100,13 +100,14 @@ class Viewer:
             log(f"beliefs/{name}", rr.Image(belief))
         # With a tracker, a detection has the same name on every frame.
         numbers = result.identities or range(len(result.detections))
-        names = [f"{it.object}_{k}" for it, k in zip(result.detections, numbers, strict=True)]
-        for number, (name, detection) in enumerate(zip(names, result.detections, strict=True)):
+        pairs = zip(result.detections, numbers, strict=True)
+        named = {f"{detection.object}_{k}": detection for detection, k in pairs}
+        for number, (name, detection) in enumerate(named.items()):
             self._log_part(name, detection, COLOURS[number % len(COLOURS)])
-        for name in self._shown - set(names):
+        for name in self._shown - named.keys():
             for group in GROUPS:
                 log(f"world/{group}/{name}", rr.Clear(recursive=True))
-        self._shown = set(names)
+        self._shown = set(named)
 
     def close(self) -> None:
         """Complete the recording."""

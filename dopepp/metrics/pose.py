@@ -246,7 +246,7 @@ class PoseMetrics(Metric):
         self.compute()
         return np.asarray(getattr(self._gathered[name].errors, measure).numpy())
 
-    def references(self, seed: int = 0) -> dict[str, dict[str, PoseRow]]:
+    def references(self) -> dict[str, dict[str, PoseRow]]:
         """Return the rows of each reference on the evaluated instances, by object or :data:`MEAN`.
 
         All ranks must call this method, like ``compute``.
@@ -254,7 +254,7 @@ class PoseMetrics(Metric):
         self.compute()
         table: dict[str, dict[str, PoseRow]] = {reference: {} for reference in REFERENCES}
         for name, part in self.parts.items():
-            rows = reference_rows(part, self._gathered[name].T_gt.numpy(), seed)
+            rows = reference_rows(part, self._gathered[name].T_gt.numpy())
             for reference, row in rows.items():
                 table[reference][name] = row
         for reference, by_part in table.items():

@@ -190,10 +190,11 @@ class MultiScale(Head):
 class MultiScaleBranch(Branch):
     """One branch of a MultiScaleDOPEstage: three scales down, then top-down fusion.
 
-    Down: five 3×3 convolutions at full scale, three at half and three at quarter scale. Up: a
-    convset and a 1×1 convolution at quarter scale, upsampling by 2, concatenation with the half
-    scale; likewise into full scale; a convset; 1×1 to the maps. ReLU follows every convolution
-    except output convolutions, because a convset without ReLU would be a single linear map.
+    Down: five 3×3 convolutions at full scale, three at half and three at quarter scale. Up, from
+    quarter to half scale and from half to full scale: a convset, a 1×1 convolution, upsampling by 2
+    and concatenation with the features of the larger scale. A last convset and a 1×1 convolution
+    give the maps. ReLU follows every convolution except output convolutions, because a convset
+    without ReLU would be a single linear map.
     """
 
     def __init__(

@@ -366,7 +366,7 @@ def fit_weights(
     Args:
         features: Features of the detections.
         correct: Whether each pose is right; a detection without an instance is not.
-        usual: Weights that few detections hardly change (default: 0).
+        usual: Weights without a penalty, near which few detections leave the result (default: 0).
 
     Raises:
         ValueError: All or no detections are right.

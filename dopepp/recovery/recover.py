@@ -173,7 +173,7 @@ def _check_shapes(belief: Beliefs, field: Fields, num_objects: int, K: Cameras) 
     """Check the shapes of maps and cameras.
 
     Raises:
-        ValueError: They do not match.
+        ValueError: The shapes do not match.
     """
     expected = (num_objects * NUM_KEYPOINTS, num_objects * NUM_CORNERS * 2)
     if belief.ndim != 4 or field.ndim != 4 or 0 in belief.shape[2:]:

@@ -168,7 +168,7 @@ def _centre_of_mass(corners: Float[np.ndarray, "faces 3 3"]) -> Vector:
 def _foot_inside(
     corners: Float[np.ndarray, "triangles 3 3"], normals: Float[np.ndarray, "triangles 3"]
 ) -> Bool[np.ndarray, "triangles"]:
-    """Return whether the origin's foot on each triangle's plane lies in the triangle."""
+    """Return whether the origin's projection onto a triangle's plane lies in the triangle."""
     foot = np.einsum("ij,ij->i", corners[:, 0], normals)[:, None, None] * normals[:, None]
     along = np.roll(corners, -1, axis=1) - corners
     side = np.einsum("ijk,ijk->ij", np.cross(along, foot - corners), normals[:, None])

@@ -204,7 +204,7 @@ def edge_functions(hom: Array, a: int, b: int, c: int) -> EdgeFunctions:
 
 @compiled(fastmath=True)
 def open_share(u: Scalar, v: Scalar, inverse: Scalar, inverse_depth: Array) -> Scalar:
-    """Compare a point with the four texels around it; 1 beside the map.
+    """Compare a point with the four texels around it; 1 outside the map.
 
     Percentage-closer filtering: the comparisons are interpolated, not the depths.
     """

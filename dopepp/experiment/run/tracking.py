@@ -60,9 +60,8 @@ def _open(
     """Build trackers and close them; options of a node take precedence."""
     trackers = []
     for node in (nodes or {}).values():
-        target = LOGGERS.resolve(
-            node.get(TARGET)
-        )  # a wrong name is a user error, not a failure of the tracker
+        # A wrong name is the user's mistake, not a failure of the tracker.
+        target = LOGGERS.resolve(node.get(TARGET))
         options: dict[str, Any] = {"save_dir": str(folder)}
         if issubclass(target, WandbLogger):
             options |= {"name": name, "group": group, "job_type": kind, "version": begun}

@@ -89,7 +89,7 @@ def _refuse_parallel_multirun(trainer: TrainerConfig) -> None:
     """Check that a multirun uses one process, because each process would start the sweep again.
 
     Raises:
-        UserError: It would use several.
+        UserError: The multirun would use several processes.
     """
     if not HydraConfig.initialized() or HydraConfig.get().mode != RunMode.MULTIRUN:
         return
@@ -144,9 +144,8 @@ def _train(
         )
     seed_everything(config.seed, verbose=False)
     keep_freed_memory()
-    display.console.quiet = bool(
-        getattr(rank_zero_only, "rank", 0)
-    )  # only the first process reports
+    # Only the first process reports.
+    display.console.quiet = bool(getattr(rank_zero_only, "rank", 0))
     parts = build_parts(config.data)
     config = fitted_to_camera(config, parts)
     if config.tune:

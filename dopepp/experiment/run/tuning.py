@@ -122,7 +122,7 @@ class Figures:
 
     calibration_error: float  # expected calibration error of the scores
     false_positive_rate: float  # share of the images without objects on which a pose is reported
-    lookalike_rate: float  # the same of images with look-alikes of the objects
+    lookalike_rate: float  # share of the images with look-alikes on which a pose is reported
     recall: float  # share of the instances with a correct reported pose
     precision: float  # share of the reported poses that are correct
 

@@ -122,9 +122,8 @@ def on_joblib(n_jobs: int) -> Runner:
     require("joblib", "hydra/launcher=joblib", "joblib")
 
     def run(jobs: Jobs, overrides: Mapping[int, list[str]]) -> Ended:
-        from joblib.externals.loky.cloudpickle_wrapper import (
-            dumps,
-        )  # cloudpickle also serialises objects defined in scripts
+        # Unlike pickle, cloudpickle serialises objects that scripts define.
+        from joblib.externals.loky.cloudpickle_wrapper import dumps
 
         share = str(max(available_cores() // n_jobs, 1))
         limits = {name: os.environ.get(name, share) for name in THREAD_LIMITS}

@@ -105,7 +105,7 @@ def exposure(case: Case) -> Diagnosis:
     """Check whether the image is dark, or overexposed at the part."""
     brightest, white, near = highlights(case.image), clipped(case.image), 0.0
     sentence = f"highlights of {brightest:.0f} of 255, {white:.0%} white without detail"
-    if case.found is not None:
+    if case.detection is not None:
         near = clipped(case.around())
         sentence += f", {near:.0%} around the part"
     if brightest < DARK:
@@ -135,10 +135,10 @@ def camera(case: Case) -> Diagnosis:
     half = np.array([case.image.shape[1], case.image.shape[0]]) / 2
     across, down = np.degrees(2 * np.arctan(half / case.K.diagonal()[:2]))
     sentence = f"K sees {across:.0f}° × {down:.0f}°"
-    if case.found is None:
+    if case.detection is None:
         return Diagnosis("camera", sentence)
     fix = "check K: its picture size (--K-size), the crop (--crop), the calibration"
-    detection, name = case.found, case.part.name
+    detection, name = case.detection, case.part.name
     lens = focal_factor(case.part.cuboid, detection.peaks, detection.T_cam_obj, case.K)
     if lens and lens.gain > GAIN and lens.deviation < CERTAIN and not _near(lens.factor, FOCAL):
         other = f"{name} is seen in the perspective of a focal length {lens.factor:.2g} times K's"
@@ -158,9 +158,9 @@ def size(case: Case) -> Diagnosis:
         return Diagnosis("size", f"the checkpoint does not know in which sizes {name} was trained")
     near, far = case.distances or depths
     usual = f"{near:.2g} – {far:.2g} m"
-    if case.found is None:
+    if case.detection is None:
         return Diagnosis("size", f"{name} was searched at {usual}, and nearer and farther")
-    z = float(case.found.T_cam_obj[2, 3])
+    z = float(case.detection.T_cam_obj[2, 3])
     sentence = f"{name} is {case.length_px:.0f} pixels long at {z:.3g} m"
     if case.elsewhere is None:
         return Diagnosis("size", f"{sentence}; it is searched at {usual}")
@@ -174,14 +174,14 @@ def visibility(case: Case) -> Diagnosis:
     """Check how much of the part the network sees, and what its maps lack."""
     name = case.part.name
     if not case.estimator.has_network:
-        if case.found is not None:
-            return Diagnosis("visibility", f"{name} is seen, score {case.found.score:.2g}")
+        if case.detection is not None:
+            return Diagnosis("visibility", f"{name} is seen, score {case.detection.score:.2g}")
         problem = f"no pose of {name} passes the verification"
         fix = "check that all of it is on the picture and uncovered; add light from the side, or "
         fix += "train it (experiment=my_part): a network sees more in clutter"
         return Diagnosis("visibility", problem, fix)
-    if case.found is not None:
-        count, score = num_keypoints(case.found), case.found.score
+    if case.detection is not None:
+        count, score = num_keypoints(case.detection), case.detection.score
         sentence = f"{count} of 9 keypoints of {name}, score {score:.2g}"
         if score >= LEAST_SCORE:
             return Diagnosis("visibility", sentence)
@@ -221,9 +221,9 @@ def elsewhere(case: Case) -> Diagnosis:
 
 def pose(case: Case) -> Diagnosis:
     """Check whether keypoints and outline agree with the pose."""
-    if case.found is None:
+    if case.detection is None:
         return Diagnosis("pose", "no pose to check")
-    detection, refined, name = case.found, case.refined, case.part.name
+    detection, refined, name = case.detection, case.refined, case.part.name
     share = detection.reprojection_error_px / case.length_px
     sentence = f"{name}'s keypoints are {detection.reprojection_error_px:.1f} pixels off it"
     if not case.estimator.has_network:
@@ -272,10 +272,10 @@ def _lens_ratio(case: Case) -> float | None:
     None if the part's distance lies within the training range, if its size on the image does not,
     or if the focal lengths hardly differ.
     """
-    if case.seen is None or case.distances is not None or case.found is None:
+    if case.seen is None or case.distances is not None or case.detection is None:
         return None
     learned = Letterbox.fit(case.image.shape[1::-1], case.estimator.checkpoint.input_size)
-    length, z = case.length_px * learned.scale_x, float(case.found.T_cam_obj[2, 3])
+    length, z = case.length_px * learned.scale_x, float(case.detection.T_cam_obj[2, 3])
     smallest, largest, near, far = case.seen
     if near / MARGIN < z < far * MARGIN or not smallest / MARGIN < length < largest * MARGIN:
         return None

@@ -106,7 +106,7 @@ class Case:
         return detection if is_believed else None
 
     @property
-    def found(self) -> Detection | None:
+    def detection(self) -> Detection | None:
         """Best detection at any distance."""
         return self.expected or self.elsewhere
 
@@ -114,7 +114,7 @@ class Case:
     def part(self) -> Part:
         """Detected part, or the checkpoint's first."""
         parts = {part.name: part for part in self.estimator.parts}
-        return parts[self.found.object] if self.found else self.estimator.parts[0]
+        return parts[self.detection.object] if self.detection else self.estimator.parts[0]
 
     @property
     def seen(self) -> Seen | None:
@@ -126,8 +126,8 @@ class Case:
     @property
     def length_px(self) -> float:
         """Diameter of the detected part on the image, pixels."""
-        assert self.found is not None
-        return self._length_px(self.found)
+        assert self.detection is not None
+        return self._length_px(self.detection)
 
     @cached_property
     def box(self) -> Letterbox:
@@ -135,7 +135,7 @@ class Case:
         if not self.estimator.has_network:
             return Letterbox.scaled(self.image.shape[1::-1], 1.0)
         boxes = letterboxes(self.estimator.checkpoint, self.K, self.image, self.distances)
-        if self.found is None or self.seen is None:
+        if self.detection is None or self.seen is None:
             return boxes[-1]
         usual = math.sqrt(self.seen.smallest_px * self.seen.largest_px)
         return min(boxes, key=lambda box: abs(math.log(self.length_px * box.scale_x / usual)))
@@ -143,19 +143,20 @@ class Case:
     @cached_property
     def refined(self) -> Detection | None:
         """Detection with the agreement of its outline; None without a mesh or detection."""
-        if self.found is None or any(part.mesh is None for part in self.parts):
+        if self.detection is None or any(part.mesh is None for part in self.parts):
             return None
         if self.estimator.refiner is not None:
-            return self.found
+            return self.detection
         estimator = self.estimator.refining("region", self.parts)
-        return estimator.refined([self.found], self.image, self.K)[0]
+        return estimator.refined([self.detection], self.image, self.K)[0]
 
     def around(self) -> Picture:
         """Return a crop around the detected part in the size of :attr:`box`, or the whole image."""
         picture = self.box.image(self.image)
-        if self.found is None:
+        if self.detection is None:
             return picture
-        points = self.box.points(self.found.keypoints[np.isfinite(self.found.keypoints[:, 0])])
+        keypoints = self.detection.keypoints
+        points = self.box.points(keypoints[np.isfinite(keypoints[:, 0])])
         size = (picture.shape[1], picture.shape[0])
         low = np.clip(np.floor(points.min(axis=0)), 0, size).astype(int)
         high = np.clip(np.ceil(points.max(axis=0)) + 1, 0, size).astype(int)

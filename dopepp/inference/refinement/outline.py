@@ -52,10 +52,8 @@ class OutlineMesh:
     is_closed: bool  # whether the mesh is closed: front triangles hide all others
 
 
-def make_outline_mesh(
-    vertices: Vertices, faces: Faces, max_faces: int = MAX_LIGHT_FACES
-) -> OutlineMesh:
-    """Prepare a mesh for drawing its outline, simplified to at most ``max_faces`` triangles.
+def make_outline_mesh(vertices: Vertices, faces: Faces) -> OutlineMesh:
+    """Prepare a mesh for drawing its outline, simplified to at most MAX_LIGHT_FACES triangles.
 
     Raises:
         ValueError: All triangles have zero area.
@@ -64,8 +62,8 @@ def make_outline_mesh(
     faces = faces[face_areas(vertices, faces) > 0]
     if not len(faces):
         raise ValueError("all triangles have zero area")
-    if len(faces) > max_faces:
-        vertices, faces, *_ = decimate(vertices, faces, None, max_faces)
+    if len(faces) > MAX_LIGHT_FACES:
+        vertices, faces, *_ = decimate(vertices, faces, None, MAX_LIGHT_FACES)
         faces = faces[face_areas(vertices, faces) > 0]
     a, b, c = vertices[faces].swapaxes(0, 1)
     normals = np.cross(b - a, c - a)

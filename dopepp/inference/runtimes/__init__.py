@@ -88,7 +88,7 @@ class ExportedNetwork(ABC):
 
     Args:
         path: File, for messages.
-        checkpoint: Description of what the network was trained for, without weights.
+        checkpoint: Parts, input size and thresholds of the network, without weights.
         export: How the network was exported.
     """
 

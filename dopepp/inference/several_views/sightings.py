@@ -63,7 +63,7 @@ def separation(first: Prior, second: Prior) -> float:
 def nearest_equivalent(
     T_world_obj: Transform, to: Transform, group: Group, cuboid: Cuboid
 ) -> Transform:
-    """Return that of a symmetric part's equivalent poses which is nearest to another pose."""
+    """Return the equivalent pose of a symmetric part that is nearest to another pose."""
     equal = T_world_obj @ group
     points = cuboid @ equal[:, :3, :3].swapaxes(1, 2) + equal[:, None, :3, 3]
     distances = ((points - transform(to, cuboid)) ** 2).sum(axis=(1, 2))

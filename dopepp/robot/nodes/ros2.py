@@ -41,6 +41,7 @@ QUEUE_IN: Final = 5
 
 QUEUE_OUT: Final = 10
 WAIT_S: Final = 0.2  # seconds between two checks whether the node should stop
+PATIENCE_S: Final = 5.0  # seconds to wait for the end of a picture when the node stops
 CHECKPOINTS: Final = -1.0
 """Value of the parameter ``confidence`` that selects the checkpoint's threshold."""
 
@@ -282,12 +283,12 @@ class Slot(Generic[Item]):
         if self._error is not None:
             raise self._error
 
-    def stop(self, wait_s: float = 5.0) -> None:
+    def stop(self) -> None:
         """Stop after the current picture."""
         with self._fresh:
             self._stopped = True
             self._fresh.notify()
-        self._thread.join(wait_s)
+        self._thread.join(PATIENCE_S)
 
     def _run(self) -> None:
         """Process the newest picture until the slot is stopped."""

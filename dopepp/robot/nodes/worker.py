@@ -172,9 +172,7 @@ class Worker:
             is_cropped = self._camera is None and lens is not None and lens.roi is not None
             frame = CameraFrame(image, topic, self._number, stamp.seconds)
             result = self.result(frame, camera, is_cropped)
-        except (
-            ValueError
-        ) as error:  # includes UserError; numpy raises it for fields of wrong length
+        except ValueError as error:  # a wrong value (UserError), or fields of wrong lengths
             self._reject("camera", str(error))
             return None
         self.problem = ""

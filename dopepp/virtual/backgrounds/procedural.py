@@ -50,9 +50,8 @@ def _texture(rng: Generator, width: int, height: int) -> Picture:
     """Return a random pattern in a random palette of two to five colours."""
     pattern = _PATTERNS[int(rng.integers(len(_PATTERNS)))]
     scale = 1.0
-    if (
-        width > _SHARP_WIDTH_PX
-    ):  # large backgrounds are drawn coarser and enlarged, because backgrounds are out of focus
+    # Large backgrounds are drawn coarser and enlarged, because backgrounds are out of focus.
+    if width > _SHARP_WIDTH_PX:
         scale = max(rng.uniform(0.35, 0.75), _SHARP_WIDTH_PX / width)
     columns, rows = round(width * scale), max(round(height * scale), 1)
     field = pattern(rng, columns, rows)

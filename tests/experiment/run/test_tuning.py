@@ -213,7 +213,7 @@ def test_the_factor_of_refined_poses_is_that_of_the_right_ones():
 def test_few_refined_poses_keep_their_covariances(caplog):
     few = Refining(true=0.4)
     assert fit_refined_factor(few, [PART], Many(FEWEST_REFINED)) == 1.0  # type: ignore[arg-type]
-    assert f"12 right poses of at least {FEWEST_REFINED}" in caplog.text
+    assert f"12 right poses, fewer than {FEWEST_REFINED}" in caplog.text
     with pytest.raises(UserError, match="refinement is far too confident"):
         fit_refined_factor(Refining(true=9.0), [PART], Many(250))  # type: ignore[arg-type]
 

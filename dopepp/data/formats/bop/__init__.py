@@ -94,7 +94,7 @@ def pair_infos(truths: Sequence[Record], stated: object, node: Node) -> list[Rec
 
     Args:
         truths: The image's ``gt`` records.
-        stated: The image's ``gt_info`` entry; null and an empty list state nothing.
+        stated: The image's ``gt_info`` entry; null and an empty list count as missing.
         node: The entry's node.
     """
     if stated is None or stated == []:

@@ -272,7 +272,7 @@ def read_depth(record: Mapping[str, Any], annotation: Path, shape: Shape) -> Dep
 
 
 def read_labels(annotation: Path, shape: Shape) -> NDArray[Any] | None:
-    """Read ``STEM.seg.png``; None if it is missing or in colours, which no file explains."""
+    """Read ``STEM.seg.png``; None if it is missing or a colour image, whose meaning is unknown."""
     path = companion(annotation, ".seg.png")
     image = read_image(path) if path.is_file() else None
     is_map = image is not None and image.ndim == 2

@@ -131,7 +131,7 @@ def _to_surface(overlay: SurfaceOverlay, past: Int[np.ndarray, "past"], supporte
 
 
 def _to_pixels(overlay: SurfaceOverlay, beside: Mask) -> Pulls:
-    """Pull the nearest points to uncovered surface until they cover it."""
+    """Pull points of the part towards adjacent pixels that continue its surface."""
     rows, columns = np.nonzero(beside)
     nearest = overlay.nearest[rows, columns]
     pulls = np.stack([columns, rows], axis=1) - overlay.pixels[nearest]

@@ -126,7 +126,7 @@ def _cast(plane: Plane, shadow: ShadowMap) -> tuple[Float32[np.ndarray, "rows co
 
 
 def _warp(source: Array, to_source: Array, box: Box, out: Array) -> None:
-    """Warp an image by a homography into the pixels of a box; 0 beside the image."""
+    """Warp an image by a homography into the pixels of a box; 0 outside the image."""
     shift = np.array([[1.0, 0.0, box[0]], [0.0, 1.0, box[1]], [0.0, 0.0, 1.0]])
     size = (box[2] - box[0], box[3] - box[1])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
