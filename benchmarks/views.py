@@ -31,13 +31,13 @@ from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import (
     CameraMatrix,
     Transform,
+    camera_beside,
     invert_transform,
-    make_transform,
     moved,
     step_between,
     transform,
 )
-from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
+from dopepp.geometry.rotation import rotation_angle
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Part
@@ -61,13 +61,6 @@ class StaticScene(NamedTuple):
     T_world_obj: Transform
 
 
-def beside(target: Transform, angle: float, direction: float) -> Transform:
-    """Return T_new_cam of a camera that looks at a target from an angle beside it, radians."""
-    axis = np.array([math.cos(direction), math.sin(direction), 0.0])
-    turn, centre = rotation_vector_to_matrix(angle * axis), target[:3, 3]
-    return make_transform(turn, centre - turn @ centre)
-
-
 def static_scene(
     factory: Factory, index: int, angle: float, num_views: int, hidden: float
 ) -> StaticScene:
@@ -76,7 +69,9 @@ def static_scene(
     target = scene.objects[scene.targets[0]]
     true, direction = target.T_cam_obj, rng.uniform(0.0, 2 * math.pi)
     poses = [np.eye(4)]
-    poses += [beside(true, angle, direction + n * math.pi / 2) for n in range(num_views - 1)]
+    poses += [
+        camera_beside(true[:3, 3], angle, direction + n * math.pi / 2) for n in range(num_views - 1)
+    ]
     images = []
     for number, T_new_cam in enumerate(poses):
         seen = scene.seen_from(T_new_cam)

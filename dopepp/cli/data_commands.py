@@ -42,6 +42,9 @@ def render(
     working_distance: Annotated[
         str | None, Option(help="With --camera: NEAREST,FARTHEST part in metres.")
     ] = None,
+    views: Annotated[
+        int, Option(help="Cameras of each scene, in a folder with their poses (bop only).")
+    ] = 1,
     workers: Annotated[int | None, Option(help="Processes (default: all cores).")] = None,
     seed: Annotated[int, Option(help="Random seed.")] = 0,
     preview: Annotated[bool, Option("--preview", help="Only write OUT.preview.png.")] = False,
@@ -78,6 +81,7 @@ def render(
             layout=layout,
             camera=camera,
             working_distance=working_distance,
+            views=views,
         )
         if preview:
             from dopepp.data.render_preview import (

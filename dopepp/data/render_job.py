@@ -25,7 +25,11 @@ import yaml
 from dopepp.core.errors import NO_SPACE, UserError, stopped
 from dopepp.core.files import PARTIAL_SUFFIX, is_abandoned, partial_path, write_whole
 from dopepp.core.json import read_json
+from dopepp.core.validation import Range, check
 from dopepp.data.formats import RECORD_FILE, Writer
+from dopepp.data.rendered import rendered_sample
+from dopepp.data.sample import Sample
+from dopepp.geometry.camera import invert_transform
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.mesh.read import ASSUMED_UNIT
 from dopepp.parts.part import Part, check_name
@@ -43,6 +47,7 @@ WRITERS: Final = {
 }
 """Module and class of each layout's writer."""
 
+MAX_VIEWS: Final = 16
 RECORD_VERSION: Final = 1  # version of the record's layout
 _HASH_DIGITS: Final = 16  # digits of the rendering code's hash
 _NAMED: Final = re.compile(r"([^=/\\]+)=(.+)")  # ``NAME=FILE``; a name is not a path
@@ -54,11 +59,23 @@ class Job:
 
     factory: Factory  # renders image (0, index)
     layout: str
+    views: int  # cameras of each scene
     record: Mapping[str, Any]  # the settings as plain values; equal records give equal bytes
 
     def writer(self, root: Path) -> Writer:
         """Return a new writer into a folder."""
-        return _find_writer(self.layout)(root, self.factory.parts)
+        writer = _find_writer(self.layout)(root, self.factory.parts)
+        if self.views > 1:
+            writer.chunk_size = self.views  # a folder for each static scene
+        return writer
+
+    def sample(self, index: int) -> Sample:
+        """Render an image; consecutive images are the views of a scene."""
+        scene, view = divmod(index, self.views)
+        sample = rendered_sample(self.factory.render(0, scene, view=view), "virtual", str(index))
+        if self.views > 1:
+            sample.T_world_cam = invert_transform(self.factory.camera(0, scene, view))
+        return sample
 
 
 def make_job(
@@ -75,6 +92,7 @@ def make_job(
     layout: str = "bop",
     camera: str | Path | None = None,
     working_distance: str | None = None,
+    views: int = 1,
 ) -> Job:
     """Make a job from user input.
 
@@ -92,11 +110,16 @@ def make_job(
         layout: Key of :data:`WRITERS`.
         camera: File of the camera to simulate; None for the preset's camera.
         working_distance: ``NEAREST,FARTHEST`` distance of the parts from this camera, metres.
+        views: Cameras of each scene, which is then a folder; BOP only.
 
     Raises:
         UserError: A value is not usable.
     """
     _find_writer(layout)
+    check("--views", views, int, Range(1, MAX_VIEWS))
+    if views > 1 and layout != "bop":
+        problem = f"--views {views} with --format {layout}"
+        raise UserError(problem, "--format bop", "leave out --format, or --views")
     scenes = preset_of(preset, _nested(changes))
     targets = [named_part(text, unit) for text in parts]
     if camera is not None or working_distance is not None:
@@ -122,7 +145,10 @@ def make_job(
         "preset": asdict(factory.preset),
         "rendering_code": code_hash()[:_HASH_DIGITS],
     }
-    return Job(factory, layout, record)
+    # One view adds no key, so that older folders can be continued.
+    if views > 1:
+        record["views"] = views
+    return Job(factory, layout, views, record)
 
 
 def _find_writer(layout: str) -> Callable[[Path, Sequence[Part]], Writer]:

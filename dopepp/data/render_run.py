@@ -26,8 +26,7 @@ from dopepp.core.errors import StoppedError, UserError, stopped
 from dopepp.core.pool import ClusterPool, LostWorkerError, Pool, ProcessPool, available_cores
 from dopepp.data.formats import RECORD_FILE, Writer
 from dopepp.data.render_job import Job, begin, is_begun
-from dopepp.data.rendered import MAX_ITEMS, rendered_sample
-from dopepp.virtual.factory import Factory
+from dopepp.data.rendered import MAX_ITEMS
 from dopepp.virtual.renderers.photoreal import THREADS_SETTING
 
 _log = logging.getLogger(__name__)
@@ -176,11 +175,11 @@ class RenderTasks:
 
     def __init__(self, job: Job, root: Path) -> None:
         self._job, self._root = job, root
-        self._opened: tuple[Factory, Writer] | None = None
+        self._writer: Writer | None = None
 
     def __call__(self, task: RenderTask) -> tuple[float, float]:
         """Perform a task; return the CPU seconds of rendering and of encoding and writing."""
-        factory, writer = self._open()
+        writer = self._open()
         if task.finalizes:
             written = writer.written(task.chunk)
             # Otherwise other shards still render images of the chunk.
@@ -190,23 +189,23 @@ class RenderTasks:
         render_s = write_s = 0.0
         for index in task.indices:
             start = time.process_time()
-            sample = rendered_sample(factory.render(0, index), "virtual", str(index))
+            sample = self._job.sample(index)
             middle = time.process_time()
             writer.write(index, sample)
             render_s += middle - start
             write_s += time.process_time() - middle
         return render_s, write_s
 
-    def _open(self) -> tuple[Factory, Writer]:
-        if self._opened is None:
+    def _open(self) -> Writer:
+        if self._writer is None:
             cv2.setNumThreads(1)
             os.environ.setdefault(THREADS_SETTING, "1")
             if not is_begun(self._root):
                 problem = f"{self._root} without {RECORD_FILE}, seen from a worker"
                 allowed = "a folder with the same path on every machine of the cluster"
                 raise UserError(problem, allowed, "pass an --out on a shared file system")
-            self._opened = self._job.factory, self._job.writer(self._root)
-        return self._opened
+            self._writer = self._job.writer(self._root)
+        return self._writer
 
 
 def render_dataset(

@@ -6,7 +6,7 @@ To add a source, write a class with the :class:`DescribedSource` methods and one
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Any, Protocol
@@ -54,6 +54,8 @@ class Sample:
         depth: Metres along z, float32, 0 if unknown; None if the source has no depth.
         source: Name of the source, e.g. ``ycb_video/data``.
         key: The item within its source, e.g. ``0050/000003``.
+        T_world_cam: Pose of the camera in a static scene; None if unknown.
+        others: Further pictures of the static scene, with their cameras' poses.
     """
 
     image: Picture
@@ -62,6 +64,8 @@ class Sample:
     depth: DepthMap | None = None
     source: str = ""
     key: str = ""
+    T_world_cam: Transform | None = None
+    others: Sequence[Sample] = ()
 
     @property
     def size(self) -> tuple[int, int]:

@@ -56,6 +56,19 @@ def moved(T_cam_obj: Transform, step: Step) -> Transform:
     return make_transform(turn @ T_cam_obj[:3, :3], T_cam_obj[:3, 3] + step[3:])
 
 
+def camera_beside(point: Vector, angle: float, direction: float) -> Transform:
+    """Return T_new_cam of a camera that looks at a point from beside this camera.
+
+    Args:
+        point: The point in this camera, metres.
+        angle: Angle between both lines of sight to the point, radians.
+        direction: Direction of the rotation's axis in the image plane, radians.
+    """
+    axis = np.array([math.cos(direction), math.sin(direction), 0.0])
+    turn = rotation_vector_to_matrix(angle * axis)
+    return make_transform(turn, point - turn @ point)
+
+
 def step_between(before: Transform, after: Transform) -> Step:
     """Return the step from one pose to another, the inverse of :func:`moved`."""
     turn = matrix_to_rotation_vector(after[:3, :3] @ before[:3, :3].T)

@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import Transform, make_transform, transform
+from dopepp.geometry.camera import Transform, camera_beside, make_transform, transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import Vector
 from dopepp.parts.catalogue import BUILTIN
@@ -32,6 +32,8 @@ from dopepp.virtual.renderers import find_renderer
 from dopepp.virtual.scene import NEAR, Rendered, Scene, SceneObject, triple
 from dopepp.virtual.sensor import capture
 from dopepp.virtual.tabletop import arrange_on_table
+
+BESIDE_DEG: Final = (20.0, 40.0)  # angle between the preset's and a further camera of a scene
 
 _PACKAGE: Final = Path(__file__).parents[1]
 _FOLDERS: Final = ("virtual", "parts", "geometry")  # the code that decides pixels and labels
@@ -80,19 +82,47 @@ class Factory:
         self._targets = [make_body(part, is_target=True) for part in parts]
         self._others = [make_body(part, is_target=False) for part in self.negatives]
 
-    def render(self, epoch: int, index: int, scale: float = 1.0) -> Rendered:
+    def render(self, epoch: int, index: int, scale: float = 1.0, view: int = 0) -> Rendered:
         """Render an image with its ground truth, including the sensor's effects.
 
         Args:
             epoch: Epoch of the image.
             index: Index of the image within the epoch.
             scale: Magnification of the targets, relative to the preset.
+            view: Number of the camera; 0 is the preset's, others are those of :meth:`camera`.
 
         Raises:
             UserError: The preset cannot show the part, or the camera would be below the table.
         """
-        rendered = self._render(self.scene(epoch, index, scale))
+        scene = self.scene(epoch, index, scale)
+        if view:
+            sensor = replace(scene.sensor, noise_seed=scene.sensor.noise_seed + view)
+            seen = scene.seen_from(self.camera(epoch, index, view))
+            scene = replace(seen, objects=_in_front(seen.objects), sensor=sensor)
+        rendered = self._render(scene)
         return replace(rendered, image=capture(rendered.image, rendered.scene.sensor))
+
+    def camera(self, epoch: int, index: int, view: int) -> Transform:
+        """Return the pose of a further camera of a static scene, T_new_cam; view 0 is the preset's.
+
+        It looks at the middle of the targets from :data:`BESIDE_DEG` beside the preset's camera,
+        and from above the table.
+        """
+        if view == 0:
+            return np.eye(4)
+        scene = self.scene(epoch, index)
+        rng = np.random.default_rng([self.seed, epoch, index, view])
+        angle, first = np.radians(rng.uniform(*BESIDE_DEG)), rng.uniform(0.0, 2 * np.pi)
+        middle = _middle([scene.objects[number] for number in scene.targets])
+        point = np.array([0.0, 0.0, 1.0]) if middle is None else middle
+        cameras = [camera_beside(point, angle, first + turn) for turn in np.pi / 4 * np.arange(8)]
+        if scene.plane is None:
+            return cameras[0]
+        normal, offset = np.array(scene.plane.normal), scene.plane.offset
+        # The camera's centre is −Rᵀt in the preset's camera.
+        heights = [-float(normal @ (T[:3, :3].T @ T[:3, 3])) - offset for T in cameras]
+        high = [T for T, height in zip(cameras, heights, strict=True) if height > -offset / 2]
+        return high[0] if high else cameras[int(np.argmax(heights))]
 
     def scene(self, epoch: int, index: int, scale: float = 1.0) -> Scene:
         """Return the scene of an image without rendering it."""
@@ -137,15 +167,12 @@ class Factory:
         objects = [
             replace(item, T_cam_obj=_moved(item.T_cam_obj, shift)) for item in composition.objects
         ]
-        # The camera may have reached or passed some of them.
-        hulls = (transform(item.T_cam_obj, item.surface.hull) for item in objects)
-        seen = [item for item, hull in zip(objects, hulls, strict=True) if hull[:, 2].min() > NEAR]
         # ``reach`` stays, so the lamps light the scene as before.
         lights = tuple(
             replace(light, position=triple(np.array(light.position) + shift)) for light in lights
         )
         sensor = preset.sensors.draw(rng)
-        return Scene(K, background, tuple(seen), lights, ambient, plane, sensor)
+        return Scene(K, background, _in_front(objects), lights, ambient, plane, sensor)
 
 
 def approach(objects: Sequence[SceneObject], scale: float) -> Vector:
@@ -154,11 +181,21 @@ def approach(objects: Sequence[SceneObject], scale: float) -> Vector:
     The distance from the camera to the mean of the targets' centres is divided by ``scale``;
     without a target the camera stays.
     """
+    middle = _middle(objects)
+    return np.zeros(3) if middle is None or scale == 1 else np.asarray((1 / scale - 1) * middle)
+
+
+def _middle(objects: Sequence[SceneObject]) -> Vector | None:
+    """Return the mean of the targets' centres; None without a target."""
     pairs = [(item.T_cam_obj, item.part) for item in objects if item.part is not None]
     centres = [transform(T_cam_obj, part.cuboid[CENTROID]) for T_cam_obj, part in pairs]
-    if not centres or scale == 1:
-        return np.zeros(3)
-    return np.asarray((1 / scale - 1) * np.mean(centres, axis=0))
+    return np.mean(centres, axis=0) if centres else None
+
+
+def _in_front(objects: Sequence[SceneObject]) -> tuple[SceneObject, ...]:
+    """Return the objects that the camera has not reached or passed."""
+    hulls = (transform(item.T_cam_obj, item.surface.hull) for item in objects)
+    return tuple(item for item, hull in zip(objects, hulls, strict=True) if hull[:, 2].min() > NEAR)
 
 
 def _moved(T_cam: Transform, shift: Vector) -> Transform:

@@ -144,6 +144,7 @@ class DataConfig:
             and ``test``; None for renders. Splits may share a folder.
         targets: BOP's list of test images; None for all images, ``auto`` for the root's list, if
             present.
+        views: Number of pictures of a static scene from which an evaluation also estimates poses.
         classes: Part names by class name in NDDS files, if the names differ.
         download_dir: Folder for downloaded shards; None downloads nothing.
         jitter: Node of the camera jitter, if any.
@@ -177,6 +178,7 @@ class DataConfig:
     frames: tuple[str, ...] | None
     image_sets: Mapping[str, str | None]
     targets: str | None = None
+    views: Annotated[int, Range(1, 16)] = 1
     classes: Mapping[str, str] | None = None
     download_dir: str | None = None
     jitter: Node = field(default_factory=dict)

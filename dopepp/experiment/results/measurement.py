@@ -103,6 +103,11 @@ class EstimatorMethod:
         seconds = time.perf_counter() - start
         return [candidate for candidate in candidates if candidate.object in self._names], seconds
 
+    @property
+    def takes_views(self) -> bool:
+        """Whether the estimator can estimate poses from several views."""
+        return self.estimator.refiner is not None and self.estimator.refiner.verifies
+
     def silence(self, sample: Sample) -> Reason | None:
         """Return why the best candidate in an image without detections was rejected, if any."""
         reasons = furthest(
@@ -123,6 +128,30 @@ class EstimatorMethod:
                 trained = build_network(checkpoint.spec)
             parameters, gmacs = network_cost(trained, checkpoint.input_size)
         return Cost(parameters, gmacs, milliseconds)
+
+
+class ViewsMethod(EstimatorMethod):
+    """Estimator that runs on all pictures of a static scene; poses are those in the first."""
+
+    def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
+        """Run the estimator on all pictures and return the candidates of measured objects."""
+        pictures = [sample, *sample.others]
+        poses = [it.T_world_cam for it in pictures if it.T_world_cam is not None]
+        depths = [it.depth for it in pictures if it.depth is not None]
+        images, cameras = [it.image for it in pictures], [it.K for it in pictures]
+        start = time.perf_counter()
+        result = self.estimator.predict_views(
+            images, cameras, poses, depths if len(depths) == len(pictures) else None
+        )
+        seconds = time.perf_counter() - start
+        # Poses that the views contradict keep their scores, and are not reported.
+        weaker = [item for item in result.weaker if item.score < self.min_score]
+        candidates = [
+            replace(item.evidence[0].detection, score=item.score)
+            for item in (*result.detections, *weaker)
+            if item.object in self._names and item.evidence[0].status != "outside"
+        ]
+        return candidates, seconds
 
 
 @dataclass(frozen=True)

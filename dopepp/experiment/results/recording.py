@@ -16,6 +16,7 @@ from dopepp.drawing.curves import RateCurve, coverage_figure, figure_image, save
 from dopepp.drawing.sheet import contact_sheet
 from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.assembly.renders import scaled_test_renders
+from dopepp.experiment.assembly.static_scenes import with_views
 from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.config.run_config import Protocols
 from dopepp.experiment.results import conditions, display
@@ -31,6 +32,7 @@ from dopepp.experiment.results.measurement import (
     Measured,
     Method,
     ScoredPose,
+    ViewsMethod,
     measure,
     object_numbers,
 )
@@ -100,18 +102,26 @@ def measure_and_record(
     if protocols.scales:
         conditions.SCALE.check_methods(methods)
     scaled = {scale: scaled_test_renders(data, parts, scale) for scale in protocols.scales}
+    views = {
+        f"{name}, {data.views} views": ViewsMethod(method.estimator, parts)
+        for name, method in methods.items()
+        if data.views > 1 and isinstance(method, EstimatorMethod) and method.takes_views
+    }
+    if views:
+        source = with_views(source, data.views)
     samples = (source.sample(index, 0) for index in range(len(source)))
     is_bop = data.root is not None and data.format in ("bop", "webdataset")
-    measured = measure(methods, samples, num_pictures, bop=is_bop and not data.is_rendered("test"))
+    both = {**methods, **views}
+    measured = measure(both, samples, num_pictures, bop=is_bop and not data.is_rendered("test"))
     for file in files.values():
         file.check_used()
     for report in measured.reports:
         display.show_report(report, all_measures)
         if report.name in measured.bop:
             display.console.print(f"{report.name}: {measured.bop[report.name].in_words()}")
-    _show_silence(methods, measured.silent, source)
+    _show_silence(both, measured.silent, source)
     # Later comparisons use the unrefined result of the network, or the file if there is none.
-    reports = of_networks(measured.reports, len(files))
+    reports = of_networks(measured.reports, len(files) + len(views))
     refines = refine is not None and bool(estimators)
     main = reports[-2 if refines else -1]
     main.details.update(details or {})

@@ -116,6 +116,10 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     measured = str(paths[-1] if paths else asked.results or TEMPLATES)
     stored = None if checkpoint is None else trained_on(checkpoint.data)
     data = chosen_data(asked.data, asked.virtual, stored, measured)
+    refines = "region" in (asked.refine or ()) or asked.templates is not None
+    if data.views > 1 and not refines:
+        problem, fix = f"data.views={data.views} without refine=region", "add refine=region"
+        raise UserError(problem, "both options, or templates=[near,far]", fix)
     write_config(run_dir, asked.plain)
     fingerprint = "" if checkpoint is None else checkpoint.data_fingerprint
     write_environment(run_dir, data.eval_seed, fingerprint)

@@ -176,6 +176,14 @@ class BopReader:
     def __len__(self) -> int:
         return len(self._items)
 
+    @cached_property
+    def image_ids(self) -> list[tuple[str, int]]:
+        """Folder of the scene and number of each image."""
+        return [
+            (self._scenes[number].folder.name, int(self._scenes[number].image_ids[row]))
+            for number, row in self._items.tolist()
+        ]
+
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Read an image; the epoch is ignored."""
         number, row = self._items[index].tolist()

@@ -30,7 +30,7 @@ from dopepp.data.formats.images import depth_units, encode_png
 from dopepp.data.formats.invariants import Box
 from dopepp.data.sample import Instance, Sample
 from dopepp.drawing.pictures import Mask
-from dopepp.geometry.camera import Transform
+from dopepp.geometry.camera import Transform, invert_transform
 from dopepp.parts.part import Part
 from dopepp.virtual.renderers.raster import Silhouette, silhouette
 from dopepp.virtual.scene import SceneObject
@@ -150,7 +150,7 @@ class Labels:
     """An image's annotation in BOP's format.
 
     Attributes:
-        camera: ``cam_K`` and ``depth_scale``.
+        camera: ``cam_K``, ``depth_scale`` and, in a static scene, the pose of the world.
         depth: Units of ``depth_scale`` mm, 0 where unknown.
     """
 
@@ -191,6 +191,9 @@ def make_labels(
         truth = {"cam_R_m2c": T[:3, :3].ravel().tolist(), "cam_t_m2c": (T[:3, 3] * MM).tolist()}
         truths.append({**truth, "obj_id": object_ids[instance.label]})
     camera = {"cam_K": np.asarray(sample.K, np.float64).ravel().tolist(), "depth_scale": scale}
+    if sample.T_world_cam is not None:
+        T = invert_transform(sample.T_world_cam)
+        camera |= {"cam_R_w2c": T[:3, :3].ravel().tolist(), "cam_t_w2c": (T[:3, 3] * MM).tolist()}
     return Labels(camera, truths, infos, depth, masks, visible)
 
 
