@@ -8,7 +8,7 @@ other sightings.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -16,18 +16,13 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.geometry.camera import project_keypoints
-from dopepp.geometry.cuboid import CENTROID, Cuboid
+from dopepp.geometry.cuboid import CENTROID
+from dopepp.inference.picture import are_same
 from dopepp.inference.refinement.joint_refinement import PosedPicture
 from dopepp.inference.refinement.refiner import LOOSER, Refiner
 from dopepp.inference.refinement.region.round import OutlineAgreement
 from dopepp.inference.refinement.solver import Prior, UndecidedError
-from dopepp.inference.several_views.sightings import (
-    Group,
-    PartSighting,
-    fused,
-    nearest_equivalent,
-    separation,
-)
+from dopepp.inference.several_views.sightings import PartGeometry, PartSighting, separation
 from dopepp.inference.several_views.views_result import Status, ViewEvidence, WorldDetection
 from dopepp.recovery.detection import log_odds
 
@@ -70,30 +65,52 @@ class JointEstimator:
         refiner: Refines and verifies poses on the image.
         views: Pictures of the scene.
         names: Name of each view.
+        geometries: Geometry of each part.
         slope: Weight of the verification's log odds in the score.
     """
 
     def __init__(
-        self, refiner: Refiner, views: Sequence[PosedPicture], names: Sequence[str], slope: float
+        self,
+        refiner: Refiner,
+        views: Sequence[PosedPicture],
+        names: Sequence[str],
+        geometries: Mapping[str, PartGeometry],
+        slope: float,
     ) -> None:
-        self._refiner, self._views, self._names, self._slope = refiner, views, names, slope
+        self._refiner, self._views, self._names = refiner, views, names
+        self._geometries, self._slope = geometries, slope
 
-    def estimate(
-        self, sightings: Sequence[PartSighting], group: Group, cuboid: Cuboid
-    ) -> JointPart:
+    def parts(self, clusters: Sequence[Sequence[PartSighting]]) -> list[JointPart]:
+        """Estimate the parts of all clusters, without duplicates, best score first.
+
+        Sightings that do not agree with the joint pose of their cluster form clusters of their own.
+        """
+        parts: list[JointPart] = []
+        waiting = list(clusters)
+        while waiting:
+            cluster = waiting.pop()
+            parts.append(self.estimate(cluster))
+            waiting += [[other] for other in cluster if other not in parts[-1].sightings]
+        parts.sort(key=lambda part: -part.detection.score)
+        kept: list[JointPart] = []
+        for part in parts:
+            if not any(_is_duplicate(part, better) for better in kept):
+                kept.append(part)
+        return kept
+
+    def estimate(self, sightings: Sequence[PartSighting]) -> JointPart:
         """Refine the pose of a part on all views that show it.
 
         Args:
             sightings: Sightings of the part, best first.
-            group: Symmetry group of the part.
-            cuboid: Cuboid of the part, metres.
 
         Returns:
             The part with the sightings that agree with the joint pose. If no two views agree, the
             pose is that of the best sighting.
         """
         name, everything = sightings[0].detection.object, set(range(len(self._views)))
-        start = fused([sighting.pose for sighting in sightings], group, cuboid)
+        geometry = self._geometries[name]
+        start = geometry.mean([sighting.pose for sighting in sightings])
         limit = Prior(start.T_cam_obj, start.information / LOOSER**2)
         members = {sighting.view for sighting in sightings}
         chosen, tried = everything, list[set[int]]()
@@ -101,7 +118,7 @@ class JointEstimator:
             tried.append(chosen)
             numbers = sorted(chosen)
             starts = [item.start for item in sightings if item.view in chosen]
-            prior = fused(starts or [sightings[0].start], group, cuboid)
+            prior = geometry.mean(starts or [sightings[0].start])
             try:
                 views = [self._views[number] for number in numbers]
                 joint = self._refiner.refine_views(name, views, limit, prior)
@@ -110,15 +127,14 @@ class JointEstimator:
             pose = Prior(joint.T_world_obj, np.linalg.inv(joint.covariance))
             shown = dict(zip(numbers, joint.agreements, strict=True))
             evidence = [
-                self._evidence(number, pose, sightings, group, cuboid, shown.get(number))
-                for number in everything
+                self._evidence(number, pose, sightings, shown.get(number)) for number in everything
             ]
             supporting = {n for n in everything if evidence[n].status == "supports"}
             if supporting >= chosen:
                 agreeing = [item for item in sightings if item.view in chosen] or sightings
                 disagreement = max(joint.disagreements)
                 if len(agreeing) > 1:
-                    apart = [_separation(item, pose, group, cuboid) for item in agreeing]
+                    apart = [geometry.separation(pose, item.pose) for item in agreeing]
                     disagreement = max(disagreement, min(apart) / math.sqrt(6))
                 # Views that disagree more than they should have larger errors than stated.
                 looser = Prior(pose.T_cam_obj, pose.information / max(1.0, disagreement) ** 2)
@@ -128,7 +144,7 @@ class JointEstimator:
         best = max(sightings, key=lambda sighting: sighting.detection.score)
         alone = best.detection
         evidence = [
-            self._evidence(number, best.pose, [best], group, cuboid, None)
+            self._evidence(number, best.pose, [best], None)
             if number != best.view
             else ViewEvidence(self._names[number], "supports", alone.probability or 0.0, alone)
             for number in everything
@@ -140,8 +156,6 @@ class JointEstimator:
         number: int,
         pose: Prior,
         sightings: Sequence[PartSighting],
-        group: Group,
-        cuboid: Cuboid,
         agreement: OutlineAgreement | None,
     ) -> ViewEvidence:
         """Return whether a view shows the part at a pose in the world."""
@@ -149,10 +163,11 @@ class JointEstimator:
         sighting = next((item for item in sightings if item.view == number), None)
         at = view.to_camera(pose.T_cam_obj, np.linalg.inv(pose.information))
         original = sightings[0].detection if sighting is None else sighting.detection
+        geometry = self._geometries[original.object]
         detection = replace(
             original,
             T_cam_obj=at.T_cam_obj,
-            keypoints=project_keypoints(cuboid, at.T_cam_obj, view.K),
+            keypoints=project_keypoints(geometry.cuboid, at.T_cam_obj, view.K),
             peaks=np.full_like(original.peaks, np.nan) if sighting is None else original.peaks,
             covariance=np.linalg.inv(at.information),
             agreement=None if agreement is None else agreement.share,
@@ -167,7 +182,7 @@ class JointEstimator:
             least_share = min(least_share, (original.agreement or 0.0) - decrease)
         is_shown = agreement is not None and probability >= least and share >= least_share
         if sighting is not None and original.kept:
-            is_shown = _separation(sighting, pose, group, cuboid) <= CONSISTENT
+            is_shown = geometry.separation(pose, sighting.pose) <= CONSISTENT
         status: Status = "supports" if is_shown else "hidden"
         if not _is_inside(detection.keypoints[CENTROID], view):
             status = "outside"
@@ -197,10 +212,20 @@ class JointEstimator:
         return JointPart(sightings, WorldDetection(*given, evidence, disagreement))
 
 
-def _separation(sighting: PartSighting, pose: Prior, group: Group, cuboid: Cuboid) -> float:
-    """Return the Mahalanobis distance between a sighting's pose and another pose."""
-    nearest = nearest_equivalent(sighting.pose.T_cam_obj, pose.T_cam_obj, group, cuboid)
-    return separation(pose, Prior(nearest, sighting.pose.information))
+def _is_duplicate(part: JointPart, better: JointPart) -> bool:
+    """Return whether two parts are the same instance, detected twice.
+
+    Both must be at the same position in every view. If a view supports only the first part, the
+    covariances must also explain the difference of the poses. Otherwise the views contradict each
+    other.
+    """
+    detection, other = part.detection, better.detection
+    shared = {item.view for item in part.sightings} & {item.view for item in better.sightings}
+    pairs = zip(detection.evidence, other.evidence, strict=True)
+    if shared or not all(are_same(a.detection, b.detection) for a, b in pairs):
+        return False
+    is_supported = set(detection.views) <= set(other.views)
+    return is_supported or separation(detection.pose, other.pose) <= CONSISTENT
 
 
 def _probability(odds: float) -> float:

@@ -18,16 +18,51 @@ from jaxtyping import Float
 
 from dopepp.geometry.camera import Transform, moved, transform
 from dopepp.geometry.cuboid import Cuboid
+from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.refinement.joint_refinement import PosedPicture
 from dopepp.inference.refinement.refiner import LOOSER
 from dopepp.inference.refinement.solver import PoseMatrix, Prior
+from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 
 GATE: Final = 4.5 * LOOSER
 """Largest Mahalanobis distance between detections of one part. It is generous, because covariances
 were fitted to images like those of training, and the joint pose is verified."""
 
-Group = Float[np.ndarray, "group 4 4"]  # transforms that map the part onto itself
+
+@dataclass(frozen=True, eq=False)
+class PartGeometry:
+    """Cuboid and symmetries of a part, for comparing its poses."""
+
+    cuboid: Cuboid
+    group: Float[np.ndarray, "group 4 4"]  # transforms that map the part onto itself
+
+    @classmethod
+    def of(cls, part: Part) -> PartGeometry:
+        """Return the geometry of a part."""
+        return cls(
+            part.cuboid, symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
+        )
+
+    def nearest(self, pose: Prior, to: Transform) -> Prior:
+        """Return the equivalent of a pose that is nearest to another pose."""
+        equal = pose.T_cam_obj @ self.group
+        points = self.cuboid @ equal[:, :3, :3].swapaxes(1, 2) + equal[:, None, :3, 3]
+        distances = ((points - transform(to, self.cuboid)) ** 2).sum(axis=(1, 2))
+        return Prior(np.asarray(equal[distances.argmin()]), pose.information)
+
+    def separation(self, pose: Prior, other: Prior) -> float:
+        """Return the Mahalanobis distance from a pose to the nearest equivalent of another pose."""
+        return separation(pose, self.nearest(other, pose.T_cam_obj))
+
+    def mean(self, poses: Sequence[Prior]) -> Prior:
+        """Return the mean of several poses, weighted by their information."""
+        first = poses[0].T_cam_obj
+        information, gradient = np.zeros((6, 6)), np.zeros(6)
+        for pose in poses:
+            information = information + pose.information
+            gradient += pose.information @ self.nearest(pose, first).offset(first)
+        return Prior(moved(first, np.linalg.solve(information, gradient)), information)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,33 +95,14 @@ def separation(first: Prior, second: Prior) -> float:
     return math.sqrt(Prior(first.T_cam_obj, np.linalg.inv(both)).squared_distance(second.T_cam_obj))
 
 
-def nearest_equivalent(
-    T_world_obj: Transform, to: Transform, group: Group, cuboid: Cuboid
-) -> Transform:
-    """Return the equivalent pose of a symmetric part that is nearest to another pose."""
-    equal = T_world_obj @ group
-    points = cuboid @ equal[:, :3, :3].swapaxes(1, 2) + equal[:, None, :3, 3]
-    distances = ((points - transform(to, cuboid)) ** 2).sum(axis=(1, 2))
-    return np.asarray(equal[distances.argmin()])
-
-
-def distance(first: PartSighting, second: PartSighting, group: Group, cuboid: Cuboid) -> float:
-    """Return the Mahalanobis distance between two sightings."""
-    pose = nearest_equivalent(second.pose.T_cam_obj, first.pose.T_cam_obj, group, cuboid)
-    return separation(first.pose, Prior(pose, second.pose.information))
-
-
 def associate(
-    views: Sequence[Sequence[PartSighting]],
-    groups: Mapping[str, Group],
-    cuboids: Mapping[str, Cuboid],
+    views: Sequence[Sequence[PartSighting]], geometries: Mapping[str, PartGeometry]
 ) -> list[list[PartSighting]]:
     """Join the sightings that can show the same part.
 
     Args:
         views: Sightings of each view.
-        groups: Symmetry group of each part.
-        cuboids: Cuboid of each part, metres.
+        geometries: Geometry of each part.
 
     Returns:
         Sightings of each possible part, at most one of each view. The part with the best detection
@@ -101,7 +117,7 @@ def associate(
         name, cluster = seed.detection.object, [seed]
         for view in range(len(views)):
             others = [
-                (distance(seed, other, groups[name], cuboids[name]), number)
+                (geometries[name].separation(seed.pose, other.pose), number)
                 for number, other in enumerate(free)
                 if other.view == view != seed.view and other.detection.object == name
             ]
@@ -110,14 +126,3 @@ def associate(
                 cluster.append(free.pop(number))
         clusters.append(cluster)
     return clusters
-
-
-def fused(poses: Sequence[Prior], group: Group, cuboid: Cuboid) -> Prior:
-    """Return the mean of several poses of a part, weighted by their information."""
-    first = poses[0].T_cam_obj
-    information, gradient = np.zeros((6, 6)), np.zeros(6)
-    for pose in poses:
-        nearest = nearest_equivalent(pose.T_cam_obj, first, group, cuboid)
-        information = information + pose.information
-        gradient += pose.information @ Prior(nearest, pose.information).offset(first)
-    return Prior(moved(first, np.linalg.solve(information, gradient)), information)
