@@ -101,19 +101,25 @@ def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part
 
 
 def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
-    """Parse the config of ``evaluate.py``; measure a checkpoint, a file of poses, or both."""
+    """Measure estimators and files of poses, or tune a checkpoint.
+
+    Args:
+        config: Config of ``evaluate.py``.
+        run_dir: Run folder.
+
+    Returns:
+        A report per method; none after tuning.
+
+    Raises:
+        UserError: An option, a file or the data is wrong.
+    """
     program.quiet_lightning()
     asked = EvaluationConfig.of(config)
     extensions.enable(asked.extensions)
     _check_combination(asked)
-    paths = [path for path in (asked.baseline, asked.ckpt_path) if path is not None]
-    device = asked.device
-    if device == "auto":
-        exported = any(is_export(Path(path)) for path in paths)
-        device = "cuda" if torch.cuda.is_available() and not exported else "cpu"
-    loaded = [PoseEstimator.load(path, device, scale_error=asked.scale_error) for path in paths]
+    loaded = _load(asked)
     checkpoint = loaded[-1].checkpoint if loaded else None
-    measured = str(paths[-1] if paths else asked.results or TEMPLATES)
+    measured = str(asked.ckpt_path or asked.baseline or asked.results or TEMPLATES)
     stored = None if checkpoint is None else trained_on(checkpoint.data)
     data = chosen_data(asked.data, asked.virtual, stored, measured)
     refines = "region" in (asked.refine or ()) or asked.templates is not None
@@ -132,28 +138,13 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     if asked.tune:
         _tune_only(asked, loaded, parts, data, run_dir)
         return []
-    names = [str(estimator.checkpoint.data.get("name", "estimate")) for estimator in loaded]
-    files: dict[str, Path] = {}
-    if asked.templates is not None:
-        position = max(len(loaded) - 1, 0)  # metrics.json describes the last estimator
-        names.insert(position, TEMPLATES)
-        templates = TemplateEstimator.of_parts(
-            parts, asked.templates, scale_error=asked.scale_error
-        )
-        loaded.insert(position, templates)
-    if asked.results is not None:  # BOP file names begin with the name of the method
-        file = Path(asked.results)
-        names.append(file.stem.partition("_")[0] if asked.method is None else str(asked.method))
-        files = {names[-1]: file}
-    for number, name in enumerate(names[:-1]):
-        if name in names[number + 1 :]:
-            names[number] += " (baseline)" if number == 0 else " (checkpoint)"
+    estimators, files = _methods(asked, loaded, parts)
     without_parts = None
     if asked.negatives is not None:
         camera = None if asked.negatives_camera is None else Path(asked.negatives_camera)
         without_parts = frames_without_parts(Path(asked.negatives), camera, data, parts)
     reports = measure_and_record(
-        dict(zip(names, loaded, strict=False)),
+        estimators,
         parts,
         data,
         run_dir,
@@ -168,6 +159,40 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     described = main_report(of_networks(reports, len(files)))
     write_run_readme(run_dir, f"Evaluation of {measured}", described)
     return reports
+
+
+def _load(asked: EvaluationConfig) -> list[PoseEstimator]:
+    """Load the baseline and the checkpoint, if given."""
+    paths = [path for path in (asked.baseline, asked.ckpt_path) if path is not None]
+    device = asked.device
+    if device == "auto":
+        exported = any(is_export(Path(path)) for path in paths)
+        device = "cuda" if torch.cuda.is_available() and not exported else "cpu"
+    return [PoseEstimator.load(path, device, scale_error=asked.scale_error) for path in paths]
+
+
+def _methods(
+    asked: EvaluationConfig, loaded: Sequence[PoseEstimator], parts: Parts
+) -> tuple[dict[str, PoseEstimator], dict[str, Path]]:
+    """Return all estimators and files of poses, by name."""
+    estimators = list(loaded)
+    names = [str(estimator.checkpoint.data.get("name", "estimate")) for estimator in loaded]
+    files: dict[str, Path] = {}
+    if asked.templates is not None:
+        position = max(len(loaded) - 1, 0)  # metrics.json describes the last estimator
+        names.insert(position, TEMPLATES)
+        templates = TemplateEstimator.of_parts(
+            parts, asked.templates, scale_error=asked.scale_error
+        )
+        estimators.insert(position, templates)
+    if asked.results is not None:  # BOP file names begin with the name of the method
+        file = Path(asked.results)
+        names.append(file.stem.partition("_")[0] if asked.method is None else str(asked.method))
+        files = {names[-1]: file}
+    for number, name in enumerate(names[:-1]):
+        if name in names[number + 1 :]:
+            names[number] += " (baseline)" if number == 0 else " (checkpoint)"
+    return dict(zip(names, estimators, strict=False)), files
 
 
 def _check_combination(asked: EvaluationConfig) -> None:

@@ -148,6 +148,7 @@ def transform_of(value: object, where: str) -> Transform:
 
 
 def _error(value: object, path: Path) -> tuple[float, float]:
+    """Return ``camera_error`` in metres and radians; the file states metres and degrees."""
     metres, degrees = check(f"{path}: camera_error", value, tuple[float, float], Range(0.0, 10.0))
     return metres, math.radians(degrees)
 

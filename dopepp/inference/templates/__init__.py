@@ -14,6 +14,7 @@ The result is a list of start poses. Refinement and verification choose among th
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
 import cv2
@@ -36,6 +37,7 @@ from dopepp.inference.picture import MAX_PIXELS, Region
 from dopepp.inference.refinement.outline import filled_mask, make_outline_mesh, posed
 from dopepp.inference.templates.matching import STRIDE, Matches, match
 from dopepp.inference.templates.ranking import (
+    Features,
     learned_ranking,
     move_nearby,
     turn_views,
@@ -189,6 +191,27 @@ class TemplateDetector:
         Raises:
             UserError: The part is too small on the image to be detected.
         """
+        sizes = self._sizes(image, K, distances)
+        groups = [self._matches(image, size, size / focal_length(K)) for size in sizes]
+        matches = _joined(groups)
+        promise = matches.scores + EXTENT * self._templates.extents[matches.views]
+        matches = matches.at(np.argsort(-promise)[:NUM_RANKED])
+        octaves = np.floor(np.log(sizes[0] / matches.poses[:, 3]) / math.log(OCTAVE) + 1e-9)
+        members = [matches.at(octaves == octave) for octave in np.unique(octaves)]
+        ranked, features = zip(
+            *(self._ranked_octave(image, group) for group in members), strict=True
+        )
+        matches = _joined(ranked)
+        return matches.views, matches.poses, np.concatenate(features)
+
+    def _sizes(
+        self, image: Picture, K: CameraMatrix, distances: tuple[float, float]
+    ) -> Float[np.ndarray, "sizes"]:
+        """Return the projected diameters to search, pixels, largest first.
+
+        Raises:
+            UserError: The smallest is too small on the image, which is shrunk to MAX_PIXELS.
+        """
         near, far = distances
         length = self.part.diameter * focal_length(K)  # at a depth of one metre, pixels
         count = max(1, math.ceil(math.log(far / near) / math.log(SCALE_STEP)))
@@ -201,31 +224,27 @@ class TemplateDetector:
                 f"at least {SMALLEST_PX * max(least, 1.0):.0f} pixels",
                 "search a region (roi), or state a nearer working distance",
             )
-        groups = [self._matches(image, size, size / focal_length(K)) for size in sizes]
-        matches = Matches(*(np.concatenate(columns) for columns in zip(*groups, strict=True)))
-        promise = matches.scores + EXTENT * self._templates.extents[matches.views]
-        matches = matches.at(np.argsort(-promise)[:NUM_RANKED])
-        octaves = np.floor(np.log(sizes[0] / matches.poses[:, 3]) / math.log(OCTAVE) + 1e-9)
-        ranked, features, weights = [], [], learned_ranking().weights
-        for octave in np.unique(octaves):
-            members = matches.at(octaves == octave)
-            scale = min(1.0, FINE_PX / members.poses[:, 3].max())
-            small = _resized(image, scale)
-            responses = edge_responses(small, FINE_SPREAD, _odd(FINE_PX))
-            reach = 1 + STRIDE / 2 * float(members.poses[:, 3].mean()) * scale / COARSE_PX
-            members.poses[:, [0, 1, 3]] *= scale
-            members, before = move_nearby(members, self._templates, responses, small, reach)
-            best = np.argsort(-before @ weights)[:NUM_TURNED]
-            members = members.at(best)
-            turned, after = turn_views(members, self._templates, responses, small)
-            for group in (members, turned):
-                group.poses[:, [0, 1, 3]] /= scale
-            ranked += [members, turned]
-            # Better neighbouring views exist for wrong matches, too: half of the gain counts.
-            features += [before[best], (before[best] + after) / 2]
-        views = np.concatenate([members.views for members in ranked])
-        poses = np.concatenate([members.poses for members in ranked])
-        return views, poses, np.concatenate(features)
+        return np.asarray(sizes)
+
+    def _ranked_octave(self, image: Picture, matches: Matches) -> tuple[Matches, Features]:
+        """Move matches of similar size, and replace views of the best by neighbouring views.
+
+        Returns:
+            The best moved matches, followed by the same matches with replaced views, and features.
+        """
+        scale = min(1.0, FINE_PX / matches.poses[:, 3].max())
+        small = _resized(image, scale)
+        responses = edge_responses(small, FINE_SPREAD, _odd(FINE_PX))
+        reach = 1 + STRIDE / 2 * float(matches.poses[:, 3].mean()) * scale / COARSE_PX
+        matches.poses[:, [0, 1, 3]] *= scale
+        matches, before = move_nearby(matches, self._templates, responses, small, reach)
+        best = np.argsort(-before @ learned_ranking().weights)[:NUM_TURNED]
+        matches = matches.at(best)
+        turned, after = turn_views(matches, self._templates, responses, small)
+        both = _joined([matches, turned])
+        both.poses[:, [0, 1, 3]] /= scale
+        # Better neighbouring views exist for wrong matches, too: half of the gain counts.
+        return both, np.concatenate([before[best], (before[best] + after) / 2])
 
     def _matches(self, image: Picture, size: float, nearness: float) -> Matches:
         """Return the best matches of all templates at one distance.
@@ -263,6 +282,11 @@ class TemplateDetector:
         transforms = np.tile(np.eye(4), (len(poses), 1, 1))
         transforms[:, :3, :3], transforms[:, :3, 3] = rotations, shifts
         return transforms
+
+
+def _joined(groups: Sequence[Matches]) -> Matches:
+    """Concatenate groups of matches."""
+    return Matches(*(np.concatenate(columns) for columns in zip(*groups, strict=True)))
 
 
 def _distinct(

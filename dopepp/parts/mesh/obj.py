@@ -282,7 +282,7 @@ class FoldedPolygonError(ValueError):
 def _folded(
     vertices: Vertices, faces: Faces, polygons: Int[np.ndarray, " faces"]
 ) -> Bool[np.ndarray, " faces"]:
-    """Return which triangles face against their polygon, or whose polygon cancels out."""
+    """Return which triangles face opposite to their polygon, or belong to one of total area 0."""
     a, b, c = vertices[faces].swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
     totals = np.zeros((int(polygons[-1]) + 1, 3))

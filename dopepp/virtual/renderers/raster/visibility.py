@@ -66,7 +66,7 @@ class Projected:
         return box if box[0] < box[2] and box[1] < box[3] else None
 
     def inside(self, size: Size) -> bool:
-        """Return whether the object lies within the pixel centres of an image (width, height)."""
+        """Return whether an image of (width, height) shows all of the object's box."""
         left, top, right, bottom = self.extent
         return 0 <= left <= right <= size[0] - 1 and 0 <= top <= bottom <= size[1] - 1
 
