@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 
 from dopepp import PoseEstimator
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import invert_transform, make_transform, resize_camera
+from dopepp.geometry.camera import invert_transform, make_transform, moved, resize_camera
 from dopepp.geometry.camera_file import Camera
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
 from dopepp.parts.catalogue import pivconnector
@@ -183,6 +183,35 @@ def test_a_view_without_the_part_leaves_the_single_view(estimator, scene, views)
     result = predicted(estimator, scene, views, images=[images[0], empty], poses=[np.eye(4), away])
     assert [item.status for item in result.detections[0].evidence] == ["supports", "outside"]
     assert result.detections[0].score == pytest.approx(alone.score, abs=1e-6)
+
+
+def test_a_detection_that_the_image_did_not_refine_does_not_veto_the_others(
+    estimator, scene, views, true, monkeypatch
+):
+    candidates, calls = estimator.candidates, []
+
+    def with_a_wrong_second_view(*given):
+        detections = candidates(*given)
+        calls.append(len(detections))
+        if len(calls) < 2:
+            return detections
+        covariance = np.diag(np.repeat([math.radians(5.0), 0.005], 3) ** 2)
+        wrong = moved(detections[0].T_cam_obj, np.array([0.0, 0.0, 0.0, 0.04, 0.0, 0.0]))  # 8 σ
+        unrefined = {"covariance": covariance, "start": (wrong, covariance), "probability": 0.05}
+        return [
+            replace(
+                detections[0], T_cam_obj=wrong, kept="wrong", agreement=None, support=None,
+                score=0.01, **unrefined,
+            )
+        ]  # fmt: skip
+
+    monkeypatch.setattr(estimator, "candidates", with_a_wrong_second_view)
+    result = predicted(estimator, scene, views)
+    assert len(calls) == 2
+    (detection,) = result.detections
+    assert detection.views == ["view 0", "view 1"]
+    assert max(errors(detection.T_world_obj, true)) < 0.4
+    assert not result.findings
 
 
 def test_views_may_have_different_sizes_and_lenses(estimator, scene, views, true):

@@ -44,7 +44,8 @@ AGAINST: Final = -1.5
 """Lower bound of a view's log odds, because the part may be occluded or hardly visible there."""
 
 COINCIDENCE: Final = 1.5
-"""Log odds that each further detection at the same pose adds: wrong detections rarely agree."""
+"""Log odds that each further detection at the same pose adds, or view whose outline agrees: wrong
+poses rarely fit two views."""
 
 USUAL_MOVE: Final = 1.0
 """Assumed Mahalanobis distance between start and refined pose, which the verification asks for."""
@@ -110,12 +111,12 @@ class JointEstimator:
         """
         name, everything = sightings[0].detection.object, set(range(len(self._views)))
         geometry = self._geometries[name]
-        start = geometry.mean([sighting.pose for sighting in sightings])
-        limit = Prior(start.T_cam_obj, start.information / LOOSER**2)
-        members = {sighting.view for sighting in sightings}
-        chosen, tried = everything, list[set[int]]()
-        while len(chosen) > 1 and chosen not in tried:
-            tried.append(chosen)
+        chosen, tried = everything, list[tuple[set[int], int]]()
+        while len(chosen) > 1 and (chosen, len(sightings)) not in tried:
+            tried.append((chosen, len(sightings)))
+            start = geometry.mean([sighting.pose for sighting in sightings])
+            limit = Prior(start.T_cam_obj, start.information / LOOSER**2)
+            members = {sighting.view for sighting in sightings}
             numbers = sorted(chosen)
             starts = [item.start for item in sightings if item.view in chosen]
             prior = geometry.mean(starts or [sightings[0].start])
@@ -130,6 +131,16 @@ class JointEstimator:
                 self._evidence(number, pose, sightings, shown.get(number)) for number in everything
             ]
             supporting = {n for n in everything if evidence[n].status == "supports"}
+            # What the image did not refine may be wrong, and is left out if it contradicts the
+            # pose that several views support.
+            consistent = [
+                item
+                for item in sightings
+                if not item.detection.kept or geometry.separation(pose, item.pose) <= CONSISTENT
+            ]
+            if len(supporting) > 1 and 0 < len(consistent) < len(sightings):
+                sightings, chosen = consistent, supporting
+                continue
             if supporting >= chosen:
                 agreeing = [item for item in sightings if item.view in chosen] or sightings
                 disagreement = max(joint.disagreements)
@@ -176,13 +187,13 @@ class JointEstimator:
         detection = self._refiner.verified(detection, view.image, view.K, USUAL_MOVE)
         probability, share = detection.probability or 0.0, detection.agreement or 0.0
         least, least_share = SUPPORTING, AGREEING
-        if sighting is not None:
+        if sighting is not None and not original.kept:
             factor, decrease = WEAKER
             least = min(least, factor * (original.probability or 0.0))
             least_share = min(least_share, (original.agreement or 0.0) - decrease)
         is_shown = agreement is not None and probability >= least and share >= least_share
         if sighting is not None and original.kept:
-            is_shown = geometry.separation(pose, sighting.pose) <= CONSISTENT
+            is_shown |= geometry.separation(pose, sighting.pose) <= CONSISTENT
         status: Status = "supports" if is_shown else "hidden"
         if not _is_inside(detection.keypoints[CENTROID], view):
             status = "outside"
@@ -204,7 +215,13 @@ class JointEstimator:
                 odds += alone
             elif item.status != "outside":
                 odds += seen if item.status == "supports" else min(0.0, seen)
-        odds += COINCIDENCE * (len(sightings) - 1)
+        agreeing = sum(
+            item.status == "supports"
+            and item.probability >= SUPPORTING
+            and (item.detection.agreement or 0.0) >= AGREEING
+            for item in evidence
+        )
+        odds += COINCIDENCE * (max(len(sightings), agreeing) - 1)
         # The score of the best single view, with the odds of all views instead of its own.
         score = _probability(log_odds(best.score) + self._slope * (odds - alone))
         covariance = np.linalg.inv(pose.information)
