@@ -47,6 +47,7 @@ class _OneLineErrors(TyperGroup):
     """Reports a wrong option or a missing argument in one line."""
 
     def invoke(self, ctx: Any) -> Any:
+        """Run a command; print an expected error as one line."""
         try:
             return super().invoke(ctx)
         except _UsageError as error:

@@ -65,6 +65,7 @@ class _Compilation(event.Listener):  # type: ignore[misc]  # numba has no types
     is_first, depth, collects = True, 0, False
 
     def on_start(self, event: event.Event) -> None:
+        """Pause garbage collection; at the first compilation, start the second process."""
         if self.depth == 0:
             self.collects = gc.isenabled()
             gc.disable()
@@ -76,6 +77,7 @@ class _Compilation(event.Listener):  # type: ignore[misc]  # numba has no types
                 _call_in_process(*function.split(":"))
 
     def on_end(self, event: event.Event) -> None:
+        """Resume garbage collection after the outermost compilation."""
         self.depth -= 1
         if self.depth == 0 and self.collects:
             gc.enable()

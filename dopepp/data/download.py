@@ -171,6 +171,7 @@ class _Redirects(urllib.request.HTTPRedirectHandler):
     def redirect_request(
         self, req: urllib.request.Request, fp: Any, code: int, msg: str, headers: Any, newurl: str
     ) -> urllib.request.Request | None:
+        """Follow a redirection if its target is allowed."""
         scheme = urlsplit(newurl).scheme.lower()
         if req.type == "https" and scheme != "https":
             raise _failed(req.full_url, f"redirected to {newurl}, which is not https")

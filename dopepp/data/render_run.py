@@ -334,5 +334,6 @@ class _RateColumn(shown.ProgressColumn):
     """Images per second over the last half minute; empty while unknown."""
 
     def render(self, task: shown.Task) -> Text:
+        """Return the rate as text."""
         speed = task.finished_speed or task.speed
         return Text(f"{speed:.1f}/s" if speed else "", style="progress.data.speed")

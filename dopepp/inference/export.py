@@ -64,6 +64,7 @@ class _Maps(nn.Module):
         self.network = network
 
     def forward(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the maps of uint8 images."""
         belief, field = self.network.maps(pixels)
         return belief.float(), field.float()
 

@@ -525,6 +525,7 @@ class _RememberedSource:
         return len(self.source)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
+        """Return an item, from the cache if possible."""
         if epoch:
             return self.source.sample(index, epoch)
         return self.memory.recall((id(self), index), lambda: self.source.sample(index), _num_bytes)
@@ -540,6 +541,7 @@ class _RememberedNetwork:
     size_multiple: int
 
     def maps(self, images: Images) -> Stage:
+        """Return the maps of images, from the cache if possible."""
         pixels = images.permute(0, 2, 3, 1).contiguous().cpu().numpy()
         key = (id(self), pixels.shape, hashlib.blake2b(pixels.tobytes()).digest())
         return self.memory.recall(
