@@ -135,6 +135,21 @@ _PARTIAL: Final = re.compile(r"\..+\.([0-9a-f]{8})-([0-9]+)\.partial")
 _ABANDONED_S: Final = 600.0  # age of an abandoned partial file of another machine, seconds
 
 
+def read_limited(path: Path, max_bytes: int) -> bytes:
+    """Read an untrusted file, which may grow or be endless.
+
+    Raises:
+        OSError: The file cannot be read.
+        ValueError: The file is larger than ``max_bytes``.
+    """
+    with path.open("rb") as file:
+        is_large = os.fstat(file.fileno()).st_size > max_bytes
+        content = b"" if is_large else file.read(max_bytes + 1)
+    if is_large or len(content) > max_bytes:
+        raise ValueError(f"more than {max_bytes / 1e6:g} MB")
+    return content
+
+
 def partial_path(path: Path) -> Path:
     """Return a temporary path in a file's folder, which no other process uses on any machine."""
     return path.with_name(f".{path.name}.{_machine()}-{os.getpid()}{PARTIAL_SUFFIX}")

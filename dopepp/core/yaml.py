@@ -12,6 +12,7 @@ from typing import Final
 import yaml
 
 from dopepp.core.errors import UserError
+from dopepp.core.files import read_limited
 
 MAX_BYTES: Final = 1_000_000  # fifty times the largest config of a run
 MAX_DEPTH: Final = 32
@@ -25,13 +26,10 @@ def read_yaml(path: Path) -> object:
             has an anchor, an alias or a tag.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise _bad(path, f"of {path.stat().st_size} bytes")
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise _bad(path, f"unreadable: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise _bad(path, f"unreadable: {error!s:.200}") from error
+        text = read_limited(path, MAX_BYTES).decode("utf-8")
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise _bad(path, f"unreadable: {reason!s:.200}") from error
     return parse_yaml(text, path)
 
 

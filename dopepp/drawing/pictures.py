@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from dopepp.core.errors import RunError, UserError
-from dopepp.core.files import partial_path
+from dopepp.core.files import partial_path, read_limited
 
 # OpenCV reads this once, before its first video: FFmpeg must not write to the terminal.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
@@ -87,7 +87,7 @@ def read_picture(path: Path, longest_px: int | None = None) -> Picture:
         ValueError: The file is missing, damaged or not a picture, or exceeds :data:`MAX_SIDE`.
     """
     try:
-        with _opened(_content(path), FORMATS) as image:
+        with _opened(read_limited(path, MAX_BYTES), FORMATS) as image:
             if max(image.size) > MAX_SIDE:
                 raise ValueError(f"{image.width}×{image.height} pixels")
             scale = 1.0 if longest_px is None else longest_px / max(image.size)
@@ -123,7 +123,7 @@ def read_content(path: Path) -> bytes:
         UserError: The file is missing or too large.
     """
     try:
-        return _content(path)
+        return read_limited(path, MAX_BYTES)
     except (OSError, ValueError) as error:
         reason, allowed = str(error), f"at most {MAX_BYTES / 1e6:.0f} MB"
         fix = "save the picture with fewer pixels"
@@ -208,14 +208,6 @@ def read_photo(path: Path) -> Picture:
             f"stretch it: magick {path.name} -auto-level -depth 8 picture.png",
         )
     return np.ascontiguousarray(picture[..., :3])
-
-
-def _content(path: Path) -> bytes:
-    with path.open("rb") as file:
-        content = file.read(MAX_BYTES + 1)
-    if len(content) > MAX_BYTES:
-        raise ValueError(f"more than {MAX_BYTES / 1e6:.0f} MB")
-    return content
 
 
 def _opened(content: bytes, formats: tuple[str, ...]) -> Image.Image:

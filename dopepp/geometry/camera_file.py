@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from dopepp.core.errors import UserError
+from dopepp.core.files import read_limited
 from dopepp.geometry.camera import (
     ANYWHERE,
     WHOLE,
@@ -157,11 +158,7 @@ def _camera(calibration: Calibration, source: str) -> Camera:
 def _text(path: Path) -> str:
     """Return the text of a file of at most ``MAX_BYTES``."""
     try:
-        with path.open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
-        if len(content) > MAX_BYTES:
-            raise ValueError(f"more than {MAX_BYTES / 1e3:g} kB")
-        return content.decode("utf-8-sig").strip()
+        return read_limited(path, MAX_BYTES).decode("utf-8-sig").strip()
     except (OSError, ValueError) as error:  # ValueError also for a null character in its name
         problem = f"camera file {path!s:.200}: {getattr(error, 'strerror', None) or error}"
         allowed = f"a UTF-8 camera file of at most {MAX_BYTES / 1e3:g} kB: {FORMATS}"

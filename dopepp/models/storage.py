@@ -23,7 +23,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import partial_path, write_whole
+from dopepp.core.files import partial_path, read_limited, write_whole
 from dopepp.core.json import parse_json
 
 MAX_BYTES: Final = 4 * 2**30  # Six times the checkpoint of the full DOPE with Adam's moments
@@ -294,9 +294,7 @@ def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """
     path = Path(path)
     try:
-        if path.stat().st_size > MAX_SAFETENSORS_BYTES:
-            raise ValueError(f"{path.stat().st_size} bytes")
-        content = path.read_bytes()
+        content = read_limited(path, MAX_SAFETENSORS_BYTES)
         header = _header(content)
         tensors = load(content)
         # The library has checked the position of every tensor and byte by now.

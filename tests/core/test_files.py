@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import PICTURES, check_target, write_picture, write_png, write_whole
+from dopepp.core.files import (
+    PICTURES,
+    check_target,
+    read_limited,
+    write_picture,
+    write_png,
+    write_whole,
+)
 
 
 def test_a_png_keeps_its_pixels_in_rgb(tmp_path):
@@ -26,6 +33,15 @@ def test_what_is_no_image_is_refused(image, tmp_path):
     with pytest.raises(ValueError, match=r"an image must be uint8 \(H, W, 3\), got"):
         write_png(tmp_path / "image.png", image)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_is_read_up_to_a_limit(tmp_path):
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"12345")
+    assert read_limited(path, 5) == b"12345"
+    for large in (path, Path("/dev/zero")):  # an endless file states no size
+        with pytest.raises(ValueError, match="more than 4e-06 MB"):
+            read_limited(large, 4)
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):

@@ -265,7 +265,7 @@ def test_a_bad_file_is_one_line(name, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("missing", "No such file"), ("", "Is a directory"), ("large", "more than 250 kB"),
+    [("missing", "No such file"), ("", "Is a directory"), ("large", "more than 0.25 MB"),
      ("nul\0", "null")],
 )  # fmt: skip
 def test_a_file_that_is_none(name, message, tmp_path):

@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from dopepp.core.errors import UserError
+from dopepp.core.files import read_limited
 from dopepp.core.json import parse_json
 from dopepp.core.validation import STRICT, Range, check, parse
 from dopepp.geometry.cuboid import NUM_CORNERS, NUM_KEYPOINTS
@@ -161,11 +162,9 @@ def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
     if not path.is_file():
         raise invalid_export(path, "no such file")
     try:
-        if path.stat().st_size > max_bytes:
-            raise invalid_export(path, f"{path.stat().st_size} bytes", f"at most {max_bytes}")
-        return path.read_bytes()
-    except OSError as error:
-        raise invalid_export(path, error.strerror or error) from error
+        return read_limited(path, max_bytes)
+    except (OSError, ValueError) as error:
+        raise invalid_export(path, getattr(error, "strerror", None) or error) from error
 
 
 def check_shapes(path: Path, shapes: Mapping[str, Iterable[int] | None], num_pixels: int) -> None:

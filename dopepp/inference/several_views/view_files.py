@@ -22,6 +22,7 @@ from typing import Any, Final
 import numpy as np
 
 from dopepp.core.errors import UserError
+from dopepp.core.files import read_limited
 from dopepp.core.json import read_json
 from dopepp.core.validation import Range, check, shown
 from dopepp.core.yaml import read_yaml
@@ -195,9 +196,7 @@ def _colmap(path: Path) -> CameraPoses:
 def _lines(path: Path) -> list[str]:
     """Return the lines of a COLMAP file without comments, but with empty lines."""
     try:
-        if path.stat().st_size > MAX_COLMAP_BYTES:
-            raise ValueError(f"more than {MAX_COLMAP_BYTES / 1e6:g} MB")
-        text = path.read_text("utf-8")
+        text = read_limited(path, MAX_COLMAP_BYTES).decode("utf-8")
     except (OSError, ValueError) as error:
         problem = f"{path}: {getattr(error, 'strerror', None) or error}"
         raise UserError(problem, FORMATS, "pass images.txt with cameras.txt beside it") from error
