@@ -12,6 +12,7 @@ setup(
             "experiment/results/templates/*",
             "inference/refinement/verification.json",
             "inference/templates/ranking.json",
+            "parts/convex/*.npz",
             "pretrained/*",
             "robot/grasping/data/*",
             "robot/nodes/share/*",

@@ -104,7 +104,7 @@ def rendered_sample(rendered: Rendered, source: str, key: str) -> Sample:
 
 
 _TEXT_LENGTH: Final = 64
-_MAX_INSTANCES: Final = 16
+_MAX_INSTANCES: Final = 40
 """Masks are stored as a uint8 map: 0 for the background, i + 1 for instance i."""
 
 _FILLED: Final = 1 << 32

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Annotated
+from typing import Annotated, Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -20,10 +20,14 @@ from scipy.spatial import ConvexHull, QhullError
 from dopepp.core.errors import UserError
 from dopepp.core.validation import Checked, Pair, Share, Span
 from dopepp.geometry.rotation import Vector
+from dopepp.parts.convex import Piece, convex_pieces
 from dopepp.parts.mesh import Vertices
 from dopepp.parts.part import Mesh, Part
 from dopepp.virtual.scene import Triple, triple
 from dopepp.virtual.surface import Surface, make_surface
+
+WALL: Final = 0.03
+"""Thickness of a bin's walls, inner sides."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +50,13 @@ class Body:
         if self.source is not None:
             return self.source.hull.scaled(np.array(self.stretch))
         return make_hull(self.surface)
+
+    @cached_property
+    def pieces(self) -> tuple[Piece, ...]:
+        """Convex pieces for physics, object frame, metres; of a distractor, only its hull."""
+        if self.part is None:
+            return (self.hull.vertices,)
+        return convex_pieces(self.part)
 
     def stretched(self, scale: Vector) -> Body:
         """Return a distractor stretched along the axes by positive factors."""
@@ -256,8 +267,21 @@ def _profiles() -> Iterator[tuple[CrossSection, float]]:
 
 def _unit_surface(solid: Manifold) -> Surface:
     """Centre a solid, scale its bounding sphere to radius 1 and prepare it."""
+    mesh = _mesh_of(solid)
+    vertices = mesh.vertices - (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
+    vertices /= np.linalg.norm(vertices, axis=1).max()
+    return make_surface(replace(mesh, vertices=vertices))
+
+
+def _mesh_of(solid: Manifold) -> Mesh:
     mesh = solid.to_mesh()
     vertices = np.asarray(mesh.vert_properties, np.float64)[:, :3]
-    vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    vertices /= np.linalg.norm(vertices, axis=1).max()
-    return make_surface(Mesh(vertices, np.asarray(mesh.tri_verts, np.int32)))
+    return Mesh(vertices, np.asarray(mesh.tri_verts, np.int32))
+
+
+@cache
+def bin_walls() -> Body:
+    """Return a bin without a floor: inner width, depth and height 1, origin on the ground."""
+    outer = CrossSection.square((1 + 2 * WALL,) * 2, center=True)
+    solid = (outer - CrossSection.square((1.0, 1.0), center=True)).extrude(1.0)
+    return Body(make_surface(_mesh_of(solid)))

@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-from dopepp.core.errors import UserError
+from dopepp.core.errors import UserError, require
 from dopepp.geometry.camera import Transform, camera_beside, make_transform, transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import Vector
@@ -26,6 +26,7 @@ from dopepp.virtual.arrangement import Composition, arrange_floating
 from dopepp.virtual.backgrounds import Backgrounds, ProceduralBackgrounds
 from dopepp.virtual.backgrounds.procedural import ClutteredBackgrounds
 from dopepp.virtual.body import make_body
+from dopepp.virtual.heap import arrange_heap
 from dopepp.virtual.presets import Preset
 from dopepp.virtual.presets.table import plane_of
 from dopepp.virtual.renderers import find_renderer
@@ -81,6 +82,10 @@ class Factory:
         self.renderer, self._render = renderer, find_renderer(renderer)
         self._targets = [make_body(part, is_target=True) for part in parts]
         self._others = [make_body(part, is_target=False) for part in self.negatives]
+        if preset.table is not None and preset.table.pile is not None:
+            require("mujoco", "table.pile (preset heap)", "robot")
+            for body in self._targets:
+                body.pieces  # noqa: B018 (cached for all processes: a new mesh takes a minute)
 
     def render(self, epoch: int, index: int, scale: float = 1.0, view: int = 0) -> Rendered:
         """Render an image with its ground truth, including the sensor's effects.
@@ -131,9 +136,14 @@ class Factory:
         if any(preset.clutter) or preset.background_contrast != (1.0, 1.0):
             contrast = preset.background_contrast
             backgrounds = ClutteredBackgrounds(backgrounds, preset.clutter, contrast)
-        order = rng.permutation(len(self._targets))
+        pile = None if preset.table is None else preset.table.pile
+        # Several images show a heap from several sides.
+        drawing = rng if pile is None else np.random.default_rng([self.seed, pile.number(index), 1])
+        order = drawing.permutation(len(self._targets))
         low, high = preset.targets_per_image
-        count = int(rng.integers(low, high + 1))
+        count = int(drawing.integers(low, high + 1))
+        if pile is not None and drawing.random() >= pile.mixed_share:
+            order = order[:1]
         targets = [self._targets[order[number % len(order)]] for number in range(count)]
         composition = Composition(preset, rng, self._others)
         K, size, plane = composition.K, composition.size, None
@@ -144,7 +154,10 @@ class Factory:
             lights, ambient = preset.lighting.draw(rng, np.array([0.0, 0.0, depth]))
             background = backgrounds.draw(rng, *size)
         else:
-            T_cam_table = arrange_on_table(composition, preset.table, targets)
+            if pile is None:
+                T_cam_table = arrange_on_table(composition, preset.table, targets)
+            else:
+                T_cam_table = arrange_heap(composition, preset.table, pile, targets, drawing)
             shift = approach(composition.objects, scale)
             lights, ambient = preset.lighting.draw(rng, T_cam_table[:3, 3], T_cam_table[:3, 2])
             picture = preset.table.draw_picture(rng, backgrounds, K, size, T_cam_table)

@@ -63,9 +63,7 @@ class _Setting:
 
     def __init__(self, composition: Composition, table: Table, targets: Sequence[Body]) -> None:
         self.composition, self.table, self.rng = composition, table, composition.rng
-        self.T_cam_table = table.draw_view(self.rng)
-        if composition.preset.window is not None:
-            self.T_cam_table = _in_the_middle(self.T_cam_table, composition)
+        self.T_cam_table = draw_view(table, composition)
         distance = float(self.T_cam_table[2, 3])
         diameter = max((2 * body.surface.radius for body in targets), default=0.3 * distance)
         self._radius = diameter * self.rng.uniform(*table.heap_radius)
@@ -131,8 +129,11 @@ class _Setting:
         return float(x), float(y)
 
 
-def _in_the_middle(T_cam_table: Transform, composition: Composition) -> Transform:
-    """Turn the camera so that the middle of the window, not of the picture, shows the origin."""
+def draw_view(table: Table, composition: Composition) -> Transform:
+    """Draw T_cam_table; the middle of the image or window shows the table's origin."""
+    T_cam_table = table.draw_view(composition.rng)
+    if composition.preset.window is None:
+        return T_cam_table
     middle = np.array([*(np.array(composition.size) / 2 - 0.5), 1.0])
     ray = np.linalg.solve(composition.K, middle)
     aside = np.array([-ray[1], ray[0], 0.0])  # rotation axis z × ray

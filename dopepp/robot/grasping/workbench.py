@@ -21,7 +21,7 @@ from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import Transform, invert_transform, make_transform
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.parts.part import Part
-from dopepp.robot.grasping.cell import CAMERA, JOINTS, TRAY, Cell, Solid, convex_pieces
+from dopepp.robot.grasping.cell import CAMERA, JOINTS, TRAY, Cell, Solid
 from dopepp.robot.grasping.rehearsal import SIZE, TRUE_K
 from dopepp.virtual.backgrounds import ProceduralBackgrounds
 from dopepp.virtual.body import Body, distractor_shapes, make_body
@@ -82,7 +82,7 @@ class Layout:
     def __init__(self, part: Part, name: str, yaw_deg: float, rest: str) -> None:
         self._name = name
         self.part, self.body = part, make_body(part, is_target=True)
-        self.solid = Solid(convex_pieces(part), part.mesh, COLOUR)
+        self.solid = Solid(self.body.pieces, part.mesh, COLOUR)
         self._yaw, self._rest = np.radians(yaw_deg), rest
 
     def draw(self, rng: Generator) -> list[PlacedSolid]:
@@ -145,7 +145,7 @@ def _standing(body: Body, position: np.ndarray, rng: Generator) -> PlacedSolid:
     """Place a distractor upright on the bench, with a random yaw."""
     rotation = Rotation.from_rotvec([0.0, 0.0, rng.uniform(0, 2 * np.pi)]).as_matrix()
     height = DROP_HEIGHT - float(body.surface.vertices[:, 2].min())
-    solid = Solid((np.asarray(body.hull.vertices),), None, (0.35, 0.45, 0.6))
+    solid = Solid(body.pieces, None, (0.35, 0.45, 0.6))
     T_base_obj = make_transform(rotation, position + np.array([0.0, 0.0, height]))
     return PlacedSolid(body, solid, T_base_obj)
 

@@ -85,6 +85,14 @@ class Preset(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_camera(self.K, (self.width, self.height), f"preset {self.name}")
+        has_pile = self.table is not None and self.table.pile is not None
+        if has_pile and (self.min_visible_fraction or self.centroid_inside or self.depths):
+            raise UserError(
+                f"min_visible_fraction={self.min_visible_fraction:g}, "
+                f"centroid_inside={self.centroid_inside} and depths={self.depths} of a pile",
+                "min_visible_fraction=0, centroid_inside=false and depths=null with table.pile",
+                "leave these fields out: physics decides what is visible",
+            )
 
     @property
     def K(self) -> CameraMatrix:  # noqa: N802 (the field's name of the matrix)

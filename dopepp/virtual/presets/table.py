@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.random import Generator
 
-from dopepp.core.validation import Checked, Pair, Share, Span
+from dopepp.core.validation import Checked, Pair, Range, Share, Span
 from dopepp.drawing.pictures import Mask, Picture, Size
 from dopepp.geometry.camera import CameraMatrix, Transform, make_transform
 from dopepp.geometry.rotation import Vector, rotation_to_z, rotation_vector_to_matrix
@@ -18,6 +18,32 @@ from dopepp.virtual.backgrounds import Backgrounds
 from dopepp.virtual.body import Hull
 from dopepp.virtual.presets.placement import Angle, looking_down
 from dopepp.virtual.scene import Plane, triple
+
+
+@dataclass(frozen=True)
+class Pile(Checked):
+    """A heap of objects dropped by physics (extra ``robot``), which decides what is visible.
+
+    Attributes:
+        piles: Number of different heaps in every 10,000 images; heaps are cached on disk.
+        mixed_share: Share of heaps of all kinds of targets; other heaps have one kind.
+        bin_share: Share of heaps in a bin; other heaps lie on the open table.
+        room: Side of the area into which objects fall, and of the bin, for one object, over the
+            cube root of its bounding box; the side grows with the root of the number of objects.
+        wall_height: Height of the bin's walls.
+        aside: Largest distance of the camera's aim from the heap's middle, heap radii.
+    """
+
+    piles: Annotated[int, Range(1, 10_000, "a count")] = 200
+    mixed_share: Share = 0.5
+    bin_share: Share = 0.5
+    room: Annotated[Pair, Span(0.1, 10.0, "factor")] = (1.0, 2.2)
+    wall_height: Annotated[Pair, Span(0.05, 5.0, "diameters of the largest target")] = (0.3, 1.0)
+    aside: Share = 0.4
+
+    def number(self, index: int) -> int:
+        """Return the number of an image's heap; blocks of 10,000 images share no heap."""
+        return index // 10_000 * self.piles + index % self.piles
 
 
 @dataclass(frozen=True)
@@ -31,6 +57,7 @@ class Table(Checked):
         tilted_share: Share of objects that lean by ``tilt_deg`` instead of resting on a face.
         heaped: Whether objects are dropped onto a heap instead of lying side by side.
         heap_radius: Radius within which a heap's objects are dropped.
+        pile: Heaps dropped by physics, in place of single objects; None for no physics.
         picture_width: Width of the plane that the background's picture covers; outside, the
             picture is mirrored.
     """
@@ -42,6 +69,7 @@ class Table(Checked):
     tilt_deg: Annotated[Pair, Span(0.0, 90.0, "degrees")] = (5.0, 30.0)
     heaped: bool = False
     heap_radius: Annotated[Pair, Span(0.0, 10.0, "diameters of the largest target")] = (0.3, 0.8)
+    pile: Pile | None = None
     picture_width: Annotated[Pair, Span(0.1, 20.0, "camera distances")] = (1.2, 2.4)
 
     def draw_view(self, rng: Generator) -> Transform:

@@ -130,7 +130,7 @@ class View:
             height=round(scale * self.size[1]),
             intrinsics_px=intrinsics_of(resize_camera(self.K, scale, scale)),
             placement=WorkingPlacement(near, far),
-            depths=None if table is None else (near / _BEYOND, far * _BEYOND),
+            depths=None if table is None or table.pile else (near / _BEYOND, far * _BEYOND),
         )
 
     def whole(self, preset: Preset, scale: float) -> Preset:

@@ -16,7 +16,8 @@ from dopepp.geometry.camera import (
     transform,
 )
 from dopepp.parts.catalogue import BUILTIN, load_part
-from dopepp.robot.grasping.cell import TRAY, Cell, Solid, convex_pieces
+from dopepp.parts.convex import convex_pieces
+from dopepp.robot.grasping.cell import TRAY, Cell, Solid
 from dopepp.robot.grasping.rehearsal import SIZE, TRUE_K, looking_at
 from dopepp.robot.grasping.workbench import HEAP, LAYOUTS, SPREAD, Layout, RasterView
 

@@ -1,0 +1,88 @@
+"""Convex pieces: the shape of a part for simulations of rigid bodies.
+
+The decomposition of a mesh (CoACD, Wei et al. 2022; extra ``robot``) takes a minute and is cached:
+for built-in parts in this package, for other meshes in the user's cache, under the hash of the
+mesh.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import ConvexHull
+
+from dopepp.core.errors import UserError, require
+from dopepp.core.files import cache_folder, write_whole
+from dopepp.parts.part import Mesh, Part
+
+Piece = Float[np.ndarray, "vertices 3"]
+
+CONCAVITY: Final = 0.05  # CoACD's threshold: largest distance of a piece from its convex hull
+MAX_PIECES: Final = 64
+_BUILT_IN: Final = Path(__file__).parent
+
+logger = logging.getLogger(__name__)
+
+
+def convex_pieces(part: Part) -> tuple[Piece, ...]:
+    """Return convex pieces that make up a part's shape, in its frame, metres.
+
+    Raises:
+        UserError: The part has no mesh, the cached pieces are damaged, or the extra is missing.
+    """
+    if part.mesh is None:
+        problem, allowed = f"part {part.name} without a mesh", "a built-in part or a mesh file"
+        raise UserError(problem, allowed, "pass --part FILE")
+    name = f"{part.mesh_hash[:16]}.npz"
+    for path in (_BUILT_IN / name, cache_folder() / "solids" / name):
+        if path.is_file():
+            return _read_pieces(path)
+    require("coacd", f"the decomposition of {part.name}", "robot")
+    logger.info("%s: decomposing the mesh into convex pieces, once: about a minute", part.name)
+    pieces = _decompose(part.mesh)
+    vertices, counts = np.concatenate(pieces).astype(np.float32), [len(piece) for piece in pieces]
+    content = io.BytesIO()
+    np.savez_compressed(content, vertices=vertices, counts=counts)
+    write_whole(cache_folder() / "solids" / name, content.getvalue())
+    return _read_pieces(cache_folder() / "solids" / name)
+
+
+def hull_faces(piece: Piece) -> Int[np.ndarray, "faces 3"]:
+    """Return the triangles of a convex piece's hull with outward normals."""
+    hull = ConvexHull(piece)
+    a, b, c = piece[hull.simplices].swapaxes(0, 1)
+    is_inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
+    faces = hull.simplices.astype(np.int32)
+    faces[is_inward] = faces[is_inward][:, ::-1]
+    return faces
+
+
+def _decompose(mesh: Mesh) -> tuple[Piece, ...]:
+    import coacd
+
+    coacd.set_log_level("error")
+    search = {"resolution": 500, "mcts_nodes": 10, "mcts_iterations": 30, "mcts_max_depth": 2}
+    pieces: list[Any] = coacd.run_coacd(
+        coacd.Mesh(mesh.vertices, mesh.faces),
+        threshold=CONCAVITY,
+        max_convex_hull=MAX_PIECES,
+        preprocess_mode="auto",  # only for open meshes: it rounds edges
+        seed=0,
+        **search,
+    )
+    return tuple(np.asarray(vertices, np.float64) for vertices, _ in pieces)
+
+
+def _read_pieces(path: Path) -> tuple[Piece, ...]:
+    try:
+        with np.load(path, allow_pickle=False) as content:
+            vertices, counts = np.asarray(content["vertices"], np.float64), content["counts"]
+        return tuple(np.split(vertices, np.cumsum(counts)[:-1]))
+    except (OSError, KeyError, ValueError) as error:
+        fix = "delete this file; the next run creates the file again"
+        raise UserError(f"{path}: {error}", "a file written by dopepp", fix) from error

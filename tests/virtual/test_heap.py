@@ -1,0 +1,199 @@
+"""Heaps: objects rest on each other without overlaps, the same in every process, in any view."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import dopepp.core.errors
+from dopepp.core.errors import UserError
+from dopepp.geometry.camera import invert_transform, make_transform, transform
+from dopepp.virtual import Factory, visible_fractions
+from dopepp.virtual.presets import Preset, preset_of
+from dopepp.virtual.presets.table import Pile
+from dopepp.virtual.renderers import find_renderer
+
+BOX = np.array([0.10, 0.06, 0.02])  # sides of ``box_part``
+DIAMETER = float(np.linalg.norm(BOX))
+
+
+def small(**changes: object) -> Preset:
+    fewer = {"targets_per_image": [5, 9], "distractors": {"number": [0, 0]}}
+    return preset_of("heap", {**fewer, **changes}).resized(160, 120)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def cache(tmp_path_factory):
+    pytest.importorskip("mujoco", reason="needs the extra robot")
+    pytest.importorskip("coacd", reason="needs the extra robot")
+    with pytest.MonkeyPatch.context() as patch:
+        folder = tmp_path_factory.mktemp("cache")
+        patch.setenv("XDG_CACHE_HOME", str(folder))
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def heaps(box_part):
+    factory = Factory([box_part], small(), 1)
+    return [factory.scene(0, index) for index in range(6)]
+
+
+def in_table_frame(scene):
+    """Poses of the boxes relative to a frame on the plane with z upwards."""
+    normal = np.array(scene.plane.normal)
+    x = np.cross([0.3, 0.5, 0.7], normal)
+    x /= np.linalg.norm(x)
+    R = np.stack([x, np.cross(normal, x), normal])
+    T = make_transform(R, -scene.plane.offset * np.array([0.0, 0.0, 1.0]))
+    return [T @ item.T_cam_obj for item in scene.objects if item.is_target]
+
+
+def grid(steps=9):
+    """Points over a box's surface, box frame."""
+    axis = np.linspace(-0.5, 0.5, steps)
+    points = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    return points[np.isclose(np.abs(points).max(axis=1), 0.5)] * BOX
+
+
+def depth_inside(pose, other):
+    """Largest depth of one box's surface inside another box, metres."""
+    points = transform(invert_transform(other) @ pose, grid())
+    return float((BOX / 2 - np.abs(points)).min(axis=1).max())
+
+
+def test_objects_of_a_heap_overlap_by_less_than_a_hundredth_of_the_diameter(heaps):
+    for scene in heaps:
+        poses = in_table_frame(scene)
+        assert 5 <= len(poses) <= 9
+        for number, pose in enumerate(poses):
+            assert transform(pose, grid())[:, 2].min() > -0.01 * DIAMETER
+            for other in poses[:number]:
+                assert depth_inside(pose, other) < 0.01 * DIAMETER
+                assert depth_inside(other, pose) < 0.01 * DIAMETER
+
+
+def test_no_object_floats(heaps):
+    for scene in heaps:
+        poses = in_table_frame(scene)
+        for pose in poses:
+            on_floor = transform(pose, grid())[:, 2].min() < 0.01 * DIAMETER
+            others = [other for other in poses if other is not pose]
+            # A box a little lower would enter the box or the wall that carries it.
+            lowered = make_transform(pose[:3, :3], pose[:3, 3] - [0.0, 0.0, 0.03 * DIAMETER])
+            carried = any(
+                max(depth_inside(lowered, other), depth_inside(other, lowered)) > 0
+                for other in others
+            )
+            leans = len(scene.objects) > len(poses)  # on the bin, which is not a box
+            assert on_floor or carried or leans
+    highest = [max(pose[2, 3] for pose in in_table_frame(scene)) for scene in heaps]
+    assert max(highest) > 0.04  # at least two thicknesses: boxes lie on boxes
+
+
+def test_objects_lie_inside_a_bin(box_part):
+    table = {"pile": {"bin_share": 1.0, "wall_height": [1.0, 1.0], "room": [2.5, 2.5]}}
+    scene = Factory([box_part], small(table=table), 2).scene(0, 0)
+    (walls,) = (item for item in scene.objects if not item.is_target)
+    T_bin_cam, (width, depth, height) = (
+        invert_transform(walls.T_cam_obj),
+        np.ptp(walls.surface.vertices, axis=0),
+    )
+    assert height == pytest.approx(DIAMETER)
+    for item in scene.objects:
+        if item.is_target:
+            x, y, z = transform(T_bin_cam @ item.T_cam_obj, grid()).T
+            assert max(np.abs(x).max() - width / 2, np.abs(y).max() - depth / 2) < 0
+            assert z.min() > -0.01 * DIAMETER
+
+
+def test_a_heap_repeats_from_its_seed_with_and_without_its_cache(box_part, heaps, cache):
+    assert list((cache / "dopepp" / "piles").glob("*.npy"))
+    cached = Factory([box_part], small(), 1).scene(0, 0)
+    for path in (cache / "dopepp" / "piles").glob("*.npy"):
+        path.unlink()
+    simulated = Factory([box_part], small(), 1).scene(0, 0)
+    for scene in (cached, simulated):
+        for item, again in zip(heaps[0].objects, scene.objects, strict=True):
+            np.testing.assert_array_equal(item.T_cam_obj, again.T_cam_obj)
+
+
+def test_a_damaged_cache_is_named(box_part, cache):
+    factory = Factory([box_part], small(), 5)
+    factory.scene(0, 0)
+    newest = max(
+        (cache / "dopepp" / "piles").glob("*.npy"), key=lambda path: path.stat().st_mtime_ns
+    )
+    newest.write_bytes(newest.read_bytes()[:200])
+    with pytest.raises(UserError, match="delete this file"):
+        factory.scene(0, 0)
+    newest.unlink()
+
+
+def relative(scene):
+    first = invert_transform(scene.objects[0].T_cam_obj)
+    return np.stack([first @ item.T_cam_obj for item in scene.objects])
+
+
+def test_images_share_a_heap_and_differ_in_view(box_part):
+    factory = Factory([box_part], small(table={"pile": {"piles": 2}}), 1)
+    scenes = [factory.scene(epoch, index) for epoch, index in ((0, 0), (0, 2), (3, 0))]
+    for scene in scenes[1:]:
+        np.testing.assert_allclose(relative(scene), relative(scenes[0]), atol=1e-9)
+        assert np.abs(scene.objects[0].T_cam_obj - scenes[0].objects[0].T_cam_obj).max() > 0.01
+    other = factory.scene(0, 1)
+    assert len(other.objects) != len(scenes[0].objects) or (
+        np.abs(relative(other) - relative(scenes[0])).max() > 0.01
+    )
+    pile = Pile(piles=7)
+    assert {pile.number(i) for i in range(10_000)}.isdisjoint(
+        {pile.number(10**9 + i) for i in range(99)}
+    )
+
+
+def test_several_kinds_and_distractors_are_dropped(sized_box):
+    kinds = [sized_box("large", 1.0), sized_box("small", 0.5)]
+    table = {"pile": {"mixed_share": 1.0, "bin_share": 0.0}}
+    changes = {"table": table, "distractors": {"number": [2, 2]}}
+    scene = Factory(kinds, small(**changes), 3).scene(0, 0)
+    assert {item.label for item in scene.objects} == {"large", "small", "distractor"}
+    assert sum(item.label == "distractor" for item in scene.objects) == 2
+    changes["table"] = {"pile": {"mixed_share": 0.0}}
+    scene = Factory(kinds, small(**changes), 3).scene(0, 0)
+    assert len({item.label for item in scene.objects if item.is_target}) == 1
+
+
+def test_a_window_shows_a_heap_and_labels_only_parts_in_view(box_part):
+    preset = replace(small(), window=(64, 64))
+    factory = Factory([box_part], preset, 1)
+    for index in range(6):
+        scene = factory.scene(0, index)
+        assert scene.targets
+        inside = np.array([item.is_target for item in scene.objects])
+        assert not visible_fractions(scene)[~inside].any() or (~inside).sum() <= 1  # the bin
+
+
+def test_both_renderers_draw_a_heap(heaps):
+    scene = heaps[0]
+    fractions = find_renderer("raster")(scene).visible_fractions
+    pytest.importorskip("mitsuba", reason="the extra photoreal is not installed")
+    pytest.importorskip("pyoidn", reason="the extra photoreal is not installed")
+    traced = find_renderer("photoreal")(scene)
+    np.testing.assert_allclose(traced.visible_fractions, fractions, atol=0.05)
+
+
+def test_a_missing_extra_is_one_clear_line(box_part, monkeypatch):
+    monkeypatch.setattr(dopepp.core.errors, "find_spec", lambda name: None)
+    with pytest.raises(
+        UserError, match=r"without the package mujoco.*pip install 'dopepp\[robot\]'"
+    ):
+        Factory([box_part], small(), 0)
+
+
+def test_visibility_is_not_chosen_in_a_heap():
+    for change in (
+        {"min_visible_fraction": 0.3},
+        {"centroid_inside": True},
+        {"depths": (0.1, 1.0)},
+    ):
+        with pytest.raises(UserError, match="physics decides what is visible"):
+            preset_of("heap", change)
