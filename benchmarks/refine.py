@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from depth import sensed
 
-from dopepp.data.part_symmetries import with_found_symmetries
+from dopepp.data.part_symmetries import with_symmetries
 from dopepp.geometry.camera import moved, transform
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.geometry.symmetry import symmetry_group
@@ -52,7 +52,7 @@ def errors(T: np.ndarray, true: np.ndarray, part: Part, group: np.ndarray) -> li
 
 def measure(name: str, preset: str, num_images: int, seed: int, unit: str, terms: list[str]) -> str:
     """Return one row of the table."""
-    part = with_found_symmetries(load_part(name, unit))
+    part = with_symmetries(load_part(name, unit))
     group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
     refiner = PartRefiner(part, terms)
     factory = Factory([part], PRESETS[preset].resized(*SIZE), seed)

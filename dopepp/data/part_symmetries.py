@@ -45,7 +45,7 @@ def choose_symmetries(
     if choice == NONE:
         return [replace(part, symmetries_discrete=None, symmetries_continuous=()) for part in parts]
     if choice == AUTO:
-        return [with_found_symmetries(part) for part in parts]
+        return [with_symmetries(part) for part in parts]
     if isinstance(choice, Mapping):
         given = {name: bop_models.parse_symmetries(name, entry) for name, entry in choice.items()}
         return [_with(part, *given[part.name]) if part.name in given else part for part in parts]
@@ -66,7 +66,7 @@ def _with(
     return replace(part, symmetries_discrete=discrete, symmetries_continuous=continuous)
 
 
-def with_found_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
+def with_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
     """Return a part with the symmetries of its mesh, and log them.
 
     Raises:
@@ -91,7 +91,7 @@ def with_found_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
 
 def describe_symmetries(path: Path | str, unit: str | None, tolerance: float) -> str:
     """Return the ``models_info.json`` entry of a mesh file or built-in part as JSON."""
-    entry = bop_models.model_info(with_found_symmetries(load_part(path, unit), tolerance))
+    entry = bop_models.model_info(with_symmetries(load_part(path, unit), tolerance))
     entry |= {field: entry.get(field, []) for field in bop_models.SYMMETRY_FIELDS}
     return json.dumps(entry, indent=2, ensure_ascii=False)
 

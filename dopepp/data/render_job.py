@@ -241,7 +241,7 @@ _MAX_RECORD_BYTES: Final = 4_000_000  # about 10,000 parts
 _MAX_DIFFERENCES: Final = 3  # differences shown in an error message
 
 
-def is_begun(root: Path) -> bool:
+def has_started(root: Path) -> bool:
     """Return whether a job has claimed the folder."""
     return (root / RECORD_FILE).is_file()
 

@@ -25,7 +25,7 @@ from rich.text import Text
 from dopepp.core.errors import StoppedError, UserError, stopped
 from dopepp.core.pool import ClusterPool, LostWorkerError, Pool, ProcessPool, available_cores
 from dopepp.data.formats import RECORD_FILE, Writer
-from dopepp.data.render_job import Job, begin, is_begun
+from dopepp.data.render_job import Job, begin, has_started
 from dopepp.data.rendered import MAX_ITEMS
 from dopepp.virtual.renderers.photoreal import THREADS_SETTING
 
@@ -200,7 +200,7 @@ class RenderTasks:
         if self._writer is None:
             cv2.setNumThreads(1)
             os.environ.setdefault(THREADS_SETTING, "1")
-            if not is_begun(self._root):
+            if not has_started(self._root):
                 problem = f"{self._root} without {RECORD_FILE}, seen from a worker"
                 allowed = "a folder with the same path on every machine of the cluster"
                 raise UserError(problem, allowed, "pass an --out on a shared file system")
@@ -236,7 +236,7 @@ def render_dataset(
     if not 1 <= num_items <= MAX_ITEMS:
         raise UserError(f"-n {num_items}", f"1 to {MAX_ITEMS:,} images", "pass e.g. -n 1000")
     root, shard = root.resolve(), shard or Shard()
-    if not is_begun(root):
+    if not has_started(root):
         # This fails before anything is written if the preset cannot show the part.
         job.factory.scene(0, 0)
     begin(root, job.record)

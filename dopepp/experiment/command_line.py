@@ -49,7 +49,7 @@ def prepare(open_nodes: Sequence[str], short_names: Mapping[str, str], num_words
     """
     words, given = sys.argv[:num_words], sys.argv[num_words:]
     arguments = [_spelled_out(text, short_names, open_nodes) for text in given]
-    begun = multirun.begun_run([*words[1:], *arguments])
+    begun = multirun.requeued_run([*words[1:], *arguments])
     if begun is not None:
         arguments.append(f"resume={begun}")
     _refuse_used_folder(arguments)

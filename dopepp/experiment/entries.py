@@ -147,7 +147,7 @@ def run_job(config: DictConfig, job: Job) -> float | None:
         if not multirun.is_remote(hydra):
             return _run_one_of_many(config, job, run_dir)
         program.configure_logging()
-        with multirun.own_output(run_dir / multirun.LOG_FILE):
+        with multirun.redirected_output(run_dir / multirun.LOG_FILE):
             return _run_one_of_many(config, job, run_dir)
     if program.is_first_process():
         program.say(f"begins in {program.shown(run_dir)}")
@@ -158,7 +158,7 @@ def run_job(config: DictConfig, job: Job) -> float | None:
             from dopepp.experiment.run.resume import remember_overrides
 
             remember_overrides(run_dir)
-            multirun.remember_run(sys.argv[1:], run_dir)
+            multirun.record_run(sys.argv[1:], run_dir)
         job(_plain(config), run_dir)
     # Errors are handled here because Hydra would print a stack trace.
     except (UserError, OmegaConfBaseException) as error:
@@ -199,7 +199,7 @@ def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | Non
         (run_dir / name).unlink(missing_ok=True)
     try:
         plain = _plain(config)
-        if multirun.goes_on(plain, run_dir):
+        if multirun.can_resume(plain, run_dir):
             plain["resume"] = str(run_dir)
         result = job(plain, run_dir)
         return result.details.get(OBJECTIVE) if isinstance(result, Report) else None

@@ -44,8 +44,8 @@ class Difference:
         high: Upper end of the confidence interval.
         num_differing: Number of instances on which the methods differ.
         fewest: Smallest ``num_differing`` that can be significant (:func:`fewest_differing`).
-        seeds_to_tell: Estimated number of seeds that would make the difference significant
-            (:func:`seeds_to_tell`); None if unknown.
+        seeds_needed: Estimated number of seeds that would make the difference significant
+            (:func:`seeds_needed`); None if unknown.
     """
 
     value: float
@@ -53,7 +53,7 @@ class Difference:
     high: float
     num_differing: int
     fewest: int
-    seeds_to_tell: float | None = None
+    seeds_needed: float | None = None
 
     @property
     def within_noise(self) -> bool:
@@ -119,12 +119,12 @@ def paired_difference(
     low, high = np.quantile(defined, [tail, 1 - tail])
     value = float(figures[0].mean() - figures[1].mean())
     paired = same_seeds and len(figures[0]) > 1 and statistic == "mean"
-    needed = seeds_to_tell(mine, baseline, confidence) if paired else None
+    needed = seeds_needed(mine, baseline, confidence) if paired else None
     num_differing, fewest = _num_differing(mine, baseline), fewest_differing(confidence)
     return Difference(value, float(low), float(high), num_differing, fewest, needed)
 
 
-def seeds_to_tell(mine: Numbers, baseline: Numbers, confidence: float = 0.95) -> float:
+def seeds_needed(mine: Numbers, baseline: Numbers, confidence: float = 0.95) -> float:
     """Estimate how many paired seeds would make a difference in means significant.
 
     With S seeds the interval's half-width is √(z² · V + t₍S₋₁₎² · W / S), where V is the variance

@@ -177,7 +177,7 @@ def saved_step(path: Path) -> int | None:
         return None
 
 
-def check_room(run_dir: Path, weight_bytes: int) -> None:
+def check_free_space(run_dir: Path, weight_bytes: int) -> None:
     """Check in advance that a run can write its checkpoints.
 
     Args:

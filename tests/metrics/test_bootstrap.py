@@ -14,7 +14,7 @@ from dopepp.metrics.bootstrap import (
     Difference,
     fewest_differing,
     paired_difference,
-    seeds_to_tell,
+    seeds_needed,
 )
 
 Z = norm.ppf(0.975)
@@ -199,7 +199,7 @@ def test_as_many_seeds_as_it_says_tell_a_difference(gain, spread, noise, seeds):
     over_seeds = spread * (over_seeds - over_seeds.mean()) / over_seeds.std(ddof=1)
     over_images = noise * (over_images - over_images.mean()) / over_images.std(ddof=1)
     mine = 0.5 + gain + over_seeds[:, None] + over_images
-    asked = seeds_to_tell([mine], [np.full_like(mine, 0.5)])
+    asked = seeds_needed([mine], [np.full_like(mine, 0.5)])
 
     def reach(num: float) -> float:
         of_seeds = t.ppf(0.975, num - 1) ** 2 * spread**2 / num
@@ -216,8 +216,8 @@ def test_as_many_seeds_as_it_says_tell_a_difference(gain, spread, noise, seeds):
 def test_too_few_images_are_not_made_up_for_by_seeds():
     mine, other = np.zeros((3, 10)), np.zeros((3, 10))
     mine[:, 0] = 1
-    assert seeds_to_tell([mine], [other]) == np.inf
+    assert seeds_needed([mine], [other]) == np.inf
     result = difference([mine], [other])
-    assert result.seeds_to_tell == np.inf
+    assert result.seeds_needed == np.inf
     alone = difference([mine[:1]], [other[:1]])
-    assert alone.seeds_to_tell is None
+    assert alone.seeds_needed is None

@@ -63,7 +63,7 @@ class BackgroundCrops:
     def search(self, size: Size, rng: Generator) -> Picture | None:
         """Return a random crop of (height, width) that has contrast.
 
-        Without such a crop, return one with two colours, else None.
+        If there is none, return a crop with at least two colours, or None.
         """
         free = self._is_free(size)
         if not free.any():

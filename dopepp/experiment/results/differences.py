@@ -104,7 +104,7 @@ def differences(entry: Entry, baseline: Entry | None, name: str) -> dict[str, Va
             low=max(change.low, -limit),
             high=min(change.high, limit),
             num_differing=change.num_differing,
-            seeds_to_tell=math.nan if change.seeds_to_tell is None else change.seeds_to_tell,
+            seeds_needed=math.nan if change.seeds_needed is None else change.seeds_needed,
         )
     return values
 
@@ -296,8 +296,8 @@ def noise(table: pd.DataFrame) -> list[str]:
 
 def _needed(change: Value) -> str:
     """Return a remark on the number of seeds that would make a difference significant."""
-    if math.isnan(change.seeds_to_tell) or change.value == 0:
+    if math.isnan(change.seeds_needed) or change.value == 0:
         return ""
-    if math.isinf(change.seeds_to_tell):
+    if math.isinf(change.seeds_needed):
         return " (significant with more images only)"
-    return f" (significant with about {change.seeds_to_tell:,.0f} seeds)"
+    return f" (significant with about {change.seeds_needed:,.0f} seeds)"

@@ -70,7 +70,7 @@ class Value(NamedTuple):
         high: Upper end.
         num_differing: For a difference, number of instances on which the methods differ; NaN if
             the methods cannot be compared.
-        seeds_to_tell: For a difference, approximate number of seeds for significance.
+        seeds_needed: For a difference, approximate number of seeds for significance.
         deviation: For a mean, sample standard deviation over the seeds.
         seeds: Seeds of the method on the object.
     """
@@ -84,7 +84,7 @@ class Value(NamedTuple):
     low: float = math.nan
     high: float = math.nan
     num_differing: float = math.nan
-    seeds_to_tell: float = math.nan
+    seeds_needed: float = math.nan
     deviation: float = math.nan
     seeds: tuple[int, ...] = ()
 

@@ -342,7 +342,7 @@ def measure(
                 part.name: metrics[name].errors(part.name, "rotation_deg") for part in method.parts
             },
             diameters={part.name: float(part.diameter) for part in method.parts},
-            test_set=seen.word(),
+            test_set=seen.hexdigest(),
             details={"bop": asdict(measured.bop[name])} if name in measured.bop else {},
         )
         for name, method in methods.items()

@@ -206,7 +206,7 @@ class Fingerprint:
             truths.append([instance.label, _rounded(instance.T_cam_obj), counts, covered])
         self._add([sample.source, sample.key, sample.size, _rounded(sample.K), truths])
 
-    def word(self) -> str:
+    def hexdigest(self) -> str:
         """Return the hash of all images added so far."""
         return self._hash.hexdigest()
 

@@ -114,19 +114,19 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
         UserError: An option, a file or the data is wrong.
     """
     program.quiet_lightning()
-    asked = EvaluationConfig.of(config)
-    extensions.enable(asked.extensions)
-    _check_combination(asked)
-    loaded = _load(asked)
+    options = EvaluationConfig.of(config)
+    extensions.enable(options.extensions)
+    _check_combination(options)
+    loaded = _load(options)
     checkpoint = loaded[-1].checkpoint if loaded else None
-    measured = str(asked.ckpt_path or asked.baseline or asked.results or TEMPLATES)
+    measured = str(options.ckpt_path or options.baseline or options.results or TEMPLATES)
     stored = None if checkpoint is None else trained_on(checkpoint.data)
-    data = chosen_data(asked.data, asked.virtual, stored, measured)
-    refines = "region" in (asked.refine or ()) or asked.templates is not None
+    data = chosen_data(options.data, options.virtual, stored, measured)
+    refines = "region" in (options.refine or ()) or options.templates is not None
     if data.views > 1 and not refines:
         problem, fix = f"data.views={data.views} without refine=region", "add refine=region"
         raise UserError(problem, "both options, or templates=[near,far]", fix)
-    write_config(run_dir, asked.plain)
+    write_config(run_dir, options.plain)
     fingerprint = "" if checkpoint is None else checkpoint.data_fingerprint
     write_environment(run_dir, data.eval_seed, fingerprint)
     parts = parts_of(loaded, data)
@@ -135,25 +135,25 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
         display.console.print(share)
     if checkpoint is not None:
         warn_of_other_images(checkpoint, data, parts)
-    if asked.tune:
-        _tune_only(asked, loaded, parts, data, run_dir)
+    if options.tune:
+        _tune_only(options, loaded, parts, data, run_dir)
         return []
-    estimators, files = _methods(asked, loaded, parts)
+    estimators, files = _methods(options, loaded, parts)
     without_parts = None
-    if asked.negatives is not None:
-        camera = None if asked.negatives_camera is None else Path(asked.negatives_camera)
-        without_parts = frames_without_parts(Path(asked.negatives), camera, data, parts)
+    if options.negatives is not None:
+        camera = None if options.negatives_camera is None else Path(options.negatives_camera)
+        without_parts = frames_without_parts(Path(options.negatives), camera, data, parts)
     reports = measure_and_record(
         estimators,
         parts,
         data,
         run_dir,
-        asked.num_pictures,
+        options.num_pictures,
         results=files,
-        bop_csv=asked.bop_csv,
-        all_measures=asked.all_measures,
-        protocols=asked.protocols,
-        refine=asked.refine,
+        bop_csv=options.bop_csv,
+        all_measures=options.all_measures,
+        protocols=options.protocols,
+        refine=options.refine,
         without_parts=without_parts,
     )
     described = main_report(of_networks(reports, len(files)))
@@ -161,33 +161,33 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     return reports
 
 
-def _load(asked: EvaluationConfig) -> list[PoseEstimator]:
+def _load(options: EvaluationConfig) -> list[PoseEstimator]:
     """Load the baseline and the checkpoint, if given."""
-    paths = [path for path in (asked.baseline, asked.ckpt_path) if path is not None]
-    device = asked.device
+    paths = [path for path in (options.baseline, options.ckpt_path) if path is not None]
+    device = options.device
     if device == "auto":
         exported = any(is_export(Path(path)) for path in paths)
         device = "cuda" if torch.cuda.is_available() and not exported else "cpu"
-    return [PoseEstimator.load(path, device, scale_error=asked.scale_error) for path in paths]
+    return [PoseEstimator.load(path, device, scale_error=options.scale_error) for path in paths]
 
 
 def _methods(
-    asked: EvaluationConfig, loaded: Sequence[PoseEstimator], parts: Parts
+    options: EvaluationConfig, loaded: Sequence[PoseEstimator], parts: Parts
 ) -> tuple[dict[str, PoseEstimator], dict[str, Path]]:
     """Return all estimators and files of poses, by name."""
     estimators = list(loaded)
     names = [str(estimator.checkpoint.data.get("name", "estimate")) for estimator in loaded]
     files: dict[str, Path] = {}
-    if asked.templates is not None:
+    if options.templates is not None:
         position = max(len(loaded) - 1, 0)  # metrics.json describes the last estimator
         names.insert(position, TEMPLATES)
         templates = TemplateEstimator.of_parts(
-            parts, asked.templates, scale_error=asked.scale_error
+            parts, options.templates, scale_error=options.scale_error
         )
         estimators.insert(position, templates)
-    if asked.results is not None:  # BOP file names begin with the name of the method
-        file = Path(asked.results)
-        names.append(file.stem.partition("_")[0] if asked.method is None else str(asked.method))
+    if options.results is not None:  # BOP file names begin with the name of the method
+        file = Path(options.results)
+        names.append(file.stem.partition("_")[0] if options.method is None else str(options.method))
         files = {names[-1]: file}
     for number, name in enumerate(names[:-1]):
         if name in names[number + 1 :]:
@@ -195,47 +195,47 @@ def _methods(
     return dict(zip(names, estimators, strict=False)), files
 
 
-def _check_combination(asked: EvaluationConfig) -> None:
+def _check_combination(options: EvaluationConfig) -> None:
     """Check for options that exclude or require each other.
 
     Raises:
         UserError: Two options exclude each other, or a required option is missing.
     """
-    has_network = asked.ckpt_path is not None or asked.baseline is not None
-    if asked.ckpt_path is None and asked.results is None and asked.templates is None:
+    has_network = options.ckpt_path is not None or options.baseline is not None
+    if options.ckpt_path is None and options.results is None and options.templates is None:
         fix = "add ckpt_path=FILE for a checkpoint, results=FILE for a file of poses, or "
         fix += "templates=[0.3,0.5] for the meshes alone"
         allowed = "one or more of ckpt_path=…, results=… and templates=…"
         raise UserError("no method to measure", allowed, fix)
-    if asked.refine is not None and not has_network:
+    if options.refine is not None and not has_network:
         allowed = "refine=… together with ckpt_path=… (poses from a file are not refined)"
         fix = "leave out refine, or add ckpt_path"
-        raise UserError(f"refine={asked.refine} without ckpt_path", allowed, fix)
-    if asked.scale_error is not None and asked.refine is None and asked.templates is None:
+        raise UserError(f"refine={options.refine} without ckpt_path", allowed, fix)
+    if options.scale_error is not None and options.refine is None and options.templates is None:
         fix = "add refine=region, or leave out scale_error"
         raise UserError(
-            f"scale_error={asked.scale_error} without refine", "both options together", fix
+            f"scale_error={options.scale_error} without refine", "both options together", fix
         )
-    if asked.negatives_camera is not None and asked.negatives is None:
+    if options.negatives_camera is not None and options.negatives is None:
         fix = "add negatives=FOLDER, or leave out negatives_camera"
         raise UserError(
-            f"negatives_camera={asked.negatives_camera} without negatives",
+            f"negatives_camera={options.negatives_camera} without negatives",
             "both options together",
             fix,
         )
-    if asked.negatives is not None and not has_network and asked.templates is None:
+    if options.negatives is not None and not has_network and options.templates is None:
         fix = "add ckpt_path, or leave out negatives (a file has no poses on these pictures)"
         raise UserError(
-            f"negatives={asked.negatives} without ckpt_path", "both options together", fix
+            f"negatives={options.negatives} without ckpt_path", "both options together", fix
         )
-    if asked.tune and (asked.protocols or asked.negatives is not None or asked.templates):
+    if options.tune and (options.protocols or options.negatives is not None or options.templates):
         problem = "tune=true with shading, scale, by, negatives or templates"
         fix = "tune first, then measure"
         raise UserError(problem, "tune=true without these options", fix)
 
 
 def _tune_only(
-    asked: EvaluationConfig,
+    options: EvaluationConfig,
     loaded: Sequence[PoseEstimator],
     parts: Parts,
     data: DataConfig,
@@ -246,20 +246,22 @@ def _tune_only(
     Raises:
         UserError: Other options are given, or there is not exactly one checkpoint.
     """
-    if asked.protocols:
+    if options.protocols:
         raise UserError(
             "tune=true with shading, scale or by",
             "tune=true without these options",
             "tune first, then measure the tuned checkpoint with these options",
         )
-    if asked.ckpt_path is None or len(loaded) > 1:
-        is_missing = asked.ckpt_path is None
+    if options.ckpt_path is None or len(loaded) > 1:
+        is_missing = options.ckpt_path is None
         problem = f"tune=true {'without ckpt_path' if is_missing else 'with a baseline'}"
         fix = "add ckpt_path=FILE" if is_missing else "leave out baseline"
         raise UserError(problem, "one ckpt_path, and no baseline", fix)
     if not isinstance(loaded[0].network, PoseNetwork):
         fix = "tune the checkpoint, then export the tuned checkpoint"
-        raise UserError(f"tune=true of {asked.ckpt_path}, which is an export", "a checkpoint", fix)
-    estimator = refining(loaded[0], asked.refine, parts)
-    tune_and_record(estimator, Path(asked.ckpt_path), parts, data, run_dir, asked)
+        raise UserError(
+            f"tune=true of {options.ckpt_path}, which is an export", "a checkpoint", fix
+        )
+    estimator = refining(loaded[0], options.refine, parts)
+    tune_and_record(estimator, Path(options.ckpt_path), parts, data, run_dir, options)
     display.show_files(run_dir)

@@ -43,7 +43,7 @@ def tracked(config: RunConfig, run_dir: Path) -> Iterator[list[GuardedLogger]]:
     chosen = [override for override in overrides_of(run_dir) if not override.startswith(_UNSAID)]
     name = " ".join([config.model.name, config.data.name, *chosen])
     group = run_dir.resolve().parent.name if run_dir.name.isdigit() else None
-    begun = _begun_id(run_dir) if config.resume is not None else None
+    begun = _interrupted_id(run_dir) if config.resume is not None else None
     with _open(config.logger, run_dir, name, group, "train", begun) as trackers:
         yield trackers
 
@@ -76,7 +76,7 @@ def _open(
             tracker.close(failed)
 
 
-def _begun_id(run_dir: Path) -> str | None:
+def _interrupted_id(run_dir: Path) -> str | None:
     """Return the Weights & Biases id of an interrupted run, or None."""
     folders = sorted((run_dir / "wandb").glob("*run-*-*"), key=lambda path: path.stat().st_mtime)
     match = re.fullmatch(r"(?:offline-)?run-\d+_\d+-(\w+)", folders[-1].name) if folders else None

@@ -63,7 +63,7 @@ from dopepp.training.loggers import GuardedLogger
 from dopepp.training.pose_validation import EarlyStop
 from dopepp.training.processes import ProcessDiedError
 from dopepp.training.pruning import PrunedError, raise_if_pruned
-from dopepp.training.run_checkpoints import FOLDER, check_room, newest_checkpoint, saved_step
+from dopepp.training.run_checkpoints import FOLDER, check_free_space, newest_checkpoint, saved_step
 from dopepp.training.system import PoseSystem
 from dopepp.training.throughput import FOLDER as PROFILE
 from dopepp.training.throughput import profile_rows
@@ -163,7 +163,7 @@ def _train(
     # Lightning may reject the options, so the trainer is built before anything is written.
     trainer = build_trainer(config, run_dir, trackers=trackers)
     weights = system.network.state_dict().values()
-    check_room(run_dir, sum(value.numel() * value.element_size() for value in weights))
+    check_free_space(run_dir, sum(value.numel() * value.element_size() for value in weights))
     display.show_config(config.plain)
     for change in changes:
         display.console.print(f"changed since the run began: {change}")
@@ -183,7 +183,7 @@ def _train(
     raise_if_pruned(trainer)
     if not trainer.is_global_zero:
         raise SystemExit(0)  # only the first process measures and reports
-    _say_how_it_ended(trainer, run_dir)
+    _print_outcome(trainer, run_dir)
     report = _measure_run(config, parts, run_dir, trainer)
     log_report(trackers, report, run_dir)
     if not config.keep_checkpoints:
@@ -214,7 +214,7 @@ def _fit(
         raise RunError(f"{error}; {advice}") from error
 
 
-def _say_how_it_ended(trainer: Trainer, run_dir: Path) -> None:
+def _print_outcome(trainer: Trainer, run_dir: Path) -> None:
     """Print the reason for early stopping, and the profile."""
     for stopping in trainer.early_stopping_callbacks:
         if isinstance(stopping, EarlyStop) and stopping.impatient:

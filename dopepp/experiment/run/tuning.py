@@ -104,7 +104,7 @@ class Scored:
         """Return which images show objects that resemble the parts."""
         return np.array([kind == LOOKALIKES for kind in self.kinds], bool)
 
-    def loudest(self, scores: Float[np.ndarray, "n"]) -> Float[np.ndarray, "images"]:
+    def best_scores(self, scores: Float[np.ndarray, "n"]) -> Float[np.ndarray, "images"]:
         """Return the best score in every image; 0 without a detection."""
         best = np.zeros(self.num_images)
         np.maximum.at(best, self.image, scores)
@@ -166,7 +166,7 @@ def tune(
     before = _measured(plain, parts, test, empty_test, old)
     new, shown, kept = _chosen_factors(estimator, parts, validation, empty, rate, old)
     if estimator.refiner is not None and estimator.refiner.verifies:
-        estimator.recovery = _audible(new)
+        estimator.recovery = _without_thresholds(new)
         without = score_images(estimator, parts, empty)
         factor = fit_refined_factor(estimator, parts, validation)
         new = replace(new, **choose(shown, without, rate, refined=True))  # type: ignore[arg-type]
@@ -198,17 +198,17 @@ def _chosen_factors(
         empty string if they were replaced).
     """
     plain = _without_refinement(estimator)
-    plain.recovery = replace(_audible(old), distance_factor=1.0, covariance_factor=1.0)
+    plain.recovery = replace(_without_thresholds(old), distance_factor=1.0, covariance_factor=1.0)
     factors = fit_factors(matched_poses(plain, parts, validation))
     results: list[tuple[RecoveryOptions, Scored, float]] = []
     for base in (replace(old, **factors), old):  # type: ignore[arg-type]
-        plain.recovery = _audible(base)
+        plain.recovery = _without_thresholds(base)
         with_objects, without = (
             score_images(plain, parts, source) for source in (validation, empty)
         )
         # Undo former tuning of refined poses: their score is fitted to the untuned verification.
         options = replace(base.unrefined(), **choose(with_objects, without, rate))  # type: ignore[arg-type]
-        estimator.recovery = _audible(options)
+        estimator.recovery = _without_thresholds(options)
         shown = score_images(estimator, parts, validation)
         results.append((options, shown, shown.average_precision(shown.scores)))
     (new, shown_new, fitted), (same, shown_same, former) = results
@@ -219,7 +219,7 @@ def _chosen_factors(
     return same, shown_same, kept
 
 
-def _audible(options: RecoveryOptions) -> RecoveryOptions:
+def _without_thresholds(options: RecoveryOptions) -> RecoveryOptions:
     """Return options without thresholds, under which every detection is reported."""
     return replace(options, min_score=0.0, refined_min_score=0.0)
 
@@ -232,7 +232,7 @@ def _measured(
     options: RecoveryOptions,
 ) -> Figures:
     """Return the figures of options on test images."""
-    estimator.recovery = _audible(options)
+    estimator.recovery = _without_thresholds(options)
     shown, without = (score_images(estimator, parts, source) for source in (test, empty))
     estimator.recovery = options
     return _figures(shown, without, estimator.min_score)
@@ -332,14 +332,14 @@ def choose(
         )
     else:
         weights = fit_weights(features, correct, usual)
-    loudest = empty.loudest(score(empty.features, weights))[~empty.shows_lookalikes()]
-    loudest = np.sort(loudest)[::-1]
-    allowed = int(false_positive_rate * len(loudest))
+    best = empty.best_scores(score(empty.features, weights))[~empty.shows_lookalikes()]
+    best = np.sort(best)[::-1]
+    allowed = int(false_positive_rate * len(best))
     # A score equal to the threshold passes, so it lies just above the first rejected score.
-    threshold = float(np.nextafter(loudest[allowed], 1.0)) if allowed < len(loudest) else 0.0
+    threshold = float(np.nextafter(best[allowed], 1.0)) if allowed < len(best) else 0.0
     names = ["min_score", *(f"score_{feature}" for feature in FEATURES)]
     if refined:
-        threshold = _refined_threshold(threshold, shown, weights) if allowed < len(loudest) else 0.0
+        threshold = _refined_threshold(threshold, shown, weights) if allowed < len(best) else 0.0
         names = [f"refined_{name}" for name in ("min_score", *REFINED_FEATURES)]
     return dict(zip(names, [threshold, *map(float, weights)], strict=True))
 
@@ -468,7 +468,7 @@ def _figures(test: Scored, empty: Scored, threshold: float) -> Figures:
     """Return the figures of detections on test images with and without objects."""
     scores, correct = torch.from_numpy(test.scores), torch.from_numpy(test.correct)
     error = expected_calibration_error(scores, correct)
-    loud = empty.loudest(np.where(empty.scores >= threshold, 1.0, 0.0))
+    loud = empty.best_scores(np.where(empty.scores >= threshold, 1.0, 0.0))
     reported = test.scores >= threshold
     right = float((test.correct & reported).sum())
     recall, precision = right / max(test.num_instances, 1), right / max(int(reported.sum()), 1)

@@ -112,7 +112,7 @@ def is_remote(hydra: Any) -> bool:
 
 
 @contextmanager
-def own_output(path: Path) -> Iterator[None]:
+def redirected_output(path: Path) -> Iterator[None]:
     """Append the output of this process and its children to a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     before = [os.dup(number) for number in _STANDARD_OUT_AND_ERROR]
@@ -133,7 +133,7 @@ def _redirect(targets: list[int]) -> None:
         os.dup2(target, number)
 
 
-def goes_on(config: Mapping[str, Any], run_dir: Path) -> bool:
+def can_resume(config: Mapping[str, Any], run_dir: Path) -> bool:
     """Return whether a job was interrupted in this folder with the same config.
 
     Requeued SLURM jobs and restarted searches continue in their folder.
@@ -174,14 +174,14 @@ def requeue() -> str:
     return f"SLURM requeues job {job}"
 
 
-def remember_run(command: Sequence[str], run_dir: Path) -> None:
+def record_run(command: Sequence[str], run_dir: Path) -> None:
     """Store the run folder of this SLURM job and command; do nothing outside SLURM."""
     note = _note(command)
     if note is not None:
         write_whole(note, f"{run_dir.absolute()}\n".encode())
 
 
-def begun_run(command: Sequence[str]) -> Path | None:
+def requeued_run(command: Sequence[str]) -> Path | None:
     """Return the run folder of this command if the SLURM job was requeued, else None."""
     note = _note(command)
     restarts = os.environ.get("SLURM_RESTART_COUNT", "0")

@@ -23,7 +23,7 @@ def word(*samples: Sample) -> str:
     fingerprint = Fingerprint([pivconnector()])
     for sample in samples:
         fingerprint.add(sample)
-    return fingerprint.word()
+    return fingerprint.hexdigest()
 
 
 def test_the_same_images_have_one_word():
@@ -61,4 +61,4 @@ def test_number_order_and_objects_count():
     assert len({word(a), word(a, b), word(b, a), word(a, b, b)}) == 4
     fingerprint = Fingerprint([pivconnector(), servoholder()])
     fingerprint.add(a)
-    assert fingerprint.word() != word(a)
+    assert fingerprint.hexdigest() != word(a)

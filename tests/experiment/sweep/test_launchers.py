@@ -153,18 +153,18 @@ def test_joblib_wants_a_number_of_processes():
 
 def test_a_job_goes_on_in_its_folder_only_with_its_own_config(tmp_path):
     config = {"seed": 1, "model": {"width": 0.5}, "resume": None}
-    assert not multirun.goes_on(config, tmp_path)
+    assert not multirun.can_resume(config, tmp_path)
     write_config(tmp_path, {**config, "resume": "outputs/x"})
-    assert not multirun.goes_on(config, tmp_path)  # it saved nothing
+    assert not multirun.can_resume(config, tmp_path)  # it saved nothing
     (tmp_path / LAST_CHECKPOINT).parent.mkdir()
     (tmp_path / LAST_CHECKPOINT).touch()
-    assert multirun.goes_on(config, tmp_path)
-    assert not multirun.goes_on({**config, "seed": 2}, tmp_path)
-    assert not multirun.goes_on({**config, "resume": "outputs/y"}, tmp_path)
+    assert multirun.can_resume(config, tmp_path)
+    assert not multirun.can_resume({**config, "seed": 2}, tmp_path)
+    assert not multirun.can_resume({**config, "resume": "outputs/y"}, tmp_path)
 
 
 def test_what_children_print_is_in_the_file_too(tmp_path, capfd):
-    with multirun.own_output(tmp_path / "job" / "job.log"):
+    with multirun.redirected_output(tmp_path / "job" / "job.log"):
         os.write(1, b"by this process\n")
         subprocess.run(["bash", "-c", "echo by a child; echo as an error >&2"], check=True)
     os.write(1, b"after it\n")
@@ -180,15 +180,15 @@ def slurm_job(tmp_path, monkeypatch):
 
 
 def test_only_a_requeued_job_goes_on_and_with_its_own_command(slurm_job, tmp_path, monkeypatch):
-    multirun.remember_run(["seed=1"], tmp_path / "a")
-    multirun.remember_run(["seed=2"], tmp_path / "b")
-    assert multirun.begun_run(["seed=1"]) is None  # the first time: no restart
+    multirun.record_run(["seed=1"], tmp_path / "a")
+    multirun.record_run(["seed=2"], tmp_path / "b")
+    assert multirun.requeued_run(["seed=1"]) is None  # the first time: no restart
     monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
-    assert multirun.begun_run(["seed=1"]) == tmp_path / "a"
-    assert multirun.begun_run(["seed=2"]) == tmp_path / "b"
-    assert multirun.begun_run(["seed=3"]) is None
+    assert multirun.requeued_run(["seed=1"]) == tmp_path / "a"
+    assert multirun.requeued_run(["seed=2"]) == tmp_path / "b"
+    assert multirun.requeued_run(["seed=3"]) is None
     monkeypatch.setenv("SLURM_JOB_ID", "13")
-    assert multirun.begun_run(["seed=1"]) is None
+    assert multirun.requeued_run(["seed=1"]) is None
 
 
 @pytest.mark.parametrize(
