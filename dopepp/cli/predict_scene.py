@@ -65,7 +65,11 @@ def predict_scene(
         if any(source.rate is not None for source in sources):
             problem = "--views with a video, a recording or a camera"
         raise UserError(problem, "two pictures or more", "pass the pictures of one static scene")
-    shots = [poses.of(Path(frame.name)) for frame in frames]
+    paths = [Path(frame.name) for frame in frames]
+    names = [path.name for path in paths]
+    if len(set(names)) < len(names):  # pictures of one moment, in a folder for each camera
+        names = ["/".join(path.parts[-2:]) for path in paths]
+    shots = [poses.of(path) for path in paths]
     cameras: list[Camera] = []
     for frame, shot in zip(frames, shots, strict=True):
         lens = shot.camera or camera
@@ -79,7 +83,7 @@ def predict_scene(
         [shot.T_world_cam for shot in shots],
         distances=distances,
         camera_error=poses.error,
-        names=[Path(frame.name).name for frame in frames],
+        names=names,
     )
     for record in result.records():
         typer.echo(json.dumps(record, ensure_ascii=False))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import time
 
 import cv2
@@ -222,6 +223,14 @@ def test_several_views_of_a_scene(run, tmp_path):
     assert json.loads((tmp_path / "scene.json").read_text())["detections"] == [record]
     drawn = sorted(file.name for file in (tmp_path / "out").iterdir())
     assert drawn == ["0_a.png", "1_b.png"]
+    for name in views:  # as from a rig: a folder for each camera
+        (tmp_path / name[0]).mkdir()
+        shutil.copy(tmp_path / name, tmp_path / name[0] / "7.png")
+    rig = {"camera": "K.txt", "views": {name[0]: view for name, view in views.items()}}
+    (tmp_path / "rig.yaml").write_text(json.dumps(rig))
+    folders = [tmp_path / name / "7.png" for name in "ab"]
+    again = run("predict", RELEASED, *folders, "--views", tmp_path / "rig.yaml")
+    assert [view["image"] for view in json.loads(again.stdout)["views"]] == ["a/7.png", "b/7.png"]
     views["b.png"]["T_world_cam"]["matrix"][0][3] += 0.05
     path.write_text(json.dumps({"camera": "K.txt", "views": views}))
     done = run("predict", RELEASED, *pictures, "--views", path)

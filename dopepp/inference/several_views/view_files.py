@@ -64,13 +64,13 @@ class CameraPoses:
     source: str
 
     def of(self, picture: Path) -> CameraPose:
-        """Return the camera of a picture.
+        """Return the camera of a picture, named by the picture, its number or its folder.
 
         Raises:
             UserError: The file has no pose of the picture.
         """
         number = picture.stem.lstrip("0") or "0"
-        for name in (picture.name, picture.stem, number):
+        for name in (picture.name, picture.stem, number, picture.parent.name):
             if name in self.poses:
                 return self.poses[name]
         names = ", ".join(list(self.poses)[:5]) + ", …" * (len(self.poses) > 5)
