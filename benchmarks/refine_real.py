@@ -18,7 +18,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain, product
 from pathlib import Path
 from typing import NamedTuple
@@ -46,7 +46,8 @@ from dopepp.geometry.camera import (
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.refinement.refiner import Refiner
-from dopepp.inference.refinement.region import RegionRefiner, shared_errors
+from dopepp.inference.refinement.region import RegionRefiner
+from dopepp.inference.refinement.region.shared_errors import SCALE_ERROR
 from dopepp.metrics.functional import mahalanobis
 from dopepp.metrics.pose import assign
 from dopepp.parts.part import Part
@@ -99,33 +100,42 @@ def read_frames(scene: Path, half: slice) -> Iterator[Frame]:
 class DrawnStarts:
     """Starts around the published poses, or at them."""
 
-    def __init__(self, parts: dict[int, Part], from_truth: bool) -> None:
+    def __init__(
+        self, parts: dict[int, Part], limits: Sequence[float], spread: float, from_truth: bool
+    ) -> None:
         meshes = {n: part.mesh for n, part in parts.items() if part.mesh is not None}
-        self.refiners = {n: RegionRefiner(mesh.vertices, mesh.faces) for n, mesh in meshes.items()}
-        self.from_truth, self.rng = from_truth, np.random.default_rng(SEED)
+        self.refiners = {
+            (n, limit): RegionRefiner(mesh.vertices, mesh.faces, limit)
+            for (n, mesh), limit in product(meshes.items(), limits)
+        }
+        self.spread, self.from_truth = spread, from_truth
+        self.rng = np.random.default_rng(SEED)
 
     def starts(self, frame: Frame) -> Iterator[tuple[int, Transform, Transform]]:
         """Yield model number, true pose and start of every object."""
         for number, true in frame.objects:
             step = self.rng.normal(size=6)
-            step[:3] *= TURN / np.linalg.norm(step[:3])
-            step[3:] *= SHIFT / np.linalg.norm(step[3:])
+            step[:3] *= self.spread * TURN / np.linalg.norm(step[:3])
+            step[3:] *= self.spread * SHIFT / np.linalg.norm(step[3:])
             yield number, true, true if self.from_truth else moved(true, step)
 
-    def refine(self, frame: Frame, number: int, start: Transform) -> Refined:
-        """Refine a start."""
-        end = self.refiners[number].refine(frame.image, frame.K, start, COVARIANCE)
+    def refine(self, frame: Frame, number: int, start: Transform, limit: float) -> Refined:
+        """Refine a start; ``limit`` is the largest relative error of the scale."""
+        refiner = self.refiners[number, limit]
+        end = refiner.refine(frame.image, frame.K, start, self.spread**2 * COVARIANCE)
         return Refined(start, end.T_cam_obj, end.covariance)
 
 
 class NetworkStarts:
     """Detections of a network as starts, with the corrections of its checkpoint."""
 
-    def __init__(self, parts: dict[int, Part], checkpoint: str) -> None:
+    def __init__(self, parts: dict[int, Part], limits: Sequence[float], checkpoint: str) -> None:
         self.estimator = PoseEstimator.load(checkpoint)
         names = [part.name for part in self.estimator.parts]
         self.parts = {n: part for n, part in parts.items() if part.name in names}
-        self.refiner = Refiner("region", list(self.parts.values()))
+        self.refiners = {
+            limit: Refiner("region", list(self.parts.values()), limit) for limit in limits
+        }
 
     def starts(self, frame: Frame) -> Iterator[tuple[int, Transform, Detection]]:
         """Yield model number, true pose and detection of every object that is detected."""
@@ -141,9 +151,9 @@ class NetworkStarts:
                 if index >= 0:
                     yield number, poses[index], detection
 
-    def refine(self, frame: Frame, number: int, start: Detection) -> Refined:
-        """Refine a start."""
-        end = self.refiner(start, frame.image, frame.K, None)
+    def refine(self, frame: Frame, number: int, start: Detection, limit: float) -> Refined:
+        """Refine a start; ``limit`` is the largest relative error of the scale."""
+        end = self.refiners[limit](start, frame.image, frame.K, None)
         return Refined(start.T_cam_obj, end.T_cam_obj, None if end.kept else end.covariance)
 
 
@@ -189,8 +199,11 @@ def main() -> None:
         "--scale-errors",
         type=float,
         nargs="+",
-        default=[shared_errors.SCALE_ERROR],
-        help="values of SCALE_ERROR to compare; 1e-6 trusts the outline's distance",
+        default=[SCALE_ERROR],
+        help="largest relative errors of the scale to compare; 1e-6 trusts the outline's distance",
+    )
+    parser.add_argument(
+        "--spread", type=float, default=1.0, help="factor on the errors of drawn starts"
     )
     parser.add_argument("--from-truth", action="store_true", help="start at the published poses")
     parser.add_argument(
@@ -203,9 +216,10 @@ def main() -> None:
     parts = parts_by_id(arguments.folder, bop_parts(arguments.folder))
     method: DrawnStarts | NetworkStarts
     if arguments.checkpoint is None:
-        method = DrawnStarts(parts, arguments.from_truth)
+        spread, from_truth = arguments.spread, arguments.from_truth
+        method = DrawnStarts(parts, arguments.scale_errors, spread, from_truth)
     else:
-        method = NetworkStarts(parts, arguments.checkpoint)
+        method = NetworkStarts(parts, arguments.scale_errors, arguments.checkpoint)
     scenes = sorted((arguments.folder / arguments.split).iterdir())
     frames = chain.from_iterable(read_frames(scene, HALVES[arguments.half]) for scene in scenes)
     starts = [(frame, *start) for frame in frames for start in method.starts(frame)]
@@ -214,9 +228,8 @@ def main() -> None:
     for limit, (count, (frame, number, true, start)) in product(
         arguments.scale_errors, enumerate(starts)
     ):
-        shared_errors.SCALE_ERROR = limit  # type: ignore[misc]
         part, began = parts[number], time.process_time()
-        pose = method.refine(frame, number, start)  # type: ignore[arg-type]
+        pose = method.refine(frame, number, start, limit)  # type: ignore[arg-type]
         took = 1e3 * (time.process_time() - began)
         group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
         before, after = (
