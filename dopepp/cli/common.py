@@ -58,7 +58,7 @@ MaxMs = Annotated[
 
 ScaleError = Annotated[
     float | None,
-    Option(help="Largest relative error of part size or focal length (default: 0.01)."),
+    Option(help="Largest relative error of part size or focal length (default: 0.005)."),
 ]
 
 Track = Annotated[bool, Option("--track", help="Track the parts from frame to frame.")]

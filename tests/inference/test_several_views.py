@@ -67,12 +67,14 @@ def errors(T: np.ndarray, true: np.ndarray) -> tuple[float, float, float]:
 def test_a_second_view_fixes_the_distance(estimator, scene, views, true):
     images, poses = views
     (alone,) = estimator.predict(images[0], scene.K)
-    before = errors(alone.T_cam_obj, true)
+    ray = true[:3, 3] / np.linalg.norm(true[:3, 3])
+    variance_alone = float(ray @ alone.covariance[3:, 3:] @ ray)
     for count in (2, 3):
         result = estimator.predict_views(images[:count], [scene.K] * count, poses[:count])
         (detection,) = result.detections
         turn, along, across = errors(detection.T_world_obj, true)
-        assert along < 0.3 < 0.5 < before[1]
+        assert along < 0.3
+        assert ray @ detection.covariance[3:, 3:] @ ray < 0.7 * variance_alone
         assert across < 0.3
         assert turn < 0.4
         assert not result.findings
