@@ -34,6 +34,7 @@ from dopepp.experiment.assembly.negative_frames import LOOKALIKES, negative_fram
 from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.config.run_config import FalsePositiveTarget
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.refinement.region.shared_errors import SCALE_ERROR
 from dopepp.inference.runtimes import Runtime
 from dopepp.metrics.functional import (
     add,
@@ -168,7 +169,7 @@ def tune(
     if estimator.refiner is not None and estimator.refiner.verifies:
         estimator.recovery = _without_thresholds(new)
         without = score_images(estimator, parts, empty)
-        factor = fit_refined_factor(estimator, parts, validation)
+        factor = fit_refined_factor(estimator, parts, WrongFocalLengths(validation))
         new = replace(new, **choose(shown, without, rate, refined=True))  # type: ignore[arg-type]
         new = replace(new, refined_covariance_factor=factor)
     after = _measured(estimator, parts, test, empty_test, new)
@@ -254,6 +255,35 @@ def fit_factors(
     distance = fit_distance_factor(estimated, true)
     covariance = fit_covariance_factor(squared_distances(pairs, distance))
     return {"distance_factor": distance, "covariance_factor": covariance}
+
+
+@dataclass(frozen=True)
+class WrongFocalLengths:
+    """Images of a source with a camera matrix as a calibration may state it.
+
+    The relative error of the focal length is uniformly distributed up to the scale error that
+    refinement assumes. With exact cameras, covariances would be fitted to errors that no real
+    camera reaches.
+    """
+
+    source: SampleSource
+
+    @property
+    def name(self) -> str:
+        """Name of the source."""
+        return self.source.name
+
+    def __len__(self) -> int:
+        """Return the number of images."""
+        return len(self.source)
+
+    def sample(self, index: int, epoch: int = 0) -> Sample:
+        """Return an image with its wrong camera matrix, equal in every call."""
+        sample = self.source.sample(index, epoch)
+        error = np.random.default_rng(index).uniform(-SCALE_ERROR, SCALE_ERROR)
+        K = sample.K.copy()
+        K[[0, 1], [0, 1]] *= 1.0 + error
+        return replace(sample, K=K)
 
 
 def fit_refined_factor(estimator: PoseEstimator, parts: Parts, source: SampleSource) -> float:

@@ -1,5 +1,6 @@
 """Weights and threshold from detections; the tuned checkpoint beside the old one."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_array_equal
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample
@@ -16,6 +18,7 @@ from dopepp.experiment.run.tuning import (
     LEAST_REFINED_SCORE,
     MOST_LOST,
     Scored,
+    WrongFocalLengths,
     choose,
     fit_factors,
     fit_refined_factor,
@@ -26,6 +29,7 @@ from dopepp.experiment.run.tuning import (
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.refinement.region.shared_errors import SCALE_ERROR
 from dopepp.metrics.functional import expected_calibration_error
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.network import build_network
@@ -208,6 +212,19 @@ def test_the_factor_of_refined_poses_is_that_of_the_right_ones():
     estimator = Refining(true=0.4)
     factor = fit_refined_factor(estimator, [PART], Many(250))  # type: ignore[arg-type]
     assert factor == pytest.approx(0.4, rel=0.15)
+
+
+def test_the_focal_length_is_wrong_by_up_to_the_scale_error():
+    source = WrongFocalLengths(Many(200))
+    cameras = [source.sample(index).K for index in range(len(source))]
+    errors = np.array([camera[0, 0] / K[0, 0] - 1 for camera in cameras])
+    assert np.abs(errors).max() <= SCALE_ERROR
+    assert np.std(errors) == pytest.approx(SCALE_ERROR / math.sqrt(3), rel=0.1)
+    assert abs(np.mean(errors)) < 3 * SCALE_ERROR / math.sqrt(3 * 200)
+    again = source.sample(7).K
+    assert_array_equal(again, cameras[7])
+    assert again[1, 1] / K[1, 1] == pytest.approx(again[0, 0] / K[0, 0])
+    assert_array_equal(again[:, 2], K[:, 2])
 
 
 def test_few_refined_poses_keep_their_covariances(caplog):
