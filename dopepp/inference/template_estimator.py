@@ -166,13 +166,13 @@ class TemplateEstimator(PoseEstimator):
         for detector in self.detectors:
             poses = [end for end in refined if end.object == detector.part.name]
             for _ in range(REPEATS if self.max_ms is None else 0):
-                poses.sort(key=lambda detection: -(detection.probability or 0.0))
+                poses.sort(key=_probability, reverse=True)
                 best = poses[:NUM_REPEATED]
                 starts = [detector.start(end.T_cam_obj, end.score, K) for end in best]
                 again = super().refined(starts, image, K, depth)
                 poses[:NUM_REPEATED] = [
-                    max(pair, key=lambda end: end.probability or 0.0)
-                    for pair in zip(again, best, strict=True)
+                    new if new.kept == "" and _probability(new) > _probability(old) else old
+                    for new, old in zip(again, best, strict=True)
                 ]
             ends += poses
         return ends
@@ -229,6 +229,11 @@ class TemplateEstimator(PoseEstimator):
         raise _networks_only("belief maps")
 
 
+def _probability(detection: Detection) -> float:
+    """Return the probability of a detection; 0 if it is not verified."""
+    return detection.probability or 0.0
+
+
 def _plainness(detector: TemplateDetector, detection: Detection) -> float:
     """Return the log odds that a pose with a small silhouette must have in addition.
 
@@ -254,7 +259,7 @@ def _loudest(
     levels = []
     for image in images:
         ends = estimator.refined(detector.detect(image, K, depths), image, K)
-        odds = [log_odds(end.probability or 0.0) - _plainness(detector, end) for end in ends]
+        odds = [log_odds(_probability(end)) - _plainness(detector, end) for end in ends]
         levels.append(max(odds, default=0.0))
     return levels
 
