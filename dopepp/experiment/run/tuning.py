@@ -257,7 +257,6 @@ def fit_factors(
     return {"distance_factor": distance, "covariance_factor": covariance}
 
 
-@dataclass(frozen=True)
 class WrongFocalLengths:
     """Images of a source with a camera matrix as a calibration may state it.
 
@@ -266,20 +265,15 @@ class WrongFocalLengths:
     camera reaches.
     """
 
-    source: SampleSource
-
-    @property
-    def name(self) -> str:
-        """Name of the source."""
-        return self.source.name
+    def __init__(self, source: SampleSource) -> None:
+        self._source, self.name = source, source.name
 
     def __len__(self) -> int:
-        """Return the number of images."""
-        return len(self.source)
+        return len(self._source)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Return an image with its wrong camera matrix, equal in every call."""
-        sample = self.source.sample(index, epoch)
+        sample = self._source.sample(index, epoch)
         error = np.random.default_rng(index).uniform(-SCALE_ERROR, SCALE_ERROR)
         K = sample.K.copy()
         K[[0, 1], [0, 1]] *= 1.0 + error
