@@ -53,7 +53,8 @@ def predict_scene(
         json_file: File for a line of JSON; None writes none.
 
     Raises:
-        UserError: There are fewer than two pictures, or a picture has no pose or no camera.
+        UserError: There are fewer than two pictures, a source is not a still picture, or a picture
+            has no pose or no camera.
     """
     from dopepp.core.files import write_whole
     from dopepp.inference.several_views.view_files import read_camera_poses

@@ -70,7 +70,7 @@ class Range:
         return f"{noun} from {self.lowest:{form}} to {self.highest:{form}}{self._unit}"
 
     def holds(self, value: Any) -> bool:
-        """Return whether a number, or every number of a tuple, is inside."""
+        """Return whether a number, or every number of a tuple, is within the range."""
         numbers = value if isinstance(value, tuple) else (value,)
         return all(self.lowest <= number <= self.highest for number in numbers)
 
@@ -103,7 +103,7 @@ class Span(Range):
         return f"(smallest, largest) with {bounds}{self._unit}"
 
     def holds(self, value: Any) -> bool:
-        """Return whether both numbers are inside and in ascending order."""
+        """Return whether both numbers are within the range and in ascending order."""
         smallest, largest = value
         return bool(self.lowest <= smallest <= largest <= self.highest)
 

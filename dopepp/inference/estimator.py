@@ -308,7 +308,12 @@ class PoseEstimator:
         return merge_scales(scales)
 
     def _recalibrated(self, refined: Sequence[Detection], by_depth: bool) -> list[Detection]:
-        """Return refined detections with their scores and covariances, best first."""
+        """Replace scores and covariances by those fitted for refined poses; sort by score.
+
+        Args:
+            refined: Detections after refinement and verification.
+            by_depth: Whether a depth image was used for refinement.
+        """
         return recalibrated(refined, self.recovery, by_depth)
 
     @property

@@ -163,7 +163,16 @@ def read_depth_image(path: Path, scale: float) -> Depth32:
 
 
 def undistorted_depth(depth: Depth32, K: CameraMatrix, distortion: Coefficients) -> Depth32:
-    """Undistort depth by its nearest pixel, because a mean of two depths lies on no surface."""
+    """Undistort a depth image.
+
+    Nearest-neighbour interpolation is used, because the mean of depths on both sides of an edge is
+    the depth of neither surface.
+
+    Args:
+        depth: Depth image, metres.
+        K: Camera matrix of the input and the output, pixels.
+        distortion: Distortion coefficients in OpenCV's order.
+    """
     size = depth.shape[::-1]
     maps = cv2.initUndistortRectifyMap(K, distortion, np.eye(3), K, size, cv2.CV_32FC1)
     return np.asarray(cv2.remap(depth, *maps, cv2.INTER_NEAREST), np.float32)

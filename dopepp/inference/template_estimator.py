@@ -206,12 +206,20 @@ class TemplateEstimator(PoseEstimator):
 
     @property
     def network(self) -> NoReturn:  # type: ignore[override]
-        """Raise a UserError: templates have no network."""
+        """Not available.
+
+        Raises:
+            UserError: Templates have no network.
+        """
         raise _networks_only("a network")
 
     @property
     def checkpoint(self) -> Checkpoint:  # type: ignore[override]
-        """Raise a UserError: templates have no checkpoint."""
+        """Not available.
+
+        Raises:
+            UserError: Templates have no checkpoint.
+        """
         raise _networks_only("a checkpoint")
 
     def views(
@@ -221,11 +229,19 @@ class TemplateEstimator(PoseEstimator):
         distances: Distances | None = None,
         roi: Region | None = None,
     ) -> list[NetworkView]:
-        """Raise a UserError: templates have no network."""
+        """Not available.
+
+        Raises:
+            UserError: Templates have no network.
+        """
         raise _networks_only("inputs of a network")
 
     def maps(self, image: Picture) -> NoReturn:
-        """Raise a UserError: templates have no belief maps."""
+        """Not available.
+
+        Raises:
+            UserError: Templates have no belief maps.
+        """
         raise _networks_only("belief maps")
 
 

@@ -224,7 +224,11 @@ def _is_listening(port: int) -> bool:
 
 
 def _blueprint(distance: float) -> Any:
-    """Arrange space on the left, image and beliefs on the right."""
+    """Return the layout: a 3D view on the left; image, belief maps and summary on the right.
+
+    Args:
+        distance: Distance of the parts from the camera, metres.
+    """
     import rerun.blueprint as rrb
 
     eye = rrb.EyeControls3D(

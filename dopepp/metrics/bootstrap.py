@@ -238,11 +238,12 @@ def _stretching(
 
 
 def _num_differing(mine: Numbers, baseline: Numbers) -> int:
-    """Count the instances whose numbers, sorted over seeds, differ between the methods."""
+    """Count the instances whose mean over seeds differs between the methods."""
     count = 0
     for ours, theirs in zip(mine, baseline, strict=True):
         finite = [np.where(np.isfinite(v), v, np.inf) for v in (ours, theirs)]
         means = [np.sort(values, axis=0).mean(axis=0) for values in finite]
-        # Means of equal numbers over different numbers of seeds may differ by rounding.
+        # Values are sorted, because the order of a sum changes its rounding. The tolerance covers
+        # the rounding of means over different numbers of seeds.
         count += int((~np.isclose(means[0], means[1], rtol=1e-12, atol=0)).sum())
     return count

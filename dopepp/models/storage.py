@@ -144,7 +144,7 @@ def read_mapping(path: Path, what: str) -> dict[Any, Any]:
         raise UserError(problem, what, fix) from error
     if not isinstance(content, dict):
         fix = "pass a file of this kind"
-        raise UserError(f"{path} with a {type(content).__name__} in it", what, fix)
+        raise UserError(f"{path}, which contains a {type(content).__name__}", what, fix)
     return content
 
 

@@ -1,8 +1,9 @@
 """The factory: renders image ``(epoch, index)`` of an endless, reproducible supply.
 
-A scale renders the same scene from nearer or farther (paper Fig. 11). The camera moves along the
-ray to the middle of the targets and keeps its orientation and lens. Objects, lamps and the plane
-stay in the world; ambient light and the background of floating objects are infinitely far away.
+A scale renders the same scene from closer or farther away (paper Fig. 11). The camera moves along
+the ray to the middle of the targets and keeps its orientation and lens. Objects, lamps and the
+plane stay in the world; ambient light and the background of floating objects are infinitely far
+away.
 """
 
 from __future__ import annotations
@@ -130,7 +131,11 @@ class Factory:
         return high[0] if high else cameras[int(np.argmax(heights))]
 
     def scene(self, epoch: int, index: int, scale: float = 1.0) -> Scene:
-        """Return the scene of an image without rendering it."""
+        """Return the scene of an image without rendering it.
+
+        Raises:
+            UserError: No target fits into a scene, or the camera is below the parts at this scale.
+        """
         preset, backgrounds = self.preset, self.backgrounds
         rng = np.random.default_rng([self.seed, epoch, index])
         if any(preset.clutter) or preset.background_contrast != (1.0, 1.0):

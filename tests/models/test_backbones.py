@@ -113,7 +113,7 @@ def test_a_file_of_something_else_is_refused(tmp_path, torchvision):
     for content, message in (
         (renamed, r"got nothing under features\.0\.weight in .*vgg19\.pth"),
         (other_shape, r"\(128, 64, 1, 1\) under features\.5\.weight"),
-        ([1, 2], "with a list in it"),
+        ([1, 2], "which contains a list"),
     ):
         torch.save(content, path)
         with pytest.raises(UserError, match=message):

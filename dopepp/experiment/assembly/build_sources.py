@@ -269,9 +269,9 @@ def fitted_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
     largest = view.sizes_px(parts, scale)[1]
     if largest > min(size):
         raise UserError(
-            f"data.input_size={list(size)} for parts of {largest:.0f} pixels across",
-            "an input size above the size of the parts",
-            "leave data.input_size=null, or set a smaller virtual.camera_scale",
+            f"data.input_size={list(size)} for parts {largest:.0f} pixels across",
+            f"width and height of at least {largest:.0f} pixels",
+            "set data.input_size=null, or a smaller virtual.camera_scale",
         )
     for line in view.in_words(parts, scale, size):
         _log.info("%s", line)

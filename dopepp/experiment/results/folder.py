@@ -70,7 +70,7 @@ def read_json(path: Path) -> dict[str, Any]:
         raise UserError(f"{error.got}, unreadable", allowed, fix) from error
     if not isinstance(record, dict):
         fix = "run the training or the evaluation again"
-        raise UserError(f"{path} with a {type(record).__name__}", "a JSON object", fix)
+        raise UserError(f"{path}, which contains a {type(record).__name__}", "a JSON object", fix)
     return record
 
 

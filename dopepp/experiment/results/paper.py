@@ -273,7 +273,7 @@ def _number(value: float | None) -> str:
 
 
 def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
-    """Return pass rates at every share with the paper's figures and Δ, and draw their curves.
+    """Return the pass rates at every share with the paper's figures and Δ, and plot their curves.
 
     Rates are means over seeds. Δ refers to the first method at the same share, or to the first
     refined method for refined poses. The interval of Δ is Student's t interval of the differences
@@ -381,7 +381,10 @@ def parameter_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Pat
 
 
 def time_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
-    """Return a row per network with its times, then the paper's other methods; draw frame rates."""
+    """Return a row per network with its times, then a row per other method of the paper.
+
+    Plots of the frame rates are written to ``frame_rate.png`` in ``folder``.
+    """
     printed = f"{_PAPER}: ms/frame"
 
     def row(label: str, cost: Mapping[str, Any]) -> Row:

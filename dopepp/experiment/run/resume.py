@@ -94,7 +94,9 @@ def check_resume(
     before = read_yaml(path) if path.is_file() else config.plain
     if not isinstance(before, Mapping):
         fix = "restore the file from a copy, or start a new run"
-        raise UserError(f"{path} with a {type(before).__name__}", "a config", fix)
+        raise UserError(
+            f"{path}, which contains a {type(before).__name__}", "a mapping of options", fix
+        )
     differences = config_differences(before, config.plain)
     state = [change for change in differences if change.key == _OPTIMIZER]
     if saved.spec != payload["spec"] or state:
@@ -188,7 +190,7 @@ def read_overrides(run: Path) -> list[str] | None:
 
 
 def remember_overrides(run: Path) -> None:
-    """Store the overrides of a run atomically, unlike Hydra."""
+    """Store the overrides of a run atomically, because Hydra's own file may be truncated."""
     if not HydraConfig.initialized():
         return
     overrides = [str(text) for text in HydraConfig.get().overrides.task]

@@ -173,7 +173,11 @@ def least_farthest(
     symmetries: Affine,
     perspective: bool,
 ) -> Float[Tensor, "n"]:
-    """Return min over S of max over x of ‖π(Bx + b) − π(A(Sx) + a)‖; infinite if undefined.
+    """Return the maximum point distance under the best symmetry (MSSD, MSPD).
+
+    The distance of a pair of poses is the minimum over symmetries S of the maximum over points x of
+    ‖π(Bx + b) − π(A(Sx) + a)‖. It is infinite if a third coordinate is not positive under
+    ``perspective``.
 
     Args:
         estimated: Estimated maps (B, b).

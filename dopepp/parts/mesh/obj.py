@@ -146,7 +146,11 @@ def _texture(obj: ObjFile, path: Path) -> Picture | None:
 
 
 def _colour_maps(path: Path) -> dict[str | None, str | None]:
-    """Return the file name of each MTL material's colour map, or None."""
+    """Return the file name of the colour map, or None, for each material of an MTL file.
+
+    Raises:
+        UserError: The file is too large, or a colour map has options.
+    """
     if (size := path.stat().st_size) > MAX_MATERIAL_BYTES:
         allowed = f"up to {MAX_MATERIAL_BYTES / 1e6:.0f} MB"
         fix = "delete the materials that the mesh does not use"

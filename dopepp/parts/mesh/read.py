@@ -65,7 +65,10 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
 
 
 def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
-    """Return a mesh and the unit of its file; see :func:`read_mesh`."""
+    """Return a mesh in metres and the unit of its file.
+
+    Arguments and errors are those of :func:`read_mesh`.
+    """
     path = Path(path)
     if unit is not None and unit not in UNITS:
         fix = "set the unit in which the file was exported, e.g. unit=mm"
@@ -121,7 +124,9 @@ def ycb_part(root: str | Path, name: str) -> Part:
     if not names:
         problem, allowed = f"{root}, which has no models/NAME/points.xyz", "the root of YCB-Video"
         raise UserError(
-            problem, allowed, "set data.root to this folder, or unpack YCB_Video_Models"
+            problem,
+            allowed,
+            "set data.root to the root of YCB-Video, or unpack YCB_Video_Models into it",
         )
     if name not in names:
         fix = "set data.objects to names of this list"

@@ -65,7 +65,11 @@ class HandEye:
 
 
 def check_mount(mount: str) -> Mount:
-    """Return a valid mount, or raise :class:`UserError`."""
+    """Return a valid mount.
+
+    Raises:
+        UserError: The mount is invalid.
+    """
     if mount not in ("hand", "bench"):
         fix = "pass --mount hand for a camera on the robot, --mount bench for a fixed camera"
         raise UserError(f"--mount {mount}", "hand or bench", fix)

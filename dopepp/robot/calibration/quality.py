@@ -53,12 +53,12 @@ class Consistency:
 
     @property
     def is_rigid(self) -> bool:
-        """Whether one mount explains all motions, apart from the unit of lengths."""
+        """Whether a single mount explains all motions up to a common factor of the lengths."""
         return self.turn < TURN and self.shift < SHIFT
 
     @property
     def is_right(self) -> bool:
-        """Whether one mount explains all motions."""
+        """Whether a single mount explains all motions."""
         return self.is_rigid and 1 / SCALE < self.scale < SCALE
 
 
@@ -150,7 +150,11 @@ def check_poses(
 
 
 def _check_motion(T: Transforms, what: str, source: str) -> None:
-    """Raise a UserError for poses with equal orientations."""
+    """Check that the orientations of poses differ.
+
+    Raises:
+        UserError: The largest rotation between two poses is below ``MIN_TURN``.
+    """
     i, j = np.triu_indices(len(T), 1)
     between = T[i, :3, :3] @ T[j, :3, :3].transpose(0, 2, 1)
     largest = Rotation.from_matrix(between).magnitude().max(initial=0.0)
@@ -195,7 +199,13 @@ def _format_error(
 
 
 def _scale_error(scale: float, unit: str, source: str) -> UserError:
-    """Return the error for poses whose rotations fit and whose lengths do not."""
+    """Return the error for robot motions that agree with the camera's except for their lengths.
+
+    Args:
+        scale: Factor that corrects the robot's lengths.
+        unit: Unit in which the robot's positions were read.
+        source: File of the poses, for the message.
+    """
     factor, right = 1 / scale, _unit_of(scale, unit)
     if right is not None:
         problem = f"{source} in {unit}, which makes the robot's motions {factor:.4g} times too long"

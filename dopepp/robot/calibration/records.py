@@ -134,7 +134,11 @@ def read_points(path: Path, unit: str) -> Float[np.ndarray, "points 3"]:
 
 
 def check_unit(unit: str) -> str:
-    """Return a valid unit, or raise :class:`UserError`."""
+    """Return a valid unit.
+
+    Raises:
+        UserError: The unit is unknown.
+    """
     if unit not in UNITS:
         raise UserError(f"--unit {unit}", ", ".join(UNITS), "pass the unit, e.g. --unit mm")
     return unit
@@ -250,7 +254,11 @@ def write_calibration(
 
 
 def check_trust(findings: Sequence[str], force: bool) -> None:
-    """Refuse a calibration with findings, unless by force."""
+    """Check that a calibration has no findings.
+
+    Raises:
+        UserError: There are findings, and ``force`` is not set.
+    """
     if findings and not force:
         problem = f"a calibration that is not trustworthy: {'; '.join(findings)}"
         fix = "measure again as advised, or add --force to write it anyway"

@@ -33,7 +33,12 @@ class Tip:
 
 
 def find_tip(T_base_flange: Float[np.ndarray, "poses 4 4"]) -> Tip:
-    """Estimate the tip p from poses (R_i, t_i) that touch one point q: R_i p + t_i = q.
+    """Estimate the position of a tool's tip from poses in which the tip touches a fixed point.
+
+    The tip p (flange frame) and the point q (base frame) solve R_i p + t_i = q for all poses i.
+
+    Args:
+        T_base_flange: Poses (R_i, t_i) of the flange, metres.
 
     Raises:
         UserError: There are fewer than four poses.

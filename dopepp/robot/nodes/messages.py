@@ -93,7 +93,7 @@ class AnswerFormatter:
         self._triangles = {part.name: _triangles(part) for part in parts}
 
     def topics(self) -> list[tuple[str, str]]:
-        """Return every topic with its type, except for the diagnosis."""
+        """Return the name and message type of every topic except the diagnostics."""
         names = self._names.values()
         return [
             *((f"pose_{name}", "geometry_msgs/PoseStamped") for name in names),

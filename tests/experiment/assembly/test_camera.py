@@ -123,7 +123,7 @@ def test_on_a_table(my_part):
         ("[0.4,0.7]", ("virtual.camera=null",), "working_distance alone"),
         ("[0.4,0.7]", ("virtual.camera=/nowhere.yaml",), "camera file /nowhere.yaml"),
         ("[0.4,0.7]", ("virtual.camera_scale=1.0", "data.input_size=[128,128]"),
-         "data.input_size=[128, 128] for parts of 253 pixels across"),
+         "data.input_size=[128, 128] for parts 253 pixels across"),
         ("[0.4,0.7]", ("virtual.camera_scale=0.1",), "working_distance to 0.7 m, where"),
     ],
 )  # fmt: skip

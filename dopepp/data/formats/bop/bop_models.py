@@ -76,7 +76,7 @@ def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Pa
     infos = read_models(Path(root))
     if not infos:
         problem = f"{root}, which has no {INFO_FILE} in {', '.join(MODEL_FOLDERS)}"
-        fix = "set data.root to this folder, or unpack the data set's models into it"
+        fix = "set data.root to the root folder, or unpack the data set's models into it"
         raise UserError(problem, "the root folder of a BOP data set", fix)
     by_name = {info.name: info for info in infos.values()}
     wanted = list(objects or by_name)

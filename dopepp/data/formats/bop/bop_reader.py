@@ -276,8 +276,8 @@ def _scene_folders(root: Path, split: str) -> list[Path]:
         raise UserError(
             f"{root / split}, which is not a folder",
             f"one of {splits}" if splits else "a BOP data set's folder with its splits",
-            "set data.root or data.image_sets to this folder; without labelled images, train on "
-            "renders of the models with data=bop_renders",
+            "set data.root and data.image_sets to existing folders; without labelled images, train "
+            "on renders of the models with data=bop_renders",
         )
     folders = [p for p in (root / split).iterdir() if bop.is_number(p.name) and p.is_dir()]
     if not folders:

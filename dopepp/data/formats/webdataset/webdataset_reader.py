@@ -209,7 +209,8 @@ def _check_keys(shards: Sequence[ShardIndex]) -> None:
     for shard in shards:
         if twice := [key for key in shard.keys if key in owners]:
             other = owners[twice[0]]
-            problem = f"{shard.path} with {len(twice)} keys of {other}, e.g. {', '.join(twice[:3])}"
+            examples = ", ".join(twice[:3])
+            problem = f"{shard.path}, which repeats {len(twice)} keys of {other}, e.g. {examples}"
             fix = "delete the repeated shard, or write it again"
             raise UserError(problem, "each key in only one shard", fix)
         owners |= dict.fromkeys(shard.keys, shard.path)

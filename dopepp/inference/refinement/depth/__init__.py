@@ -244,25 +244,28 @@ def _search(
     bin_size: float,
     half: int,
     tolerance: float,
-    best: Array,
+    shift: Array,
 ) -> int:
-    """Write the shift in camera axes at which most points agree; return their number.
+    """Search the translation of a pose that agrees best with the depth image.
 
-    All shifts across the viewing axis are tried. For each of them, the points vote on the shift
-    along the axis, in ``half`` bins of ``bin_size`` on each side of the present depth. All lengths
-    are metres.
+    Shifts along x and y are tried on a grid. For each shift, the points vote on the shift along z.
+    The score is the number of votes minus penalties: for points in front of the measured surface,
+    for occluded points, for points without depth, and for the distance from the prior.
 
     Args:
-        depth: Depth image.
-        K: Camera matrix.
-        points: Visible points, camera frame.
-        information: Information of the prior about a shift.
-        moved: Shift of the present pose from the prior's.
-        step: Distance between neighbouring shifts along x and y.
-        bin_size: Size of a bin.
-        half: Bins to each side.
-        tolerance: Largest depth difference of a vote, which then has the weight 0.
-        best: Output.
+        depth: Depth image, shape (height, width), metres.
+        K: Camera matrix, shape (3, 3), pixels.
+        points: Visible points in the camera frame, shape (n, 3), metres.
+        information: Information matrix of the prior about a translation, shape (3, 3), 1/m².
+        moved: Translation from the prior's pose to the present pose, shape (3,), metres.
+        step: Distance between neighbouring shifts along x and y, metres.
+        bin_size: Size of a bin along z, metres.
+        half: Number of bins on each side of the present depth.
+        tolerance: Depth difference at which the weight of a vote falls to 0, metres.
+        shift: Output: the best shift in the camera frame, shape (3,), metres.
+
+    Returns:
+        Number of points that agree with the best shift.
     """
     rows, columns = depth.shape
     count = points.shape[0]
@@ -301,15 +304,15 @@ def _search(
                     behind += votes[k + width]
                 if near < 1.0:
                     continue
-                shift = (a * step + moved[0], b * step + moved[1], (k - half) * bin_size + moved[2])
+                dx, dy, dz = a * step, b * step, (k - half) * bin_size
+                offset = (dx + moved[0], dy + moved[1], dz + moved[2])  # from the prior's pose
                 far = 0.0
                 for m in range(3):
                     for n in range(3):
-                        far += shift[m] * information[m, n] * shift[n]
+                        far += offset[m] * information[m, n] * offset[n]
                 hidden = max(counted - near - behind, 0.0)
                 score = near - behind - HIDDEN * hidden - MISSING * missing - PENALTY * count * far
                 if score > highest:
                     highest, most = score, int(near)
-                    best[0], best[1] = a * step, b * step
-                    best[2] = (k - half) * bin_size
+                    shift[0], shift[1], shift[2] = dx, dy, dz
     return most
