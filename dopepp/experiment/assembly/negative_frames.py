@@ -75,6 +75,8 @@ def negative_frames(
         # Far from the centre, the short focal length distorts parts more than in the preset.
         near, far = view.distance
         preset = replace(preset, placement=DistancePlacement(near, far, _MARGIN))
+    if preset.table is not None:  # without physics, which look-alikes do not need
+        preset = replace(preset, table=replace(preset.table, pile=None))
     share = math.ceil(num_images / (3 if user_photos is None else 4))
 
     def whole(pictures: PhotoBackgrounds, kind: str) -> PictureFrames:

@@ -106,3 +106,15 @@ def test_a_folder_that_splits_share_is_divided():
     assert share_of({"train": "a", "val": "b", "test": "b"}, "test") == (0.5, 1.0)
     assert share_of({"train": "a", "val": "a", "test": "b"}, "val") == (0.8, 1.0)
     assert share_of({"train": "a", "val": "b", "test": "a"}, "test") == (0.8, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("seen_on", "preset", "turning"),
+    [(None, "wide", "facing"), ("front", "wide", "facing"), ("any", "wide", "free"),
+     ("table", "table", "free"), ("bin", "heap", "free")],
+)  # fmt: skip
+def test_the_recipe_for_a_part_takes_the_views_that_are_asked_for(seen_on, preset, turning, parsed):
+    chosen = () if seen_on is None else (f"seen_on={seen_on}",)
+    scenes = parsed("experiment=my_part", *chosen).data.preset
+    assert (scenes.name, scenes.turning.kind) == (preset, turning)
+    assert (scenes.table is not None) == (preset != "wide")
