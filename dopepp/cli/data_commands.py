@@ -13,7 +13,18 @@ from dopepp.cli.common import Unit, report_errors, resumable
 
 
 class RenderCommand(TyperCommand):
-    """Lists the presets in its help. The presets are read only for the help."""
+    """Lists the presets in its help, and rejects lists after ``--negatives``."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Reject names after the value of ``--negatives``, which would become targets."""
+        if args and not args[0].startswith("-"):  # the targets stand first
+            for option, value, word in zip(args, args[1:], args[2:], strict=False):
+                if option == "--negatives" and not word.startswith("-"):
+                    ctx.fail(
+                        f"got {word} after --negatives {value}; allowed: one part after each "
+                        f"--negatives; fix: write --negatives {value} --negatives {word}"
+                    )
+        return super().parse_args(ctx, args)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the help."""

@@ -161,7 +161,7 @@ def _with_mesh(part: Part, chosen: str | None, unit: str | None) -> Part:
         problem = f"no mesh of {part.name} in the checkpoint"
         raise UserError(problem, "a mesh file for every part without a mesh", fix)
     loaded = load_part(chosen, unit)
-    if part.mesh_hash and loaded.mesh_hash != part.mesh_hash:
+    if part.mesh_hash and not part.has_shape_of(loaded):
         _log.warning("the checkpoint was not trained on this mesh of %s (%s)", part.name, chosen)
     return replace(part, mesh=loaded.mesh, mesh_deviation=loaded.mesh_deviation)
 

@@ -50,6 +50,7 @@ MAX_SYMMETRIES: Final = 1000
 MAX_LIGHT_FACES: Final = 4000
 """Triangles of a record's mesh: edges of two pixels on a part of 100 pixels."""
 
+_SAME_SHAPE: Final = 0.001  # largest distance between equal surfaces, diameters
 _FARTHEST: Final = 1e6  # Largest coordinate, metres; its square stays finite
 
 
@@ -101,6 +102,24 @@ class Part:
     symmetries_discrete: Float[np.ndarray, "symmetries 4 4"] | None = None
     symmetries_continuous: tuple[ContinuousSymmetry, ...] = ()
     unit: str = ""
+
+    @property
+    def has_symmetries(self) -> bool:
+        """Whether the part has symmetries besides the identity."""
+        discrete = self.symmetries_discrete
+        return bool(self.symmetries_continuous) or (discrete is not None and len(discrete) > 0)
+
+    def has_shape_of(self, other: Part) -> bool:
+        """Return whether the surfaces agree, whatever their triangles.
+
+        Surfaces may deviate by 0.1 % of the diameter. Parts without meshes are compared by hash.
+        """
+        if self.mesh_hash == other.mesh_hash or self.mesh is None or other.mesh is None:
+            return self.mesh_hash == other.mesh_hash
+        most = _SAME_SHAPE * self.diameter + self.mesh_deviation + other.mesh_deviation
+        pairs = ((self.mesh, other.points), (other.mesh, self.points))
+        trees = ((SurfaceTree(mesh.vertices, mesh.faces), points) for mesh, points in pairs)
+        return all(bool((tree.distances(points) <= most).all()) for tree, points in trees)
 
     @cached_property
     def light_mesh(self) -> tuple[Mesh, float] | None:

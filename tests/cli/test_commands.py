@@ -178,6 +178,7 @@ def test_render_previews_and_stops(run, tmp_path):
         (["-n", "5", "/nowhere/part.stl"], "got mesh /nowhere/part.stl, no such file"),
         (["-n", "5", "screw"], "got unknown part 'screw'"),
         (["-n", "5", "--negatives", "servoholder"], "got negative servoholder"),
+        (["-n", "5", "--negatives", "a.stl", "b.stl"], "got b.stl after --negatives a.stl"),
         (["-n", "5", "--out", "/dev/null/x"], "got folder /dev/null/x: Not a directory"),
     ],
 )

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -69,3 +71,22 @@ def test_the_allowed_sizes_include_their_ends(diameter):
 def test_a_name_must_be_printable(name):
     with pytest.raises(UserError, match=r"part name .* printable characters"):
         make_part(name, box((0.1, 0.1, 0.1)))
+
+
+def test_a_shape_is_the_same_whatever_its_triangles():
+    solid = trimesh.creation.box((0.1, 0.06, 0.02))
+    part, finer, other, thin = (
+        make_part("box", Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int32)))
+        for mesh in (
+            solid,
+            solid.subdivide(),
+            solid.copy().apply_scale(1.005),
+            trimesh.creation.box((0.1, 0.06, 0.019)),
+        )
+    )
+    assert part.mesh_hash != finer.mesh_hash
+    assert part.has_shape_of(finer)
+    assert not part.has_shape_of(other)
+    assert not part.has_shape_of(thin)
+    assert part.has_shape_of(replace(part, mesh=None))
+    assert not part.has_shape_of(replace(other, mesh=None))

@@ -124,7 +124,8 @@ def break_down(
     """
     instances = {name: _instances(each, quantity, rates) for name, each in metrics.items()}
     quantities = next(reversed(instances.values()))["quantity"]
-    ends = quantities.groupby(bin_numbers(quantities, num_bins)).agg(["min", "max", "median"])
+    printed = quantities.round(QUANTITIES[quantity].decimals)  # bins have distinct names
+    ends = quantities.groupby(bin_numbers(printed, num_bins)).agg(["min", "max", "median"])
     bins = [Bin(*map(float, row)) for row in ends.itertuples(index=False)]
     values = [
         value

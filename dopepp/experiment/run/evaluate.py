@@ -81,12 +81,16 @@ def _show(tuning: Tuning, path: Path) -> None:
 def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part]:
     """Return the last estimator's parts, or all parts of the test data without estimators.
 
+    Unless ``data.symmetries`` is set, parts for which the test data states no symmetries have those
+    of the checkpoint.
+
     Raises:
         UserError: The test data lacks one of the estimator's parts.
     """
     if not estimators:
         return build_parts(data)
-    names = [part.name for part in estimators[-1].parts]
+    trained = estimators[-1].parts
+    names = [part.name for part in trained]
     if data.root is not None and data.objects is None:
         data = replace(data, objects=tuple(names))
     available = {part.name: part for part in build_parts(data)}
@@ -97,7 +101,19 @@ def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part
             ", ".join(names),
             "set data.root or data.parts to data of these objects",
         )
-    return [available[name] for name in names]
+    pairs = [(part, available[part.name]) for part in trained]
+    if data.symmetries is not None:
+        return [part for _, part in pairs]
+    return [
+        part
+        if part.has_symmetries
+        else replace(
+            part,
+            symmetries_discrete=stored.symmetries_discrete,
+            symmetries_continuous=stored.symmetries_continuous,
+        )
+        for stored, part in pairs
+    ]
 
 
 def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:

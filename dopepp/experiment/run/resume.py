@@ -282,7 +282,7 @@ def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Parts)
         parts: Objects of the checkpoint, as defined by the test data.
     """
     pairs = zip(checkpoint.parts, parts, strict=True)
-    others = [a.name for a, b in pairs if a.mesh_hash and b.mesh_hash not in ("", a.mesh_hash)]
+    others = [a.name for a, b in pairs if a.mesh_hash and b.mesh_hash and not a.has_shape_of(b)]
     if others:
         _log.warning("the checkpoint was trained on another shape of %s", ", ".join(others))
     stored, config = checkpoint.data.get("images"), trained_on(checkpoint.data)

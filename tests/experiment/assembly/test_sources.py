@@ -1,5 +1,6 @@
 import logging
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -102,6 +103,17 @@ def test_an_object_without_ground_truth_in_the_test_set_is_not_available(tiny, y
     ] == "n/a"
     # The mean is over the object that was there.
     assert report.mean.add_01d == report.rows["003_cracker_box"].add_01d
+
+
+def test_test_data_without_symmetries_take_those_of_the_checkpoint(parsed):
+    data = parsed("data=virtual", "data.parts=[servoholder]").data
+    (part,) = build_parts(data)
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])[None]
+    trained = SimpleNamespace(parts=[replace(part, symmetries_discrete=half_turn)])
+    (taken,) = parts_of([trained], data)
+    np.testing.assert_array_equal(taken.symmetries_discrete, half_turn)
+    (refused,) = parts_of([trained], replace(data, symmetries="none"))
+    assert not refused.has_symmetries
 
 
 def test_a_users_mesh_with_its_unit(tiny, tmp_path):

@@ -145,6 +145,17 @@ def test_rates_of_bins_are_those_of_their_instances(measured, tmp_path):
     assert picture.std() > 0
 
 
+def test_numbers_that_are_printed_alike_share_a_bin(measured, monkeypatch):
+    metrics, *_ = measured
+    fractions = iter([0.99991, 0.99994, 0.99998, 1.0] * 50)
+    alike = QUANTITIES["visibility"]._replace(
+        of=lambda poses: np.array([next(fractions) for _ in poses.T_gt])
+    )
+    monkeypatch.setitem(QUANTITIES, "visibility", alike)
+    bins, _ = break_down({"dopepp": metrics}, "visibility", 4, RATES)
+    assert [(each.low, each.high) for each in bins] == [(0.99991, 1.0)]
+
+
 def test_methods_share_the_bins_and_keep_their_own_objects(measured):
     metrics, truths, _ = measured
     perfect = fed([part("a")], {"a": np.zeros(30)}, {"a": truths["a"]})
