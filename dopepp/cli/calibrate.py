@@ -225,7 +225,10 @@ def rig(
     out: Out,
     hand_eye: Annotated[
         Path | None,
-        Option(help="Of the first camera, by handeye --mount bench (default: its own frame)."),
+        Option(
+            help="Result of `handeye --mount bench` for the first camera: poses in the robot's "
+            "base frame (default: poses in the first camera's frame)."
+        ),
     ] = None,
     force: Force = False,
 ) -> None:

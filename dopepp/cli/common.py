@@ -148,7 +148,7 @@ def check_region(refine: str | None) -> None:
     """Check that the refinement is ``region`` or none.
 
     Raises:
-        UserError: The refinement is another.
+        UserError: The refinement is neither.
     """
     if refine not in (None, "region"):
         raise UserError(f"--refine {refine}", "region", "pass --refine region, or leave it out")

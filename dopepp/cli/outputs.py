@@ -143,7 +143,7 @@ class JsonLines:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def close(self) -> None:
-        """Move the file to its path."""
+        """Close the partial file and move it to the final path."""
         if self._file is not None:
             self._file.close()
             self._partial.replace(self._path)

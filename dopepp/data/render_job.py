@@ -247,7 +247,13 @@ def has_started(root: Path) -> bool:
 
 
 def begin(root: Path, record: Mapping[str, Any]) -> None:
-    """Claim a folder for a job, unless the job has claimed it already, and clean it.
+    """Claim a folder for a job, and remove the files of interrupted writes.
+
+    A folder that this job has claimed before is accepted.
+
+    Args:
+        root: Folder of the data set.
+        record: Settings of the job.
 
     Raises:
         UserError: The folder is not writable, or holds another job or other files.

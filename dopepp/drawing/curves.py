@@ -108,7 +108,10 @@ def figure_image(figure: Figure) -> Picture:
 
 
 def _area(errors: Float[np.ndarray, "n"]) -> float:
-    """Return the exact area under the curve (``metrics.auc`` is in a higher layer)."""
+    """Return the area under the accuracy-threshold curve up to MAX_THRESHOLD, in [0, 1].
+
+    ``metrics.auc`` cannot be imported here, because it is in a higher layer.
+    """
     if len(errors) == 0:
         return 0.0
     # fmin ignores NaN, so NaN is a miss.

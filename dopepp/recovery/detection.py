@@ -179,7 +179,7 @@ class RecoveryOptions:
         return tuple(getattr(self, f"refined_{name}") for name in REFINED_FEATURES)
 
     def unrefined(self) -> RecoveryOptions:
-        """Return the options with the default score of refined poses."""
+        """Return a copy with default values for all options of refined poses."""
         defaults = {field.name: field.default for field in fields(self)}
         return replace(self, **{k: v for k, v in defaults.items() if k.startswith("refined_")})  # type: ignore[arg-type]
 
@@ -266,7 +266,16 @@ def refined_features(detection: Detection) -> Float[np.ndarray, "features"]:
 def detection_features(
     detection: Detection, cuboid: Cuboid, K: CameraMatrix
 ) -> Float[np.ndarray, "features"]:
-    """Return the features of one detection; they do not depend on its score."""
+    """Return the features of a detection for the logistic model of its score.
+
+    The features are those of :data:`FEATURES` in their order. They do not depend on the present
+    score.
+
+    Args:
+        detection: Detection before refinement.
+        cuboid: Keypoints of the part, metres.
+        K: Camera matrix, pixels.
+    """
     T, corners = detection.T_cam_obj, cuboid[:NUM_CORNERS]
     size = float(np.linalg.norm(np.ptp(corners, axis=0)))
     pixels = project(transform(T, corners), K)

@@ -121,7 +121,7 @@ class SymmetryHandling:
 
     def __init__(self, parts: Sequence[Part], options: SymmetryOptions) -> None:
         self.options, self.num_objects = options, len(parts)
-        rows = [_row(part) for part in parts]
+        rows = [_symmetry_row(part) for part in parts]
         longest = max(len(row["transforms"]) for row in rows)
         for row in rows:
             count = len(row["transforms"])
@@ -183,8 +183,16 @@ class SymmetryHandling:
         return self._tables
 
 
-def _row(part: Part) -> dict[str, np.ndarray]:
-    """Return the symmetries of a part and the reference orientation of its poses."""
+def _symmetry_row(part: Part) -> dict[str, np.ndarray]:
+    """Return a part's row of the tables of symmetries.
+
+    Returns:
+        Arrays by name: ``transforms`` (n, 4, 4), the discrete symmetries with the identity;
+        ``axes`` (3,), the unit axis of a round part, or zeros; ``offsets`` (3,), a point on this
+        axis, metres; ``references`` (3, 3), the reference orientation; ``fixed`` (3,), the point
+        that all symmetries keep, metres; ``cuboids`` (9, 3), the keypoints, metres; ``symmetric``,
+        whether the part has symmetries.
+    """
     discrete = part.symmetries_discrete
     transforms = np.eye(4)[None]
     if discrete is not None and len(discrete):

@@ -231,7 +231,11 @@ def code_hash() -> str:
 
 
 def _all_negatives(parts: Sequence[Part], given: Sequence[Part]) -> tuple[Part, ...]:
-    """Return the given negatives and the built-in parts that are neither targets nor given."""
+    """Return the given negatives and the built-in parts that are neither targets nor given.
+
+    Raises:
+        UserError: A negative has the name or the mesh of a target.
+    """
     names, hashes = {part.name for part in parts}, {part.mesh_hash for part in parts}
     for part in given:
         if part.name in names or part.mesh_hash in hashes:

@@ -192,7 +192,10 @@ def depth_units(depth: DepthMap, covered: Mask) -> tuple[NDArray[np.uint16], flo
 
 
 def encode_runs(mask: Mask) -> dict[str, list[int]]:
-    """Encode a mask as run lengths; the first run counts zeros."""
+    """Encode a mask as COCO's uncompressed run lengths.
+
+    Pixels are counted column by column. Runs of 0 and 1 alternate, and the first is a run of 0.
+    """
     pixels = mask.ravel(order="F")
     borders = np.flatnonzero(np.diff(pixels)) + 1
     runs = np.diff(np.concatenate([[0], borders, [pixels.size]])).tolist()

@@ -341,7 +341,10 @@ def _shading(label: str, entry: Entry, measures: Sequence[str]) -> pd.DataFrame:
 
 
 def _pooled(rates: pd.DataFrame) -> Iterator[Value]:
-    """Yield the mean rate over seeds, with the interval over the instances of all seeds."""
+    """Yield the mean rate over seeds of each method and share, with its 95 % Wilson interval.
+
+    The interval counts the instances of all seeds.
+    """
     for (method, share), seeds in rates.groupby(["method", "share"], sort=False):
         rate = float(seeds["rate"].mean())
         low, high = interval(rate, int(seeds["num_instances"].sum()))

@@ -282,7 +282,8 @@ def alone(folder: Path, study: str) -> Iterator[None]:
             raise UserError(
                 f"search.study={study}, which another command is searching in {folder}",
                 "one command at a time",
-                "wait for its end, raise its search.num_parallel, or set another search.study=NAME",
+                "wait for the other command, set another search.study=NAME, or start a single "
+                "command with a larger search.num_parallel",
             ) from error
         yield
 

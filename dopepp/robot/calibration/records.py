@@ -115,9 +115,10 @@ def read_robot_poses(path: Path) -> RobotPoses:
         problem = f"{path} with the columns {', '.join(sorted(fields))[:200]}"
         raise UserError(problem, FORMAT, "rename the columns to these names")
     numbers = _numbers(records, ("x", "y", "z", *ROTATIONS[kind]), path)
-    if kind == "quaternion" and not (np.abs(numbers[:, 3:]).max(axis=1) > 1e-6).all():
-        fix = "delete the pose whose quaternion is 0, 0, 0, 0"
-        raise UserError(f"{path}: a quaternion of zeros", "unit quaternions", fix)
+    zeros = np.flatnonzero(np.abs(numbers[:, 3:]).max(axis=1) <= 1e-6)
+    if kind == "quaternion" and len(zeros):
+        problem, fix = f"{path}, pose {zeros[0] + 1}: quaternion 0, 0, 0, 0", "delete this pose"
+        raise UserError(problem, "unit quaternions", fix)
     return RobotPoses(names, numbers[:, :3], kind, numbers[:, 3:], str(path))
 
 

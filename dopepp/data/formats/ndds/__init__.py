@@ -198,9 +198,12 @@ class NddsSettings:
     def fixed_transform(self, annotation: Path, label: str) -> NDArray[np.float64] | None:
         """Return a class's ``fixed_model_transform`` as a rigid 4×4 matrix for column vectors.
 
-        The matrix maps the mesh into the object frame. The file holds its transpose, scaled by the
-        mesh's unit over the file's (100 for metres and centimetres); the translation is in the
-        file's unit. None if the file has no such rotation, scale and translation.
+        The matrix maps the mesh into the object frame; its translation is in the file's unit. The
+        file stores the transpose of this matrix. Its rotation is multiplied by the ratio of the
+        units of mesh and file, e.g. 100 for metres and centimetres.
+
+        Returns:
+            The matrix, or None if the file has no matrix of a rotation, a scale and a translation.
         """
         for matrix in self._arrays(annotation, label, "fixed_model_transform", 4, 4):
             rigid = matrix.T
