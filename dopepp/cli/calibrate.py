@@ -273,7 +273,11 @@ def _pose_format(unit: str, angles: str, quaternion: str, direction: str) -> Pos
 
 
 def _picture_names(folder: Path) -> list[str]:
-    """Return the names of a folder's pictures, sorted."""
+    """Return the names of a folder's pictures, sorted.
+
+    Raises:
+        UserError: The folder has no pictures.
+    """
     from dopepp.core.files import PICTURES
 
     suffixes = (*PICTURES, ".tif", ".tiff")

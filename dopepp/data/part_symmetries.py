@@ -97,7 +97,11 @@ def describe_symmetries(path: Path | str, unit: str | None, tolerance: float) ->
 
 
 def _read_infos(choice: str) -> dict[str, bop_models.ModelInfo]:
-    """Return a file's entries by the part's name."""
+    """Return a file's entries by the part's name.
+
+    Raises:
+        UserError: The file does not exist.
+    """
     path = Path(choice)
     if not path.is_file():
         allowed = f"null, {NONE}, {AUTO} or a models_info.json"

@@ -152,7 +152,11 @@ def make_job(
 
 
 def _find_writer(layout: str) -> Callable[[Path, Sequence[Part]], Writer]:
-    """Import and return the class of a layout's writer."""
+    """Import and return the class of a layout's writer.
+
+    Raises:
+        UserError: The layout is unknown.
+    """
     if layout not in WRITERS:
         fix = "pass --format with one of these names"
         raise UserError(f"format {layout!r}", ", ".join(WRITERS), fix)
@@ -172,7 +176,11 @@ def named_part(text: str, unit: str | None) -> Part:
 def _in_camera(
     scenes: Preset, parts: Sequence[Part], path: str | Path | None, distance: str | None
 ) -> Preset:
-    """Return the preset with the camera of a file, and log the parts' sizes in its pictures."""
+    """Return the preset with the camera of a file, and log the parts' sizes in its pictures.
+
+    Raises:
+        UserError: Only the camera or only the distance is given, or the distance is not a pair.
+    """
     if path is None or distance is None:
         missing = "--camera FILE" if path is None else "--working-distance 0.3,0.8"
         given = "--working-distance" if path is None else "--camera"
@@ -198,7 +206,11 @@ def _sides(size: str) -> tuple[int, int]:
 
 
 def _nested(changes: Sequence[str]) -> dict[str, Any]:
-    """Convert ``a.b=1`` to ``{"a": {"b": 1}}``."""
+    """Convert ``a.b=1`` to ``{"a": {"b": 1}}``.
+
+    Raises:
+        UserError: A change has another form, or two changes set the same field.
+    """
     tree: dict[str, Any] = {}
     for change in changes:
         path, sign, text = change.partition("=")

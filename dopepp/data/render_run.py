@@ -97,7 +97,11 @@ def run(
 
 
 def _engine(engine: str, workers: int | None, ray_address: str | None) -> OpenPool:
-    """Return the function that opens the pool, after checking the options."""
+    """Return the function that opens the pool, after checking the options.
+
+    Raises:
+        UserError: An option is invalid, or an address is given without the engine ``ray``.
+    """
     workers = available_cores() if workers is None else workers
     if not 1 <= workers <= MAX_WORKERS:
         fix = "pass an allowed number, or leave out --workers"

@@ -117,7 +117,11 @@ def _in_memory(dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndarray, " ite
 
 
 def _in_file(path: Path, dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndarray, " items"]:
-    """Map an existing file, or a new file of zeros, into memory."""
+    """Map an existing file, or a new file of zeros, into memory.
+
+    Raises:
+        UserError: The file cannot be created, e.g. because the disk is full.
+    """
     # Disk space is allocated now, because a full disk under a map with holes kills the process.
     size = dtype.itemsize * num_items
     try:

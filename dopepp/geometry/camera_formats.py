@@ -238,7 +238,11 @@ def _numbers(name: str, value: object) -> list[float]:
 
 
 def _number(name: str, value: Any) -> float:
-    """Return a number, or the number in a text."""
+    """Return a number, or the number in a text.
+
+    Raises:
+        UserError: The value is not a finite number.
+    """
     numbers = None if isinstance(value, bool) else _floats([value])
     if numbers is None:
         problem = f"{name}={shown(value, 80)}"
@@ -261,7 +265,11 @@ def _side(name: str, value: object) -> int:
 
 
 def _matrix(values: Sequence[float], name: str) -> CameraMatrix:
-    """Return the camera matrix of nine numbers, row by row, or of fx, fy, cx, cy."""
+    """Return the camera matrix of nine numbers, row by row, or of fx, fy, cx, cy.
+
+    Raises:
+        UserError: There are neither nine nor four numbers.
+    """
     if len(values) == 9:
         return pinhole_matrix([values[:3], values[3:6], values[6:]], name)  # type: ignore[arg-type]
     if len(values) != 4:

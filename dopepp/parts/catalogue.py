@@ -153,7 +153,11 @@ def with_meshes(
 
 
 def _with_mesh(part: Part, chosen: str | None, unit: str | None) -> Part:
-    """Return a part with the chosen mesh, or with its own mesh."""
+    """Return a part with the mesh of a chosen file, or unchanged without a chosen file.
+
+    Raises:
+        UserError: The part has no mesh, and none was chosen.
+    """
     if chosen is None:
         if part.mesh is not None:
             return part

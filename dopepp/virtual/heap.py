@@ -92,7 +92,11 @@ def arrange_heap(
 def _drop(
     bodies: Sequence[Body], pile: Pile, diameter: float, rng: Generator
 ) -> tuple[Sequence[Transform], Sides | None]:
-    """Return the bodies' poses at rest, and the sides of their bin, if any."""
+    """Return the bodies' poses at rest, and the sides of their bin, if any.
+
+    Raises:
+        UserError: The bodies do not come to rest in any trial.
+    """
     from dopepp.virtual.physics import settle  # needs the extra
 
     if not bodies:

@@ -161,7 +161,11 @@ def map_geometry(maps: MapsConfig, stride: int) -> MapGeometry:
 
 
 def _start_from(network: torch.nn.Module, path: Path) -> None:
-    """Copy the weights of a checkpoint into a network of the same architecture."""
+    """Copy the weights of a checkpoint into a network of the same architecture.
+
+    Raises:
+        UserError: The checkpoint's network has another architecture.
+    """
     trained, _ = load_network(path)
     try:
         network.load_state_dict(trained.state_dict())

@@ -77,7 +77,11 @@ def _resolve(sources: Iterable[SourceLike]) -> Iterator[SourceLike]:
 
 
 def _expand(pattern: str) -> list[Path]:
-    """Return the paths that match a glob pattern."""
+    """Return the paths that match a glob pattern.
+
+    Raises:
+        UserError: No file matches.
+    """
     if paths := glob.glob(pattern, recursive=True):  # noqa: PTH207
         return sort_paths(map(Path, paths))
     problem = "which matches no file" if glob.has_magic(pattern) else "no such file"

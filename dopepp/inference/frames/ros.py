@@ -241,7 +241,11 @@ class Bag(FrameSource):
             raise self._unreadable(f"{error}") from error
 
     def _select(self, links: Sequence[Connection], topic: str | None) -> str:
-        """Return the requested image topic, or the only image topic."""
+        """Return the requested image topic, or the only image topic.
+
+        Raises:
+            UserError: The recording lacks the requested topic, or has no or several image topics.
+        """
         names = sorted({link.topic for link in links})
         if topic in names or (topic is None and len(names) == 1):
             return topic or names[0]

@@ -124,7 +124,11 @@ def _index(word: str, count: int) -> int:
 
 
 def _texture(obj: ObjFile, path: Path) -> Picture | None:
-    """Read the texture of the used materials; None without a texture."""
+    """Read the texture of the used materials; None without a texture.
+
+    Raises:
+        UserError: A material is undefined, or the faces use several textures.
+    """
     if not obj.libraries:
         return None
     maps: dict[str | None, str | None] = {None: None}

@@ -85,7 +85,11 @@ def _print(line: str) -> None:
 
 
 def _parse_address(text: str) -> tuple[str, int]:
-    """Return the IP address and port of ``host:port``."""
+    """Return the IP address and port of ``host:port``.
+
+    Raises:
+        UserError: The text has another form, or the host is unknown.
+    """
     host, _, port = text.rpartition(":")
     try:
         if not host or not 0 < int(port) < 65_536:

@@ -116,7 +116,11 @@ class BopReader:
         self._log_oddities(with_model)
 
     def _present(self) -> Int[np.ndarray, "items 2"]:
-        """Return (scene, row) of the selected images on disk, in order."""
+        """Return (scene, row) of the selected images on disk, in order.
+
+        Raises:
+            UserError: None of the selected images is on disk.
+        """
         listed = [
             (number, row)
             for number, scene in enumerate(self._scenes)
@@ -270,7 +274,11 @@ class BopReader:
 
 
 def _scene_folders(root: Path, split: str) -> list[Path]:
-    """Return a split's scenes in order, i.e. the folders whose names are numbers."""
+    """Return a split's scenes in order, i.e. the folders whose names are numbers.
+
+    Raises:
+        UserError: The split's folder is missing or has no scene.
+    """
     if not (root / split).is_dir():
         splits = sorted({path.parent.parent.name for path in root.glob("*/*/scene_camera.json")})
         raise UserError(
