@@ -10,6 +10,7 @@ import os
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
+from functools import cache
 from itertools import combinations
 from multiprocessing import get_context
 
@@ -19,9 +20,9 @@ from dopepp.data.render_job import named_part
 from dopepp.geometry.camera import invert_transform, transform
 from dopepp.parts.convex import convex_pieces
 from dopepp.parts.mesh import SurfaceTree
-from dopepp.virtual import PRESETS, Factory, SceneObject
+from dopepp.virtual import PRESETS, Factory, SceneObject, Surface
 
-SAMPLES = 1000  # tested surface points of an object
+SAMPLES = 300  # tested surface points of an object
 
 
 def heap(text: str, unit: str | None, index: int) -> tuple[float, ...]:
@@ -38,14 +39,20 @@ def heap(text: str, unit: str | None, index: int) -> tuple[float, ...]:
 
 def overlap(first: SceneObject, second: SceneObject) -> float:
     """Return the largest depth of sampled points of the first object inside the second, metres."""
-    points, _ = SurfaceTree(first.surface.vertices, first.surface.faces).spread(SAMPLES, 0)
+    points, _ = tree(first.surface).spread(SAMPLES, 0)
     points = transform(invert_transform(second.T_cam_obj) @ first.T_cam_obj, points)
     vertices = second.surface.vertices
     points = points[((points > vertices.min(0)) & (points < vertices.max(0))).all(axis=1)]
     if not len(points):
         return 0.0
     inside = points[[is_inside(point, vertices[second.surface.faces]) for point in points]]
-    return float(SurfaceTree(vertices, second.surface.faces).distances(inside).max(initial=0.0))
+    return float(tree(second.surface).distances(inside).max(initial=0.0))
+
+
+@cache
+def tree(surface: Surface) -> SurfaceTree:
+    """Return a search tree of a surface's points."""
+    return SurfaceTree(surface.vertices, surface.faces)
 
 
 def is_inside(point: np.ndarray, corners: np.ndarray) -> bool:
