@@ -68,6 +68,10 @@ LEAST_REFINED_SCORE: Final = 0.1
 """Lowest threshold of refined poses. Poses that are far more likely wrong than right are never
 reported, even if the pictures without the objects would permit it."""
 
+LEAST_REFINED_FACTOR: Final = 0.5
+"""Smallest covariance factor of refined poses. Smaller factors fit renders of the network's size, and
+make covariances too small on larger pictures and on real ones."""
+
 FEWEST_REFINED: Final = 20  # least number of right refined poses that a covariance factor is fit to
 
 MOST_LOST: Final = 0.01  # largest share of correct refined poses below the threshold
@@ -284,7 +288,8 @@ def fit_refined_factor(estimator: PoseEstimator, parts: Parts, source: SampleSou
     """Fit the covariance factor of refined poses to the errors of right poses.
 
     Returns:
-        The factor; 1 if there are fewer than :data:`FEWEST_REFINED` right poses.
+        The factor, at least :data:`LEAST_REFINED_FACTOR`; 1 if there are fewer than
+        :data:`FEWEST_REFINED` right poses.
 
     Raises:
         UserError: The covariances differ too much from the errors.
@@ -295,7 +300,8 @@ def fit_refined_factor(estimator: PoseEstimator, parts: Parts, source: SampleSou
         text = "covariances of refined poses keep a factor of 1: %d right poses, fewer than %d"
         _log.warning(text, len(pairs), FEWEST_REFINED)
         return 1.0
-    return fit_covariance_factor(squared_distances(pairs), refined=True)
+    factor = fit_covariance_factor(squared_distances(pairs), refined=True)
+    return max(factor, LEAST_REFINED_FACTOR)
 
 
 def squared_distances(

@@ -15,6 +15,7 @@ from dopepp.data.sample import Instance, Sample
 from dopepp.experiment.config.run_config import FalsePositiveTarget
 from dopepp.experiment.run.tuning import (
     FEWEST_REFINED,
+    LEAST_REFINED_FACTOR,
     LEAST_REFINED_SCORE,
     MOST_LOST,
     Scored,
@@ -208,10 +209,10 @@ class Refining:
         return [replace(detection, agreement=None, covariance=np.eye(6)) if kept else detection]
 
 
-def test_the_factor_of_refined_poses_is_that_of_the_right_ones():
-    estimator = Refining(true=0.4)
-    factor = fit_refined_factor(estimator, [PART], Many(250))  # type: ignore[arg-type]
-    assert factor == pytest.approx(0.4, rel=0.15)
+@pytest.mark.parametrize(("true", "fitted"), [(0.8, 0.8), (0.3, LEAST_REFINED_FACTOR)])
+def test_the_factor_of_refined_poses_is_that_of_the_right_ones(true, fitted):
+    factor = fit_refined_factor(Refining(true), [PART], Many(250))  # type: ignore[arg-type]
+    assert factor == pytest.approx(fitted, rel=0.15)
 
 
 def test_the_focal_length_is_wrong_by_up_to_the_scale_error():
