@@ -69,8 +69,8 @@ LEAST_REFINED_SCORE: Final = 0.1
 reported, even if the pictures without the objects would permit it."""
 
 LEAST_REFINED_FACTOR: Final = 0.5
-"""Smallest covariance factor of refined poses. Smaller factors fit renders of the network's size, and
-make covariances too small on larger pictures and on real ones."""
+"""Smallest covariance factor of refined poses. Smaller factors fit renders of the network's size,
+and make covariances too small on larger pictures and on real ones."""
 
 FEWEST_REFINED: Final = 20  # least number of right refined poses that a covariance factor is fit to
 
