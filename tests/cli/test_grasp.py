@@ -59,6 +59,7 @@ def test_the_arm_takes_a_second_picture_and_states_why(grasped):
     assert exact["second_view"] == ""
 
 
+@pytest.mark.slow
 def test_templates_grip_a_part_without_training(grasped, tmp_path):
     content, output = grasped("-n", 1, "--poses", "templates", "--workers", 1)
     assert content["sources"]["templates"]["caught"] == 1
