@@ -219,6 +219,7 @@ def test_two_killed_processes_end_as_whole_ones(start, command, tiny, tmp_path):
     assert all(torch.equal(first[name], value) for name, value in other.items())
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_run_killed_three_times_ends_as_one_left_in_peace(command):
     """At random moments; ``benchmarks/crash.py`` does fifty."""
