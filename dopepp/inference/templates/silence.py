@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 NUM_PHOTOS: Final = 8
 SIZE: Final = (480, 360)  # of a photo, pixels
 PART_PX: Final = 120.0  # diameter of the part at the middle of its distances
-MARGIN: Final = 3.0  # distance of the level from the photos' mean, standard deviations
+MARGIN: Final = 2.5  # distance of the level from the photos' mean, standard deviations
 LOWEST: Final = 0.0  # lower bound of the level, log odds
 VERSION: Final = 6  # part of the cache's key; increase it when search or verification change
 
