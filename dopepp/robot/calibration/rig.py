@@ -6,6 +6,7 @@ together on all points (bundle adjustment). The world is the frame of the first 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -77,9 +78,7 @@ def calibrate_rig(boards: Boards, cameras: Mapping[str, Camera]) -> Rig:
     if not MIN_CAMERAS <= len(names) <= MAX_CAMERAS:
         allowed = f"{MIN_CAMERAS} to {MAX_CAMERAS} cameras"
         raise UserError(f"a rig of {len(names)} cameras", allowed, "pass a folder for each camera")
-    counts: dict[str, int] = {}
-    for moment in (moment for sightings in boards.values() for moment in sightings):
-        counts[moment] = counts.get(moment, 0) + 1
+    counts = Counter(moment for sightings in boards.values() for moment in sightings)
     shared = {moment for moment, count in counts.items() if count > 1}
     poses = {
         name: {
@@ -162,7 +161,7 @@ def _most_central(steps: Transforms) -> Transform:
 class _Adjustment:
     """Bundle adjustment of cameras and boards.
 
-    Unanchors are a rotation and a shift of every camera but the first, then of every board.
+    Unknowns are a rotation and a shift of every camera but the first, then of every board.
     """
 
     def __init__(self, boards: Boards, cameras: Mapping[str, Camera], poses: BoardPoses) -> None:
@@ -189,13 +188,13 @@ class _Adjustment:
     def solve(self) -> None:
         """Refine all poses, and estimate the covariances of the cameras."""
         start = self._transforms
-        num_unanchor = 6 * (len(start) - 1)
+        num_unknowns = 6 * (len(start) - 1)
         ends = np.cumsum([0, *(2 * len(sighting.points) for sighting in self._sightings)])
-        sparsity = lil_matrix((ends[-1], num_unanchor), dtype=np.int8)
+        sparsity = lil_matrix((ends[-1], num_unknowns), dtype=np.int8)
         for number, (camera, moment) in enumerate(self._views):
-            for unanchor in (camera - 1, self._num_cameras - 1 + moment):
-                if unanchor >= 0:
-                    sparsity[ends[number] : ends[number + 1], 6 * unanchor : 6 * unanchor + 6] = 1
+            for unknown in (camera - 1, self._num_cameras - 1 + moment):
+                if unknown >= 0:
+                    sparsity[ends[number] : ends[number + 1], 6 * unknown : 6 * unknown + 6] = 1
 
         def placed(step: Float[np.ndarray, "numbers"]) -> Transforms:
             return np.concatenate([start[:1], displaced(start[1:], step.reshape(-1, 6))])
@@ -205,7 +204,7 @@ class _Adjustment:
 
         solution = least_squares(
             errors,
-            np.zeros(num_unanchor),
+            np.zeros(num_unknowns),
             jac_sparsity=sparsity,
             x_scale="jac",
             max_nfev=MAX_STEPS,
@@ -216,7 +215,7 @@ class _Adjustment:
         self.T_world_cam = self._transforms[: self._num_cameras]
         self._errors = self._residuals(self._transforms)
         squares = sum(float(np.square(error).sum()) for error in self._errors)
-        noise = max(PIXEL_NOISE**2, squares / max(1, int(ends[-1]) - num_unanchor))
+        noise = max(PIXEL_NOISE**2, squares / max(1, int(ends[-1]) - num_unknowns))
         jacobian: Any = solution.jac
         information = (jacobian.T @ jacobian).toarray()
         num_camera = 6 * (self._num_cameras - 1)
