@@ -135,7 +135,11 @@ class JsonLines:
         self._file = self._file or self._partial.open("wb", buffering=0)
 
     def take(self, result: PoseResult) -> None:
-        """Append a line, completely or not at all."""
+        """Append one line for the picture. A line that does not fit on the disk is removed again.
+
+        Raises:
+            OSError: The disk is full.
+        """
         assert self._file is not None
         line, end = f"{result.to_json()}\n".encode(), self._file.tell()
         if self._file.write(line) < len(line):

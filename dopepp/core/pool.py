@@ -110,7 +110,11 @@ class PickledFunction:
 
 
 def opened(answer: bytes) -> Any:
-    """Return the value from an answer of :class:`PickledFunction`, or raise its error."""
+    """Return the value of a pickled (value, error) pair from :class:`PickledFunction`.
+
+    Raises:
+        Exception: The pair holds an error, which is raised again.
+    """
     value, error = pickle.loads(answer)
     if error is not None:
         raise error

@@ -33,9 +33,9 @@ _RESERVED: Final = frozenset('<>:"|?*\\')
 
 
 class Bounded(io.RawIOBase):
-    """A seekable stream that rejects a huge read.
+    """A seekable stream that rejects reads of more than ``CHUNK_BYTES``.
 
-    The tar format lets a header claim a name of any length, which :mod:`tarfile` reads at once.
+    A tar header can claim a name of any length, and :mod:`tarfile` would read it at once.
     """
 
     def __init__(self, stream: IO[bytes]) -> None:
@@ -50,11 +50,15 @@ class Bounded(io.RawIOBase):
         return self._stream.tell()
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Go to a position."""
+        """Move to a position, and return it."""
         return self._stream.seek(offset, whence)
 
     def read(self, size: int = -1) -> bytes:
-        """Return the next ``size`` bytes, at most a megabyte."""
+        """Return the next ``size`` bytes.
+
+        Raises:
+            ValueError: The size is negative (read everything) or above ``CHUNK_BYTES``.
+        """
         if not 0 <= size <= CHUNK_BYTES:
             raise ValueError(f"a header of {size} bytes")
         return self._stream.read(size)

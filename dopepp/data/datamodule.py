@@ -52,7 +52,14 @@ class PoseDataModule(LightningDataModule):
 
     Training items are resized, jittered, masked, augmented and padded; validation items are only
     letterboxed; test items keep their resolution. Only training items depend on the epoch.
-    ``masking`` requires ``backgrounds`` for objects that fill their picture.
+
+    Args:
+        input_size: (width, height) of the network's input, pixels.
+        backgrounds: Images for masks on objects that fill their picture; required with ``masking``.
+
+    Raises:
+        UserError: The training source has fewer images than a batch.
+        ValueError: ``masking`` is given without ``backgrounds``.
     """
 
     def __init__(

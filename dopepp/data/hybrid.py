@@ -59,6 +59,9 @@ class HybridSource:
         real: Real camera frames; None for a real share of 0.
         real_fraction: Share of ``real``, in [0, 1].
         synthetic_fraction: Share of ``synthetic`` in the remaining items, in [0, 1].
+
+    Raises:
+        UserError: All three sources are None.
     """
 
     def __init__(

@@ -48,7 +48,11 @@ class PictureFrames:
         return self._length
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Return frame ``index``; the epoch is ignored."""
+        """Return frame ``index``; the epoch is ignored.
+
+        Raises:
+            IndexError: The index is negative, or not below the number of frames.
+        """
         if not 0 <= index < self._length:
             raise IndexError(f"item {index} of {self._length}")
         lap, number = divmod(index, len(self._order))
@@ -115,7 +119,11 @@ class FrameMix:
         return self._length
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Return frame ``index``."""
+        """Return frame ``index``, from the sources in turn.
+
+        Raises:
+            IndexError: The index is negative, or not below the number of frames.
+        """
         if not 0 <= index < self._length:
             raise IndexError(f"item {index} of {self._length}")
         item, kind = divmod(index, len(self.sources))

@@ -40,6 +40,9 @@ class RenderedSource:
     Args:
         split: One of the three disjoint index ranges; ``val`` and ``test`` ignore the epoch.
         scale: Magnification of the parts, by moving the camera closer.
+
+    Raises:
+        ValueError: The scale is not positive and finite.
     """
 
     def __init__(
@@ -59,7 +62,11 @@ class RenderedSource:
         return self._num_items
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Render item ``index``."""
+        """Render item ``index``.
+
+        Raises:
+            IndexError: The index is negative, or not below the number of items.
+        """
         if not 0 <= index < self._num_items:
             raise IndexError(f"item {index} of {self._num_items}")
         epoch = epoch if self.split == "train" else 0

@@ -54,7 +54,10 @@ class CBAM(Attention):
 
     Channel: features · σ(MLP(mean) + MLP(maximum)) over the map (Eq. 5). Spatial: features ·
     σ(conv([mean; maximum])) over the channels (Eq. 6). ``reduction`` divides the width of the MLP's
-    hidden layer; the ``kernel_size`` of the spatial convolution is odd.
+    hidden layer; ``kernel_size`` is the size of the spatial convolution.
+
+    Raises:
+        UserError: The kernel size is even, or not in 1 to 31.
     """
 
     def __init__(self, channels: int, reduction: int = 16, kernel_size: int = 3) -> None:

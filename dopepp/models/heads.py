@@ -163,6 +163,9 @@ class MultiScale(Head):
     convolution except output convolutions. ``maps`` selects the fusion's input from each scale:
     ``plain`` for maps of 9 or 16 channels (§3.3), ``learned`` for maps with a loss of their own,
     None for features.
+
+    Raises:
+        UserError: ``maps`` is none of these values.
     """
 
     cell_multiple = 4

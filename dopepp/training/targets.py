@@ -43,6 +43,9 @@ class SymmetryOptions(Checked):
         canonical: Whether targets use the equivalent pose nearest to the reference.
         border_deg: Difference of angles to the reference, degrees, within which equivalent poses
             are alternatives; the pose with the lowest loss is used. 0 allows no alternatives.
+
+    Raises:
+        UserError: ``border_deg`` is above 0 without ``canonical``.
     """
 
     canonical: bool = True

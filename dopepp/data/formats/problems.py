@@ -55,7 +55,16 @@ class Problems:
         raise UserError(": ".join(filter(None, parts)), allowed, fix)
 
     def take(self, path: Path | str, where: str, error: UserError) -> None:
-        """Report the error that another package raised; see :meth:`report`."""
+        """Report an error that another package raised.
+
+        Args:
+            path: File with the problem.
+            where: Field in the file.
+            error: The error.
+
+        Raises:
+            UserError: In this class, always: the given error.
+        """
         raise error
 
 

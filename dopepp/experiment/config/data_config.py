@@ -163,6 +163,9 @@ class DataConfig:
             it for ``virtual.camera``.
         batch_size: Images per step and process.
         num_workers: Loader processes; None uses one per core.
+
+    Raises:
+        UserError: A side of ``input_size`` is not a positive multiple of 32.
     """
 
     __pydantic_config__ = STRICT

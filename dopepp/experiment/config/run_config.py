@@ -152,6 +152,9 @@ class LearningRateConfig:
     """Options of ``job=lr_finder``: first and last learning rate, and number of steps.
 
     The sweep ends earlier if the loss diverges.
+
+    Raises:
+        UserError: ``max_lr`` is not above ``min_lr``.
     """
 
     __pydantic_config__ = STRICT

@@ -60,7 +60,11 @@ class CompareJobs(Callback):
         write_multirun_readme(Path(str(config.hydra.sweep.dir)), program.command(), {})
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Compare all jobs of the multirun; exit with code 1 if a job failed."""
+        """Compare all jobs of the multirun.
+
+        Raises:
+            SystemExit: A job failed; the exit code is 1.
+        """
         if not compare_jobs(Path(str(config.hydra.sweep.dir)), config):
             raise SystemExit(1)
 

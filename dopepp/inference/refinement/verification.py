@@ -92,7 +92,11 @@ class VerificationModel(NamedTuple):
 
 @cache
 def learned_model() -> VerificationModel:
-    """Return the model that ships with the package."""
+    """Return the model that ships with the package.
+
+    Raises:
+        ValueError: The model was fitted to other evidence than ``EVIDENCE``.
+    """
     path = files("dopepp.inference.refinement").joinpath("verification.json")
     values: dict[str, Any] = json.loads(path.read_text("utf-8"))
     if tuple(values["evidence"]) != EVIDENCE:

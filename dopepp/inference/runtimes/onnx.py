@@ -45,7 +45,12 @@ _ERRORS_ONLY: Final = 3
 
 
 def read_network(path: Path) -> OnnxNetwork:
-    """Read an ONNX export. The file is not trusted; :func:`check_model` lists what is rejected."""
+    """Read an ONNX export of this package. The file is not trusted.
+
+    Raises:
+        UserError: The packages onnx and onnxruntime are not installed, or the file is missing,
+            truncated, not an export of this package, or rejected by :func:`check_model`.
+    """
     for package in ("onnx", "onnxruntime"):
         require(package, str(path), "onnx")
     import onnx
@@ -62,7 +67,17 @@ def read_network(path: Path) -> OnnxNetwork:
 
 
 class OnnxNetwork(ExportedNetwork):
-    """An ONNX file whose ``content`` passed :func:`check_model`."""
+    """A network that ONNX Runtime executes on the CPU.
+
+    Args:
+        content: Bytes of an ONNX file that passed :func:`check_model`.
+        path: The file, for error messages.
+        checkpoint: The checkpoint from which the file was exported.
+        export: Options of the export.
+
+    Raises:
+        UserError: ONNX Runtime cannot load the file.
+    """
 
     def __init__(self, content: bytes, path: Path, checkpoint: Checkpoint, export: Export) -> None:
         super().__init__(path, checkpoint, export)

@@ -52,7 +52,17 @@ def predict_views(
     camera_error: tuple[float, float] = CAMERA_ERROR,
     names: Sequence[str] | None = None,
 ) -> ViewsResult:
-    """Estimate the poses of parts; see :meth:`PoseEstimator.predict_views`."""
+    """Estimate the poses of parts from several pictures of a static scene.
+
+    The other arguments and the result are described in :meth:`PoseEstimator.predict_views`.
+
+    Args:
+        estimator: Estimator with a refinement by region.
+
+    Raises:
+        UserError: The estimator does not refine by region, an argument is invalid, or the numbers
+            of images, cameras and poses differ.
+    """
     refiner = estimator.refiner
     if refiner is None or not refiner.verifies:
         fix = "load the estimator with refine='region'"

@@ -65,7 +65,11 @@ class RankingModel(NamedTuple):
 
 @cache
 def learned_ranking() -> RankingModel:
-    """Return the model that ships with the package."""
+    """Return the model that ships with the package.
+
+    Raises:
+        ValueError: The model was fitted to other features than ``FEATURES``.
+    """
     path = files("dopepp.inference.templates").joinpath("ranking.json")
     values: dict[str, Any] = json.loads(path.read_text("utf-8"))
     if tuple(values["weights"]) != FEATURES:

@@ -67,7 +67,15 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
 def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
     """Return a mesh in metres and the unit of its file.
 
-    Arguments and errors are those of :func:`read_mesh`.
+    Args:
+        path: Mesh file; see :func:`read_mesh`.
+        unit: mm, cm, m or inch, or None; see :func:`read_mesh`.
+
+    Returns:
+        The mesh, and the unit from which it was converted.
+
+    Raises:
+        UserError: The file or the unit is invalid; see :func:`read_mesh`.
     """
     path = Path(path)
     if unit is not None and unit not in UNITS:

@@ -279,7 +279,11 @@ class Slot(Generic[Item]):
             self._fresh.notify()
 
     def check(self) -> None:
-        """Raise the exception that ended the thread, if any."""
+        """Check that no exception has ended the thread.
+
+        Raises:
+            Exception: The exception that ended the thread.
+        """
         if self._error is not None:
             raise self._error
 

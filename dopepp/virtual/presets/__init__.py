@@ -60,6 +60,10 @@ class Preset(Checked):
         depths: Smallest and largest depth of the targets' cuboid centres; None for any.
         clutter: Number of flat pieces of other pictures on the background.
         background_contrast: Factor on the background's contrast.
+
+    Raises:
+        UserError: The camera is implausible, or a pile is combined with ``min_visible_fraction``,
+            ``centroid_inside`` or ``depths``.
     """
 
     name: str

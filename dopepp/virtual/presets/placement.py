@@ -150,6 +150,9 @@ class OffsetPlacement(_Placement):
         distance: Depth of the box's middle.
         axial: Largest offset along the optical axis to either side.
         lateral: Largest offset along image x and along image y to either side.
+
+    Raises:
+        UserError: ``axial`` is not below ``distance``.
     """
 
     distance: Metres = 0.20

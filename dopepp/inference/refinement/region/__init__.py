@@ -277,7 +277,18 @@ def _descend(rounds: Sequence[Round], start: Transform, prior: Prior, reach: flo
 
 
 def search_distance(coarse: Round, prior: Prior) -> float:
-    """Return how far the outline may be from the given pose, pixels of the image."""
+    """Return how far from the projected contour to search for the part's outline.
+
+    Args:
+        coarse: First round of the refinement, with the smallest image.
+        prior: Distribution of the pose before the refinement.
+
+    Returns:
+        Distance in pixels of the full image; it grows with the pose's standard deviation.
+
+    Raises:
+        UndecidedError: The image shows too little of the part's outline.
+    """
     contour = coarse.contour(prior.T_cam_obj)
     if contour is None:
         raise UndecidedError("too little of the part's outline is on the picture")
