@@ -54,10 +54,7 @@ def predict_views(
 ) -> ViewsResult:
     """Estimate the poses of parts from several pictures of a static scene.
 
-    The other arguments and the result are described in :meth:`PoseEstimator.predict_views`.
-
-    Args:
-        estimator: Estimator with a refinement by region.
+    The arguments and the result are described in :meth:`PoseEstimator.predict_views`.
 
     Raises:
         UserError: The estimator does not refine by region, an argument is invalid, or the numbers
