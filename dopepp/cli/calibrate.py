@@ -409,6 +409,7 @@ def _bench_from_board(
 
 
 def _show_lens(calibration: LensCalibration) -> None:
+    """Print the errors per picture, the covered part of the picture, and the camera matrix."""
     for name, error in zip(calibration.names, calibration.errors_px, strict=True):
         typer.echo(f"{name}: {error:.3f} px")
     for name in calibration.outliers:

@@ -53,7 +53,7 @@ _CORES_EVERY_S: Final = 10.0
 
 
 def available_cores() -> int:
-    """Return the number of cores that this process may use (Linux), or the machine's number."""
+    """Return the number of cores that this process may use; outside Linux, of all cores."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

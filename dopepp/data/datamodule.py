@@ -277,12 +277,16 @@ class PoseLoader(DataLoader[Any]):
         self._resume_at = 0
 
     def __iter__(self) -> Iterator[Batch]:  # type: ignore[override]  # torch names its own class
-        """Yield batches, starting after the batches of a loaded state."""
+        """Yield the batches of an epoch; after a state was loaded, only its remaining batches.
+
+        Raises:
+            UserError: A worker could not read a sample.
+        """
         self._num_batches, self._resume_at = self._resume_at, 0
         assert self.batch_size is not None
         self._epoch_sampler.skip = self._num_batches * self.batch_size
         for batch in super().__iter__():
-            if isinstance(batch, UserError):
+            if isinstance(batch, UserError):  # a worker returns its error in place of a batch
                 break
             self._num_batches += 1
             yield batch

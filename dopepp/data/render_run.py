@@ -276,7 +276,7 @@ class _Run:
         self.num_there = report.num_images - sum(self._left.values())
 
     def tasks(self, images_per_task: int) -> Iterator[RenderTask]:
-        """Yield all render tasks and, in between, finalizing tasks of complete chunks."""
+        """Yield the tasks that render images, and tasks that finalize each completed chunk."""
         for chunk in self._chunks.values():
             for first in range(0, len(chunk.missing), images_per_task):
                 yield from self.finalizes()

@@ -123,7 +123,10 @@ def draw_line(
     colour: tuple[int, ...],
     thickness: int,
 ) -> None:
-    """Draw an anti-aliased segment IN PLACE, a dot if the ends are equal, nothing if not finite."""
+    """Draw an anti-aliased line segment on the canvas, in place.
+
+    Equal ends give a dot. Ends that are not finite are not drawn.
+    """
     clipped = _clip(start, end, canvas.shape[1], canvas.shape[0], margin=2 * thickness)
     if clipped is None:
         return

@@ -111,7 +111,7 @@ def checked_depth(depth: Depth, image_size: Size) -> Depth32:
         image_size: (width, height) of the colour image.
 
     Raises:
-        UserError: The depth is not aligned to the image, no array of floats, negative, or
+        UserError: The depth is not aligned to the image, not an array of floats, negative, or
             implausible in metres.
     """
     depth = np.asarray(depth)
@@ -205,11 +205,11 @@ def network_views(
     distances: Distances | None = None,
     roi: Region | None = None,
 ) -> list[NetworkView]:
-    """Return the inputs that the network is run on, the smallest first.
+    """Scale and pad an image to the inputs on which the network runs, the smallest first.
 
     Args:
         checkpoint: Checkpoint of the network.
-        multiple: Number that divides the sides of the inputs.
+        multiple: The sides of the inputs are padded to multiples of this number.
         image: RGB, without distortion.
         K: Camera matrix, pixels.
         distances: Expected depths of the parts (default: those of training).
@@ -303,10 +303,15 @@ def merge_scales(scales: Sequence[Sequence[Detection]]) -> list[Detection]:
 def _depths(
     seen: Seen, reach: float, size: Size, distances: Distances | None
 ) -> tuple[float, float]:
-    """Return the nearest and farthest depth to cover, metres.
+    """Return the nearest and farthest depth at which the part is searched, metres.
 
-    ``reach`` is the part's length at a depth of one metre, pixels. ``any`` ranges from where the
-    part fills the image to where it is as small as in training, in an image of MAX_PIXELS.
+    Args:
+        seen: Depths and sizes of the part in the training images.
+        reach: Length of the part's image at a depth of one metre, pixels.
+        size: (width, height) of the image, pixels.
+        distances: Depths in metres; None for the depths of training; ``any`` for all depths from
+            where the part fills the image to where it is as small as in training, after the image
+            is reduced to MAX_PIXELS.
     """
     if distances is None:
         return seen.nearest, seen.farthest

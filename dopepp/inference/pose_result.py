@@ -145,7 +145,7 @@ class PoseResult:
         """Write :meth:`plot` as PNG or JPEG, according to the suffix.
 
         Raises:
-            UserError: The suffix is another one, or the file cannot be written.
+            UserError: The suffix is neither PNG's nor JPEG's, or the file cannot be written.
         """
         check_target(Path(path), PICTURES)
         write_picture(Path(path), self.plot())

@@ -76,7 +76,7 @@ class Viewer:
         """Continue with another source on the same timeline."""
 
     def take(self, result: PoseResult) -> None:
-        """Add a result."""
+        """Add a frame: its picture, outlines, belief maps and poses."""
         import rerun as rr
 
         log, distance = self._recording.log, self._distance(result)

@@ -122,10 +122,17 @@ def _read_window(belief: Array, left: int, top: int, score: float, window: Array
 def mean_vectors(
     vectors: Array, cells: Array, position: Array, radius: float, toward: Array
 ) -> None:
-    """Write the weighted mean of the vectors in each corner's disc.
+    """Average the vector field over the disc around each corner.
 
-    Where discs overlap, cells hold the vector of the nearest corner. The weights 1 − (d/radius)²
+    Where discs overlap, a cell's vector belongs to the nearest corner. The weights 1 − (d/radius)²
     fall to 0 at the edges of discs, where inexact positions make the vectors uncertain.
+
+    Args:
+        vectors: x and y component of the field, (2, height, width).
+        cells: (column, row) of each corner's peak.
+        position: (x, y) of each corner, cells.
+        radius: Radius of the discs, cells.
+        toward: Filled with the mean vector of each corner; zeros before.
     """
     height, width = vectors.shape[1:]
     half = math.ceil(radius)

@@ -237,6 +237,7 @@ def _within(error: str, metres: float) -> Formula:
 
 
 def _area(error: str) -> Formula:
+    """Return the formula of the area under an error's accuracy curve up to 0.1 m."""
     return lambda errors: auc(getattr(errors, error), 0.1)
 
 

@@ -32,7 +32,7 @@ def size_in_words(extents: Vector) -> str:
 
 
 def part_in_words(part: Part) -> str:
-    """Describe a part: name, size, unit of its file, and bodies if there are several."""
+    """Describe a part in one line: its name, size, unit of the file, and bodies if several."""
     words = f"{part.name}: {size_in_words(np.ptp(part.cuboid, axis=0))}"
     if part.unit:
         words += f", read in {part.unit}"

@@ -351,11 +351,10 @@ def fit_covariance_factor(
     factor = float(squared[order[np.searchsorted(passed, 0.9)]]) / _TENTH_BEYOND
     low, high = REFINED_COVARIANCE_FACTORS if refined else COVARIANCE_FACTORS
     if not low <= factor <= high:
-        lean = "confident" if factor > high else "cautious"
-        whose = "refinement" if refined else "network"
-        causes = f"train longer, because the {whose} is far too {lean}; or, if"
+        tendency = "confident" if factor > high else "cautious"
+        causes = f"train longer, because the network is far too {tendency}; or, if"
         if refined:
-            causes = f"the refinement is far too {lean}; check the mesh and scale_error; if"
+            causes = f"the refinement is far too {tendency}; check the mesh and scale_error; if"
         raise UserError(
             f"covariances that must be multiplied by {factor:.3g} to match the poses' errors",
             f"a factor from {low:g} to {high:g}",

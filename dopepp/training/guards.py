@@ -68,7 +68,7 @@ class FiniteSteps(Callback):
         self.skipped = self.in_a_row = 0
         self._passes: list[_Pass] = []
         self._buffers: list[Tensor] = []
-        self._kept: list[Tensor] = []
+        self._saved_buffers: list[Tensor] = []
 
     def state_dict(self) -> dict[str, Any]:
         """Return the number of skipped steps."""
@@ -82,15 +82,15 @@ class FiniteSteps(Callback):
         """Collect the buffers that a forward pass changes: batch norm's statistics."""
         self._passes = []
         self._buffers = list(pl_module.buffers())
-        self._kept = [buffer.clone() for buffer in self._buffers]
+        self._saved_buffers = [buffer.clone() for buffer in self._buffers]
 
     def on_train_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, batch: Batch, batch_idx: int
     ) -> None:
-        """Save the statistics before the first pass of a step."""
+        """Copy batch norm's statistics before the first batch of an optimiser step."""
         self._batch = batch
         if not self._passes and self._buffers:
-            torch._foreach_copy_(self._kept, self._buffers)
+            torch._foreach_copy_(self._saved_buffers, self._buffers)
 
     def on_before_backward(
         self, trainer: Trainer, pl_module: LightningModule, loss: Tensor
@@ -129,7 +129,7 @@ class FiniteSteps(Callback):
         if scaler is not None and names == ["gradient"] and scaler.get_scale() >= 1:
             return
         if self._buffers:
-            torch._foreach_copy_(self._buffers, self._kept)
+            torch._foreach_copy_(self._buffers, self._saved_buffers)
         # A scaler skips steps with non-finite gradients itself.
         if scaler is None or "gradient" not in names:
             optimizer.zero_grad(set_to_none=True)
@@ -167,7 +167,13 @@ class FiniteSteps(Callback):
 
 
 def _dump_batch(path: Path, batch: Batch, facts: Mapping[str, Any]) -> None:
-    """Write ``path.pt`` (for ``torch.load``) and ``path.png``, or warn."""
+    """Write a batch for inspection; if the disk does not accept it, only warn.
+
+    Args:
+        path: Path without suffix: ``.pt`` holds the tensors and facts, ``.png`` the images.
+        batch: The batch.
+        facts: Further values for the ``.pt`` file, by name.
+    """
     shown = batch.rows(torch.arange(min(len(batch), _MAX_TILES))).to("cpu")
     images, truths = shown.images.permute(0, 2, 3, 1).numpy(), shown.keypoints.numpy()
     tiles = [

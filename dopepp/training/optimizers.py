@@ -185,8 +185,8 @@ class AveragedWeights(WeightAveraging):
         self._averaged.module.load_state_dict(checkpoint.get(_AVERAGED, checkpoint["state_dict"]))
 
 
-def go_on_with_trained(checkpoint: dict[str, Any]) -> None:
-    """Replace a loaded checkpoint's ``state_dict`` by the trained weights, to resume training."""
+def restore_trained_weights(checkpoint: dict[str, Any]) -> None:
+    """Replace averaged weights in a checkpoint's ``state_dict`` by the weights being trained."""
     if TRAINED in checkpoint:
         checkpoint[_AVERAGED] = checkpoint["state_dict"]
         checkpoint["state_dict"] = checkpoint.pop(TRAINED)

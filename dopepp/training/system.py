@@ -30,7 +30,7 @@ from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection, RecoveryOptions
 from dopepp.recovery.recover import recover_batch
 from dopepp.training.loggers import MetricsTable
-from dopepp.training.optimizers import go_on_with_trained
+from dopepp.training.optimizers import restore_trained_weights
 from dopepp.training.targets import (
     SymmetryHandling,
     SymmetryOptions,
@@ -157,8 +157,11 @@ class PoseSystem(LightningModule):
         return configured
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Restore only the progress of schedules; a resumed run may have a longer schedule."""
-        go_on_with_trained(checkpoint)
+        """Prepare a checkpoint for resuming: trained weights, and the progress of schedules.
+
+        The schedules' other values come from the config, because a resumed run may be longer.
+        """
+        restore_trained_weights(checkpoint)
         states = checkpoint["lr_schedulers"]
         self._resumed_schedules = [_without_progress(state) for state in states]
         checkpoint["lr_schedulers"] = [

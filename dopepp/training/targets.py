@@ -62,7 +62,14 @@ class SymmetryOptions(Checked):
 def draw_maps(
     batch: Batch, keypoints: Keypoints, num_objects: int, geometry: MapGeometry
 ) -> Targets:
-    """Draw the target maps of all instances that are visible enough for metrics."""
+    """Draw the target maps of a batch; instances that are hidden too far for metrics are left out.
+
+    Args:
+        batch: Images with labels.
+        keypoints: Keypoints of every instance, input pixels.
+        num_objects: Number of the network's objects.
+        geometry: Stride and spread of the maps.
+    """
     height, width = batch.images.shape[-2:]
     map_size = height // geometry.stride, width // geometry.stride
     seen = batch.visible_fraction >= MIN_VISIBLE_FRACTION

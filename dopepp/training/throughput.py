@@ -120,7 +120,7 @@ class Operators(PyTorchProfiler):
             self._totals[operator.key] = (calls + operator.count, seconds)
 
     def totals(self) -> list[Total]:
-        """Return all operators, slowest first."""
+        """Return each operator's total time and number of calls, slowest first."""
         return _slowest_first((name, *total) for name, total in self._totals.items())
 
     def summary(self) -> str:

@@ -183,7 +183,12 @@ def _poses(composition: Composition, body: Body) -> Iterator[Transform]:
 
 
 def _place_distractor(composition: Composition, reference: float) -> None:
-    """Add a distractor that neither pierces nor hides a target, in at most eight trials."""
+    """Try up to eight times to add a distractor that neither pierces nor hides a target.
+
+    Args:
+        composition: The scene so far.
+        reference: Depth, in metres, that the preset's range of distractor depths multiplies.
+    """
     rng, ranges = composition.rng, composition.preset.distractors
     for _ in range(8):
         depth = reference * rng.uniform(*ranges.depth)

@@ -215,7 +215,7 @@ class HeightMap:
         np.maximum(self._heights[window], footprint.top + height, out=self._heights[window])
 
     def is_free(self, footprint: Footprint, cell: Cell) -> bool:
-        """Return whether no object lies under or over the footprint."""
+        """Return whether no object lies under or over a footprint placed at this cell."""
         window = self._window(footprint, cell)
         return not bool((self._heights[window][np.isfinite(footprint.bottom)] > 0).any())
 

@@ -204,9 +204,18 @@ def edge_functions(hom: Array, a: int, b: int, c: int) -> EdgeFunctions:
 
 @compiled(fastmath=True)
 def open_share(u: Scalar, v: Scalar, inverse: Scalar, inverse_depth: Array) -> Scalar:
-    """Compare a point with the four texels around it; 1 outside the map.
+    """Return which share of the four shadow-map texels around a point leaves the point lit.
 
-    Percentage-closer filtering: the comparisons are interpolated, not the depths.
+    This is percentage-closer filtering: the comparisons are interpolated, not the depths.
+
+    Args:
+        u: Column in the shadow map, texels.
+        v: Row in the shadow map, texels.
+        inverse: Inverse depth of the point, as seen from the light.
+        inverse_depth: Shadow map, (rows, columns, 1).
+
+    Returns:
+        Share from 0 (in shadow) to 1 (lit); 1 for points outside the map.
     """
     rows, columns = inverse_depth.shape[0], inverse_depth.shape[1]
     if not (_ZERO <= u < np.float32(columns - 1) and _ZERO <= v < np.float32(rows - 1)):

@@ -77,10 +77,13 @@ def rotation_problem(rotation: RotationMatrix, tolerance: float = 1e-3) -> str |
 
 
 def check_translation(node: Node, translation: Vector, diameter: float | None) -> bool:
-    """Report an object behind the camera (``z``) or at an implausible distance (``unit``).
+    """Check an object's position relative to the camera.
+
+    A position behind the camera is reported in the field ``z``, an implausible distance, which
+    suggests a wrong unit, in the field ``unit``.
 
     Args:
-        node: Parent of the two reported fields.
+        node: Parent of the two fields.
         translation: Camera frame, in the unit of ``diameter``.
         diameter: The object's diameter; None if unknown.
 

@@ -33,9 +33,9 @@ from dopepp.experiment.assembly.build_system import build_optional
 from dopepp.experiment.assembly.photos import training_backgrounds
 from dopepp.experiment.assembly.renders import (
     held_out_renders,
-    kept,
     training_renders,
     validation_windows,
+    with_cache,
 )
 from dopepp.experiment.config.data_config import DataConfig, LensConfig
 from dopepp.experiment.config.run_config import RunConfig
@@ -130,10 +130,10 @@ def _real_frames(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
     """Open the labelled training images, cut into windows if the user's camera is given."""
     frames, view = labelled_images(data, parts, seed, "train"), data.virtual.view
     if view is None:
-        return kept(frames, data, data.cache, data.network_input)
+        return with_cache(frames, data, data.cache, data.network_input)
     box = Letterbox.scaled(view.size, data.virtual.camera_scale or 1.0)
     picture = box.width, box.height
-    whole = kept(frames, data, data.cache, picture)
+    whole = with_cache(frames, data, data.cache, picture)
     return WindowedSource(whole, picture, data.network_input, seed)
 
 

@@ -27,7 +27,7 @@ def training_renders(
     """Render the training images at the size of the network's input, which saves time."""
     factory = _factory(data, parts, seen_preset(data), seed, backgrounds)
     source = RenderedSource(factory, data.samples_per_epoch)
-    return kept(source, data, data.cache, data.network_input)
+    return with_cache(source, data, data.cache, data.network_input)
 
 
 def validation_windows(data: DataConfig, parts: Parts) -> DescribedSource:
@@ -40,7 +40,14 @@ def validation_windows(data: DataConfig, parts: Parts) -> DescribedSource:
 def held_out_renders(
     data: DataConfig, parts: Parts, split: Split, scale: float = 1.0
 ) -> DescribedSource:
-    """Render the scenes of a held-out split at their native size, with scaled parts."""
+    """Return the renders of the validation or test split, at the camera's full resolution.
+
+    Args:
+        data: Options of the data.
+        parts: The parts.
+        split: ``val`` or ``test``.
+        scale: Factor on the apparent size of the parts.
+    """
     renderer, count = data.virtual.renderer, data.num_val
     cache: Cache = "none"
     if split == "test":
@@ -51,7 +58,7 @@ def held_out_renders(
     backgrounds = find_backgrounds(data.virtual.backgrounds, split)
     factory = _factory(data, parts, preset, data.eval_seed, backgrounds, renderer)
     name = "virtual" if renderer == "raster" else renderer
-    return kept(RenderedSource(factory, count, split, name, scale), data, cache, None)
+    return with_cache(RenderedSource(factory, count, split, name, scale), data, cache, None)
 
 
 def scaled_test_renders(data: DataConfig, parts: Parts, scale: float) -> DescribedSource:
@@ -91,7 +98,7 @@ def validation_renders(
     return held_out_renders(data, with_meshes(checkpoint.parts), "val")
 
 
-def kept(
+def with_cache(
     source: DescribedSource, data: DataConfig, cache: Cache, input_size: tuple[int, int] | None
 ) -> DescribedSource:
     """Add the configured cache to a source.

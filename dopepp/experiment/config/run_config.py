@@ -275,7 +275,7 @@ class MeasurementConfig(FalsePositiveTarget):
 
     @property
     def protocols(self) -> Protocols:
-        """Shading, scale and rates per bin."""
+        """Measurements in addition to the test set: shading, scales and rates per bin."""
         return Protocols.of(vars(self))
 
 

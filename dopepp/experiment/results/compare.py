@@ -111,7 +111,7 @@ def write_comparison(entries: Sequence[Entry], folder: Path) -> dict[str, Any]:
 
 
 def accuracy_curves(entries: Sequence[Entry]) -> dict[str, np.ndarray]:
-    """Return the ADD of all instances over objects and seeds, by method."""
+    """Return, by method, the ADD errors of all instances of all objects and seeds, metres."""
     return {
         entry.name: np.concatenate([e for report in entry.reports for e in report.errors.values()])
         for entry in entries

@@ -168,13 +168,13 @@ def read_run(folder: Path) -> Run:
         run.failure = str(error)
     if run.report is not None and "checkpoint" in run.report.details:
         run.checkpoint = folder / str(run.report.details["checkpoint"])
-    training, configs = config, [_as_asked(folder, config)] if config else []
+    training, configs = config, [_without_automatic_sizes(folder, config)] if config else []
     if "ckpt_path" in config:  # an evaluation: its checkpoint belongs to a training
         run.checkpoint = Path(str(config["ckpt_path"]))
         trained = run.checkpoint.parent.parent
         training = _mapping(trained / CONFIG_FILE)
         run.overrides = [*overrides_of(trained), *run.overrides]
-        configs = [config, _as_asked(trained, training)] if training else []
+        configs = [config, _without_automatic_sizes(trained, training)] if training else []
     seed = training.get("seed")
     run.seed = seed if isinstance(seed, int) else None
     run.recipe = _recipe(configs)
@@ -191,13 +191,14 @@ def _model(config: Mapping[str, Any], run: Run) -> str:
     return chosen[-1] if chosen else "run" if run.report is None else run.report.name
 
 
-def _as_asked(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a run's config without the sizes that were chosen automatically."""
-    asked, kept = _mapping(folder / _HYDRA / "config.yaml"), dict(config)
+def _without_automatic_sizes(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a run's config with None for the sizes that were chosen automatically."""
+    composed, result = _mapping(folder / _HYDRA / "config.yaml"), dict(config)
     for node, name in _CHOSEN_SIZES:
-        if (asked.get(node) or {}).get(name, name) is None and isinstance(kept.get(node), dict):
-            kept[node] = {**kept[node], name: None}
-    return kept
+        is_automatic = (composed.get(node) or {}).get(name, name) is None
+        if is_automatic and isinstance(result.get(node), dict):
+            result[node] = {**result[node], name: None}
+    return result
 
 
 def _recipe(configs: Sequence[Mapping[str, Any]]) -> str:
@@ -294,7 +295,7 @@ def group(runs: Sequence[Run]) -> list[Entry]:
 
 
 def with_refined(entries: Sequence[Entry]) -> list[Entry]:
-    """Return the methods, each followed by its refined version if measured in every run."""
+    """Insert after each method the same method with refinement, if every run measured it."""
     pairs: list[Entry] = []
     for entry in entries:
         pairs.append(entry)

@@ -378,20 +378,29 @@ def measure_scales(
 
 
 def _scale_level(scale: float, measured: Measured, unmoved: Measured) -> Level:
-    """Summarise a level, with a note if the instances or their visibility differ from scale 1."""
+    """Summarise the results at one scale.
+
+    A note states the evaluated instances if their number or visibility differs from scale 1.
+
+    Args:
+        scale: Factor on the apparent size of the parts.
+        measured: Measurement at this scale.
+        unmoved: Measurement at scale 1.
+    """
     rows = {report.name: report.rows for report in measured.reports}
-    visible, usual = _visible_fractions(measured), _visible_fractions(unmoved)
+    visible, reference = _visible_fractions(measured), _visible_fractions(unmoved)
     mean = float(visible.mean()) if len(visible) else math.nan
     note = (
         f"Evaluated instances at {SCALE.heading(scale)}: {_in_words(visible)}; "
-        f"at {SCALE.heading(1)}: {_in_words(usual)}."
-        if len(visible) != len(usual) or abs(mean - usual.mean()) > _NOTABLE
+        f"at {SCALE.heading(1)}: {_in_words(reference)}."
+        if len(visible) != len(reference) or abs(mean - reference.mean()) > _NOTABLE
         else ""
     )
     return Level(scale, rows, {"visible_fraction": mean}, note)
 
 
 def _in_words(fractions: Float[np.ndarray, "n"]) -> str:
+    """Return the number of instances and their mean visible fraction as text."""
     share = f", {100 * fractions.mean():.0f} % visible on average"
     return f"{len(fractions)}{share}" if len(fractions) else "none"
 

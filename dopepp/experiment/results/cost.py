@@ -124,7 +124,7 @@ class RehearsedEstimator(PoseEstimator):
     network_ended: float
 
     def maps(self, image: UInt8[np.ndarray, "height width 3"]) -> Maps:
-        """Run the network on the image and return ``answer`` instead of its maps."""
+        """Run and time the network, then discard its maps and return the maps in ``answer``."""
         self.network_began = time.perf_counter()
         super().maps(image)
         if self.device.type == "cuda":

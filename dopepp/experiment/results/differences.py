@@ -175,7 +175,7 @@ def headline(table: pd.DataFrame, symmetric: bool = False) -> list[Row]:
     """Return the compact table, with ``value ± deviation`` and ``Δ [interval]`` as cells.
 
     Args:
-        table: Frame of a comparison.
+        table: Full table of a comparison, one row per value.
         symmetric: Whether any object has symmetries.
     """
     chosen = _HEADLINE | _SYMMETRIC if symmetric else _HEADLINE

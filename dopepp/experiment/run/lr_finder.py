@@ -122,16 +122,16 @@ def _short_training(config: RunConfig) -> RunConfig:
 def _sweep(
     trainer: Trainer, system: PoseSystem, datamodule: PoseDataModule, options: LearningRateConfig
 ) -> tuple[Steps, Steps]:
-    """Return rate and loss of every step until the loss diverges."""
-    passes: list[float] = []
+    """Train with rising learning rates; return rate and loss of each step with a finite loss."""
+    batch_losses: list[float] = []
 
-    def note(module: object, inputs: object, output: tuple[Tensor, object]) -> None:
+    def store_loss(module: object, inputs: object, output: tuple[Tensor, object]) -> None:
         # Lightning stores only a running mean and would continue with infinite losses.
-        passes.append(float(output[0].detach()))
-        if not math.isfinite(passes[-1]):
+        batch_losses.append(float(output[0].detach()))
+        if not math.isfinite(batch_losses[-1]):
             trainer.should_stop = True
 
-    with system.loss.register_forward_hook(note):
+    with system.loss.register_forward_hook(store_loss):
         sweep = Tuner(trainer).lr_find(
             system,
             datamodule=datamodule,
@@ -142,8 +142,8 @@ def _sweep(
         )
     assert sweep is not None, "Lightning skips the sweep only with fast_dev_run"
     per_step = trainer.accumulate_grad_batches
-    count = min(len(sweep.results["lr"]), len(passes) // per_step)
-    losses = np.array(passes[: count * per_step]).reshape(count, per_step).mean(axis=1)
+    count = min(len(sweep.results["lr"]), len(batch_losses) // per_step)
+    losses = np.array(batch_losses[: count * per_step]).reshape(count, per_step).mean(axis=1)
     count = int(np.isfinite(losses).cumprod().sum())
     return np.array(sweep.results["lr"][:count]), losses[:count]
 

@@ -140,13 +140,13 @@ def refine_views(
 
     Args:
         region: Refiner of the part.
-        views: Pictures.
+        views: Pictures with the poses of their cameras.
         start: Pose in the world from which the search starts; its information limits the search.
         prior: Distribution of the pose before the pictures' outlines are used.
         surface: Surface points of the part, for views with depth.
 
     Raises:
-        UndecidedError: No view shows the outline.
+        UndecidedError: No view shows the part's outline, at the start or later.
     """
     covariance = np.linalg.inv(start.information)
     searches: list[_ViewSearch] = []
@@ -160,14 +160,14 @@ def refine_views(
     end = Solution(start.T_cam_obj, prior.information)
     num_stages = max((len(search.rounds) for search in searches), default=0)
     terms: list[Term] = []
-    for left in range(num_stages, 0, -1):
-        searches = [search for search in searches if search.learn(end.T_cam_obj, left)]
-        terms = [term for search in searches for term in search.terms(left)]
-        steps = max((search.round(left).stage.steps for search in searches), default=0)
-        reached = descend(end.T_cam_obj, prior, terms, steps)
-        if reached is None or not terms:
+    for stages_left in range(num_stages, 0, -1):
+        searches = [search for search in searches if search.learn(end.T_cam_obj, stages_left)]
+        terms = [term for search in searches for term in search.terms(stages_left)]
+        steps = max((search.round(stages_left).stage.steps for search in searches), default=0)
+        solution = descend(end.T_cam_obj, prior, terms, steps)
+        if solution is None or not terms:
             raise UndecidedError("the part's outline left the picture")
-        end = reached
+        end = solution
     agreements: list[OutlineAgreement | None] = [None] * len(views)
     for search in searches:
         agreements[search.number] = search.agreement(end.T_cam_obj)

@@ -75,12 +75,17 @@ class Prior:
         return step_between(T_cam_obj, self.T_cam_obj)
 
     def squared_distance(self, T_cam_obj: Transform) -> float:
-        """Return the squared Mahalanobis distance of a pose."""
+        """Return the squared Mahalanobis distance of a pose from this distribution."""
         offset = self.offset(T_cam_obj)
         return max(0.0, float(offset @ self.information @ offset))
 
     def draws(self, spread: float, count: int) -> list[Transform]:
-        """Draw poses with ``spread`` times the standard deviations, equal in every call."""
+        """Draw poses from a Gaussian around the pose; every call returns the same poses.
+
+        Args:
+            spread: Factor on the standard deviations.
+            count: Number of poses.
+        """
         deviations = spread * np.linalg.cholesky(np.linalg.inv(self.information))
         draws = np.random.default_rng(0).normal(size=(count, 6))
         return [moved(self.T_cam_obj, deviations @ draw) for draw in draws]

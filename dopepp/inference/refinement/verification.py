@@ -217,7 +217,7 @@ class Verifier:
             [
                 along.mean(),
                 along.mean() - beside,
-                _weakest(along, outline),
+                _weakest_sector(along, outline),
                 crease.mean() if len(crease) else 0.0,
                 crease.mean() - crease_beside if len(crease) else 0.0,
                 min(1.0, len(crease) / len(along)),
@@ -278,22 +278,35 @@ def _responses(
     lines: Float[np.ndarray, "points 4"],
     distance: float,
 ) -> tuple[Float[np.ndarray, "points"], float]:
-    """Return the response at each point of lines, and the mean of lines shifted by a distance."""
+    """Return the gradient response at each point, and the mean response of shifted points.
+
+    Args:
+        gradients: Derivatives of the image along x and y.
+        lines: Pixel (x, y) and unit normal (x, y) of each point.
+        distance: Length of the eight shifts around each point, pixels.
+    """
     angles = np.arange(8) * math.pi / 4
     shifts = distance * np.column_stack([np.cos(angles), np.sin(angles)])
-    here, beside = np.zeros(len(lines)), np.zeros(len(lines))
-    _respond(*gradients, lines, np.zeros((1, 2)), here)
-    _respond(*gradients, lines, shifts, beside)
-    return here, float(beside.mean() / len(shifts)) if len(lines) else 0.0
+    responses, shifted = np.zeros(len(lines)), np.zeros(len(lines))
+    _respond(*gradients, lines, np.zeros((1, 2)), responses)
+    _respond(*gradients, lines, shifts, shifted)
+    return responses, float(shifted.mean() / len(shifts)) if len(lines) else 0.0
 
 
-def _weakest(along: Float[np.ndarray, "points"], outline: Float[np.ndarray, "points 4"]) -> float:
-    """Return the mean response of the second weakest of eight sectors around the outline."""
-    away = outline[:, :2] - outline[:, :2].mean(axis=0)
-    sector = ((np.arctan2(away[:, 1], away[:, 0]) / (2 * math.pi) + 0.5) * SECTORS).astype(int)
-    sector = np.minimum(sector, SECTORS - 1)
+def _weakest_sector(
+    responses: Float[np.ndarray, "points"], outline: Float[np.ndarray, "points 4"]
+) -> float:
+    """Return the mean response in the second weakest of the sectors around the outline's centre.
+
+    Args:
+        responses: Gradient response of each outline point.
+        outline: Pixel (x, y) and normal (x, y) of each outline point.
+    """
+    offsets = outline[:, :2] - outline[:, :2].mean(axis=0)
+    angles = np.arctan2(offsets[:, 1], offsets[:, 0])
+    sector = np.minimum((angles / (2 * math.pi) + 0.5) * SECTORS, SECTORS - 1).astype(int)
     counts = np.bincount(sector, minlength=SECTORS)
-    means = np.bincount(sector, along, SECTORS)[counts > 0] / counts[counts > 0]
+    means = np.bincount(sector, responses, SECTORS)[counts > 0] / counts[counts > 0]
     return float(np.sort(means)[min(1, len(means) - 1)])
 
 
@@ -377,9 +390,17 @@ def _walk_creases(edges: Array, sides: Array, pixels: Array, ids: Array, spacing
 
 @compiled()
 def _respond(gx: Array, gy: Array, lines: Array, shifts: Array, responses: Array) -> None:
-    """Add the response at each shifted point: 1 for a strong gradient along the point's normal.
+    """Add to ``responses`` each point's gradient response, summed over the shifts.
 
-    The gradient of a pixel is that of the channel that changes most.
+    A response is 1 for a strong image gradient along the point's normal, and 0 for none. Of the
+    three colour channels, the channel with the largest gradient counts.
+
+    Args:
+        gx: Derivative of each channel along x.
+        gy: Derivative of each channel along y.
+        lines: Pixel (x, y) and unit normal (x, y) of each point.
+        shifts: Offsets (x, y) at which every point is evaluated, pixels.
+        responses: One sum per point, updated in place.
     """
     height, width = gx.shape[:2]
     for i in range(len(lines)):

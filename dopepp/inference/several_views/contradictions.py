@@ -105,6 +105,7 @@ def contradictions(
 
 
 def _support(detection: WorldDetection) -> list[int]:
+    """Return the numbers of the views that support a detection."""
     return [n for n, item in enumerate(detection.evidence) if item.status == "supports"]
 
 

@@ -109,56 +109,58 @@ class JointEstimator:
             The part with the sightings that agree with the joint pose. If no two views agree, the
             pose is that of the best sighting.
         """
-        name, everything = sightings[0].detection.object, set(range(len(self._views)))
+        name, all_views = sightings[0].detection.object, set(range(len(self._views)))
         geometry = self._geometries[name]
-        chosen, tried = everything, list[tuple[set[int], int]]()
-        while len(chosen) > 1 and (chosen, len(sightings)) not in tried:
-            tried.append((chosen, len(sightings)))
+        # Refine on the selected views, select the views that support the result, and repeat.
+        selected, tried = all_views, list[tuple[set[int], int]]()
+        while len(selected) > 1 and (selected, len(sightings)) not in tried:
+            tried.append((selected, len(sightings)))
             start = geometry.mean([sighting.pose for sighting in sightings])
-            limit = Prior(start.T_cam_obj, start.information / LOOSER**2)
-            members = {sighting.view for sighting in sightings}
-            numbers = sorted(chosen)
-            starts = [item.start for item in sightings if item.view in chosen]
+            search_range = Prior(start.T_cam_obj, start.information / LOOSER**2)
+            views_with_sighting = {sighting.view for sighting in sightings}
+            numbers = sorted(selected)
+            starts = [item.start for item in sightings if item.view in selected]
             prior = geometry.mean(starts or [sightings[0].start])
             try:
                 views = [self._views[number] for number in numbers]
-                joint = self._refiner.refine_views(name, views, limit, prior)
+                joint = self._refiner.refine_views(name, views, search_range, prior)
             except UndecidedError:
                 break
             pose = Prior(joint.T_world_obj, np.linalg.inv(joint.covariance))
             shown = dict(zip(numbers, joint.agreements, strict=True))
             evidence = [
-                self._evidence(number, pose, sightings, shown.get(number)) for number in everything
+                self._evidence(number, pose, sightings, shown.get(number)) for number in all_views
             ]
-            supporting = {n for n in everything if evidence[n].status == "supports"}
-            # What the image did not refine may be wrong, and is left out if it contradicts the
-            # pose that several views support.
+            supporting = {n for n in all_views if evidence[n].status == "supports"}
+            # A sighting that its image could not refine (`kept`) may be wrong. If it contradicts
+            # the pose that several views support, refine again without this sighting.
             consistent = [
                 item
                 for item in sightings
                 if not item.detection.kept or geometry.separation(pose, item.pose) <= CONSISTENT
             ]
             if len(supporting) > 1 and 0 < len(consistent) < len(sightings):
-                sightings, chosen = consistent, supporting
+                sightings, selected = consistent, supporting
                 continue
-            if supporting >= chosen:
-                agreeing = [item for item in sightings if item.view in chosen] or sightings
+            if supporting >= selected:
+                agreeing = [item for item in sightings if item.view in selected] or sightings
                 disagreement = max(joint.disagreements)
                 if len(agreeing) > 1:
-                    apart = [geometry.separation(pose, item.pose) for item in agreeing]
-                    disagreement = max(disagreement, min(apart) / math.sqrt(6))
-                # Views that disagree more than they should have larger errors than stated.
+                    separations = [geometry.separation(pose, item.pose) for item in agreeing]
+                    disagreement = max(disagreement, min(separations) / math.sqrt(6))
+                # A disagreement above 1 shows errors larger than stated: scale the covariance up.
                 looser = Prior(pose.T_cam_obj, pose.information / max(1.0, disagreement) ** 2)
                 return self._part(agreeing, looser, evidence, disagreement)
-            several = len(supporting & chosen) > 1
-            chosen = supporting & chosen if several else members
+            several = len(supporting & selected) > 1
+            selected = supporting & selected if several else views_with_sighting
         best = max(sightings, key=lambda sighting: sighting.detection.score)
-        alone = best.detection
+        detection = best.detection
+        probability = detection.probability or 0.0
         evidence = [
             self._evidence(number, best.pose, [best], None)
             if number != best.view
-            else ViewEvidence(self._names[number], "supports", alone.probability or 0.0, alone)
-            for number in everything
+            else ViewEvidence(self._names[number], "supports", probability, detection)
+            for number in all_views
         ]
         return self._part([best], best.pose, evidence)
 

@@ -266,7 +266,14 @@ class TemplateDetector:
     def transforms(
         self, views: np.ndarray, poses: np.ndarray, K: CameraMatrix
     ) -> Float[np.ndarray, "matches 4 4"]:
-        """Return the poses of matches, metres."""
+        """Convert matches of templates to poses of the part, metres.
+
+        Args:
+            views: Index of each match's template.
+            poses: Columns of each match: pixel (u, v) of the part's centre, rotation in the image
+                plane in radians, and projected diameter in pixels.
+            K: Camera matrix, pixels.
+        """
         u, v, turns, sizes = poses.T
         depths = self.part.diameter * focal_length(K) / sizes
         rays = np.column_stack(

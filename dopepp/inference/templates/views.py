@@ -121,7 +121,7 @@ def make_templates(
 
 
 def joined(groups: Sequence[Templates]) -> Templates:
-    """Concatenate groups of templates, which have equal lengths."""
+    """Concatenate groups of templates with equal numbers of views."""
     templates = Templates(
         *(
             np.concatenate([getattr(group, field.name) for group in groups])

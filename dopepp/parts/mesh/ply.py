@@ -178,11 +178,25 @@ def _doubles(text: bytes) -> bytes:
 
 
 def _read_table(body: bytes, start: int, element: Element) -> tuple[Table, int]:
-    """Read a table at once if all rows have lists of equal length, otherwise row by row."""
+    """Read all rows of an element (e.g. of the vertices).
+
+    The rows are read at once if all have lists of equal length, otherwise one after the other.
+
+    Args:
+        body: Data of the file, after its header.
+        start: Offset of the first row in ``body``, bytes.
+        element: Name, number of rows and columns of the element.
+
+    Returns:
+        The columns by name, and the offset of the byte after the last row.
+
+    Raises:
+        ValueError: The data end too early, or there are too many rows with uneven lists.
+    """
     name, num_rows, columns = element
     too_short = ValueError(f"less data than {num_rows} rows of element {name}")
-    smallest = sum((c.number if c.length is None else c.length).itemsize for c in columns)
-    if start + num_rows * smallest > len(body):
+    smallest_row = sum((c.number if c.length is None else c.length).itemsize for c in columns)
+    if start + num_rows * smallest_row > len(body):
         raise too_short
     fields: list[tuple[Any, ...]] = []
     for name, number, length, _ in columns:

@@ -149,18 +149,23 @@ def check_poses(
     )
 
 
-def _check_motion(T: Transforms, what: str, source: str) -> None:
-    """Check that the orientations of poses differ.
+def _check_motion(T: Transforms, body: str, source: str) -> None:
+    """Check that the recorded poses differ enough in orientation for a calibration.
+
+    Args:
+        T: Recorded poses of one body.
+        body: Name of the body, for the message.
+        source: Name of the recording, for the message.
 
     Raises:
         UserError: The largest rotation between two poses is below ``MIN_TURN``.
     """
     i, j = np.triu_indices(len(T), 1)
-    between = T[i, :3, :3] @ T[j, :3, :3].transpose(0, 2, 1)
-    largest = Rotation.from_matrix(between).magnitude().max(initial=0.0)
+    relative = T[i, :3, :3] @ T[j, :3, :3].transpose(0, 2, 1)
+    largest = Rotation.from_matrix(relative).magnitude().max(initial=0.0)
     if largest < MIN_TURN:
         raise UserError(
-            f"{source}: the {what} rotates by {np.degrees(largest):.1f}° over all {len(T)} poses",
+            f"{source}: the {body} rotates by {np.degrees(largest):.1f}° over all {len(T)} poses",
             "rotations of at least 30° about different axes",
             "turn the robot between pictures, and record each picture's pose",
         )

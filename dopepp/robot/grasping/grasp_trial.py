@@ -193,7 +193,7 @@ class Trials:
 
     @cached_property
     def templates(self) -> PoseEstimator:
-        """Estimator of the part's mesh by templates, for the camera's distances."""
+        """Estimator that detects the part with templates of its mesh, without training."""
         from dopepp.inference.estimator import PoseEstimator
 
         near, far = self.distance

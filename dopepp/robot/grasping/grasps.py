@@ -319,17 +319,20 @@ def _score(
 
 
 def _distinct(scored: list[tuple[float, Grasp]], count: int) -> list[Grasp]:
-    """Return the best grasps that differ from each other."""
+    """Return at most ``count`` (score, grasp) pairs' grasps, best first, without near-duplicates.
+
+    A grasp is left out if a better grasp is within ``APART`` of its position and directions.
+    """
     distance, cosine = APART[0], math.cos(APART[1])
-    kept: list[Grasp] = []
+    distinct: list[Grasp] = []
     for _, grasp in sorted(scored, key=lambda pair: -pair[0]):
-        if len(kept) == count:
+        if len(distinct) == count:
             break
         if not any(
             np.linalg.norm(grasp.point - other.point) < distance
             and abs(grasp.closing @ other.closing) > cosine
             and grasp.approach @ other.approach > cosine
-            for other in kept
+            for other in distinct
         ):
-            kept.append(grasp)
-    return kept
+            distinct.append(grasp)
+    return distinct

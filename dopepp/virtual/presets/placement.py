@@ -218,7 +218,14 @@ class FillPlacement(_Placement):
     kind: Literal["fill"] = "fill"
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
-        """Return the object's origin in the camera frame, metres."""
+        """Return the object's origin in the camera frame, metres.
+
+        Args:
+            rng: Random numbers.
+            K: Camera matrix, pixels.
+            size: (width, height) of the image.
+            rotated_hull: Corners of the part's convex hull, relative to its origin, camera axes.
+        """
         share = rng.uniform(self.smallest, self.largest)
         offset = rng.uniform(-0.5, 0.5, 2)
         centre = (rotated_hull.min(axis=0) + rotated_hull.max(axis=0)) / 2
@@ -230,11 +237,11 @@ class FillPlacement(_Placement):
             image = project(hull + depth * ray, K)
             lower, upper = image.min(axis=0), image.max(axis=0)
             # The bounding box stays inside the image; a box that fills the image cannot move.
-            wanted = np.array(size) / 2 - 0.5 + offset * (size - (upper - lower))
-            missing = wanted - (lower + upper) / 2
-            if np.abs(missing).max() < 0.05:
+            target_centre = np.array(size) / 2 - 0.5 + offset * (size - (upper - lower))
+            correction = target_centre - (lower + upper) / 2
+            if np.abs(correction).max() < 0.05:
                 break
-            pixel = pixel + missing
+            pixel = pixel + correction
         return np.asarray(depth * ray - centre)
 
 

@@ -142,7 +142,13 @@ def read_poses(truths: Sequence[Record], infos: Sequence[Record | None], nodes: 
 def _stated_column(
     records: Sequence[object], field: str, node: Callable[[int], Node]
 ) -> Float[np.ndarray, " records"]:
-    """Return one number per record; NaN for a record that does not state the number."""
+    """Return the number in a field of each record, or NaN for records without the field.
+
+    Args:
+        records: Records of the objects of an image.
+        field: Name of the field.
+        node: Returns the node of the record with this index, for reports.
+    """
     stated = [n for n, record in enumerate(records) if field in mapping(record)]
     values = np.full(len(records), math.nan)
     rows = [records[n] for n in stated]
@@ -193,13 +199,14 @@ class SceneRecords(NamedTuple):
 
 
 def read_records(folder: Path, problems: Problems = STRICT) -> SceneRecords:
-    """Read a scene's JSON files; the two with ground truth may be missing."""
+    """Read a scene's JSON files; ``scene_gt`` and ``scene_gt_info`` may be missing."""
     camera, gt, gt_info = (
         Node(problems, folder / f"scene_{name}.json") for name in ("camera", "gt", "gt_info")
     )
     cameras = _by_image(camera)
     truths, infos = (_by_image(p) if Path(p.path).exists() else {} for p in (gt, gt_info))
     objects = {image: gt[f"{image}"].entries(rows) for image, rows in truths.items()}
+    # Images that only scene_gt_info lists have no objects.
     paired: dict[int, list[Record | None]] = {image: [] for image in infos.keys() - objects}
     for image, records in objects.items():
         paired[image] = pair_infos(records, infos.get(image), gt_info[f"{image}"])
@@ -223,7 +230,13 @@ def _by_image(node: Node) -> dict[int, Any]:
 def image_files(
     scene: Path, kind: tuple[tuple[str, ...], tuple[str, ...]], problems: Problems = STRICT
 ) -> dict[int, Path]:
-    """Return a scene's :data:`PICTURES` or :data:`DEPTHS` by image number."""
+    """Return the files of a scene's colour or depth images by image number.
+
+    Args:
+        scene: Folder of the scene.
+        kind: :data:`PICTURES` or :data:`DEPTHS`, the allowed folders and suffixes.
+        problems: Receiver of an image that is present twice.
+    """
     folders, suffixes = kind
     folder = next((scene / name for name in folders if (scene / name).is_dir()), None)
     files: dict[int, Path] = {}

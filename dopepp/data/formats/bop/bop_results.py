@@ -205,4 +205,5 @@ def _check_unit(path: Path, table: Table) -> None:
 def _bad(
     problem: str, allowed: str, fix: str = "correct the line, or write the file again"
 ) -> UserError:
+    """Return the error for a malformed results file."""
     return UserError(problem, allowed, fix)

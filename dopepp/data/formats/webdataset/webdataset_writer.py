@@ -108,7 +108,17 @@ class WebdatasetWriter(BopFolder):
 
 
 def _merged(paths: Sequence[Path], chunk: int) -> Iterator[tuple[str, Content]]:
-    """Yield archives' images by number, one in memory at a time; later archives replace images."""
+    """Merge the images of tar archives, in order of the image number.
+
+    If several archives hold an image, the last archive wins. One image is in memory at a time.
+
+    Args:
+        paths: Archives; missing archives are ignored.
+        chunk: Number of the chunk, which begins the keys.
+
+    Yields:
+        Key and files of an image.
+    """
     images: dict[int, tuple[Path, list[TarMember]]] = {}
     for path in paths:
         if path.exists():

@@ -44,11 +44,11 @@ def check_ycb(report: CheckReport) -> None:
 
 
 def _check_lists(report: CheckReport) -> None:
-    """Check the image sets, and note listed frames that are not on disk."""
+    """Check the files in ``image_sets/``, and note frames that they list but the disk lacks."""
     for path in sorted((report.root / "image_sets").glob("*.txt")):
         if path.stem == "classes":
             continue
-        absent = 0
+        num_absent = 0
         for subset, folder in ycb_video.FOLDERS.items():
             try:
                 listed = ycb_video.read_image_set(report.root, path.stem, subset)
@@ -56,9 +56,9 @@ def _check_lists(report: CheckReport) -> None:
                 report.take(path, "line", error)
                 break
             metas = (report.root / folder / f"{frame}-meta.mat" for frame in listed)
-            absent += sum(not meta.is_file() for meta in metas)
-        if absent:
-            report.note(f"{path.name} lists {absent:,} frames that are not on disk")
+            num_absent += sum(not meta.is_file() for meta in metas)
+        if num_absent:
+            report.note(f"{path.name} lists {num_absent:,} frames that are not on disk")
 
 
 def _frames(folder: Path) -> Iterator[str]:

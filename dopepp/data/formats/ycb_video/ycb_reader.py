@@ -77,7 +77,7 @@ class YcbVideoReader:
         classes = ycb_video.read_classes(self.root)
         unknown = [part.name for part in parts if part.name not in classes]
         if unknown:
-            allowed = f"those of classes.txt: {classes}"
+            allowed = f"the names in classes.txt: {classes}"
             fix = "set data.objects to names of this list"
             raise UserError(f"objects {unknown}", allowed, fix)
         self._parts = {classes.index(part.name) + 1: part for part in parts}

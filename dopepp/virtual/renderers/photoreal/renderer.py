@@ -135,7 +135,15 @@ class Tracer:
     def trace(
         self, world: dict[str, Any], film: Film
     ) -> Float32[np.ndarray, "film_height film_width 4"]:
-        """Return the denoised radiance and the coverage of a film's pixels."""
+        """Render the scene by path tracing, and denoise it.
+
+        Args:
+            world: Mitsuba's description of the objects; lights are added.
+            film: The pixels to render.
+
+        Returns:
+            Per pixel, the linear radiance (RGB) and the share that objects cover.
+        """
         lit = {**world, **make_surroundings(self._mi, self._scene)}
         traced = self._measure(lit, film, _PATHS, SAMPLES_PER_PIXEL)
         # Four samples per pixel suffice: surface features are far less noisy than light.

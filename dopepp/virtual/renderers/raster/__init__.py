@@ -87,7 +87,7 @@ def silhouette(item: SceneObject, K: Array, size: Size) -> Silhouette:
 
 
 def visible_fractions(scene: Scene) -> Float[np.ndarray, "objects"]:
-    """Return the visible fractions that a renderer reports, without shading anything."""
+    """Return each object's visible fraction as a render reports it, without computing colours."""
     projected = [project_object(item, scene.K) for item in scene.objects]
     samples = draw_samples(scene, projected, (0, 0, *scene.size), CENTRE_SAMPLE)
     owners = np.searchsorted(first_ids(scene), samples.ids[..., 0], side="right") - 1

@@ -49,9 +49,16 @@ def shade_object(
     first_id: int,
     colour: Array,
 ) -> None:
-    """Add one object's light to the colour of the pixels that show it.
+    """Add the light that an object reflects to the pixels that show it.
 
-    ``colour`` is the sum of sRGB values per pixel, float32 (height, width, 3), updated in place.
+    Args:
+        item: The object.
+        projected: Its projected triangles.
+        scene: The scene.
+        lights: The lights with their shadow maps.
+        samples: Triangle number of each sample of the pixels.
+        first_id: Number of the object's first triangle.
+        colour: Sum of sRGB values per pixel, float32 (height, width, 3), updated in place.
     """
     fragments = gather_fragments(item, projected, scene, samples, first_id)
     if fragments is None:
