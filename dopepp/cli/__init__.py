@@ -60,6 +60,7 @@ app = typer.Typer(cls=_OneLineErrors, no_args_is_help=True)
 
 
 def _show_version(is_requested: bool) -> None:
+    """Print the version and exit, if the option is given."""
     if is_requested:
         typer.echo(f"dopepp {__version__}")
         raise typer.Exit

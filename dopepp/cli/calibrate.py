@@ -259,6 +259,7 @@ def rig(
 
 
 def _pose_format(unit: str, angles: str, quaternion: str, direction: str) -> PoseFormat:
+    """Check the options that describe a file of robot poses, and combine them."""
     from dopepp.robot.calibration.records import PoseFormat, check_unit
 
     for name, value, allowed in (
@@ -355,6 +356,7 @@ def _find_board(board: Board, picture: Picture, name: str, quiet: bool) -> Sight
 def _check_sightings(
     sightings: list[Sighting], size: Size | None, source: str, count: int
 ) -> tuple[list[Sighting], Size]:
+    """Return the detected boards and the pictures' size; reject pictures without any board."""
     if not sightings or size is None:
         raise UserError(
             f"{source}: no board in any of {count} pictures",
@@ -430,6 +432,7 @@ def _show_lens(calibration: LensCalibration) -> None:
 def _show_hand_eye(
     boards: Sequence[BoardPose], calibration: HandEye, quality: CalibrationQuality
 ) -> None:
+    """Print each picture's errors, the robot's estimated error, and advice on further poses."""
     from math import degrees
 
     for number, board in enumerate(boards):
@@ -451,6 +454,7 @@ def _show_hand_eye(
 
 
 def _show_rig(calibration: Rig) -> None:
+    """Print the rejected pictures and each camera's errors and deviations."""
     from math import degrees, hypot
 
     for moment in calibration.outliers:
@@ -469,6 +473,7 @@ def _show_rig(calibration: Rig) -> None:
 def _rig_record(
     calibration: Rig, T_base_first: Transform, folder: Path, out: Path
 ) -> dict[str, object]:
+    """Return the content of the rig's file: the pose and folder of every camera."""
     from math import degrees
     from os.path import relpath
 
@@ -488,6 +493,7 @@ def _rig_record(
 
 
 def _hand_eye_record(calibration: HandEye, quality: CalibrationQuality) -> dict[str, object]:
+    """Return the content of the hand-eye file: both transforms with their covariance."""
     from dopepp.robot.calibration.records import transform_record
 
     mount, other = ("flange", "base") if calibration.mount == "hand" else ("base", "flange")

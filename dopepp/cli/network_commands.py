@@ -100,6 +100,7 @@ def _row(path: Path, timing: Timing) -> dict[str, str]:
 
 
 def _print_table(rows: list[dict[str, str]]) -> None:
+    """Print rows with aligned columns; the first column is the model."""
     widths = {key: max(len(key), *(len(row[key]) for row in rows)) for key in rows[0]}
     for row in ({key: key for key in rows[0]}, *rows):
         cells = [row[key].rjust(width) for key, width in list(widths.items())[1:]]

@@ -54,6 +54,7 @@ class Outputs:
         self._each(lambda output: output.take(result))
 
     def _each(self, action: Callable[[Output], None]) -> None:
+        """Call a method of every output."""
         for path, output in self._outputs:
             with _disk_errors(path):
                 action(output)
@@ -192,6 +193,7 @@ class BopCsv:
 
 @contextmanager
 def _disk_errors(path: Path) -> Iterator[None]:
+    """Convert an ``OSError`` in the block to a :class:`RunError` that names the path."""
     try:
         yield
     except OSError as error:

@@ -81,12 +81,15 @@ def config_folders() -> Iterator[tuple[str, Path]]:
 
 
 def _enabled() -> list[str]:
+    """Return the names of the enabled packages, which child processes inherit."""
     return [name for name in os.environ.get(VARIABLE, "").split(",") if name]
 
 
 def _entries(group: str) -> tuple[EntryPoint, ...]:
+    """Return the entry points of a group in all installed packages."""
     return tuple(entry_points(group=f"dopepp.{group}"))
 
 
 def _package(entry: EntryPoint) -> str:
+    """Return the name of the package that declares an entry point, or an empty string."""
     return "" if entry.dist is None else str(entry.dist.name)

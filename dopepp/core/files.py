@@ -51,6 +51,7 @@ def write_picture(path: Path, image: UInt8[np.ndarray, "height width 3"]) -> Non
 
 
 def _encoded(image: UInt8[np.ndarray, "height width 3"], suffix: str) -> bytes:
+    """Return an image encoded in the format of a suffix."""
     import cv2  # takes a tenth of a second, and not every command writes pictures
 
     return bytes(cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes())

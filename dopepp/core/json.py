@@ -99,6 +99,7 @@ class _NotFiniteError(ValueError):
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Convert the pairs of a JSON object to a dictionary, and reject a repeated key."""
     fields = dict(pairs)
     if len(fields) < len(pairs):
         seen: set[str] = set()
@@ -108,6 +109,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _finite(text: str) -> float:
+    """Convert a number's text to a float, and reject overflow."""
     number = float(text)
     if not math.isfinite(number):
         raise _NotFiniteError(text)
@@ -142,5 +144,6 @@ def _may_overflow(bare: bytes) -> bool:
 
 
 def _bad(where: str, problem: str) -> UserError:
+    """Return the error for invalid JSON."""
     allowed = "UTF-8 JSON with finite numbers and each key once"
     return UserError(f"{where}: {problem}", allowed, "correct the file, or write it again")

@@ -230,6 +230,7 @@ class ProcessPool(Pool):
         return opened(answer)
 
     def _start(self) -> SpawnProcess:
+        """Start this thread's worker process and connect to it."""
         context = get_context("spawn")
         self._worker.connection, remote = context.Pipe()
         process = context.Process(target=_serve, args=(remote,))
@@ -241,6 +242,7 @@ class ProcessPool(Pool):
         return process
 
     def _kill(self) -> None:
+        """Kill all worker processes."""
         for process in self._processes:
             process.kill()
 

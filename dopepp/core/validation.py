@@ -76,6 +76,7 @@ class Range:
 
     @property
     def _unit(self) -> str:
+        """Return the unit in parentheses, or an empty string."""
         return f" ({self.unit})" if self.unit else ""
 
     def __get_pydantic_core_schema__(self, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -205,6 +206,7 @@ class Checked:
 
 @cache
 def _ranged_fields(kind: Any) -> dict[str, Any]:
+    """Return the annotations of the fields that have a :class:`Range`."""
     hints = typing.get_type_hints(kind, include_extras=True)
     return {
         name: hint
@@ -223,16 +225,19 @@ def shown(value: object, most: int = 100) -> str:
 
 @cache
 def _adapter(kind: type[T]) -> TypeAdapter[T]:
+    """Return pydantic's validator of a type."""
     # A class of an extension may have arguments that no plain value can represent.
     config = None if dataclasses.is_dataclass(kind) else ConfigDict(arbitrary_types_allowed=True)
     return TypeAdapter(kind, config=config)
 
 
 def _validated(kind: Any, value: object, name: str) -> Any:
+    """Validate a plain value against a type, without converting between types."""
     return _adapter(kind).validate_json(_json(value, name), strict=True)
 
 
 def _json(value: object, name: str) -> str:
+    """Return a plain value as JSON, and reject values that JSON cannot represent."""
     try:
         return json.dumps(value)
     except (TypeError, ValueError, RecursionError) as error:

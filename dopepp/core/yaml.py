@@ -64,5 +64,6 @@ def _check_events(text: str) -> None:
 
 
 def _bad(where: Path | str, problem: str) -> UserError:
+    """Return the error for YAML that is not accepted."""
     allowed = f"YAML of at most {MAX_BYTES / 1e6:g} MB, without anchors and tags"
     return UserError(f"{where}, {problem}", allowed, "write plain YAML, or restore the file")

@@ -60,6 +60,7 @@ def check_dataset(root: Path) -> CheckReport:
 
 
 def _layout_of(root: Path) -> str | None:
+    """Return the name of a folder's layout, or None if the folder has no known layout."""
     return next((name for name, (is_layout, _) in LAYOUTS.items() if is_layout(root)), None)
 
 

@@ -173,6 +173,7 @@ class PoseDataModule(LightningDataModule):
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _splits(self) -> dict[str, DescribedSource]:
+        """Return the sources by the name of their split."""
         return {"train": self.train_source, "val": self.val_source, "test": self.test_source}
 
 
@@ -307,6 +308,7 @@ class PoseLoader(DataLoader[Any]):
 
 
 def _collate(items: list[Sample | UserError], object_index: dict[str, int]) -> Batch | UserError:
+    """Stack samples to a batch, or return the first error among the samples."""
     for item in items:
         if isinstance(item, UserError):
             return item
@@ -314,6 +316,7 @@ def _collate(items: list[Sample | UserError], object_index: dict[str, int]) -> B
 
 
 def _start_worker(worker: int) -> None:
+    """Prepare a worker process of the data loader: no OpenCV threads, no signal handling."""
     # The workers use all cores; OpenCV's threads would compete and do not survive forks.
     cv2.setNumThreads(0)
     # Signals may reach the whole process group. The main process decides when to stop, and workers

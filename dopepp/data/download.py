@@ -190,10 +190,12 @@ def _verify(path: Path, url: str, sha256: str) -> None:
 
 
 def _failed(url: str, reason: str) -> UserError:
+    """Return the error for a download that did not succeed."""
     fix = "check the network and run the command again, which resumes the download"
     return UserError(f"{url}: {reason}", "a reachable server with the file", fix)
 
 
 def _other_file(url: str, problem: str, expected: str) -> UserError:
+    """Return the error for a downloaded file that differs from the expected file."""
     fix = "run the command again; if this error remains, the file on the server has changed"
     return UserError(f"{url}: {problem}", expected, fix)

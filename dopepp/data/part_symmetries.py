@@ -63,6 +63,7 @@ def choose_symmetries(
 def _with(
     part: Part, discrete: bop_models.Discrete | None, continuous: bop_models.Continuous
 ) -> Part:
+    """Return a part with these symmetries."""
     return replace(part, symmetries_discrete=discrete, symmetries_continuous=continuous)
 
 

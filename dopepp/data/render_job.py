@@ -199,6 +199,7 @@ def _in_camera(
 
 
 def _sides(size: str) -> tuple[int, int]:
+    """Parse an image size ``WIDTHxHEIGHT``."""
     match = re.fullmatch(r"([0-9]{1,6})[x,]([0-9]{1,6})", size)
     if match is None:
         raise UserError(f"--size {size}", "WIDTHxHEIGHT in pixels", "pass e.g. --size 640x480")

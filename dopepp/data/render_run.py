@@ -201,6 +201,7 @@ class RenderTasks:
         return render_s, write_s
 
     def _open(self) -> Writer:
+        """Return this process's writer into the data set; open it at the first task."""
         if self._writer is None:
             cv2.setNumThreads(1)
             os.environ.setdefault(THREADS_SETTING, "1")

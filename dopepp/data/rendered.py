@@ -218,12 +218,14 @@ class CachedSource:
         ]
 
     def _resized(self, index: int) -> Sample:
+        """Return an item of the source at the cached size."""
         sample = self._source.sample(index, 0)
         if self._input_size is None:
             return sample
         return replace(resize_sample(sample, self._input_size), depth=None)
 
     def _checksum(self, index: int) -> int:
+        """Return a checksum of a slot that is never 0, the value of an empty slot."""
         return zlib.crc32(self._slots[index : index + 1].view("u1").data) | _FILLED
 
     def _store(self, index: int, sample: Sample) -> None:

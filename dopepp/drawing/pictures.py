@@ -259,6 +259,7 @@ def _is_deep(image: Image.Image, content: bytes) -> bool:
 
 
 def _reason(error: Exception) -> str:
+    """Return an exception's message on one line, or its type if it has no message."""
     return " ".join(str(error).split()) or type(error).__name__
 
 

@@ -127,6 +127,7 @@ def entry(
 
 
 def _exit(line: object, code: int) -> None:
+    """Print a line on stderr and exit with a code."""
     sys.stdout.flush()
     sys.stderr.write(f"{line}\n")
     raise SystemExit(code)

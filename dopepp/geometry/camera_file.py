@@ -209,4 +209,5 @@ def _fix(size: Size, calibrated: Size) -> str:
 
 
 def _by(size: Size) -> str:
+    """Format a size as ``width×height``."""
     return f"{size[0]}×{size[1]}"

@@ -128,6 +128,7 @@ def _xml(text: str, source: str) -> dict[object, object]:
 
 
 def _words(element: ElementTree.Element) -> object:
+    """Return an XML element's text as one word or a list of words."""
     words = (element.text or "").split()
     return words[0] if len(words) == 1 else words
 
@@ -197,6 +198,7 @@ class _Fields:
 
 
 def _key(name: str) -> str:
+    """Return a field's name in the form in which names are compared."""
     return name.lower().replace("_", "")
 
 
@@ -260,6 +262,7 @@ def _floats(values: Sequence[Any]) -> list[float] | None:
 
 
 def _side(name: str, value: object) -> int:
+    """Return a side of the image size, a whole number of pixels."""
     number = _number(name, value)
     return check(name, int(number) if number.is_integer() else number, int, _SIDE)
 

@@ -58,6 +58,7 @@ def focal_factor(
     extent = float(np.ptp(keypoints[is_known], axis=0).max())
 
     def errors(values: Float[np.ndarray, "unknowns"], first: float) -> Float[np.ndarray, "errors"]:
+        """Return the reprojection errors over the object's extent, for a step and a factor."""
         step, lens, start = values[:6].copy(), K.copy(), T_cam_obj.copy()
         factor = first * math.exp(values[6]) if len(values) > 6 else first
         lens[[0, 1], [0, 1]] *= factor

@@ -64,6 +64,7 @@ def symmetry_group(
 
 
 def _unit(axis: Sequence[float]) -> Vector:
+    """Return an axis normalised to length 1."""
     length = float(np.linalg.norm(axis))
     if not 0 < length < math.inf:
         raise ValueError(f"an axis of symmetry must have a length, got {list(axis)}")

@@ -247,6 +247,7 @@ def belief_sheet(estimator: PoseEstimator, image: Picture, K: CameraMatrix) -> P
 
 
 def _message(text: str, is_error: bool = False) -> str:
+    """Return a message as HTML."""
     return f'<p class="said{" wrong" * is_error}">{escape(text)}</p>'
 
 

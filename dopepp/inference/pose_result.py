@@ -198,6 +198,7 @@ class PoseResult:
         return pd.DataFrame(rows, columns=[*COLUMNS, *COLUMNS_POSE, "reprojection_error_px"])
 
     def _identified(self) -> list[tuple[Detection, int | None]]:
+        """Pair each detection with the tracker's number of its part, or None."""
         identities: Sequence[int | None] = self.identities or [None] * len(self.detections)
         return list(zip(self.detections, identities, strict=True))
 
@@ -218,6 +219,7 @@ def record(detection: Detection) -> dict[str, Any]:
 
 
 def _finite(value: Any) -> Any:
+    """Replace NaN and infinity in nested lists by None."""
     if isinstance(value, list):
         return [_finite(element) for element in value]
     return value if math.isfinite(value) else None

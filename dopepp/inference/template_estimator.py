@@ -110,6 +110,7 @@ class TemplateEstimator(PoseEstimator):
         return estimator
 
     def _refine_by(self, refine: Refine | None, parts: Sequence[Part]) -> None:
+        """Set the refinement, which must include the image region."""
         terms = (refine,) if isinstance(refine, str) else refine or ()
         if "region" not in terms:
             fix = "leave out the refinement, or use region or region and depth"
@@ -191,6 +192,7 @@ class TemplateEstimator(PoseEstimator):
     def _missing(
         self, image: Picture, K: CameraMatrix, distances: Distances | None, roi: Region | None
     ) -> list[Reason]:
+        """Return a reason for each part without a start detection."""
         near, far = self._range(distances)
         text = f"no view of the part fits the image at {near:.2g} – {far:.2g} m"
         starts = self._start_detections(image, K, distances, roi)

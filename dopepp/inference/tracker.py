@@ -333,8 +333,10 @@ def _region_around(detections: Sequence[Detection], image: Picture) -> Region | 
 
 
 def _agreement(detection: Detection) -> float:
+    """Return the agreement of a detection's outline, 0 if unknown."""
     return 0.0 if detection.agreement is None else detection.agreement
 
 
 def _centre(detection: Detection) -> Float[np.ndarray, "3"]:
+    """Return the position of a detection's origin in the camera frame, metres."""
     return detection.T_cam_obj[:3, 3]

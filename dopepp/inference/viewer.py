@@ -216,6 +216,7 @@ def belief_pictures(estimator: PoseEstimator, result: PoseResult) -> Mapping[str
 
 
 def _is_listening(port: int) -> bool:
+    """Return whether a program on this machine accepts connections at a port."""
     try:
         socket.create_connection((LOCALHOST, port), 0.5).close()
     except OSError:

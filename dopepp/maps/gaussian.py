@@ -406,6 +406,7 @@ def _covariance(
 
 @compiled()
 def _product(left: Array, right: Array) -> float:
+    """Return the scalar product of two vectors of length 6."""
     total = 0.0
     for k in range(6):
         total += left[k] * right[k]

@@ -220,6 +220,7 @@ class PoseMetrics(Metric):
             self._keep(self.false_positives, np.array(strays, np.float64))
 
     def _keep(self, state: list[Tensor], rows: Float[np.ndarray, "rows columns"]) -> None:
+        """Append rows to a metric's state."""
         if rows.size:
             state.append(torch.from_numpy(rows.ravel()).to(self.device))
 
@@ -327,6 +328,7 @@ class Gathered:
         return self.errors.add_or_s < 0.1 * self.part.diameter
 
     def _average_precision(self) -> float:
+        """Return the average precision of all detections of the object."""
         hits = self._correct
         misses = ~hits & self.errors.add.isfinite()
         # Wrong predictions precede correct ones of equal score, so that AP does not depend on the
@@ -337,6 +339,7 @@ class Gathered:
 
 
 def _table(state: list[Tensor], width: int) -> Float[Tensor, "rows columns"]:
+    """Join the chunks of a metric's state into a table with ``width`` columns."""
     flat = dim_zero_cat(state) if len(state) else torch.empty(0)
     return flat.detach().cpu().double().reshape(-1, width)
 

@@ -229,10 +229,12 @@ class Column:
 
 
 def _below(error: str, diameters: float) -> Formula:
+    """Return the formula of a pass rate at a threshold relative to the diameter."""
     return lambda errors: pass_rate(getattr(errors, error), diameters * errors.diameter)
 
 
 def _within(error: str, metres: float) -> Formula:
+    """Return the formula of a pass rate at a threshold in metres."""
     return lambda errors: pass_rate(getattr(errors, error), metres)
 
 
@@ -253,10 +255,12 @@ def _of_finite(error: str, statistic: Callable[[Tensor], float]) -> Formula:
 
 
 def _median(error: str) -> Formula:
+    """Return the formula of the median of an error's finite values."""
     return _of_finite(error, lambda finite: statistics.median(finite.tolist()))
 
 
 def _p90(error: str) -> Formula:
+    """Return the formula of the 90 % quantile of an error's finite values."""
     return _of_finite(error, lambda finite: float(finite.quantile(0.9)))
 
 
@@ -269,18 +273,22 @@ def _near(errors: PoseErrors) -> float | None:
 
 
 def _ar_mssd(errors: PoseErrors) -> float:
+    """Return BOP's average recall of MSSD."""
     return average_recall(errors.mssd, [share * errors.diameter for share in BOP_THRESHOLDS])
 
 
 def _ar_mspd(errors: PoseErrors) -> float | None:
+    """Return BOP's average recall of MSPD, or None without cameras."""
     return None if errors.mspd is None else average_recall(errors.mspd, BOP_MSPD_THRESHOLDS)
 
 
 def _mspd_5px(errors: PoseErrors) -> float | None:
+    """Return the share of poses with an MSPD below 5 pixels, or None without cameras."""
     return None if errors.mspd is None else pass_rate(errors.mspd, 5)
 
 
 def _median_deviations(errors: PoseErrors) -> float | None:
+    """Return the median Mahalanobis distance over its value for exact covariances."""
     median = _median("mahalanobis")(errors)
     return None if median is None else median / _USUAL_MAHALANOBIS
 

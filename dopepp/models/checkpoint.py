@@ -246,6 +246,7 @@ def _check_weights(checkpoint: Checkpoint, size: int) -> None:
 
 
 def _same_kind(value: object, expected: Tensor) -> bool:
+    """Return whether a stored value fits a network's tensor: dense, same shape and number kind."""
     return (
         isinstance(value, Tensor)
         and value.layout is torch.strided
@@ -324,6 +325,7 @@ def packed(payload: Mapping[str, Any]) -> str:
 
 
 def _half(name: str, value: Tensor) -> Tensor:
+    """Convert a floating-point tensor to half precision, and reject values that overflow."""
     if not value.is_floating_point():
         return value
     half = value.to(torch.float16)

@@ -217,6 +217,7 @@ def same_conv(
 
 
 def _weights_file(path: object) -> str:
+    """Return the path of the weights: a given file, or the ImageNet weights of a package."""
     if not isinstance(path, str):
         allowed = f"a file path, or the word {IMAGENET}"
         raise UserError(f"weights_path={path!r:.200}", allowed, "set weights_path to one of these")

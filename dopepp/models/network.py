@@ -164,6 +164,7 @@ def check_spec(spec: Mapping[str, Any]) -> None:
 
 
 def _check_keys(spec: object) -> None:
+    """Check that a spec has exactly the required keys."""
     if not isinstance(spec, Mapping) or set(spec) != set(SPEC_KEYS):
         keys = sorted(map(str, spec)) if isinstance(spec, Mapping) else repr(spec)[:200]
         allowed = f"exactly {', '.join(SPEC_KEYS)}"

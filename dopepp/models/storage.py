@@ -175,6 +175,7 @@ def check_container(path: Path, what: str) -> int:
 
 
 def _check_file(path: Path, what: str) -> None:
+    """Check that a path is a file."""
     if not path.is_file():
         raise UserError(f"{path}, which is not a file", what, "pass the path of an existing file")
 
@@ -276,6 +277,7 @@ def _storage_references(stream: IO[bytes]) -> Iterator[tuple[str, str, int]]:
 
 
 def _storage_reference(value: object) -> tuple[str, str, int]:
+    """Return kind, key and number of values of a storage reference in a pickle."""
     match value:
         case ("storage", _Name() as kind, str(key), str(), int(count), *_):
             if kind in _STORAGE_BYTES and key.isascii():

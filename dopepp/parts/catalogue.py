@@ -198,6 +198,7 @@ def _rectangle(
 
 
 def _disc(centre: tuple[float, float], radius: float) -> CrossSection:
+    """Return a disc, approximated by a polygon."""
     return CrossSection.circle(radius, SEGMENTS).translate(centre)
 
 

@@ -93,4 +93,5 @@ def _meshes(mesh: Mesh) -> Iterator[tuple[str, Mesh]]:
 
 
 def _changed(mesh: Mesh, vertices: Vertices, faces: Faces) -> Mesh:
+    """Return a mesh with other vertices and faces, and with computed normals."""
     return replace(mesh, vertices=vertices, faces=np.ascontiguousarray(faces), normals=None)

@@ -222,6 +222,7 @@ class Candidates:
         return np.asarray(np.linalg.solve(normal_matrix, lever.T @ (weight * away)))
 
     def _error(self, axis: Vector, order: int) -> float:
+        """Return the RMS distance of the rotated surface points from the surface."""
         moved = self._probes @ axis_rotation(axis, 2 * np.pi / order).T
         return float(np.sqrt((self._surface.distances(moved) ** 2).mean()))
 

@@ -295,6 +295,7 @@ def log_odds(probability: float) -> float:
 
 
 def _odds(probability: float, certain: float = _CERTAIN) -> float:
+    """Return the odds of a probability, which is first limited to a range inside (0, 1)."""
     bounded = float(np.clip(probability, certain, 1 - certain))
     return bounded / (1 - bounded)
 

@@ -198,6 +198,7 @@ class StopRequest:
         self._kept = {}
 
     def _remember(self, number: int, _: FrameType | None) -> None:
+        """Handle a signal: request a stop; on a second Ctrl-C, stop at once."""
         if os.getpid() != self._process:  # a forked worker of the data loader
             return
         if number == signal.SIGINT and self.number is not None:

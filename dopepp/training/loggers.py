@@ -113,6 +113,7 @@ class GuardedLogger(Logger):
             return None
 
     def _forward(self, call: Callable[[Logger], T]) -> T | None:
+        """Call the inner logger, if it is still in use."""
         inner = self.inner
         return None if inner is None else self.guard(lambda: call(inner))
 

@@ -217,6 +217,7 @@ class BeliefMaps(ValidationSheet):
 
 
 def _log_picture(trainer: Trainer, name: str, image: Picture) -> None:
+    """Send a picture to every logger that accepts pictures."""
     for logger in trainer.loggers:
         if isinstance(logger, GuardedLogger):
             logger.log_picture(name, image, trainer.global_step)

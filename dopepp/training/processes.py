@@ -116,6 +116,7 @@ class WatchedDDP(DDPStrategy):
         super().__init__(timeout=timedelta(seconds=timeout_s))
 
     def _configure_launcher(self) -> None:
+        """Use the launcher that watches the other processes."""
         assert self.cluster_environment is not None
         self._launcher = WatchedLauncher(
             self.cluster_environment, self.num_processes, self.num_nodes

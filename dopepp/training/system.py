@@ -234,6 +234,7 @@ def check_state(checkpoint: Mapping[str, Any]) -> None:
 
 
 def _tensors(value: object) -> Iterator[Tensor]:
+    """Yield all tensors in nested mappings and lists."""
     if isinstance(value, Tensor):
         yield value
     elif isinstance(value, (Mapping, list, tuple)):

@@ -188,6 +188,7 @@ class SymmetryHandling:
         return poses, torch.where(tables["there"][index], angle, torch.inf)
 
     def _on(self, device: torch.device) -> dict[str, Tensor]:
+        """Return the tables of symmetries on a device."""
         if self._tables["axes"].device != device:
             self._tables = {name: table.to(device) for name, table in self._tables.items()}
         return self._tables

@@ -155,4 +155,5 @@ def profile_rows(profiler: object, limit: int = 12) -> list[dict[str, str]]:
 
 
 def _slowest_first(totals: Iterable[Total]) -> list[Total]:
+    """Sort by total time, largest first."""
     return sorted(totals, key=lambda total: total[2], reverse=True)

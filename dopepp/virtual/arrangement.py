@@ -163,6 +163,7 @@ def arrange_floating(composition: Composition, targets: Sequence[Body], usual: B
 
 
 def _draw_pose(composition: Composition, body: Body) -> Transform:
+    """Draw a body's orientation and position from the preset."""
     preset, rng = composition.preset, composition.rng
     rotation = preset.turning.draw(rng)
     turned = body.surface.hull @ rotation.T

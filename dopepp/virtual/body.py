@@ -274,6 +274,7 @@ def _unit_surface(solid: Manifold) -> Surface:
 
 
 def _mesh_of(solid: Manifold) -> Mesh:
+    """Convert a solid of the manifold library to a mesh."""
     mesh = solid.to_mesh()
     vertices = np.asarray(mesh.vert_properties, np.float64)[:, :3]
     return Mesh(vertices, np.asarray(mesh.tri_verts, np.int32))

@@ -217,6 +217,7 @@ def _in_front(objects: Sequence[SceneObject]) -> tuple[SceneObject, ...]:
 
 
 def _moved(T_cam: Transform, shift: Vector) -> Transform:
+    """Return a pose shifted by a vector."""
     return make_transform(T_cam[:3, :3], T_cam[:3, 3] + shift)
 
 

@@ -105,6 +105,7 @@ def settle(
 def _simulate(
     solids: Sequence[tuple[Piece, ...]], starts: Poses, walls: Sequence[Piece], diameter: float
 ) -> Poses | None:
+    """Simulate the fall of solids; return their poses at rest, or None if they keep moving."""
     scale = _SIZE / diameter
     model = _model(solids, walls, scale)
     state = mujoco.MjData(model)

@@ -220,6 +220,7 @@ class HeightMap:
         return not bool((self._heights[window][np.isfinite(footprint.bottom)] > 0).any())
 
     def _window(self, footprint: Footprint, cell: Cell) -> tuple[slice, slice]:
+        """Return the slices of the map's cells under a footprint placed at a cell."""
         rows, columns = footprint.top.shape
         left = cell[0] + footprint.corner[0] + self._half
         top = cell[1] + footprint.corner[1] + self._half

@@ -173,6 +173,7 @@ def finalizing(staging: Path) -> Iterator[None]:
 
 
 def _open(path: Path) -> int:
+    """Open or create a lock file; return its descriptor."""
     path.parent.mkdir(parents=True, exist_ok=True)
     return os.open(path, os.O_RDWR | os.O_CREAT)
 
@@ -187,6 +188,7 @@ def _retry(act: Callable[[], T]) -> T:
 
 
 def _is_same(descriptor: int, path: Path) -> bool:
+    """Return whether an open file is still the file at a path."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
     except FileNotFoundError:

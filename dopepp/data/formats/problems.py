@@ -228,6 +228,7 @@ class Node:
 
 
 def _leniently(content: bytes) -> Any:
+    """Parse JSON; return None if it is invalid."""
     try:
         return json.loads(content)
     except (ValueError, RecursionError):

@@ -79,6 +79,7 @@ def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> lis
 
 
 def _can_be_shaded(instance: Instance) -> bool:
+    """Return whether an instance has visible pixels in its mask."""
     return instance.mask is not None and bool(instance.mask.any())
 
 
@@ -135,6 +136,7 @@ class _Cover:
         return self.order <= min(int(last), _NEVER - 1)
 
     def _num_asked(self, share: float) -> int:
+        """Return the number of pixels to cover for a share."""
         return round(share * self._num_seen)
 
     def _draw_crop(self, crops: BackgroundCrops, rng: Generator) -> Picture | None:
@@ -163,5 +165,6 @@ class _Cover:
 
 
 def _box(seen: Mask) -> tuple[slice, slice]:
+    """Return the slices of rows and columns that a mask's pixels span."""
     rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)

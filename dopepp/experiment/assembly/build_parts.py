@@ -49,6 +49,7 @@ def _read_parts(data: DataConfig) -> list[Part]:
 
 
 def _ycb_parts(root: Path, objects: Sequence[str] | None) -> list[Part]:
+    """Read YCB objects by name (default: the paper's objects)."""
     classes = read_classes(root)
     names = PAPER_OBJECTS if objects is None else objects
     unknown = [name for name in names if name not in classes]

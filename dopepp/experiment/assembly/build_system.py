@@ -286,6 +286,7 @@ def estimate_training_s(
 
 
 def _loading_s(datamodule: PoseDataModule) -> float:
+    """Return the mean time to load a training item in this process, seconds."""
     items = min(_PROBE_ITEMS, len(datamodule.train_source))
     start = time.perf_counter()
     for index in range(items):

@@ -211,6 +211,7 @@ def _recipe(configs: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _without(config: Mapping[str, Any], *keys: str) -> dict[str, Any]:
+    """Return a copy of a mapping without some keys."""
     return {key: value for key, value in config.items() if key not in keys}
 
 
@@ -317,6 +318,7 @@ def _is_of_another_part(entry: Entry, method: Sequence[Entry]) -> bool:
 
 
 def _join(method: Sequence[Entry]) -> Entry:
+    """Join the entries of a method that were measured on different parts into one entry."""
     by_seed = [dict(zip(entry.seeds, entry.reports, strict=True)) for entry in method]
     return replace(
         method[0],

@@ -116,6 +116,7 @@ def _scored(entry: Entry, name: str) -> list[str]:
 
 
 def _by_seed(entry: Entry) -> list[Report]:
+    """Return an entry's reports in the order of their seeds."""
     pairs = zip(entry.seeds, entry.reports, strict=True)
     return [report for _, report in sorted(pairs, key=lambda pair: str(pair[0]))]
 

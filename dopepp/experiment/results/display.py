@@ -31,6 +31,7 @@ def show_config(config: Mapping[str, Any]) -> None:
 
 
 def _branch(tree: Tree, config: Mapping[str, Any]) -> None:
+    """Add the nested values of a config to a tree."""
     for key, value in config.items():
         if isinstance(value, Mapping) and value:
             _branch(tree.add(Text(str(key), style="bold")), value)

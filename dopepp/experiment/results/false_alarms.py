@@ -141,6 +141,7 @@ def count_false_alarms(
 
 
 def _tile(estimator: PoseEstimator, sample: Sample) -> Tile:
+    """Draw the best false detection on a picture."""
     best = estimator.candidates(sample.image, sample.K, cropped=True)[0]
     label = f"{best.object} {best.score:.3g}"
     return Tile(overlay(sample.image, [Wireframe(best.keypoints, YELLOW, label)]), sample.key)

@@ -154,6 +154,7 @@ class Value(NamedTuple):
         return int(self.value) if self.measure.startswith("num_") else self.value
 
     def _shown(self, value: float) -> str:
+        """Return a number in the unit and format of its column."""
         return self.column.shown(None if math.isnan(value) else value, signed=self.is_change)
 
 

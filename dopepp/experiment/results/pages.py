@@ -100,6 +100,7 @@ _CARD_FIELDS: Final = (
 
 @cache
 def _templates() -> Environment:
+    """Return the page templates of this package, in which an undefined name is an error."""
     folder = Path(__file__).parent / "templates"
     options: Any = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}
     return Environment(loader=FileSystemLoader(folder), undefined=StrictUndefined, **options)

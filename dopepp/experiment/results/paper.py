@@ -156,6 +156,7 @@ class PaperTable:
         }
 
     def _label(self, entry: Entry) -> str:
+        """Return the paper's label of an entry, composed from the overrides of its run."""
         used = entry.runs[0].overrides if entry.runs else []
         label = " ".join(self.labels[key] for key in self.labels if key in used)
         return f"{label} + {entry.refine}" if label and entry.refine else label
@@ -269,6 +270,7 @@ def _pose_row(
 
 
 def _number(value: float | None) -> str:
+    """Return a number with thousands separators, or an empty string for None."""
     return "" if value is None else f"{value:,}"
 
 
@@ -357,6 +359,7 @@ def _by_share(points: pd.DataFrame, text: Callable[[pd.Series[float]], str]) -> 
 
 
 def _mean(rates: pd.Series[float]) -> str:
+    """Return mean ± standard deviation as text; the mean alone for a single seed."""
     return f"{rates.mean():.1f}" + (f" ± {rates.std():.1f}" if len(rates) > 1 else "")
 
 
@@ -422,6 +425,7 @@ def _cost_rows(
 
 
 def _failed(label: str, entry: Entry) -> str:
+    """Return a line about a network that was not measured."""
     return f"{label}: {entry.failure or 'not measured'}"
 
 

@@ -161,6 +161,7 @@ class Report:
 
 
 def _rows(record: Mapping[str, Mapping[str, Any]]) -> dict[str, PoseRow]:
+    """Restore table rows from plain values."""
     return {name: PoseRow(**row) for name, row in record.items()}
 
 
@@ -211,6 +212,7 @@ class Fingerprint:
         return self._hash.hexdigest()
 
     def _add(self, facts: object) -> None:
+        """Add plain values to the hash."""
         self._hash.update(json.dumps(facts).encode() + b"\n")
 
 

@@ -199,12 +199,14 @@ def remember_overrides(run: Path) -> None:
 
 
 def _task(hydra: object) -> object:
+    """Return the overrides of the task in Hydra's stored config, or None."""
     for key in ("hydra", "overrides", "task"):
         hydra = hydra.get(key) if isinstance(hydra, dict) else None
     return hydra
 
 
 def _listed(differences: Sequence[ConfigDifference]) -> str:
+    """Return differences as text."""
     return ", ".join(map(str, differences)) or "the number of objects"
 
 
@@ -246,6 +248,7 @@ def differing_images(stored: Mapping[str, Any], present: Mapping[str, Any]) -> l
 
 
 def _look(sample: Sample) -> dict[str, Any]:
+    """Return a small copy of a sample's image and its ground truth as plain values."""
     box = Letterbox.fit(sample.size, _LOOK_SIZE)
     small = cv2.resize(sample.image, (box.width, box.height), interpolation=cv2.INTER_AREA)
     return {
@@ -269,6 +272,7 @@ def _picture_difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> fl
 
 
 def _shown(value: object) -> str:
+    """Return a value as text of limited length."""
     text = str(value)
     return text if len(text) <= _LONG else f"{text[:_LONG]}…"
 

@@ -117,6 +117,7 @@ def log_comparison(nodes: Mapping[str, Any] | None, folder: Path) -> None:
 
 
 def _send_pictures(tracker: GuardedLogger, paths: Mapping[str, Path]) -> None:
+    """Log the pictures that exist and are complete."""
     for name, path in paths.items():
         try:
             picture = read_rgb(path) if path.is_file() else None

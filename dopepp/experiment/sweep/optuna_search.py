@@ -156,6 +156,7 @@ class _Trials:
                 self._study.tell(trial.number, value, state=state)
 
     def _running(self) -> list[FrozenTrial]:
+        """Return the study's trials that have not ended."""
         return self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
 
 
@@ -233,6 +234,7 @@ def _distribution(sweep: Override) -> distributions.BaseDistribution:
 
 
 def _bad_entry(problem: str) -> UserError:
+    """Return the error for an entry of the search space."""
     return UserError(
         f"search.space with {problem}",
         "interval(low, high), int(interval(…)), tag(log, interval(…)), range(…), choice(…)",

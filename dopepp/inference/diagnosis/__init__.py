@@ -284,6 +284,7 @@ def _lens_ratio(case: Case) -> float | None:
 
 
 def _near(ratio: float, factor: float) -> bool:
+    """Return whether a ratio differs from 1 by less than a factor."""
     return 1 / factor < ratio < factor
 
 

@@ -174,9 +174,11 @@ class Case:
         return strongest
 
     def _detections(self, distances: tuple[float, float] | None) -> list[Detection]:
+        """Return the detections at these distances (default: those of training)."""
         return self.estimator.predict(self.image, self.K, distances=distances, cropped=self.cropped)
 
     def _length_px(self, detection: Detection) -> float:
+        """Return the diameter of a detected part on the image, pixels."""
         (part,) = (part for part in self.estimator.parts if part.name == detection.object)
         return part.diameter * focal_length(self.K) / float(detection.T_cam_obj[2, 3])
 

@@ -138,6 +138,7 @@ class Video(FrameSource):
 
     @contextlib.contextmanager
     def _opened(self) -> Iterator[cv2.VideoCapture]:
+        """Open the file for the duration of the block."""
         capture = _open_capture(self.name, cv2.CAP_FFMPEG)
         try:
             if not capture.isOpened():
@@ -148,6 +149,7 @@ class Video(FrameSource):
 
 
 def _check_container(path: Path) -> None:
+    """Check by its first bytes that a file is a video."""
     try:
         with path.open("rb") as file:
             header = file.read(16)
@@ -158,6 +160,7 @@ def _check_container(path: Path) -> None:
 
 
 def _unreadable(path: Path, reason: str) -> UserError:
+    """Return the error for a video that cannot be read."""
     allowed = f"a video that FFmpeg can read, up to {MAX_PIXELS / 1e6:.0f} megapixels a frame"
     fix = f"copy it again, or convert it: ffmpeg -i {path.name} video.mp4"
     return UserError(f"video {path}: {reason}", allowed, fix)
@@ -278,6 +281,7 @@ def is_url(text: str) -> bool:
 
 
 def _open_live(address: int | str) -> cv2.VideoCapture:
+    """Open a camera or a stream; streams have timeouts."""
     if isinstance(address, int) or not is_url(address):
         return _open_capture(address)
     timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, int(1000 * FIRST_S)]

@@ -256,6 +256,7 @@ class Bag(FrameSource):
         raise UserError(f"{self._path} {problem}", allowed, fix)
 
     def _unreadable(self, reason: str) -> UserError:
+        """Return the error for a recording that cannot be read."""
         allowed = f"a ROS recording ({', '.join(BAGS)}, or a folder with metadata.yaml)"
         return UserError(f"{self._path}: {reason:.300}", allowed, "copy it again, or record again")
 

@@ -164,6 +164,7 @@ def _tile_of(length: int, start: int, extent: int, tiles: int) -> Int[np.ndarray
 
 @compiled()
 def _bins(image: Array, bins: Array) -> None:
+    """Write each pixel's colour bin: four bits per channel."""
     for v in range(bins.shape[0]):
         for u in range(bins.shape[1]):
             r, g, b = image[v, u, 0] >> 4, image[v, u, 1] >> 4, image[v, u, 2] >> 4
@@ -229,6 +230,7 @@ def _tables(counts: Array, tables: Array) -> None:
 
 @compiled()
 def _look_up(bins: Array, rows: Array, columns: Array, tables: Array, odds: Array) -> None:
+    """Write the log odds of each pixel's colour in the table of its tile."""
     for v in range(bins.shape[0]):
         for u in range(bins.shape[1]):
             odds[v, u] = tables[rows[v], columns[u], bins[v, u]]
@@ -236,6 +238,7 @@ def _look_up(bins: Array, rows: Array, columns: Array, tables: Array, odds: Arra
 
 @compiled()
 def _sum(row: Array) -> Scalar:
+    """Return the sum of a row in float32."""
     total = np.float32(0.0)
     for k in range(len(row)):
         total += row[k]
@@ -257,6 +260,7 @@ def _blur(counts: Array) -> None:
 
 @compiled()
 def _blur_row(counts: Array, first: int, stride: int) -> None:
+    """Blur one line of a histogram by (1, 2, 1)/4 in place."""
     before = counts[first]
     for i in range(STEPS):
         count = counts[first + i * stride]

@@ -88,6 +88,7 @@ def turned(R: RotationMatrix, matrix: PoseMatrix) -> PoseMatrix:
 
 
 def _turn(R: RotationMatrix) -> PoseMatrix:
+    """Return the 6×6 matrix that rotates both the rotation and the translation of a step."""
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = R
     return turn

@@ -185,6 +185,7 @@ def _shapes(
 
 
 def _shape(kind: onnx.TypeProto) -> list[int] | None:
+    """Return the shape of a tensor type; None if a side is unknown."""
     tensor = kind.tensor_type
     is_known = tensor.HasField("shape") and all(s.HasField("dim_value") for s in tensor.shape.dim)
     return [side.dim_value for side in tensor.shape.dim] if is_known else None

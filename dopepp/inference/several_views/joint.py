@@ -248,9 +248,11 @@ def _is_duplicate(part: JointPart, better: JointPart) -> bool:
 
 
 def _probability(odds: float) -> float:
+    """Convert log odds to a probability."""
     return 1.0 / (1.0 + math.exp(-odds))
 
 
 def _is_inside(pixel: Float[np.ndarray, "2"], view: PosedPicture) -> bool:
+    """Return whether a view's image contains a pixel."""
     height, width = view.image.shape[:2]
     return bool((pixel >= 0).all() and pixel[0] < width and pixel[1] < height)

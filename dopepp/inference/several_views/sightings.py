@@ -85,6 +85,7 @@ def sight(view: int, detection: Detection, picture: PosedPicture) -> PartSightin
 
 
 def _in_world(picture: PosedPicture, T_cam_obj: Transform, covariance: PoseMatrix) -> Prior:
+    """Express a pose and its covariance in the world, with the error of the camera's pose."""
     T_world_obj, in_world = picture.to_world(T_cam_obj, covariance)
     return Prior(T_world_obj, np.linalg.inv(in_world))
 

@@ -327,4 +327,5 @@ def _resized(image: Picture, scale: float) -> Picture:
 
 
 def _odd(side: float) -> int:
+    """Round a length down to an integer, and even integers up to the next odd integer."""
     return int(side) | 1

@@ -233,6 +233,7 @@ def to_float64(array: Tensor) -> Tensor:
 
 
 def _all_finite(*tensors: Tensor) -> Bool[Tensor, "n"]:
+    """Return for each pose whether all of its numbers are finite."""
     return torch.cat([tensor.flatten(1) for tensor in tensors], dim=1).isfinite().all(dim=1)
 
 

@@ -63,6 +63,7 @@ def hull_faces(piece: Piece) -> Int[np.ndarray, "faces 3"]:
 
 
 def _decompose(mesh: Mesh) -> tuple[Piece, ...]:
+    """Decompose a mesh into approximately convex pieces."""
     import coacd
 
     coacd.set_log_level("error")
@@ -79,6 +80,7 @@ def _decompose(mesh: Mesh) -> tuple[Piece, ...]:
 
 
 def _read_pieces(path: Path) -> tuple[Piece, ...]:
+    """Read the pieces that an earlier run stored."""
     try:
         with np.load(path, allow_pickle=False) as content:
             vertices, counts = np.asarray(content["vertices"], np.float64), content["counts"]

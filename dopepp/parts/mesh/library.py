@@ -133,6 +133,7 @@ def _count_pieces(model: bytes) -> int:
 
 
 def _check_size(num_bytes: int, most: int = MAX_UNPACKED_BYTES) -> None:
+    """Check that unpacked data are not too large."""
     if num_bytes > min(most, MAX_UNPACKED_BYTES):
         raise ValueError(f"{num_bytes / 1e6:.0f} MB of text, over {most / 1e6:.0f} MB")
 
@@ -284,6 +285,7 @@ def read_scene(data: bytes, kind: str) -> tuple[RawMesh, int]:
 
 
 def _moved(vertices: Vertices, transform: Transform) -> Vertices:
+    """Apply a transform to vertices, with equal results on every processor."""
     if (transform == np.eye(4)).all():
         return vertices  # a product would spread infinite coordinates as NaN
     # The last digits of a matrix product would depend on the processor.

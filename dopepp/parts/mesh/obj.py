@@ -107,6 +107,7 @@ class ObjFile:
 
 
 def _numbers(words: list[str], count: int) -> list[float]:
+    """Convert the first ``count`` words of a line to finite numbers."""
     numbers = [float(word) for word in words[:count]]
     if len(numbers) < count:
         raise ValueError(f"needs {count} numbers")

@@ -202,6 +202,7 @@ def _checked(path: Path, raw: RawMesh) -> Mesh:
 
 
 def _damaged(path: Path, problem: str, fix: str = "export the mesh again") -> UserError:
+    """Return the error for a mesh file that is damaged or too large."""
     content = "triangles, finite coordinates and colours of their range"
     allowed = f"a whole mesh with {content}, under {MAX_BYTES / 1e6:.0f} MB"
     return UserError(f"mesh {path} with {problem}", allowed, fix)

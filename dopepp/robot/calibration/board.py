@@ -143,14 +143,17 @@ class Board:
 
     @cached_property
     def _charuco(self) -> Any:
+        """OpenCV's description of this ChArUco board."""
         size = (self.columns, self.rows)
         return cv2.aruco.CharucoBoard(size, self.spacing, self.marker, _markers(self.dictionary))
 
     @cached_property
     def _detector(self) -> Any:
+        """OpenCV's detector of this ChArUco board."""
         return cv2.aruco.CharucoDetector(self._charuco)
 
     def _find_charuco(self, grey: Grey) -> tuple[Any, Any]:
+        """Return indices and pixels of the visible ChArUco corners."""
         pixels, indices, _, markers = self._detector.detectBoard(grey)
         if markers is not None and len(np.unique(markers)) < len(markers):
             problem = "a picture of two boards with the same markers"
@@ -159,6 +162,7 @@ class Board:
         return ([], []) if indices is None else (np.ravel(indices), pixels)
 
     def _find_chess(self, grey: Grey) -> tuple[Any, Any]:
+        """Return indices and pixels of the chessboard's corners, from the frame's origin."""
         is_found, pixels = cv2.findChessboardCornersSB(grey, (self.columns, self.rows), None)
         if not is_found:
             return [], []
@@ -172,12 +176,14 @@ class Board:
         return np.arange(len(pixels)), pixels if first < second else pixels[::-1]
 
     def _find_circles(self, grey: Grey) -> tuple[Any, Any]:
+        """Return indices and pixels of the grid's circles."""
         size, layout = (self.columns, self.rows), cv2.CALIB_CB_ASYMMETRIC_GRID
         is_found, pixels = cv2.findCirclesGrid(grey, size, None, layout)
         return (np.arange(len(pixels)), pixels) if is_found else ([], [])
 
 
 def _markers(dictionary: str) -> Any:
+    """Return an OpenCV dictionary of ArUco markers by its name."""
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}"))
 
 
@@ -199,6 +205,7 @@ def parse_board(text: str) -> Board:
 
 
 def _parsed(text: str) -> Board:
+    """Parse a board's description; raise ``ValueError`` if that is impossible."""
     kind, _, rest = text.partition(":")
     fields = rest.split(":")
     fewest, most = NUM_FIELDS.get(kind, (0, 0))

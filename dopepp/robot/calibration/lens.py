@@ -163,6 +163,7 @@ def write_camera(path: Path, camera: Camera, trusted: bool = True) -> None:
 
 
 def _matrix(values: Float[np.ndarray, "rows columns"]) -> dict[str, object]:
+    """Return a matrix in the layout of OpenCV's and ROS's YAML files."""
     rows, columns = values.shape
     return {"rows": rows, "cols": columns, "data": np.float64(values).ravel().tolist()}
 
@@ -177,6 +178,7 @@ class _Solution(NamedTuple):
 
 
 def _solve(views: Sequence[Sighting], size: Size) -> _Solution:
+    """Calibrate the camera with OpenCV from all views."""
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
     try:

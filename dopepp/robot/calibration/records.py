@@ -146,6 +146,7 @@ def check_unit(unit: str) -> str:
 
 
 def _read_csv(path: Path) -> list[Record]:
+    """Read the rows of a CSV file with a header."""
     try:
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
@@ -195,6 +196,7 @@ def _numbers(
 
 
 def _matrix(record: Record, row: int, path: Path) -> Transform:
+    """Return the 4×4 ``matrix`` of a record; reject a matrix that is not a rigid transform."""
     try:
         T = np.array(record["matrix"], np.float64).reshape(4, 4)
     except (KeyError, TypeError, ValueError):

@@ -249,6 +249,7 @@ class _Adjustment:
         return self._rms([camera for camera, _ in self._views], self._num_cameras)
 
     def _rms(self, groups: Sequence[int], count: int) -> Float[np.ndarray, "groups"]:
+        """Return the RMS reprojection error of each group of views, pixels."""
         squares = [float(np.square(error).sum()) for error in self._errors]
         points = [len(error) for error in self._errors]
         sums = np.bincount(groups, squares, count) / np.bincount(groups, points, count)

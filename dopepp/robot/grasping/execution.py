@@ -92,14 +92,17 @@ class Execution:
             self.outcome.collided |= self._is_hit()
 
     def _heights(self) -> Float[np.ndarray, "solids"]:
+        """Return the height of every solid's origin, metres."""
         cell, state = self._cell, self._state
         return np.array([cell.pose(state, number)[2, 3] for number in range(cell.count)])
 
     def _rest(self, joints: Joints) -> None:
+        """Hold the arm at these joints for a short pause."""
         for _ in range(round(PAUSE_S / STEP)):
             self._advance(joints, np.zeros(JOINTS))
 
     def _advance(self, joints: Joints, speeds: Joints) -> None:
+        """Command joints and speeds for one simulation step, and record frames for films."""
         state = self._state
         state.ctrl[:JOINTS] = joints + self._zero + LAG_S * speeds
         state.ctrl[JOINTS] = self._command

@@ -71,6 +71,7 @@ def parse_sources(text: str) -> tuple[PoseSource, ...]:
 
 
 def _check_choice(option: str, value: str, allowed: Iterable[str]) -> None:
+    """Check the value of an option against the allowed names."""
     if value not in allowed:
         fix = f"pass {option} with one of these names"
         raise UserError(f"{option} {value}", ", ".join(allowed), fix)
@@ -200,6 +201,7 @@ class _TrialRunner:
 
     @cached_property
     def _trials(self) -> Trials:
+        """The trials of the task, set up on first use in this process."""
         return Trials(self._task)
 
     def __call__(self, number: int) -> list[Record]:
@@ -331,6 +333,7 @@ def curve(records: Sequence[Record]) -> Any:
 
 
 def _summary(rows: Sequence[Record]) -> dict[str, Any]:
+    """Return the counts, their intervals and the numbers of failures."""
     total = count_records(rows)
     return {
         **asdict(total),

@@ -216,6 +216,7 @@ class Trials:
         return near + 0.4 * (far - near), near + 0.75 * (far - near)
 
     def _robot(self, block: int) -> tuple[TrueRobot, CalibratedRobot]:
+        """Draw the true robot of a block of trials, and calibrate it."""
         rng = np.random.default_rng([self.task.seed, block, 1])
         robot = draw_robot(rng, self.tip)
         return robot, calibrate(robot, self.arm, rng, float(np.mean(self.distance)))
@@ -266,10 +267,12 @@ class Trials:
         return Attempt(record, outcome or Outcome(), estimate)
 
     def _viewpoints(self, scene: TrialScene) -> ViewpointPlanner:
+        """Return the planner of the camera's second view."""
         robot = scene.calibrated
         return ViewpointPlanner(self.arm, self._planner(scene), robot.knowledge, robot.camera)
 
     def _planner(self, scene: TrialScene) -> Planner:
+        """Return the planner of grasps among the parts of a scene."""
         count = 1 if self.task.layout == "single" else MAX_OBSTACLES
         return Planner(self.arm, self.gripper, self._parts_cell(count), scene.calibrated.knowledge)
 
@@ -314,6 +317,7 @@ class Trials:
         return np.asarray(self.arm.flange(joints) @ scene.calibrated.knowledge.T_flange_cam)
 
     def _true_camera_pose(self, robot: TrueRobot, joints: Joints) -> Transform:
+        """Return T_base_cam of the real robot, for joints that its controller reads."""
         return np.asarray(self.arm.flange(joints + robot.zero) @ robot.T_flange_cam)
 
     def _record(
@@ -324,6 +328,7 @@ class Trials:
         estimate: Transform | None,
         outcome: Outcome | None,
     ) -> Record:
+        """Return the result of a trial."""
         robot = scene.calibrated
         ends = (robot.hand_eye_mm, robot.hand_eye_deg, look.second_view)
         trial = (scene.number, source.name, source.error[0])
@@ -375,6 +380,7 @@ class Trials:
 
 
 def _height(T_base_obj: Transform) -> float:
+    """Return the height of a pose's origin, metres."""
     return float(T_base_obj[2, 3])
 
 

@@ -152,6 +152,7 @@ def read_grasps(path: Path, part: Part) -> tuple[Grasp, ...]:
 
 
 def _checked(record: _GraspRecord, name: str, part: Part) -> Grasp:
+    """Return the grasp of a file's record after checking its position and directions."""
     point, closing, approach = map(np.array, (record.point, record.closing, record.approach))
     lower, upper = part.cuboid.min(axis=0) - 0.01, part.cuboid.max(axis=0) + 0.01
     if not ((point >= lower) & (point <= upper)).all():

@@ -77,6 +77,7 @@ class Arm:
         return None
 
     def _has_reached(self, T_base_flange: Transform) -> bool:
+        """Return whether the current joints reach a pose within the tolerances."""
         current = self._cell.flange_pose(self._configuration.data)
         shift = np.linalg.norm(current[:3, 3] - T_base_flange[:3, 3])
         turn = rotation_angle(current[:3, :3].T @ T_base_flange[:3, :3])
@@ -284,6 +285,7 @@ class Planner:
         return True
 
     def _collides(self, joints: Joints, opening: float) -> bool:
+        """Return whether the arm collides at these joints and this opening of the fingers."""
         state, cell = self._state, self._cell
         state.qpos[:JOINTS] = joints
         state.qpos[cell.fingers] = self._gripper.fingers(opening)
@@ -293,6 +295,7 @@ class Planner:
         return any(self._is_hit(contact) for contact in state.contact)
 
     def _is_hit(self, contact: Any) -> bool:
+        """Return whether a contact is a collision that involves the robot."""
         first, second = contact.geom
         if contact.dist > -PENETRATION or (self._hand[first] and self._hand[second]):
             return False

@@ -88,6 +88,7 @@ class ViewpointPlanner:
         return Viewpoint(reached[number], reason)
 
     def _camera_pose(self, joints: Joints) -> Transform:
+        """Return the controller's T_base_cam at these joints."""
         return np.asarray(self._arm.flange(joints) @ self._knowledge.T_flange_cam)
 
     def _candidates(self, point: Vector, distance: float, start: Joints) -> Iterator[Joints]:

@@ -95,6 +95,7 @@ class Layout:
         return self._placed(rng, SPREAD, DROP_HEIGHT, 0.0).T_base_obj
 
     def _placed(self, rng: Generator, spread: float, height: float, tilt_deg: float) -> PlacedSolid:
+        """Draw a pose of the part within ``spread`` of the tray's centre, at a height, metres."""
         up = np.array([0.0, 0.0, 1.0])
         if self._rest == "any":
             normals, shares = self.body.hull.rests
@@ -151,6 +152,7 @@ def _standing(body: Body, position: np.ndarray, rng: Generator) -> PlacedSolid:
 
 
 def _draw_in_disc(rng: Generator, radius: float) -> tuple[float, float]:
+    """Draw a point uniformly from a disc around the origin, metres."""
     distance, angle = radius * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
     return float(distance * np.cos(angle)), float(distance * np.sin(angle))
 
@@ -203,6 +205,7 @@ class RasterView:
     def _take(
         self, scene: Scene, T_base_first: Transform, T_base_cam: Transform, rng: Generator
     ) -> Picture:
+        """Render the arranged scene from a camera pose, with the sensor's effects."""
         seen = scene.seen_from(invert_transform(T_base_cam) @ T_base_first)
         seen = seen if self._shadows else replace(seen, plane=None)
         return capture(self._render(seen).image, self._sensors.draw(rng))
@@ -229,6 +232,7 @@ class MujocoView:
         return partial(self._take, poses)
 
     def _take(self, poses: Sequence[Transform], T_base_cam: Transform, rng: Generator) -> Picture:
+        """Render the scene from a camera pose, with the solids at these poses."""
         model, state = self._cell.model, self._state
         for number, pose in enumerate(poses):
             self._cell.put(state, number, pose)

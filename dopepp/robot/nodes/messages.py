@@ -135,6 +135,7 @@ class AnswerFormatter:
         ]
 
     def _detections(self, answer: Answer, header: Fields) -> Fields:
+        """Return the poses as ``vision_msgs/Detection3DArray``."""
         detections = []
         for name, detection in self._frames(answer):
             cuboid, centre = self._cuboids[detection.object], detection.T_cam_obj.copy()
@@ -145,6 +146,7 @@ class AnswerFormatter:
         return {"header": header, "detections": detections}
 
     def _transforms(self, answer: Answer, header: Fields) -> Fields:
+        """Return the poses as ``tf2_msgs/TFMessage``."""
         transforms = []
         for name, detection in self._frames(answer):
             pose = _pose(detection.T_cam_obj)
@@ -194,6 +196,7 @@ def image_fields(image: Picture, header: Fields) -> Fields:
 
 
 def _hypothesis(detection: Detection) -> Fields:
+    """Return ``vision_msgs/ObjectHypothesisWithPose`` with ROS's order of the covariance."""
     order = [3, 4, 5, 0, 1, 2]
     covariance = detection.covariance[np.ix_(order, order)]
     return {
@@ -203,11 +206,13 @@ def _hypothesis(detection: Detection) -> Fields:
 
 
 def _pose(T: Transform) -> Fields:
+    """Return a transform as ``geometry_msgs/Pose``."""
     w, x, y, z = matrix_to_quaternion(T[:3, :3]).tolist()
     return {"position": _xyz(T[:3, 3]), "orientation": {"x": x, "y": y, "z": z, "w": w}}
 
 
 def _xyz(values: Float[np.ndarray, "3"]) -> Fields:
+    """Return three numbers as fields x, y and z."""
     return dict(zip("xyz", values.tolist(), strict=True))
 
 

@@ -140,6 +140,7 @@ class _Node:
         self._worker.update(replace(self._worker.settings, **parameters))
 
     def _advertise(self, topic: str, kind: str) -> None:
+        """Create the publisher of a topic; warn if its message type is not installed."""
         full = topic if topic.startswith("/") else f"~/{topic}"
         try:
             message = type_of(kind)
@@ -167,12 +168,15 @@ class _Node:
         ]
 
     def _take_info(self, message: Any) -> None:
+        """Store the newest ``camera_info``."""
         self._info = message  # valid until the next message
 
     def _take_picture(self, message: Any) -> None:
+        """Pass a picture with the newest ``camera_info`` to the worker's thread."""
         self.slot.put((message, self._info))
 
     def _answer(self, item: tuple[Any, Any | None]) -> None:
+        """Process a picture and publish the answer, in the worker's thread."""
         answer = self._worker.take(*item, self._topic)
         if answer is None:
             return
@@ -213,6 +217,7 @@ class _Node:
         return diagnosis(stamp, self._name, problem, values)
 
     def _offers_less(self) -> bool:
+        """Return whether a publisher of the pictures offers best-effort delivery only."""
         from rclpy.qos import ReliabilityPolicy
 
         offers = self.handle.get_publishers_info_by_topic(self._topic)
@@ -220,10 +225,12 @@ class _Node:
         return any(offer.qos_profile.reliability == lesser for offer in offers)
 
     def _publish(self, message: Message) -> None:
+        """Publish a message if its topic is advertised."""
         if message.topic in self._publishers:
             self._publishers[message.topic].publish(native(message.kind, message.fields))
 
     def _is_wanted(self, topic: str) -> bool:
+        """Return whether a topic is enabled and has subscribers."""
         if topic == OVERLAY and not self._worker.settings.overlay:
             return False
         publisher = self._publishers.get(topic)
@@ -351,6 +358,7 @@ def type_of(kind: str) -> Any:
 
 
 def _fill(message: Any, fields: Fields) -> Any:
+    """Set the fields of a message, and return the message."""
     kinds = message.get_fields_and_field_types()
     for name, value in fields.items():
         setattr(message, name, _value(getattr(message, name), kinds[name], value))
@@ -375,4 +383,5 @@ def _value(default: Any, kind: str, value: Any) -> Any:
 
 @cache
 def _points(triangles: Triangles) -> list[Any]:
+    """Return the corners of triangles as ``geometry_msgs/Point``."""
     return [native("geometry_msgs/Point", point) for point in triangles.points]

@@ -77,6 +77,7 @@ def _datagrams(address: str) -> Iterator[Callable[[str], None]]:
 
 
 def _print(line: str) -> None:
+    """Print a line without buffering."""
     try:
         sys.stdout.write(f"{line}\n")
         sys.stdout.flush()  # a reader must not wait for a full buffer
@@ -182,6 +183,7 @@ class _Recorder:
 
 
 def _ros2_kind(kind: str) -> str:
+    """Return ROS 2's full name of a message type, e.g. ``sensor_msgs/msg/Image``."""
     return kind.replace("/", "/msg/")
 
 

@@ -122,11 +122,13 @@ def _coordinates(rng: Generator, width: int, height: int) -> tuple[Field, Field]
 
 
 def _gradient(rng: Generator, width: int, height: int) -> Field:
+    """Return a smooth gradient that curves across one direction."""
     along, across = _coordinates(rng, width, height)
     return np.asarray(along * np.float32(rng.uniform(0.5, 1.5)) + across * across + 0.5)
 
 
 def _checker(rng: Generator, width: int, height: int) -> Field:
+    """Return a checkerboard of two grey levels."""
     along, across = _coordinates(rng, width, height)
     tiles = np.float32(rng.uniform(2, 16))
     odd = _whole(along * tiles) + _whole(across * tiles) & 1

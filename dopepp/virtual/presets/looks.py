@@ -124,12 +124,14 @@ class Materials(Checked):
 
 
 def _grey(rng: Generator, brightness: float) -> Triple:
+    """Draw a nearly grey colour of a brightness."""
     return triple(np.clip(brightness * (1 + rng.uniform(-_GREY_CAST, _GREY_CAST, 3)), 0.0, 1.0))
 
 
 def _grooves(
     rng: Generator, axis: int, pitch: Pair, slope: Pair, irregularity: float = 0.0
 ) -> Grooves:
+    """Draw grooves along an axis, with pitch and slope from their ranges."""
     direction = triple(np.eye(3)[axis])
     return Grooves(direction, rng.uniform(*pitch), rng.uniform(*slope), irregularity)
 

@@ -179,6 +179,7 @@ class OffsetPlacement(_Placement):
         return np.array([position[0], position[1], self._draw_depth(rng)])
 
     def _draw_depth(self, rng: Generator) -> float:
+        """Draw a depth within ``axial`` of ``distance``, metres."""
         return self.distance + rng.uniform(-self.axial, self.axial)
 
 

@@ -301,6 +301,7 @@ def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int
     owners = [(row, n) for row, i in enumerate(images) for n in range(len(truths.get(i, ())))]
 
     def nodes(what: str, number: int) -> Node:
+        """Return the node of an image's camera or of an object's record, for error messages."""
         node = Node(STRICT, folder / f"scene_{what}.json")
         if what == "camera":
             return node[f"{images[number]}"]
@@ -337,5 +338,6 @@ def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int
 def _relative_files(
     folder: Path, kind: tuple[tuple[str, ...], tuple[str, ...]], images: Sequence[int]
 ) -> list[str]:
+    """Return each image's file relative to the scene, or an empty string if missing."""
     files = image_files(folder, kind)
     return [files[i].relative_to(folder).as_posix() if i in files else "" for i in images]

@@ -62,6 +62,7 @@ def scene_folders(root: Path) -> Iterator[Path]:
 
 
 def _is_scene(folder: Path) -> bool:
+    """Return whether a folder is a BOP scene, judged by its name and files."""
     named = folder.name.isdecimal() and (folder / "rgb").is_dir()
     return named or any((folder / name).is_file() for name in (_CAMERA, _TRUTH, _INFO))
 
@@ -301,6 +302,7 @@ def check_image(
 def _check_camera(
     nodes: Nodes, camera: object, shape: Shape | None, has_depth: bool
 ) -> CameraMatrix | None:
+    """Check an image's camera record; return K, or None if K is missing or implausible."""
     node = nodes("camera", 0)
     K: CameraMatrix = bop.read_cameras([camera], nodes)[0][0]
     if has_depth and "depth_scale" not in mapping(camera):

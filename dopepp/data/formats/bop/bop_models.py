@@ -204,6 +204,7 @@ def _info(node: Node, model: Path, record: object) -> ModelInfo:
 
 
 def _symmetries(node: Node, fields: Mapping[str, Any]) -> tuple[Discrete | None, Continuous]:
+    """Read the discrete and continuous symmetries of a model's record."""
     discrete, continuous = SYMMETRY_FIELDS
     return (
         _discrete(node[discrete], fields.get(discrete)),
@@ -244,6 +245,7 @@ def _discrete(node: Node, value: object) -> Discrete | None:
 
 
 def _continuous(node: Node, value: object) -> Continuous:
+    """Read continuous symmetries as pairs of axis and offset, metres."""
     pairs = []
     for number, row in enumerate(node.entries(_rows(node, value))):
         entry = node[number]
@@ -255,6 +257,7 @@ def _continuous(node: Node, value: object) -> Continuous:
 
 
 def _rows(node: Node, value: object) -> list[Any]:
+    """Return a list of symmetries; report any other value and return an empty list."""
     if value is None or (isinstance(value, list) and len(value) <= MAX_SYMMETRIES):
         return value or []
     node.report(f"{value!r:.60}", f"a list of at most {MAX_SYMMETRIES}")

@@ -212,6 +212,7 @@ class BopReader:
     def _instance(
         self, scene: BopScene, k: int, stem: str, K: CameraMatrix, shape: Shape
     ) -> Instance:
+        """Return object ``k`` of a scene as an instance of an image, with its mask if stored."""
         path = scene.folder / "mask_visib" / f"{stem}_{scene.gt_ids[k]:06d}.png"
         mask = decode_mask(read_content(path), str(path), shape) if path.exists() else None
         poses, part = scene.poses, self._parts[int(scene.poses.obj_ids[k])]
@@ -266,6 +267,7 @@ class BopReader:
 
     @cached_property
     def _num_instances(self) -> dict[str, int]:
+        """Count the instances of each part on the selected images."""
         counts: Counter[int] = Counter()
         for number, row in self._items.tolist():
             scene = self._scenes[number]

@@ -69,6 +69,7 @@ class BopFolder:
 
     @cached_property
     def _surfaces(self) -> dict[str, tuple[Part, Surface]]:
+        """Return each part and its surface by name, for parts with a mesh."""
         return {part.name: (part, make_surface(part.mesh)) for part in self._parts if part.mesh}
 
     def labels(self, sample: Sample) -> Labels:
@@ -126,6 +127,7 @@ class BopWriter(BopFolder):
                 path.unlink()
 
     def _scene(self, chunk: int) -> Path:
+        """Return the folder of the scene that a chunk is written to."""
         return self.root / self.split / f"{chunk:06d}"
 
     def _write_camera(self, chunk: int, image: int, camera: Mapping[str, Any]) -> None:
@@ -142,6 +144,7 @@ class BopWriter(BopFolder):
 
 
 def _staged(scene: Path) -> list[Path]:
+    """Return the files of the scene's images that are not merged yet."""
     return staged_items(scene / STAGING, ".json")
 
 

@@ -246,6 +246,7 @@ class NddsSettings:
 
 
 def _entries(settings: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
+    """Return the objects in a list of a settings file; empty if the list is missing."""
     rows = settings.get(name)
     return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
 

@@ -259,6 +259,7 @@ def _most(values: Sequence[float]) -> float:
 def _undecidable(
     where: str, why: str, shown: Sequence[PoseConvention], errors: dict[PoseConvention, float]
 ) -> UserError:
+    """Return the error for a data set whose annotations fit none or several conventions."""
     figures = "; ".join(f"{errors[convention]:.3g} px: {convention}" for convention in shown)
     return UserError(
         f"{where}: {why}; reprojection error: {figures}",

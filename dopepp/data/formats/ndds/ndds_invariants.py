@@ -124,6 +124,7 @@ def _check_item(
 def _check_camera(
     node: Node, settings: NddsSettings, record: Mapping[str, Any], shape: Shape | None
 ) -> CameraMatrix | None:
+    """Check an annotation's image size and K; return K, or None if K is missing or implausible."""
     data = mapping(record.get("camera_data"))
     width, height = data.get("width"), data.get("height")
     if shape is not None and None not in (width, height) and (height, width) != shape:

@@ -159,6 +159,7 @@ class NddsReader:
         return Sample(image, K, instances, depth, self.name, self._key(path))
 
     def _key(self, path: Path) -> str:
+        """Return an annotation's path below the data set, without suffix."""
         return path.relative_to(self.folder).as_posix().removesuffix(".json")
 
     def _is_out_of_view(self, observation: Observation) -> bool:

@@ -119,6 +119,7 @@ class NddsWriter:
         write_whole(self._path(index, ".json"), _encode(record))
 
     def _path(self, index: int, suffix: str) -> Path:
+        """Return the path of an item's file with a suffix."""
         return self._root / f"{index:06d}{suffix}"
 
     def written(self, chunk: int) -> set[int]:
@@ -236,4 +237,5 @@ def segmentation_map(
 
 
 def _encode(record: dict[str, Any]) -> bytes:
+    """Encode a record as indented JSON."""
     return (json.dumps(record, indent=1, allow_nan=False) + "\n").encode()

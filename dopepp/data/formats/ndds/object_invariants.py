@@ -130,6 +130,7 @@ class ObjectCheck:
             self._check_image(axes, K, shape, seen, None if mask is None else self._visibility)
 
     def _add(self, field: str, message: str) -> None:
+        """Report a problem in a field of the object."""
         self._node[field].report(message)
 
     def _numbers(self, field: str, *shape: int) -> Float[np.ndarray, "..."] | None:
@@ -306,6 +307,7 @@ class ObjectCheck:
 
 
 def _finite(values: Float[np.ndarray, "..."] | None) -> Float[np.ndarray, "..."] | None:
+    """Return an array, or None if a number is missing or not finite."""
     return values if values is not None and np.isfinite(values).all() else None
 
 
@@ -321,4 +323,5 @@ def _quarter_turn_distance(rotation: RotationMatrix) -> float:
 
 
 def _text(values: Float[np.ndarray, " n"]) -> str:
+    """Format a vector for a message."""
     return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"

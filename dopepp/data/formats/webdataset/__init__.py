@@ -166,6 +166,7 @@ def _walk(node: Node, file: io.BufferedReader, size: int) -> Iterator[TarMember]
 
 
 def _leads_out(info: tarfile.TarInfo) -> bool:
+    """Return whether a member's name could leave the folder or is not a plain path."""
     name = PurePosixPath(info.name)
     odd = "\\" in info.name or not info.name.isprintable()
     return name.is_absolute() or ".." in name.parts or odd

@@ -160,6 +160,7 @@ class ShardRecords:
         self.json = cache(self._json)
 
     def _member(self, name: str) -> Node:
+        """Return the node of a JSON member, for error messages."""
         return Node(self._problems, f"{self.start}.{name}.json")
 
     def nodes(self, what: str, number: int) -> Node:
@@ -201,10 +202,12 @@ class ShardRecords:
 
 
 def _records(shard: ShardIndex, image: int) -> ShardRecords:
+    """Return the JSON members of one image of a shard."""
     return ShardRecords(f"{shard.path}/{shard.keys[image]}", partial(shard.read, image))
 
 
 def _check_keys(shards: Sequence[ShardIndex]) -> None:
+    """Check that no two shards contain the same key."""
     owners: dict[str, Path] = {}
     for shard in shards:
         if twice := [key for key in shard.keys if key in owners]:
@@ -269,6 +272,7 @@ def _expanded(text: str) -> list[str]:
 
 
 def _local(path: Path) -> list[Path]:
+    """Return the shard at a path, or all shards in a folder."""
     if path.is_file():
         return [path]
     shards = sorted(file for file in path.glob("*.tar") if not file.name.startswith("."))

@@ -89,6 +89,7 @@ class WebdatasetWriter(BopFolder):
             partial.unlink(missing_ok=True)
 
     def _write_keys(self, chunk: int) -> None:
+        """Add the shard's keys to ``key_to_shard.json``."""
         if not self._shard(chunk).exists():
             return
         path = self.root / self.split / KEY_FILE
@@ -98,12 +99,15 @@ class WebdatasetWriter(BopFolder):
             write_whole(path, by_line(dict(sorted(merged.items()))))
 
     def _shard(self, chunk: int) -> Path:
+        """Return the path of a chunk's shard."""
         return self.root / self.split / f"shard-{chunk:06d}.tar"
 
     def _staging(self, chunk: int) -> Path:
+        """Return the folder for a chunk's images that are not merged yet."""
         return self.root / self.split / STAGING / f"{chunk:06d}"
 
     def _staged(self, chunk: int) -> list[Path]:
+        """Return the files of the chunk's images that are not merged yet."""
         return staged_items(self._staging(chunk), ".tar")
 
 
@@ -130,6 +134,7 @@ def _merged(paths: Sequence[Path], chunk: int) -> Iterator[tuple[str, Content]]:
 
 
 def _archive(key: str, content: Content) -> bytes:
+    """Return the bytes of a tar file with the files of one image."""
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w") as archive:
         _add(archive, key, content)
@@ -137,6 +142,7 @@ def _archive(key: str, content: Content) -> bytes:
 
 
 def _add(archive: tarfile.TarFile, key: str, content: Content) -> None:
+    """Add the files of one image to a tar file, in a fixed order and with fixed metadata."""
     for extension, data in sorted(content.items()):
         info = tarfile.TarInfo(f"{key}.{extension}")
         info.size, info.mode = len(data), 0o444
@@ -145,4 +151,5 @@ def _add(archive: tarfile.TarFile, key: str, content: Content) -> None:
 
 
 def _image(key: str) -> int:
+    """Return the image number in a key."""
     return int(key.rpartition("_")[2])

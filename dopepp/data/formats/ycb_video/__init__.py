@@ -170,6 +170,7 @@ def _columns(node: Node, fields: Mapping[str, NDArray[Any]]) -> list[tuple[int, 
 
 
 def _pose(value: NDArray[Any], node: Node) -> Transform:
+    """Return a 3×4 pose as a transform; report an invalid pose and fill it with NaN."""
     pose = node.numbers(value, 3, 4)
     if problem := rotation_problem(pose[:, :3]):
         node["R"].report(problem, "a rigid transform")
@@ -214,6 +215,7 @@ def read_frame(
 
 
 def _read_colour(path: Path, alpha: bool) -> UInt8[np.ndarray, "height width channels"]:
+    """Read an 8-bit colour image with the expected number of channels."""
     image = read_image(path)
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 + alpha:
         problem, allowed = f"shape {image.shape}, {image.dtype}", f"8 bits and {3 + alpha} channels"

@@ -130,9 +130,11 @@ class YcbVideoReader:
         return Sample(self._rgb(frame.image, name, epoch), K, instances, depth, self.name, name)
 
     def _start(self, frame: str) -> str:
+        """Return the beginning of the paths of a frame's files."""
         return str(self.root / ycb_video.FOLDERS[self.subset] / frame)
 
     def _meta(self, frame: str) -> FrameMeta:
+        """Read the ground truth of a frame."""
         return ycb_video.read_meta(Path(f"{self._start(frame)}-meta.mat"))
 
     def _rgb(self, image: NDArray[Any], frame: str, epoch: int) -> Picture:

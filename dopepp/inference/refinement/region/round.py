@@ -224,12 +224,14 @@ class Round:
         return self.reach(reach) / self.crop.scale
 
     def _outline(self, pose: Transform) -> Contour:
+        """Return the outline at a pose, or raise :class:`UndecidedError` if it is not visible."""
         contour = self.contour(pose)
         if contour is None:
             raise UndecidedError("the part's outline left the picture")
         return contour
 
     def _agreement(self, contour: Contour, reach: float) -> OutlineAgreement:
+        """Return the agreement of a contour with the image within a search distance."""
         shifts = self._shifts(contour, reach)
         weights = shifts.information
         offset = np.average(shifts.mean, weights=weights + LEAST_INFORMATION)
@@ -250,6 +252,7 @@ class Round:
         return float(np.linalg.slogdet(before + added)[1] - np.linalg.slogdet(before)[1])
 
     def _shifts(self, contour: Contour, reach: float) -> Shifts:
+        """Measure the shifts of a contour within a search distance, pixels of the image."""
         reach, odds, colours = self.reach(reach), self._smooth_odds, self.crop.colours
         return find_shifts(odds, colours, contour, reach, _step(reach), self._weights)
 

@@ -160,6 +160,7 @@ def _colour(mi: Any, item: SceneObject, K: CameraMatrix) -> dict[str, Any]:
 def _bitmap(
     mi: Any, texels: Float32[np.ndarray, "rows columns 3"], to_uv: np.ndarray
 ) -> dict[str, Any]:
+    """Return Mitsuba's description of a texture of linear colours."""
     bitmap = mi.Bitmap(np.clip(texels, 0.0, _MAX_ALBEDO))
     return {"type": "bitmap", "bitmap": bitmap, "raw": True, "to_uv": mi.ScalarTransform4f(to_uv)}
 

@@ -188,6 +188,7 @@ def _over(light: Colours, alpha: Depth, behind: Picture) -> Picture:
 
 
 def _slices(window: Box) -> Area:
+    """Return the slices of rows and columns of a window."""
     left, top, right, bottom = window
     return slice(top, bottom), slice(left, right)
 
@@ -339,6 +340,7 @@ def _device() -> tuple[Any, Any]:
 
 
 def _check(interface: Any, device: Any) -> None:
+    """Raise the error that Open Image Denoise has recorded, if any."""
     message = interface.oidn_ffi.new("const char **")
     if interface.oidn_Capi.oidnGetDeviceError(device, message):
         text = interface.oidn_ffi.string(message[0]).decode(errors="replace")
