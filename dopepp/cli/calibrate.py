@@ -463,9 +463,9 @@ def _show_rig(calibration: Rig) -> None:
         seen = f"{name}: {calibration.shared[number]} pictures with another camera, "
         seen += f"{calibration.errors_px[number]:.3f} px"
         if number:
-            away = 1000 * hypot(*calibration.T_world_cam[number][:3, 3])
+            distance_mm = 1000 * hypot(*calibration.T_world_cam[number][:3, 3])
             shift, turn = calibration.deviations[number]
-            seen += f", {away:.1f} mm from {calibration.names[0]}, standard deviations "
+            seen += f", {distance_mm:.1f} mm from {calibration.names[0]}, standard deviations "
             seen += f"{1000 * shift:.2f} mm and {degrees(turn):.3f}°"
         typer.echo(seen)
 

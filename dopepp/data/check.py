@@ -79,7 +79,9 @@ def _refuse_parent(root: Path, layout: str | None) -> None:
     if not any(is_set.values()) and (layout is not None or not layouts):
         return
     listed = [f"{name} ({kind})" for name, kind in layouts.items()]
-    more = f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
-    problem = f"{root}, a folder of {len(listed)} data sets: {', '.join(listed[:_LISTED])}{more}"
+    remainder = f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
+    problem = (
+        f"{root}, a folder of {len(listed)} data sets: {', '.join(listed[:_LISTED])}{remainder}"
+    )
     fix = f"check each on its own, e.g. dopepp check {root / next(iter(layouts))}"
     raise UserError(problem, "one data set", fix)

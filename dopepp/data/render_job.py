@@ -310,17 +310,17 @@ def _claim(root: Path, record: Mapping[str, Any]) -> None:
         raise UserError(problem, "the settings of the folder's first job", fix)
 
 
-def _differences(there: object, now: object, where: str) -> Iterator[str]:
+def _differences(stored: object, current: object, where: str) -> Iterator[str]:
     """Yield each different field with both values."""
-    if isinstance(there, dict) and isinstance(now, dict):
-        for key in now | there:
+    if isinstance(stored, dict) and isinstance(current, dict):
+        for key in current | stored:
             field = f"{where}.{key}" if where else str(key)
-            yield from _differences(there.get(key), now.get(key), field)
-    elif isinstance(there, list) and isinstance(now, list) and len(there) == len(now):
-        for number, pair in enumerate(zip(there, now, strict=True)):
+            yield from _differences(stored.get(key), current.get(key), field)
+    elif isinstance(stored, list) and isinstance(current, list) and len(stored) == len(current):
+        for number, pair in enumerate(zip(stored, current, strict=True)):
             yield from _differences(*pair, f"{where}[{number}]")
-    elif there != now:
-        texts = (json.dumps(value) for value in (there, now))
+    elif stored != current:
+        texts = (json.dumps(value) for value in (stored, current))
         before, after = (text if len(text) <= 60 else f"{text[:57]}..." for text in texts)
         yield f"{where or 'content'} is {before} there and {after} now"
 

@@ -225,8 +225,8 @@ def pad_sample(sample: Sample, input_size: Size) -> Sample:
         return sample
 
     def pad(array: NDArray[Any]) -> NDArray[Any]:
-        beyond = [(0, input_size[1] - height), (0, input_size[0] - width)]
-        return np.pad(array, beyond + [(0, 0)] * (array.ndim - 2))
+        padding = [(0, input_size[1] - height), (0, input_size[0] - width)]
+        return np.pad(array, padding + [(0, 0)] * (array.ndim - 2))
 
     return replace(_map_pixels(sample, pad), image=pad(sample.image))
 

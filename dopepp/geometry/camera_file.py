@@ -181,8 +181,8 @@ def _cut(K: CameraMatrix, calibrated: Size | None, size: Size, crop: Crop) -> Ca
         problem = f"{stated} with a picture of {_by(size)}"
         fix = f"pass --crop {x} {y} {size[0]} {size[1]}"
         raise UserError(problem, "x y followed by the picture's width and height", fix)
-    beyond = calibrated is not None and (x + width > calibrated[0] or y + height > calibrated[1])
-    if min(x, y) < 0 or beyond:
+    exceeds = calibrated is not None and (x + width > calibrated[0] or y + height > calibrated[1])
+    if min(x, y) < 0 or exceeds:
         inside = f"inside the calibrated picture{f' of {_by(calibrated)}' if calibrated else ''}"
         fix = "pass the position of the crop in the calibrated picture"
         raise UserError(stated, f"x y width height {inside}", fix)

@@ -278,8 +278,8 @@ def letterboxes(
         if boxes and scale < MARGIN * boxes[-1].scale_x:
             continue
         # The camera of training gets the size of training to the pixel.
-        same = 1 / MARGIN < scale / learned.scale_x < MARGIN
-        boxes.append(learned if same else Letterbox.scaled(size, scale))
+        is_trained_size = 1 / MARGIN < scale / learned.scale_x < MARGIN
+        boxes.append(learned if is_trained_size else Letterbox.scaled(size, scale))
     fitting = [box for box in boxes if box.width * box.height <= MAX_PIXELS]
     return fitting or [Letterbox.scaled(size, math.sqrt(MAX_PIXELS / (size[0] * size[1])))]
 

@@ -270,19 +270,19 @@ def silhouette_contours(
 
     There are none without a mesh, or if some of the mesh is not in front of the camera.
     """
-    at = None if shape.mesh is None else posed(shape.mesh, T_cam_obj, K)
-    if at is None or shape.mesh is None:
+    posed_mesh = None if shape.mesh is None else posed(shape.mesh, T_cam_obj, K)
+    if posed_mesh is None or shape.mesh is None:
         return []
     # One pixel beyond the image, so that a part that leaves it has no line along the border.
     limit = np.array(image.shape[1::-1]) + 2
-    low = np.maximum(np.floor(at.pixels.min(axis=0)) - 1, -2).astype(int)
-    high = np.minimum(np.ceil(at.pixels.max(axis=0)) + 2, limit)
+    low = np.maximum(np.floor(posed_mesh.pixels.min(axis=0)) - 1, -2).astype(int)
+    high = np.minimum(np.ceil(posed_mesh.pixels.max(axis=0)) + 2, limit)
     width, height = (high - low).astype(int)
     if min(width, height) <= 0:
         return []
-    at = posed(shape.mesh, T_cam_obj, crop_camera(K, *low))
-    assert at is not None
-    mask = filled_mask(shape.mesh, at, (int(width), int(height)))
+    posed_mesh = posed(shape.mesh, T_cam_obj, crop_camera(K, *low))
+    assert posed_mesh is not None
+    mask = filled_mask(shape.mesh, posed_mesh, (int(width), int(height)))
     contours, _ = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     return [np.asarray(contour + low.reshape(1, 1, 2)) for contour in contours]
 

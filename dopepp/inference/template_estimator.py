@@ -170,10 +170,10 @@ class TemplateEstimator(PoseEstimator):
                 poses.sort(key=_probability, reverse=True)
                 best = poses[:NUM_REPEATED]
                 starts = [detector.start(end.T_cam_obj, end.score, K) for end in best]
-                again = super().refined(starts, image, K, depth)
+                refined_again = super().refined(starts, image, K, depth)
                 poses[:NUM_REPEATED] = [
                     new if new.kept == "" and _probability(new) > _probability(old) else old
-                    for new, old in zip(again, best, strict=True)
+                    for new, old in zip(refined_again, best, strict=True)
                 ]
             ends += poses
         return ends

@@ -203,23 +203,23 @@ class Candidates:
             if np.linalg.norm(step) < 1e-6:  # a thousandth of any tolerance
                 break
         # The axis is an eigenvector, because the skew part of a half turn vanishes.
-        better = np.asarray(np.linalg.eigh(rotation + rotation.T)[1][:, -1])
-        better = better if better @ axis > 0 else -better
+        refined = np.asarray(np.linalg.eigh(rotation + rotation.T)[1][:, -1])
+        refined = refined if refined @ axis > 0 else -refined
         # Special axes, e.g. along edges, are exact, so only a much smaller error replaces them.
-        if special and self._error(better, order) > 0.8 * self._error(axis, order):
+        if special and self._error(refined, order) > 0.8 * self._error(axis, order):
             return axis
-        return better
+        return refined
 
     def _step(self, rotation: RotationMatrix) -> Vector:
         """Return the rotation vector that moves the rotated points towards their planes."""
         moved = self._probes @ rotation.T
         closest, normals = self._surface.nearest(moved)
-        away = ((closest - moved) * normals).sum(axis=1)
-        weight = np.minimum(1.0, _GIVE / np.maximum(np.abs(away), _GIVE))
+        offsets = ((closest - moved) * normals).sum(axis=1)
+        weight = np.minimum(1.0, _GIVE / np.maximum(np.abs(offsets), _GIVE))
         lever = np.cross(moved, normals)
         # Damping prevents steps that slide the surface along itself.
         normal_matrix = (lever * weight[:, None]).T @ lever + 1e-4 * np.eye(3)
-        return np.asarray(np.linalg.solve(normal_matrix, lever.T @ (weight * away)))
+        return np.asarray(np.linalg.solve(normal_matrix, lever.T @ (weight * offsets)))
 
     def _error(self, axis: Vector, order: int) -> float:
         """Return the RMS distance of the rotated surface points from the surface."""

@@ -368,14 +368,14 @@ def fit_covariance_factor(
 def fit_weights(
     features: Float[np.ndarray, "n features"],
     correct: Bool[np.ndarray, "n"],
-    usual: Float[np.ndarray, "features"] | None = None,
+    defaults: Float[np.ndarray, "features"] | None = None,
 ) -> Float[np.ndarray, "features"]:
     """Fit the score's weights by maximum likelihood (Newton's method) with a ridge penalty.
 
     Args:
         features: Features of the detections.
         correct: Whether each pose is right; a detection without an instance is not.
-        usual: Weights without a penalty, near which few detections leave the result (default: 0).
+        defaults: Weights toward which the ridge penalty pulls (default: 0).
 
     Raises:
         ValueError: All or no detections are right.
@@ -383,16 +383,16 @@ def fit_weights(
     correct = np.asarray(correct, bool)
     if not correct.any() or correct.all():
         raise ValueError("a score needs right and wrong detections to learn from")
-    if usual is None:
-        usual = np.zeros(features.shape[1])
-        ridge = _RIDGE * np.eye(len(usual))
+    if defaults is None:
+        defaults = np.zeros(features.shape[1])
+        ridge = _RIDGE * np.eye(len(defaults))
         ridge[0, 0] = 0.0  # the share of right detections is well determined
     else:
-        ridge = _USUAL_RIDGE * np.eye(len(usual))
-    weights = usual.copy()
+        ridge = _USUAL_RIDGE * np.eye(len(defaults))
+    weights = defaults.copy()
     for _ in range(_STEPS):
         predicted = score(features, weights)
-        gradient = features.T @ (correct - predicted) - ridge @ (weights - usual)
+        gradient = features.T @ (correct - predicted) - ridge @ (weights - defaults)
         hessian = (features * (predicted * (1 - predicted))[:, None]).T @ features + ridge
         step = np.linalg.lstsq(hessian, gradient, rcond=None)[0]
         weights = weights + step * min(1.0, _EXPONENTS / max(float(np.abs(step).max()), 1e-12))

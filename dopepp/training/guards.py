@@ -305,13 +305,13 @@ class EmptyMaps(Callback):
     def _labels(self) -> tuple[bool, str]:
         """Return whether labels are a likely cause, judged by their positions, and the advice."""
         inside, sizes = torch.cat(self._inside), torch.cat(self._sizes)
-        look = "check the green labels in val_overlay.png, and run dopepp check on the data"
+        advice = "check the green labels in val_overlay.png, and run dopepp check on the data"
         if not len(inside):
-            return True, f"no object in the validation images is visible enough; {look}"
+            return True, f"no object in the validation images is visible enough; {advice}"
         share, cells = float(inside.mean()), float(sizes.nanmedian())
         wrong = share < _MIN_INSIDE or not cells >= _MIN_CELLS
         return wrong, (
             f"{100 * share:.0f} % of the keypoints are inside the images and an object is "
-            f"{cells:.1f} cells of the maps wide; {look}; a part's unit is data.unit; small "
+            f"{cells:.1f} cells of the maps wide; {advice}; a part's unit is data.unit; small "
             "objects need a larger data.input_size, narrow peaks a larger maps.sigma"
         )

@@ -87,11 +87,11 @@ def orthogonalised(matrix: Float[Tensor, "m n"]) -> Float[Tensor, "m n"]:
         return orthogonalised(matrix.T).T
     matrix = matrix / (matrix.norm() + 1e-12)
     gram = matrix @ matrix.T
-    now = whole = _polynomial(gram)
+    factor = whole = _polynomial(gram)
     for _ in range(_ROUNDS - 1):
-        gram = now @ now @ gram
-        now = _polynomial(gram)
-        whole = now @ whole
+        gram = factor @ factor @ gram
+        factor = _polynomial(gram)
+        whole = factor @ whole
     return whole @ matrix
 
 

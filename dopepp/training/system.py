@@ -195,9 +195,9 @@ class PoseSystem(LightningModule):
         scheduled = {"lr"} if self.trainer.lr_scheduler_configs else set()
         for optimizer in self.trainer.optimizers:
             for group, settings in zip(optimizer.param_groups, self._settings, strict=True):
-                kept = {"params", *scheduled}
-                kept |= {"momentum", "betas"} if "max_momentum" in settings else set()
-                group.update({k: v for k, v in settings.items() if k not in kept})
+                unchanged = {"params", *scheduled}
+                unchanged |= {"momentum", "betas"} if "max_momentum" in settings else set()
+                group.update({k: v for k, v in settings.items() if k not in unchanged})
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the description, so that the file can be loaded without this module or a config.

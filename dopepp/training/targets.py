@@ -103,16 +103,16 @@ def choose_keypoints(
     for slot, choice in allowed[:, :, 1:].any(dim=0).nonzero().tolist():
         # Draw maps only for images on which this choice is allowed for the instance.
         rows = allowed[:, slot, 1 + choice].nonzero()[:, 0]
-        some = batch.rows(rows)
+        images = batch.rows(rows)
         answer = [(logits[rows].detach(), field[rows].detach()) for logits, field in stages]
         other = keypoints[rows]
         other[:, slot] = choices[rows, slot, 1 + choice]
         present_loss, other_loss = (
-            loss.per_image(answer, *draw_maps(some, points, symmetry.num_objects, geometry))
+            loss.per_image(answer, *draw_maps(images, points, symmetry.num_objects, geometry))
             for points in (keypoints[rows], other)
         )
-        better = other_loss < present_loss
-        keypoints[rows] = torch.where(better[:, None, None, None], other, keypoints[rows])
+        is_better = other_loss < present_loss
+        keypoints[rows] = torch.where(is_better[:, None, None, None], other, keypoints[rows])
     return keypoints
 
 

@@ -139,11 +139,13 @@ class Preview:
         return True
 
 
-def arrange_floating(composition: Composition, targets: Sequence[Body], usual: Body) -> float:
+def arrange_floating(
+    composition: Composition, targets: Sequence[Body], reference_body: Body
+) -> float:
     """Place targets and distractors, and return the targets' mean depth, metres.
 
     If the first target does not fit, no target is placed. Without targets, the depth is drawn for
-    the body ``usual``.
+    the body ``reference_body``.
     """
     for body in targets:
         material = composition.draw_material(body)
@@ -155,7 +157,7 @@ def arrange_floating(composition: Composition, targets: Sequence[Body], usual: B
             break
     depths = [float(item.T_cam_obj[2, 3]) for item in composition.objects]
     if not depths:
-        depths = [max(float(_draw_pose(composition, usual)[2, 3]), NEAR)]
+        depths = [max(float(_draw_pose(composition, reference_body)[2, 3]), NEAR)]
     low, high = composition.preset.distractors.number
     for _ in range(int(composition.rng.integers(low, high + 1))):
         _place_distractor(composition, depths[0])
@@ -209,8 +211,8 @@ def _is_clear(composition: Composition, body: Body, T_cam_obj: Transform) -> boo
     # 60 % of the bounding sphere's radius counts as solid.
     centre, core = T_cam_obj[:3, 3], 0.6 * body.surface.radius
     for target in composition.objects:
-        away = float(np.linalg.norm(target.T_cam_obj[:3, 3] - centre))
-        if target.part is None or away > core + target.surface.radius:
+        distance = float(np.linalg.norm(target.T_cam_obj[:3, 3] - centre))
+        if target.part is None or distance > core + target.surface.radius:
             continue
         probes = target.part.points[:: max(len(target.part.points) // 200, 1)]
         points = transform(target.T_cam_obj, probes)

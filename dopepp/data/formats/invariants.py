@@ -156,9 +156,9 @@ def check_box(
         return
     width, height = predicted.right - predicted.left, predicted.bottom - predicted.top
     tolerance = max(BOX_TOLERANCE_PX, BOX_TOLERANCE_SHARE * max(width, height))
-    beyond = predicted.beyond(seen)
-    if beyond > tolerance:
-        distance = f"{beyond:.0f} px outside the reprojected box {predicted}"
+    excess_px = predicted.beyond(seen)
+    if excess_px > tolerance:
+        distance = f"{excess_px:.0f} px outside the reprojected box {predicted}"
         node.report(f"visible at {seen}, {distance} (allowed {tolerance:.0f} px)")
         return
     is_whole = visible_fraction is not None and visible_fraction >= FULLY_VISIBLE

@@ -227,14 +227,14 @@ def build_trainer(config: RunConfig, run_dir: Path, trackers: Sequence[Logger] =
         ) from error
 
 
-def choose_precision(asked: str, accelerator: str) -> tuple[str, str]:
+def choose_precision(requested: str, accelerator: str) -> tuple[str, str]:
     """Return Lightning's name of the precision, and the reason for the choice.
 
     ``auto`` selects bf16 if the hardware supports it, because emulation is slow. The choice depends
     on the hardware only, not on timings, so runs are repeatable.
     """
-    if asked != "auto":
-        return asked, "as requested"
+    if requested != "auto":
+        return requested, "as requested"
     if accelerator == "cuda":
         fast = torch.cuda.is_bf16_supported(including_emulation=False)
         return (
@@ -279,9 +279,9 @@ def estimate_training_s(
     if trainer.max_steps > 0:
         num_images = min(num_images, trainer.max_steps * datamodule.batch_size)
     threads = max(1, torch.get_num_threads())
-    first, again = (_loading_s(datamodule) / threads for _ in range(2))
+    first, second = (_loading_s(datamodule) / threads for _ in range(2))
     num_first = min(num_images, per_epoch)
-    loading = first * num_first + again * (num_images - num_first)
+    loading = first * num_first + second * (num_images - num_first)
     return _step_s_per_image(network, datamodule, precision) * num_images + loading
 
 

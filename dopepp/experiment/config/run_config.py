@@ -223,15 +223,15 @@ class Protocols:
 
 
 def _levels(
-    option: str, given: object, bounds: tuple[float, float], usual: float, allowed: str
+    option: str, value: object, bounds: tuple[float, float], standard_level: float, allowed: str
 ) -> tuple[float, ...]:
-    """Read levels; the ``usual`` level is omitted, because it is always measured."""
-    levels = [] if given is None else given if isinstance(given, list) else [given]
+    """Read levels; the ``standard_level`` level is omitted, because it is always measured."""
+    levels = [] if value is None else value if isinstance(value, list) else [value]
     numbers: list[float] = [n for n in levels if isinstance(n, int | float) and type(n) is not bool]
     wrong = len(numbers) < len(levels) or not all(bounds[0] <= n <= bounds[1] for n in numbers)
-    if wrong or (given is not None and set(numbers) <= {usual}):
-        raise UserError(f"{option}={given!r:.100}", allowed, f"set {option} to a list of these")
-    return tuple(sorted({float(level) for level in numbers if level != usual}))
+    if wrong or (value is not None and set(numbers) <= {standard_level}):
+        raise UserError(f"{option}={value!r:.100}", allowed, f"set {option} to a list of these")
+    return tuple(sorted({float(level) for level in numbers if level != standard_level}))
 
 
 def _quantities(given: object) -> tuple[QuantityName, ...]:

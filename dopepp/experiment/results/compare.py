@@ -97,8 +97,8 @@ def write_comparison(entries: Sequence[Entry], folder: Path) -> dict[str, Any]:
     means = [report.mean for entry in entries for report in entry.reports]
     compact = headline(table, any(row.num_symmetries > 1 for row in means))
     sentences, rows = notes(entries, table), full(table)
-    narrow = [{key: row[key] for key in row if key not in _TOO_WIDE} for row in compact]
-    display.show_table("comparison", narrow, num_labels=2)
+    narrow_rows = [{key: row[key] for key in row if key not in _TOO_WIDE} for row in compact]
+    display.show_table("comparison", narrow_rows, num_labels=2)
     for sentence in sentences:
         display.console.print(sentence)
     write_csv(folder / TABLE_FILE, rows, header_of(rows))

@@ -239,10 +239,12 @@ def save_frame_rates(path: Path, frames: Mapping[str, pd.DataFrame]) -> None:
     """
     lines = []
     for number, (name, times) in enumerate(frames.items()):
-        at, colour = times["seconds"].cumsum().to_numpy(), f"C{number}"
-        whole, alone = (1 / times[[name]].to_numpy().T for name in ("seconds", "network_seconds"))
-        lines.append(PlotLine(f"{name}, picture to poses", at, whole, colour, False))
-        lines.append(PlotLine(f"{name}, network alone", at, alone, colour, True))
+        seconds, colour = times["seconds"].cumsum().to_numpy(), f"C{number}"
+        whole, network_rate = (
+            1 / times[[name]].to_numpy().T for name in ("seconds", "network_seconds")
+        )
+        lines.append(PlotLine(f"{name}, picture to poses", seconds, whole, colour, False))
+        lines.append(PlotLine(f"{name}, network alone", seconds, network_rate, colour, True))
     write_png(path, figure_image(lines_figure(lines, "time (s)", "frames a second")))
 
 

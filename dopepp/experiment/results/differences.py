@@ -164,8 +164,8 @@ def _baseline_of(entry: Entry, entries: Sequence[Entry]) -> Entry | None:
 def _cost_values(entry: Entry, name: str) -> Iterator[Value]:
     """Yield the cost in this run and, for a narrowed network, the cost at full size."""
     costs = {"": entry.cost}
-    if entry.reports and (wide := entry.reports[0].details.get(FULL_SIZE_COST)) is not None:
-        costs["full-size "] = Cost(**wide)
+    if entry.reports and (full_size := entry.reports[0].details.get(FULL_SIZE_COST)) is not None:
+        costs["full-size "] = Cost(**full_size)
     for prefix, cost in costs.items():
         for measure, value in zip(COST_FORMS, vars(cost).values(), strict=True):
             number = math.nan if value is None else float(value)
@@ -267,11 +267,11 @@ def _interval_note(baseline: Entry, alike: Sequence[Entry]) -> str:
         f"Δ is against {baseline.name}, with its 95 % interval from a paired bootstrap over the "
         f"same {count:,} test instances"
     )
-    alone = [entry.name for entry in (baseline, *alike) if len(entry.reports) == 1]
-    if len(alone) == len(alike) + 1:
+    single_seed = [entry.name for entry in (baseline, *alike) if len(entry.reports) == 1]
+    if len(single_seed) == len(alike) + 1:
         return f"{sentence}. The interval excludes the noise of training (one training each)."
-    if alone:
-        names = ", ".join(alone)
+    if single_seed:
+        names = ", ".join(single_seed)
         unknown = f"the training noise of {names}, which has a single training"
         return f"{sentence} and over seeds. The interval excludes {unknown}."
     return f"{sentence} and over the seeds of the trainings."

@@ -88,9 +88,9 @@ def write_environment(
     path = run_dir / VERSIONS_FILE
     earlier: list[object] = []
     if path.is_file():
-        before = read_json(path)
-        past = before.pop("earlier", [])
-        earlier = [*(past if isinstance(past, list) else []), before]
+        latest = read_json(path)
+        previous = latest.pop("earlier", [])
+        earlier = [*(previous if isinstance(previous, list) else []), latest]
     present = environment(seed, data_fingerprint)
     diff = _git("diff", "--binary", "HEAD")
     if present["git"] is not None and diff:

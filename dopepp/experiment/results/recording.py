@@ -207,8 +207,8 @@ def made_worse(network: PoseMetrics, refined: PoseMetrics) -> dict[str, float]:
             np.concatenate([method.errors(name, error) for name in refined.parts])
             for method in (network, refined)
         )
-        worse = (after > before + 0.001)[np.isfinite(after)]
-        shares[error] = float(worse.mean()) if len(worse) else 0.0
+        is_worse = (after > before + 0.001)[np.isfinite(after)]
+        shares[error] = float(is_worse.mean()) if len(is_worse) else 0.0
     return shares
 
 

@@ -260,13 +260,13 @@ def _look(sample: Sample) -> dict[str, Any]:
     }
 
 
-def _picture_difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> float:
+def _picture_difference(stored: Mapping[str, Any], present: Mapping[str, Any]) -> float:
     """Return the mean absolute difference in grey levels; infinite for different sizes."""
-    if before["size"] != now["size"]:
+    if stored["size"] != present["size"]:
         return np.inf
     pictures = (
         np.frombuffer(bytes.fromhex(look["pixels"]), np.uint8).astype(float)
-        for look in (before, now)
+        for look in (stored, present)
     )
     return float(np.abs(np.subtract(*pictures)).mean())
 

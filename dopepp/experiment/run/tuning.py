@@ -315,8 +315,8 @@ def squared_distances(
         T_est = np.broadcast_to(detection.T_cam_obj, equivalents.shape).copy()
         T_est[:, :3, 3] *= distance_factor
         poses = T_est[:, :3, :3], T_est[:, :3, 3], equivalents[:, :3, :3], equivalents[:, :3, 3]
-        away = mahalanobis(*map(torch.from_numpy, (*poses, stated)))
-        squared.append(float(away.min()) ** 2)
+        distances = mahalanobis(*map(torch.from_numpy, (*poses, stated)))
+        squared.append(float(distances.min()) ** 2)
     return np.array(squared)
 
 
@@ -348,20 +348,20 @@ def choose(
     """
     features = np.concatenate([shown.features, empty.features])
     correct = np.concatenate([shown.correct, empty.correct])
-    usual = np.array(RecoveryOptions().refined_weights) if refined else None
+    defaults = np.array(RecoveryOptions().refined_weights) if refined else None
     if refined and (not correct.any() or correct.all()):
         weights = np.array(RecoveryOptions().refined_weights)
     elif not correct.any() or correct.all():
-        what = "right" if correct.any() else "wrong"
+        kind = "right" if correct.any() else "wrong"
         raise UserError(
-            f"{len(correct)} validation detections, all of them {what}"
+            f"{len(correct)} validation detections, all of them {kind}"
             if len(correct)
             else "no detection on any validation image",
             "right and wrong detections to learn from",
             "train longer, or raise data.num_val and num_empty",
         )
     else:
-        weights = fit_weights(features, correct, usual)
+        weights = fit_weights(features, correct, defaults)
     best = empty.best_scores(score(empty.features, weights))[~empty.shows_lookalikes()]
     best = np.sort(best)[::-1]
     allowed = int(false_positive_rate * len(best))

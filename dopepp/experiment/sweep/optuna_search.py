@@ -120,8 +120,8 @@ class _Trials:
                 "set another search.study=NAME, or move the folder away",
             )
 
-    def run(self, wanted: int, at_a_time: int) -> list[JobReturn]:
-        """Finish the trials of an earlier command, then run new trials until ``wanted`` ended."""
+    def run(self, num_trials: int, at_a_time: int) -> list[JobReturn]:
+        """Finish the trials of an earlier command, then run new trials up to ``num_trials``."""
         returns: list[JobReturn] = []
         self._tell(self._running())
         left = self._running()
@@ -131,7 +131,7 @@ class _Trials:
         for trials in _consecutive(left, at_a_time):
             returns += self._launch(trials)
         ended = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)
-        while (missing := wanted - len(self._study.get_trials(False, ended))) > 0:
+        while (missing := num_trials - len(self._study.get_trials(False, ended))) > 0:
             asked = range(min(missing, at_a_time))
             numbers = {self._study.ask(self._space.varied).number for _ in asked}
             returns += self._launch([trial for trial in self._running() if trial.number in numbers])
@@ -321,22 +321,22 @@ def open_study(options: Mapping[str, Any], facts: Mapping[str, str], seed: int) 
     return study
 
 
-def _check_same(before: Mapping[str, str], now: Mapping[str, str], study: str) -> None:
+def _check_same(stored: Mapping[str, str], now: Mapping[str, str], study: str) -> None:
     """Check that the trials of a study can be compared.
 
     Raises:
         UserError: The configurations differ in more than the searched options.
     """
-    keys = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
+    keys = sorted(key for key in {*stored, *now} if stored.get(key) != now.get(key))
     if not keys:
         return
     present, original = (
         ", ".join(f"{key}={facts.get(key, 'absent')}" for key in keys[:_NUM_SHOWN])
-        for facts in (now, before)
+        for facts in (now, stored)
     )
-    more = f" and {len(keys) - _NUM_SHOWN} more" if len(keys) > _NUM_SHOWN else ""
+    remainder = f" and {len(keys) - _NUM_SHOWN} more" if len(keys) > _NUM_SHOWN else ""
     raise UserError(
-        f"{present}{more}, but {original} at the start of the study {study}",
+        f"{present}{remainder}, but {original} at the start of the study {study}",
         "the options of the study's first command",
         "repeat that command, or start another study with search.study=NAME",
     )

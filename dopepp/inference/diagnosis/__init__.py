@@ -157,17 +157,17 @@ def size(case: Case) -> Diagnosis:
     if depths is None:
         return Diagnosis("size", f"the checkpoint does not know in which sizes {name} was trained")
     near, far = case.distances or depths
-    usual = f"{near:.2g} – {far:.2g} m"
+    trained = f"{near:.2g} – {far:.2g} m"
     if case.detection is None:
-        return Diagnosis("size", f"{name} was searched at {usual}, and nearer and farther")
+        return Diagnosis("size", f"{name} was searched at {trained}, and nearer and farther")
     z = float(case.detection.T_cam_obj[2, 3])
     sentence = f"{name} is {case.length_px:.0f} pixels long at {z:.3g} m"
     if case.elsewhere is None:
-        return Diagnosis("size", f"{sentence}; it is searched at {usual}")
-    fix = f"move it to {usual}, or search there: --distance {0.9 * z:.2g} {1.1 * z:.2g}"
+        return Diagnosis("size", f"{sentence}; it is searched at {trained}")
+    fix = f"move it to {trained}, or search there: --distance {0.9 * z:.2g} {1.1 * z:.2g}"
     if not _near(z / math.sqrt(near * far), 5):
         fix += "; the cause may also be a wrong unit of the part's mesh or of a distance"
-    return Diagnosis("size", f"{sentence}, and nothing is found at {usual}", fix)
+    return Diagnosis("size", f"{sentence}, and nothing is found at {trained}", fix)
 
 
 def visibility(case: Case) -> Diagnosis:

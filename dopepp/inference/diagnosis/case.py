@@ -137,8 +137,8 @@ class Case:
         boxes = letterboxes(self.estimator.checkpoint, self.K, self.image, self.distances)
         if self.detection is None or self.seen is None:
             return boxes[-1]
-        usual = math.sqrt(self.seen.smallest_px * self.seen.largest_px)
-        return min(boxes, key=lambda box: abs(math.log(self.length_px * box.scale_x / usual)))
+        typical_px = math.sqrt(self.seen.smallest_px * self.seen.largest_px)
+        return min(boxes, key=lambda box: abs(math.log(self.length_px * box.scale_x / typical_px)))
 
     @cached_property
     def refined(self) -> Detection | None:

@@ -127,16 +127,16 @@ def log_odds(
         None if part or surroundings have too few pixels on the image.
     """
     thinned = math.ceil(max(mask.shape) / LONGEST_PX)
-    few, unsure, ring = mask[::thinned, ::thinned], unsure / thinned, ring / thinned
-    left, top, width, height = cv2.boundingRect(few)
+    reduced_mask, unsure, ring = mask[::thinned, ::thinned], unsure / thinned, ring / thinned
+    left, top, width, height = cv2.boundingRect(reduced_mask)
     reach = math.ceil(1.1 * (unsure + ring)) + 2  # OpenCV's distances are up to 5 % too short
     counted = (
         slice(max(0, top - reach), top + height + reach),
         slice(max(0, left - reach), left + width + reach),
     )
-    few = np.ascontiguousarray(few[counted])
-    within = cv2.distanceTransform(few, cv2.DIST_L2, 3)
-    beyond = cv2.distanceTransform(1 - few, cv2.DIST_L2, 3)
+    reduced_mask = np.ascontiguousarray(reduced_mask[counted])
+    within = cv2.distanceTransform(reduced_mask, cv2.DIST_L2, 3)
+    beyond = cv2.distanceTransform(1 - reduced_mask, cv2.DIST_L2, 3)
     # A slender part keeps the inner half of its width.
     unsure_within = min(unsure, 0.5 * float(within.max()))
     columns = _tile_of(bins.shape[1], left * thinned, width * thinned, tiles)

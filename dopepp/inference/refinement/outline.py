@@ -101,16 +101,16 @@ def posed(mesh: OutlineMesh, T_cam_obj: Transform, K: CameraMatrix) -> PosedMesh
 
 
 def filled_mask(
-    mesh: OutlineMesh, at: PosedMesh, size: tuple[int, int]
+    mesh: OutlineMesh, posed_mesh: PosedMesh, size: tuple[int, int]
 ) -> UInt8[np.ndarray, "height width"]:
     """Return a mask of (width, height): 1 if the mesh covers the pixel's centre, else 0."""
     width, height = size
     mask = np.zeros((height, width), np.uint8)
     if mesh.is_closed:
         turns = np.zeros((height, width + 1), np.int32)
-        _wind(at.pixels, mesh.edges, mesh.sides, at.front, turns, mask)
+        _wind(posed_mesh.pixels, mesh.edges, mesh.sides, posed_mesh.front, turns, mask)
     else:
-        _fill(at.pixels, mesh.faces, mask)
+        _fill(posed_mesh.pixels, mesh.faces, mask)
     return mask
 
 
@@ -127,18 +127,23 @@ class Contour:
 
 
 def find_contour(
-    mesh: OutlineMesh, at: PosedMesh, mask: UInt8[np.ndarray, "height width"], spacing: float
+    mesh: OutlineMesh,
+    posed_mesh: PosedMesh,
+    mask: UInt8[np.ndarray, "height width"],
+    spacing: float,
 ) -> Contour:
     """Return the points of an outline that are on the image.
 
     Args:
         mesh: Mesh.
-        at: Mesh at its pose.
+        posed_mesh: Mesh at its pose.
         mask: Filled mask of the posed mesh.
         spacing: Approximate distance between points, pixels.
     """
-    edges, distance = (mesh.edges, mesh.sides, mesh.opposed), float(at.T_cam_obj[2, 3])
-    rows = _walk(*edges, at.front, at.arms, at.pixels, distance, mask, spacing)
+    edges, distance = (mesh.edges, mesh.sides, mesh.opposed), float(posed_mesh.T_cam_obj[2, 3])
+    rows = _walk(
+        *edges, posed_mesh.front, posed_mesh.arms, posed_mesh.pixels, distance, mask, spacing
+    )
     return Contour(rows[:, :3], rows[:, 3:5], rows[:, 5:])
 
 

@@ -169,10 +169,10 @@ class SurfaceOverlay:
             noise: Standard deviation of the depth, metres.
             reach: Width around the part, spacings.
         """
-        beside = (self.distance > COVERED) & (self.distance <= COVERED + reach)
+        is_beside = (self.distance > COVERED) & (self.distance <= COVERED + reach)
         at_points = self.at_points
         adjacent = np.where(np.abs(at_points) <= GATE * noise, at_points, np.nan)[self.nearest]
-        return np.asarray(beside & (np.abs(self.offset - adjacent) <= STEP * noise))
+        return np.asarray(is_beside & (np.abs(self.offset - adjacent) <= STEP * noise))
 
 
 def lay_over(

@@ -122,24 +122,28 @@ class SharpEdges:
         sharp = (second >= 0) & (cosines < SHARP) & (mesh.opposed == 0)
         self._creases, self._sides = mesh.edges[sharp], mesh.sides[sharp]
 
-    def drawn(self, at: PosedMesh, size: tuple[int, int]) -> Int[np.ndarray, "height width"]:
+    def drawn(
+        self, posed_mesh: PosedMesh, size: tuple[int, int]
+    ) -> Int[np.ndarray, "height width"]:
         """Return the triangle at each pixel, −1 for none."""
         width, height = size
         ids = np.full((height, width), -1, np.int32)
-        inverse_depth = 1.0 / (at.arms[:, 2] + at.T_cam_obj[2, 3])
+        inverse_depth = 1.0 / (posed_mesh.arms[:, 2] + posed_mesh.T_cam_obj[2, 3])
         nearest = np.zeros((height, width), np.float32)
-        shown = at.front if self.mesh.is_closed else np.ones_like(at.front)
-        _draw(at.pixels, inverse_depth, self.mesh.faces, shown, ids, nearest)
+        shown = posed_mesh.front if self.mesh.is_closed else np.ones_like(posed_mesh.front)
+        _draw(posed_mesh.pixels, inverse_depth, self.mesh.faces, shown, ids, nearest)
         return ids
 
     def visible(
-        self, at: PosedMesh, ids: Int[np.ndarray, "height width"], spacing: float
+        self, posed_mesh: PosedMesh, ids: Int[np.ndarray, "height width"], spacing: float
     ) -> Float[np.ndarray, "points 4"]:
         """Return pixel and normal of points on visible creases, ``spacing`` pixels apart.
 
         ``ids`` are the triangles that :meth:`drawn` returns.
         """
-        return np.asarray(_walk_creases(self._creases, self._sides, at.pixels, ids, spacing))
+        return np.asarray(
+            _walk_creases(self._creases, self._sides, posed_mesh.pixels, ids, spacing)
+        )
 
 
 class Verifier:
@@ -315,8 +319,8 @@ def _contrast(colours: Picture, outline: Float[np.ndarray, "points 4"]) -> float
     height, width = colours.shape[:2]
     sides = []
     for side in (-BESIDE_PX, BESIDE_PX):
-        at = np.rint(outline[:, :2] + side * outline[:, 2:]).astype(int)
-        columns, rows = np.clip(at[:, 0], 0, width - 1), np.clip(at[:, 1], 0, height - 1)
+        pixels = np.rint(outline[:, :2] + side * outline[:, 2:]).astype(int)
+        columns, rows = np.clip(pixels[:, 0], 0, width - 1), np.clip(pixels[:, 1], 0, height - 1)
         sides.append(colours[rows, columns].astype(np.float64))
     difference = np.abs(sides[0] - sides[1]).max(axis=1)
     return float((difference / (difference + 2 * NOISE)).mean())

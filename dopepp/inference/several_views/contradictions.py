@@ -100,8 +100,8 @@ def contradictions(
                 f"{detection.disagreement:.2g} standard deviations: calibrate the camera poses "
                 "again, or state their errors"
             )
-    kept = [item for item in detections if not any(item is other for other in rejected)]
-    return kept, findings
+    remaining = [item for item in detections if not any(item is other for other in rejected)]
+    return remaining, findings
 
 
 def _support(detection: WorldDetection) -> list[int]:
@@ -136,11 +136,11 @@ def _swapped(
             replace(picture, T_cam_world=pictures[other].T_cam_world)
             for picture, other in zip(pictures, order, strict=True)
         ]
-        again = [
+        moved_sightings = [
             [sight(item.view, item.detection, views[item.view]) for item in view]
             for view in sightings
         ]
-        return sum(len(cluster) - 1 for cluster in associated(again))
+        return sum(len(cluster) - 1 for cluster in associated(moved_sightings))
 
     order = list(range(len(pictures)))
     exchanged = {}

@@ -174,15 +174,15 @@ class JointEstimator:
         """Return whether a view shows the part at a pose in the world."""
         view = self._views[number]
         sighting = next((item for item in sightings if item.view == number), None)
-        at = view.to_camera(pose.T_cam_obj, np.linalg.inv(pose.information))
+        distribution = view.to_camera(pose.T_cam_obj, np.linalg.inv(pose.information))
         original = sightings[0].detection if sighting is None else sighting.detection
         geometry = self._geometries[original.object]
         detection = replace(
             original,
-            T_cam_obj=at.T_cam_obj,
-            keypoints=project_keypoints(geometry.cuboid, at.T_cam_obj, view.K),
+            T_cam_obj=distribution.T_cam_obj,
+            keypoints=project_keypoints(geometry.cuboid, distribution.T_cam_obj, view.K),
             peaks=np.full_like(original.peaks, np.nan) if sighting is None else original.peaks,
-            covariance=np.linalg.inv(at.information),
+            covariance=np.linalg.inv(distribution.information),
             agreement=None if agreement is None else agreement.share,
             support=None if agreement is None else agreement.support,
         )
@@ -210,11 +210,11 @@ class JointEstimator:
     ) -> JointPart:
         """Combine the evidence of all views to the probability and score of a part."""
         best = max((item.detection for item in sightings), key=lambda detection: detection.score)
-        alone, odds = log_odds(best.probability or 0.0), 0.0
+        single_odds, odds = log_odds(best.probability or 0.0), 0.0
         for item in evidence:
             seen = max(AGAINST, log_odds(item.probability))
             if item.detection is best:
-                odds += alone
+                odds += single_odds
             elif item.status != "outside":
                 odds += seen if item.status == "supports" else min(0.0, seen)
         agreeing = sum(
@@ -225,7 +225,7 @@ class JointEstimator:
         )
         odds += COINCIDENCE * (max(len(sightings), agreeing) - 1)
         # The score of the best single view, with the odds of all views instead of its own.
-        score = _probability(log_odds(best.score) + self._slope * (odds - alone))
+        score = _probability(log_odds(best.score) + self._slope * (odds - single_odds))
         covariance = np.linalg.inv(pose.information)
         given = best.object, score, _probability(odds), pose.T_cam_obj, covariance
         return JointPart(sightings, WorldDetection(*given, evidence, disagreement))

@@ -127,21 +127,23 @@ def _information(
     scale_error: float,
 ) -> PoseMatrix | None:
     """Return the information of a part's outline; None if the picture does not show all of it."""
-    at = posed(mesh, T_cam_obj, K)
-    if at is None:
+    posed_mesh = posed(mesh, T_cam_obj, K)
+    if posed_mesh is None:
         return None
-    low, high = at.pixels.min(axis=0), at.pixels.max(axis=0)
+    low, high = posed_mesh.pixels.min(axis=0), posed_mesh.pixels.max(axis=0)
     if low.min() < 0 or (high > np.array(size) - 1).any():
         return None
     scale = min(1.0, LONGEST_PX / float((high - low).max()))
     corner = np.floor(scale * low) - 4
     K = crop_camera(resize_camera(K, scale, scale), *corner)
     width, height = (np.ceil(scale * high) - corner + 5).astype(int).tolist()
-    at = posed(mesh, T_cam_obj, K)
-    assert at is not None
+    posed_mesh = posed(mesh, T_cam_obj, K)
+    assert posed_mesh is not None
     extent = scale * float((high - low).max())
     spacing = max(1.5, 3.0 * extent / NUM_POINTS)
-    contour = find_contour(mesh, at, filled_mask(mesh, at, (width, height)), spacing)
+    contour = find_contour(
+        mesh, posed_mesh, filled_mask(mesh, posed_mesh, (width, height)), spacing
+    )
     precision = np.full(len(contour), 1.0 / USUAL_PX**2)
     shifts = Shifts(np.zeros(len(contour)), precision)
     rows, nothing = outline_rows(contour, T_cam_obj, K), np.zeros(6)

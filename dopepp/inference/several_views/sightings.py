@@ -122,8 +122,8 @@ def associate(
                 for number, other in enumerate(free)
                 if other.view == view != seed.view and other.detection.object == name
             ]
-            apart, number = min(others, default=(math.inf, 0))
-            if apart <= GATE:
+            distance, number = min(others, default=(math.inf, 0))
+            if distance <= GATE:
                 cluster.append(free.pop(number))
         clusters.append(cluster)
     return clusters

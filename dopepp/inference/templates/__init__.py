@@ -169,9 +169,9 @@ class TemplateDetector:
         x, y, z = T_cam_obj[:3, :3] @ self._centre + T_cam_obj[:3, 3]
         focal = SILHOUETTE_PX * z / self.part.diameter
         u, v = SILHOUETTE_PX - focal * np.array([x, y]) / z
-        at = posed(self._mesh, T_cam_obj, camera_matrix(focal, focal, u, v))
+        posed_mesh = posed(self._mesh, T_cam_obj, camera_matrix(focal, focal, u, v))
         size = 2 * SILHOUETTE_PX, 2 * SILHOUETTE_PX
-        area = 0 if at is None else int(filled_mask(self._mesh, at, size).sum())
+        area = 0 if posed_mesh is None else int(filled_mask(self._mesh, posed_mesh, size).sum())
         return max(area, 1) / SILHOUETTE_PX**2
 
     def ranked(
@@ -308,10 +308,10 @@ def _distinct(
         chosen.append(index)
         if len(chosen) == NUM_STARTS:
             break
-        apart = np.linalg.norm(centres[:, :2] - centres[index, :2], axis=1)
+        distances = np.linalg.norm(centres[:, :2] - centres[index, :2], axis=1)
         trace = np.einsum("nij,ij->n", transforms[:, :3, :3], transforms[index, :3, :3])
         free &= (
-            (apart > SAME_PLACE * diameter)
+            (distances > SAME_PLACE * diameter)
             | (np.abs(centres[:, 2] / centres[index, 2] - 1) > SAME_DEPTH)
             | (trace < 1 + 2 * math.cos(SAME_TURN))
         )

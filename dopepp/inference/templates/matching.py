@@ -62,12 +62,12 @@ def match(responses: Responses, templates: Templates, diameter_px: float) -> Mat
     phases = _by_phase(responses, rows, columns, margin)
     side = max(1, round(CELL * diameter_px / STRIDE))
     shape = (-(-rows // side), -(-columns // side), NUM_KEPT)
-    scores, kept = np.full(shape, -np.inf), np.zeros((*shape, 3), np.int64)
+    scores, best = np.full(shape, -np.inf), np.zeros((*shape, 3), np.int64)
     moments = np.empty((len(templates.points), NUM_TURNS, 2))
     lines = templates.points, templates.normals
-    _match(phases, rows, columns, margin, *lines, diameter_px, side, scores, kept, moments)
+    _match(phases, rows, columns, margin, *lines, diameter_px, side, scores, best, moments)
     filled = np.isfinite(scores)
-    views, turns, positions = kept[filled].T
+    views, turns, positions = best[filled].T
     v, u = np.divmod(positions, columns)
     poses = [
         STRIDE * u,
@@ -119,7 +119,7 @@ def _match(
     scale: float,
     side: int,
     scores: Array,
-    kept: Array,
+    best: Array,
     moments: Array,
 ) -> None:
     """Write score, view, turn and position of each cell's best matches.
@@ -176,6 +176,6 @@ def _match(
                             if total[r * across + k] == most:
                                 position = r * columns + k
                     scores[i, j, slot] = score
-                    kept[i, j, slot, 0], kept[i, j, slot, 1] = view, turn
-                    kept[i, j, slot, 2] = position
+                    best[i, j, slot, 0], best[i, j, slot, 1] = view, turn
+                    best[i, j, slot, 2] = position
                     weakest[i, j] = np.argmin(scores[i, j])

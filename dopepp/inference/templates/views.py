@@ -154,11 +154,14 @@ def _drawn(
     size: tuple[int, int],
 ) -> tuple[Float[np.ndarray, "points 5"], Float[np.ndarray, "inner 2"]]:
     """Return pixel, normal and kind (1: outline, 0: crease) of edge points, and inner pixels."""
-    at = posed(mesh, make_transform(R, np.array([0.0, 0.0, distance]) - R @ centre), K)
-    assert at is not None  # the whole part is in front of the camera
-    ids = edges.drawn(at, size)
+    posed_mesh = posed(mesh, make_transform(R, np.array([0.0, 0.0, distance]) - R @ centre), K)
+    assert posed_mesh is not None  # the whole part is in front of the camera
+    ids = edges.drawn(posed_mesh, size)
     mask = (ids >= 0).astype(np.uint8)
-    contour, creases = find_contour(mesh, at, mask, SPACING_PX), edges.visible(at, ids, SPACING_PX)
+    contour, creases = (
+        find_contour(mesh, posed_mesh, mask, SPACING_PX),
+        edges.visible(posed_mesh, ids, SPACING_PX),
+    )
     outline = np.column_stack([contour.pixels, contour.normals, np.ones(len(contour))])
     lines = np.concatenate([outline, np.column_stack([creases, np.zeros(len(creases))])])
     columns, rows = np.rint(lines[:, :2]).astype(int).clip(0, np.array(size) - 1).T

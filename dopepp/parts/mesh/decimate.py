@@ -46,12 +46,12 @@ def decimate(
     Raises:
         ValueError: No grid leaves a triangle, because all are tiny and far apart.
     """
-    cells, kept = _cluster(vertices, faces, max_faces)
+    cells, remaining = _cluster(vertices, faces, max_faces)
     placed = _cell_positions(vertices, faces, cells)
     moved = float(np.sqrt(np.square(placed[cells] - vertices).sum(axis=1).max()))
     owners = cells if values is None else _islands(faces, cells)
     # Each group becomes a vertex at the cell's position, with the mean values of the group.
-    used, index = np.unique(owners[faces[kept]], return_inverse=True)
+    used, index = np.unique(owners[faces[remaining]], return_inverse=True)
     first = np.empty(int(owners.max()) + 1, np.int64)
     first[owners] = np.arange(len(owners))
     if values is not None:
@@ -68,14 +68,14 @@ def _cluster(
     best_cells, best_kept = np.zeros(len(vertices), np.int64), np.zeros(0, np.int64)
     for _ in range(12):
         cells = _cells(vertices, side)
-        kept = _surviving(cells[faces])
-        if len(best_kept) < len(kept) <= max_faces:
-            best_cells, best_kept = cells, kept
-        if _WELL_USED * max_faces <= len(kept) <= max_faces:
+        remaining = _surviving(cells[faces])
+        if len(best_kept) < len(remaining) <= max_faces:
+            best_cells, best_kept = cells, remaining
+        if _WELL_USED * max_faces <= len(remaining) <= max_faces:
             break
         # The number of triangles falls with the square of a cell's side.
         aim = (1 + _WELL_USED) / 2 * max_faces
-        side *= float(np.clip(np.sqrt(len(kept) / aim), 0.25, 4.0))
+        side *= float(np.clip(np.sqrt(len(remaining) / aim), 0.25, 4.0))
     if len(best_kept) == 0:
         raise ValueError(f"{len(faces)} triangles that cannot be reduced to {max_faces}")
     return best_cells, best_kept

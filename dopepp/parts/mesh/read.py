@@ -286,9 +286,9 @@ def _minority(areas: Float[np.ndarray, " faces"], topology: Topology) -> Bool[np
     count, components = connected(start, end, 2 * num_faces)
     as_is, flipped = components.reshape(2, num_faces)
     weight = np.bincount(as_is, areas, minlength=count)
-    better = weight[flipped] > weight[as_is]
+    flip_is_better = weight[flipped] > weight[as_is]
     tied = (weight[flipped] == weight[as_is]) & (flipped < as_is)
-    return np.asarray(better | tied)
+    return np.asarray(flip_is_better | tied)
 
 
 def _inverted_bodies(

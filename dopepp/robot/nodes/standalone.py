@@ -199,10 +199,10 @@ def _value(store: Typestore, node: Any, value: Any) -> Any:
     """Return the value of a field, whose type is ``node``."""
     from rosbags.interfaces import Nodetype
 
-    what, detail = node
-    if what == Nodetype.NAME:
+    type_kind, detail = node
+    if type_kind == Nodetype.NAME:
         return _filled(store, detail, value or {})
-    if what == Nodetype.BASE:
+    if type_kind == Nodetype.BASE:
         return value if value is not None else "" if detail[0] == "string" else 0
     (inner, kind), _ = detail
     if inner == Nodetype.BASE and kind[0] != "string":

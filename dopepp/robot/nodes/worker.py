@@ -245,10 +245,10 @@ class Worker:
             problem = f"pictures on {topic} without a stamp, which TF needs: "
             self._warn("no stamp", f"{problem}let the driver set header.stamp")
         elif last is not None and stamp < last:
-            back = last.seconds - stamp.seconds
+            decrease_s = last.seconds - stamp.seconds
             self._warn(
                 "back",
-                f"stamps on {topic} went back by {back:.3f} s: a restarted recording or "
+                f"stamps on {topic} went back by {decrease_s:.3f} s: a restarted recording or "
                 "simulation, or two cameras on one topic? Parts are detected again",
             )
             if self._tracker is not None:

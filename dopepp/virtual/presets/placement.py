@@ -274,9 +274,9 @@ class WorkingPlacement(_Placement):
         for _ in range(10):
             middle = depth * np.linalg.solve(K, [*pixel, 1.0])
             image = project(hull + middle, K)
-            beyond = np.maximum(image.max(axis=0) - (np.array(size) - 0.5), 0.0)
+            overhang = np.maximum(image.max(axis=0) - (np.array(size) - 0.5), 0.0)
             before = np.maximum(-0.5 - image.min(axis=0), 0.0)
-            missing = np.where(room > 0, before - beyond, 0.0)
+            missing = np.where(room > 0, before - overhang, 0.0)
             if not missing.any():
                 break
             pixel = pixel + missing

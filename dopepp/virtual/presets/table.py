@@ -90,12 +90,12 @@ class Table(Checked):
         """
         normals, shares = hull.rests
         down = normals[int(np.searchsorted(np.cumsum(shares)[:-1], rng.random(), side="right"))]
-        turn, lean = rng.uniform(0, 2 * np.pi), rng.random() < self.tilted_share
+        turn, is_tilted = rng.uniform(0, 2 * np.pi), rng.random() < self.tilted_share
         azimuth, tilt = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(*self.tilt_deg))
         right, across, up = rotation_to_z(down)
         level = np.stack([right, -across, -up])
         rotation = rotation_vector_to_matrix(np.array([0.0, 0.0, turn])) @ level
-        if lean:
+        if is_tilted:
             axis = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
             rotation = rotation_vector_to_matrix(tilt * axis) @ rotation
         return np.asarray(rotation), float((hull.vertices @ rotation[2]).min())

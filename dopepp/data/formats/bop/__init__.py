@@ -300,10 +300,10 @@ def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int
         _log.warning("%s: %s; first: %d", folder, problem, min(without))
     owners = [(row, n) for row, i in enumerate(images) for n in range(len(truths.get(i, ())))]
 
-    def nodes(what: str, number: int) -> Node:
+    def nodes(record_kind: str, number: int) -> Node:
         """Return the node of an image's camera or of an object's record, for error messages."""
-        node = Node(STRICT, folder / f"scene_{what}.json")
-        if what == "camera":
+        node = Node(STRICT, folder / f"scene_{record_kind}.json")
+        if record_kind == "camera":
             return node[f"{images[number]}"]
         row, n = owners[number]
         return node[f"{images[row]}"][n]

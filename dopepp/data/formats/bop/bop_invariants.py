@@ -134,9 +134,9 @@ class _SceneCheck:
             for number in sorted(by_number.keys() - set(range(len(objects)))):
                 report.report(by_number[number], "file", f"no object {number} on the image")
 
-        def nodes(what: str, number: int) -> Node:
-            node = Node(report, folder / f"scene_{what}.json")[f"{image}"]
-            return node if what == "camera" else node[number]
+        def nodes(record_kind: str, number: int) -> Node:
+            node = Node(report, folder / f"scene_{record_kind}.json")[f"{image}"]
+            return node if record_kind == "camera" else node[number]
 
         def read_mask(name: str, number: int) -> Mask | None:
             if not self._masks[name]:

@@ -160,8 +160,8 @@ def read_models(root: Path) -> dict[int, ModelInfo]:
 
 def modelled(infos: Mapping[int, ModelInfo]) -> set[int]:
     """Return the objects with a model file, or all objects if none has a file."""
-    there = {number for number, info in infos.items() if info.path.is_file()}
-    return there or set(infos)
+    with_file = {number for number, info in infos.items() if info.path.is_file()}
+    return with_file or set(infos)
 
 
 def info_path(root: Path) -> Path | None:

@@ -108,9 +108,9 @@ class BopWriter(BopFolder):
     def finalize(self, chunk: int, indices: Sequence[int]) -> None:
         """Merge the staged records into the scene's files, and the first camera into the root's."""
         scene = self._scene(chunk)
-        wanted = {index % self.chunk_size for index in indices}
+        image_numbers = {index % self.chunk_size for index in indices}
         with finalizing(scene / STAGING):
-            staged = [path for path in _staged(scene) if int(path.stem) in wanted]
+            staged = [path for path in _staged(scene) if int(path.stem) in image_numbers]
             items: dict[int, Any] = {int(path.stem): read_json(path) for path in staged}
             for field in SCENE_FIELDS:
                 path = scene / f"scene_{field}.json"

@@ -184,8 +184,8 @@ class NddsSettings:
         cameras = _entries(settings, "camera_settings")
         cameras = [camera for camera in cameras if camera.get("name") == side] or cameras
         if len(cameras) == 1 and isinstance(cameras[0].get("intrinsic_settings"), dict):
-            there = Node(problems, path, "camera_settings[].intrinsic_settings")
-            return _intrinsics(cameras[0]["intrinsic_settings"], there)
+            settings_node = Node(problems, path, "camera_settings[].intrinsic_settings")
+            return _intrinsics(cameras[0]["intrinsic_settings"], settings_node)
         # An unreadable settings file is reported once, not for each image.
         files = annotation.with_name(CAMERA_SETTINGS), self._root / CAMERA_SETTINGS
         if not any(file.is_file() and self.read(file) is None for file in files):

@@ -127,10 +127,12 @@ class Observation:
     @cached_property
     def _corners(self) -> dict[Frame, NDArray[np.float64]]:
         """Corners in the mesh frame by object frame, in the file's order, metres."""
-        usual, front = self.part.cuboid[:8], _turned_corners(self.part, _FRONT_X)
+        part_corners, front = self.part.cuboid[:8], _turned_corners(self.part, _FRONT_X)
         rotation = np.eye(3) if self.fixed is None else self.fixed[:3, :3]
         fixed = _turned_corners(self.part, rotation)
-        return dict(zip(get_args(Frame), (usual, front, usual, fixed, fixed), strict=True))
+        return dict(
+            zip(get_args(Frame), (part_corners, front, part_corners, fixed, fixed), strict=True)
+        )
 
 
 def _turned_corners(part: Part, rotation: RotationMatrix) -> Float[np.ndarray, "8 3"]:
@@ -246,8 +248,8 @@ def _same_poses(observations: Sequence[Observation], a: PoseConvention, b: PoseC
         T_a, T_b, part = observation.T_cam_obj(a), observation.T_cam_obj(b), observation.part
         if T_a is None or T_b is None:
             return False
-        apart = np.abs(transform(T_a, part.cuboid) - transform(T_b, part.cuboid)).max()
-        distances.append(float(apart) / part.diameter)
+        separation = np.abs(transform(T_a, part.cuboid) - transform(T_b, part.cuboid)).max()
+        distances.append(float(separation) / part.diameter)
     return _most(distances) <= _SAME_POSE
 
 

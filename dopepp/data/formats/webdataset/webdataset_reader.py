@@ -115,15 +115,15 @@ class WebdatasetReader:
 
     def _chosen(self, poses: bop.BopPoses) -> list[int]:
         """Return the indices of the parts' objects in front of the camera."""
-        wanted = np.isin(poses.obj_ids, list(self._parts)) & (poses.T_cam_obj[:, 2, 3] > 0)
-        return [int(number) for number in np.flatnonzero(wanted)]
+        is_selected = np.isin(poses.obj_ids, list(self._parts)) & (poses.T_cam_obj[:, 2, 3] > 0)
+        return [int(number) for number in np.flatnonzero(is_selected)]
 
     def contains(self, label: str) -> bool:
         """Return whether any image shows this object, reading ground truth until one does."""
-        wanted = {number for number, part in self._parts.items() if part.name == label}
-        for number, image in self._items.tolist() if wanted else ():
+        object_ids = {number for number, part in self._parts.items() if part.name == label}
+        for number, image in self._items.tolist() if object_ids else ():
             poses = _records(self._shards[number], image).poses()
-            if any(int(poses.obj_ids[k]) in wanted for k in self._chosen(poses)):
+            if any(int(poses.obj_ids[k]) in object_ids for k in self._chosen(poses)):
                 return True
         return False
 
@@ -163,10 +163,10 @@ class ShardRecords:
         """Return the node of a JSON member, for error messages."""
         return Node(self._problems, f"{self.start}.{name}.json")
 
-    def nodes(self, what: str, number: int) -> Node:
+    def nodes(self, record_kind: str, number: int) -> Node:
         """Return the node of a record."""
-        member = self._member(what)
-        return member if what == "camera" else member[number]
+        member = self._member(record_kind)
+        return member if record_kind == "camera" else member[number]
 
     def _json(self, name: str) -> Any:
         """Return a member's content; None if it is missing or unreadable."""

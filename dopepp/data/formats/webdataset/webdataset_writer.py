@@ -62,10 +62,10 @@ class WebdatasetWriter(BopFolder):
 
     def finalize(self, chunk: int, indices: Sequence[int]) -> None:
         """Merge the staged images into the shard and into ``key_to_shard.json``."""
-        wanted = {index % self.chunk_size for index in indices}
+        image_numbers = {index % self.chunk_size for index in indices}
         with finalizing(self.root / self.split / STAGING):
             staged = {int(path.stem): path for path in self._staged(chunk)}
-            staged = {image: path for image, path in staged.items() if image in wanted}
+            staged = {image: path for image, path in staged.items() if image in image_numbers}
             if staged:
                 self._write_shard(chunk, staged)
             # This also adds a shard that was finalized elsewhere and copied here.

@@ -149,9 +149,9 @@ class YcbVideoReader:
 
     def contains(self, label: str) -> bool:
         """Return whether any frame shows this object, reading frames until one does."""
-        wanted = {index for index, part in self._parts.items() if part.name == label}
-        return bool(wanted) and any(
-            not wanted.isdisjoint(self._meta(frame).poses) for frame in self.frames
+        class_indices = {index for index, part in self._parts.items() if part.name == label}
+        return bool(class_indices) and any(
+            not class_indices.isdisjoint(self._meta(frame).poses) for frame in self.frames
         )
 
     def describe(self) -> list[SourceInfo]:

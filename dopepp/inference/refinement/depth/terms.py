@@ -94,16 +94,16 @@ def outline_terms(
     """
     gate = GATE * view.noise
     offset = overlay.at_points
-    past = np.flatnonzero((offset > gate) | np.isnan(offset))
+    in_front = np.flatnonzero((offset > gate) | np.isnan(offset))
     supported = overlay.covered & (np.abs(overlay.offset) <= gate)
-    beside = overlay.continues(view.noise, reach / spacing)
+    continues = overlay.continues(view.noise, reach / spacing)
     scale = float(overlay.points[:, 2].mean()) / view.K[0, 0]
     # A point represents spacing² of surface, a pixel scale².
     pixel_weight = min(1.0, (scale / spacing) ** 2)
     H, g = np.zeros((6, 6)), np.zeros(6)
     for (points, pulls_px), weight in (
-        (_to_surface(overlay, past, supported), 1.0),
-        (_to_pixels(overlay, beside), pixel_weight),
+        (_to_surface(overlay, in_front, supported), 1.0),
+        (_to_pixels(overlay, continues), pixel_weight),
     ):
         pulls = scale * pulls_px
         near = np.linalg.norm(pulls, axis=1) <= reach
@@ -118,21 +118,23 @@ def outline_terms(
     return H, g
 
 
-def _to_surface(overlay: SurfaceOverlay, past: Int[np.ndarray, "past"], supported: Mask) -> Pulls:
+def _to_surface(
+    overlay: SurfaceOverlay, in_front: Int[np.ndarray, "past"], supported: Mask
+) -> Pulls:
     """Return the pulls of points in front of the measured depth to the nearest supported pixel."""
-    if not len(past) or not supported.any():
+    if not len(in_front) or not supported.any():
         return np.empty((0, 3)), np.empty((0, 2))
     _, labels = nearest_zero((~supported).astype(np.uint8))
     rows, columns = np.nonzero(supported)
     target = np.zeros((int(labels.max()) + 1, 2))
     target[labels[rows, columns]] = np.stack([columns, rows], axis=1)
-    pixels = overlay.pixels[past]
-    return overlay.points[past], target[labels[pixels[:, 1], pixels[:, 0]]] - pixels
+    pixels = overlay.pixels[in_front]
+    return overlay.points[in_front], target[labels[pixels[:, 1], pixels[:, 0]]] - pixels
 
 
-def _to_pixels(overlay: SurfaceOverlay, beside: Mask) -> Pulls:
+def _to_pixels(overlay: SurfaceOverlay, continues: Mask) -> Pulls:
     """Pull points of the part towards adjacent pixels that continue its surface."""
-    rows, columns = np.nonzero(beside)
+    rows, columns = np.nonzero(continues)
     nearest = overlay.nearest[rows, columns]
     pulls = np.stack([columns, rows], axis=1) - overlay.pixels[nearest]
     short = 1.0 - COVERED / overlay.distance[rows, columns]

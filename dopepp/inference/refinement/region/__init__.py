@@ -123,9 +123,9 @@ class RegionRefiner:
                 prior = Prior(given, np.linalg.inv(np.asarray(covariance, np.float64) + floor))
             # A weaker prior (larger covariance) at the same pose.
             weak = np.linalg.inv(prior.information) + FAR**2 * np.linalg.inv(broad.information)
-            loose = Prior(given, np.linalg.inv(weak))
+            wide_prior = Prior(given, np.linalg.inv(weak))
             rounds = self.rounds(image, K, given, FOLLOWED if followed else FOUND)
-            return refinement(*_search(rounds, prior, loose, starts))
+            return refinement(*_search(rounds, prior, wide_prior, starts))
         except UndecidedError as undecided:
             return Refinement(given, reason=str(undecided))
 
@@ -138,7 +138,7 @@ class RegionRefiner:
             UndecidedError: The image does not determine the pose.
         """
         visible = depth.visible(start.T_cam_obj)
-        rounds = self.rounds(image, K, start.T_cam_obj, more=[depth.term(visible)])
+        rounds = self.rounds(image, K, start.T_cam_obj, further_terms=[depth.term(visible)])
         reach = search_distance(rounds[0], Prior(start.T_cam_obj, start.information))
         # Depth weighs more the nearer a pose is, so that the descent takes all rounds to converge.
         end = _descend(rounds, start.T_cam_obj, depth.prior, reach)
@@ -151,7 +151,7 @@ class RegionRefiner:
         K: CameraMatrix,
         pose: Transform,
         weights: Weights = FOUND,
-        more: Sequence[Term] = (),
+        further_terms: Sequence[Term] = (),
     ) -> list[Round]:
         """Return the rounds of optimisation around a pose, from coarse to fine.
 
@@ -159,14 +159,14 @@ class RegionRefiner:
             UndecidedError: The part is not in view.
         """
         K = np.asarray(K, np.float64)
-        at = posed(self.mesh, pose, K)
-        if at is None:
+        posed_mesh = posed(self.mesh, pose, K)
+        if posed_mesh is None:
             raise UndecidedError("the part reaches behind the camera")
-        corners = np.stack([at.pixels.min(axis=0), at.pixels.max(axis=0)])
+        corners = np.stack([posed_mesh.pixels.min(axis=0), posed_mesh.pixels.max(axis=0)])
         stages = (COARSE, MIDDLE, FINE)
         crops = [crop_around(image, K, corners, stage.longest_px) for stage in stages]
         return [
-            Round(self.mesh, crop, stage, weights, more, self._scale_error)
+            Round(self.mesh, crop, stage, weights, further_terms, self._scale_error)
             for crop, stage in zip(crops, stages, strict=True)
         ]
 
@@ -177,7 +177,9 @@ def refinement(end: Solution, agreement: OutlineAgreement) -> Refinement:
     return Refinement(end.T_cam_obj, covariance, "", agreement.share, agreement.support)
 
 
-def _search(rounds: Sequence[Round], prior: Prior, loose: Prior, starts: Starts | None) -> Outcome:
+def _search(
+    rounds: Sequence[Round], prior: Prior, wide_prior: Prior, starts: Starts | None
+) -> Outcome:
     """Descend from the given pose and, if the result is doubtful, from other starts.
 
     Raises:
@@ -193,7 +195,7 @@ def _search(rounds: Sequence[Round], prior: Prior, loose: Prior, starts: Starts 
     except UndecidedError as undecided:
         doubt = undecided
     if starts is not None and (near is None or near[1].share < SURE):
-        near = _search_far(rounds, prior, loose, starts(), near) or near
+        near = _search_far(rounds, prior, wide_prior, starts(), near) or near
     if near is None:
         assert doubt is not None
         raise doubt
@@ -203,7 +205,7 @@ def _search(rounds: Sequence[Round], prior: Prior, loose: Prior, starts: Starts 
 def _search_far(
     rounds: Sequence[Round],
     prior: Prior,
-    loose: Prior,
+    wide_prior: Prior,
     starts: Sequence[Transform],
     near: Outcome | None,
 ) -> Outcome | None:
@@ -216,18 +218,18 @@ def _search_far(
     best: Outcome | None = None
     given, first, last = prior.T_cam_obj, rounds[0], rounds[-1]
     with contextlib.suppress(UndecidedError):
-        reach = search_distance(first, loose)
+        reach = search_distance(first, wide_prior)
         if near is None:
             last.learn(given, reach)
         before = last.agreement(given, reach) if near is None else near[1]
         least_support = max(SUPPORTED, before.support + MORE)
         first.learn(given, reach)
-        others = [*starts, *loose.draws(1 / FAR, NUM_DRAWS)]
-        others.sort(key=lambda start: -first.log_likelihood(start, loose))
+        others = [*starts, *wide_prior.draws(1 / FAR, NUM_DRAWS)]
+        others.sort(key=lambda start: -first.log_likelihood(start, wide_prior))
         for start in (given, *others[:NUM_STARTS]):
             with contextlib.suppress(UndecidedError):
-                coarse = _coarse_end(first, start, loose, reach)
-                end, _ = _refine(rounds[1:], coarse, loose, reach)
+                coarse = _coarse_end(first, start, wide_prior, reach)
+                end, _ = _refine(rounds[1:], coarse, wide_prior, reach)
                 # The strongest prior under which this end is not surprising.
                 surprise = max(1.0, prior.squared_distance(end.T_cam_obj) / 6)
                 admitting = Prior(given, prior.information / surprise)
@@ -243,8 +245,8 @@ def _search_far(
 def _coarse_end(coarse: Round, start: Transform, prior: Prior, reach: float) -> Transform:
     """Return the end of the coarse round, which has a weaker prior."""
     coarse.learn(start, reach)
-    wide = Prior(prior.T_cam_obj, prior.information / WIDENED**2)
-    return coarse.descend(start, wide, reach).T_cam_obj
+    weaker = Prior(prior.T_cam_obj, prior.information / WIDENED**2)
+    return coarse.descend(start, weaker, reach).T_cam_obj
 
 
 def necessary_rounds(rounds: Sequence[Round], reach: float) -> Sequence[Round]:

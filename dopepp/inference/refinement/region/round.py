@@ -259,9 +259,9 @@ class Round:
     def _silhouette(self, pose: Transform) -> Silhouette | None:
         """Return the mesh at a pose and its mask, cached for the last pose."""
         if self._last[0] is not pose:
-            at, silhouette = posed(self._mesh, pose, self.crop.K), None
-            if at is not None:
-                silhouette = at, filled_mask(self._mesh, at, self.crop.size)
+            posed_mesh, silhouette = posed(self._mesh, pose, self.crop.K), None
+            if posed_mesh is not None:
+                silhouette = posed_mesh, filled_mask(self._mesh, posed_mesh, self.crop.size)
             self._last = pose, silhouette
         return self._last[1]
 

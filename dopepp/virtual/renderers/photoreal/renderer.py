@@ -165,8 +165,8 @@ class Tracer:
         traced[..., 3] = hit[..., 3]
         traced = film.resampled(traced)
         alpha = np.clip(traced[..., 3], 0.0, 1.0)
-        light, kept = split_light(traced[..., :3], alpha, table.unshadowed(area))
-        image[area] = shadowed(image[area], table.faded(kept, area))
+        light, light_share = split_light(traced[..., :3], alpha, table.unshadowed(area))
+        image[area] = shadowed(image[area], table.faded(light_share, area))
         image[area] = _over(light, alpha, image[area])
 
     def _measure(
@@ -233,11 +233,11 @@ class TableTop:
         """Return the disc's radiance without objects; 0 outside the disc."""
         return np.asarray(self.albedo * self._light[area])
 
-    def faded(self, kept: Colours, area: Area) -> Colours:
+    def faded(self, light_share: Colours, area: Area) -> Colours:
         """Return the shares of light, faded to 1 towards the disc's rim."""
         share = np.clip((1 - self._away[area]) / (1 - 0.6), 0.0, 1.0)[..., None]
         # Smoothstep: no visible line at either end of the fading.
-        return 1 + (kept - 1) * share * share * (3 - 2 * share)
+        return 1 + (light_share - 1) * share * share * (3 - 2 * share)
 
     def _full_light(self) -> Colours:
         """Return the radiance of a white table without objects, in closed form."""
@@ -275,22 +275,22 @@ def split_light(light: Colours, alpha: Depth, unshadowed: Colours) -> tuple[Colo
         Radiance of the objects, and the share of the light that remains on the disc.
     """
     is_disc = (alpha <= 0) & (unshadowed.min(axis=-1) > _LEAST_LIGHT)
-    kept = np.where(is_disc[..., None], light / np.maximum(unshadowed, _LEAST_LIGHT), 1.0)
-    kept = np.clip(kept, 0.0, 4.0)  # above 1: objects reflect light onto a dark table
+    light_share = np.where(is_disc[..., None], light / np.maximum(unshadowed, _LEAST_LIGHT), 1.0)
+    light_share = np.clip(light_share, 0.0, 4.0)  # above 1: objects reflect light onto a dark table
     # Pixels on an object's rim mix object and disc, so the shadow beside them is extrapolated.
     weight = cv2.GaussianBlur(is_disc.astype(np.float64), (0, 0), _SPREAD_PX)[..., None]
-    spread = cv2.GaussianBlur(np.where(is_disc[..., None], kept, 0.0), (0, 0), _SPREAD_PX)
+    spread = cv2.GaussianBlur(np.where(is_disc[..., None], light_share, 0.0), (0, 0), _SPREAD_PX)
     carried = np.where(weight > 1e-3, spread / np.maximum(weight, 1e-3), 1.0)
-    kept = np.where(is_disc[..., None], kept, carried)
-    objects = light - (1 - alpha[..., None]) * unshadowed * kept
-    return np.where(alpha[..., None] > 0, np.maximum(objects, 0), 0).astype(np.float32), kept
+    light_share = np.where(is_disc[..., None], light_share, carried)
+    objects = light - (1 - alpha[..., None]) * unshadowed * light_share
+    return np.where(alpha[..., None] > 0, np.maximum(objects, 0), 0).astype(np.float32), light_share
 
 
-def shadowed(picture: Picture, kept: Colours) -> Picture:
-    """Multiply a picture's linear light by the shares ``kept`` in shadows."""
-    steps = np.minimum(SRGB_TO_LINEAR[picture] * kept * CODE_STEPS + 0.5, CODE_STEPS)
+def shadowed(picture: Picture, light_share: Colours) -> Picture:
+    """Multiply a picture's linear light by the shares ``light_share`` in shadows."""
+    steps = np.minimum(SRGB_TO_LINEAR[picture] * light_share * CODE_STEPS + 0.5, CODE_STEPS)
     changed = (LINEAR_TO_SRGB[steps.astype(np.int32)] + 0.5).astype(np.uint8)
-    return np.where(kept == 1.0, picture, changed)
+    return np.where(light_share == 1.0, picture, changed)
 
 
 def denoise(colour: Colours, albedo: Colours, normal: Colours) -> Colours:

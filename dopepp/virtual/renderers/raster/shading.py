@@ -297,10 +297,10 @@ def reflect_light(
         square = lx * lx + ly * ly + lz * lz + _TINY
         norm = _ONE / math.sqrt(square)
         n_l = max((nx * lx + ny * ly + nz * lz) * norm, _ZERO)
-        away = _ONE / math.sqrt(px * px + py * py + pz * pz)
-        n_v = max(-(nx * px + ny * py + nz * pz) * away, _GRAZING)
+        inverse_distance = _ONE / math.sqrt(px * px + py * py + pz * pz)
+        n_v = max(-(nx * px + ny * py + nz * pz) * inverse_distance, _GRAZING)
         # |l + v|² = 2 + 2 l·v, and v·h = (1 + l·v)/|l + v|.
-        l_v = -(lx * px + ly * py + lz * pz) * (norm * away)
+        l_v = -(lx * px + ly * py + lz * pz) * (norm * inverse_distance)
         half = _ONE / math.sqrt(_TWO + _TWO * l_v + _TINY)
         n_h = min((n_l + n_v) * half, _ONE)
         alpha2 = alpha[p] * alpha[p]
