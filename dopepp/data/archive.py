@@ -69,13 +69,16 @@ def safe_extract(archive: Path | str, folder: Path | str, most_members: int = MO
 
     Raises:
         UserError: The archive is missing, damaged, or of another format; a member's path leads out
-            of the folder or repeats another path; a member is no plain file or folder; there are
-            too many members; or the folder is in use or not writable. The folder is then removed.
+            of the folder or repeats another path; a member is neither a plain file nor a folder;
+            there are too many members; or the folder is not empty or not writable. Nothing remains
+            of an archive that is not unpacked completely.
     """
     archive, folder = Path(archive), Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         fix = "pass the path of a new folder"
-        raise UserError(f"{folder}, which is in use", "a new or empty folder", fix)
+        raise UserError(
+            f"{folder}, which is not empty or not a folder", "a new or empty folder", fix
+        )
     if not archive.is_file():
         fix = "pass the path of an existing file"
         raise UserError(f"archive {archive}, no such file", "a tar file", fix)
@@ -123,10 +126,10 @@ def _checked(
         # file systems do.
         for parent in (*path.parents, path) if member.isdir() else path.parents:
             if is_folder.setdefault(str(parent).casefold(), True) is False:
-                raise _refused(archive, f"{shown} below or instead of a file")
+                raise _refused(archive, f"{shown}, whose path or parent is also a file")
         if not member.isdir():
             if str(path).casefold() in is_folder:
-                raise _refused(archive, f"two members {member.name[:100]!r}")
+                raise _refused(archive, f"more than one {shown}")
             is_folder[str(path).casefold()] = False
         members[path] = member
     return members

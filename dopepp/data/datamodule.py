@@ -79,7 +79,7 @@ class PoseDataModule(LightningDataModule):
     ) -> None:
         super().__init__()
         if masking is not None and backgrounds is None:
-            raise ValueError("masking needs backgrounds, for objects that fill their picture")
+            raise ValueError("masking requires backgrounds, for objects that fill their picture")
         if len(train) < batch_size:
             problem = f"{len(train)} training images for batches of {batch_size}"
             fix = "lower data.batch_size or raise data.samples_per_epoch"

@@ -54,7 +54,7 @@ class PictureFrames:
             IndexError: The index is negative, or not below the number of frames.
         """
         if not 0 <= index < self._length:
-            raise IndexError(f"item {index} of {self._length}")
+            raise IndexError(f"index {index} is out of range for {self._length} frames")
         lap, number = divmod(index, len(self._order))
         rng = item_rng(self._seed, Purpose.WINDOW, lap, number)
         share = 1.0 if lap < 2 else rng.uniform(0.5, 1.0)
@@ -125,7 +125,7 @@ class FrameMix:
             IndexError: The index is negative, or not below the number of frames.
         """
         if not 0 <= index < self._length:
-            raise IndexError(f"item {index} of {self._length}")
+            raise IndexError(f"index {index} is out of range for {self._length} frames")
         item, kind = divmod(index, len(self.sources))
         return self.sources[kind].sample(item, epoch)
 

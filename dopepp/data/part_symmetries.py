@@ -52,7 +52,7 @@ def choose_symmetries(
     infos = _read_infos(choice)
     for part in parts:
         if part.name not in infos:
-            problem = f"data.symmetries={choice}, which has no {part.name}"
+            problem = f"data.symmetries={choice}, which has no entry for {part.name}"
             raise UserError(problem, ", ".join(infos), f'add an entry with "name": "{part.name}"')
     return [
         _with(part, infos[part.name].symmetries_discrete, infos[part.name].symmetries_continuous)

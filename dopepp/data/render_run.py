@@ -90,7 +90,7 @@ def run(
         StoppedError: The disk is full, or a worker has died.
     """
     if num is None:
-        raise UserError("no -n", "the number of images, or --preview", "add -n 1000")
+        raise UserError("no number of images", "-n NUMBER, or --preview", "add e.g. -n 1000")
     part, open_pool = Shard.parse(shard), _engine(engine, workers, ray_address)
     with ProgressDisplay(Console(stderr=True)) as progress:
         return render_dataset(job, out, num, open_pool, part, progress)
@@ -206,7 +206,7 @@ class RenderTasks:
             cv2.setNumThreads(1)
             os.environ.setdefault(THREADS_SETTING, "1")
             if not has_started(self._root):
-                problem = f"{self._root} without {RECORD_FILE}, seen from a worker"
+                problem = f"{self._root}, in which a worker finds no {RECORD_FILE}"
                 allowed = "a folder with the same path on every machine of the cluster"
                 raise UserError(problem, allowed, "pass an --out on a shared file system")
             self._writer = self._job.writer(self._root)

@@ -68,7 +68,7 @@ class RenderedSource:
             IndexError: The index is negative, or not below the number of items.
         """
         if not 0 <= index < self._num_items:
-            raise IndexError(f"item {index} of {self._num_items}")
+            raise IndexError(f"index {index} is out of range for {self._num_items} items")
         epoch = epoch if self.split == "train" else 0
         rendered = self.factory.render(epoch, FIRST_INDEX[self.split] + index, self.scale)
         return rendered_sample(rendered, self.name, f"{self.split}/{epoch}/{index}")
@@ -140,7 +140,7 @@ def _in_file(path: Path, dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndar
     except OSError as error:
         problem = f"data.cache=disk, {size / 1e9:.2f} GB in {path.parent}: {error.strerror}"
         fix = "set data.cache_dir to another disk, or data.cache=none"
-        raise UserError(problem, "a folder with as much free space", fix) from error
+        raise UserError(problem, "a folder with at least this much free space", fix) from error
 
 
 class CachedSource:

@@ -202,8 +202,9 @@ def read_photo(path: Path) -> Picture:
     else:  # Pillow keeps the upper eight of 16 bits in colours
         picture = np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
     if is_deep and picture[..., :3].max() < DARKEST:
+        brightest = picture[..., :3].max() / 255
         raise UserError(
-            f"image {path} of 16 bits, with values up to {picture[..., :3].max()} of 255",
+            f"image {path} of 16 bits, whose largest value is {brightest:.1%} of white",
             "values that use all 16 bits, not only 10 or 12 bits",
             f"stretch it: magick {path.name} -auto-level -depth 8 picture.png",
         )

@@ -119,7 +119,7 @@ def _xml(text: str, source: str) -> dict[object, object]:
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
-        problem = f"{source}, unreadable: {error!s:.200}"
+        problem = f"{source}, which cannot be parsed: {error!s:.200}"
         raise UserError(problem, allowed, "write the file with cv2.FileStorage") from error
     if root.tag != "opencv_storage":
         fix = "write the file with cv2.FileStorage"
@@ -160,7 +160,7 @@ def calibration_of_fields(content: Mapping[Any, object], source: str) -> Calibra
     distortion = () if lens is None else tuple(_numbers(*lens))
     fisheye, model = fields.find("fisheye_model"), fields.find("distortion_model")
     if fisheye is not None and fisheye[1] not in (0, "0"):
-        raise UserError(f"{source}: fisheye_model=1", "no fisheye lens", _UNDISTORT)
+        raise UserError(f"{source}: fisheye_model=1", "a camera without a fisheye lens", _UNDISTORT)
     models: tuple[object, ...] = ("plumb_bob", "rational_polynomial")
     models += () if any(distortion) else ("", None)
     if model is not None and model[1] not in models:
@@ -220,7 +220,11 @@ def _size(fields: _Fields) -> Size | None:
         return None
     if width is None or height is None:
         missing = "image_height" if width else "image_width"
-        raise UserError(f"{fields.source} without {missing}", "both or neither", f"add {missing}")
+        raise UserError(
+            f"{fields.source} without {missing}",
+            "image_width and image_height, or neither",
+            f"add {missing}",
+        )
     return _side(*width), _side(*height)
 
 

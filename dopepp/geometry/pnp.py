@@ -96,7 +96,7 @@ def solve_pnp(
         mirror image for a plate and, with outliers, SQPnP on subsets without one or two points.
 
     Raises:
-        ValueError: The arguments differ in length, or K is no invertible pinhole matrix.
+        ValueError: The arguments differ in length, or K is not an invertible pinhole matrix.
     """
     object_points = np.asarray(object_points, np.float64).reshape(-1, 3)
     image_points = np.asarray(image_points, np.float64).reshape(-1, 2)

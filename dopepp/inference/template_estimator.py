@@ -113,8 +113,8 @@ class TemplateEstimator(PoseEstimator):
         """Set the refinement, which must include the image region."""
         terms = (refine,) if isinstance(refine, str) else refine or ()
         if "region" not in terms:
-            fix = "leave out the refinement, or use region or region and depth"
-            raise UserError(f"templates with refine={refine}", "a refinement with region", fix)
+            fix = "leave out refine, or set it to one of these"
+            raise UserError(f"templates with refine={refine}", "region, or region and depth", fix)
         super()._refine_by(refine, parts)
 
     @property
@@ -312,4 +312,5 @@ def load_solid_part(
 def _networks_only(noun: str) -> UserError:
     """Return the error about a feature that only networks have."""
     fix = "train the part (python train.py experiment=my_part), and pass the checkpoint"
-    return UserError(f"{noun} of templates", "a trained network", fix)
+    problem = f"{noun}, which an estimator by templates does not have"
+    return UserError(problem, "an estimator with a trained network", fix)

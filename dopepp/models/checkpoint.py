@@ -173,7 +173,9 @@ def parse_description(payload: object) -> Checkpoint:
     """
     if not isinstance(payload, dict):
         raise UserError(
-            f"a {type(payload).__name__} under {KEY!r}", "a mapping", "train the network again"
+            f"a description of type {type(payload).__name__}",
+            "a mapping",
+            "train the network again",
         )
     _check_plain(payload)
     version = payload.get("format_version")
@@ -240,7 +242,7 @@ def _check_weights(checkpoint: Checkpoint, size: int) -> None:
     stored = 0 if odd else sum(value.numel() * value.element_size() for value in weights.values())
     if odd or stored > size:
         first = odd[0] if odd else "their size"
-        problem = f"weights that do not fit the spec's network, first {first}"
+        problem = f"weights that do not fit the network of the spec, beginning with {first}"
         fix = f"{_FIX}, unchanged"
         raise UserError(problem, f"the {len(expected)} tensors of that network", fix)
 
@@ -282,7 +284,9 @@ def find(path: Path) -> Path:
     if path.name not in released:
         names = ", ".join(f"{FOLDER}/{name}" for name in released) or "none"
         raise UserError(
-            f"checkpoint {path}", f"an existing file, or one of {names}", "use one of these names"
+            f"checkpoint {path}, no such file",
+            f"an existing file, or one of {names}",
+            "use one of these names",
         )
     return released[path.name]
 

@@ -1,6 +1,6 @@
 """Look-alikes: parts that resemble a part and must not be mistaken for it.
 
-A uniformly scaled copy is no look-alike, because one camera cannot distinguish it from the part
+A uniformly scaled copy is not a look-alike, because one camera cannot distinguish it from the part
 at another distance. To add a look-alike, yield its mesh from ``_meshes``.
 """
 

@@ -233,7 +233,7 @@ def _checked_cuboid(rows: Sequence[_Point]) -> Float[np.ndarray, "9 3"]:
     """Return the cuboid of a record.
 
     Raises:
-        UserError: The corners are no axis-aligned box, or in another order.
+        UserError: The corners do not form an axis-aligned box, or are in another order.
     """
     cuboid = np.array(rows, np.float64)
     expected = cuboid_keypoints(cuboid.min(axis=0), cuboid.max(axis=0))
@@ -253,7 +253,7 @@ def _checked_transforms(
     """Return the discrete symmetries of a record.
 
     Raises:
-        UserError: A matrix is no rigid transform.
+        UserError: A matrix is not a rigid transform.
     """
     if matrices is None:
         return None

@@ -71,7 +71,9 @@ class Seen(NamedTuple):
         """
         if not isinstance(values, list | tuple) or len(values) != len(cls._fields):
             fix = "use a checkpoint written by train.py"
-            raise UserError(f"seen sizes {values!r:.100}", ", ".join(cls._fields), fix)
+            raise UserError(
+                f"the learned range of sizes {values!r:.100}", ", ".join(cls._fields), fix
+            )
         sizes = check("sizes of a part", values[:2], tuple[float, float], Span(0.1, 1e5, "pixels"))
         depths = check(
             "distances of a part", values[2:], tuple[float, float], Span(1e-4, 1e4, "metres")

@@ -99,7 +99,7 @@ def select_peaks(
         peaks: Peaks of all channels of a batch.
         image: Index of the image.
         number: Index of the object.
-        threshold: Belief below which a centroid is no instance.
+        threshold: Belief below which a centroid does not count as an instance.
         cells: Width and height of the maps.
         stride: Pixels per cell.
     """

@@ -115,7 +115,7 @@ class RecoveryOptions:
 
     Attributes:
         sigma: Width of a perfect belief peak, cells.
-        peak_threshold: Belief below which a corner's maximum is no peak.
+        peak_threshold: Belief below which a corner's maximum does not count as a peak.
         centroid_threshold: Belief below which there is no instance.
         max_angle_deg: Largest angle between a corner's vector and its centroid, degrees.
         max_peaks: Maximum number of peaks per channel.

@@ -158,7 +158,7 @@ def test_render_previews_and_stops(run, tmp_path):
     [
         (["-n", "0"], "got -n 0; allowed: 1 to"),
         (["-n", "1000000001"], "got -n 1000000001; allowed: 1 to 1,000,000,000"),
-        ([], "got no -n; allowed: the number of images, or --preview"),
+        ([], "got no number of images; allowed: -n NUMBER, or --preview"),
         (["-n", "5", "--size", "4x4"], "got width=4 of "),
         (["-n", "5", "--size", "big"], "got --size big; allowed: WIDTHxHEIGHT"),
         (["-n", "many"], "Invalid value for '-n'"),

@@ -166,4 +166,4 @@ def test_a_folder_stops_at_a_damaged_picture_with_what_was_written(predict, file
 
 def test_a_camera_that_is_not_there(predict, files):
     done = predict(97, code=2)
-    assert done.stderr.startswith("got camera 97, which does not open")
+    assert done.stderr.startswith("got camera 97, which cannot be opened")

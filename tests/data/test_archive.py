@@ -56,7 +56,7 @@ def test_folders_may_come_twice_and_permissions_are_not_taken_over(tmp_path):
 def test_an_empty_folder_is_used_and_another_one_left_alone(tmp_path):
     (tmp_path / "out").mkdir()
     unpack(tmp_path, pack(GOOD))
-    with pytest.raises(UserError, match=r"out, which is in use; allowed: a new or empty folder"):
+    with pytest.raises(UserError, match=r"out, which is not empty or not a folder; allowed: a new"):
         unpack(tmp_path, pack(GOOD))
     assert (tmp_path / "out" / "set" / "a.txt").exists()
 

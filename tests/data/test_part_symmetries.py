@@ -56,7 +56,7 @@ def test_mistakes_are_named(stl, tmp_path):
         choose_symmetries([part], "gone.json")
     path = tmp_path / "other.json"
     path.write_text('{"1": {"name": "other", "diameter": 10}}')
-    with pytest.raises(UserError, match=r"other.json, which has no block.*other"):
+    with pytest.raises(UserError, match=r"other.json, which has no entry for block.*other"):
         choose_symmetries([part], str(path))
     bare = Part("bare", part.cuboid, part.diameter, part.points)
     with pytest.raises(UserError, match="part bare without a mesh"):

@@ -243,7 +243,7 @@ BAD = {
                  "with DOCTYPE"),
     "an entity": ("<opencv_storage><K>&b;</K></opencv_storage>", "undefined entity"),
     "other XML": ("<svg/>", "<svg>"),
-    "no XML": ("<opencv_storage><K>", "unreadable"),
+    "no XML": ("<opencv_storage><K>", "cannot be parsed"),
     "cameras of NDDS": ('{"camera_settings": [{}, {}]}', "camera_settings with 2 cameras"),
 }  # fmt: skip
 

@@ -60,7 +60,7 @@ def test_views_share_a_camera_or_have_their_own(tmp_path):
     first, second = poses.of(tmp_path / "a.png"), poses.of(tmp_path / "b.png")
     assert (first.camera.K[0, 0], second.camera.K[0, 0]) == (600, 700)
     assert_allclose(second.T_world_cam, T_WORLD_CAM, atol=1e-12)
-    with pytest.raises(UserError, match=r"without c\.png"):
+    with pytest.raises(UserError, match=r"pose for c\.png"):
         poses.of(tmp_path / "c.png")
 
 

@@ -165,7 +165,7 @@ def set_weight(value: Any) -> Any:
     ("edit", "message"),
     [
         (lambda c: c.pop("dopepp"), "without 'dopepp' entry"),
-        (lambda c: c.update(dopepp=[1]), "a list under 'dopepp'"),
+        (lambda c: c.update(dopepp=[1]), "a description of type list"),
         (set_payload("format_version", 3), "format_version 3, .*allowed: 2; fix: use"),
         (set_payload("format_version", 1), "format_version 1"),
         (lambda c: c["dopepp"].pop("spec"), "no spec"),
@@ -186,7 +186,7 @@ def set_weight(value: Any) -> Any:
         (set_payload("data_fingerprint", 3), "data_fingerprint=3"),
         (lambda c: c.pop("state_dict"), "state_dict as NoneType"),
         (lambda c: c.update(state_dict={}), "weights that do not fit"),
-        (lambda c: c["state_dict"].pop(first_weight(c)), "do not fit .*first backbone"),
+        (lambda c: c["state_dict"].pop(first_weight(c)), "do not fit .*beginning with backbone"),
         (lambda c: c["state_dict"].update({"network.extra": torch.ones(1)}), "first extra"),
         (set_weight(torch.ones(8, 3, 3, 3).to_sparse()), "_rebuild_sparse_tensor"),
         (set_weight(torch.ones(8, 3, 3, 3, device="meta")), "_rebuild_meta_tensor_no_storage"),
@@ -253,7 +253,9 @@ def test_weights_beyond_half_precision_are_refused(checkpoint, tmp_path):
 def test_a_name_stands_for_a_file_of_the_package(released, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "released_paths", lambda: {"bracket": released})
     assert read(Path("pretrained/bracket")).input_size == (128, 96)
-    with pytest.raises(UserError, match="pretrained/other; allowed: an existing file, or one of"):
+    with pytest.raises(
+        UserError, match="pretrained/other, no such file; allowed: an existing file, or one of"
+    ):
         read(Path("pretrained/other"))
     monkeypatch.chdir(tmp_path)  # a file of the user's own goes first
     (tmp_path / "pretrained").mkdir()

@@ -154,7 +154,7 @@ GRAPHS = {
         lambda made: made.functions.append(helper.make_function(
             "mine", "f", [], [], [], [helper.make_opsetid("", 20)])), "functions",
     ),
-    "a branch": (graph_edit(branching), "operator If with a graph inside"),
+    "a branch": (graph_edit(branching), "operator If with a nested graph"),
     "sparse weights": (graph_edit(sparse), "sparse tensors"),
     "an enlargement": (graph_edit(enlarged), "tensor floats of .* numbers"),
     "an expansion": (graph_edit(expanded), "tensor floats of .* numbers"),
@@ -206,7 +206,7 @@ DESCRIPTIONS = {
     "none": (lambda payload: None, "no description"),
     "cut": (lambda payload: json.dumps(payload)[:500], "line 1, column"),
 
-    "a list": (lambda payload: "[1]", "a list under 'dopepp'"),
+    "a list": (lambda payload: "[1]", "a description of type list"),
 
     "too long": (lambda payload: " " * (MAX_HEADER_BYTES + 1), "a description of 16000001"),
     "a call": (
@@ -252,7 +252,7 @@ def test_what_is_no_onnx_file(spoilt, good, tmp_path, rejected):
     path = tmp_path / "b.onnx"
     for content in (b"", whole[:-700], whole[:40], good.read_bytes(), b"\xff" * 1000, b"[]"):
         path.write_bytes(content)
-        rejected(path, r"b\.onnx: (no ONNX model|no description)")
+        rejected(path, r"b\.onnx: (not an ONNX model|no description)")
     with path.open("wb") as file:
         file.truncate(2**40)
     rejected(path, "more than 1073.74 MB")
@@ -285,8 +285,8 @@ def folder(translated, tmp_path):
 
 
 XMLS = {
-    "cut": (lambda xml: xml[:3000], "no XML, or cut short"),
-    "nothing": (lambda xml: "", "no XML, or cut short"),
+    "cut": (lambda xml: xml[:3000], "not an XML file, or truncated"),
+    "nothing": (lambda xml: "", "not an XML file, or truncated"),
     "entities": (
         lambda xml: '<!DOCTYPE net [<!ENTITY a "aaaaaaaaaa">]>' + xml, "declarations or comments",
     ),
@@ -294,11 +294,11 @@ XMLS = {
         lambda xml: xml.replace('version="opset1"', 'version="extension"', 1),
         r"operator extension\.",
     ),
-    "a graph inside": (lambda xml: xml.replace("<output>", "<body/><output>", 1), "graph inside"),
+    "a graph inside": (lambda xml: xml.replace("<output>", "<body/><output>", 1), "nested graph"),
     "a constant beyond the file": (
-        lambda xml: re.sub(r'offset="\d+"', 'offset="99999999"', xml), "of 9999|at 9999",
+        lambda xml: re.sub(r'offset="\d+"', 'offset="99999999"', xml), "of 9999|offset 9999",
     ),
-    "a negative constant": (lambda xml: re.sub(r'offset="\d+"', 'offset="-8"', xml), "at -8"),
+    "a negative constant": (lambda xml: re.sub(r'offset="\d+"', 'offset="-8"', xml), "offset -8"),
     "a constant of terabytes": (
         lambda xml: re.sub('shape="9, ?3,', 'shape="1099511627776, 3,', xml), r"a: ",
     ),

@@ -87,7 +87,7 @@ def share(num_items: int, part_of: tuple[float, float], name: str) -> slice:
         raise ValueError(f"part_of must be ascending in [0, 1], got {part_of}")
     chosen = slice(round(first * num_items), round(last * num_items))
     if chosen.start == chosen.stop:
-        problem = f"{name}: no image in the share {first:.3g} – {last:.3g} of {num_items} images"
+        problem = f"{name}: no image in the fraction {first:.3g} – {last:.3g} of {num_items} images"
         fix = "set data.image_sets to a separate folder for each split"
         raise UserError(problem, "a folder with more images", fix)
     return chosen
@@ -119,12 +119,12 @@ def read_object(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
     """Read the JSON object that a writer extends; return an empty one if there is no file.
 
     Raises:
-        UserError: The file is no JSON object.
+        UserError: The file is not a JSON object.
     """
     content = read_json(path, max_bytes) if path.exists() else {}
     if not isinstance(content, dict):
         fix = "restore the file from a copy, or choose another folder"
-        raise UserError(f"{path}, no JSON object", "a file of this writer", fix)
+        raise UserError(f"{path}, which is not a JSON object", "a file of `dopepp render`", fix)
     return content
 
 

@@ -171,7 +171,7 @@ def _start_from(network: torch.nn.Module, path: Path) -> None:
         network.load_state_dict(trained.state_dict())
     except RuntimeError as error:
         raise UserError(
-            f"init_from={path}, whose network differs from the chosen one",
+            f"init_from={path}, whose network differs from the configured one",
             "a checkpoint of the same backbone, attention, head, width and number of objects",
             "set the model's options as in the run of the checkpoint, or leave out init_from",
         ) from error

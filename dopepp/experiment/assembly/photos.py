@@ -61,8 +61,8 @@ def held_out_photos(data: DataConfig, split: Literal["val", "test"]) -> PhotoBac
     if photos.is_divided:
         return photos
     raise UserError(
-        f"tuning with the {len(photos.paths)} photos of "
-        f"virtual.backgrounds={data.virtual.backgrounds}, too few to divide",
+        f"virtual.backgrounds={data.virtual.backgrounds} with {len(photos.paths)} photos, too few "
+        "to keep some of them for tuning",
         _NEEDED,
         "add photos, leave out virtual.backgrounds (procedural backgrounds), or set tune=false",
     )

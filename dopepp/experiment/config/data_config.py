@@ -342,7 +342,7 @@ def _changed(base: object, changes: Mapping[str, Any], where: str) -> dict[str, 
     """Replace options recursively."""
     if not isinstance(base, Mapping):
         fix = f"choose a file of conf/{where} with {where}=NAME"
-        raise UserError(f"{where}={base!r:.100}", "a mapping", fix)
+        raise UserError(f"{where}={base!r:.100} in the checkpoint", "a mapping of options", fix)
     merged = dict(base)
     for key, value in changes.items():
         if key not in base and where in _CLOSED:

@@ -67,7 +67,7 @@ def read_json(path: Path) -> dict[str, Any]:
     except UserError as error:
         allowed = "a file written by a run"
         fix = "run the training or the evaluation again"
-        raise UserError(f"{error.got}, unreadable", allowed, fix) from error
+        raise UserError(f"{error.got}, which cannot be read", allowed, fix) from error
     if not isinstance(record, dict):
         fix = "run the training or the evaluation again"
         raise UserError(f"{path}, which contains a {type(record).__name__}", "a JSON object", fix)

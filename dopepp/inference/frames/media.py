@@ -205,7 +205,7 @@ class Live(FrameSource):
             allowed = "the number of a connected camera" if is_number else "the address of a stream"
             by_number = "close other programs that use it, or try camera 0 or 1"
             fix = by_number if is_number else "test the address with another player, e.g. ffplay"
-            raise UserError(f"{self.name}, which does not open", allowed, fix)
+            raise UserError(f"{self.name}, which cannot be opened", allowed, fix)
         self.rate = _plausible_rate(capture.get(cv2.CAP_PROP_FPS))
         reader = _NewestFrame(capture, self.name, self._clock)
         timeout, num_requests = self._timeouts[0], 0

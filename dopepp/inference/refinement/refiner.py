@@ -178,7 +178,7 @@ class PartRefiner:
         if "region" in terms:
             if part.mesh is None:
                 raise UserError(
-                    f"refine=region and no mesh of {part.name} in the checkpoint",
+                    f"refine=region with a checkpoint that has no mesh of {part.name}",
                     "a mesh of every part of the checkpoint",
                     f"add --part {part.name}=FILE and its --unit (parts=… in Python), "
                     "or train again",
@@ -204,7 +204,7 @@ class PartRefiner:
             UndecidedError: The pictures do not determine the pose.
         """
         if self._region is None:
-            raise UndecidedError("several views are refined with the term region")
+            raise UndecidedError("several views are refined only with refine=region")
         surface = self._surface if self._uses_depth else None
         return refine_views(self._region, views, start, prior, surface)
 

@@ -100,7 +100,7 @@ def learned_model() -> VerificationModel:
     path = files("dopepp.inference.refinement").joinpath("verification.json")
     values: dict[str, Any] = json.loads(path.read_text("utf-8"))
     if tuple(values["evidence"]) != EVIDENCE:
-        raise ValueError(f"{path} was learned from other evidence: run {values['command']}")
+        raise ValueError(f"{path} was fitted to other evidence: run {values['command']}")
     arrays = [np.array(values[name]) for name in VerificationModel._fields]
     return VerificationModel(*arrays)
 

@@ -222,7 +222,11 @@ def unpack(text: str | None, path: Path) -> tuple[Checkpoint, Export]:
             class that may not be built.
     """
     if text is None or len(text) > MAX_HEADER_BYTES:
-        problem = "no description" if text is None else f"a description of {len(text)} characters"
+        problem = (
+            "no description of the network"
+            if text is None
+            else f"a description of {len(text)} characters"
+        )
         allowed = f"at most {MAX_HEADER_BYTES} characters under {KEY!r}, written by `dopepp export`"
         raise UserError(f"{path}: {problem}", allowed, _FIX)
     payload = parse_json(text, f"{path}, description under {KEY!r}")
@@ -233,7 +237,7 @@ def unpack(text: str | None, path: Path) -> tuple[Checkpoint, Export]:
         check("stride", checkpoint.stride, int, Range(1, 256))
         if export.size_multiple % checkpoint.stride or not checkpoint.parts:
             problem = f"size_multiple {export.size_multiple} and {len(checkpoint.parts)} parts"
-            allowed = f"a multiple of the stride {checkpoint.stride}, and a part at least"
+            allowed = f"a multiple of the stride {checkpoint.stride}, and at least one part"
             raise UserError(problem, allowed, _FIX)
     except UserError as error:
         raise UserError(f"{error.got}, in {path}", error.allowed, error.fix) from error

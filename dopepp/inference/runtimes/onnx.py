@@ -59,7 +59,7 @@ def read_network(path: Path) -> OnnxNetwork:
     try:
         model = onnx.load_model_from_string(content)
     except Exception as error:  # protobuf raises several types
-        raise invalid_export(path, "no ONNX model, or cut short") from error
+        raise invalid_export(path, "not an ONNX model, or truncated") from error
     metadata = {entry.key: entry.value for entry in model.metadata_props}
     checkpoint, export = unpack(metadata.get(KEY), path)
     check_model(model, path, checkpoint.input_size)
@@ -119,7 +119,8 @@ def check_model(model: onnx.ModelProto, path: Path, size: tuple[int, int]) -> No
 
     graph = model.graph
     if model.functions or model.training_info or graph.sparse_initializer:
-        raise invalid_export(path, "functions, training steps or sparse tensors", "one plain graph")
+        problem = "a model with functions, training steps or sparse tensors"
+        raise invalid_export(path, problem, "a model of one plain graph")
     for node in graph.node:
         name = f"operator {node.op_type:.60}"
         if node.domain not in _DOMAINS:
@@ -127,11 +128,11 @@ def check_model(model: onnx.ModelProto, path: Path, size: tuple[int, int]) -> No
             raise invalid_export(path, problem, "operators of ONNX itself")
         kinds = {attribute.type for attribute in node.attribute}
         if kinds & {onnx.AttributeProto.GRAPH, onnx.AttributeProto.GRAPHS}:
-            raise invalid_export(path, f"{name} with a graph inside", "one graph")
+            raise invalid_export(path, f"{name} with a nested graph", "a single graph")
     for tensor in _tensors(graph):
         if tensor.data_location == onnx.TensorProto.EXTERNAL or tensor.external_data:
             problem = f"tensor {tensor.name:.60} in another file"
-            raise invalid_export(path, problem, "all in one file")
+            raise invalid_export(path, problem, "a model with all tensors in one file")
     inputs, outputs = ([value.name for value in ends] for ends in (graph.input, graph.output))
     if inputs != [INPUT] or tuple(outputs) != OUTPUTS:
         problem = f"inputs {inputs!s:.100} and outputs {outputs!s:.100}"

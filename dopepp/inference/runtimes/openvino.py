@@ -129,25 +129,28 @@ def _shapes(model: Any) -> dict[str, list[int] | None]:
 def _check_xml(content: bytes, num_weights: int, path: Path) -> str | None:
     """Check that an XML is one plain graph, and return its description."""
     if b"<!" in content:
-        raise invalid_export(path, "an XML with declarations or comments", "layers and edges alone")
+        problem = "an XML file with declarations or comments"
+        raise invalid_export(path, problem, "an XML file of layers and edges only")
     parser = etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True)
     try:
         root = etree.fromstring(content, parser)
     except etree.XMLSyntaxError as error:
-        raise invalid_export(path, f"no XML, or cut short: {error}") from error
+        raise invalid_export(path, f"not an XML file, or truncated: {error}") from error
     for layer in root.iter("layer"):
         kind, version = layer.get("type", ""), layer.get("version", "")
         if not _OPSET.fullmatch(version):
             problem = f"operator {version:.60}.{kind:.60}"
             raise invalid_export(path, problem, "operators of OpenVINO itself")
         if any(str(child.tag).endswith("body") for child in layer):
-            raise invalid_export(path, f"operator {kind:.60} with a graph inside", "one graph")
+            problem = f"operator {kind:.60} with a nested graph"
+            raise invalid_export(path, problem, "a single graph")
         data = layer.find("data")
         if kind == "Const" and data is not None:
             span = [str(data.get(key)) for key in ("offset", "size")]
             are_numbers = all(text.isdecimal() and len(text) < 16 for text in span)
             if not are_numbers or sum(map(int, span)) > num_weights:
-                problem = f"a constant of {span[1]:.20} bytes at {span[0]:.20} of {num_weights}"
-                raise invalid_export(path, problem, "constants within the weights' file")
+                problem = f"a constant of {span[1]:.20} bytes at offset {span[0]:.20}"
+                allowed = f"constants within the {num_weights} bytes of the weights' file"
+                raise invalid_export(path, problem, allowed)
     entry = root.find(f"rt_info/{KEY}")
     return None if entry is None else entry.get("value")

@@ -64,7 +64,7 @@ def predict_views(
     if refiner is None or not refiner.verifies:
         fix = "load the estimator with refine='region'"
         problem = f"several views with refine={estimator.refine}"
-        raise UserError(problem, "a refinement with region", fix)
+        raise UserError(problem, "refine='region', or region and depth", fix)
     names = names or [f"view {number}" for number in range(len(images))]
     views = _posed_pictures(images, cameras, T_world_cam, depths, camera_error, names)
     sightings, speeds = _search(estimator, views, distances)

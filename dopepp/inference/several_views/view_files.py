@@ -75,7 +75,8 @@ class CameraPoses:
                 return self.poses[name]
         names = ", ".join(list(self.poses)[:5]) + ", …" * (len(self.poses) > 5)
         fix = "add the picture to the file, or correct its name"
-        raise UserError(f"{self.source} without {picture.name}", names or "a picture", fix)
+        problem = f"{self.source} without a camera pose for {picture.name}"
+        raise UserError(problem, names or "names of pictures", fix)
 
 
 def read_camera_poses(path: Path) -> CameraPoses:
@@ -91,7 +92,9 @@ def read_camera_poses(path: Path) -> CameraPoses:
     content = read_yaml(path)
     views = content.get("views") if isinstance(content, Mapping) else None
     if not isinstance(content, Mapping) or not isinstance(views, Mapping) or not views:
-        raise UserError(f"{path} without views", FORMATS, "write a file of one of these forms")
+        raise UserError(
+            f"{path} without camera poses", FORMATS, "write a file of one of these forms"
+        )
     camera, hand_eye, error = (content.get(key) for key in ("camera", "hand_eye", "camera_error"))
     T_flange_cam = None
     if hand_eye is not None:
@@ -121,7 +124,7 @@ def transform_of(value: object, where: str) -> Transform:
         where: File and field, for error messages.
 
     Raises:
-        UserError: The value has none of these forms, or is no rigid transform.
+        UserError: The value has none of these forms, or is not a rigid transform.
     """
     fields = value if isinstance(value, Mapping) else {}
     problem = f"{where}={shown(value)}"
@@ -165,7 +168,8 @@ def _bop(path: Path) -> CameraPoses:
             t = np.array(record["cam_t_w2c"], np.float64).reshape(3) / 1000.0
         except (KeyError, TypeError, ValueError):
             allowed = "cam_R_w2c (9 numbers) and cam_t_w2c (3 numbers, millimetres)"
-            raise UserError(where, allowed, "use a data set with camera poses") from None
+            problem = f"{where} without a valid camera pose"
+            raise UserError(problem, allowed, "use a data set with camera poses") from None
         T_cam_world = transform_of({"matrix": make_transform(R, t)}, where)
         camera = camera_of_fields({"cam_K": record.get("cam_K")}, where)
         poses[name] = CameraPose(invert_transform(T_cam_world), camera)

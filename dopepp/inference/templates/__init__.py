@@ -299,7 +299,7 @@ def _joined(groups: Sequence[Matches]) -> Matches:
 def _distinct(
     transforms: Float[np.ndarray, "matches 4 4"], centre: np.ndarray, diameter: float
 ) -> list[int]:
-    """Return the indices of the first poses that are no duplicates of earlier poses."""
+    """Return the indices of the poses that do not duplicate an earlier pose."""
     centres = transforms[:, :3, :3] @ centre + transforms[:, :3, 3]
     free, chosen = np.ones(len(transforms), bool), []
     for index in range(len(transforms)):

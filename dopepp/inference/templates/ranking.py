@@ -73,7 +73,7 @@ def learned_ranking() -> RankingModel:
     path = files("dopepp.inference.templates").joinpath("ranking.json")
     values: dict[str, Any] = json.loads(path.read_text("utf-8"))
     if tuple(values["weights"]) != FEATURES:
-        raise ValueError(f"{path} was learned from other features: run {values['command']}")
+        raise ValueError(f"{path} was fitted to other features: run {values['command']}")
     return RankingModel(np.array(list(values["weights"].values())), values["bias"], values["score"])
 
 

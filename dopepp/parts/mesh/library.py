@@ -206,7 +206,7 @@ def _check(header: dict[str, Any], primitives: list[dict[str, Any]], num_bytes: 
         raise ValueError("a fan of triangles, which is not read")
     accessors = header.get("accessors", ())
     if any("bufferView" not in array or "sparse" in array for array in accessors):
-        raise ValueError("an array that is compressed, sparse or left out")
+        raise ValueError("an array that is compressed, sparse or missing")
     sizes = [view["byteLength"] for view in header.get("bufferViews", ())]
     counts = [array["count"] for array in accessors]
     used = [i for p in primitives for i in (*p["attributes"].values(), p.get("indices"))]
@@ -222,7 +222,7 @@ def _check(header: dict[str, Any], primitives: list[dict[str, Any]], num_bytes: 
     for scene in header.get("scenes", ())[header.get("scene", 0) :][:1]:
         children += scene.get("nodes", ())
     if len(set(children)) < len(children):
-        raise ValueError("a node in two places")
+        raise ValueError("a node with two parents")
 
 
 def _picture(header: dict[str, Any], primitive: dict[str, Any]) -> int | None:

@@ -110,7 +110,7 @@ def _numbers(words: list[str], count: int) -> list[float]:
     """Convert the first ``count`` words of a line to finite numbers."""
     numbers = [float(word) for word in words[:count]]
     if len(numbers) < count:
-        raise ValueError(f"needs {count} numbers")
+        raise ValueError(f"fewer than {count} numbers")
     if not all(map(math.isfinite, numbers)):
         raise ValueError("a coordinate that is not a finite number")
     return numbers

@@ -306,7 +306,7 @@ def _inverted_bodies(
 def body_extents(vertices: Vertices, faces: Faces) -> list[Float[np.ndarray, "3"]]:
     """Return the sides of the box of each separate body, the largest body first.
 
-    A body is a connected surface (corners at one position are merged) that is no cavity: a cavity
+    A body is a connected surface (corners at one position are merged) other than a cavity. A cavity
     faces inwards and lies in the box of another body.
     """
     positions, corners = weld(vertices, faces)

@@ -150,8 +150,8 @@ def bench_of_board(T_base_board: Sequence[Transform], board: Board) -> Bench:
     findings = []
     if len(poses) == 1:
         findings.append(
-            "a single picture is no check: take two more, from elsewhere if the camera is on the "
-            "flange"
+            "a single picture cannot be verified: take two more, from other poses if the camera is "
+            "on the flange"
         )
     if distances[worst] > MAX_RESIDUAL:
         findings.append(

@@ -159,7 +159,8 @@ def _checked(record: _GraspRecord, name: str, part: Part) -> Grasp:
         raise UserError(f"{name}.point={list(record.point)}", "a point of the part, metres", FIX)
     lengths = [float(np.linalg.norm(direction)) for direction in (closing, approach)]
     if min(lengths) < 1e-6 or abs(closing @ approach) > 0.02 * lengths[0] * lengths[1]:
-        raise UserError(name, "closing and approach at a right angle", FIX)
+        problem = f"{name} with closing={record.closing} and approach={record.approach}"
+        raise UserError(problem, "two directions at a right angle", FIX)
     z = approach / lengths[1]
     x = closing - (closing @ z) * z
     return Grasp(point, x / np.linalg.norm(x), z, record.width)

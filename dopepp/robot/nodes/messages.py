@@ -87,7 +87,7 @@ class AnswerFormatter:
         self._cuboids = {part.name: part.cuboid for part in parts}
         self._names = {part.name: re.sub(r"\W", "_", part.name, flags=re.ASCII) for part in parts}
         if len(set(self._names.values())) < len(parts):
-            problem = f"parts {', '.join(self._names)}"
+            problem = f"parts with equal topic names: {', '.join(self._names)}"
             fix = "rename a part and train its network again"
             raise UserError(problem, "names that differ in letters and digits", fix)
         self._triangles = {part.name: _triangles(part) for part in parts}

@@ -192,7 +192,7 @@ def written_out(name: str, changes: object = None) -> tuple[str, object]:
     """Return the shipped base preset of ``name``, and the file's and caller's changes to it.
 
     Raises:
-        UserError: The preset does not exist, or the file is no mapping with a ``base``.
+        UserError: The preset does not exist, or the file is not a mapping with a ``base``.
     """
     path = Path(name)
     if path.suffix != ".yaml":

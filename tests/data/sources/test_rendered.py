@@ -58,7 +58,7 @@ def test_splits_are_disjoint_and_only_training_has_epochs(factory):
 
 def test_bounds_description_and_objects(factory):
     source = RenderedSource(factory, 3)
-    with pytest.raises(IndexError, match="item 3 of 3"):
+    with pytest.raises(IndexError, match="index 3 is out of range"):
         source.sample(3)
     assert source.contains(servoholder().name)
     assert not source.contains(pivconnector().name)

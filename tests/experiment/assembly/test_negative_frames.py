@@ -114,7 +114,7 @@ def test_too_few_photos_are_refused(tiny, photos):
         (photos / f"{number}.png").unlink()
     assert len(frames(tiny(f"virtual.backgrounds={photos}"), "val")) == 6
     (photos / "0.png").unlink()
-    with pytest.raises(UserError, match=r"the 5 photos of .*at least 6 different"):
+    with pytest.raises(UserError, match=r"with 5 photos, .*at least 6 different"):
         frames(tiny(f"virtual.backgrounds={photos}"), "val")
 
 

@@ -192,7 +192,7 @@ def test_an_evaluation_is_what_its_checkpoint_was_trained_as(tmp_path, report_of
 @pytest.mark.parametrize(
     ("file", "content", "reason"),
     [
-        (METRICS_FILE, "{", "unreadable"),
+        (METRICS_FILE, "{", "cannot be read"),
         (METRICS_FILE, "{}", "metrics.json is of another version"),
         (METRICS_FILE, '{"name": 1, "objects": []}', "of another version"),
         (COST_FILE, "{}", "cost.json is of another version"),

@@ -240,7 +240,7 @@ GLB_CASES: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
         "coordinates that are floats",
     ),
     "too few coordinates": (array("TEXCOORD_0", count=3), "3 texture coordinates of 4 vertices"),
-    "sparse positions": (array("POSITION", sparse=SPARSE), "compressed, sparse or left out"),
+    "sparse positions": (array("POSITION", sparse=SPARSE), "compressed, sparse or missing"),
     "a fan": (
         lambda header: header["meshes"][0]["primitives"][0].update(mode=6), "a fan of triangles"
     ),

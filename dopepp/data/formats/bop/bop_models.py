@@ -104,7 +104,7 @@ def parts_by_id(root: Path, parts: Sequence[Part]) -> dict[int, Part]:
         number = names.get(part.name) if names else number_in_name(part.name)
         if number is None:
             raise UserError(
-                f"part {part.name!r} for the data set {root}",
+                f"part {part.name!r}, which is not in the data set {root}",
                 ", ".join(names) or f"obj_NNNNNN, as there is no {MODEL_FOLDERS[0]}/{INFO_FILE}",
                 f'choose a part of this list, or write "name": "{part.name}" into {INFO_FILE}',
             )

@@ -62,7 +62,7 @@ def read_targets(path: Path) -> Targets:
     """
     records = parse(list[_Target], read_json(path), f"{path}", "download the file again")
     if not records:
-        raise UserError(f"{path}", "a list of targets", "download the file again")
+        raise UserError(f"{path}, an empty list", "a list of targets", "download the file again")
     targets: Targets = {}
     for target in records:
         key = target.scene_id, target.im_id

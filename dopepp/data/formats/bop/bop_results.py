@@ -195,8 +195,8 @@ def _check_unit(path: Path, table: Table) -> None:
     low, high = _PLAUSIBLE_MM
     if not low <= distances[middle] <= high:
         raise _bad(
-            f"{path}: line {table[middle, 0]:.0f}: t of length {distances[middle]:.4g}, half of "
-            f"all lines have {'less' if distances[middle] < low else 'more'}",
+            f"{path}: translations t with a median length of {distances[middle]:.4g}, e.g. in "
+            f"line {table[middle, 0]:.0f}",
             f"millimetres: a median of {low:g} – {high:g}",
             "write t in millimetres: multiply it by 1000 if it is in metres",
         )

@@ -1,6 +1,6 @@
 """Invariants of YCB-Video, for the frames on disk; listed frames may be missing.
 
-An object without a label pixel is no defect: some releases label only some objects.
+An object without a label pixel is not a defect: some releases label only some objects.
 """
 
 from __future__ import annotations

@@ -212,7 +212,7 @@ class Round:
         if not is_near and not self._more:
             after = self.log_likelihood(end.T_cam_obj, prior)
             if after <= self.log_likelihood(prior.T_cam_obj, prior):
-                raise UndecidedError("the picture fits the given pose no worse")
+                raise UndecidedError("the picture agrees as well with the given pose")
         return agreement
 
     def reach(self, reach: float) -> float:

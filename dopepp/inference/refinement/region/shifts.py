@@ -23,7 +23,7 @@ from jaxtyping import Float, Float32, UInt8
 from dopepp.core.compiled import Array, compiled
 from dopepp.inference.refinement.outline import Contour
 
-LEAST_CHANGE: Final = 3.0  # grey levels of noise: smaller changes are no edges
+LEAST_CHANGE: Final = 3.0  # grey levels of noise: smaller changes are not edges
 
 CHANCE: Final = 1.2
 """Largest ratio of the variance of a uniform distribution to that measured on pure noise."""

@@ -96,7 +96,9 @@ def _start() -> int:
     library = _chosen_library()
     if library is not None and os.environ.get(LIBRARY_SETTING) != str(library):
         if "drjit" in sys.modules:
-            _log.warning("Dr.Jit was imported before dopepp could choose its libLLVM: scalar_rgb")
+            _log.warning(
+                "Dr.Jit was imported before dopepp chose its libLLVM: rendering with scalar_rgb"
+            )
             library = None
         else:
             os.environ[LIBRARY_SETTING] = str(library)
@@ -160,7 +162,7 @@ def is_usable(library: Path) -> bool:
             command, env=environment, capture_output=True, text=True, timeout=60.0
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        _log.warning("%s could not be tried: %s", library, error)
+        _log.warning("%s could not be tested: %s", library, error)
         return False
     usable = trial.returncode == 0 and "mean" in trial.stdout
     _log.info("%s %s with Mitsuba", library, "works" if usable else "does not work")
@@ -168,5 +170,7 @@ def is_usable(library: Path) -> bool:
         cached.parent.mkdir(parents=True, exist_ok=True)
         cached.write_text("works" if usable else "fails", "utf-8")
     except OSError as error:
-        _log.warning("%s cannot be written, libLLVM will be tried again: %s", cached, error)
+        _log.warning(
+            "%s cannot be written, so the next process tests libLLVM again: %s", cached, error
+        )
     return usable

@@ -160,7 +160,7 @@ def test_scenes_images_targets_and_shares(tmp_path, block):
     targets = [{"scene_id": 10, "im_id": i, "obj_id": 1, "inst_count": 1} for i in (10, 0, 0)]
     (tmp_path / "test_targets_bop19.json").write_text(json.dumps(targets))
     assert keys(targets="test_targets_bop19.json") == ["000010/000000", "000010/000010"]
-    with pytest.raises(UserError, match=r"no image in the share 0 – 0\.01 of 8 images"):
+    with pytest.raises(UserError, match=r"no image in the fraction 0 – 0\.01 of 8 images"):
         keys(part_of=(0, 0.01))
     (tmp_path / "test_targets_bop19.json").write_text('[{"scene_id": "1", "im_id": 3}]')
     with pytest.raises(UserError, match=r"bop19\.json\[0\]\.scene_id=.1."):
