@@ -19,7 +19,7 @@ def test_an_error_in_a_worker_arrives_as_what_it_was(small_job, tmp_path):
         (tmp_path / "_dopepp_render.json").unlink()
         return ProcessPool(content, 1)
 
-    with pytest.raises(UserError, match="seen from a worker"):
+    with pytest.raises(UserError, match="in which a worker finds no"):
         render_dataset(small_job(), tmp_path, 3, open_pool)
 
 
