@@ -125,11 +125,13 @@ class RecoveryOptions:
             the frames. On the other half it kept 94 % of them and 6 % of the false candidates.
         distance_factor: Factor on the distance of every pose, set by ``evaluate.py tune=true``.
         covariance_factor: Factor on the covariance of every pose, set by ``tune=true``.
-        score_bias: First weight of the score's features, set by ``evaluate.py tune=true``; with
-            the defaults, the score is the mean belief.
+        score_bias, score_belief, score_spread, score_misfit, score_found: Weights of the score's
+            features, set by ``evaluate.py tune=true``; with the defaults, the score is the mean
+            belief.
         refined_min_score: Refined detections below this score are dropped.
-        refined_bias: First weight of the score of refined poses, set by ``evaluate.py tune=true
-            refine=region``; with the defaults, the score is the probability of the verification.
+        refined_bias, refined_score, refined_verification: Weights of the features of a refined
+            pose's score, set by ``evaluate.py tune=true refine=region``; with the defaults, the
+            score is the probability of the verification.
         refined_covariance_factor: Factor on the covariance of poses refined on the image alone, set
             by ``tune=true refine=region``.
     """

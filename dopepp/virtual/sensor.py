@@ -51,9 +51,20 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Sensors(Checked):
-    """Probabilities and ranges of a :class:`Sensor`; ``motion_px`` is the displacement's length.
+    """Probabilities and ranges of the camera effects in :class:`Sensor`.
 
-    Blur and motion scale with the preset's image size.
+    Attributes:
+        exposure_probability: Probability of a wrong exposure.
+        exposure_ev: Exposure; 1 doubles the light.
+        blur_probability: Probability of defocus blur.
+        blur_px: Standard deviation of the blur; it scales with the preset's image size.
+        motion_probability: Probability of motion blur.
+        motion_px: Displacement during the exposure; it scales with the preset's image size.
+        noise_probability: Probability of noise.
+        read_noise: Standard deviation of signal-independent noise.
+        shot_noise: Standard deviation of signal-dependent noise at white.
+        jpeg_probability: Probability of JPEG compression.
+        jpeg_quality: Quality of the JPEG compression.
     """
 
     exposure_probability: Probability = 0.5

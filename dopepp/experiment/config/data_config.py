@@ -38,7 +38,13 @@ _CLOSED: Final = ("data.jitter", "data.masking", "data.augment", "data.image_set
 
 @dataclass(frozen=True, kw_only=True)
 class LensConfig:
-    """Picture size and camera matrix of a camera, pixels."""
+    """Camera of the application. ``camera=FILE`` sets all of these values.
+
+    Attributes:
+        width, height: Picture size, pixels.
+        fx, fy: Focal lengths, pixels.
+        cx, cy: Principal point, pixels.
+    """
 
     __pydantic_config__ = STRICT
     width: Side

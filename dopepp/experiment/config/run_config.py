@@ -65,7 +65,12 @@ class ModelConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class MapsConfig:
-    """Target maps: standard deviation of belief peaks and radius of the field's discs, cells."""
+    """Target maps, with lengths in cells.
+
+    Attributes:
+        sigma: Standard deviation of belief peaks.
+        field_radius: Radius of the disc around a corner on which its vector is drawn.
+    """
 
     __pydantic_config__ = STRICT
     sigma: Cells
@@ -140,7 +145,12 @@ class TrainerConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class CostConfig:
-    """Options of ``job=cost``: number of timed frames and batch size of the network alone."""
+    """Options of ``job=cost``.
+
+    Attributes:
+        num_frames: Number of timed frames, from picture to poses.
+        batch_size: Images per pass when the network is timed alone.
+    """
 
     __pydantic_config__ = STRICT
     num_frames: Annotated[int, Range(1, _MOST)]
@@ -149,9 +159,12 @@ class CostConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class LearningRateConfig:
-    """Options of ``job=lr_finder``: first and last learning rate, and number of steps.
+    """Options of ``job=lr_finder``. The sweep ends earlier if the loss diverges.
 
-    The sweep ends earlier if the loss diverges.
+    Attributes:
+        min_lr: Learning rate of the first step.
+        max_lr: Learning rate of the last step.
+        num_steps: Number of steps.
 
     Raises:
         UserError: ``max_lr`` is not above ``min_lr``.
@@ -251,7 +264,13 @@ class MeasurementConfig(FalsePositiveTarget):
 
     Attributes:
         plain: The whole config in plain values, as printed and stored.
-        shading, scale_factors, by, num_bins: Further protocols, see :class:`Protocols`.
+        shading: Shares of every object's visible area to cover; each share is evaluated (default:
+            none).
+        scale_factors: Factors on the apparent size of the parts; each factor is evaluated (default:
+            none). ``scale`` is the short name.
+        by: Quantities by which rates are broken down: distance, visibility, size, rotation
+            (default: none).
+        num_bins: Number of bins of each quantity in ``by``.
         tune: Whether to tune a distance factor, a score and its threshold before the measurement.
         refine: Refinement to measure, and to tune, in addition: ``region`` on the picture,
             ``depth`` on the depth image, or a list of both.
@@ -373,7 +392,7 @@ class EvaluationConfig(MeasurementConfig):
         device: torch's name of the device, or ``auto``.
         num_pictures: Number of test images to draw.
         scale_error: Largest relative error of the parts' size or of the focal length that
-            refinement assumes (default: 0.01).
+            refinement assumes (default: 0.005; for templates 0.001).
     """
 
     ckpt_path: str | None

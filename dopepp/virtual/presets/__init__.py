@@ -46,6 +46,8 @@ class Preset(Checked):
     """A distribution of scenes.
 
     Attributes:
+        name: Name in messages and records.
+        width, height: Image size.
         horizontal_fov_deg: Horizontal field of view of a camera with square pixels and a centred
             principal point; ignored if ``intrinsics_px`` is given.
         intrinsics_px: fx, fy, cx, cy of an explicit camera, pixels of this image size.

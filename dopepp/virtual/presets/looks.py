@@ -34,6 +34,7 @@ class Materials(Checked):
     Attributes:
         albedo: Linear albedo of the brightest channel, the same range for greys and colours.
         coloured_share: Share of untextured surfaces that have a colour; the others are grey.
+        saturation: Saturation of colours.
         roughness: Roughness of dielectrics.
         specular: Reflectance of dielectrics at normal incidence.
         texture_gain: Factor on the colours of coloured surfaces.
@@ -43,7 +44,10 @@ class Materials(Checked):
             that are missing in the model.
         noise: Relative amplitude of noise on the albedo of an untextured surface.
         noise_pitch: Size of the noise over the object's radius.
+        metal_share: Share of untextured surfaces that are bare metal.
         metal_albedo: Reflectance of metals at normal incidence.
+        metal_roughness: Roughness of metals.
+        brushed_share: Share of metals with brush marks.
         brush_pitch: Mean distance of the marks on brushed metals.
         brush_slope: Largest slope of a mark's flanks, the tangent of the normal's tilt.
         print_share: Share of untextured dielectrics that are 3D prints with layer lines.
@@ -153,6 +157,9 @@ class Lighting(Checked):
 
     Attributes:
         num_lights: Number of point lights; the first, the key light, casts the sharpest shadows.
+        key_intensity: Intensity of the key light.
+        fill_intensity: Intensity of the other point lights.
+        ambient_intensity: Intensity of the ambient light.
         max_angle_deg: Largest angle at the scene between a light and the camera (or, over a plane,
             the plane's normal); 0 is a flash light on the camera.
         distance: Distance of a light from the scene.

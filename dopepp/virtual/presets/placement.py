@@ -187,7 +187,10 @@ class OffsetPlacement(_Placement):
 class DistancePlacement(_Placement):
     """Uniform in the depth of the object's origin and, laterally, over the image.
 
-    ``margin`` is the smallest distance of the origin from the border, in image widths and heights.
+    Attributes:
+        nearest: Smallest depth.
+        farthest: Largest depth.
+        margin: Smallest distance of the origin from the border, in image widths and heights.
     """
 
     _ends = ("nearest", "farthest")
@@ -206,10 +209,14 @@ class DistancePlacement(_Placement):
 
 @dataclass(frozen=True)
 class FillPlacement(_Placement):
-    """The part fills a drawn share of the image and lies inside it.
+    """The part fills a random share of the image and lies inside it.
 
     The share is the larger of bounding-box width over image width and bounding-box height over
     image height. The distance is found by iteration.
+
+    Attributes:
+        smallest: Smallest share.
+        largest: Largest share.
     """
 
     _ends = ("smallest", "largest")
@@ -252,6 +259,10 @@ class WorkingPlacement(_Placement):
 
     A position is the centre of the rotated part's bounding box. Parts larger than the picture are
     centred.
+
+    Attributes:
+        nearest: Smallest depth.
+        farthest: Largest depth.
     """
 
     _ends = ("nearest", "farthest")

@@ -55,6 +55,7 @@ class Table(Checked):
         elevation_deg: Angle between the plane and the line of sight; 90 looks straight down.
         roll_deg: Largest rotation of the camera about its line of sight to either side.
         tilted_share: Share of objects that lean by ``tilt_deg`` instead of resting on a face.
+        tilt_deg: Angle by which leaning objects are tilted.
         heaped: Whether objects are dropped onto a heap instead of lying side by side.
         heap_radius: Radius within which a heap's objects are dropped.
         pile: Heaps dropped by physics, in place of single objects; None for no physics.

@@ -95,8 +95,14 @@ def test_what_is_written_is_read_back(seed, count, tmp_path_factory):
         (GOOD.replace("-10.5", "1e12"), r"line 2: t .*; allowed: millimetres"),
         (GOOD.replace("812.25,0.5", "812.25,-2"), r"line 2: time '-2'; allowed: seconds, or -1"),
         (GOOD.replace("812.25,0.5", "812.25,inf"), r"line 2: time: 'inf'"),
-        (GOOD.replace("-10.5 20 812.25", "-0.01 0.02 0.81"), r"median length of 0\.81, e\.g\. in line 2.*metres"),
-        (GOOD.replace("-10.5 20 812.25", "0 0 812250"), r"median length of 8\.\d+e\+05, e\.g\. in line 2"),
+        (
+            GOOD.replace("-10.5 20 812.25", "-0.01 0.02 0.81"),
+            r"median length of 0\.81, e\.g\. in line 2.*metres",
+        ),
+        (
+            GOOD.replace("-10.5 20 812.25", "0 0 812250"),
+            r"median length of 8\.\d+e\+05, e\.g\. in line 2",
+        ),
         (f"{GOOD}\n1,5,2,0.75,{R},0 0 700,1\n{GOOD}", r"line 4, which repeats line 2;.*once"),
         (GOOD + "é", r"line 2, which is no ASCII text"),
         (GOOD.replace("0.75", "0" * 5000), r"line 2 of more than 4096 bytes"),
