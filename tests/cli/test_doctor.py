@@ -59,11 +59,11 @@ def test_a_good_picture_is_well(run, folder):
         (["plain.png", "--camera", "K.txt"], "!! visibility: nothing like pivconnector is seen"),
         (
             ["good.png", "--camera", "K.txt", "--at", "5,5"],
-            "!! elsewhere: confident elsewhere: 1 of 1 detections above",
+            "!! elsewhere: 1 of 1 detections above",
         ),
         (
             ["good.png", "--camera", "K.txt", "--empty"],
-            "!! elsewhere: confident elsewhere: 1 of 1 detections above",
+            "!! elsewhere: 1 of 1 detections above",
         ),
         (["good.png", "--K", "220", "220", "127.5", "127.5"], "!! camera: K with fx=220"),
         (

@@ -124,7 +124,7 @@ def test_detections_beside_the_part_and_on_pictures_without_it_are_named(estimat
     assert not elsewhere(rendered.image, (0.0, 0.0), (u, v)).fix
     beside = elsewhere(rendered.image, (u + 1.3 * half, v))
     assert re.match(
-        r"confident elsewhere: 1 of 1 detections above [\d.]+ are away from every part",
+        r"1 of 1 detections above [\d.]+ are away from every part",
         beside.sentence,
     )
     named = re.search(r"at \((\d+), (\d+)\)", beside.sentence)

@@ -216,7 +216,7 @@ def elsewhere(case: Case) -> Diagnosis:
     )
     best_stray = f"the best has the score {best.score:.2g}, at ({u:.0f}, {v:.0f})"
     fix = TUNE if case.estimator.has_network else "raise the threshold: --conf, or train the part"
-    return Diagnosis("elsewhere", f"confident elsewhere: {counts}; {best_stray}", fix)
+    return Diagnosis("elsewhere", f"{counts}; {best_stray}", fix)
 
 
 def pose(case: Case) -> Diagnosis:
