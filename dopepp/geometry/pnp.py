@@ -124,7 +124,17 @@ def solve_pnp(
 def _prepared(
     object_points: Array, image_points: Array, K: Array, covariance: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the usable points' rays and whitenings W (WᵀW = Σ⁻¹), and which points are usable."""
+    """Convert image points to rays, and their covariances to whitenings W with WᵀW = Σ⁻¹.
+
+    Args:
+        object_points: Points in the object frame, (n, 3).
+        image_points: Measured pixels, (n, 2).
+        K: Camera matrix, pixels.
+        covariance: Covariance of each pixel, (n, 2, 2).
+
+    Returns:
+        Rays (x/z, y/z) and whitenings of the usable points, and which points are usable.
+    """
     # Inputs may be any number and squares may overflow, so the results are checked. W is the
     # inverse of Cholesky's L with Σ = LLᵀ.
     n, count = len(object_points), 0
@@ -210,7 +220,21 @@ def _concluded(
     size: float,
     centre: Array,
 ) -> tuple[Array, float, Array]:
-    """Return pose (metres), RMS error (pixels) and covariance from the points that agree."""
+    """Fit the pose to the points that agree by least squares, and convert it to the object's frame.
+
+    Args:
+        object_points: Points that agree, centred and divided by ``size``.
+        rays: Measured ray (x/z, y/z) of each point.
+        whitening: Whitening of each ray.
+        to_px: Matrix from rays to pixels.
+        R: Initial rotation, updated in place.
+        t: Initial translation over ``size``, updated in place.
+        size: Size by which the points were divided, metres.
+        centre: Centre of the points in the object frame, metres.
+
+    Returns:
+        Pose (metres), RMS reprojection error (pixels) and 6×6 covariance.
+    """
     # Least squares is the best estimate for points that agree. A rotation ω about the points'
     # centre is the same rotation about the object's origin and a shift by centre × ω.
     refine_pose(object_points, rays, whitening, R, t, NO_GATE)
@@ -316,9 +340,24 @@ def _improved(
     best: float,
     agree: Array,
 ) -> float:
-    """Refine the likeliest starts, update the best pose and ``agree``, and return its cost.
+    """Refine the most likely start poses, and update the best pose in place.
 
-    For a plate, the other tilt of each start is refined as well.
+    For a plate, the mirrored tilt of each start pose is refined as well.
+
+    Args:
+        object_points: Normalised points in the object frame.
+        rays: Measured ray (x/z, y/z) of each point.
+        whitening: Whitening of each ray.
+        starts: Start poses: rotation vector and translation, (n, 6).
+        normal: Normal of the plate in the object frame.
+        is_plate: Whether the points are nearly in a plane.
+        best_R: Rotation of the best pose.
+        best_t: Translation of the best pose.
+        best: Cost of the best pose.
+        agree: Which points agree with the best pose.
+
+    Returns:
+        The cost of the best pose.
     """
     count = len(starts)
     residuals = np.empty((len(rays), 2))

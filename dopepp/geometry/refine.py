@@ -98,7 +98,19 @@ def refine_pose(
 def reproject(
     object_points: Array, rays: Array, whitening: Array, R: Array, t: Array, out: Array
 ) -> bool:
-    """Write whitened reprojection errors, NaN behind the camera; return whether none is behind."""
+    """Compute the whitened reprojection error of every point.
+
+    Args:
+        object_points: Points in the object frame, (n, 3).
+        rays: Measured ray (x/z, y/z) of each point.
+        whitening: Whitening of each ray, (n, 2, 2).
+        R: Rotation of the pose.
+        t: Translation of the pose.
+        out: Filled with the errors, (n, 2); NaN for points behind the camera.
+
+    Returns:
+        Whether all points are in front of the camera.
+    """
     in_front = True
     for i in range(len(rays)):
         x, y, z = object_points[i, 0], object_points[i, 1], object_points[i, 2]

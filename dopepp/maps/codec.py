@@ -186,7 +186,20 @@ def _find(
     covariance: Array,
     toward: Array,
 ) -> None:
-    """Fill the peaks of all channels, in cells; the field may be empty."""
+    """Find and fit the peaks of all channels.
+
+    Args:
+        belief: Belief maps.
+        field: Vector field, which may be empty.
+        threshold: Belief below which a maximum is not a peak.
+        half: Half-width of the fitted window, cells.
+        sigma: Standard deviation of a perfect peak, cells.
+        radius: Radius of the field's discs, cells.
+        score: Filled with the belief of each peak, by channel.
+        position: Filled with (x, y) of each peak, cells.
+        covariance: Filled with the covariance of each position, cells².
+        toward: Filled with the mean vector of the field at each peak.
+    """
     cells = np.empty((score.shape[1], 2), np.int64)
     for channel in range(len(belief)):
         count = _strongest(belief[channel], threshold, score[channel], cells)

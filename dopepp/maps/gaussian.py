@@ -177,9 +177,21 @@ def _own_cells(
     margin: float,
     usable: Array,
 ) -> None:
-    """Mark a window's finite cells where no other peak is higher, except clamped plateaus.
+    """Mark the cells of a peak's window that belong to this peak.
 
-    Of Gaussians s·exp(−d²/2σ²), the highest in a cell has the smallest d² − 2σ² log s.
+    A cell belongs to the peak if it is finite, no other peak is higher in the cell, and the cell is
+    not part of a clamped plateau. Of Gaussians s·exp(−d²/2σ²), the highest in a cell has the
+    smallest d² − 2σ² log s.
+
+    Args:
+        i: Index of the peak.
+        windows: Window of cells around each peak, relative to its belief.
+        cells: (column, row) of each peak.
+        position: Estimated (x, y) of each peak, cells.
+        scores: Belief of each peak.
+        sigma: Standard deviation of a perfect peak, cells.
+        margin: Advantage that this peak needs over another peak, cells².
+        usable: Filled with whether each cell belongs to the peak.
     """
     side, highest = windows.shape[1], 0
     half = side // 2
@@ -223,7 +235,18 @@ def _fit_logarithm(
     room: Array,
     theta: Array,
 ) -> None:
-    """Write the weighted linear least-squares fit of log b with the prior on the shape."""
+    """Fit the logarithm of a Gaussian to the cells of a window by weighted linear least squares.
+
+    Args:
+        window: Cells around a peak, relative to its belief.
+        logarithm: Logarithm of these cells.
+        usable: Which cells belong to the peak.
+        sigma: Standard deviation of a perfect peak, cells.
+        noise: Variance of a cell over the peak's squared belief, which weights the shape's prior.
+        work: Workspace for sums, (5, 10).
+        room: Workspace, (11, 6).
+        theta: Filled with the coefficients of (1, x, y, −x², −xy, −y²).
+    """
     side, half, curvature = len(window), len(window) // 2, 0.5 / sigma**2
     theta[:] = 0.0
     theta[3] = theta[5] = curvature
@@ -255,7 +278,21 @@ def _linearised(
     gradient: Array,
     hessian: Array,
 ) -> tuple[float, float]:
-    """Write the normal equations of b with the prior; return Σ residual² and the cell count."""
+    """Write the normal equations of a Gaussian fit at the present coefficients.
+
+    Args:
+        window: Cells around a peak, relative to its belief.
+        usable: Which cells belong to the peak.
+        theta: Coefficients of (1, x, y, −x², −xy, −y²) in the exponent.
+        noise: Variance of a cell over the peak's squared belief, which weights the shape's prior.
+        sigma: Standard deviation of a perfect peak, cells.
+        work: Workspace for sums, (5, 10).
+        gradient: Filled with the gradient.
+        hessian: Filled with the 6×6 matrix.
+
+    Returns:
+        The sum of squared residuals and the number of cells.
+    """
     side, half = len(window), len(window) // 2
     squared, used = 0.0, 0.0
     work[:] = 0.0

@@ -250,7 +250,20 @@ def _direction_evidence(
     max_angle: float,
     coincident_px: float,
 ) -> Array:
-    """Compute :func:`direction_evidence`."""
+    """Compute :func:`direction_evidence` for arrays.
+
+    Args:
+        position: (x, y) of each corner peak, pixels, by corner.
+        score: Belief of each corner peak; 0 for none.
+        toward: Mean field vector at each corner peak.
+        centroid: (x, y) of each instance's centroid, pixels.
+        centroid_score: Belief of each centroid.
+        max_angle: Largest angle between vector and centroid, radians.
+        coincident_px: Distance to the centroid within which the direction does not matter.
+
+    Returns:
+        Evidence by instance, corner and peak; −∞ for peaks in another direction.
+    """
     evidence = np.full((len(centroid), *score.shape), -math.inf)
     beliefs = np.log(centroid_score)
     for k, m in np.ndindex(score.shape):
@@ -286,10 +299,18 @@ def _gain(
     deviation: Array,
     area_px: float,
 ) -> Array:
-    """Add the evidence of the distance to the expected position; negative sums become 0.
+    """Add the evidence of each peak's distance from its expected position; negative sums become 0.
 
     This evidence is the ratio of a Gaussian density to the density of a peak anywhere on the maps.
     Without an expected position, the ratio is 1.
+
+    Args:
+        evidence: Logarithmic evidence by instance, corner and peak.
+        position: (x, y) of each peak, pixels.
+        covariance_px: Covariance of each peak.
+        expected: Expected (x, y) of each instance's corners, pixels; NaN if unknown.
+        deviation: Standard deviation of each instance's expected positions, pixels.
+        area_px: Area of the maps, squared pixels.
     """
     gain = np.zeros(evidence.shape)
     for i, k, m in np.ndindex(evidence.shape):
@@ -372,7 +393,18 @@ def _predict(
 def _best_triple(
     arms: Array, evidence: Array, usable: Array, area_px: float, expected: Array
 ) -> float:
-    """Write the arms that the best triple of candidates predicts; return their deviation."""
+    """Predict the corners of an instance from the three corner peaks that agree with most others.
+
+    Args:
+        arms: Vector from the centroid to each candidate peak, by corner, pixels.
+        evidence: Logarithmic evidence of each candidate.
+        usable: Number of candidates of each corner.
+        area_px: Area of the maps, squared pixels.
+        expected: Filled with the predicted vector of each corner.
+
+    Returns:
+        The standard deviation of the predictions, pixels.
+    """
     best, best_variance = -math.inf, PREDICTION_PX**2
     diagonals, given = np.empty((4, 2)), np.empty(3, np.int64)
     corners, chosen = np.empty(3, np.int64), np.empty(3, np.int64)
@@ -411,9 +443,20 @@ def _best_triple(
 def _agreement(
     diagonals: Array, arms: Array, evidence: Array, usable: Array, area_px: float, least: float
 ) -> tuple[float, float]:
-    """Return the evidence of all candidates near the corners of these diagonals, and its variance.
+    """Sum the evidence of all candidates near the corners that four diagonals predict.
 
     The summation stops early, with an upper bound, once the sum cannot exceed ``least``.
+
+    Args:
+        diagonals: Vector from the centroid to one end of each diagonal, pixels.
+        arms: Vector from the centroid to each candidate peak, by corner, pixels.
+        evidence: Logarithmic evidence of each candidate.
+        usable: Number of candidates of each corner.
+        area_px: Area of the maps, squared pixels.
+        least: Sum to exceed.
+
+    Returns:
+        The sum, and the variance of the predicted positions, squared pixels.
     """
     size = 0.0
     for d in range(4):

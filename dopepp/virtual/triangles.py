@@ -38,7 +38,15 @@ _pool = threading.local()
 
 @compiled()
 def project_vertices(vertices: Array, T_cam_obj: Array, K: Array, cam: Array, hom: Array) -> None:
-    """Write camera-frame vertices (metres) and their homogeneous pixels ``K x_cam``."""
+    """Transform vertices to the camera frame, and project them.
+
+    Args:
+        vertices: Vertices in the object frame, metres.
+        T_cam_obj: Pose of the object.
+        K: Camera matrix, pixels.
+        cam: Filled with the vertices in the camera frame, metres.
+        hom: Filled with the homogeneous pixels ``K x_cam``.
+    """
     for i in range(vertices.shape[0]):
         x, y, z = vertices[i, 0], vertices[i, 1], vertices[i, 2]
         for r in range(3):
@@ -191,7 +199,16 @@ def rasterise(
 
 @compiled(inline="always")
 def edge_functions(hom: Array, a: int, b: int, c: int) -> EdgeFunctions:
-    """Return a triangle's edge functions: its corners' weights at a pixel, up to a factor."""
+    """Return the three edge functions of a triangle, as coefficients of (x, y, 1).
+
+    An edge function at a pixel is the weight of the opposite corner, up to a common factor.
+
+    Args:
+        hom: Homogeneous pixels of the vertices.
+        a: First corner.
+        b: Second corner.
+        c: Third corner.
+    """
     ax, ay, aw = hom[a, 0], hom[a, 1], hom[a, 2]
     bx, by, bw = hom[b, 0], hom[b, 1], hom[b, 2]
     cx, cy, cw = hom[c, 0], hom[c, 1], hom[c, 2]

@@ -183,7 +183,22 @@ def _count(
     farthest: float,
     counts: Array,
 ) -> int:
-    """Count the colours of part and surroundings per tile; return the smaller number of pixels."""
+    """Count the colours of part and surroundings in each tile.
+
+    Args:
+        bins: Colour bin of each pixel.
+        rows: Tile of each row of pixels.
+        columns: Tile of each column of pixels.
+        within: Distance of each pixel inside the mask from the border, pixels.
+        beyond: Distance of each pixel outside the mask from the border, pixels.
+        nearest_within: Pixels of the part this close to the border are not counted.
+        nearest: Surrounding pixels this close to the border are not counted.
+        farthest: Surrounding pixels beyond this distance are not counted.
+        counts: Updated counts, (part or surroundings, tile rows, tile columns, bins).
+
+    Returns:
+        The smaller of the two numbers of counted pixels.
+    """
     inside = outside = 0
     for v in range(bins.shape[0]):
         for u in range(bins.shape[1]):
@@ -230,7 +245,15 @@ def _tables(counts: Array, tables: Array) -> None:
 
 @compiled()
 def _look_up(bins: Array, rows: Array, columns: Array, tables: Array, odds: Array) -> None:
-    """Write the log odds of each pixel's colour in the table of its tile."""
+    """Write the log odds of each pixel, from the colour table of its tile.
+
+    Args:
+        bins: Colour bin of each pixel.
+        rows: Tile of each row of pixels.
+        columns: Tile of each column of pixels.
+        tables: Log odds by tile row, tile column and colour bin.
+        odds: Filled with the log odds of each pixel.
+    """
     for v in range(bins.shape[0]):
         for u in range(bins.shape[1]):
             odds[v, u] = tables[rows[v], columns[u], bins[v, u]]

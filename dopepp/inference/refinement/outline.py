@@ -160,7 +160,20 @@ def outline_rows(
 def _pose(
     vertices: Array, planes: Array, T: Array, K: Array, arms: Array, pixels: Array, front: Array
 ) -> bool:
-    """Write arms, pixels and facing; return False if a vertex is not in front of the camera."""
+    """Project a mesh, and find the triangles that face the camera.
+
+    Args:
+        vertices: Vertices in the object frame, metres.
+        planes: Normal and offset of each triangle's plane, object frame.
+        T: Pose of the object in the camera frame.
+        K: Camera matrix, pixels.
+        arms: Filled with the rotated vertices, relative to the object's origin, camera axes.
+        pixels: Filled with the projected vertices.
+        front: Filled with whether each triangle faces the camera.
+
+    Returns:
+        Whether all vertices are in front of the camera.
+    """
     for i in range(len(vertices)):
         for r in range(3):
             arms[i, r] = (
@@ -216,7 +229,13 @@ def _wind(
 ) -> None:
     """Set the pixels that the border of the triangles facing the camera winds around.
 
-    ``turns`` counts crossings; it is one pixel wider than the mask, and initially zero.
+    Args:
+        pixels: Projected vertices.
+        edges: Vertices of each edge.
+        sides: The two triangles of each edge.
+        front: Whether each triangle faces the camera.
+        turns: Zeros, one column wider than the mask; filled with the changes of the winding number.
+        mask: Filled with 1 inside the border and 0 outside.
     """
     height, width = mask.shape
     for e in range(len(edges)):
@@ -252,7 +271,22 @@ def _walk(
     mask: Array,
     spacing: float,
 ) -> Array:
-    """Return arm, pixel and normal of points every ``spacing`` pixels along all edges."""
+    """Sample points of the silhouette's border along the edges of a mesh.
+
+    Args:
+        edges: Vertices of each edge.
+        sides: The two triangles of each edge; −1 for none.
+        opposed: 1 for edges whose triangles have opposite orientations.
+        front: Whether each triangle faces the camera.
+        arms: Rotated vertices, relative to the object's origin, camera axes.
+        pixels: Projected vertices.
+        distance: Depth of the object's origin, metres.
+        mask: Mask of the silhouette.
+        spacing: Distance of two points, pixels.
+
+    Returns:
+        Arm (3), pixel (2) and outward normal (2) of each point.
+    """
     rows, count, left = np.empty((256, 7)), 0, 0.5 * spacing
     normal = np.empty(2)
     for e in range(len(edges)):
@@ -291,7 +325,20 @@ def _walk(
 def _outward(
     mask: Array, u: float, v: float, dx: float, dy: float, length: float, normal: Array
 ) -> bool:
-    """Write the outward direction at a point; return whether the mask ends there."""
+    """Write the unit normal that points out of the mask at a point of its border.
+
+    Args:
+        mask: Mask of the silhouette.
+        u: Column of the point, pixels.
+        v: Row of the point, pixels.
+        dx: Horizontal component of the edge, pixels.
+        dy: Vertical component of the edge, pixels.
+        length: Length of the edge, pixels.
+        normal: Filled with the normal.
+
+    Returns:
+        Whether the mask ends at the point.
+    """
     height, width = mask.shape
     if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
         return False
@@ -325,10 +372,17 @@ def _outward(
 
 @compiled()
 def _rows(arms: Array, normals: Array, T: Array, K: Array, rows: Array) -> None:
-    """Write the derivatives of each point's motion along its normal.
+    """Write the derivatives of each point's motion along its normal by the pose.
 
     By the shift, it is n·du with du = f (dX/Z − X dZ/Z²). By the rotation, it is the cross product
     of the arm and this vector.
+
+    Args:
+        arms: Points relative to the object's origin, camera axes, metres.
+        normals: Unit normal of each point in the image.
+        T: Pose of the object in the camera frame.
+        K: Camera matrix, pixels.
+        rows: Filled with the derivatives by rotation and shift, (n, 6), pixels.
     """
     for i in range(len(arms)):
         x, y, z = arms[i, 0], arms[i, 1], arms[i, 2]

@@ -264,10 +264,18 @@ def _offsets(
     limit: float,
     offset: Array,
 ) -> None:
-    """Write each pixel's depth minus that of its nearest point's plane, metres.
+    """Write each pixel's measured depth minus the depth of the part's nearest plane, metres.
 
-    The offset is NaN if the nearest point is beyond ``farthest``. ``limit`` bounds the difference
-    between the depths of plane and point.
+    Args:
+        depth: Measured depth, metres; 0 where unknown.
+        rays: Ray (x/z, y/z) of each pixel.
+        distance: Distance of each pixel from the part's nearest visible point, pixels.
+        nearest: Index of this point.
+        points: Points of the posed part, camera frame, metres.
+        normals: Normals of the points, camera frame.
+        farthest: Pixels farther from their nearest point get NaN.
+        limit: Largest difference between the depths of plane and point, metres.
+        offset: Filled with the differences; NaN where unknown.
     """
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):

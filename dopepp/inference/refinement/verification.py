@@ -330,7 +330,16 @@ def _contrast(colours: Picture, outline: Float[np.ndarray, "points 4"]) -> float
 def _draw(
     pixels: Array, inverse_depth: Array, faces: Array, shown: Array, ids: Array, nearest: Array
 ) -> None:
-    """Write the nearest shown triangle at each pixel's centre."""
+    """Write the nearest visible triangle at each pixel's centre.
+
+    Args:
+        pixels: Projected vertices.
+        inverse_depth: Inverse depth of each vertex, 1/m.
+        faces: Vertices of each triangle.
+        shown: Whether each triangle is drawn.
+        ids: Filled with the triangle at each pixel; unchanged where there is none.
+        nearest: Filled with the inverse depth at each pixel; zeros before.
+    """
     height, width = ids.shape
     for f in range(len(faces)):
         if not shown[f]:
@@ -366,7 +375,18 @@ def _draw(
 
 @compiled()
 def _walk_creases(edges: Array, sides: Array, pixels: Array, ids: Array, spacing: float) -> Array:
-    """Return pixel and normal of points along visible creases, ``spacing`` pixels apart."""
+    """Sample points along the visible creases of a mesh.
+
+    Args:
+        edges: Vertices of each crease.
+        sides: The two triangles of each crease.
+        pixels: Projected vertices.
+        ids: Triangle at each pixel.
+        spacing: Distance of two points, pixels.
+
+    Returns:
+        Pixel (2) and unit normal (2) of each point.
+    """
     height, width = ids.shape
     rows, count, left = np.empty((512, 4)), 0, 0.5 * spacing
     for e in range(len(edges)):

@@ -122,9 +122,20 @@ def _match(
     best: Array,
     moments: Array,
 ) -> None:
-    """Write score, view, turn and position of each cell's best matches.
+    """Write the best matches of all templates and turns in each cell of the image.
 
-    ``moments`` receives mean and standard deviation of each template's sums.
+    Args:
+        phases: Edge responses, rearranged by orientation and position modulo the stride.
+        rows: Number of positions from top to bottom.
+        columns: Number of positions from left to right.
+        margin: Number of positions added around the image.
+        points: Points of each view, diameters.
+        normals: Direction of each point's normal, radians.
+        scale: Projected diameter, pixels.
+        side: Side of a cell, positions.
+        scores: Filled with the scores of each cell's best matches.
+        best: Filled with view, turn and position of these matches.
+        moments: Filled with mean and standard deviation of each template's sums.
     """
     bins, length = len(phases) // (STRIDE * STRIDE), phases.shape[1]
     turns, across = moments.shape[1], columns + 2 * margin

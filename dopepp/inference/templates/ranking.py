@@ -133,7 +133,17 @@ def _features(
 def _response(
     maps: Array, points: Array, normals: Array, u: float, v: float, turn: float, scale: float
 ) -> float:
-    """Return the mean response of a template's points."""
+    """Return the mean edge response at the points of a posed template.
+
+    Args:
+        maps: Edge responses by orientation, row and column.
+        points: Points of the template, diameters.
+        normals: Direction of each point's normal, radians.
+        u: Column of the template's centre, pixels.
+        v: Row of the template's centre, pixels.
+        turn: Rotation in the image plane, radians.
+        scale: Projected diameter, pixels.
+    """
     bins, height, width = maps.shape
     c, s, total = scale * math.cos(turn), scale * math.sin(turn), 0
     for p in range(len(points)):
@@ -149,7 +159,19 @@ def _response(
 def _climb(
     maps: Array, points: Array, normals: Array, pose: Array, reach: float, rounds: int
 ) -> float:
-    """Change the numbers of a pose in turn while the response rises; return the response."""
+    """Maximise the response over the four numbers of a pose, changing one number at a time.
+
+    Args:
+        maps: Edge responses by orientation, row and column.
+        points: Points of the template, diameters.
+        normals: Direction of each point's normal, radians.
+        pose: Column, row, turn and projected diameter, updated in place.
+        reach: First step of column and row, pixels.
+        rounds: Number of rounds; each has smaller steps.
+
+    Returns:
+        The highest response.
+    """
     most = _response(maps, points, normals, pose[0], pose[1], pose[2], pose[3])
     steps = np.array([reach, reach, TURN / 2, GROWTH * pose[3]])
     for _ in range(rounds):
@@ -175,7 +197,17 @@ def _search(
     reach: float,
     best: Array,
 ) -> None:
-    """Move each pose to the highest response: first on a grid, then by :func:`_climb`."""
+    """Move each match to the highest response nearby: first on a grid, then by :func:`_climb`.
+
+    Args:
+        maps: Edge responses by orientation, row and column.
+        points: Points of each view, diameters.
+        normals: Direction of each point's normal, radians.
+        views: View of each match.
+        poses: Column, row, turn and projected diameter of each match, updated in place.
+        reach: Half the side of the grid, pixels.
+        best: Filled with the response of each match.
+    """
     for i in range(len(views)):
         edges, angles, scale = points[views[i]], normals[views[i]], poses[i, 3]
         few, directions = edges[:FEW], angles[:FEW]
@@ -203,7 +235,18 @@ def _turn(
     poses: Array,
     responses: Array,
 ) -> None:
-    """Replace each view by its best neighbour, until no neighbour has a higher response."""
+    """Replace the view of each match by its best neighbour, until no neighbour is better.
+
+    Args:
+        maps: Edge responses by orientation, row and column.
+        points: Points of each view, diameters.
+        normals: Direction of each point's normal, radians.
+        neighbours: Neighbouring views of each view.
+        twists: Turn in the image plane that aligns each neighbour with the view, radians.
+        views: View of each match, updated in place.
+        poses: Column, row, turn and projected diameter of each match, updated in place.
+        responses: Filled with the response of each match.
+    """
     pose, best = np.empty(4), np.empty(4)
     for i in range(len(views)):
         best[:] = poses[i]

@@ -255,7 +255,20 @@ def _search(
     perspective: bool,
     errors: Array,
 ) -> None:
-    """Write the errors of all poses; arguments as in :func:`least_farthest`."""
+    """Compute the maximum point distance of every pose under its best symmetry.
+
+    Args:
+        B: Matrix of each estimated pose: R, or K·R for distances in the image.
+        b: Offset of each estimated pose.
+        A: Matrix of each true pose.
+        a: Offset of each true pose.
+        points: Points of the object, the probes first.
+        turns: Rotation of each symmetry.
+        shifts: Translation of each symmetry.
+        num_probes: Number of points that give a lower bound quickly.
+        perspective: Whether points are divided by their depth.
+        errors: Filled with the error of each pose; infinite for a point behind the camera.
+    """
     targets = np.empty((len(points), 3))
     P, p = np.empty((len(turns), 3, 3)), np.empty((len(turns), 3))
     floors = np.empty(len(turns))

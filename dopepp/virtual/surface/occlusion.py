@@ -164,9 +164,18 @@ def _bake(
     grid: _Points,
     sums: Array,
 ) -> None:
-    """Sum cosines over directions in four rows: open front, all front, open back, all back.
+    """Sum the cosines of directions over each point's hemisphere; each direction has a depth map.
 
-    The mesh lies within ``radius`` around ``centre``. A depth map is rendered for each direction.
+    Args:
+        vertices: Vertices of the mesh.
+        faces: Vertices of each triangle.
+        closed: Whether the mesh is closed.
+        centre: Centre of a sphere around the mesh.
+        radius: Radius of this sphere.
+        directions: Unit vectors, evenly spread.
+        samples: Offset of the sample in a pixel.
+        grid: Points on the triangles.
+        sums: Filled with four rows per point: unblocked front, all front, unblocked back, all back.
     """
     points, upright, ground, flat = grid
     side = _MAP_SIDE

@@ -92,7 +92,16 @@ def _used_texels(
 def _halve(
     source: Array, share: Array, decode: Array, encode: Array, out: Array, out_share: Array
 ) -> None:
-    """Average the used texels under every texel of the next level, in linear light."""
+    """Average the used texels of a level under every texel of the next, coarser level.
+
+    Args:
+        source: Texels, sRGB, (rows, columns, 3).
+        share: Used share of each texel.
+        decode: Table from sRGB to linear light.
+        encode: Table from linear light to sRGB.
+        out: Filled with the texels of the next level.
+        out_share: Filled with the used share of these texels.
+    """
     rows, columns = source.shape[:2]
     height, width = rows / out.shape[0], columns / out.shape[1]
     for j in range(out.shape[0]):
@@ -119,7 +128,17 @@ def _halve(
 def _bilinear(
     texels: Array, first: int, rows: int, columns: int, decode: Array, u: float, v: float
 ) -> tuple[float, float, float]:
-    """Sample a repeating level in linear light; v points up, row 0 is the top."""
+    """Sample a repeating texture level in linear light; v points up, row 0 is the top.
+
+    Args:
+        texels: Texels of all levels, (n, 3).
+        first: Index of the level's first texel.
+        rows: Number of rows of the level.
+        columns: Number of columns of the level.
+        decode: Table from sRGB to linear light.
+        u: Horizontal texture coordinate.
+        v: Vertical texture coordinate.
+    """
     x = (u - math.floor(u)) * columns - 0.5
     y = (1.0 - (v - math.floor(v))) * rows - 0.5
     i, j = math.floor(x), math.floor(y)

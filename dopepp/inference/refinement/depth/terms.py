@@ -156,9 +156,26 @@ def _add_planes(
     H: Array,
     g: Array,
 ) -> float:
-    """Add the point-to-plane terms of all covered pixels to H and g; return their total weight.
+    """Add the point-to-plane terms of all pixels that the part covers to the normal equations.
 
     A rotation ω and a shift τ of the part move a point at ``arm`` from its origin by ω × arm + τ.
+
+    Args:
+        depth: Measured depth, metres; 0 where unknown.
+        rays: Ray (x/z, y/z) of each pixel.
+        distance: Distance of each pixel from the part's nearest visible point, pixels.
+        nearest: Index of this point.
+        points: Points of the posed part, camera frame, metres.
+        normals: Normals of the points, camera frame.
+        origin: Origin of the part, camera frame, metres.
+        reach: Residual from which the robust weight is 0, metres.
+        noise: Standard deviation of the depth, metres.
+        rough: Standard deviation of the part's surface, metres.
+        H: Updated 6×6 matrix of the normal equations.
+        g: Updated right side of the normal equations.
+
+    Returns:
+        The sum of the weights.
     """
     row = np.empty(6)
     total = 0.0

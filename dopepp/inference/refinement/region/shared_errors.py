@@ -130,10 +130,18 @@ def _terms(
     H: Array,
     g: Array,
 ) -> None:
-    """Write the reweighted terms of (rotation, shift, offset).
+    """Write the robustly weighted normal equations of (rotation, shift, offset of the outline).
 
-    ``independent`` is the number of measurements that a point represents if errors are small,
-    ``alike`` the number of points that share an error otherwise.
+    Args:
+        rows: Derivatives of each point's motion by the pose, (n, 6).
+        means: Measured shift of the outline at each point, pixels.
+        information: Inverse variance of each shift.
+        prior_H: Information of the prior.
+        prior_g: Right side of the prior's normal equations.
+        independent: Number of measurements that a point represents if errors are small.
+        alike: Number of neighbouring points that share an error otherwise.
+        H: Filled with the 7×7 matrix of the normal equations.
+        g: Filled with their right side.
     """
     squares, valid, weights = np.empty(len(rows)), np.empty(len(rows)), np.empty(len(rows))
     num_valid = 0
@@ -208,7 +216,15 @@ def _median(values: Array) -> float:
 
 @compiled()
 def _add(rows: Array, means: Array, weights: Array, H: Array, g: Array) -> None:
-    """Write the normal equations; the derivative by the offset is 1."""
+    """Write the weighted normal equations of (rotation, shift, offset); every point has the offset.
+
+    Args:
+        rows: Derivatives of each point's motion by the pose, (n, 6).
+        means: Measured shift of the outline at each point, pixels.
+        weights: Weight of each point.
+        H: Filled with the 7×7 matrix of the normal equations.
+        g: Filled with their right side.
+    """
     row = np.ones(7)
     for c in range(7):
         g[c] = 0.0

@@ -128,7 +128,20 @@ def _shifts(
     edge: float,
     shifts: Array,
 ) -> None:
-    """Write mean and information of each normal's shift."""
+    """Write mean and information of the shift of the part's border along each normal.
+
+    Args:
+        odds: Log odds of part against surroundings for every pixel.
+        pixels: Points of the projected outline.
+        normals: Outward unit normal of each point.
+        changes: Change of the image between neighbouring samples of each normal.
+        strength: Change that counts as an edge.
+        step: Distance of two samples, pixels.
+        count: Number of samples to either side of a point.
+        colour: Weight of the colours.
+        edge: Weight of the edges.
+        shifts: Filled with mean (pixels) and information of each point.
+    """
     sums = np.empty(2 * count + 2)
     # The part may end between any two samples, before the first or after the last.
     unknown = step * step * (len(sums) ** 2 - 1) / 12.0

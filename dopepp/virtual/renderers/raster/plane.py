@@ -222,7 +222,15 @@ def hidden_sky(
 
 @compiled()
 def _splat(points: Array, reach: float, slopes: Array, grid: Array, bits: Array) -> None:
-    """Set a direction's bit in the cells around each point's shadow in this direction."""
+    """Mark the cells of a grid on the plane that points of an object shade.
+
+    Args:
+        points: Points relative to the plane: two coordinates in it and the height, metres.
+        reach: Half-width of a point's shadow, cells.
+        slopes: Horizontal displacement of a shadow per height, by direction of light.
+        grid: Two coordinates of the first cell, and the side of a cell, metres.
+        bits: Updated bit set of shading directions in each cell.
+    """
     rows, columns = bits.shape
     for p in range(points.shape[0]):
         for k in range(slopes.shape[0]):
@@ -293,7 +301,16 @@ def _is_full(ids: Array, j: int, i: int) -> bool:
 def _light_row(
     corner: tuple[int, int], j: int, lit: _LitPlane, shades: Array, total: Array, lost: Array
 ) -> None:
-    """Sum all light on a row of the plane's pixels, and the hidden part of it."""
+    """Sum the light on one row of the plane's pixels, and the part of it that objects block.
+
+    Args:
+        corner: (column, row) of the area's first pixel.
+        j: Row in the area.
+        lit: The plane and its lights.
+        shades: Share of the sky, then of each light, that objects block at each pixel.
+        total: Filled with the light of each channel and pixel.
+        lost: Filled with the blocked light of each channel and pixel.
+    """
     to_point, normal, sky, lights, P = lit
     fv = np.float32(corner[1] + j)
     px, py = to_point[0, 1] * fv + to_point[0, 2], to_point[1, 1] * fv + to_point[1, 2]

@@ -256,7 +256,18 @@ def ambient_row(ambient: Ambient) -> Array:
 def _project_points(
     position: Array, normal: Array, bulge: Array, light: Array, P: Array, lift: Scalar, out: Array
 ) -> None:
-    """Project lifted points to u, v, 1/depth in the map; 1/depth is −1 for averted points."""
+    """Project surface points into a light's shadow map.
+
+    Args:
+        position: Points in the camera frame, (3, n), metres.
+        normal: Unit normals, (3, n).
+        bulge: Height of the smooth surface above each point's triangle, metres.
+        light: Position of the light, camera frame, metres.
+        P: Projection of the light, 3×4.
+        lift: Distance by which points are lifted along their normals, per depth from the light.
+        out: Filled with u, v and inverse depth in the map, (3, n). The inverse depth is −1 for
+            points that face away from the light.
+    """
     x0, y0, z0 = light[0], light[1], light[2]
     a, b, c, d = P[0, 0], P[0, 1], P[0, 2], P[0, 3]
     e, f, g, h = P[1, 0], P[1, 1], P[1, 2], P[1, 3]
@@ -275,7 +286,13 @@ def _project_points(
 
 @compiled(fastmath=True)
 def _compare(projected: Array, inverse_depth: Array, lit: Array) -> None:
-    """Compare projected points with the map."""
+    """Write the lit share of projected points, by comparison with the shadow map.
+
+    Args:
+        projected: u, v and inverse depth of each point, (3, n).
+        inverse_depth: Shadow map.
+        lit: Filled with the lit share of each point, from 0 to 1.
+    """
     for p in range(lit.shape[0]):
         u, v, inverse = projected[0, p], projected[1, p], projected[2, p]
         lit[p] = open_share(u, v, inverse, inverse_depth) if inverse > _ZERO else _ZERO
