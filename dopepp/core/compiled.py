@@ -44,9 +44,9 @@ _warm_ups: Final[list[str]] = []
 
 
 def compile_beside(function: str) -> None:
-    """Register a function that calls the inner loops of a later job.
+    """Register a function that a second process calls to compile the inner loops of a later job.
 
-    When this process has to compile, as on a new machine, a second process calls the function. Both
+    The second process starts when this process has to compile, as on a new machine. Both processes
     use the same cache, so that two cores share the compilation.
 
     Args:

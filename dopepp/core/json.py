@@ -127,7 +127,7 @@ def _position(text: str) -> str:
 
 
 def _depth(bare: bytes) -> int:
-    """Return the nesting depth of a text without strings."""
+    """Return the nesting depth of JSON whose strings are removed."""
     code = np.frombuffer(bare, np.uint8)
     opened = (code == ord("[")) | (code == ord("{"))
     closed = (code == ord("]")) | (code == ord("}"))
@@ -136,7 +136,7 @@ def _depth(bare: bytes) -> int:
 
 
 def _may_overflow(bare: bytes) -> bool:
-    """Return whether a text without strings may have a number beyond float64's range."""
+    """Return whether JSON without its strings may contain a number beyond float64's range."""
     code = np.frombuffer(bare, np.uint8)
     others = np.flatnonzero((code < ord("0")) | (code > ord("9")))
     runs = np.diff(others, prepend=-1, append=len(code))

@@ -268,7 +268,7 @@ def silhouette_contours(
 ) -> list[Int[np.ndarray, "points 1 2"]]:
     """Return the closed contours of a posed mesh on an image, pixels.
 
-    There are none without a mesh, or if some of the mesh is not in front of the camera.
+    The list is empty without a mesh, or if a vertex is not in front of the camera.
     """
     posed_mesh = None if shape.mesh is None else posed(shape.mesh, T_cam_obj, K)
     if posed_mesh is None or shape.mesh is None:

@@ -104,7 +104,7 @@ class TemplateEstimator(PoseEstimator):
         detectors = [TemplateDetector(part, checked, tilt) for part in parts]
         estimator = cls(detectors, checked, refine, max_ms, scale_error)
         for detector in detectors:
-            loudest = partial(_loudest, detector, checked)
+            loudest = partial(_largest_log_odds, detector, checked)
             level = silent_level(detector.part, checked, tilt, loudest)
             estimator.levels[detector.part.name] = level
         return estimator
@@ -183,8 +183,8 @@ class TemplateEstimator(PoseEstimator):
         slope, scored = self.recovery.refined_verification, []
         detectors = {detector.part.name: detector for detector in self.detectors}
         for detection in refined:
-            plainness = _plainness(detectors[detection.object], detection)
-            bias = -slope * (plainness + self.levels.get(detection.object, 0.0))
+            handicap = _silhouette_handicap(detectors[detection.object], detection)
+            bias = -slope * (handicap + self.levels.get(detection.object, 0.0))
             options = replace(self.recovery, refined_bias=bias)
             scored += recalibrated([detection], options, by_depth)
         return merge_scales([[detection] for detection in scored])
@@ -252,15 +252,15 @@ def _probability(detection: Detection) -> float:
     return detection.probability or 0.0
 
 
-def _plainness(detector: TemplateDetector, detection: Detection) -> float:
-    """Return the log odds that a pose with a small silhouette must have in addition.
+def _silhouette_handicap(detector: TemplateDetector, detection: Detection) -> float:
+    """Return the log odds that a pose needs in addition, because its silhouette is small.
 
     Small silhouettes resemble many objects: a plate seen edge-on fits every stick.
     """
     return -math.log(detector.silhouette(detection.T_cam_obj))
 
 
-def _loudest(
+def _largest_log_odds(
     detector: TemplateDetector,
     distances: tuple[float, float],
     images: Iterable[Picture],
@@ -277,7 +277,7 @@ def _loudest(
     levels = []
     for image in images:
         ends = estimator.refined(detector.detect(image, K, depths), image, K)
-        odds = [log_odds(_probability(end)) - _plainness(detector, end) for end in ends]
+        odds = [log_odds(_probability(end)) - _silhouette_handicap(detector, end) for end in ends]
         levels.append(max(odds, default=0.0))
     return levels
 

@@ -105,15 +105,23 @@ def settle(
 def _simulate(
     solids: Sequence[tuple[Piece, ...]], starts: Poses, walls: Sequence[Piece], diameter: float
 ) -> Poses | None:
-    """Simulate the fall of solids; return their poses at rest, or None if they keep moving."""
+    """Simulate the fall of solids; return their poses at rest, or None if they keep moving.
+
+    Args:
+        solids: Convex pieces of each solid.
+        starts: Initial pose of each solid, metres.
+        walls: Convex pieces that do not move.
+        diameter: Diameter of the largest solid, metres; the simulation is scaled by it.
+    """
     scale = _SIZE / diameter
     model = _model(solids, walls, scale)
     state = mujoco.MjData(model)
     for row, pose in zip(state.qpos.reshape(-1, 7), starts, strict=True):
         row[:3], row[3:] = scale * pose[:3, 3], matrix_to_quaternion(pose[:3, :3])
     ends = [scale * _hull(solid) for solid in solids]
-    before, drag = _moved(starts, ends), _DRAG
-    left = round(_LONGEST / _WINDOW)
+    # Positions of all vertices are compared after every window of simulated time.
+    positions, drag = _moved(starts, ends), _DRAG
+    windows_left = round(_LONGEST / _WINDOW)
     for _ in range(_MOST_WINDOWS):
         inertia = model.body_inertia[1:].max(axis=1)
         damping = np.stack([*[model.body_mass[1:]] * 3, *[inertia] * 3], axis=1)
@@ -122,15 +130,15 @@ def _simulate(
         mujoco.mj_forward(model, state)
         frames = zip(state.xmat[1:], state.xpos[1:], strict=True)
         poses = np.stack([make_transform(R.reshape(3, 3), position) for R, position in frames])
-        after = _moved(poses, ends)
-        motion = np.linalg.norm(after - before, axis=1).max()
+        moved = _moved(poses, ends)
+        motion = np.linalg.norm(moved - positions, axis=1).max()
         overlap = -state.contact.dist.min(initial=0.0)
         if motion < _REST * _SIZE and overlap < MOST_OVERLAP * _SIZE:
             poses[:, :3, 3] /= scale
             return poses
-        before = after
-        left -= drag == _MOST_DRAG
-        if not left:
+        positions = moved
+        windows_left -= drag == _MOST_DRAG
+        if not windows_left:
             break
         if drag > _DRAG or motion < _LANDED * _SIZE:
             drag = min(2 * drag, _MOST_DRAG)

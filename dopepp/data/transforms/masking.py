@@ -63,7 +63,7 @@ class BackgroundCrops:
     def search(self, size: Size, rng: Generator) -> Picture | None:
         """Return a random crop of (height, width) that has contrast.
 
-        If there is none, return a crop with at least two colours, or None.
+        Without such a crop, return a crop with at least two colours, or None.
         """
         free = self._is_free(size)
         if not free.any():

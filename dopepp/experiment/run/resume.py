@@ -210,7 +210,7 @@ def _listed(differences: Sequence[ConfigDifference]) -> str:
     return ", ".join(map(str, differences)) or "the number of objects"
 
 
-_LOOK_SIZE: Final = (16, 12)
+_THUMBNAIL_SIZE: Final = (16, 12)
 _MAX_LEVELS: Final = 2.0
 """Mean difference of two small pictures, in grey levels, above which they count as different."""
 _MAX_LABEL: Final = 1e-4
@@ -225,7 +225,7 @@ def describe_images(source: DescribedSource) -> dict[str, Any]:
         f"{number} {info.name}": {"images": info.num_images, **info.identity}
         for number, info in enumerate(source.describe())
     }
-    return {"sources": sources, "first_image": _look(source.sample(0, 0))}
+    return {"sources": sources, "first_image": _thumbnail(source.sample(0, 0))}
 
 
 def differing_images(stored: Mapping[str, Any], present: Mapping[str, Any]) -> list[str]:
@@ -247,9 +247,9 @@ def differing_images(stored: Mapping[str, Any], present: Mapping[str, Any]) -> l
     return lines
 
 
-def _look(sample: Sample) -> dict[str, Any]:
+def _thumbnail(sample: Sample) -> dict[str, Any]:
     """Return a small copy of a sample's image and its ground truth as plain values."""
-    box = Letterbox.fit(sample.size, _LOOK_SIZE)
+    box = Letterbox.fit(sample.size, _THUMBNAIL_SIZE)
     small = cv2.resize(sample.image, (box.width, box.height), interpolation=cv2.INTER_AREA)
     return {
         "K": sample.K.tolist(),
@@ -265,8 +265,8 @@ def _picture_difference(stored: Mapping[str, Any], present: Mapping[str, Any]) -
     if stored["size"] != present["size"]:
         return np.inf
     pictures = (
-        np.frombuffer(bytes.fromhex(look["pixels"]), np.uint8).astype(float)
-        for look in (stored, present)
+        np.frombuffer(bytes.fromhex(record["pixels"]), np.uint8).astype(float)
+        for record in (stored, present)
     )
     return float(np.abs(np.subtract(*pictures)).mean())
 

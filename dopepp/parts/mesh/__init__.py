@@ -62,7 +62,13 @@ def face_areas(vertices: Vertices, faces: Faces) -> Float[np.ndarray, " faces"]:
 def sample_surface(
     vertices: Vertices, faces: Faces, num_points: int = NUM_SURFACE_POINTS, seed: int = SURFACE_SEED
 ) -> Points:
-    """Draw points uniformly over the surface.
+    """Draw random points uniformly over the area of a mesh.
+
+    Args:
+        vertices: Vertices.
+        faces: Vertices of each triangle.
+        num_points: Number of points.
+        seed: Random seed.
 
     Raises:
         ValueError: The triangles have no area.

@@ -242,7 +242,8 @@ class _Adjustment:
         """Return the moments whose error is far above the median and above a limit, pixels."""
         errors = self._rms([moment for _, moment in self._views], len(self._moments))
         limit = max(limit_px, OUTLIER * float(np.median(errors)))
-        return [it for it, error in zip(self._moments, errors, strict=True) if error > limit]
+        pairs = zip(self._moments, errors, strict=True)
+        return [moment for moment, error in pairs if error > limit]
 
     def camera_errors_px(self) -> Float[np.ndarray, "cameras"]:
         """Return the RMS reprojection error of every camera."""

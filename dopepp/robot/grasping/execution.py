@@ -67,22 +67,26 @@ class Execution:
         mujoco.mj_step(self._cell.model, self._state, nstep=round(seconds / STEP))
 
     def run(self, plan: Plan) -> Outcome:
-        """Approach, close the fingers, lift and shake."""
-        before = self._heights()
+        """Execute a plan: approach, close the fingers, lift and shake.
+
+        Returns:
+            The outcome, with the number of the solid that is held after shaking, if any.
+        """
+        heights_before = self._heights()
         self._command = self._gripper.command(plan.opening)
         for path in (plan.approach, plan.descent):
             self.move(path)
-        here = plan.descent[-1]
+        grasp_joints = plan.descent[-1]
         for share in np.linspace(0, 1, round(CLOSING_S / STEP)):
             self._command = (1 - share) * self._gripper.command(plan.opening) + share * CLOSED
-            self._advance(here, np.zeros(JOINTS))
-        self._rest(here)
+            self._advance(grasp_joints, np.zeros(JOINTS))
+        self._rest(grasp_joints)
         for joints in chain(_timed(plan.lift), _shaken(plan.lift[-1])):
             self._advance(*joints)
         self._rest(plan.lift[-1])
-        risen = self._heights() - before
-        if len(risen) and risen.max() > HELD_HEIGHT:
-            self.outcome.held = int(risen.argmax())
+        rises = self._heights() - heights_before
+        if len(rises) and rises.max() > HELD_HEIGHT:
+            self.outcome.held = int(rises.argmax())
         return self.outcome
 
     def move(self, path: Path) -> None:

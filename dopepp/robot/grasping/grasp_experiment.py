@@ -156,18 +156,18 @@ def make_experiment(
 
 def _facts(task: GraspTask, records: Sequence[Record], seconds: float) -> dict[str, object]:
     """Return the settings and totals at the top of a report."""
-    shift = max(record.hand_eye_mm for record in records)
-    turn = max(record.hand_eye_deg for record in records)
+    worst_shift_mm = max(record.hand_eye_mm for record in records)
+    worst_turn_deg = max(record.hand_eye_deg for record in records)
     return {
         "part": task.part,
         "network": task.network and f"{task.network}, {'' if task.refine else 'not '}refined",
         "layout": task.layout,
         "pictures": task.renderer,
         "second view, first trial": next(
-            (it.second_view for it in records if it.second_view), None
+            (record.second_view for record in records if record.second_view), None
         ),
         "seed": task.seed,
-        "hand-eye, worst": f"{shift:.2f} mm, {turn:.3f}°",
+        "hand-eye, worst": f"{worst_shift_mm:.2f} mm, {worst_turn_deg:.3f}°",
         "MuJoCo": version("mujoco"),
         "seconds": round(seconds),
     }

@@ -126,7 +126,7 @@ class Record:
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What the controller saw, and where the arm ended."""
+    """Result of the controller's observation of a scene."""
 
     poses: list[Transform]  # T_base_obj of the parts, the highest first
     joints: Joints  # joints of the arm at the last picture, radians

@@ -182,7 +182,7 @@ def _refusal(info: tarfile.TarInfo, archive_size: int) -> str:
     if not 0 <= info.size <= MAX_MEMBER_BYTES:
         return f"of {info.size / 1e6:,.0f} MB"
     if info.offset_data + info.size > archive_size:
-        return "within which the archive is cut short"
+        return "which is truncated"
     return "" if key and dot else "which is not KEY.EXTENSION"
 
 

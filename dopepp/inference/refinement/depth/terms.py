@@ -121,7 +121,13 @@ def outline_terms(
 def _to_surface(
     overlay: SurfaceOverlay, in_front: Int[np.ndarray, "past"], supported: Mask
 ) -> Pulls:
-    """Return the pulls of points in front of the measured depth to the nearest supported pixel."""
+    """Pull the part's points in front of the measured depth to the nearest supported pixel.
+
+    Args:
+        overlay: Posed part on the depth.
+        in_front: Indices of points that lie in front of the measured depth.
+        supported: Pixels whose depth agrees with the part.
+    """
     if not len(in_front) or not supported.any():
         return np.empty((0, 3)), np.empty((0, 2))
     _, labels = nearest_zero((~supported).astype(np.uint8))
@@ -133,7 +139,12 @@ def _to_surface(
 
 
 def _to_pixels(overlay: SurfaceOverlay, continues: Mask) -> Pulls:
-    """Pull points of the part towards adjacent pixels that continue its surface."""
+    """Pull the part's points towards adjacent pixels that continue its surface.
+
+    Args:
+        overlay: Posed part on the depth.
+        continues: Pixels beside the part whose depth continues its surface.
+    """
     rows, columns = np.nonzero(continues)
     nearest = overlay.nearest[rows, columns]
     pulls = np.stack([columns, rows], axis=1) - overlay.pixels[nearest]

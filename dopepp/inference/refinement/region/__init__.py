@@ -180,26 +180,32 @@ def refinement(end: Solution, agreement: OutlineAgreement) -> Refinement:
 def _search(
     rounds: Sequence[Round], prior: Prior, wide_prior: Prior, starts: Starts | None
 ) -> Outcome:
-    """Descend from the given pose and, if the result is doubtful, from other starts.
+    """Descend from the given pose and, if the result is doubtful, from other start poses.
+
+    Args:
+        rounds: Rounds of optimisation, from coarse to fine.
+        prior: Distribution of the pose before the refinement.
+        wide_prior: The same pose with larger standard deviations, for the wider search.
+        starts: Returns further start poses; None for no wider search.
 
     Raises:
         UndecidedError: No descent is accepted.
     """
-    near, doubt = None, None
+    outcome, failure = None, None
     try:
-        reach = search_distance(rounds[0], prior)
-        needed, start = necessary_rounds(rounds, reach), prior.T_cam_obj
+        search_px = search_distance(rounds[0], prior)
+        needed, start = necessary_rounds(rounds, search_px), prior.T_cam_obj
         if needed[0] is not needed[-1]:  # the list may contain the last round only
-            start, needed = _coarse_end(needed[0], start, prior, reach), needed[1:]
-        near = _refine(needed, start, prior, reach)
+            start, needed = _coarse_end(needed[0], start, prior, search_px), needed[1:]
+        outcome = _refine(needed, start, prior, search_px)
     except UndecidedError as undecided:
-        doubt = undecided
-    if starts is not None and (near is None or near[1].share < SURE):
-        near = _search_far(rounds, prior, wide_prior, starts(), near) or near
-    if near is None:
-        assert doubt is not None
-        raise doubt
-    return near
+        failure = undecided
+    if starts is not None and (outcome is None or outcome[1].share < SURE):
+        outcome = _search_far(rounds, prior, wide_prior, starts(), outcome) or outcome
+    if outcome is None:
+        assert failure is not None
+        raise failure
+    return outcome
 
 
 def _search_far(
@@ -207,33 +213,40 @@ def _search_far(
     prior: Prior,
     wide_prior: Prior,
     starts: Sequence[Transform],
-    near: Outcome | None,
+    nearby: Outcome | None,
 ) -> Outcome | None:
-    """Descend from the most likely starts; return the result that agrees best.
+    """Descend from the most likely start poses; return the result that agrees best with the image.
+
+    Args:
+        rounds: Rounds of optimisation, from coarse to fine.
+        prior: Distribution of the pose before the refinement.
+        wide_prior: The same pose with larger standard deviations.
+        starts: Further start poses; random poses from the wide prior are added.
+        nearby: Result of the search near the given pose, if any.
 
     Returns:
-        None if no result agrees well, or if none has more support than ``near``, or than the given
-        pose if ``near`` is None.
+        The result, or None if no result agrees well and has more support than ``nearby`` (without
+        ``nearby``: than the given pose).
     """
     best: Outcome | None = None
     given, first, last = prior.T_cam_obj, rounds[0], rounds[-1]
     with contextlib.suppress(UndecidedError):
-        reach = search_distance(first, wide_prior)
-        if near is None:
-            last.learn(given, reach)
-        before = last.agreement(given, reach) if near is None else near[1]
-        least_support = max(SUPPORTED, before.support + MORE)
-        first.learn(given, reach)
-        others = [*starts, *wide_prior.draws(1 / FAR, NUM_DRAWS)]
-        others.sort(key=lambda start: -first.log_likelihood(start, wide_prior))
-        for start in (given, *others[:NUM_STARTS]):
+        search_px = search_distance(first, wide_prior)
+        if nearby is None:
+            last.learn(given, search_px)
+        former_agreement = last.agreement(given, search_px) if nearby is None else nearby[1]
+        least_support = max(SUPPORTED, former_agreement.support + MORE)
+        first.learn(given, search_px)
+        further_starts = [*starts, *wide_prior.draws(1 / FAR, NUM_DRAWS)]
+        further_starts.sort(key=lambda start: -first.log_likelihood(start, wide_prior))
+        for start in (given, *further_starts[:NUM_STARTS]):
             with contextlib.suppress(UndecidedError):
-                coarse = _coarse_end(first, start, wide_prior, reach)
-                end, _ = _refine(rounds[1:], coarse, wide_prior, reach)
+                coarse = _coarse_end(first, start, wide_prior, search_px)
+                end, _ = _refine(rounds[1:], coarse, wide_prior, search_px)
                 # The strongest prior under which this end is not surprising.
-                surprise = max(1.0, prior.squared_distance(end.T_cam_obj) / 6)
-                admitting = Prior(given, prior.information / surprise)
-                outcome = _refine([last], end.T_cam_obj, admitting, reach)
+                factor = max(1.0, prior.squared_distance(end.T_cam_obj) / 6)
+                weakened_prior = Prior(given, prior.information / factor)
+                outcome = _refine([last], end.T_cam_obj, weakened_prior, search_px)
                 least = SURE if best is None else best[1].share
                 if outcome[1].share >= least and outcome[1].support >= least_support:
                     best = outcome
@@ -243,14 +256,26 @@ def _search_far(
 
 
 def _coarse_end(coarse: Round, start: Transform, prior: Prior, reach: float) -> Transform:
-    """Return the end of the coarse round, which has a weaker prior."""
+    """Return the pose after the coarse round, in which the prior is weaker.
+
+    Args:
+        coarse: The coarse round.
+        start: Start pose.
+        prior: Distribution of the pose before the refinement.
+        reach: Search distance, pixels of the image.
+    """
     coarse.learn(start, reach)
     weaker = Prior(prior.T_cam_obj, prior.information / WIDENED**2)
     return coarse.descend(start, weaker, reach).T_cam_obj
 
 
 def necessary_rounds(rounds: Sequence[Round], reach: float) -> Sequence[Round]:
-    """Drop the rounds that search farther than necessary; a tracked part needs only the last."""
+    """Drop the rounds that search farther than necessary; a tracked part needs only the last round.
+
+    Args:
+        rounds: Rounds of optimisation, from coarse to fine.
+        reach: Search distance, pixels of the image.
+    """
     while len(rounds) > 1 and rounds[1].farthest(reach) >= ENOUGH * reach:
         rounds = rounds[1:]
     if len(rounds) == 1 and rounds[0].farthest(reach) < reach:
@@ -262,6 +287,12 @@ def necessary_rounds(rounds: Sequence[Round], reach: float) -> Sequence[Round]:
 def _refine(rounds: Sequence[Round], start: Transform, prior: Prior, reach: float) -> Outcome:
     """Descend in one round after the other, and check the result.
 
+    Args:
+        rounds: Rounds of optimisation, from coarse to fine.
+        start: Start pose.
+        prior: Distribution of the pose before the refinement.
+        reach: Search distance, pixels of the image.
+
     Raises:
         UndecidedError: The result is not accepted.
     """
@@ -270,7 +301,7 @@ def _refine(rounds: Sequence[Round], start: Transform, prior: Prior, reach: floa
 
 
 def _descend(rounds: Sequence[Round], start: Transform, prior: Prior, reach: float) -> Solution:
-    """Descend in one round after the other."""
+    """Descend in one round after the other; see :func:`_refine` for the arguments."""
     end = Solution(start, prior.information)
     for stage in rounds:
         stage.learn(end.T_cam_obj, reach)
