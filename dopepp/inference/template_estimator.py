@@ -286,7 +286,7 @@ def _checked_distances(distances: object) -> tuple[float, float]:
     """Return a working distance after checking it.
 
     Raises:
-        UserError: The working distance is missing, or no range of metres.
+        UserError: The working distance is missing, or is not a range of metres.
     """
     if distances is None:
         raise UserError(

@@ -228,7 +228,16 @@ def _resampled_difference(
 def _stretching(
     effects: Float[np.ndarray, "seeds"], draws: Draws, confidence: float
 ) -> Float[np.ndarray, "resamples"]:
-    """Return the correction of each resample for the small number of seeds."""
+    """Return a term that widens the bootstrap distribution, because few seeds vary too little.
+
+    The term moves each resample away from the mean, so that the interval gets the width that
+    Student's t gives for this number of seeds.
+
+    Args:
+        effects: Difference between the methods for each seed.
+        draws: Weight of each seed in each resample.
+        confidence: Level of the interval.
+    """
     num = len(effects)
     if num == 1:
         return np.zeros(len(draws))

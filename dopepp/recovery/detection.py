@@ -55,7 +55,7 @@ _CERTAIN: Final = 1e-3  # Beliefs within this distance of 0 or 1 are treated ali
 _EXPONENTS: Final = 4.0  # Logarithms are clipped beyond this, so that outliers do not dominate
 _TYPICAL_MISFIT: Final = 0.01  # Average reprojection error over the size in the image
 _RIDGE: Final = 0.1  # Weight of the squared weights, in detections, which keeps them finite
-_USUAL_RIDGE: Final = 1.0  # ridge weight around ``usual`` weights
+_DEFAULTS_RIDGE: Final = 1.0  # Weight of the squared distance from default weights, in detections
 _STEPS: Final = 50  # Maximum number of Newton steps
 _MEAN_BELIEF: Final = tuple(float(name == "belief") for name in FEATURES)
 _VERIFIED: Final = 1e-4  # least distance of a verified probability from 0 and 1
@@ -376,7 +376,7 @@ def fit_weights(
 
     Args:
         features: Features of the detections.
-        correct: Whether each pose is right; a detection without an instance is not.
+        correct: Whether each pose is right; False for a detection without an instance.
         defaults: Weights toward which the ridge penalty pulls (default: 0).
 
     Raises:
@@ -390,7 +390,7 @@ def fit_weights(
         ridge = _RIDGE * np.eye(len(defaults))
         ridge[0, 0] = 0.0  # the share of right detections is well determined
     else:
-        ridge = _USUAL_RIDGE * np.eye(len(defaults))
+        ridge = _DEFAULTS_RIDGE * np.eye(len(defaults))
     weights = defaults.copy()
     for _ in range(_STEPS):
         predicted = score(features, weights)

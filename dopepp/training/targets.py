@@ -148,9 +148,9 @@ class SymmetryHandling:
 
         Instances of parts without symmetries keep exactly their labelled keypoints.
         """
-        poses, excess = self._poses(batch)
-        order = excess.argsort(dim=-1, stable=True)
-        nearest = excess.gather(-1, order)
+        poses, angles = self._poses(batch)  # angles to the reference orientation
+        order = angles.argsort(dim=-1, stable=True)
+        nearest = angles.gather(-1, order)
         poses = poses.gather(2, order[..., None, None].expand_as(poses))
         index = batch.object_index.clamp(min=0)
         tables = self._on(batch.T_cam_obj.device)

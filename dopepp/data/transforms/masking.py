@@ -162,10 +162,10 @@ class RandomMask(Checked):
         ]
         crops = BackgroundCrops(sample.image, silhouettes, self.min_contrast, self.max_draws)
         image, covered = sample.image.copy(), np.zeros(sample.image.shape[:2], bool)
-        for seen in silhouettes:
-            if rng.random() >= self.probability or not seen.any():
+        for object_mask in silhouettes:
+            if rng.random() >= self.probability or not object_mask.any():
                 continue
-            patch = self._patch(seen, rng)
+            patch = self._patch(object_mask, rng)
             if patch is None:
                 continue
             height, width = (side.stop - side.start for side in patch)

@@ -71,10 +71,10 @@ def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> lis
     covers = []
     for number, (instance, rng) in enumerate(zip(sample.instances, rngs, strict=True)):
         if _can_be_shaded(instance):
-            seen, others = silhouettes[number], np.zeros(shape, bool)
+            own, others = silhouettes[number], np.zeros(shape, bool)
             for other in silhouettes[:number] + silhouettes[number + 1 :]:
                 others |= other
-            covers.append(_Cover(seen, others & ~seen, crops, largest, rng))
+            covers.append(_Cover(own, others & ~own, crops, largest, rng))
     return [_shaded(sample, silhouettes, covers, share) for share in shares]
 
 
@@ -86,12 +86,19 @@ def _can_be_shaded(instance: Instance) -> bool:
 def _shaded(
     sample: Sample, silhouettes: Sequence[Mask], covers: Sequence[_Cover], share: float
 ) -> Shaded:
-    """Cover a share of each object."""
+    """Cover a share of each object with its patches, and update the instances and the depth.
+
+    Args:
+        sample: The image without shading.
+        silhouettes: Silhouette of each instance.
+        covers: Patches of the instances that can be shaded.
+        share: Share of each object's visible pixels to cover.
+    """
     image, covered = sample.image.copy(), np.zeros(sample.image.shape[:2], bool)
     for cover in covers:
-        laid = cover.laid(share)
-        image[cover.box][laid] = cover.pixels[laid]
-        covered[cover.box] |= laid
+        is_patch = cover.laid(share)
+        image[cover.box][is_patch] = cover.pixels[is_patch]
+        covered[cover.box] |= is_patch
     instances = covered_instances(sample.instances, silhouettes, covered)
     depth = None if sample.depth is None else np.where(covered, np.float32(0), sample.depth)
     return Shaded(

@@ -241,10 +241,10 @@ def share_in_words(data: DataConfig) -> str | None:
         return None
     folder = data.image_sets["test"]
     sharing = [name for name in ("train", "val") if data.image_sets[name] == folder]
-    all_of_it = " ".join(f"data.image_sets.{name}=none" for name in sharing)
+    overrides = " ".join(f"data.image_sets.{name}=none" for name in sharing)
     return (
         f"measuring the last {last - first:.0%} of the images in {folder}, which "
-        f"is shared with {' and '.join(sharing)}; {all_of_it} measures the whole folder "
+        f"is shared with {' and '.join(sharing)}; {overrides} measures the whole folder "
         "with its training images, and data.image_sets.test=FOLDER another folder"
     )
 

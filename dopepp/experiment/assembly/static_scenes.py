@@ -62,7 +62,10 @@ class StaticScenes:
         return replace(first, others=others)
 
     def _beside(self, index: int) -> Sequence[int]:
-        """Return the indices of further pictures of an image's scene."""
+        """Return the indices of further pictures of an image's scene.
+
+        The optical axis of each camera is about ``ANGLE_DEG`` from the nearest axis chosen before.
+        """
         scene = self._reader.image_ids[index][0]
         left, chosen = [number for number in self._scenes[scene] if number != index], [index]
         axes = {number: self._T_world_cam[number][:3, 2] for number in self._scenes[scene]}

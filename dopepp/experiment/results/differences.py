@@ -242,7 +242,13 @@ def notes(entries: Sequence[Entry], table: pd.DataFrame) -> list[str]:
 def _baseline_notes(
     baseline: Entry, others: Sequence[Entry], doubts: Sequence[str]
 ) -> Iterator[str]:
-    """Yield sentences about the baseline, the intervals and the methods without Δ."""
+    """Yield sentences about the baseline, the intervals and the methods without Δ.
+
+    Args:
+        baseline: Baseline of Δ.
+        others: The other methods.
+        doubts: Sentences about differences that may be chance.
+    """
     alike = [entry for entry in others if comparable(entry, baseline)]
     if alike:
         yield _interval_note(baseline, alike)

@@ -256,7 +256,15 @@ def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
 def _pose_row(
     layout: PaperTable, method: str, name: str, texts: Row, printed: Mapping[str, float]
 ) -> Row:
-    """Return a row with the text, the paper's figure and the Δ of every measure."""
+    """Return a table row with every measure, the paper's figure for it, and Δ to the baseline.
+
+    Args:
+        layout: Layout of the paper's table.
+        method: The method.
+        name: Name of the object.
+        texts: Text of each measure and Δ, by field.
+        printed: Figures that the paper prints, by key of the layout.
+    """
     row = {_METHOD: method, _OBJECT: name}
     for key in ("pass", "auc_10cm", _STRICT, "median_rotation_deg"):
         measure = layout.field(key)

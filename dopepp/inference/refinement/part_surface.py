@@ -178,7 +178,17 @@ class SurfaceOverlay:
 def lay_over(
     view: DepthView, surface: SurfacePoints, is_visible: Visible, T_cam_obj: Transform
 ) -> SurfaceOverlay | None:
-    """Compare every pixel with a posed part's nearest visible point; None if none is in view."""
+    """Compare every pixel of a depth view with the posed part's nearest visible point.
+
+    Args:
+        view: Crop of a depth image.
+        surface: Points on the part's surface.
+        is_visible: Which points the part itself does not hide.
+        T_cam_obj: Pose of the part.
+
+    Returns:
+        The comparison, or None if no visible point lies in the view.
+    """
     points = surface.points[is_visible] @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
     normals = surface.normals[is_visible] @ T_cam_obj[:3, :3].T
     exact = points[:, :2] / points[:, 2:] * view.K.diagonal()[:2] + view.K[:2, 2]

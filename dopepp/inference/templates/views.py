@@ -135,7 +135,7 @@ def joined(groups: Sequence[Templates]) -> Templates:
 def _neighbours(
     rotations: Rotations,
 ) -> tuple[Int[np.ndarray, "views neighbours"], Float[np.ndarray, "views neighbours"]]:
-    """Return neighbours and twists of each view; see :class:`Templates`."""
+    """Return the neighbouring views of each view, and the turns that align them with the view."""
     directions = rotations[:, 2]
     count = min(NUM_NEIGHBOURS, len(rotations) - 1)
     nearest = np.argsort(-directions @ directions.T, axis=1)[:, 1 : count + 1]

@@ -206,7 +206,7 @@ def average_precision(
 
     Args:
         scores: Score of each prediction.
-        correct: Whether each prediction is correct; duplicates are not.
+        correct: Whether each prediction is correct; False for duplicates.
         num_instances: Number of ground-truth instances.
 
     Returns:

@@ -39,7 +39,15 @@ _CHUNK_POINTS: Final = 1 << 17
 def add(
     R_est: Rotations, t_est: Positions, R_gt: Rotations, t_gt: Positions, points: Points
 ) -> Errors:
-    """Return the mean distance between corresponding points at both poses (ADD), metres."""
+    """Return the mean distance between corresponding points at both poses (ADD), metres.
+
+    Args:
+        R_est: Estimated rotations.
+        t_est: Estimated translations, metres.
+        R_gt: True rotations.
+        t_gt: True translations, metres.
+        points: ADD points of the object, metres.
+    """
     R_est, t_est, R_gt, t_gt, points = _checked(R_est, t_est, R_gt, t_gt, points)
     # (R_est − R_gt)·x + (t_est − t_gt) needs a single matrix product.
     rotation, translation = R_est - R_gt, t_est - t_gt
@@ -54,7 +62,10 @@ def add(
 def add_s(
     R_est: Rotations, t_est: Positions, R_gt: Rotations, t_gt: Positions, points: Points
 ) -> Errors:
-    """Return the mean distance from true points to the nearest ESTIMATED points (ADD-S), metres."""
+    """Return the mean distance from true points to the nearest estimated points (ADD-S), metres.
+
+    The arguments are those of :func:`add`.
+    """
     R_est, t_est, R_gt, t_gt, points = _checked(R_est, t_est, R_gt, t_gt, points)
     valid = _all_finite(R_est, t_est, R_gt, t_gt)
     poses = (tensor[valid].cpu().numpy() for tensor in (R_est, R_gt, t_gt - t_est))

@@ -148,7 +148,7 @@ def _read_points(path: Path) -> Points:
     """Read a file of points.
 
     Raises:
-        UserError: The file is missing, too large or no table of three columns.
+        UserError: The file is missing or too large, or is not a table of three columns.
     """
     allowed = "lines of three finite numbers"
     try:

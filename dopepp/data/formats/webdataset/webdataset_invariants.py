@@ -62,7 +62,7 @@ def check_webdataset(report: CheckReport) -> None:
 
 
 def _content(report: CheckReport, path: Path, group: Iterator[shards.TarMember]) -> Content:
-    """Read an image's members up to the limit."""
+    """Read the members of an image, up to the size limit of an image."""
     content: Content = {}
     total = 0
     for _, extension, *span in group:

@@ -102,7 +102,19 @@ def _group(
     offsets: Array,
     groups: tuple[Array, ...],
 ) -> int:
-    """Group the samples of every pixel by patch and return the number of groups."""
+    """Group the samples of every pixel by smooth patch.
+
+    Args:
+        window: Part of the image: left, top, right, bottom.
+        samples: Sample buffers of the window.
+        first_id: Number of the object's first triangle.
+        patches: Smooth patch of each triangle.
+        offsets: Offset of each sample in a pixel.
+        groups: Filled with pixel, weight, triangle, x, y and inverse depth of each group.
+
+    Returns:
+        The number of groups.
+    """
     origin, inverse_depth, ids = samples
     pixel, weight, triangle, x, y, depth = groups
     num_faces = patches.shape[0]
@@ -155,9 +167,16 @@ def _group(
 def _interpolate(
     fragments: Fragments, hom: Array, mesh: Mesh, rotation: Array, inverse_K: Array
 ) -> None:
-    """Write corner weights, positions, normals and bulges; complement back faces.
+    """Write the corner weights, position, normal and bulge of every fragment.
 
-    ``mesh`` holds vertices, faces and corner normals.
+    Triangles that are seen from behind are marked by the bitwise complement of their number.
+
+    Args:
+        fragments: Fragments of an object, updated in place.
+        hom: Homogeneous pixels of the vertices.
+        mesh: Vertices, faces and corner normals.
+        rotation: Rotation from the object to the camera frame.
+        inverse_K: Inverse camera matrix.
     """
     vertices, faces, normals = mesh
     triangle, share = fragments.face, fragments.share
