@@ -238,8 +238,8 @@ def _part_record(part: Part) -> dict[str, Any]:
     """Describe a part by its name, size and hashes of shape and appearance."""
     mesh = part.mesh
     appearance = hashlib.sha256()
-    looks = () if mesh is None else (mesh.uv, mesh.texture, mesh.colours, mesh.normals)
-    for array in looks:
+    arrays = () if mesh is None else (mesh.uv, mesh.texture, mesh.colours, mesh.normals)
+    for array in arrays:
         if array is not None:
             appearance.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
     return {

@@ -162,6 +162,17 @@ def normal_equations(
     The derivatives of a ray (u, v) = (X, Y)/Z by x_cam are [1, 0, −u]/Z and [0, 1, −v]/Z. Since
     d(Exp(ω) p)/dω = −[p]×, a row a becomes −a [p]× = p × a with p = R x_obj. The weights are the
     derivative of r²/(r² + g²) by r², times g². Points behind the camera are ignored.
+
+    Args:
+        object_points: Points in the object frame, (n, 3).
+        rays: Measured ray (x/z, y/z) of each point.
+        whitening: Whitening of each ray, (n, 2, 2).
+        R: Rotation of the pose.
+        t: Translation of the pose.
+        residuals: Whitened reprojection error of each point.
+        gate: Scale g of the cost, standard deviations.
+        hessian: Filled with JᵀJ, (6, 6).
+        gradient: Filled with Jᵀr.
     """
     for c in range(6):
         gradient[c] = 0.0
@@ -234,7 +245,13 @@ def solve_inside(
 
 @compiled()
 def turn(step: Array, R: Array, out: Array) -> None:
-    """Write Exp(ω) R for the rotation vector ω in the first three numbers of a step."""
+    """Write Exp(ω) R for the rotation vector ω in the first three numbers of a step.
+
+    Args:
+        step: The step: ω, and possibly further numbers, which are ignored.
+        R: Rotation matrix.
+        out: Filled with the turned rotation matrix.
+    """
     x, y, z = step[0], step[1], step[2]
     angle = math.sqrt(x * x + y * y + z * z)
     a, b = 1.0, 0.5

@@ -116,7 +116,7 @@ def nearest_rotation(matrices: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndar
 
 
 def is_rigid(T: Float[np.ndarray, "4 4"]) -> bool:
-    """Return whether a matrix is 4×4 and finite: a rotation, a shift and the row 0, 0, 0, 1."""
+    """Return whether a matrix is a finite 4×4 rigid transform, with the last row 0, 0, 0, 1."""
     return (
         T.shape == (4, 4)
         and bool(np.isfinite(T).all())

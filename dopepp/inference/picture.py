@@ -327,6 +327,11 @@ def _scales(seen: Seen, reach: float, depths: tuple[float, float]) -> Sequence[f
     """Return the smallest set of scales at which a part has a trained size at all depths.
 
     Each scale shows the part in the middle size at the middle depth of its range.
+
+    Args:
+        seen: Sizes of the part in the training images.
+        reach: Length of the part's image at a depth of one metre, pixels.
+        depths: Least and greatest depth of the part, metres.
     """
     near, far = depths
     learned = math.log(MARGIN**2 * seen.largest_px / seen.smallest_px)

@@ -371,7 +371,16 @@ def _system(
 
 @compiled()
 def _mode(window: Array, theta: Array) -> tuple[float, float, bool]:
-    """Return the fit's maximum and True, or the centre of the highest cells and False."""
+    """Find the maximum of a peak.
+
+    Args:
+        window: Cells around the peak, odd side length.
+        theta: Coefficients of (1, x, y, −x², −xy, −y²) of the fitted logarithm.
+
+    Returns:
+        x and y from the middle of the window, cells, and whether the fit determines them. Otherwise
+        they are the centre of the highest cells.
+    """
     half = len(window) // 2
     across, down, count = 0.0, 0.0, 0
     for v in range(-2, 3):

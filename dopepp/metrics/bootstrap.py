@@ -209,7 +209,15 @@ def _resampled_difference(
     draws: Sequence[Draws],
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "resamples"]:
-    """Return the difference in each resample, averaged over objects."""
+    """Return the difference between the methods' figures in each resample, averaged over objects.
+
+    Args:
+        mine: Numbers of the method, by object: (seeds, instances).
+        baseline: Numbers of the baseline.
+        compute: Returns the figure of resampled instances.
+        draws: Weight of each seed in each resample, for both methods.
+        rng: Random numbers, which draw the instances.
+    """
     total = np.zeros(len(draws[0]))
     for ours, theirs in zip(mine, baseline, strict=True):
         count = ours.shape[1]

@@ -194,7 +194,19 @@ def make_detection(
     name: str,
     options: RecoveryOptions,
 ) -> Detection | None:
-    """Return the calibrated detection of a keypoint group; None if PnP found no pose."""
+    """Make the detection of a keypoint group from its pose.
+
+    Args:
+        group: The keypoints of one instance.
+        result: The pose from PnP.
+        cuboid: Keypoints of the part, metres.
+        K: Camera matrix, pixels.
+        name: Name of the part.
+        options: Calibration of distance, covariance and score.
+
+    Returns:
+        The calibrated detection; None if PnP found no pose.
+    """
     if result.T_cam_obj is None or result.covariance is None:
         return None
     belief = float(np.where(result.inliers, group.score, 0.0).clip(0.0, 1.0).mean())

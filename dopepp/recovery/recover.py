@@ -211,7 +211,16 @@ def _rejected(
     cells: tuple[int, int],
     stride: int,
 ) -> tuple[Kind, float, str]:
-    """Return the kind, value and text of the reason that rejected a candidate."""
+    """Return kind, value and text of the reason that rejected a candidate.
+
+    Args:
+        group: The candidate's keypoints.
+        result: Its pose from PnP.
+        detection: Its detection; None without a pose.
+        options: Thresholds of the recovery.
+        cells: Size of the maps, cells.
+        stride: Input pixels per cell.
+    """
     kind: Kind = "pose"
     best, text, points = float(np.nan_to_num(group.score[CENTROID])), result.reason, group.position
     if detection is not None:

@@ -230,7 +230,20 @@ class HeightMap:
 def _greatest(
     x: Column, y: Column, values: Column, surface: Surface, faces: Faces, corner: Cell, shape: Shape
 ) -> Float32[np.ndarray, "rows columns"]:
-    """Return 1 + the greatest value at every cell's centre, 0 outside the object."""
+    """Draw triangles into a height map with the greatest value at every cell.
+
+    Args:
+        x: Column of each vertex.
+        y: Row of each vertex.
+        values: Value of each vertex, in [0, 1].
+        surface: The surface, which may be closed.
+        faces: Vertices of each triangle to draw.
+        corner: (column, row) of the map's first cell.
+        shape: Number of rows and columns.
+
+    Returns:
+        1 + the greatest value at every cell's centre; 0 outside the object.
+    """
     # The rasteriser keeps the greatest 1/z and interpolates it linearly over the image. A vertex at
     # column x and row y with z = 1/(1 + value) therefore maps any linear value in [0, 1].
     z = 1.0 / (1.0 + values)

@@ -136,9 +136,9 @@ class ViewsMethod(EstimatorMethod):
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
         """Run the estimator on all pictures and return the candidates of measured objects."""
         pictures = [sample, *sample.others]
-        poses = [it.T_world_cam for it in pictures if it.T_world_cam is not None]
-        depths = [it.depth for it in pictures if it.depth is not None]
-        images, cameras = [it.image for it in pictures], [it.K for it in pictures]
+        poses = [view.T_world_cam for view in pictures if view.T_world_cam is not None]
+        depths = [view.depth for view in pictures if view.depth is not None]
+        images, cameras = [view.image for view in pictures], [view.K for view in pictures]
         start = time.perf_counter()
         result = self.estimator.predict_views(
             images, cameras, poses, depths if len(depths) == len(pictures) else None

@@ -379,9 +379,14 @@ def _refined_threshold(
 ) -> float:
     """Return the threshold of refined poses.
 
-    It is the threshold that satisfies the rate of false positives (``silent``), but it rejects at
-    most the share :data:`MOST_LOST` of the correct poses and is at least
-    :data:`LEAST_REFINED_SCORE`. Otherwise a single frame with a high score could cost most poses.
+    The threshold for the rate of false positives (``silent``) applies if it rejects at most the
+    share :data:`MOST_LOST` of the correct poses, because otherwise a single frame with a high score
+    could cost most poses. The threshold is at least :data:`LEAST_REFINED_SCORE`.
+
+    Args:
+        silent: Threshold that satisfies the rate of false positives.
+        shown: Features of the poses on images with the objects, and which poses are correct.
+        weights: Weights of the features in the score.
     """
     correct = score(shown.features, weights)[shown.correct]
     most = float(np.quantile(correct, MOST_LOST)) if len(correct) else 1.0

@@ -324,6 +324,11 @@ def open_study(options: Mapping[str, Any], facts: Mapping[str, str], seed: int) 
 def _check_same(stored: Mapping[str, str], now: Mapping[str, str], study: str) -> None:
     """Check that the trials of a study can be compared.
 
+    Args:
+        stored: Fixed options of the study's first command.
+        now: Fixed options of this command.
+        study: Name of the study.
+
     Raises:
         UserError: The configurations differ in more than the searched options.
     """

@@ -213,7 +213,13 @@ def _count(
 
 @compiled()
 def _tables(counts: Array, tables: Array) -> None:
-    """Write the log odds of part against surroundings per tile and colour; blurs ``counts``."""
+    """Write the log odds of part against surroundings per tile and colour.
+
+    Args:
+        counts: Histograms of the part and of its surroundings per tile, shape (2, tiles, tiles,
+            colours); blurred in place.
+        tables: Filled with the log odds, shape (tiles, tiles, colours).
+    """
     tiles = counts.shape[1]
     total, near = np.empty((2, STEPS**3), np.float32), np.empty((2, STEPS**3), np.float32)
     for side in range(2):

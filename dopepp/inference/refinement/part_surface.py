@@ -233,10 +233,19 @@ def _hide(
     spacing: float,
     is_visible: Array,
 ) -> None:
-    """Write which points are visible: those that fewer than two discs hide.
+    """Write which points are visible: points that fewer than two discs around other points hide.
 
-    Points are sorted into a grid over the image: ``keys`` are the column and row of each point's
-    cell, ``order`` the points by cell, and ``starts`` the index of each cell's first point.
+    Args:
+        points: Points of the posed part, camera frame, metres.
+        normals: Normals of the points, camera frame.
+        rays: Ray (x/z, y/z) of each point.
+        keys: Column and row of each point's cell in a grid over the image.
+        order: Indices of the points, sorted by cell.
+        starts: Position in ``order`` of each cell's first point.
+        columns: Number of columns of the grid.
+        rows: Number of rows of the grid.
+        spacing: Distance between neighbouring points, metres.
+        is_visible: Filled with whether each point is visible.
     """
     clearance, reach = CLEARANCE * spacing, DISC * spacing
     for i in range(points.shape[0]):

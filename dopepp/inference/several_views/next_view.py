@@ -126,7 +126,16 @@ def _information(
     prior: PoseMatrix,
     scale_error: float,
 ) -> PoseMatrix | None:
-    """Return the information of a part's outline; None if the picture does not show all of it."""
+    """Return the information an image of the outline would add; None if the part is cut off.
+
+    Args:
+        mesh: Mesh of the part.
+        T_cam_obj: Pose of the part in the camera.
+        K: Camera matrix, pixels.
+        size: (width, height) of the image.
+        prior: Information about the pose before the image.
+        scale_error: Largest relative error of the part's size or of the focal length.
+    """
     posed_mesh = posed(mesh, T_cam_obj, K)
     if posed_mesh is None:
         return None

@@ -280,7 +280,19 @@ def _describe(
     poses: Array,
     features: Array,
 ) -> None:
-    """Write the features that depend on the image at each pose."""
+    """Write the features of each match that depend on the image.
+
+    Args:
+        maps: Edge responses by orientation, row and column.
+        image: RGB.
+        points: Edge points of each view, diameters.
+        normals: Direction of each point's normal, radians.
+        is_outline: Whether each point is on the outline.
+        inner: Points of each view inside the outline, diameters.
+        views: View of each match.
+        poses: Column, row, turn and projected diameter of each match.
+        features: Filled with the features.
+    """
     bins, height, width = maps.shape
     mean, colours = np.zeros(3), np.zeros((inner.shape[1], 3))
     for i in range(len(views)):

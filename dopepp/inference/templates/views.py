@@ -153,7 +153,20 @@ def _drawn(
     K: CameraMatrix,
     size: tuple[int, int],
 ) -> tuple[Float[np.ndarray, "points 5"], Float[np.ndarray, "inner 2"]]:
-    """Return pixel, normal and kind (1: outline, 0: crease) of edge points, and inner pixels."""
+    """Draw a part from one direction, and choose points of the drawing.
+
+    Args:
+        mesh: Mesh of the part.
+        edges: Creases of the mesh.
+        centre: Centre of the part, object frame, metres.
+        distance: Distance of the centre from the camera, metres.
+        R: Rotation from the object to the camera frame.
+        K: Camera matrix of the drawing, pixels.
+        size: (width, height) of the drawing.
+
+    Returns:
+        Pixel, normal and kind (1: outline, 0: crease) of edge points, and the pixels inside.
+    """
     posed_mesh = posed(mesh, make_transform(R, np.array([0.0, 0.0, distance]) - R @ centre), K)
     assert posed_mesh is not None  # the whole part is in front of the camera
     ids = edges.drawn(posed_mesh, size)

@@ -101,7 +101,13 @@ def _bake_mesh(vertices: Array, faces: Array, normals: Array, closed: bool) -> O
 
 
 def _is_convex(corners: Array, flat: Array, closed: bool) -> bool:
-    """Return whether all corners lie behind every face's plane, or on it for an open mesh."""
+    """Return whether all corners lie behind every face's plane, or on it for an open mesh.
+
+    Args:
+        corners: Corners of the triangles, shape (F, 3, 3).
+        flat: Unit normals of the triangles, shape (F, 3).
+        closed: Whether the mesh is closed.
+    """
     points = corners.reshape(-1, 3)
     slack = 1e-4 * float(np.ptp(points, axis=0).max())
     heights = points @ flat.T - (corners[:, 0] * flat).sum(axis=1)

@@ -120,7 +120,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
             try:
                 text = content.decode("utf-8-sig" if number == 1 else "ascii").strip()
             except UnicodeDecodeError as error:
-                raise _bad(f"{path}: line {number}, which is no ASCII text", allowed) from error
+                raise _bad(f"{path}: line {number}, which is not ASCII text", allowed) from error
             is_header = number == 1 and [f.strip() for f in text.split(",")] == list(FIELDS)
             if text and not is_header:
                 yield number, text

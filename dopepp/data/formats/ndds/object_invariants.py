@@ -278,7 +278,17 @@ class ObjectCheck:
         seen: Box | None,
         fraction: float | None,
     ) -> None:
-        """Compare projections and visible pixels with the cuboid (if any) or each other."""
+        """Compare the annotated projections and the visible pixels with the cuboid.
+
+        Without a cuboid, projections and visible pixels are compared with each other.
+
+        Args:
+            axes: Rotation from the file's camera axes into OpenCV's.
+            K: Camera matrix, pixels.
+            shape: (height, width) of the image.
+            seen: Box of the visible pixels.
+            fraction: Visible fraction.
+        """
         if self._cuboid is not None:
             points = self._cuboid @ axes.T
             self._check_projections(points, K)

@@ -112,7 +112,15 @@ class _FrameCheck:
     def _check_pose(
         self, node: Node, meta: FrameMeta, index: int, K: CameraMatrix | None, seen: Box | None
     ) -> None:
-        """Check the class and the pose of an object in a frame."""
+        """Check the class and the pose of an object in a frame.
+
+        Args:
+            node: Node of the frame's ``meta.mat``.
+            meta: Content of this file.
+            index: Class index of the object.
+            K: Camera matrix, pixels.
+            seen: Box of the object's visible pixels.
+        """
         column, T_cam_obj = meta.columns[index], meta.poses[index]
         if not 1 <= index <= len(self._classes):
             allowed = f"1 … {len(self._classes)}, the lines of classes.txt"

@@ -81,10 +81,18 @@ def region_terms(
 def _eliminate_scale(
     H: Array, g: Array, prior_H: Array, prior_g: Array, position: Array, limit: float
 ) -> None:
-    """Eliminate a bounded error of the scale, in place.
+    """Eliminate a bounded error of the scale from the normal equations, in place.
 
     The pose moves to the minimum of prior and outline under the bound. The information is that
     under a normal error of the same variance, so that the covariance contains the error.
+
+    Args:
+        H: Matrix of the outline's normal equations.
+        g: Right side of the outline's normal equations.
+        prior_H: Information of the prior.
+        prior_g: Right side of the prior's normal equations.
+        position: Position of the part in the camera frame, metres.
+        limit: Largest relative error of the scale.
     """
     both, target, column = np.empty((6, 6)), np.empty(6), np.zeros(6)
     step, pull = np.empty(6), np.empty(6)  # steps for a scale error of 0 and of 1

@@ -84,10 +84,21 @@ def find_shifts(
 def _changes(
     colours: Array, pixels: Array, normals: Array, step: float, count: int, changes: Array
 ) -> float:
-    """Write the change of the image between neighbouring samples; return the mean change.
+    """Write the change of the image between neighbouring samples along each normal.
 
     The change is the difference between the means of two samples before and two samples after, in
     the channel in which it is largest.
+
+    Args:
+        colours: Crop of the image.
+        pixels: Points of the projected outline.
+        normals: Outward unit normal of each point.
+        step: Distance of two samples, pixels.
+        count: Number of samples to either side of a point.
+        changes: Filled with the changes of each point.
+
+    Returns:
+        The mean change.
     """
     height, width = colours.shape[:2]
     samples = np.empty((2 * count + 5, 3))

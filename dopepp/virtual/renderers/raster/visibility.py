@@ -302,7 +302,15 @@ def _compare(projected: Array, inverse_depth: Array, lit: Array) -> None:
 def _clear_to_plane(
     inverse: Array, origin: tuple[int, int], samples: Array, near: float, inverse_depth: Array
 ) -> None:
-    """Fill a sample buffer with the plane's inverse depth; 0 where the plane is not seen."""
+    """Fill a sample buffer with the plane's inverse depth; 0 where the plane is not seen.
+
+    Args:
+        inverse: Coefficients (a, b, c) of the plane's inverse depth a u + b v + c, 1/metres.
+        origin: Column and row of the buffer's first pixel.
+        samples: Offsets of the samples from the pixel's centre, shape (S, 2).
+        near: Least depth that is drawn, metres.
+        inverse_depth: The buffer, shape (height, width, S).
+    """
     height, width, num_samples = inverse_depth.shape
     row = inverse_depth.reshape(height, width * num_samples)
     steps = np.empty(width * num_samples, np.float32)

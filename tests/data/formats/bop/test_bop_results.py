@@ -104,7 +104,7 @@ def test_what_is_written_is_read_back(seed, count, tmp_path_factory):
             r"median length of 8\.\d+e\+05, e\.g\. in line 2",
         ),
         (f"{GOOD}\n1,5,2,0.75,{R},0 0 700,1\n{GOOD}", r"line 4, which repeats line 2;.*once"),
-        (GOOD + "é", r"line 2, which is no ASCII text"),
+        (GOOD + "é", r"line 2, which is not ASCII text"),
         (GOOD.replace("0.75", "0" * 5000), r"line 2 of more than 4096 bytes"),
         (HEADER, r"line 2: scene_id 'scene_id'"),
     ],
