@@ -48,7 +48,7 @@ def grasp(
     yaw: Annotated[float | None, Option(help="Largest yaw of a part, degrees.")] = None,
     rest: Annotated[str, Option(help="Faces that point upwards: front or any.")] = "front",
     views: Annotated[
-        int, Option(help="Pictures of the camera: for a second, the arm moves it.")
+        int, Option(help="Pictures per grasp, 1 or 2; the arm moves the camera between them.")
     ] = 1,
     seed: Annotated[int, Option(min=0, help="Random seed.")] = 0,
     workers: Annotated[int | None, Option(min=1, help="Processes (default: all cores).")] = None,

@@ -213,7 +213,7 @@ class PoseTracker:
             Visible parts with scores of at least the estimator's threshold, sorted by identity.
 
         Raises:
-            UserError: The image is no RGB image, or K does not belong to it.
+            UserError: The image is not an RGB image, or K does not belong to it.
         """
         image, K, _ = prepare_image(image, K, cropped=cropped)
         self.weaker = []

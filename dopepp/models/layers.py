@@ -76,7 +76,7 @@ class ResidualBlock(nn.Module):
             self.shortcut = conv_block(*shape, stride=stride, batch_norm=True, relu=False)
 
     def forward(self, features: Features) -> Features:
-        """Return the sum, after a ReLU."""
+        """Return the sum of the residual and the shortcut, after a ReLU."""
         return functional.relu(self.residual(features) + self.shortcut(features), inplace=True)
 
 

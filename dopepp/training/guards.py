@@ -303,7 +303,10 @@ class EmptyMaps(Callback):
         )
 
     def _labels(self) -> tuple[bool, str]:
-        """Return whether labels are a likely cause, judged by their positions, and the advice."""
+        """Return whether the labels are a likely cause of empty maps, and advice on them.
+
+        Labels are a likely cause if few keypoints are inside the images or the objects are small.
+        """
         inside, sizes = torch.cat(self._inside), torch.cat(self._sizes)
         advice = "check the green labels in val_overlay.png, and run dopepp check on the data"
         if not len(inside):

@@ -30,7 +30,16 @@ Cell = tuple[int, int]  # x and y
 
 
 def arrange_on_table(composition: Composition, table: Table, targets: Sequence[Body]) -> Transform:
-    """Choose a view, add targets and distractors; return T_cam_table (plane z = 0, z up)."""
+    """Choose a view of the table, and add targets and distractors.
+
+    Args:
+        composition: Receives the objects, with the randomness of the image.
+        table: Distribution of the views.
+        targets: Targets of the image.
+
+    Returns:
+        T_cam_table (plane z = 0, z up).
+    """
     rng = composition.rng
     # Draw another view if no target fits into the image.
     for _ in range(8):

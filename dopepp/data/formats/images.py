@@ -158,7 +158,13 @@ def read_map(node: Node, shape: Shape | None, colour: bool = False) -> NDArray[A
 def one_channel(
     node: Node, image: NDArray[Any] | None, shape: tuple[int, ...] | None
 ) -> NDArray[Any] | None:
-    """Return a map; report several channels or another size than ``shape`` and return None."""
+    """Return an image of one channel (a mask or a depth map); report a wrong one and return None.
+
+    Args:
+        node: Where to report several channels or a wrong size.
+        image: The image; None if it could not be read.
+        shape: Shape of the colour image; None for any size.
+    """
     if image is None:
         return None
     if image.ndim != 2:

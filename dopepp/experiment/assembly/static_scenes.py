@@ -88,7 +88,8 @@ def with_views(source: DescribedSource, num_views: int) -> DescribedSource:
     """Return test images with further pictures of their scenes.
 
     Raises:
-        UserError: The images are no BOP data set with camera poses, or a scene has too few.
+        UserError: The images are not a BOP data set with camera poses, or a scene has too few
+            images.
     """
     if isinstance(source, BopReader):
         return StaticScenes(source, num_views)

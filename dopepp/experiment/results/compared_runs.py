@@ -144,7 +144,7 @@ def _folders(path: Path) -> list[Path]:
     """Return the run folders in a folder, which may be a run or a multirun.
 
     Raises:
-        UserError: The folder is neither.
+        UserError: The folder is neither a run nor a multirun.
     """
     if any((path / trace).exists() for trace in _TRACES):
         return [path]

@@ -257,7 +257,14 @@ def _tune_only(
     data: DataConfig,
     run_dir: Path,
 ) -> None:
-    """Tune the checkpoint without measuring it further.
+    """Tune the checkpoint; measure nothing else.
+
+    Args:
+        options: Options of the evaluation.
+        loaded: Estimators of the checkpoints.
+        parts: Parts to tune on.
+        data: Images to tune on.
+        run_dir: Folder of the results.
 
     Raises:
         UserError: Other options are given, or there is not exactly one checkpoint.

@@ -266,9 +266,18 @@ def _refine_with_both(
     by_image: Refinement,
     evidence: DepthEvidence,
 ) -> Refinement:
-    """Refine on image and depth, from the end of the image alone or else of depth alone.
+    """Refine on image and depth together.
 
-    If the image does not determine the pose, the end of depth alone is returned.
+    The refinement starts at the pose found by the image alone. If this fails, it starts at the pose
+    found by depth alone. If the image does not determine the pose, the pose found by depth alone is
+    returned.
+
+    Args:
+        region: Refiner by the image.
+        image: RGB, uint8.
+        K: Camera matrix, pixels.
+        by_image: Result of the image alone.
+        evidence: Measured depth of the part.
 
     Raises:
         UndecidedError: Depth does not determine the pose, or contradicts the image.

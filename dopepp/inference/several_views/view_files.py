@@ -177,7 +177,10 @@ def _bop(path: Path) -> CameraPoses:
 
 
 def _colmap(path: Path) -> CameraPoses:
-    """Read ``images.txt``; every second line is IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME."""
+    """Read ``images.txt``.
+
+    Each picture has two lines: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and its points.
+    """
     lines = _lines(path)
     cameras = {
         line.split()[0]: camera_of_text(line, f"{path.with_name('cameras.txt')}")

@@ -135,7 +135,14 @@ def joined(groups: Sequence[Templates]) -> Templates:
 def _neighbours(
     rotations: Rotations,
 ) -> tuple[Int[np.ndarray, "views neighbours"], Float[np.ndarray, "views neighbours"]]:
-    """Return the neighbouring views of each view, and the turns that align them with the view."""
+    """Find the neighbouring views of each view.
+
+    Args:
+        rotations: Rotations from the object to the camera of the views.
+
+    Returns:
+        Indices of the neighbours, and in-plane rotations (radians) that align them with the view.
+    """
     directions = rotations[:, 2]
     count = min(NUM_NEIGHBOURS, len(rotations) - 1)
     nearest = np.argsort(-directions @ directions.T, axis=1)[:, 1 : count + 1]

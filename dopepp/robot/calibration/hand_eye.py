@@ -191,7 +191,14 @@ def refined(
 
 
 def _residuals(M: Transforms, B: Transforms, X: Transform, Y: Transform) -> Residuals:
-    """Return each view's errors of rotation (about the board's origin) and translation."""
+    """Return each pose's errors of rotation (about the board's origin) and translation.
+
+    Args:
+        M: Poses of the flange, as in the equations M X B = Y.
+        B: Poses of the board in the camera.
+        X: Pose of the camera.
+        Y: Pose of the board.
+    """
     expected = invert_transform(X) @ inverted(M) @ Y
     turn = Rotation.from_matrix(B[:, :3, :3] @ expected[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
     return np.concatenate([turn, B[:, :3, 3] - expected[:, :3, 3]], axis=1)

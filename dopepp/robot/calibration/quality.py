@@ -63,7 +63,13 @@ class Consistency:
 
 
 def consistency(T_base_flange: Transforms, B: Transforms, mount: Mount) -> Consistency:
-    """Compare the motions of robot and board; B is as in :func:`.hand_eye.equations`."""
+    """Compare the motions of robot and board.
+
+    Args:
+        T_base_flange: Poses that the robot reports.
+        B: Poses of the board in the camera, as in :func:`.hand_eye.equations`.
+        mount: Whether the camera is on the robot's hand or on the bench.
+    """
     P, Q = pairs(T_base_flange if mount == "hand" else inverted(T_base_flange), B)
     alpha, beta = (Rotation.from_matrix(T[:, :3, :3]).as_rotvec() for T in (P, Q))
     used = np.minimum(np.linalg.norm(alpha, axis=1), np.linalg.norm(beta, axis=1)) < 3.0

@@ -69,7 +69,7 @@ class SideView:
         self._camera.distance, self._camera.azimuth, self._camera.elevation = 0.66, 155.0, -18.0
 
     def draw(self, positions: Any) -> Picture:
-        """Render a recorded state."""
+        """Render a recorded state, given by MuJoCo's ``qpos``."""
         self._state.qpos[:] = positions
         mujoco.mj_forward(self._cell.model, self._state)
         self._renderer.update_scene(self._state, self._camera)

@@ -107,7 +107,7 @@ class Gripper:
         return float(np.interp(-width, -self.widths, self.reaches))
 
     def fingers(self, width: float) -> Float[np.ndarray, "8"]:
-        """Return the fingers' joints at a width, metres."""
+        """Return the positions of the fingers' joints that open the pads to a width, metres."""
         command = self.command(width)
         return np.array([np.interp(command, COMMANDS, joint) for joint in self.joints.T])
 
@@ -276,7 +276,12 @@ class Planner:
         return np.stack(path)
 
     def _is_free(self, path: Path, opening: float) -> bool:
-        """Return whether a path is free of collisions."""
+        """Return whether the arm does not collide on a path.
+
+        Args:
+            path: Joint positions, connected by straight lines.
+            opening: Distance between the pads, metres.
+        """
         for here, there in pairwise(path):
             count = max(2, round(CHECKS * float(np.abs(there - here).max())))
             for share in np.linspace(0, 1, count):

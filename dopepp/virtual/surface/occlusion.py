@@ -78,7 +78,14 @@ def bake_open_sky(
 
 
 def _bake_mesh(vertices: Array, faces: Array, normals: Array, closed: bool) -> OpenSky:
-    """Render depth maps of a mesh from all directions, and look up its points."""
+    """Render depth maps of a mesh from all directions, and look up its points.
+
+    Args:
+        vertices: Positions, shape (V, 3).
+        faces: Triangles, shape (F, 3).
+        normals: Unit normals of the triangles' corners, shape (F, 3, 3).
+        closed: Whether the mesh is closed, so that back sides are skipped.
+    """
     corners = vertices[faces]
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
@@ -115,7 +122,15 @@ def _is_convex(corners: Array, flat: Array, closed: bool) -> bool:
 
 
 def _grids(corners: Array, size: float) -> tuple[Array, Array, int]:
-    """Choose every triangle's steps so that the points are few and evenly spaced."""
+    """Choose every triangle's steps so that the points are few and evenly spaced.
+
+    Args:
+        corners: Corners of the triangles, shape (F, 3, 3).
+        size: Diameter of the mesh.
+
+    Returns:
+        Steps along each triangle's sides, the index of its first point, and the number of points.
+    """
     longest = np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=2).max(axis=1)
     spacing, most = _FINEST * size, 3 * len(corners) + 40_000
     for _ in range(13):

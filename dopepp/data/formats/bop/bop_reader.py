@@ -173,7 +173,7 @@ class BopReader:
             _log.warning("%s: %s %s", self.name, f"{lacking:,}", problem)
 
     def _target_counts(self, scene: BopScene, row: int) -> Counter[int] | None:
-        """Return the listed number of instances of each object on an image; None for all."""
+        """Return the number of instances to find of each object on an image; None for all."""
         assert self._targets is not None
         return self._targets[int(scene.folder.name), int(scene.image_ids[row])]
 

@@ -172,7 +172,14 @@ class Tracer:
     def _measure(
         self, world: dict[str, Any], film: Film, integrator: dict[str, Any], samples: int
     ) -> Float32[np.ndarray, "film_height film_width channels"]:
-        """Return an integrator's output for every pixel of a film."""
+        """Return an integrator's output for every pixel of a film.
+
+        Args:
+            world: Mitsuba's description of the scene.
+            film: Pixels to render.
+            integrator: Mitsuba's description of the integrator.
+            samples: Samples per pixel.
+        """
         whole = {**world, "sensor": film.sensor(self._mi, samples), "integrator": integrator}
         # Parallel loading would order objects randomly and recompile for every order.
         loaded = self._mi.load_dict(whole, parallel=False)
