@@ -7,15 +7,18 @@ import numpy as np
 import pytest
 import torch
 from lightning.pytorch import Callback, Trainer
+from torch import nn
 
 from dopepp.data.batch import Batch
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.data.rendered import RenderedSource, Split
 from dopepp.data.sample import Instance, Sample, SourceInfo
 from dopepp.maps.codec import MapGeometry
+from dopepp.models.backbones import Backbone
 from dopepp.models.checkpoint import Checkpoint
+from dopepp.models.heads import ChainBranch, Head
 from dopepp.models.losses import SpatialCrossEntropy
-from dopepp.models.network import build_network
+from dopepp.models.network import BACKBONES, HEADS, build_network
 from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import RecoveryOptions
@@ -29,14 +32,40 @@ INPUT_SIZE = (128, 128)
 NOISE_SIZE = 32
 
 
+class OneLayer(Backbone):
+    """One convolution: these tests are about steps and files, not about layers."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.out_channels = 4
+        self.layers = nn.Sequential(nn.Conv2d(3, 4, 8, 8), nn.BatchNorm2d(4), nn.ReLU())
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        features: torch.Tensor = self.layers(images)
+        return features
+
+
+class Pointwise(Head):
+    """One 1×1 convolution each for beliefs and field."""
+
+    def __init__(self, in_channels: int, num_objects: int, activation: str = "identity") -> None:
+        def make_branch(inputs: int, outputs: int, stage: int) -> ChainBranch:
+            return ChainBranch(nn.Conv2d(inputs, outputs, 1))
+
+        super().__init__(in_channels, num_objects, activation, 1, make_branch)
+
+
 @pytest.fixture(scope="session")
 def part():
     return pivconnector()
 
 
 @pytest.fixture(scope="session")
-def make_system(part, tiny_spec):
-    """A tiny DOPE++ for one part, or two of the same shape."""
+def make_system(part):
+    """A system of a network of three convolutions for one part, or two of the same shape."""
+    backbone, head = (f"{__name__}.{layers.__name__}" for layers in (OneLayer, Pointwise))
+    BACKBONES.register(backbone)
+    HEADS.register(head)
 
     def make(
         num_objects: int = 1, system_class: type[PoseSystem] = PoseSystem, **options: Any
@@ -44,7 +73,13 @@ def make_system(part, tiny_spec):
         torch.manual_seed(0)
         parts = [part, Part("other", part.cuboid, part.diameter, part.points)][:num_objects]
         loss = SpatialCrossEntropy(sigma=1.0, count_weight=1.0, field_weight=0.2)
-        spec = {**tiny_spec, "activation": loss.activation, "num_objects": num_objects}
+        spec = {
+            "backbone": {"_target_": backbone},
+            "attention": {"_target_": "dopepp.models.attention.Identity"},
+            "head": {"_target_": head},
+            "activation": loss.activation,
+            "num_objects": num_objects,
+        }
         network = build_network(spec)
         described = Checkpoint(spec, {}, parts, INPUT_SIZE, network.stride, 1.0)
         return system_class(

@@ -1,11 +1,14 @@
 """What a process does when another one of its run is gone."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
-import textwrap
+import time
+from pathlib import Path
 
+from dopepp.training import processes
 from dopepp.training.processes import Watch
 
 
@@ -33,19 +36,21 @@ def test_a_death_is_told_with_its_cause():
             process.wait()
 
 
-def test_what_hangs_is_ended_from_outside(command):
+def hang(errors: Path) -> None:
+    sys.stderr = errors.open("w")
+    processes._POLL_S = processes._GRACE_S = 0.2
+    Watch([sleeper("import os; os.kill(os.getpid(), 9)")], None).start()
+    time.sleep(120)
+
+
+def test_what_hangs_is_ended_from_outside(tmp_path):
     """As in a collective on GPUs, where no exception reaches the main thread."""
-    script = """
-        import subprocess, sys, time
-        from dopepp.training import processes
-        processes._POLL_S = processes._GRACE_S = 0.2
-        child = subprocess.Popen([sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"])
-        processes.Watch([child], None).start()
-        time.sleep(120)
-    """
-    ended = command("-c", textwrap.dedent(script), timeout=100)
-    assert ended.code == 1
-    assert ended.last_line.endswith("was killed by signal 9: the run ends")
+    process = multiprocessing.get_context("fork").Process(target=hang, args=[tmp_path / "errors"])
+    process.start()
+    process.join(100)
+    assert process.exitcode == 1
+    said = (tmp_path / "errors").read_text()
+    assert said.endswith("was killed by signal 9: the run ends\n")
 
 
 def test_a_stopped_watch_lets_processes_end():
