@@ -2,8 +2,10 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
 
 MACHINE = "a GPU, 16 cores"
 
@@ -11,7 +13,10 @@ MACHINE = "a GPU, 16 cores"
 @pytest.fixture
 def gpu(monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
-    return pytest.importorskip("gpu")
+    module = pytest.importorskip("gpu")
+    monkeypatch.setattr(module, "gc", SimpleNamespace(collect=list))
+    monkeypatch.setattr(torch._dynamo, "reset", list)
+    return module
 
 
 def rows_of(gpu, calls, broken=()):

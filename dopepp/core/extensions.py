@@ -35,6 +35,9 @@ def enable(packages: Iterable[str]) -> None:
     Raises:
         UserError: A package is not installed or has no entry points.
     """
+    packages = list(packages)
+    if not packages:
+        return
     installed = {_package(entry) for group in _GROUPS for entry in _entries(group)}
     for package in packages:
         if package not in installed:
@@ -42,9 +45,7 @@ def enable(packages: Iterable[str]) -> None:
             raise UserError(
                 f"extensions=[{package}]", allowed, f"pip install {package}, or leave it out"
             )
-    names = dict.fromkeys((*_enabled(), *packages))
-    if names:
-        os.environ[VARIABLE] = ",".join(names)
+    os.environ[VARIABLE] = ",".join(dict.fromkeys((*_enabled(), *packages)))
 
 
 def components(group: str) -> dict[str, str]:

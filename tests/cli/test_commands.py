@@ -266,20 +266,20 @@ def test_neither_render_nor_check_imports_torch(layout, command, tmp_path):
 import sys
 from typer.testing import CliRunner
 from dopepp.cli import app
-from dopepp.data.render_job import make_job
-from dopepp.data.render_preview import write_preview
+from dopepp.data.render_job import begin, make_job
 from dopepp.data.render_run import RenderTasks, RenderTask
 from pathlib import Path
 out = {str(tmp_path / "out")!r}
 arguments = ["render", "servoholder", "--preset", "quickstart", "--size", "32x24",
-             "--format", {layout!r}, "--workers", "1", "-n", "2", "--out", out]
+             "--format", {layout!r}, "--preview", "-n", "2", "--out", out]
 done = CliRunner().invoke(app, arguments)
 assert done.exit_code == 0, done.output
 job = make_job(["servoholder"], preset="quickstart", size="32x24", layout={layout!r})
+begin(Path(out), job.record)
+job.writer(Path(out)).prepare()
 perform = RenderTasks(job, Path(out))
 for task in (RenderTask(0, range(2)), RenderTask(0, range(2), finalizes=True)):
     perform(task)
-write_preview(job, Path(out))
 done = CliRunner().invoke(app, ["check", out])
 assert done.exit_code == 0, done.output
 print(sorted({{"torch", "lightning", "torchmetrics", "ray", "webdataset"}} & set(sys.modules)))

@@ -56,10 +56,10 @@ def test_losses_that_are_not_finite_end_the_run_and_keep_what_it_had(run, call, 
         return loss * (torch.nan if self.training else 1), terms
 
     monkeypatch.setattr(SpatialCrossEntropy, "forward", broken)
-    again = ("trainer.max_epochs=4", "callbacks.finite.max_in_a_row=3")
+    again = ("trainer.max_epochs=2", "callbacks.finite.max_in_a_row=2")
     done = call("train.py", f"resume={run}", *again, code=1)
     line = done.last_line
-    assert "not finite in step 4 (3 steps in a row)" in line
+    assert "not finite in step 3 (2 steps in a row)" in line
     assert str(run / "nonfinite") in line
     assert line.endswith(f"resume={run}")
     assert "Traceback" not in done.err
@@ -67,7 +67,7 @@ def test_losses_that_are_not_finite_end_the_run_and_keep_what_it_had(run, call, 
         content = torch.load(run / "checkpoints" / name, weights_only=True)
         assert all(value.isfinite().all() for value in content["state_dict"].values())
     assert (run / "checkpoints" / "best.ckpt").read_bytes() == good
-    dumped = torch.load(run / "nonfinite" / "step_4_rank_0.pt", weights_only=True)
+    dumped = torch.load(run / "nonfinite" / "step_3_rank_0.pt", weights_only=True)
     assert dumped["images"].shape == (4, 3, 64, 64)
 
     monkeypatch.undo()

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import struct
 import subprocess
 import threading
@@ -87,9 +88,10 @@ def sweep_of(output_dir: Path) -> Path:
 def sweep(call, tiny, tmp_path_factory):
     """The folder of a multirun of both models that both services follow."""
     folder = tmp_path_factory.mktemp("sweep")
+    own_heads = [option for option in tiny if not option.startswith("model/head=")]
     tensorboard = "+logger.tensorboard={_target_: lightning.pytorch.loggers.TensorBoardLogger, "
     done = call(
-        "train.py", "-m", *tiny, "model=dopepp,dope", "logger=wandb",
+        "train.py", "-m", *own_heads, "model=dopepp,dope", "logger=wandb",
         tensorboard + "name: tensorboard, version: ''}", f"output_dir={folder}", code=0,
     )  # fmt: skip
     assert "already in progress" not in done.err
@@ -159,16 +161,15 @@ def test_every_job_is_a_run_and_the_comparison_one_more(sweep):
     }  # fmt: skip
 
 
-def test_a_resumed_run_goes_on_in_the_same_run(call, find_run, tiny, tmp_path):
-    call("train.py", *tiny, "logger=wandb", f"output_dir={tmp_path}", code=0)
-    run = find_run(tmp_path)
+def test_a_resumed_run_goes_on_in_the_same_run(sweep, call, tmp_path):
+    run = shutil.copytree(sweep / "0", tmp_path / "run")
     call("train.py", f"resume={run}", "trainer.max_epochs=2", "resume_anyway=true", code=0)
     paths = sorted(run.glob("wandb/offline-run-*/*.wandb"))
     assert len(paths) == 2
     assert paths[0].name == paths[1].name  # it is called after the run's id
     before, after = map(tracked, paths)
     assert before.name == after.name
-    assert before.group == after.group == ""
+    assert before.group == after.group == sweep.name
     first, second = (
         {step["trainer/global_step"] for step in run.history if "train/loss" in step}
         for run in (before, after)
@@ -176,6 +177,7 @@ def test_a_resumed_run_goes_on_in_the_same_run(call, find_run, tiny, tmp_path):
     assert max(first) < min(second)
 
 
+@pytest.mark.slow
 def test_a_service_that_dies_in_the_middle_ends_nothing(call, tiny, tmp_path, caplog):
     killed = []
 

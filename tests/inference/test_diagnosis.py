@@ -52,11 +52,11 @@ def longer(K, factor):
 
 def test_good_pictures_raise_no_alarm(estimator, factory):
     firsts = Counter()
-    for index in range(12):
+    for index in range(8):
         rendered = factory.render(0, index)
         firsts[first(estimator, rendered.image, rendered.scene.K)] += 1
     # Of a hundred pictures a few are lost, and those are told.
-    assert firsts[""] >= 10, firsts
+    assert firsts[""] >= 7, firsts
     assert not set(firsts) - {"", "visibility", "pose"}
 
 
@@ -73,10 +73,10 @@ def test_good_pictures_raise_no_alarm(estimator, factory):
 )
 def test_what_spoils_a_picture_is_named_first(estimator, factory, fault, subject):
     firsts = Counter()
-    for index in range(6):
+    for index in range(4):
         rendered = factory.render(0, index)
         firsts[first(estimator, *fault(rendered.image, rendered.scene.K))] += 1
-    assert firsts[subject] >= 4, firsts
+    assert firsts[subject] >= 3, firsts
 
 
 def test_a_part_that_is_too_small_is_named_with_its_distance(estimator, factory):

@@ -31,7 +31,7 @@ def frame(ycb_root):
 
 
 @pytest.fixture(scope="module")
-def rendered(ycb_root, frame):
+def rendered(ycb_root, frame, quick_sky):
     objects = []
     for class_index, name in CLASSES.items():
         part = ycb_part(ycb_root, name)

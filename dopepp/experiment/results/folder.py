@@ -9,6 +9,7 @@ import platform
 import subprocess
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any, Final
@@ -110,11 +111,7 @@ def environment(seed: int, data_fingerprint: str) -> dict[str, Any]:
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "packages": {
-            name: package.version
-            for package in sorted(distributions(), key=lambda package: str(package.name).lower())
-            if isinstance(name := package.name, str)
-        },
+        "packages": _packages(),
         "git": _git_state(),
         "hardware": {
             "processor": cpu_fact("model name") or platform.processor() or platform.machine(),
@@ -129,6 +126,14 @@ def environment(seed: int, data_fingerprint: str) -> dict[str, Any]:
         "data_fingerprint": data_fingerprint,
         "rendering_code": code_hash(),
     }
+
+
+@cache
+def _packages() -> dict[str, str]:
+    """Return the versions of the installed packages by name."""
+    headers = (package.metadata for package in distributions())  # parsed at every access
+    versions = [(header["Name"], header["Version"]) for header in headers if "Name" in header]
+    return dict(sorted(versions, key=lambda version: version[0].lower()))
 
 
 def _memory_bytes() -> int | None:

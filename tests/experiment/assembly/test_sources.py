@@ -59,6 +59,7 @@ def test_every_seed_is_measured_on_the_same_images_and_splits_share_none(tiny):
     assert len(set(seen)) == 3
 
 
+@pytest.mark.usefixtures("quick_sky")
 def test_a_real_root_mixes_its_frames_with_renders_of_its_objects(parsed, ycb_root):
     data = parsed(
         "data=hybrid", f"data.root={ycb_root}", "data.samples_per_epoch=100", "data.num_workers=0"

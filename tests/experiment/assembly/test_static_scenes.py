@@ -19,7 +19,7 @@ from dopepp.virtual.factory import BESIDE_DEG, Factory
 from dopepp.virtual.presets import PRESETS
 from tests.data.jobs.test_rendering import InlinePool
 
-NUM_SCENES, NUM_VIEWS = 3, 3
+NUM_SCENES, NUM_VIEWS = 2, 3
 
 
 @pytest.fixture(scope="module")

@@ -70,6 +70,7 @@ def test_all_formats_hold_every_trial(records, tmp_path):
 TASK = GraspTask(sources=(PoseSource("exact"),))
 
 
+@pytest.mark.slow
 def test_two_processes_make_the_trials_of_one(trials):
     source = TASK.sources[0]
     expected = [trials.attempt(trials.scene(number), source).record for number in (0, 1)]
