@@ -31,6 +31,10 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
+def pytest_unconfigure() -> None:
+    gc.unfreeze()  # or extension modules report leaks
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the files that take longest, so that both processes end at about the same time."""
     items.sort(key=lambda item: not {"end_to_end", "test_quality.py"} & set(item.path.parts))

@@ -42,7 +42,7 @@ def test_a_fast_dev_run_does_everything_and_keeps_no_weights(call, tiny, tmp_pat
 
 
 def test_the_learning_rate_finder_trains_nothing_else(call, tiny, tmp_path):
-    options = ("job=lr_finder", "lr_finder.num_steps=8", f"output_dir={tmp_path}")
+    options = ("job=lr_finder", "lr_finder.num_steps=20", f"output_dir={tmp_path}")
     done = call("train.py", *tiny, *options, code=0)
     assert "lr_finder.png" in done.out
     (run,) = tmp_path.glob("*/*")

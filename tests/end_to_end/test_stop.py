@@ -165,7 +165,7 @@ def test_a_disk_that_stays_full_fails_the_run(small_disk, call, find_run, tiny):
 def test_a_disk_that_is_too_small_is_refused_before_training(small_disk, call, tiny):
     fill(small_disk)
     with (small_disk / "filler").open("r+b") as stream:
-        stream.truncate((small_disk / "filler").stat().st_size - 2**20)
+        stream.truncate((small_disk / "filler").stat().st_size - 2**17)
     done = call("train.py", *tiny, f"output_dir={small_disk}")
     assert f"MB free in {small_disk}" in done.line
     assert "for 4 checkpoints" in done.line
