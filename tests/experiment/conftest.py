@@ -1,5 +1,6 @@
 """Configurations, an entry point without training time, reports and run folders."""
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -22,14 +23,23 @@ from dopepp.metrics.row import PoseErrors, PoseRow, mean_row, summarise
 CONF = Path(__file__).parents[2] / "conf"
 
 
+@pytest.fixture(scope="session")
+def compositions():
+    """Earlier compositions by config and overrides; one takes a third of a second."""
+    return {}
+
+
 @pytest.fixture
-def composed():
+def composed(compositions):
     """Compose ``conf/train.yaml`` (or another one) with overrides, as a plain dict."""
 
     def make(*overrides: str, config: str = "train") -> dict[str, Any]:
-        return OmegaConf.to_container(
-            compose(config, list(overrides)), resolve=True, throw_on_missing=True
-        )
+        key = (config, *overrides)
+        if key not in compositions:
+            compositions[key] = OmegaConf.to_container(
+                compose(config, list(overrides)), resolve=True, throw_on_missing=True
+            )
+        return copy.deepcopy(compositions[key])
 
     with initialize_config_dir(str(CONF), version_base="1.3"):
         yield make

@@ -41,7 +41,8 @@ def test_refined_poses_are_measured_beside_the_networks(composed, tmp_path):
 
 
 def test_an_exact_scale_lets_refinement_move_the_distance(composed, tmp_path):
-    options = ("ckpt_path=pretrained/pivconnector", "refine=region", "+data.num_test=4")
+    options = ("ckpt_path=pretrained/pivconnector", "refine=region", "+data.num_test=4",
+               "num_pictures=0")  # fmt: skip
     translations = []
     for scale_error in (0.0001, 0.05):
         config = composed(*options, f"scale_error={scale_error}", config="evaluate")
