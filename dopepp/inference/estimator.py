@@ -63,7 +63,7 @@ class PoseEstimator:
         max_ms: Time limit for the refinement of an image, milliseconds. The best detections are
             refined first; detections beyond the limit keep the network's pose.
         scale_error: Largest relative error of the parts' size or of the focal length (default:
-            0.005). Refinement keeps the network's distance if the image's differs by less. Choose a
+            0.005). A precise distance of the network is kept if the image's differs by less. Choose a
             small value for a calibrated camera and a measured part.
 
     Raises:

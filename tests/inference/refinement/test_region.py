@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy import ndimage
-from scipy.optimize import lsq_linear
+from scipy.stats import truncnorm
 
 from dopepp.geometry.camera import camera_matrix, make_transform, moved, project, transform
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
@@ -28,7 +28,12 @@ from dopepp.inference.refinement.outline import (
 from dopepp.inference.refinement.refiner import NUM_QUADRUPLES, poses_of_four
 from dopepp.inference.refinement.region import FINE, FOLLOWED, FOUND, SURE, RegionRefiner
 from dopepp.inference.refinement.region.round import Round
-from dopepp.inference.refinement.region.shared_errors import OFFSET_PX, SCALE_ERROR, region_terms
+from dopepp.inference.refinement.region.shared_errors import (
+    OFFSET_PX,
+    SCALE_ERROR,
+    _truncated_mean,
+    region_terms,
+)
 from dopepp.inference.refinement.region.shifts import Shifts, find_shifts
 from dopepp.inference.refinement.solver import Prior, descend
 from dopepp.parts.catalogue import pivconnector, servoholder
@@ -41,6 +46,7 @@ TRUE = make_transform(TURNED, np.array([0.01, -0.012, 0.24]))
 PART_COLOUR, AROUND_COLOUR = (200, 120, 60), (60, 90, 130)
 FLAT = np.full((64, 64, 3), 128, np.uint8)
 DEVIATIONS = np.repeat([math.radians(5), 0.003], 3)
+PRECISE = np.repeat([math.radians(5), 0.0003], 3)  # a tenth of a percent of the distance
 
 
 @pytest.fixture(scope="module", params=["pivconnector", "servoholder"])
@@ -180,8 +186,8 @@ def test_terms_take_the_common_offset_out() -> None:
 
 
 @pytest.mark.parametrize("enlarged", [0.0, 0.001, -0.0045, 0.02, -0.05])
-def test_an_error_of_the_scale_is_bounded(enlarged: float) -> None:
-    # Against the eight unknowns solved at once: pose, offset and bounded scale.
+def test_a_bounded_error_of_the_scale_has_its_expected_value(enlarged: float) -> None:
+    # Against the eight unknowns solved at once: pose, offset and scale.
     rng = np.random.default_rng(4)
     position, weights = np.array([0.1, -0.05, 0.5]), np.full(60, 2.0**0.5)
     rows = rng.normal(size=(60, 6)) * 100
@@ -196,10 +202,13 @@ def test_an_error_of_the_scale_is_bounded(enlarged: float) -> None:
     design[:60] = weights[:, None] * np.column_stack([rows, np.ones(60), by_scale])
     design[60, 6], design[61:, :6] = 1 / OFFSET_PX, factor
     target = [*weights * shifts.mean, 0.0, *factor @ offset]
-    limits = np.array([*np.full(7, np.inf), SCALE_ERROR])
-    expected = lsq_linear(design, target, (-limits, limits), tol=1e-14).x
+    unbounded = np.linalg.lstsq(design, target, rcond=None)[0][7]
+    deviation = np.linalg.inv(design.T @ design)[7, 7] ** 0.5
+    low, high = ((limit - unbounded) / deviation for limit in (-SCALE_ERROR, SCALE_ERROR))
+    error = truncnorm.mean(low, high, loc=unbounded, scale=deviation)
+    expected = np.linalg.lstsq(design[:, :7], target - error * design[:, 7], rcond=None)[0]
     assert_allclose(np.linalg.solve(H + prior[0], g + prior[1]), expected[:6], atol=2e-6)
-    assert (abs(expected[7]) < 0.99 * SCALE_ERROR) == (abs(enlarged) < SCALE_ERROR)
+    assert abs(error) < SCALE_ERROR
     # The covariance contains the error of the scale, which is uniformly distributed.
     without_error = np.linalg.inv(design[:61, :7].T @ design[:61, :7])[:6, :6]
     nearer = np.array([0, 0, 0, *position])
@@ -343,26 +352,40 @@ def test_distance_is_kept_where_the_scale_may_be_wrong(part: Part) -> None:
     wrong_camera = K * np.array([[1.006], [1.006], [1.0]])
     wrong_camera[:2, 2] = K[:2, 2]
     refiner = RegionRefiner(part.mesh.vertices, part.mesh.faces)
-    for log_distance, kept in ((0.0, 0.002), (0.06, 0.02)):
+    for log_distance, deviations, kept in ((0.0, PRECISE, 0.002), (0.06, DEVIATIONS, 0.02)):
         turned = np.array([0.05, -0.06, 0.05, *log_distance * TRUE[:3, 3]])
         given = moved(TRUE, turned)
-        refined = refiner.refine(picture(part), wrong_camera, given, np.diag(DEVIATIONS**2))
+        refined = refiner.refine(picture(part), wrong_camera, given, np.diag(deviations**2))
         degrees, _ = off(refined.T_cam_obj)
         assert degrees < 0.5
         ratio = np.linalg.norm(refined.T_cam_obj[:3, 3]) / np.linalg.norm(TRUE[:3, 3])
         assert abs(ratio - 1) < kept
         along = TRUE[:3, 3] / np.linalg.norm(TRUE[:3, 3])
         deviation = np.sqrt(along @ refined.covariance[3:, 3:] @ along)
-        assert deviation > 0.4 * SCALE_ERROR * TRUE[2, 3]
+        assert deviation > 0.4 * min(SCALE_ERROR * TRUE[2, 3], deviations[3])
 
 
-@pytest.mark.parametrize(("scale_error", "ratio"), [(0.0, 1.0), (0.01, 1.008)])
-def test_a_part_of_known_size_has_the_distance_of_its_outline(
-    part: Part, scale_error: float, ratio: float
+@given(st.floats(-0.1, 0.1, allow_subnormal=False), st.floats(1e-4, 1.0), st.floats(1e-4, 0.1))
+def test_the_expected_error_is_that_of_a_truncated_normal(
+    mean: float, deviation: float, limit: float
+) -> None:
+    expected = _truncated_mean(mean, deviation, limit)
+    low, high = (-limit - mean) / deviation, (limit - mean) / deviation
+    exact = truncnorm.mean(low, high, loc=mean, scale=deviation)
+    assert expected == pytest.approx(exact, abs=0.25 * deviation if abs(mean) > limit else 1e-9)
+    assert abs(expected) <= limit + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("scale_error", "deviations", "ratio"),
+    [(0.0, DEVIATIONS, 1.0), (0.01, PRECISE, 1.008), (0.01, 3 * DEVIATIONS, 1.0)],
+)
+def test_a_known_size_or_an_unknown_distance_gives_the_distance_of_the_outline(
+    part: Part, scale_error: float, deviations: np.ndarray, ratio: float
 ) -> None:
     refiner = RegionRefiner(part.mesh.vertices, part.mesh.faces, scale_error)
     given = moved(TRUE, np.array([0.03, -0.03, 0.03, *0.008 * TRUE[:3, 3]]))
-    refined = refiner.refine(picture(part), K, given, np.diag(DEVIATIONS**2))
+    refined = refiner.refine(picture(part), K, given, np.diag(deviations**2))
     distances = [np.linalg.norm(T[:3, 3]) for T in (refined.T_cam_obj, TRUE)]
     assert distances[0] / distances[1] == pytest.approx(ratio, abs=0.003)
 

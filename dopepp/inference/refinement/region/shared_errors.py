@@ -5,16 +5,17 @@ All points share two errors, which are unknowns with a prior:
 - Offset: blur, a halo or a mesh that is too thick move every point outwards by the same distance.
   The offset is normally distributed.
 - Scale: a larger part or focal length has the same effect on the outline as a nearer part. All
-  errors up to a limit are equally likely. While the distances of prior and outline differ by less
-  than the limit, the prior's distance is kept. Otherwise the outline moves it, except for the
-  limit. A normally distributed error would move every distance, even a right one, part of the way
-  to that of the outline.
+  errors up to a limit are equally likely. The pose is corrected by the expected error: a precise
+  prior keeps its distance while prior and outline differ by less than the limit, and a broad prior
+  leaves the distance to the outline. A normally distributed error would move every distance, even
+  a right one, part of the way to that of the outline.
 
 Neighbouring points have errors in common, and outliers get a small weight.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -83,8 +84,8 @@ def _eliminate_scale(
 ) -> None:
     """Eliminate a bounded error of the scale from the normal equations, in place.
 
-    The pose moves to the minimum of prior and outline under the bound. The information is that
-    under a normal error of the same variance, so that the covariance contains the error.
+    The pose moves to the minimum of prior and outline under the expected error. The information is
+    that under a normal error of the same variance, so that the covariance contains the error.
 
     Args:
         H: Matrix of the outline's normal equations.
@@ -113,7 +114,8 @@ def _eliminate_scale(
     for c in range(6):
         gradient -= column[c] * step[c]
         free += column[c] * pull[c]
-    error = min(max(gradient / max(free, 1e-12), -limit), limit)
+    free = max(free, 1e-12)
+    error = _truncated_mean(gradient / free, 1.0 / math.sqrt(free), limit)
     # A uniform distribution has a third of the variance.
     pivot = information + 3.0 / limit**2
     for c in range(6):
@@ -124,6 +126,17 @@ def _eliminate_scale(
         g[c] = -prior_g[c]
         for d in range(6):
             g[c] += (H[c, d] + prior_H[c, d]) * step[d]
+
+
+@compiled()
+def _truncated_mean(mean: float, deviation: float, limit: float) -> float:
+    """Return the mean of a normal distribution that is truncated to [-limit, limit]."""
+    low, high = (-limit - mean) / deviation, (limit - mean) / deviation
+    share = 0.5 * (math.erf(high / math.sqrt(2.0)) - math.erf(low / math.sqrt(2.0)))
+    if share < 1e-6:  # far outside the limits, where the nearer limit is almost certain
+        return math.copysign(limit, mean)
+    difference = math.exp(-0.5 * low * low) - math.exp(-0.5 * high * high)
+    return mean + deviation * difference / (math.sqrt(2.0 * math.pi) * share)
 
 
 @compiled()
