@@ -63,8 +63,8 @@ class PoseEstimator:
         max_ms: Time limit for the refinement of an image, milliseconds. The best detections are
             refined first; detections beyond the limit keep the network's pose.
         scale_error: Largest relative error of the parts' size or of the focal length (default:
-            0.005). A precise distance of the network is kept if the image's differs by less. Choose a
-            small value for a calibrated camera and a measured part.
+            0.005). If the network's distance is certain, refinement changes it by the remaining
+            difference only. Choose a small value for a calibrated camera and a measured part.
 
     Raises:
         UserError: The refinement is unknown, or a part has no mesh.

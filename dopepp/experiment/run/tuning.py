@@ -266,7 +266,8 @@ class WrongFocalLengths:
 
     The relative error of the focal length is uniformly distributed up to the scale error that
     refinement assumes. With exact cameras, covariances would be fitted to errors that no real
-    camera reaches.
+    camera reaches. The principal point moves too, so that the line of sight to the first object
+    stays: the error changes its distance alone, like an error of its size.
     """
 
     def __init__(self, source: SampleSource) -> None:
@@ -281,6 +282,9 @@ class WrongFocalLengths:
         error = np.random.default_rng(index).uniform(-SCALE_ERROR, SCALE_ERROR)
         K = sample.K.copy()
         K[[0, 1], [0, 1]] *= 1.0 + error
+        if sample.instances:
+            center = sample.K @ sample.instances[0].T_cam_obj[:3, 3]
+            K[:2, 2] -= error * (center[:2] / center[2] - sample.K[:2, 2])
         return replace(sample, K=K)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample
@@ -225,7 +225,22 @@ def test_the_focal_length_is_wrong_by_up_to_the_scale_error():
     again = source.sample(7).K
     assert_array_equal(again, cameras[7])
     assert again[1, 1] / K[1, 1] == pytest.approx(again[0, 0] / K[0, 0])
-    assert_array_equal(again[:, 2], K[:, 2])
+
+
+def test_a_wrong_focal_length_keeps_the_line_of_sight_to_a_part_beside_the_axis():
+    class Beside(Many):
+        def sample(self, index: int, epoch: int = 0) -> Sample:
+            sample = super().sample(index, epoch)
+            T = POSE.copy()
+            T[:3, 3] += (0.2, -0.1, 0.0)
+            return replace(sample, instances=[replace(sample.instances[0], T_cam_obj=T)])
+
+    right, wrong = Beside(4).sample(3), WrongFocalLengths(Beside(4)).sample(3)
+    assert wrong.K[0, 0] != right.K[0, 0]
+    center = right.instances[0].T_cam_obj[:3, 3]
+    pixel = right.K @ center / center[2]
+    seen = np.linalg.inv(wrong.K) @ pixel
+    assert_allclose(seen / seen[2], center / center[2], atol=1e-12)
 
 
 def test_few_refined_poses_keep_their_covariances(caplog):
