@@ -229,12 +229,16 @@ def describe_images(source: DescribedSource) -> dict[str, Any]:
 
 
 def differing_images(stored: Mapping[str, Any], present: Mapping[str, Any]) -> list[str]:
-    """Return the differences between two descriptions of images."""
+    """Return the differences between two descriptions of images.
+
+    A new version may add fields to a preset and describe it in other words, so that the first image
+    shows whether a preset has changed.
+    """
     old, new = dict(flat(stored["sources"])), dict(flat(present["sources"]))
     lines = [
         f"{key}: {_shown(old.get(key))} → {_shown(new.get(key))}"
         for key in {**old, **new}
-        if old.get(key) != new.get(key)
+        if old.get(key) != new.get(key) and not key.endswith(".preset")
     ]
     before, now = stored["first_image"], present["first_image"]
     if before["labels"] != now["labels"] or not all(

@@ -65,6 +65,13 @@ def test_a_description_of_images_tells_what_is_another():
         assert len(line) < 120
 
 
+def test_a_preset_with_a_new_field_and_equal_images_is_the_same_preset():
+    first, new = (describe_images(Pictures(preset=text)) for text in ("Preset()", "Preset(a=1)"))
+    assert differing_images(first, new) == []
+    (line,) = differing_images(first, describe_images(Pictures(110, preset="Preset(a=1)")))
+    assert line == "pixels of the first image"
+
+
 @pytest.fixture
 def resumed(tiny, tmp_path):
     """Resume a run with these overrides and say which differences are accepted."""
