@@ -47,7 +47,7 @@ from dopepp.parts.mesh import Faces, Vertices, largest_distance
 COARSE: Final = RegionStage(120, reach=1.0, steps=3, points=100, tiles=1)
 MIDDLE: Final = RegionStage(200, reach=0.5, steps=2, points=120, tiles=2)
 FINE: Final = RegionStage(300, reach=0.25, steps=3, points=160, tiles=3)
-"""The coarse stage is run from every start, the others from the best one only."""
+"""The coarse stage is run from every start, the others from the best results only."""
 
 WIDENED: Final = 2.0
 """Factor on the prior's deviations in the coarse round. Far from the right pose, the points of the
@@ -65,6 +65,7 @@ FAR: Final = 3.0
 
 NUM_DRAWS: Final = 4  # poses that are drawn in the extended search
 NUM_STARTS: Final = 4  # most likely starts that are tried besides the given pose
+NUM_CONTINUED: Final = 2  # coarse results that the other stages continue
 
 CERTAIN: Final = 0.95  # agreement that ends the search
 
@@ -239,14 +240,19 @@ def _search_far(
         first.learn(given, search_px)
         further_starts = [*starts, *wide_prior.draws(1 / FAR, NUM_DRAWS)]
         further_starts.sort(key=lambda start: -first.log_likelihood(start, wide_prior))
+        coarse_ends = []
         for start in (given, *further_starts[:NUM_STARTS]):
             with contextlib.suppress(UndecidedError):
-                coarse = _coarse_end(first, start, wide_prior, search_px)
-                end, _ = _refine(rounds[1:], coarse, wide_prior, search_px)
+                coarse_ends.append(_coarse_end(first, start, wide_prior, search_px))
+        first.learn(given, search_px)  # compare all ends in the same colours
+        coarse_ends.sort(key=lambda end: -first.log_likelihood(end, wide_prior))
+        for coarse_end in coarse_ends[:NUM_CONTINUED]:
+            with contextlib.suppress(UndecidedError):
+                end = _descend(rounds[1:], coarse_end, wide_prior, search_px).T_cam_obj
                 # The strongest prior under which this end is not surprising.
-                factor = max(1.0, prior.squared_distance(end.T_cam_obj) / 6)
+                factor = max(1.0, prior.squared_distance(end) / 6)
                 weakened_prior = Prior(given, prior.information / factor)
-                outcome = _refine([last], end.T_cam_obj, weakened_prior, search_px)
+                outcome = _refine([last], end, weakened_prior, search_px)
                 least = SURE if best is None else best[1].share
                 if outcome[1].share >= least and outcome[1].support >= least_support:
                     best = outcome
