@@ -187,7 +187,10 @@ def set_weight(value: Any) -> Any:
         (lambda c: c.pop("state_dict"), "state_dict as NoneType"),
         (lambda c: c.update(state_dict={}), "weights that do not fit"),
         (lambda c: c["state_dict"].pop(first_weight(c)), "do not fit .*beginning with backbone"),
-        (lambda c: c["state_dict"].update({"network.extra": torch.ones(1)}), "first extra"),
+        (
+            lambda c: c["state_dict"].update({"network.extra": torch.ones(1)}),
+            "beginning with extra",
+        ),
         (set_weight(torch.ones(8, 3, 3, 3).to_sparse()), "_rebuild_sparse_tensor"),
         (set_weight(torch.ones(8, 3, 3, 3, device="meta")), "_rebuild_meta_tensor_no_storage"),
         (set_weight(torch.ones(8, 3, 3, 3, dtype=torch.complex64)), "weights that do not fit"),

@@ -195,7 +195,7 @@ TOO_MUCH = {
     "attention of nothing": (spec("attention", reduction=10**9), "reduction"),
     "the widest network in a small file": (
         lambda c: (spec("backbone", width=4.0)(c), spec("head", width=4.0, stages=12)(c)),
-        "do not fit the spec's network",
+        "do not fit the network of the spec",
     ),
     "an argument that builds": (spec("head", stages={"_target_": "os.system"}), "_target_"),
     "an argument of the builder": (spec("head", in_channels=10**9), "argument 'in_channels'"),

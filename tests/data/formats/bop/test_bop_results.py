@@ -97,7 +97,7 @@ def test_what_is_written_is_read_back(seed, count, tmp_path_factory):
         (GOOD.replace("812.25,0.5", "812.25,inf"), r"line 2: time: 'inf'"),
         (
             GOOD.replace("-10.5 20 812.25", "-0.01 0.02 0.81"),
-            r"median length of 0\.81, e\.g\. in line 2.*metres",
+            r"median length of 0\.8103, e\.g\. in line 2.*metres",
         ),
         (
             GOOD.replace("-10.5 20 812.25", "0 0 812250"),
