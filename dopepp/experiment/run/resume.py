@@ -235,10 +235,11 @@ def differing_images(stored: Mapping[str, Any], present: Mapping[str, Any]) -> l
     shows whether a preset has changed.
     """
     old, new = dict(flat(stored["sources"])), dict(flat(present["sources"]))
+    presets = {f"{source}.preset" for source in present["sources"]}
     lines = [
         f"{key}: {_shown(old.get(key))} → {_shown(new.get(key))}"
         for key in {**old, **new}
-        if old.get(key) != new.get(key) and not key.endswith(".preset")
+        if old.get(key) != new.get(key) and key not in presets
     ]
     before, now = stored["first_image"], present["first_image"]
     if before["labels"] != now["labels"] or not all(

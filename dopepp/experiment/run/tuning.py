@@ -33,6 +33,7 @@ from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.assembly.negative_frames import LOOKALIKES, negative_frames
 from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.config.run_config import FalsePositiveTarget
+from dopepp.geometry.camera import project
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.refinement.region.shared_errors import SCALE_ERROR
 from dopepp.inference.runtimes import Runtime
@@ -283,8 +284,8 @@ class WrongFocalLengths:
         K = sample.K.copy()
         K[[0, 1], [0, 1]] *= 1.0 + error
         if sample.instances:
-            center = sample.K @ sample.instances[0].T_cam_obj[:3, 3]
-            K[:2, 2] -= error * (center[:2] / center[2] - sample.K[:2, 2])
+            pixel = project(sample.instances[0].T_cam_obj[None, :3, 3], sample.K)[0]
+            K[:2, 2] -= error * (pixel - sample.K[:2, 2])
         return replace(sample, K=K)
 
 

@@ -72,6 +72,11 @@ def test_a_preset_with_a_new_field_and_equal_images_is_the_same_preset():
     assert line == "pixels of the first image"
 
 
+def test_a_part_that_is_called_preset_is_compared():
+    first, other = (describe_images(Pictures(parts={"preset": mesh})) for mesh in "12")
+    assert differing_images(first, other) == ["0 pictures.parts.preset: 1 → 2"]
+
+
 @pytest.fixture
 def resumed(tiny, tmp_path):
     """Resume a run with these overrides and say which differences are accepted."""
