@@ -14,6 +14,7 @@ setup(
             "inference/templates/ranking.json",
             "parts/convex/*.npz",
             "pretrained/*",
+            "pretrained/start/*",
             "robot/grasping/data/*",
             "robot/nodes/share/*",
             "virtual/backgrounds/photos/*",

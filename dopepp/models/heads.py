@@ -7,7 +7,7 @@ To add a head, write a subclass of :class:`Head` in this module and a YAML file 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Final, TypeAlias, cast
 
 import torch
@@ -60,7 +60,7 @@ class Head(nn.Module):
 
     Args:
         in_channels: Channels of the feature maps.
-        num_objects: Number of objects, 1–64.
+        num_objects: Number of objects, 1–256.
         activation: Name of the belief activation.
         stages: Number of stages, 1–12.
         make_branch: Builds a branch from input channels, output channels and stage (from 0).
@@ -81,7 +81,7 @@ class Head(nn.Module):
     ) -> None:
         super().__init__()
         self.activate = find_activation(activation)
-        check("num_objects", num_objects, int, Range(1, 64))
+        check("num_objects", num_objects, int, Range(1, 256))
         check("stages", stages, int, Range(1, 12))
         outputs = (NUM_KEYPOINTS * num_objects, 2 * NUM_CORNERS * num_objects)
         self.belief_branches, self.field_branches = (
@@ -94,10 +94,15 @@ class Head(nn.Module):
         initialise(self)
         biases = (self.activate.initial_logit, 0.0)
         for branches, bias in zip((self.belief_branches, self.field_branches), biases, strict=True):
-            for output in (conv for branch in branches for conv in cast(Branch, branch).outputs):
+            for output in _outputs(branches):
                 if not output.weight.is_meta:  # see layers.initialise
                     nn.init.normal_(output.weight, std=_OUTPUT_STD)
                 nn.init.constant_(cast(Tensor, output.bias), bias)
+
+    @property
+    def outputs(self) -> list[nn.Conv2d]:
+        """The convolutions that produce maps; all other layers know nothing of the objects."""
+        return [*_outputs(self.belief_branches), *_outputs(self.field_branches)]
 
     def forward(self, features: Features) -> list[Stage]:
         """Return the belief logits and vector field of every stage; the last pair is the result."""
@@ -111,6 +116,11 @@ class Head(nn.Module):
                 inputs = torch.cat([features, belief, field.to(features.dtype)], dim=1)
             stages += zip(belief_branch(inputs), field_branch(inputs), strict=True)
         return stages
+
+
+def _outputs(branches: Iterable[nn.Module]) -> list[nn.Conv2d]:
+    """Return the convolutions that produce the maps of branches."""
+    return [layer for branch in branches for layer in cast(Branch, branch).outputs]
 
 
 class Cascade(Head):

@@ -61,7 +61,7 @@ FULL_WIDTH = "with width=1 and batch_norm=false"
         (SharedTrunk, {"channels": 64.5}, "channels=64.5; allowed: an integer from 8 to 1024"),
         (SharedTrunk, {"blocks": 0}, "blocks=0; allowed: an integer from 1 to 16"),
         (SharedTrunk, {"width": 5}, "width=5"),
-        (SharedTrunk, {"num_objects": 65}, "num_objects=65"),
+        (SharedTrunk, {"num_objects": 257}, "num_objects=257"),
         (SharedTrunk, {"activation": "relu"}, "activation 'relu'; allowed: identity, exp"),
         (SpatialCrossEntropy, {"sigma": 0}, "sigma=0"),
         (SpatialCrossEntropy, {"sigma": "2"}, "sigma='2'"),

@@ -156,7 +156,7 @@ def change(key: str, value: object) -> Callable[[dict[str, Any]], object]:
         (lambda spec: spec.pop("head"), "a model spec with .* allowed: exactly backbone, atten"),
         (change("stride", 4), "'stride'.* allowed: exactly"),
         (change("activation", "softmax"), "activation 'softmax'; allowed: identity, exp"),
-        (change("num_objects", 0), "num_objects=0; allowed: an integer from 1 to 64"),
+        (change("num_objects", 0), "num_objects=0; allowed: an integer from 1 to 256"),
         (change("num_objects", 10**9), "num_objects=1000000000"),
         (change("num_objects", True), "num_objects=True"),
         (lambda spec: spec["head"].update(width=1e6), "width=1000000.0"),

@@ -28,11 +28,12 @@ from dopepp.core.errors import UserError
 from dopepp.core.pool import cpu_fact
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment import program
-from dopepp.experiment.config.run_config import MapsConfig, RunConfig, TrainerConfig
+from dopepp.experiment.config.run_config import AUTO, MapsConfig, RunConfig, TrainerConfig
 from dopepp.maps.codec import MapGeometry
-from dopepp.models.checkpoint import Checkpoint, load_network
+from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.network import LOSSES, PoseNetwork, build_network
 from dopepp.models.registry import TARGET, Registry
+from dopepp.models.start import FITS, start_from_checkpoint, start_from_parts
 from dopepp.parts.part import Part
 from dopepp.parts.size import Seen
 from dopepp.recovery.detection import RecoveryOptions
@@ -123,8 +124,7 @@ def build_system(
         data_fingerprint=fingerprint,
         seen=dict(seen or {}),
     )
-    if config.init_from is not None:
-        _start_from(network, Path(config.init_from))
+    _initialise(network, config)
     return PoseSystem(
         network,
         LOSSES.build(config.model.loss),
@@ -137,6 +137,22 @@ def build_system(
         compile_network=config.compile,
         symmetry=config.symmetry,
     )
+
+
+def _initialise(network: PoseNetwork, config: RunConfig) -> None:
+    """Copy the weights that ``init_from`` names, and print which weights were chosen."""
+    if config.init_from is None:
+        return
+    if config.init_from != AUTO:
+        start_from_checkpoint(network, Path(config.init_from))
+        return
+    fits = start_from_parts(network)
+    if config.resume is None and not getattr(rank_zero_only, "rank", 0):
+        program.say(
+            "initial weights: learned on random parts (init_from=auto)"
+            if fits
+            else f"initial weights: the model's own, because those of random parts fit {FITS}"
+        )
 
 
 def build_untrained(config: RunConfig, parts: list[Part]) -> tuple[PoseNetwork, Checkpoint]:
@@ -158,23 +174,6 @@ def build_untrained(config: RunConfig, parts: list[Part]) -> tuple[PoseNetwork, 
 def map_geometry(maps: MapsConfig, stride: int) -> MapGeometry:
     """Return the geometry of the target maps."""
     return MapGeometry(stride, maps.sigma, maps.field_radius)
-
-
-def _start_from(network: torch.nn.Module, path: Path) -> None:
-    """Copy the weights of a checkpoint into a network of the same architecture.
-
-    Raises:
-        UserError: The checkpoint's network has another architecture.
-    """
-    trained, _ = load_network(path)
-    try:
-        network.load_state_dict(trained.state_dict())
-    except RuntimeError as error:
-        raise UserError(
-            f"init_from={path}, whose network differs from the configured one",
-            "a checkpoint of the same backbone, attention, head, width and number of objects",
-            "set the model's options as in the run of the checkpoint, or leave out init_from",
-        ) from error
 
 
 def build_trainer(config: RunConfig, run_dir: Path, trackers: Sequence[Logger] = ()) -> Trainer:

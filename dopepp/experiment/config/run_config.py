@@ -30,6 +30,9 @@ _MIN_CELLS: Final = 0.1
 _MAX_THRESHOLD: Final = 1000
 """Upper limit for map sizes in cells, angles in degrees and numbers of peaks."""
 
+AUTO: Final = "auto"
+"""Value of ``init_from`` that selects the package's initial weights if they fit."""
+
 Cells = Annotated[float, Range(_MIN_CELLS, _MAX_THRESHOLD)]
 Rate = Annotated[float, Range(1e-12, 1e3)]
 
@@ -315,7 +318,8 @@ class RunConfig(MeasurementConfig):
         keep_checkpoints: Whether to keep the checkpoints after the measurement.
         resume: Folder of the interrupted run to resume.
         resume_anyway: Whether to resume even if the training data or the loss have changed.
-        init_from: Checkpoint with the initial weights.
+        init_from: Checkpoint with the initial weights. ``auto``: weights learned on random parts if
+            they fit the network (:mod:`dopepp.models.start`). None: the model's own.
         model: Network and loss.
         maps: Target maps.
         recovery: Options of the recovery from maps to poses, by the names of

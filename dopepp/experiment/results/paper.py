@@ -25,6 +25,7 @@ from dopepp.core.files import write_csv, write_png
 from dopepp.core.validation import STRICT, parse
 from dopepp.core.yaml import read_yaml
 from dopepp.drawing.curves import figure_image, rates_figure
+from dopepp.experiment.config.run_config import AUTO
 from dopepp.experiment.results import display
 from dopepp.experiment.results.compared_runs import Entry
 from dopepp.experiment.results.conditions import SHADING
@@ -203,7 +204,7 @@ def _starts_untrained(config: Mapping[str, Any]) -> bool:
     """Return whether the VGG19 of a run's network started without pretrained weights."""
     model = config.get("model")
     backbone = model.get("backbone") if isinstance(model, dict) else None
-    if not isinstance(backbone, dict) or config.get("init_from") is not None:
+    if not isinstance(backbone, dict) or config.get("init_from") not in (None, AUTO):
         return False
     return backbone.get("_target_") == _UNTRAINED and backbone.get("weights_path") is None
 

@@ -71,7 +71,7 @@ def bake_open_sky(
     key = digest.digest()
     baked = _BAKED.get(key)
     if baked is None:
-        if len(_BAKED) >= 32:  # a run has fewer parts
+        if len(_BAKED) >= 256:  # a run has fewer parts
             _BAKED.pop(next(iter(_BAKED)), None)
         baked = _BAKED[key] = _bake_mesh(vertices, faces, normals, closed)
     return baked

@@ -1,0 +1,82 @@
+"""Initial weights from a trained network, or from the package's network of random parts.
+
+The package's weights come from networks that learned the poses of 288 random parts
+(``benchmarks/learn_start.py``). A new part needs half the images from there (docs/lab/start.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+import torch
+from torch import Tensor
+
+from dopepp.core.errors import UserError
+from dopepp.models.checkpoint import read
+from dopepp.models.network import PoseNetwork
+from dopepp.models.storage import read_safetensors
+
+FITS: Final = "backbone and head of dopepp_fast with model.width=0.5"
+
+_FILE: Final = Path(__file__).parents[1] / "pretrained" / "start" / "dopepp_fast.safetensors"
+
+
+def start_from_parts(network: PoseNetwork) -> bool:
+    """Copy the weights of random parts into backbone and head if they fit.
+
+    The output layers, which belong to the objects, and the attention keep their weights.
+
+    Returns:
+        Whether the weights fit; a network of another shape is left as it is.
+    """
+    weights, _ = read_safetensors(_FILE)
+    of_attention = {name for name in network.state_dict() if name.startswith("attention.")}
+    return _copy(network, weights, _output_tensors(network) | of_attention)
+
+
+def start_from_checkpoint(network: PoseNetwork, path: Path) -> None:
+    """Copy the weights of a checkpoint.
+
+    The output layers keep their weights if the checkpoint has another number of objects.
+
+    Raises:
+        UserError: The checkpoint cannot be read, or its network has another architecture.
+    """
+    checkpoint = read(path)
+    weights = checkpoint.state_dict
+    others: set[str] = set()
+    if len(checkpoint.parts) != network.num_objects:
+        others = _output_tensors(network)
+        weights = {name: value for name, value in weights.items() if name not in others}
+    if not _copy(network, weights, others):
+        raise UserError(
+            f"init_from={path}, whose network differs from the configured one",
+            "a checkpoint of the same backbone, attention, head and width",
+            "set the model's options as in the run of the checkpoint, or leave out init_from",
+        )
+
+
+def _copy(network: PoseNetwork, weights: Mapping[str, Tensor], others: set[str]) -> bool:
+    """Copy weights if exactly they and ``others`` are the network's; return whether they are."""
+    own = network.state_dict()
+    if own.keys() - others != weights.keys() or any(
+        own[name].shape != value.shape for name, value in weights.items()
+    ):
+        return False
+    with torch.no_grad():
+        for name, value in weights.items():
+            own[name].copy_(value)
+    return True
+
+
+def _output_tensors(network: PoseNetwork) -> set[str]:
+    """Return the names of the weights that belong to single objects."""
+    layers = {id(layer) for layer in network.head.outputs}
+    return {
+        f"{name}.{tensor}"
+        for name, layer in network.named_modules()
+        if id(layer) in layers
+        for tensor in layer.state_dict()
+    }
