@@ -176,8 +176,19 @@ def map_geometry(maps: MapsConfig, stride: int) -> MapGeometry:
     return MapGeometry(stride, maps.sigma, maps.field_radius)
 
 
-def build_trainer(config: RunConfig, run_dir: Path, trackers: Sequence[Logger] = ()) -> Trainer:
+def build_trainer(
+    config: RunConfig,
+    run_dir: Path,
+    trackers: Sequence[Logger] = (),
+    further: Sequence[Callback] = (),
+) -> Trainer:
     """Build Lightning's trainer with the callbacks, the CSV table and the trackers.
+
+    Args:
+        config: Config of the run.
+        run_dir: Folder of the run.
+        trackers: Loggers besides the table.
+        further: Callbacks besides those of the config.
 
     Raises:
         UserError: An option of the trainer or of a callback is wrong.
@@ -190,7 +201,7 @@ def build_trainer(config: RunConfig, run_dir: Path, trackers: Sequence[Logger] =
     precision, reason = choose_precision(options.precision, accelerator)
     if not getattr(rank_zero_only, "rank", 0):
         program.say(f"precision {precision}: {reason}")
-    callbacks = [CALLBACKS.build(node) for node in config.callbacks.values()]
+    callbacks = [*(CALLBACKS.build(node) for node in config.callbacks.values()), *further]
     if config.ema is not None:
         callbacks.append(AveragedWeights(config.ema))
     strategy: str | WatchedDDP = options.strategy

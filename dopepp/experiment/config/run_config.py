@@ -315,6 +315,8 @@ class RunConfig(MeasurementConfig):
         seed: Seed of initial weights, order and training images.
         compile: Whether to compile the network with torch.
         ema: Decay of an exponential moving average of the weights; None disables it.
+        stop_at: Share of the parts with a right refined pose that ends the training, once it is
+            confirmed on held-out pictures; None: the training has its full length.
         keep_checkpoints: Whether to keep the checkpoints after the measurement.
         resume: Folder of the interrupted run to resume.
         resume_anyway: Whether to resume even if the training data or the loss have changed.
@@ -342,6 +344,7 @@ class RunConfig(MeasurementConfig):
     seed: Seed
     compile: bool
     ema: float | None
+    stop_at: Share | None
     keep_checkpoints: bool
     resume: str | None
     resume_anyway: bool

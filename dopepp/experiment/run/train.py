@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from lightning.pytorch import Trainer, seed_everything
+from lightning.pytorch import Callback, Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities import rank_zero_only
 
@@ -25,7 +25,11 @@ from dopepp.core.errors import Interruption, RunError, UserError
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment import program
 from dopepp.experiment.assembly.build_parts import build_parts
-from dopepp.experiment.assembly.build_sources import build_datamodule, fitted_to_camera
+from dopepp.experiment.assembly.build_sources import (
+    build_datamodule,
+    fitted_to_camera,
+    held_out_source,
+)
 from dopepp.experiment.assembly.build_system import (
     build_system,
     build_trainer,
@@ -63,6 +67,7 @@ from dopepp.training.loggers import GuardedLogger
 from dopepp.training.pose_validation import EarlyStop
 from dopepp.training.processes import ProcessDiedError
 from dopepp.training.pruning import PrunedError, raise_if_pruned
+from dopepp.training.refined_progress import RefinedProgress
 from dopepp.training.run_checkpoints import FOLDER, check_free_space, newest_checkpoint, saved_step
 from dopepp.training.system import PoseSystem
 from dopepp.training.throughput import FOLDER as PROFILE
@@ -161,7 +166,7 @@ def _train(
     system = build_system(config, parts, fingerprint, images, datamodule.seen(parts))
     resume_from, changes = _resume_path(config, system)
     # Lightning may reject the options, so the trainer is built before anything is written.
-    trainer = build_trainer(config, run_dir, trackers=trackers)
+    trainer = build_trainer(config, run_dir, trackers, _progress(config, parts))
     weights = system.network.state_dict().values()
     check_free_space(run_dir, sum(value.numel() * value.element_size() for value in weights))
     display.show_config(config.plain)
@@ -190,6 +195,25 @@ def _train(
         shutil.rmtree(run_dir / FOLDER)
         display.console.print("training and measurement are complete; removing the checkpoints")
     return report
+
+
+def _progress(config: RunConfig, parts: Parts) -> list[Callback]:
+    """Return the measurement of refined poses during the training, if poses are refined.
+
+    Raises:
+        UserError: ``stop_at`` is set without ``refine=region``, which verifies the poses.
+    """
+    terms = (config.refine,) if isinstance(config.refine, str) else config.refine or ()
+    if "region" in terms:
+        pictures = held_out_source(config.data, parts, "val")
+        return [RefinedProgress(pictures, terms, config.stop_at)]
+    if config.stop_at is not None:
+        raise UserError(
+            f"stop_at={config.stop_at:g} with refine={config.refine}",
+            "stop_at with refine=region, because refined and verified poses are counted",
+            "set refine=region, or leave out stop_at",
+        )
+    return []
 
 
 def _fit(

@@ -1,0 +1,140 @@
+"""Accuracy of refined poses while the network trains, and a goal that ends the training."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from dopepp.core.files import write_png
+from dopepp.data.sample import SampleSource
+from dopepp.drawing.curves import RateCurve, figure_image, rates_figure
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.refinement.refiner import Refine
+from dopepp.metrics.functional import wilson_interval
+from dopepp.metrics.pose import MEAN, PoseMetrics
+from dopepp.models.checkpoint import parse_description
+from dopepp.training.pose_validation import best_effort
+from dopepp.training.system import PoseSystem
+
+PICTURE: Final = "refined.png"  # curve in the run folder
+
+NUM_PICTURES: Final = 40
+NUM_CONFIRMING: Final = 100  # pictures on which a reached goal is confirmed
+LEAST_SCORE: Final = 0.5  # reported poses are more likely right than wrong
+
+
+class RefinedProgress(Callback):
+    """Measures reported refined poses on whole pictures of the camera after validations.
+
+    A measurement is logged as ``val/refined`` (share of the instances with a reported pose whose
+    ADD(-S) is below a tenth of the diameter) and ``val/refined_precision``, printed with its 95 %
+    interval, and drawn in ``refined.png`` over the minutes of training.
+
+    Args:
+        pictures: Held-out pictures, at the camera's resolution.
+        refine: Evidence that refines the poses.
+        stop_at: Share that ends the training, once it is confirmed on more pictures; None: never.
+        every_s: Least time between two measurements, seconds.
+    """
+
+    def __init__(
+        self,
+        pictures: SampleSource,
+        refine: Refine,
+        stop_at: float | None = None,
+        every_s: float = 120.0,
+    ) -> None:
+        self.pictures, self.refine, self.stop_at, self.every_s = pictures, refine, stop_at, every_s
+        self.curve: list[tuple[float, float, float, float]] = []
+        """Minutes of training, share, and the ends of its interval."""
+        self._minutes_before, self._begin, self._last = 0.0, 0.0, -every_s
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the curve and the minutes of training."""
+        return {"curve": [list(point) for point in self.curve], "minutes": self._minutes()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore the curve and the minutes."""
+        self.curve = [tuple(point) for point in state_dict["curve"]]
+        self._minutes_before = float(state_dict["minutes"])
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the clock."""
+        self._begin = time.monotonic()
+        self._last = self._begin - self.every_s
+
+    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Measure the network, unless a measurement was made recently; stop at the goal."""
+        assert isinstance(pl_module, PoseSystem)
+        reached, waited_s = False, time.monotonic() - self._last
+        if trainer.is_global_zero and not trainer.sanity_checking and waited_s >= self.every_s:
+            reached = self._measure_and_report(trainer, pl_module)
+            self._last = time.monotonic()
+        trainer.should_stop = trainer.should_stop or trainer.strategy.broadcast(reached)
+
+    def _measure_and_report(self, trainer: Trainer, system: PoseSystem) -> bool:
+        """Measure, log, print and draw; return whether the goal is reached."""
+        estimator = self._estimator(system)
+        metrics = PoseMetrics(system.parts)
+        share, count, precision = self._measure(estimator, metrics, 0, NUM_PICTURES)
+        if self.stop_at is not None and share >= self.stop_at:
+            share, count, precision = self._measure(
+                estimator, metrics, NUM_PICTURES, NUM_CONFIRMING
+            )
+        low, high = wilson_interval(round(share * count), count)
+        minutes = self._minutes()
+        self.curve.append((minutes, share, low, high))
+        values = {"val/refined": share, "val/refined_precision": precision}
+        for logger in trainer.loggers:
+            logger.log_metrics(values, trainer.global_step)
+        line = (
+            f"{minutes:.1f} min: {100 * share:.0f} % of {count} parts refined and reported "
+            f"within 0.1 d (95 % interval {100 * low:.0f} – {100 * high:.0f} %), "
+            f"precision {100 * precision:.0f} %"
+        )
+        reached = self.stop_at is not None and share >= self.stop_at
+        system.print(f"{line}; stop_at={self.stop_at:g} is reached" if reached else line)
+        with best_effort(PICTURE):
+            self._draw(Path(trainer.default_root_dir))
+        return reached
+
+    def _estimator(self, system: PoseSystem) -> PoseEstimator:
+        """Return an estimator of the network as it is."""
+        checkpoint = parse_description(system.payload)
+        network = system.network.for_inference()
+        estimator = PoseEstimator(network, checkpoint, system.device, self.refine, system.parts)
+        return estimator.reporting(LEAST_SCORE)
+
+    def _measure(
+        self, estimator: PoseEstimator, metrics: PoseMetrics, first: int, end: int
+    ) -> tuple[float, int, float]:
+        """Add pictures to the metrics; return recall, number of instances and precision.
+
+        Args:
+            estimator: Estimator of the network.
+            metrics: Metrics of the pictures before the first.
+            first: First picture to add.
+            end: Picture after the last.
+        """
+        for index in range(first, min(end, len(self.pictures))):
+            sample = self.pictures.sample(index)
+            poses = estimator.predict(sample.image, sample.K)
+            metrics.update(poses, sample.instances, sample.K, sample.image.shape[1])
+        row = metrics.compute()[MEAN]
+        return row.add_or_s_01d or 0.0, row.num_instances, row.precision or 0.0
+
+    def _minutes(self) -> float:
+        """Return the minutes of training, those of interrupted runs included."""
+        return self._minutes_before + (time.monotonic() - self._begin) / 60
+
+    def _draw(self, folder: Path) -> None:
+        """Draw the curve."""
+        x, rate, low, high = np.array(self.curve).T
+        panels = {"refined and reported poses": {"ADD(-S)-0.1d": RateCurve(x, rate, low, high)}}
+        figure = rates_figure(panels, "minutes of training", columns=1)
+        figure.axes[0].set_xlim(0, None)
+        write_png(folder / PICTURE, figure_image(figure))

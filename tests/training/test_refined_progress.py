@@ -1,0 +1,131 @@
+"""The measurement of refined poses during a training, with an estimator whose poses are known."""
+
+import numpy as np
+import pytest
+import torch
+
+from dopepp.core.files import read_csv
+from dopepp.data.rendered import RenderedSource
+from dopepp.drawing.pictures import read_rgb
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.metrics.functional import wilson_interval
+from dopepp.recovery.detection import Detection
+from dopepp.training.refined_progress import NUM_CONFIRMING, NUM_PICTURES, RefinedProgress
+from dopepp.virtual.factory import Factory
+from dopepp.virtual.presets import PRESETS
+
+
+class Known:
+    """Returns the true pose of every picture, or one that is 5 cm off where ``wrong`` says so."""
+
+    def __init__(self, pictures, wrong):
+        self.pictures, self.wrong, self.asked = pictures, wrong, 0
+
+    def predict(self, image, K):
+        (instance,) = self.pictures.sample(self.asked).instances
+        T = instance.T_cam_obj.copy()
+        T[0, 3] += 0.05 * self.wrong(self.asked)
+        self.asked += 1
+        peaks = np.full((9, 2), np.nan)
+        return [Detection(instance.label, 0.9, 0.9, T, peaks, peaks, 0.0, None)]
+
+
+class Repeated:
+    """As many pictures as one likes from one render, moved by nothing."""
+
+    name = "repeated"
+
+    def __init__(self, sample, number):
+        self.only, self.number = sample, number
+
+    def __len__(self):
+        return self.number
+
+    def sample(self, index, epoch=0):
+        return self.only
+
+
+@pytest.fixture(scope="session")
+def pictures(part):
+    factory = Factory([part], PRESETS["quickstart"], seed=0)
+    return Repeated(RenderedSource(factory, 1, "val").sample(0), 120)
+
+
+@pytest.fixture
+def measure(monkeypatch, make_trainer, make_system, make_datamodule, pictures, tmp_path):
+    """Fit with a measurement after every validation; return the callback, trainer and estimator."""
+
+    def measure(wrong, epochs=1, **options):
+        known = Known(pictures, wrong)
+        monkeypatch.setattr(RefinedProgress, "_estimator", lambda self, system: known)
+        progress = RefinedProgress(pictures, "region", **options)
+        trainer = make_trainer(tmp_path, [progress], max_epochs=epochs)
+        trainer.fit(make_system(), make_datamodule())
+        return progress, trainer, known
+
+    return measure
+
+
+def test_share_precision_and_interval_are_reported_and_drawn(measure, tmp_path, capsys):
+    progress, trainer, known = measure(lambda number: number % 4 == 0)
+    ((minutes, share, low, high),) = progress.curve
+    assert known.asked == NUM_PICTURES
+    assert share == pytest.approx(0.75)
+    assert (low, high) == pytest.approx(wilson_interval(30, 40))
+    assert 0 < minutes < 5
+    shown = capsys.readouterr().out
+    assert "75 % of 40 parts refined and reported within 0.1 d" in shown
+    assert "precision 75 %" in shown
+    assert "stop_at" not in shown
+    (row,) = [row for row in read_csv(tmp_path / "metrics.csv") if row.get("val/refined")]
+    assert float(row["val/refined"]) == pytest.approx(0.75)
+    assert float(row["val/refined_precision"]) == pytest.approx(0.75)
+    assert read_rgb(tmp_path / "refined.png").std() > 10
+    assert not trainer.should_stop
+
+
+def test_a_reached_goal_is_confirmed_on_more_pictures(measure, capsys):
+    _, trainer, known = measure(lambda number: number >= NUM_PICTURES, epochs=3, stop_at=0.9)
+    assert known.asked == NUM_CONFIRMING  # the second validation came too soon to measure again
+    assert trainer.current_epoch == 3
+    assert "40 % of 100 parts" in capsys.readouterr().out
+
+
+def test_the_goal_ends_the_training(measure, capsys):
+    _, trainer, _ = measure(lambda number: number == 0, epochs=5, stop_at=0.95)
+    assert trainer.current_epoch == 1
+    assert "99 % of 100 parts" in (shown := capsys.readouterr().out)
+    assert "stop_at=0.95 is reached" in shown
+
+
+def test_measurements_keep_their_distance_in_time(measure):
+    progress, _, known = measure(lambda number: False, epochs=3, every_s=0.0)
+    assert (len(progress.curve), known.asked) == (3, 3 * NUM_PICTURES)
+    minutes = [point[0] for point in progress.curve]
+    assert minutes == sorted(minutes)
+    progress, _, _ = measure(lambda number: False, epochs=3, every_s=1e6)
+    assert len(progress.curve) == 1
+
+
+def test_a_resumed_training_continues_the_curve(pictures):
+    before = RefinedProgress(pictures, "region")
+    before.on_train_start(None, None)
+    before.curve = [(1.0, 0.2, 0.1, 0.3)]
+    after = RefinedProgress(pictures, "region")
+    after.load_state_dict({**before.state_dict(), "minutes": 7.0})
+    after.on_train_start(None, None)
+    assert after.curve == before.curve
+    assert after.state_dict()["minutes"] == pytest.approx(7.0, abs=0.1)
+
+
+def test_the_estimator_has_the_networks_present_weights(make_system, pictures):
+    system = make_system()
+    estimator = RefinedProgress(pictures, "region")._estimator(system)
+    assert isinstance(estimator, PoseEstimator)
+    assert (estimator.refine, estimator.min_score) == ("region", 0.5)
+    image = pictures.sample(0).image
+    belief, field = estimator.maps(image)
+    pixels = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
+    expected = system.network.eval().maps(pixels[None])
+    for mine, theirs in zip((belief, field), expected, strict=True):
+        np.testing.assert_allclose(mine.numpy(), theirs[0].detach().numpy(), atol=1e-4)
