@@ -22,7 +22,7 @@ from dopepp.core.files import partial_path
 CHUNK_BYTES: Final = 1 << 20
 """Largest number of bytes to read at once."""
 
-MOST_MEMBERS: Final = 200_000
+MAX_MEMBERS: Final = 200_000
 
 _MAX_NAME: Final = 1000
 _MAX_PART: Final = 200
@@ -64,7 +64,7 @@ class Bounded(io.RawIOBase):
         return self._stream.read(size)
 
 
-def safe_extract(archive: Path | str, folder: Path | str, most_members: int = MOST_MEMBERS) -> Path:
+def safe_extract(archive: Path | str, folder: Path | str, most_members: int = MAX_MEMBERS) -> Path:
     """Unpack a tar file into ``folder``, which must be new or empty.
 
     Raises:

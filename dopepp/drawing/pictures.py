@@ -61,7 +61,7 @@ MAX_BYTES: Final = 256_000_000
 DARKEST: Final = 16
 """Largest value (of 255) of 16-bit pixels with no more than 12 significant bits."""
 
-LEAST_FREE: Final = 16_000_000
+MIN_FREE: Final = 16_000_000
 """Free bytes on the disk below which writing stops, so that the file can still be completed."""
 
 USUAL_RATE: Final = 25.0
@@ -305,7 +305,7 @@ class VideoFile(AbstractContextManager["VideoFile"]):
             even = np.asarray(cv2.resize(even, self._size, interpolation=cv2.INTER_AREA))
         until = round((time - self._start) * self._rate) + 1
         until = min(until, self._written + max(1, round(LONGEST_GAP_S * self._rate)))
-        if self._written < until and shutil.disk_usage(self.path.parent).free < LEAST_FREE:
+        if self._written < until and shutil.disk_usage(self.path.parent).free < MIN_FREE:
             raise RunError(f"no space left for {self.path}; delete files on this disk")
         frame = cv2.cvtColor(even, cv2.COLOR_RGB2BGR)
         while self._written < until:

@@ -206,8 +206,8 @@ def pinhole_matrix(K: CameraMatrix, source: str) -> CameraMatrix:
     return camera_matrix(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
 
 
-LEAST_VIEW_DEG: Final = 5.0
-MOST_VIEW_DEG: Final = 150.0
+MIN_VIEW_DEG: Final = 5.0
+MAX_VIEW_DEG: Final = 150.0
 """Limits of the field of view along the longer side of a whole image, degrees."""
 
 WHOLE: Final = 0.2
@@ -238,9 +238,9 @@ def check_camera(
     K = pinhole_matrix(K, source)
     x, y = (K[0, 2] + 0.5) / width, (K[1, 2] + 0.5) / height
     views = np.degrees(2 * np.arctan2(max(width, height) / 2, K.diagonal()[:2])).round(1)
-    narrowest = LEAST_VIEW_DEG if off_centre < ANYWHERE else 0.0
+    narrowest = MIN_VIEW_DEG if off_centre < ANYWHERE else 0.0
     offset = max(abs(x - 0.5), abs(y - 0.5))
-    if offset <= off_centre and narrowest <= views.min() and views.max() <= MOST_VIEW_DEG:
+    if offset <= off_centre and narrowest <= views.min() and views.max() <= MAX_VIEW_DEG:
         return K
     problem = (
         f"K with fx={K[0, 0]:.6g}, fy={K[1, 1]:.6g}, cx={K[0, 2]:.6g}, cy={K[1, 2]:.6g} "
@@ -250,7 +250,7 @@ def check_camera(
     centre = f"within {0.5 - off_centre:.0%} – {0.5 + off_centre:.0%} of width and height"
     centre = "inside the image" if off_centre == INSIDE else centre
     allowed = "" if off_centre == ANYWHERE else f"a principal point {centre} and "
-    allowed += f"a field of view of {narrowest:g}° – {MOST_VIEW_DEG:g}°"
+    allowed += f"a field of view of {narrowest:g}° – {MAX_VIEW_DEG:g}°"
     fix = "pass the K of this image's size (K scales with the image)"
     if off_centre == WHOLE < offset and min(x, y) > 0:
         likely = f"{2 * K[0, 2] + 1:.0f}×{2 * K[1, 2] + 1:.0f}"

@@ -36,7 +36,7 @@ from dopepp.geometry.refine import (
 )
 from dopepp.geometry.rotation import RotationMatrix, Vector
 
-MOST_LEFT_OUT: Final = 2
+MAX_LEFT_OUT: Final = 2
 """Largest number of points left out of a start; the robust cost tolerates further mild outliers."""
 
 NUM_STARTS: Final = 3  # Starts from subsets that are refined
@@ -319,7 +319,7 @@ def _best_pose(
     points, rays, count = starts.object_points, starts.rays, len(whitening)
     normal, is_plate = starts.normal, starts.is_plate
     agree = np.zeros(count, bool)
-    for left_out in range(min(MOST_LEFT_OUT, count - MIN_POINTS) + 1):
+    for left_out in range(min(MAX_LEFT_OUT, count - MIN_POINTS) + 1):
         poses = starts.without(left_out)
         cost = _improved(points, rays, whitening, poses, normal, is_plate, R, t, cost, agree)
         if cost < math.inf and agree.sum() >= count - left_out:

@@ -26,10 +26,10 @@ ROUNDING: Final = 1e-12
 
 FIRST_DAMPING: Final = 1e-4
 
-LEAST_DAMPING: Final = 1e-9
+MIN_DAMPING: Final = 1e-9
 """Larger than rounding errors of the scaled 6×6 system, which is therefore never singular."""
 
-MOST_DAMPING: Final = 1e6
+MAX_DAMPING: Final = 1e6
 """Damping at convergence: steps of a millionth of Gauss–Newton's do not reduce the cost."""
 
 NO_GATE: Final = 1e3  # A gate so wide that the cost is the least-squares cost
@@ -84,13 +84,13 @@ def refine_pose(
                 residuals[i, 0], residuals[i, 1] = moved_residuals[i, 0], moved_residuals[i, 1]
             if arrived:
                 return
-            damping = max(damping / 10, LEAST_DAMPING)
+            damping = max(damping / 10, MIN_DAMPING)
             normal_equations(
                 object_points, rays, whitening, R, t, residuals, gate, hessian, gradient
             )
         else:
             damping *= 10
-            if damping >= MOST_DAMPING:
+            if damping >= MAX_DAMPING:
                 return
 
 
@@ -229,7 +229,7 @@ def solve_inside(
             for k in range(j):
                 value -= L[i, k] * L[j, k]
             # A smaller value would be a rounding error.
-            L[i, j] = math.sqrt(max(value, LEAST_DAMPING**2)) if i == j else value / L[j, j]
+            L[i, j] = math.sqrt(max(value, MIN_DAMPING**2)) if i == j else value / L[j, j]
     for i in range(6):
         step[i] = -scale[i] * gradient[i]
         for k in range(i):

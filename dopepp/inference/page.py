@@ -28,7 +28,7 @@ from dopepp.core.files import write_whole
 from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import Picture, read_photo
 from dopepp.drawing.sheet import belief_tiles, contact_sheet
-from dopepp.geometry.camera import LEAST_VIEW_DEG, MOST_VIEW_DEG, CameraMatrix, camera_matrix
+from dopepp.geometry.camera import MIN_VIEW_DEG, MAX_VIEW_DEG, CameraMatrix, camera_matrix
 from dopepp.geometry.camera_file import Camera, read_camera
 from dopepp.geometry.cuboid import NUM_KEYPOINTS
 from dopepp.geometry.rotation import matrix_to_quaternion
@@ -219,7 +219,7 @@ def _camera(kind: str, inputs: Sequence[Any], width: int, height: int) -> Camera
     """Return the camera that the page's inputs specify."""
     view, fx, fy, cx, cy, file = inputs
     if kind == VIEW:
-        check("field of view", view, float, Range(LEAST_VIEW_DEG, MOST_VIEW_DEG, "degrees"))
+        check("field of view", view, float, Range(MIN_VIEW_DEG, MAX_VIEW_DEG, "degrees"))
         focal = width / 2 / math.tan(math.radians(view) / 2)
         K = camera_matrix(focal, focal, (width - 1) / 2, (height - 1) / 2)
         return Camera(None, K, (), "the field of view")

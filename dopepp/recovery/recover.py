@@ -43,7 +43,7 @@ KINDS: Final[dict[Kind, str]] = {
 }
 """Kinds of reasons, in the order of the steps, with the text of a summary."""
 
-LEAST_CELLS: Final = 3.0  # Keypoints within fewer cells blend into one peak
+MIN_CELLS: Final = 3.0  # Keypoints within fewer cells blend into one peak
 
 
 @dataclass(frozen=True)
@@ -228,7 +228,7 @@ def _rejected(
         text = f"score {best:.3f} below {options.min_score:.3g}"
     points = points[np.isfinite(points).all(1)]
     extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
-    if len(points) >= 2 and extent < LEAST_CELLS * stride:
+    if len(points) >= 2 and extent < MIN_CELLS * stride:
         kind = "small"
         text += f" (too small: {extent:.0f} px across, a cell of the maps has {stride} px)"
     x, y = group.position[CENTROID]

@@ -20,7 +20,7 @@ from dopepp.virtual.renderers.raster.visibility import draw_alone, project_objec
 from dopepp.virtual.scene import NEAR, SceneObject
 from dopepp.virtual.surface import Surface
 
-MOST_POINTS: Final = 1500  # largest number of evaluated contour pixels
+MAX_POINTS: Final = 1500  # largest number of evaluated contour pixels
 FLOOR: Final = 2.0  # gradient of noise, grey levels per pixel
 
 
@@ -65,7 +65,7 @@ def _contour(
     inside = (x > 0) & (y > 0) & (x < size[0] - 1) & (y < size[1] - 1)
     normals = _normals(edges)[rows, columns]
     points = np.column_stack([x, y, normals])[inside]
-    points = points[:: -(-len(points) // MOST_POINTS) or 1]
+    points = points[:: -(-len(points) // MAX_POINTS) or 1]
     extent = max(seen.extent[2] - seen.extent[0], seen.extent[3] - seen.extent[1])
     return points, extent
 

@@ -28,7 +28,7 @@ from dopepp.virtual.tabletop import draw_view
 _IMAGE_WIDTH: Final = 5.0  # width of the image for the size of distractors, diameters
 _LARGEST: Final = 2.0  # diameter of the largest negative in a heap, diameters of the targets
 _GAP: Final = 0.01  # smallest distance between layers of falling objects, diameters
-_LEAST_ROOM: Final = 1.2  # smallest side of the drop area, diameters
+_MIN_ROOM: Final = 1.2  # smallest side of the drop area, diameters
 _TRIALS: Final = 8
 
 Sides = Float[np.ndarray, "3"]  # inner width, depth and height of a bin, metres
@@ -104,7 +104,7 @@ def _drop(
     # The mean side of the objects' bounding boxes.
     size = np.mean([np.ptp(body.hull.vertices, axis=0).prod() ** (1 / 3) for body in bodies])
     for _ in range(_TRIALS):
-        room = max(rng.uniform(*pile.room) * size * np.sqrt(len(bodies)), _LEAST_ROOM * diameter)
+        room = max(rng.uniform(*pile.room) * size * np.sqrt(len(bodies)), _MIN_ROOM * diameter)
         stretch, height = rng.uniform(0.8, 1.25), diameter * rng.uniform(*pile.wall_height)
         sides = np.array([room * stretch, room / stretch, height])
         has_bin = rng.random() < pile.bin_share

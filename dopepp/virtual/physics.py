@@ -38,18 +38,18 @@ import mujoco  # noqa: E402
 
 Poses = Float[np.ndarray, "solids 4 4"]
 
-MOST_OVERLAP: Final = 0.008
+MAX_OVERLAP: Final = 0.008
 """Largest depth to which solids at rest overlap, diameters of the largest solid."""
 
 _SIZE: Final = 0.1  # diameter of the largest simulated solid, metres
 _STEP: Final = 0.004  # time step, seconds
 _DRAG: Final = 16.0  # damping rate, 1/s: solids fall at no more than 0.6 m/s
-_MOST_DRAG: Final = 300.0  # reached by doubling in every window once solids have landed, 1/s
+_MAX_DRAG: Final = 300.0  # reached by doubling in every window once solids have landed, 1/s
 _WINDOW: Final = 0.1  # duration over which the motion is measured, seconds
 _REST: Final = 0.01  # largest motion of a vertex at rest in a window, diameters; a fall is 0.03
 _LANDED: Final = 0.1  # largest motion in a window once solids have landed, diameters
 _LONGEST: Final = 1.0  # a pile that moves longer at most drag is rejected, seconds
-_MOST_WINDOWS: Final = 300  # a tower of 100 solids falls for 17 seconds
+_MAX_WINDOWS: Final = 300  # a tower of 100 solids falls for 17 seconds
 _FRICTION: Final = (0.4, 0.005, 0.0001)  # sliding, torsional and rolling
 _FLOOR, _HULL, _PIECES = 1, 2, 4  # collision groups
 
@@ -76,7 +76,7 @@ def settle(
 
     Returns:
         Poses, or None if the solids do not come to rest, or overlap by more than
-        :data:`MOST_OVERLAP`.
+        :data:`MAX_OVERLAP`.
 
     Raises:
         UserError: The cached result is damaged.
@@ -122,7 +122,7 @@ def _simulate(
     # Positions of all vertices are compared after every window of simulated time.
     positions, drag = _moved(starts, ends), _DRAG
     windows_left = round(_LONGEST / _WINDOW)
-    for _ in range(_MOST_WINDOWS):
+    for _ in range(_MAX_WINDOWS):
         inertia = model.body_inertia[1:].max(axis=1)
         damping = np.stack([*[model.body_mass[1:]] * 3, *[inertia] * 3], axis=1)
         model.dof_damping[:] = drag * damping.ravel()
@@ -133,15 +133,15 @@ def _simulate(
         moved = _moved(poses, ends)
         motion = np.linalg.norm(moved - positions, axis=1).max()
         overlap = -state.contact.dist.min(initial=0.0)
-        if motion < _REST * _SIZE and overlap < MOST_OVERLAP * _SIZE:
+        if motion < _REST * _SIZE and overlap < MAX_OVERLAP * _SIZE:
             poses[:, :3, 3] /= scale
             return poses
         positions = moved
-        windows_left -= drag == _MOST_DRAG
+        windows_left -= drag == _MAX_DRAG
         if not windows_left:
             break
         if drag > _DRAG or motion < _LANDED * _SIZE:
-            drag = min(2 * drag, _MOST_DRAG)
+            drag = min(2 * drag, _MAX_DRAG)
     return None
 
 

@@ -47,7 +47,7 @@ separate row."""
 FRAME: Final[Size] = (640, 480)
 """(width, height) of the frames if there is no camera and the preset's pictures are smaller."""
 
-_MOST_DISTRACTORS: Final = 12  # in a frame, which bounds the time to render it
+_MAX_DISTRACTORS: Final = 12  # in a frame, which bounds the time to render it
 _LOOKALIKES_SHOWN: Final = (1, 3)  # in a frame
 _MARGIN: Final = 0.3  # border without look-alikes, share of the frame, if there is no camera
 _NUM_POSES: Final = 64  # number of drawn poses per part for measuring the preset's distances
@@ -140,6 +140,6 @@ def _as_dense(preset: Preset, size: Size) -> Preset:
     """Return a preset with distractors of equal size and density in larger frames."""
     old, scale = preset.distractors, size[0] / preset.width
     growth = size[0] * size[1] / (preset.width * preset.height)
-    low, high = (min(math.ceil(count * growth), _MOST_DISTRACTORS) for count in old.number)
+    low, high = (min(math.ceil(count * growth), _MAX_DISTRACTORS) for count in old.number)
     share = old.image_share[0] / scale, old.image_share[1] / scale
     return replace(preset, distractors=replace(old, number=(low, high), image_share=share))

@@ -19,12 +19,12 @@ from dopepp.virtual.backgrounds import (
     find_backgrounds,
     shipped_photos,
 )
-from dopepp.virtual.backgrounds.photo_backgrounds import FEWEST_PHOTOS, PhotoSplit
+from dopepp.virtual.backgrounds.photo_backgrounds import MIN_PHOTOS, PhotoSplit
 
 _log = logging.getLogger(__name__)
 
 _OWN_SHARE: Final = 0.25  # share of the user's pictures in the training backgrounds
-_NEEDED: Final = f"at least {3 * FEWEST_PHOTOS} different photos"
+_NEEDED: Final = f"at least {3 * MIN_PHOTOS} different photos"
 
 
 def training_backgrounds(data: DataConfig) -> Backgrounds:
@@ -39,7 +39,7 @@ def training_backgrounds(data: DataConfig) -> Backgrounds:
             "virtual.backgrounds=%s has fewer than %d different photos: training, validation and "
             "test use all of them, and tune=true is not possible",
             data.virtual.backgrounds,
-            3 * FEWEST_PHOTOS,
+            3 * MIN_PHOTOS,
         )
     user_photos = own_photos(data, "train")
     return (

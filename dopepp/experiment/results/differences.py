@@ -18,7 +18,7 @@ from dopepp.experiment.results.frame import (
     BEYOND,
     COST_FORMS,
     DELTA,
-    FEWEST_DIFFERING,
+    MIN_DIFFERING,
     FIELDS,
     WITHIN,
     Row,
@@ -295,8 +295,8 @@ def noise(table: pd.DataFrame) -> list[str]:
             subject = f"{method} on {name}" if several else method
             measures = (f"{value.column.heading}{_needed(value)}" for value in unsure)
             sentences.append(f"Within noise, {subject}: {', '.join(measures)}.")
-    if (existing["num_differing"] < FEWEST_DIFFERING).any():
-        sentence = f"If methods differ on fewer than {FEWEST_DIFFERING} instances"
+    if (existing["num_differing"] < MIN_DIFFERING).any():
+        sentence = f"If methods differ on fewer than {MIN_DIFFERING} instances"
         sentences.append(f"{sentence}, the difference counts as noise.")
     return sentences
 

@@ -46,7 +46,7 @@ NOMINAL: Final = np.linspace(0.05, 0.95, 19)
 WITHIN: Final = "within noise"
 BEYOND: Final = "beyond noise"
 
-FEWEST_DIFFERING: Final = fewest_differing(0.95)
+MIN_DIFFERING: Final = fewest_differing(0.95)
 """Minimum number of differing instances for a significant difference."""
 
 _TEXTS: Final = ("method", "object", "measure", "overrides", "folder", "job", "state")
@@ -101,7 +101,7 @@ class Value(NamedTuple):
     @property
     def within_noise(self) -> bool:
         """Whether the difference may be due to chance."""
-        return self.num_differing < FEWEST_DIFFERING or self.low <= 0 <= self.high
+        return self.num_differing < MIN_DIFFERING or self.low <= 0 <= self.high
 
     @property
     def column(self) -> Column:

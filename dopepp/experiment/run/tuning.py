@@ -65,22 +65,22 @@ from dopepp.recovery.detection import (
     score,
 )
 
-LEAST_REFINED_SCORE: Final = 0.1
+MIN_REFINED_SCORE: Final = 0.1
 """Lowest threshold of refined poses. Poses that are far more likely wrong than right are never
 reported, even if the pictures without the objects would permit it."""
 
-LEAST_REFINED_FACTOR: Final = 0.5
+MIN_REFINED_FACTOR: Final = 0.5
 """Smallest covariance factor of refined poses. Smaller factors fit renders of the network's size,
 and make covariances too small on larger pictures and on real ones."""
 
-FEWEST_REFINED: Final = 20  # least number of right refined poses that a covariance factor is fit to
+MIN_REFINED: Final = 20  # least number of right refined poses that a covariance factor is fit to
 
-MOST_LOST: Final = 0.01  # largest share of correct refined poses below the threshold
+MAX_LOST: Final = 0.01  # largest share of correct refined poses below the threshold
 SAME: Final = 0.005  # largest decrease of the average precision with fitted factors
 
 HELD_OUT: Final[tuple[Literal["val"], Literal["test"]]] = ("val", "test")
 
-MOST_BYTES: Final = 2**30
+MAX_BYTES: Final = 2**30
 """Size of the cache, bytes: 1,400 pictures of 400×400 pixels with the maps of one part."""
 
 _WEIGHTS: Final = ("score_", "refined_")
@@ -293,20 +293,20 @@ def fit_refined_factor(estimator: PoseEstimator, parts: Parts, source: SampleSou
     """Fit the covariance factor of refined poses to the errors of right poses.
 
     Returns:
-        The factor, at least :data:`LEAST_REFINED_FACTOR`; 1 if there are fewer than
-        :data:`FEWEST_REFINED` right poses.
+        The factor, at least :data:`MIN_REFINED_FACTOR`; 1 if there are fewer than
+        :data:`MIN_REFINED` right poses.
 
     Raises:
         UserError: The covariances differ too much from the errors.
     """
     matches = matched_poses(estimator, parts, source, only_right=True)
     pairs = [match for match in matches if match[0].agreement is not None]
-    if len(pairs) < FEWEST_REFINED:
+    if len(pairs) < MIN_REFINED:
         text = "covariances of refined poses keep a factor of 1: %d right poses, fewer than %d"
-        _log.warning(text, len(pairs), FEWEST_REFINED)
+        _log.warning(text, len(pairs), MIN_REFINED)
         return 1.0
     factor = fit_covariance_factor(squared_distances(pairs), refined=True)
-    return max(factor, LEAST_REFINED_FACTOR)
+    return max(factor, MIN_REFINED_FACTOR)
 
 
 def squared_distances(
@@ -385,8 +385,8 @@ def _refined_threshold(
     """Return the threshold of refined poses.
 
     The threshold for the rate of false positives (``silent``) applies if it rejects at most the
-    share :data:`MOST_LOST` of the correct poses, because otherwise a single frame with a high score
-    could cost most poses. The threshold is at least :data:`LEAST_REFINED_SCORE`.
+    share :data:`MAX_LOST` of the correct poses, because otherwise a single frame with a high score
+    could cost most poses. The threshold is at least :data:`MIN_REFINED_SCORE`.
 
     Args:
         silent: Threshold that satisfies the rate of false positives.
@@ -394,16 +394,16 @@ def _refined_threshold(
         weights: Weights of the features in the score.
     """
     correct = score(shown.features, weights)[shown.correct]
-    most = float(np.quantile(correct, MOST_LOST)) if len(correct) else 1.0
+    most = float(np.quantile(correct, MAX_LOST)) if len(correct) else 1.0
     if silent > most:
         _log.warning(
             "poses on frames without the objects have scores up to %.2f; the threshold is %.2f, "
             "because a higher threshold would lose over %.0f %% of the correct poses",
             silent,
-            max(most, LEAST_REFINED_SCORE),
-            100 * MOST_LOST,
+            max(most, MIN_REFINED_SCORE),
+            100 * MAX_LOST,
         )
-    return max(min(silent, most), LEAST_REFINED_SCORE)
+    return max(min(silent, most), MIN_REFINED_SCORE)
 
 
 def score_images(estimator: PoseEstimator, parts: Parts, *sources: SampleSource) -> Scored:
@@ -526,7 +526,7 @@ class Memory:
         most_bytes: Size of the cache. Items that do not fit are computed each time.
     """
 
-    def __init__(self, most_bytes: int = MOST_BYTES) -> None:
+    def __init__(self, most_bytes: int = MAX_BYTES) -> None:
         self._free = most_bytes
         self._kept: dict[Hashable, Any] = {}
 

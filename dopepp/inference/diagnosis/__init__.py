@@ -49,7 +49,7 @@ FOCAL, GAIN, CERTAIN = 1.35, 3.0, 0.2
 PARTLY: Final = 0.3
 """Belief at a part's centre: 0.4 to 0.8 if half occluded, mostly below 0.2 on images without it."""
 
-LEAST_SCORE: Final = 0.03
+MIN_SCORE: Final = 0.03
 """Least score of a right detection; false positives of an untuned network score lower."""
 
 OFF: Final = 0.08
@@ -183,7 +183,7 @@ def visibility(case: Case) -> Diagnosis:
     if case.detection is not None:
         count, score = num_keypoints(case.detection), case.detection.score
         sentence = f"{count} of 9 keypoints of {name}, score {score:.2g}"
-        if score >= LEAST_SCORE:
+        if score >= MIN_SCORE:
             return Diagnosis("visibility", sentence)
         problem = f"the best candidate hardly looks like {name}: {sentence}"
         return Diagnosis("visibility", problem, ABSENT)

@@ -25,7 +25,7 @@ NEARER, FARTHER = 2.0, 4.0  # factors on the expected distances for a further se
 BELIEVED: Final = (0.4, 6)
 """Least mean belief and number of keypoints of a detection outside the expected distances."""
 
-LEAST_PX: Final = 24  # smallest side of an image whose sharpness can be measured
+MIN_PX: Final = 24  # smallest side of an image whose sharpness can be measured
 
 NARROWEST: Final = 0.5  # pixels: narrower edges cannot be distinguished
 FEWEST: Final = 8  # edge pixels that a measurement of sharpness needs
@@ -161,7 +161,7 @@ class Case:
         low = np.clip(np.floor(points.min(axis=0)), 0, size).astype(int)
         high = np.clip(np.ceil(points.max(axis=0)) + 1, 0, size).astype(int)
         crop = picture[low[1] : high[1], low[0] : high[0]]
-        return crop if min(crop.shape[:2]) >= LEAST_PX else picture
+        return crop if min(crop.shape[:2]) >= MIN_PX else picture
 
     def strongest_beliefs(self) -> Float[np.ndarray, "9"]:
         """Return the strongest belief of each keypoint of the part in all image sizes."""

@@ -26,8 +26,8 @@ Points = Float[np.ndarray, "points 3"]
 Visible = Bool[np.ndarray, "points"]
 
 # Lengths are in spacings of the surface points unless stated otherwise.
-MOST_POINTS: Final = 3000  # further points slow refinement without improving accuracy
-FEWEST_POINTS: Final = 100  # least points that describe a surface
+MAX_POINTS: Final = 3000  # further points slow refinement without improving accuracy
+MIN_POINTS: Final = 100  # least points that describe a surface
 NEIGHBOURS: Final = 12  # points that a normal is estimated from
 FLAT: Final = 0.3  # neighbours farther from a plane belong to another face
 SLIVER: Final = 0.3  # twice the area (squared spacings) of a triangle that determines a plane
@@ -40,7 +40,7 @@ MARGIN: Final = 0.3  # margin of a crop, share of the part's extent
 NOISE: Final = 2e-3
 """Standard deviation of a depth camera at 1 m, metres; it grows with the square of the depth."""
 
-LEAST_NOISE: Final = 1e-3  # metres: quantisation and distortion
+MIN_NOISE: Final = 1e-3  # metres: quantisation and distortion
 GATE: Final = 3.0  # standard deviations within which depth agrees with the part
 BESIDE: Final = 6.0  # width around the part that is compared with its surface
 EXTENDED: Final = 4.0  # largest depth difference between a point and its extended plane
@@ -63,14 +63,14 @@ def surface_points(points: Points) -> SurfacePoints:
     """Estimate normals and spacing of surface points (object frame, metres).
 
     Raises:
-        ValueError: There are fewer than :data:`FEWEST_POINTS`.
+        ValueError: There are fewer than :data:`MIN_POINTS`.
     """
-    if len(points) < FEWEST_POINTS:
+    if len(points) < MIN_POINTS:
         few = f"{len(points)} points are too few for a surface"
-        raise ValueError(f"{few}; at least {FEWEST_POINTS} are needed")
+        raise ValueError(f"{few}; at least {MIN_POINTS} are needed")
     points = np.asarray(points, np.float64)
-    if len(points) > MOST_POINTS:
-        points = points[np.linspace(0, len(points) - 1, MOST_POINTS).astype(int)]
+    if len(points) > MAX_POINTS:
+        points = points[np.linspace(0, len(points) - 1, MAX_POINTS).astype(int)]
     count = min(NEIGHBOURS + 1, len(points))
     distances, neighbours = map(np.asarray, scipy.spatial.KDTree(points).query(points, count))
     # With ρ points per unit of area, πρr² of them lie within r, one of which is the point itself.
@@ -133,7 +133,7 @@ def view_around(depth: Depth, K: CameraMatrix, points_cam: Points) -> DepthView 
     K[:2] /= step
     columns, rows = np.meshgrid(np.arange(crop.shape[1]), np.arange(crop.shape[0]))
     x, y = (columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1]
-    noise = max(LEAST_NOISE, NOISE * float(points_cam[:, 2].mean()) ** 2)
+    noise = max(MIN_NOISE, NOISE * float(points_cam[:, 2].mean()) ** 2)
     return DepthView(crop, K, np.stack([x, y, np.ones(crop.shape)], -1), noise)
 
 

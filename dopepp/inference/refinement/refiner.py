@@ -47,7 +47,7 @@ from dopepp.inference.refinement.joint_refinement import (
     refine_views,
 )
 from dopepp.inference.refinement.outline import OutlineMesh
-from dopepp.inference.refinement.part_surface import FEWEST_POINTS, Points, surface_points
+from dopepp.inference.refinement.part_surface import MIN_POINTS, Points, surface_points
 from dopepp.inference.refinement.region import RegionRefiner, Starts, refinement
 from dopepp.inference.refinement.region.shared_errors import SCALE_ERROR
 from dopepp.inference.refinement.solver import (
@@ -186,7 +186,7 @@ class PartRefiner:
             self._region = RegionRefiner(part.mesh.vertices, part.mesh.faces, scale_error)
             self.verifier = Verifier(self._region.mesh, part.diameter)
         self._uses_depth, self._diameter = "depth" in terms, part.diameter
-        has_surface = self._uses_depth and len(part.points) >= FEWEST_POINTS
+        has_surface = self._uses_depth and len(part.points) >= MIN_POINTS
         self._surface = surface_points(part.points) if has_surface else None
 
     def refine_views(

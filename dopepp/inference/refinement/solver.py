@@ -27,15 +27,15 @@ ARRIVED: Final = 0.1  # standard deviations; a shorter step ends the descent
 
 # Standard deviations of a pose without covariance: radians, and diameters across and along the
 # viewing ray. An image hardly determines the distance.
-UNKNOWN_TURN: Final = math.radians(8.0)
+UNKNOWN_ROTATION: Final = math.radians(8.0)
 UNKNOWN_ACROSS: Final = 0.07
 UNKNOWN_ALONG: Final = 0.30
 
-# Lower bounds, in the same units. Errors of calibration and CAD do not show on the image, and an
+# Lower bounds, in the same units. The image does not reveal errors of calibration and CAD, and an
 # error of the focal length causes an error of the distance.
-LEAST_TURN: Final = math.radians(2.0)
-LEAST_ACROSS: Final = 0.03
-LEAST_ALONG: Final = 0.15
+MIN_ROTATION: Final = math.radians(2.0)
+MIN_ACROSS: Final = 0.03
+MIN_ALONG: Final = 0.15
 
 
 class UndecidedError(Exception):
@@ -108,12 +108,12 @@ def make_prior(
         raise UndecidedError("the pose is not finite")
     ray = T_cam_obj[:3, 3] / np.linalg.norm(T_cam_obj[:3, 3])
     along = np.outer(ray, ray)
-    floor = LEAST_TURN**2 * np.eye(6)
-    floor[3:, 3:] = LEAST_ACROSS**2 * (np.eye(3) - along) + LEAST_ALONG**2 * along
+    floor = MIN_ROTATION**2 * np.eye(6)
+    floor[3:, 3:] = MIN_ACROSS**2 * (np.eye(3) - along) + MIN_ALONG**2 * along
     floor[3:, 3:] *= diameter**2
     if covariance is None or not np.isfinite(covariance).all():
         covariance = np.zeros((6, 6))
-        covariance[:3, :3] = UNKNOWN_TURN**2 * np.eye(3)
+        covariance[:3, :3] = UNKNOWN_ROTATION**2 * np.eye(3)
         shift = UNKNOWN_ACROSS**2 * (np.eye(3) - along) + UNKNOWN_ALONG**2 * along
         covariance[3:, 3:] = diameter**2 * shift
     return Prior(T_cam_obj, np.linalg.inv(np.asarray(covariance, np.float64) + floor))

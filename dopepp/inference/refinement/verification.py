@@ -63,9 +63,9 @@ SHARP: Final = math.cos(math.radians(40.0))  # cosine of the least angle between
 BESIDE: Final = 0.12  # distance of the outlines beside, share of the extent
 BESIDE_PX: Final = 2.5  # distance from the outline at which colours are compared
 RING: Final = 0.2  # width of the surroundings, share of the extent
-MOST_PIXELS: Final = 1500  # pixels for the fit of the shading model
+MAX_PIXELS: Final = 1500  # pixels for the fit of the shading model
 SECTORS: Final = 8
-FEWEST_POINTS: Final = 12  # least points of an outline on the image
+MIN_POINTS: Final = 12  # least points of an outline on the image
 SCHARR: Final = 1 / 32  # grey levels per pixel in a sum of Scharr's kernel
 
 Gradients = tuple[Int16[np.ndarray, "height width 3"], Int16[np.ndarray, "height width 3"]]
@@ -207,7 +207,7 @@ class Verifier:
         spacing = max(1.5, 3.0 * crop.extent / SPACING)
         contour = find_contour(self.mesh, at, mask, spacing)
         odds = log_odds(crop.bins, mask, 1.5, RING * crop.extent, 1)
-        if len(contour) < FEWEST_POINTS or odds is None or mask.sum() < SMALLEST_PX**2:
+        if len(contour) < MIN_POINTS or odds is None or mask.sum() < SMALLEST_PX**2:
             return None
         gradients = _gradients(crop.colours)
         outline = _lines(contour)
@@ -245,7 +245,7 @@ class Verifier:
     ) -> tuple[float, float]:
         """Fit the colours inside by the surface normals; return ``shading`` and ``residual``."""
         inside = np.flatnonzero(ids >= 0)
-        inside = inside[:: math.ceil(len(inside) / MOST_PIXELS)]
+        inside = inside[:: math.ceil(len(inside) / MAX_PIXELS)]
         normals = self._normals[ids.ravel()[inside]] @ T_cam_obj[:3, :3].T
         rows = np.column_stack([np.ones(len(normals)), normals])
         seen = colours.reshape(-1, 3)[inside].astype(np.float64)

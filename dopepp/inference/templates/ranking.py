@@ -43,13 +43,13 @@ FEATURES: Final = (
 SUPPORT: Final = 30  # response above which a point counts as supported
 LEVEL: Final = 16.0  # difference of colours, grey levels, at which the contrast is 0.5
 EVEN: Final = 64.0  # added to the variance of colours, so that noise counts as even
-LEAST_INNER: Final = 8  # least number of inner points on the image; other matches get no features
+MIN_INNER: Final = 8  # least number of inner points on the image; other matches get no features
 ACROSS: Final = (2.5, 0.03)  # pixels and diameters between the outline and the compared colours
 TURN: Final = math.radians(5.0)  # step of the turn in the grid search
 GROWTH: Final = 0.03  # first relative step of the size
 FEW: Final = 32  # first points of a template, used in the grid search; they are far apart
 REACH_PX: Final = 1.5  # first step of the position after a change of view
-MOST_TURNS: Final = 4  # largest number of changes of a match's view
+MAX_TURNS: Final = 4  # largest number of changes of a match's view
 
 
 Features = Float[np.ndarray, "matches features"]
@@ -251,7 +251,7 @@ def _turn(
     for i in range(len(views)):
         best[:] = poses[i]
         most = _climb(maps, points[views[i]], normals[views[i]], best, REACH_PX, 2)
-        for _ in range(MOST_TURNS):
+        for _ in range(MAX_TURNS):
             view, chosen = views[i], views[i]
             poses[i] = best
             for k in range(neighbours.shape[1]):
@@ -313,7 +313,7 @@ def _describe(
                 colours[count, k] = image[y, x, k]
                 mean[k] += colours[count, k]
             count += 1
-        if count < LEAST_INNER:
+        if count < MIN_INNER:
             continue
         variance = EVEN
         for k in range(3):

@@ -30,7 +30,7 @@ DRAWN_PX: Final = 96  # diameter of the part on the drawing of a view
 MARGIN_PX: Final = 4  # margin of the drawing
 SPACING_PX: Final = 1.5  # distance between the edge points that a template's points are chosen from
 INNER_PX: Final = 4.0  # distance of inner points from edges; smaller in views without such pixels
-MOST_INNER: Final = 400  # pixels that the inner points are chosen from
+MAX_INNER: Final = 400  # pixels that the inner points are chosen from
 SLACK: Final = 0.02  # overlap of the regions that symmetries map to each other, cosine
 NEAREST: Final = 1.1  # least distance of a drawing, diameters
 
@@ -188,7 +188,7 @@ def _drawn(
     mask[rows, columns] = 0
     depth = cv2.distanceTransform(mask, cv2.DIST_L2, 3)
     v, u = np.nonzero(depth >= min(INNER_PX, 0.6 * float(depth.max())))
-    chosen = np.linspace(0, len(u) - 1, min(len(u), MOST_INNER)).astype(int)
+    chosen = np.linspace(0, len(u) - 1, min(len(u), MAX_INNER)).astype(int)
     return lines, np.column_stack([u[chosen], v[chosen]]).astype(np.float64)
 
 

@@ -27,7 +27,7 @@ length from the distance."""
 
 MAX_ERROR_PX: Final = 1.0
 OUTLIER: Final = 3.0  # smallest error of a rejected view, as a multiple of the median error
-LEAST_OUTLIER_PX: Final = 0.5
+MIN_OUTLIER_PX: Final = 0.5
 
 MIN_SHIFT: Final = 0.04
 """Mean shift of the points between two distinct views, as a share of the picture's width."""
@@ -116,7 +116,7 @@ def calibrate_lens(sightings: Sequence[Sighting], size: Size) -> LensCalibration
         )
     views = list(sightings)
     lens = _solve(views, size)
-    limit = max(LEAST_OUTLIER_PX, OUTLIER * float(np.median(lens.errors_px)))
+    limit = max(MIN_OUTLIER_PX, OUTLIER * float(np.median(lens.errors_px)))
     is_kept = lens.errors_px <= limit
     outliers: list[str] = []
     if not is_kept.all() and is_kept.sum() >= 3:

@@ -28,7 +28,7 @@ from dopepp.robot.calibration.hand_eye import (
 from dopepp.robot.calibration.records import UNITS, PoseFormat, RobotPoses
 from dopepp.robot.calibration.tool import axis_name
 
-MIN_TURN: Final = np.radians(5.0)  # smallest valid rotation between the two farthest poses
+MIN_ROTATION: Final = np.radians(5.0)  # smallest valid rotation between the two farthest poses
 TURN: Final = np.radians(1.5)  # largest median rotation error under the correct convention
 SHIFT: Final = 0.01  # largest median translation error under the correct convention, metres
 MOUNTS: Final[tuple[Mount, Mount]] = ("hand", "bench")
@@ -164,12 +164,12 @@ def _check_motion(T: Transforms, body: str, source: str) -> None:
         source: Name of the recording, for the message.
 
     Raises:
-        UserError: The largest rotation between two poses is below ``MIN_TURN``.
+        UserError: The largest rotation between two poses is below ``MIN_ROTATION``.
     """
     i, j = np.triu_indices(len(T), 1)
     relative = T[i, :3, :3] @ T[j, :3, :3].transpose(0, 2, 1)
     largest = Rotation.from_matrix(relative).magnitude().max(initial=0.0)
-    if largest < MIN_TURN:
+    if largest < MIN_ROTATION:
         raise UserError(
             f"{source}: the {body} rotates by {np.degrees(largest):.1f}° over all {len(T)} poses",
             "rotations of at least 30° about different axes",

@@ -28,7 +28,7 @@ from dopepp.robot.calibration.board import (
     board_pose,
     displaced,
 )
-from dopepp.robot.calibration.lens import LEAST_OUTLIER_PX, MAX_ERROR_PX, OUTLIER
+from dopepp.robot.calibration.lens import MIN_OUTLIER_PX, MAX_ERROR_PX, OUTLIER
 
 MIN_CAMERAS, MAX_CAMERAS = 2, 8
 MIN_SHARED: Final = 5  # moments at which a camera of a reliable rig sees the board with another
@@ -89,7 +89,7 @@ def calibrate_rig(boards: Boards, cameras: Mapping[str, Camera]) -> Rig:
         for name in names
     }
     adjustment, outliers = _Adjustment(boards, cameras, poses), list[str]()
-    for limit_px in (START_PX, LEAST_OUTLIER_PX):
+    for limit_px in (START_PX, MIN_OUTLIER_PX):
         worst = adjustment.outliers(limit_px)
         outliers += worst
         if worst:

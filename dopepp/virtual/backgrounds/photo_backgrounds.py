@@ -26,13 +26,13 @@ _LONGEST_PHOTO_PX: Final = 1000
 """Longest side of cached photos: enough for a sharp 640×480 crop. JPEG decodes at 1/2, 1/4 or 1/8,
 so 1000 lets a photo of 4000 pixels decode at a quarter."""
 
-_LEAST_REDUCTION: Final = 2.0
+_MIN_REDUCTION: Final = 2.0
 """Smallest factor by which a crop is reduced. A crop is taken from the coarsest halving of a photo
 that allows this factor, which is cheaper than reducing the whole photo."""
 
 PhotoSplit = Literal["train", "val", "test", "all"]
 
-FEWEST_PHOTOS: Final = 2  # smallest number of photos in the validation split and in the test split
+MIN_PHOTOS: Final = 2  # smallest number of photos in the validation split and in the test split
 HELD_OUT: Final = 0.15
 """Share of the photos in the validation split, and in the test split."""
 
@@ -103,8 +103,8 @@ class PhotoBackgrounds:
             by_hash.setdefault(key, []).append(path.relative_to(self.folder).as_posix())
         groups = [by_hash[key] for key in sorted(by_hash)]
         part = copy.copy(self)
-        if len(groups) >= 3 * FEWEST_PHOTOS:
-            count = max(FEWEST_PHOTOS, round(held_out * len(groups)))
+        if len(groups) >= 3 * MIN_PHOTOS:
+            count = max(MIN_PHOTOS, round(held_out * len(groups)))
             val, test = len(groups) - 2 * count, len(groups) - count
             chosen = {"train": groups[:val], "val": groups[val:test], "test": groups[test:]}[split]
             part = PhotoBackgrounds(self.folder, [name for group in chosen for name in group])
@@ -124,7 +124,7 @@ class PhotoBackgrounds:
         rows, columns = sizes[0].shape[:2]
         share = rng.uniform(0.4, 1.0)
         reduction = share * min(columns / width, rows / height)
-        photo = sizes[int(np.clip(np.log2(reduction / _LEAST_REDUCTION), 0, len(sizes) - 1))]
+        photo = sizes[int(np.clip(np.log2(reduction / _MIN_REDUCTION), 0, len(sizes) - 1))]
         rows, columns = photo.shape[:2]
         scale = share * min(columns / width, rows / height)
         crop_width, crop_height = max(int(width * scale), 1), max(int(height * scale), 1)

@@ -23,17 +23,17 @@ from dopepp.virtual.presets.placement import WorkingPlacement
 
 _log = logging.getLogger(__name__)
 
-# Diameters of a part in the network's picture. Networks fail below ``FEWEST_PX`` and learn well
+# Diameters of a part in the network's picture. Networks fail below ``MIN_PX`` and learn well
 # from 45 to 110 pixels (geometric mean 70). Ranges wider than ``_WIDE_RATIO`` take much longer to
 # learn.
-FEWEST_PX: Final = 25.0
+MIN_PX: Final = 25.0
 _FINE_PX: Final = 45.0
 _USUAL_PX: Final = 70.0
 _WIDE_RATIO: Final = 3.5
 
 _ROOM: Final = 1.3  # ratio of a window's shorter side to the diameter of the largest part
 _MULTIPLE: Final = 32  # both sides of a window are multiples of this number, pixels
-_MOST_BLUR: Final = 10.0  # largest factor on the blur in large pictures
+_MAX_BLUR: Final = 10.0  # largest factor on the blur in large pictures
 _BEYOND: Final = (
     1.25  # ratio of a part's largest depth on a table to the depth of the table's origin
 )
@@ -91,12 +91,12 @@ class View:
                 "parts that fit into the picture in any orientation",
                 f"start working_distance at {nearest:g}",
             )
-        if scale * smallest < FEWEST_PX:
-            farthest = math.floor(1000 * self.distance[1] * scale * smallest / FEWEST_PX) / 1000
+        if scale * smallest < MIN_PX:
+            farthest = math.floor(1000 * self.distance[1] * scale * smallest / MIN_PX) / 1000
             raise UserError(
                 f"working_distance to {self.distance[1]:g} m, where {_named(parts, min)} has "
                 f"{scale * smallest:.0f} pixels in the camera's picture scaled by {scale:g}",
-                f"at least {FEWEST_PX:g} pixels",
+                f"at least {MIN_PX:g} pixels",
                 f"end working_distance at {farthest:g}, or use a longer lens or larger pictures",
             )
 
@@ -135,7 +135,7 @@ class View:
 
     def whole(self, preset: Preset, scale: float) -> Preset:
         """Return a preset's scenes in whole pictures, with blur matched to the scaled windows."""
-        sensors = preset.sensors.resized(min(1 / scale, _MOST_BLUR))
+        sensors = preset.sensors.resized(min(1 / scale, _MAX_BLUR))
         return replace(self.window(preset, 1.0, None), sensors=sensors)
 
     def in_words(

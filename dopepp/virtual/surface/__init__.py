@@ -28,7 +28,7 @@ _CREASE_ANGLE_DEG: Final = 35.0
 
 _HULL_DIRECTIONS: Final = 400  # search directions for the extreme points of a large mesh
 _NUM_POINTS: Final = 400  # surface points that cast a mesh's shadow on a plane
-_MOST_CORNERS: Final = 1024  # most triangles at a vertex with averaged normals (quadratic time)
+_MAX_CORNERS: Final = 1024  # most triangles at a vertex with averaged normals (quadratic time)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +231,7 @@ def _average_normals(
             sx, sy, sz = 0.0, 0.0, 0.0
             # All pairs of a vertex's faces are compared; a hub of a million faces stays flat.
             first, last = offsets[vertex], offsets[vertex + 1]
-            if last - first > _MOST_CORNERS:
+            if last - first > _MAX_CORNERS:
                 first, last = p, p + 1
             for q in range(first, last):
                 other, m = corners[q] // 3, corners[q] % 3

@@ -24,7 +24,7 @@ from dopepp.virtual.triangles import CENTRE_SAMPLE, edge_functions, rasterise
 
 Lookup = tuple[Array, Array, Array]
 
-_MOST_PROBES: Final = 16  # along a footprint's longer axis; more stretched textures blur
+_MAX_PROBES: Final = 16  # along a footprint's longer axis; more stretched textures blur
 _SHARPNESS: Final = 0.75  # a probe's width over the footprint's; interpolation widens it again
 
 
@@ -197,7 +197,7 @@ def sample_texture(
         middle, half = 0.5 * (uu + vv), math.sqrt(0.25 * (uu - vv) ** 2 + cross * cross)
         major = math.sqrt(middle + half)
         minor = math.sqrt(max(middle - half, 0.0))
-        probes = min(max(math.ceil(major / max(minor, 1.0) - 0.5), 1), _MOST_PROBES)
+        probes = min(max(math.ceil(major / max(minor, 1.0) - 0.5), 1), _MAX_PROBES)
         du, dv = 0.0, 0.0
         if probes > 1:
             if uu >= vv:

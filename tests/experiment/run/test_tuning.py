@@ -14,10 +14,10 @@ from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample
 from dopepp.experiment.config.run_config import FalsePositiveTarget
 from dopepp.experiment.run.tuning import (
-    FEWEST_REFINED,
-    LEAST_REFINED_FACTOR,
-    LEAST_REFINED_SCORE,
-    MOST_LOST,
+    MIN_REFINED,
+    MIN_REFINED_FACTOR,
+    MIN_REFINED_SCORE,
+    MAX_LOST,
     Scored,
     WrongFocalLengths,
     choose,
@@ -209,7 +209,7 @@ class Refining:
         return [replace(detection, agreement=None, covariance=np.eye(6)) if kept else detection]
 
 
-@pytest.mark.parametrize(("true", "fitted"), [(0.8, 0.8), (0.3, LEAST_REFINED_FACTOR)])
+@pytest.mark.parametrize(("true", "fitted"), [(0.8, 0.8), (0.3, MIN_REFINED_FACTOR)])
 def test_the_factor_of_refined_poses_is_that_of_the_right_ones(true, fitted):
     factor = fit_refined_factor(Refining(true), [PART], Many(250))  # type: ignore[arg-type]
     assert factor == pytest.approx(fitted, rel=0.15)
@@ -245,8 +245,8 @@ def test_a_wrong_focal_length_keeps_the_line_of_sight_to_a_part_beside_the_axis(
 
 def test_few_refined_poses_keep_their_covariances(caplog):
     few = Refining(true=0.4)
-    assert fit_refined_factor(few, [PART], Many(FEWEST_REFINED)) == 1.0  # type: ignore[arg-type]
-    assert f"12 right poses, fewer than {FEWEST_REFINED}" in caplog.text
+    assert fit_refined_factor(few, [PART], Many(MIN_REFINED)) == 1.0  # type: ignore[arg-type]
+    assert f"12 right poses, fewer than {MIN_REFINED}" in caplog.text
     with pytest.raises(UserError, match="refinement is far too confident"):
         fit_refined_factor(Refining(true=9.0), [PART], Many(250))  # type: ignore[arg-type]
 
@@ -278,7 +278,7 @@ def test_refined_poses_far_below_even_odds_are_not_reported(caplog):
     correct = rng.random(200) < score(features, np.array([0.0, 0.0, 1.0]))
     shown = Scored(features, rng.random(200), correct, np.arange(200), ["photos"] * 200, 200)
     nothing = replace(NOTHING, features=np.zeros((0, 3)))
-    assert choose(shown, nothing, refined=True)["refined_min_score"] == LEAST_REFINED_SCORE
+    assert choose(shown, nothing, refined=True)["refined_min_score"] == MIN_REFINED_SCORE
     loud = replace(nothing, features=np.array([[1.0, 0.0, 20.0]]), correct=np.zeros(1, bool))
     loud = replace(loud, scores=np.zeros(1), image=np.zeros(1, int))
     assert choose(shown, loud, 1.0, refined=True)["refined_min_score"] == 0.0
@@ -287,7 +287,7 @@ def test_refined_poses_far_below_even_odds_are_not_reported(caplog):
     weights = np.array([options[f"refined_{name}"] for name in REFINED_FEATURES])
     lost = score(shown.features, weights)[correct] < options["refined_min_score"]
     assert options["refined_min_score"] < 0.9
-    assert lost.mean() == pytest.approx(MOST_LOST, abs=0.02)
+    assert lost.mean() == pytest.approx(MAX_LOST, abs=0.02)
     assert "a higher threshold would lose" in caplog.text
     # Poses that are all right do not say how to weigh the features.
     same = choose(replace(shown, correct=np.ones(200, bool)), nothing, refined=True)

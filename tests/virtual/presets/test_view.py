@@ -13,7 +13,7 @@ from dopepp.core.errors import UserError
 from dopepp.geometry.camera import camera_matrix, project, transform
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.virtual import PRESETS, Factory
-from dopepp.virtual.presets.view import FEWEST_PX, View, read_lens
+from dopepp.virtual.presets.view import MIN_PX, View, read_lens
 
 FOCAL = 640 / math.tan(math.radians(69 / 2))
 """Of 1280 pixels that show 69°."""
@@ -82,7 +82,7 @@ def test_what_is_advised_will_do():
     small += r"end working_distance at 3\.724,"
     with pytest.raises(UserError, match=small):
         view(0.4, 9).check(parts)
-    assert FEWEST_PX <= view(0.4, 3.724).sizes_px(parts)[0] < FEWEST_PX + 0.1
+    assert MIN_PX <= view(0.4, 3.724).sizes_px(parts)[0] < MIN_PX + 0.1
     view(0.4, 3.724).check(parts)
 
 

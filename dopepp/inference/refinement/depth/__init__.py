@@ -41,9 +41,9 @@ from dopepp.inference.refinement.solver import (
 FARTHEST: Final = 3.0
 """Mahalanobis distance beyond which depth contradicts the image."""
 
-LEAST_INLIERS: Final = 0.5  # share of the unobstructed points with depth that must agree
-LEAST_SEEN: Final = 0.25  # share of the visible points that must have agreeing depth
-MOST_RMS: Final = 2.0  # RMS offset in standard deviations of the depth; about 1 at a right pose
+MIN_INLIERS: Final = 0.5  # share of the unobstructed points with depth that must agree
+MIN_SEEN: Final = 0.25  # share of the visible points that must have agreeing depth
+MAX_RMS: Final = 2.0  # RMS offset in standard deviations of the depth; about 1 at a right pose
 CLOSE: Final = 5.0  # distance in front of a part without other objects, spacings
 BESIDE: Final = 3.0  # spacings around the part in which its surface must not continue
 SEARCHED_POINTS: Final = 400  # points in the search
@@ -57,7 +57,7 @@ HIDDEN: Final = 0.5  # point that is occluded, or whose depth agrees only in par
 PENALTY: Final = 0.03
 """Share of the points that must gain by a shift of one standard deviation of the prior."""
 
-LEAST_FOUND: Final = 20  # least number of points that agree with their depth
+MIN_FOUND: Final = 20  # least number of points that agree with their depth
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ class DepthEvidence:
         num_votes = _search(
             view.depth, view.K, points, information, moved, step, view.noise, half, tolerance, shift
         )
-        if num_votes < LEAST_FOUND:
+        if num_votes < MIN_FOUND:
             return None
         return make_transform(pose[:3, :3], pose[:3, 3] + shift)
 
@@ -224,11 +224,11 @@ class Fit:
 
     def doubt(self, before: Fit) -> str:
         """Return why this fit should be rejected in favour of ``before``, or an empty string."""
-        if self.inliers < LEAST_INLIERS:
+        if self.inliers < MIN_INLIERS:
             return f"only {self.inliers:.0%} of the part agrees with the depth"
-        if self.seen < LEAST_SEEN:
+        if self.seen < MIN_SEEN:
             return f"only {self.seen:.0%} of the part is measured and unobstructed"
-        if self.rms > MOST_RMS:
+        if self.rms > MAX_RMS:
             return f"a residual of {self.rms:.1f} standard deviations of the depth"
         return "the depth fits the given pose no worse" if self.score <= before.score else ""
 

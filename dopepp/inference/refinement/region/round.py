@@ -24,7 +24,7 @@ from dopepp.inference.refinement.outline import (
 )
 from dopepp.inference.refinement.region.shared_errors import (
     INDEPENDENT_PX,
-    LEAST_INFORMATION,
+    MIN_INFORMATION,
     SCALE_ERROR,
     region_terms,
 )
@@ -41,15 +41,15 @@ from dopepp.inference.refinement.solver import (
 
 RING: Final = 0.2  # width of the part's surroundings, share of its extent
 SAMPLES: Final = 7  # steps on each side of a normal, which are 1 to 4 pixels
-FEWEST_POINTS: Final = 24  # least outline points that determine a pose
+MIN_POINTS: Final = 24  # least outline points that determine a pose
 
-LEAST_GAIN: Final = 2.0
+MIN_GAIN: Final = 2.0
 """Least increase of the information's log determinant; below it, the image is uninformative."""
 
 FIRM: Final = (math.radians(1.0), 5e-3)
 """Standard deviations of a precise pose: radians, and metres per metre of distance."""
 
-LEAST_AGREEING: Final = 0.3  # least agreement of a refined outline that is accepted
+MIN_AGREEING: Final = 0.3  # least agreement of a refined outline that is accepted
 AGREE_PX: Final = 2.0  # largest distance from the image's outline of a point that agrees
 
 INFORMATIVE: Final = 0.1  # pixels⁻²: information of a point that counts as support
@@ -135,7 +135,7 @@ class Round:
         if silhouette is None:
             return None
         contour = find_contour(self._mesh, *silhouette, self._spacing)
-        return contour if len(contour) >= FEWEST_POINTS else None
+        return contour if len(contour) >= MIN_POINTS else None
 
     def descend(self, start: Transform, prior: Prior, reach: float) -> Solution:
         """Take the stage's steps.
@@ -196,9 +196,9 @@ class Round:
         """
         contour = self._outline(end.T_cam_obj)
         agreement = self._agreement(contour, reach)
-        if self._gain(end, prior, information) < LEAST_GAIN:
+        if self._gain(end, prior, information) < MIN_GAIN:
             raise UndecidedError("colours inside and around the part are too alike")
-        if agreement.share < LEAST_AGREEING:
+        if agreement.share < MIN_AGREEING:
             share = f"{agreement.share:.0%}"
             raise UndecidedError(f"only {share} of the outline agrees with the picture")
         distance = math.sqrt(prior.squared_distance(end.T_cam_obj))
@@ -234,9 +234,9 @@ class Round:
         """Return the agreement of a contour with the image within a search distance."""
         shifts = self._shifts(contour, reach)
         weights = shifts.information
-        offset = np.average(shifts.mean, weights=weights + LEAST_INFORMATION)
+        offset = np.average(shifts.mean, weights=weights + MIN_INFORMATION)
         agrees = np.abs(shifts.mean - offset) <= AGREE_PX
-        share = float(weights[agrees].sum() / max(weights.sum(), LEAST_INFORMATION))
+        share = float(weights[agrees].sum() / max(weights.sum(), MIN_INFORMATION))
         return OutlineAgreement(share, float((agrees & (weights > INFORMATIVE)).mean()))
 
     def _gain(self, end: Solution, prior: Prior, information: PoseMatrix) -> float:

@@ -22,13 +22,13 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.geometry.refine import LEAST_DAMPING, solve_damped
+from dopepp.geometry.refine import MIN_DAMPING, solve_damped
 from dopepp.geometry.rotation import Vector
 from dopepp.inference.refinement.region.shifts import Shifts
 from dopepp.inference.refinement.solver import DAMPING, NormalEquations
 
 INDEPENDENT_PX: Final = 4.0  # length of the outline within which small errors are equal
-LEAST_INFORMATION: Final = 1e-3  # pixels⁻²; smaller information is ignored
+MIN_INFORMATION: Final = 1e-3  # pixels⁻²; smaller information is ignored
 
 REWEIGHTINGS: Final = 2
 
@@ -104,8 +104,8 @@ def _eliminate_scale(
         target[c] = -g[c] - prior_g[c]
         for d in range(6):
             both[c, d] = H[c, d] + prior_H[c, d]
-    solve_damped(both, target, LEAST_DAMPING, step)
-    solve_damped(both, column, LEAST_DAMPING, pull)
+    solve_damped(both, target, MIN_DAMPING, step)
+    solve_damped(both, column, MIN_DAMPING, pull)
     information = gradient = 0.0
     for a in range(3):
         information += position[a] * column[3 + a]
@@ -168,7 +168,7 @@ def _terms(
     num_valid = 0
     for i in range(len(rows)):
         weights[i] = 0.0
-        if information[i] > LEAST_INFORMATION:
+        if information[i] > MIN_INFORMATION:
             weights[i] = information[i] * independent
             num_valid += 1
     if not num_valid:
@@ -192,7 +192,7 @@ def _terms(
             for c in range(6):
                 residual -= rows[i, c] * step[c]
             squares[i] = residual * residual
-            if information[i] > LEAST_INFORMATION:
+            if information[i] > MIN_INFORMATION:
                 valid[k] = squares[i]
                 k += 1
         # The median of a squared normal variable is 0.455 of its variance.
@@ -201,7 +201,7 @@ def _terms(
         # a shadow, a highlight or an error of the mesh.
         share = min(independent, 1.0 / max(alike * min(1.0, spread), 1.0))
         for i in range(len(rows)):
-            if information[i] > LEAST_INFORMATION:
+            if information[i] > MIN_INFORMATION:
                 variance = 1.0 / information[i] + spread
                 weights[i] = share / variance / (1.0 + squares[i] / (GATE**2 * variance)) ** 2
     _add(rows, means, weights, H, g)

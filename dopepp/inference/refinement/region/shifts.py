@@ -23,12 +23,12 @@ from jaxtyping import Float, Float32, UInt8
 from dopepp.core.compiled import Array, compiled
 from dopepp.inference.refinement.outline import Contour
 
-LEAST_CHANGE: Final = 3.0  # grey levels of noise: smaller changes are not edges
+MIN_CHANGE: Final = 3.0  # grey levels of noise: smaller changes are not edges
 
 CHANCE: Final = 1.2
 """Largest ratio of the variance of a uniform distribution to that measured on pure noise."""
 
-LEAST_DEVIATION: Final = 0.3  # pixels; lower bound for the position of an edge at one point
+MIN_DEVIATION: Final = 0.3  # pixels; lower bound for the position of an edge at one point
 
 
 class Weights(NamedTuple):
@@ -123,7 +123,7 @@ def _changes(
                 most = max(most, abs(samples[k + 2, c] + samples[k + 3, c] - before))
             changes[i, k] = 0.25 * most
             total += changes[i, k]
-    return total / changes.size + LEAST_CHANGE
+    return total / changes.size + MIN_CHANGE
 
 
 @compiled()
@@ -156,7 +156,7 @@ def _shifts(
     sums = np.empty(2 * count + 2)
     # The part may end between any two samples, before the first or after the last.
     unknown = step * step * (len(sums) ** 2 - 1) / 12.0
-    floor = LEAST_DEVIATION**2 + step * step / 12.0
+    floor = MIN_DEVIATION**2 + step * step / 12.0
     for i in range(len(pixels)):
         before, most = 0.0, -math.inf
         for k in range(len(sums)):

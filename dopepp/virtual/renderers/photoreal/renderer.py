@@ -69,7 +69,7 @@ _RADIANCE_OF_CODE: Final = np.interp(
 """Radiance of every code 0–255 under the tone curve."""
 
 _ALBEDO: Final = (0.05, 0.8)  # bounds of the disc's albedo, estimated from its picture and light
-_LEAST_LIGHT: Final = 1e-3  # radiance of a white table below which shadows are not estimated
+_MIN_LIGHT: Final = 1e-3  # radiance of a white table below which shadows are not estimated
 _SPREAD_PX: Final = 2.0  # width over which a shadow is extrapolated under an object's rim
 _FLOAT3: Final = 3  # OIDN_FORMAT_FLOAT3
 
@@ -266,7 +266,7 @@ class TableTop:
         if not seen.any():
             return np.full(3, np.mean(_ALBEDO))
         shown = SRGB_TO_LINEAR[self._scene.background[seen]].mean(axis=0)
-        light = np.maximum(self._light[seen].mean(axis=0), _LEAST_LIGHT)
+        light = np.maximum(self._light[seen].mean(axis=0), _MIN_LIGHT)
         return np.asarray(np.clip(shown / light, *_ALBEDO))
 
 
@@ -281,8 +281,8 @@ def split_light(light: Colours, alpha: Depth, unshadowed: Colours) -> tuple[Colo
     Returns:
         Radiance of the objects, and the share of the light that remains on the disc.
     """
-    is_disc = (alpha <= 0) & (unshadowed.min(axis=-1) > _LEAST_LIGHT)
-    light_share = np.where(is_disc[..., None], light / np.maximum(unshadowed, _LEAST_LIGHT), 1.0)
+    is_disc = (alpha <= 0) & (unshadowed.min(axis=-1) > _MIN_LIGHT)
+    light_share = np.where(is_disc[..., None], light / np.maximum(unshadowed, _MIN_LIGHT), 1.0)
     light_share = np.clip(light_share, 0.0, 4.0)  # above 1: objects reflect light onto a dark table
     # Pixels on an object's rim mix object and disc, so the shadow beside them is extrapolated.
     weight = cv2.GaussianBlur(is_disc.astype(np.float64), (0, 0), _SPREAD_PX)[..., None]

@@ -37,7 +37,7 @@ from dopepp.virtual.triangles import (
     scratch,
 )
 
-_MOST_PX: Final = 1_000_000  # a whole silhouette in a larger box is counted at a reduced scale
+_MAX_PX: Final = 1_000_000  # a whole silhouette in a larger box is counted at a reduced scale
 
 
 def render(scene: Scene) -> Rendered:
@@ -151,8 +151,8 @@ def _whole_px(item: SceneObject, seen: Projected, K: Array) -> float:
     if not math.isfinite(left):
         return math.inf  # the object surrounds the camera
     hom, scale, extent = seen.hom, 1.0, seen.extent
-    if (right - left + 2) * (bottom - top + 2) > _MOST_PX:
-        scale = math.sqrt(_MOST_PX / ((right - left + 2) * (bottom - top + 2)))
+    if (right - left + 2) * (bottom - top + 2) > _MAX_PX:
+        scale = math.sqrt(_MAX_PX / ((right - left + 2) * (bottom - top + 2)))
         hom = seen.cam @ resize_camera(K, scale, scale).T
         extent = bounds(hom, NEAR)
     return float(np.count_nonzero(draw_alone(item, hom, centres_within(extent))[0])) / scale**2
