@@ -91,14 +91,14 @@ class Side:
     def __init__(self, path: Path, tracked: bool) -> None:
         import torch
 
-        from dopepp.experiment.results.cost import RehearsedEstimator
+        from dopepp.experiment.results.cost import SimulatedMapsEstimator
         from dopepp.inference import runtimes
         from dopepp.inference.estimator import PoseEstimator
         from dopepp.parts.catalogue import with_meshes
 
         network, checkpoint = runtimes.load(path, torch.device("cpu"))
         trained = bool(checkpoint.seen)
-        kind = PoseEstimator if trained else RehearsedEstimator
+        kind = PoseEstimator if trained else SimulatedMapsEstimator
         parts = with_meshes(checkpoint.parts)
         self.estimator = kind(network, checkpoint, "cpu", "region", parts)
         self.calls = self._tracked() if tracked else self._frames(trained)

@@ -31,9 +31,9 @@ from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import (
     CameraMatrix,
     Transform,
-    camera_beside,
     invert_transform,
     moved,
+    orbited_camera,
     step_between,
     transform,
 )
@@ -70,7 +70,8 @@ def static_scene(
     true, direction = target.T_cam_obj, rng.uniform(0.0, 2 * math.pi)
     poses = [np.eye(4)]
     poses += [
-        camera_beside(true[:3, 3], angle, direction + n * math.pi / 2) for n in range(num_views - 1)
+        orbited_camera(true[:3, 3], angle, direction + n * math.pi / 2)
+        for n in range(num_views - 1)
     ]
     images = []
     for number, T_new_cam in enumerate(poses):

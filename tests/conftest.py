@@ -252,9 +252,11 @@ def near_truth(monkeypatch):
             covariance = np.diag([0.03**2] * 3 + [0.001**2] * 3)
             return Detection(self.part.name, score, score, T, points, peaks, 0.0, covariance)
 
-    def silent_level(part, distances, tilt, loudest):
+    def background_log_odds(part, distances, tilt, loudest):
         return 0.0
 
     monkeypatch.setattr("dopepp.inference.template_estimator.TemplateDetector", NearTruth)
-    monkeypatch.setattr("dopepp.inference.template_estimator.silent_level", silent_level)
+    monkeypatch.setattr(
+        "dopepp.inference.template_estimator.background_log_odds", background_log_odds
+    )
     return NearTruth

@@ -438,18 +438,18 @@ def _show_hand_eye(
     for number, board in enumerate(boards):
         rejected = "" if calibration.inliers[number] else "  rejected: contradicts the others"
         typer.echo(
-            f"{board.name}: {degrees(calibration.turns[number]):.3f}°, "
+            f"{board.name}: {degrees(calibration.rotation_errors[number]):.3f}°, "
             f"{1000 * calibration.shifts[number]:.2f} mm; without it the camera moves by "
             f"{1000 * quality.leave_one_out[number]:.2f} mm{rejected}"
         )
-    turn, shift = calibration.robot_noise
-    turns = ", ".join(f"{degrees(axis):.0f}°" for axis in quality.diversity)
+    rotation, shift = calibration.robot_noise
+    rotations = ", ".join(f"{degrees(axis):.0f}°" for axis in quality.diversity)
     typer.echo(
-        f"estimated error of the robot: {degrees(turn):.3f}°, {1000 * shift:.2f} mm\n"
-        f"rotations about the three main axes, RMS over pairs: {turns}\n"
+        f"estimated error of the robot: {degrees(rotation):.3f}°, {1000 * shift:.2f} mm\n"
+        f"rotations about the three main axes, RMS over pairs: {rotations}\n"
         f"to improve the calibration: {quality.next_pose}\n"
         f"expected error at the board's distance: {1000 * quality.shift:.2f} mm, "
-        f"{degrees(quality.turn):.3f}°"
+        f"{degrees(quality.rotation):.3f}°"
     )
 
 
@@ -464,9 +464,9 @@ def _show_rig(calibration: Rig) -> None:
         seen += f"{calibration.errors_px[number]:.3f} px"
         if number:
             distance_mm = 1000 * hypot(*calibration.T_world_cam[number][:3, 3])
-            shift, turn = calibration.deviations[number]
+            shift, rotation = calibration.deviations[number]
             seen += f", {distance_mm:.1f} mm from {calibration.names[0]}, standard deviations "
-            seen += f"{1000 * shift:.2f} mm and {degrees(turn):.3f}°"
+            seen += f"{1000 * shift:.2f} mm and {degrees(rotation):.3f}°"
         typer.echo(seen)
 
 
@@ -479,7 +479,7 @@ def _rig_record(
 
     from dopepp.robot.calibration.records import transform_record
 
-    shift, turn = calibration.deviations.max(axis=0)
+    shift, rotation = calibration.deviations.max(axis=0)
     views = {
         name: {
             "camera": relpath(folder / f"{name}.yaml", out.parent),
@@ -489,7 +489,7 @@ def _rig_record(
         }
         for number, name in enumerate(calibration.names)
     }
-    return {"camera_error": [float(shift), degrees(turn)], "views": views}
+    return {"camera_error": [float(shift), degrees(rotation)], "views": views}
 
 
 def _hand_eye_record(calibration: HandEye, quality: CalibrationQuality) -> dict[str, object]:
@@ -502,7 +502,7 @@ def _hand_eye_record(calibration: HandEye, quality: CalibrationQuality) -> dict[
         f"T_{mount}_cam": transform_record(calibration.T_mount_cam),
         f"T_{other}_board": transform_record(calibration.T_other_board),
         "covariance": calibration.covariance.tolist(),
-        "expected_error": {"position": quality.shift, "rotation": quality.turn},
+        "expected_error": {"position": quality.shift, "rotation": quality.rotation},
         "poses_used": int(calibration.inliers.sum()),
         "frames": "camera: OpenCV (x right, y down, z forward); metres and radians",
     }

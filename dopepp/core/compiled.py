@@ -43,7 +43,7 @@ _warm_ups: Final[list[str]] = []
 """Functions that a second process calls when this process starts to compile."""
 
 
-def compile_beside(function: str) -> None:
+def compile_in_background(function: str) -> None:
     """Register a function that a second process calls to compile the inner loops of a later job.
 
     The second process starts when this process has to compile, as on a new machine. Both processes

@@ -52,11 +52,11 @@ def invert_transform(T_a_b: Transform) -> Transform:
 
 def moved(T_cam_obj: Transform, step: Step) -> Transform:
     """Apply a step to a pose."""
-    turn = rotation_vector_to_matrix(step[:3])
-    return make_transform(turn @ T_cam_obj[:3, :3], T_cam_obj[:3, 3] + step[3:])
+    R = rotation_vector_to_matrix(step[:3])
+    return make_transform(R @ T_cam_obj[:3, :3], T_cam_obj[:3, 3] + step[3:])
 
 
-def camera_beside(point: Vector, angle: float, direction: float) -> Transform:
+def orbited_camera(point: Vector, angle: float, direction: float) -> Transform:
     """Return T_new_cam of a camera that looks at a point from beside this camera.
 
     Args:
@@ -65,14 +65,14 @@ def camera_beside(point: Vector, angle: float, direction: float) -> Transform:
         direction: Direction of the rotation's axis in the image plane, radians.
     """
     axis = np.array([math.cos(direction), math.sin(direction), 0.0])
-    turn = rotation_vector_to_matrix(angle * axis)
-    return make_transform(turn, point - turn @ point)
+    R = rotation_vector_to_matrix(angle * axis)
+    return make_transform(R, point - R @ point)
 
 
 def step_between(before: Transform, after: Transform) -> Step:
     """Return the step from one pose to another, the inverse of :func:`moved`."""
-    turn = matrix_to_rotation_vector(after[:3, :3] @ before[:3, :3].T)
-    return np.concatenate([turn, after[:3, 3] - before[:3, 3]])
+    rotvec = matrix_to_rotation_vector(after[:3, :3] @ before[:3, :3].T)
+    return np.concatenate([rotvec, after[:3, 3] - before[:3, 3]])
 
 
 def project(points_cam: Points, K: CameraMatrix) -> Pixels:

@@ -26,13 +26,13 @@ from dopepp.geometry.refine import (
     GATE,
     MIN_POINTS,
     NO_GATE,
+    apply_rotation,
     column_mean,
     copy_pose,
     degenerate,
     normal_equations,
     refine_pose,
     reproject,
-    turn,
 )
 from dopepp.geometry.rotation import RotationMatrix, Vector
 
@@ -363,7 +363,7 @@ def _improved(
     residuals = np.empty((len(rays), 2))
     rotations, costs = np.empty((count, 3, 3)), np.empty(count)
     for s in range(count):
-        turn(starts[s], np.eye(3), rotations[s])
+        apply_rotation(starts[s], np.eye(3), rotations[s])
         reproject(object_points, rays, whitening, rotations[s], starts[s, 3:], residuals)
         costs[s] = _truncated_cost(residuals)
     R, t = np.empty((3, 3)), np.empty(3)

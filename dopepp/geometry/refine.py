@@ -71,7 +71,7 @@ def refine_pose(
     normal_equations(object_points, rays, whitening, R, t, residuals, gate, hessian, gradient)
     for _ in range(MAX_STEPS):
         solve_inside(hessian, gradient, damping, step, workspace)
-        turn(step, R, moved_R)
+        apply_rotation(step, R, moved_R)
         for r in range(3):
             moved_t[r] = t[r] + step[3 + r]
         reproject(object_points, rays, whitening, moved_R, moved_t, moved_residuals)
@@ -244,7 +244,7 @@ def solve_inside(
 
 
 @compiled()
-def turn(step: Array, R: Array, out: Array) -> None:
+def apply_rotation(step: Array, R: Array, out: Array) -> None:
     """Write Exp(ω) R for the rotation vector ω in the first three numbers of a step.
 
     Args:

@@ -59,8 +59,8 @@ def symmetry_group(
         return rotations_about(offset, _ball_rotations(max(2 * max_step, BALL_STEP)))
     count = math.ceil(math.pi / max_step)
     angles = np.arange(count) * (2 * math.pi / count)
-    turns = rotations_about(offset, rotation_vector_to_matrix(angles[:, None] * axes[0]))
-    return np.asarray((turns[None] @ group[:, None]).reshape(-1, 4, 4))
+    about_axis = rotations_about(offset, rotation_vector_to_matrix(angles[:, None] * axes[0]))
+    return np.asarray((about_axis[None] @ group[:, None]).reshape(-1, 4, 4))
 
 
 def _unit(axis: Sequence[float]) -> Vector:
@@ -90,9 +90,9 @@ def _ball_rotations(step: float) -> Float[np.ndarray, "rotations 3 3"]:
     polar, around = np.arccos(z), np.pi * (3 - math.sqrt(5)) * number
     tilt = np.stack([-np.sin(around), np.cos(around), np.zeros_like(z)], axis=1)
     angles = np.arange(0, 2 * math.pi, 2 * math.pi / math.ceil(2 * math.pi / step))
-    turns = rotation_vector_to_matrix(angles[:, None] * np.array([0.0, 0.0, 1.0]))
+    about_axis = rotation_vector_to_matrix(angles[:, None] * np.array([0.0, 0.0, 1.0]))
     tilts = rotation_vector_to_matrix(polar[:, None] * tilt)
-    return np.asarray((tilts[:, None] @ turns[None]).reshape(-1, 3, 3))
+    return np.asarray((tilts[:, None] @ about_axis[None]).reshape(-1, 3, 3))
 
 
 def exact_group(

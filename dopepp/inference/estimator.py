@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from dopepp.core.compiled import compile_beside
+from dopepp.core.compiled import compile_in_background
 from dopepp.core.errors import UserError
 from dopepp.core.extensions import enable
 from dopepp.core.validation import Range, check
@@ -98,8 +98,8 @@ class PoseEstimator:
 
             limits = {} if self.scale_error is None else {"scale_error": self.scale_error}
             self.refiner = Refiner(refine, parts, **limits)
-        for function in ("rehearse_pose", "rehearse_refinement"):
-            compile_beside(f"dopepp.inference.refinement.refiner:{function}")
+        for function in ("warm_up_pose", "warm_up_refinement"):
+            compile_in_background(f"dopepp.inference.refinement.refiner:{function}")
         self.solid_parts = tuple(parts)
         """Parts with the meshes that refinement uses."""
         self.spent_ms = dict.fromkeys(STEPS, 0.0)

@@ -28,7 +28,7 @@ from dopepp.core.files import write_whole
 from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import Picture, read_photo
 from dopepp.drawing.sheet import belief_tiles, contact_sheet
-from dopepp.geometry.camera import MIN_VIEW_DEG, MAX_VIEW_DEG, CameraMatrix, camera_matrix
+from dopepp.geometry.camera import MAX_VIEW_DEG, MIN_VIEW_DEG, CameraMatrix, camera_matrix
 from dopepp.geometry.camera_file import Camera, read_camera
 from dopepp.geometry.cuboid import NUM_KEYPOINTS
 from dopepp.geometry.rotation import matrix_to_quaternion

@@ -32,7 +32,7 @@ from dopepp.inference.picture import (
 from dopepp.inference.refinement.refiner import Refine
 from dopepp.inference.templates import TemplateDetector
 from dopepp.inference.templates.ranking import learned_ranking
-from dopepp.inference.templates.silence import silent_level
+from dopepp.inference.templates.silence import background_log_odds
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Part, check_name
@@ -105,7 +105,7 @@ class TemplateEstimator(PoseEstimator):
         estimator = cls(detectors, checked, refine, max_ms, scale_error)
         for detector in detectors:
             loudest = partial(_largest_log_odds, detector, checked)
-            level = silent_level(detector.part, checked, tilt, loudest)
+            level = background_log_odds(detector.part, checked, tilt, loudest)
             estimator.levels[detector.part.name] = level
         return estimator
 

@@ -171,7 +171,7 @@ class PoseMetrics(Metric):
         # Object index and score of every false positive.
         self.add_state("false_positives", default=[], dist_reduce_fx="cat")
         self.add_state("num_images", default=torch.tensor(0), dist_reduce_fx="sum")
-        self._gathered: dict[str, Gathered] = {}
+        self._gathered: dict[str, EvaluatedInstances] = {}
 
     def update(
         self,
@@ -234,7 +234,7 @@ class PoseMetrics(Metric):
         for index, (name, part) in enumerate(self.parts.items()):
             false = false_positives[false_positives[:, 0] == index, 1]
             table = poses[poses[:, 0] == index]
-            self._gathered[name] = Gathered(part, table, false, num_images)
+            self._gathered[name] = EvaluatedInstances(part, table, false, num_images)
             rows[name] = self._gathered[name].row(self.method)
         rows[MEAN] = mean_row(list(rows.values()), self.method)
         return rows
@@ -262,7 +262,7 @@ class PoseMetrics(Metric):
             by_part[MEAN] = mean_row(list(by_part.values()), reference)
         return table
 
-    def instances(self, name: str) -> Gathered:
+    def instances(self, name: str) -> EvaluatedInstances:
         """Return the evaluated instances of a part, in the order of :meth:`errors`.
 
         All ranks must call this method, like ``compute``.
@@ -277,7 +277,7 @@ class PoseMetrics(Metric):
         return figure, figure.axes[0]
 
 
-class Gathered:
+class EvaluatedInstances:
     """All evaluated instances of one object, and the scores of its false positives.
 
     Attributes:

@@ -86,12 +86,12 @@ def _row(part: Part, name: str, Q: Tensor, few_points: Tensor, points: Tensor) -
     about_centre = Q[subset], origin[subset], identity[subset], origin[subset]
     # Symmetries are transforms of the object frame, whose origin may lie anywhere.
     centre = torch.from_numpy(np.asarray(part.cuboid[CENTROID], np.float64))
-    turned = Q[subset], centre - Q[subset] @ centre, identity[subset], origin[subset]
+    poses = Q[subset], centre - Q[subset] @ centre, identity[subset], origin[subset]
     group = symmetry_transforms(part)
     errors = PoseErrors(
         add=add(Q, origin, identity, origin, few_points),
         add_s=add_s(*about_centre, points),
-        mssd=mssd(*turned, bop_points(part), group),
+        mssd=mssd(*poses, bop_points(part), group),
         mspd=None,
         rotation_deg=rotation_error_deg(Q, identity),
         rotation_s_deg=rotation_error_deg(Q[subset], identity[subset], group),

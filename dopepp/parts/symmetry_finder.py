@@ -174,13 +174,13 @@ class Candidates:
 
     def axes(self, order: int) -> Iterator[Vector]:
         """Yield refined symmetry axes of a prime order, smallest coarse distance first."""
-        turns = axis_rotation(self._axes, 2 * np.pi / order)
-        change = turns @ self._moments @ np.swapaxes(turns, 1, 2) - self._moments
+        R = axis_rotation(self._axes, 2 * np.pi / order)
+        change = R @ self._moments @ np.swapaxes(R, 1, 2) - self._moments
         scale = np.linalg.norm(self._moments)
         # A half turn about an axis off by 2.6° changes the moments of a rod by 13 %.
         possible = np.linalg.norm(change, axis=(1, 2)) <= 0.2 * scale
         index = np.flatnonzero(possible)
-        moved = self._rough_probes @ np.swapaxes(turns[index], 1, 2)
+        moved = self._rough_probes @ np.swapaxes(R[index], 1, 2)
         rough = self._surface.distances(moved, neighbours=1).mean(axis=1)
         index, rough = index[rough < _ROUGH], rough[rough < _ROUGH]
         taken: list[Vector] = []

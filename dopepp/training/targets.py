@@ -176,11 +176,11 @@ class SymmetryHandling:
         sight = _line_of_sight(batch.T_cam_obj.double(), tables["fixed"][index])
         towards = (sight @ tables["references"][index]).mT[:, :, None]
         axes = tables["axes"][index][:, :, None]
-        turns = _best_turn(towards @ poses[..., :3, :3], axes)
+        about_axis = _best_axis_rotation(towards @ poses[..., :3, :3], axes)
         offset = tables["offsets"][index][:, :, None]
-        shifts = offset - (turns @ offset[..., None])[..., 0]
+        shifts = offset - (about_axis @ offset[..., None])[..., 0]
         moved = poses[..., :3, 3] + (poses[..., :3, :3] @ shifts[..., None])[..., 0]
-        rotations = poses[..., :3, :3] @ turns
+        rotations = poses[..., :3, :3] @ about_axis
         poses = poses.clone()
         poses[..., :3, :3], poses[..., :3, 3] = rotations, moved
         trace = (towards @ rotations).diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -252,7 +252,7 @@ def _line_of_sight(
     return torch.stack(rows, -1).reshape(*x.shape, 3, 3)
 
 
-def _best_turn(
+def _best_axis_rotation(
     offset: Float[Tensor, "*batch 3 3"], axes: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "*batch 3 3"]:
     """Return the rotation C about an axis for which offset·C is nearest to the identity.
@@ -267,8 +267,8 @@ def _best_turn(
     cosine = offset.diagonal(dim1=-2, dim2=-1).sum(-1) - along
     sine = (offset @ skew).diagonal(dim1=-2, dim2=-1).sum(-1)
     angle = torch.atan2(sine, cosine)[..., None, None]
-    turns: Tensor = torch.eye(3, dtype=offset.dtype, device=offset.device)
-    return turns + angle.sin() * skew + (1 - angle.cos()) * skew @ skew
+    identity: Tensor = torch.eye(3, dtype=offset.dtype, device=offset.device)
+    return identity + angle.sin() * skew + (1 - angle.cos()) * skew @ skew
 
 
 def _project(

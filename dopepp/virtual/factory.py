@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 
 from dopepp.core.errors import UserError, require
-from dopepp.geometry.camera import Transform, camera_beside, make_transform, transform
+from dopepp.geometry.camera import Transform, make_transform, orbited_camera, transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import Vector
 from dopepp.parts.catalogue import BUILTIN
@@ -121,7 +121,7 @@ class Factory:
         angle, first = np.radians(rng.uniform(*BESIDE_DEG)), rng.uniform(0.0, 2 * np.pi)
         middle = _middle([scene.objects[number] for number in scene.targets])
         point = np.array([0.0, 0.0, 1.0]) if middle is None else middle
-        cameras = [camera_beside(point, angle, first + turn) for turn in np.pi / 4 * np.arange(8)]
+        cameras = [orbited_camera(point, angle, first + turn) for turn in np.pi / 4 * np.arange(8)]
         if scene.plane is None:
             return cameras[0]
         normal, offset = np.array(scene.plane.normal), scene.plane.offset

@@ -96,12 +96,12 @@ class _Setting:
     def _candidates(self, body: Body) -> Iterable[_Lying]:
         """Draw resting poses of a body; on a heap, the lowest first."""
         if not self.table.heaped:
-            return self._turned(body)
+            return self._resting_poses(body)
         # Objects slide down: prefer the lowest pose of two orientations.
-        several = [lying for _ in range(2) for lying in self._turned(body)]
+        several = [lying for _ in range(2) for lying in self._resting_poses(body)]
         return sorted(several, key=lambda lying: lying.centre)
 
-    def _turned(self, body: Body) -> Iterator[_Lying]:
+    def _resting_poses(self, body: Body) -> Iterator[_Lying]:
         """Turn a body at random and yield resting poses."""
         rotation, lowest = self.table.draw_turning(self.rng, body.hull)
         footprint = self._map.footprint(body.surface, rotation, lowest)

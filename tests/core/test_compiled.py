@@ -26,8 +26,8 @@ def test_a_first_compilation_calls_functions_beside(command, tmp_path):
     module.write_text(
         "import gc, time\n"
         "from pathlib import Path\n"
-        "from dopepp.core.compiled import compile_beside, compiled\n"
-        "compile_beside('later:call')\n"
+        "from dopepp.core.compiled import compile_in_background, compiled\n"
+        "compile_in_background('later:call')\n"
         "@compiled()\n"
         "def double(x):\n"
         "    return x + x\n"

@@ -25,7 +25,7 @@ def level_of(measured, values, part=None, distances=DISTANCES, tilt=180.0):
         measured.extend((picture, K) for picture in shown)
         return [values[number % len(values)] for number in range(len(shown))]
 
-    return silence.silent_level(part or pivconnector(), distances, tilt, loudest)
+    return silence.background_log_odds(part or pivconnector(), distances, tilt, loudest)
 
 
 def test_level_is_mean_and_deviations_of_different_photos(measured):

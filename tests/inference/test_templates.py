@@ -14,7 +14,7 @@ from dopepp.geometry.rotation import rotation_angle
 from dopepp.inference.refinement.outline import make_outline_mesh
 from dopepp.inference.template_estimator import TemplateEstimator
 from dopepp.inference.templates import SMALLEST_PX, TemplateDetector, views
-from dopepp.inference.templates.matching import CELL, NUM_KEPT, NUM_TURNS, STRIDE, match
+from dopepp.inference.templates.matching import CELL, NUM_KEPT, NUM_ROLLS, STRIDE, match
 from dopepp.inference.templates.responses import BINS, edge_responses
 from dopepp.inference.templates.views import (
     DRAWN_PX,
@@ -172,8 +172,8 @@ def test_cells_keep_the_matches_with_the_largest_sums_of_responses():
     rows, columns, pad = len(range(0, 46, STRIDE)), len(range(0, 57, STRIDE)), 40
     padded = np.pad(responses, ((0, 0), (pad, pad), (pad, pad)))
     side, cells = round(CELL * size / STRIDE), {}
-    for view, turn in np.ndindex(3, NUM_TURNS):
-        angle = 2 * np.pi * turn / NUM_TURNS
+    for view, roll in np.ndindex(3, NUM_ROLLS):
+        angle = 2 * np.pi * roll / NUM_ROLLS
         turned = Rotation.from_euler("z", angle).apply(np.pad(points[view], ((0, 0), (0, 1))))
         sums = np.zeros((rows, columns))
         offsets = np.rint(size * turned[:, :2]).astype(int)

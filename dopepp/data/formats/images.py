@@ -108,7 +108,7 @@ def decode_depth(content: bytes, where: str, depth_scale: float, shape: Shape) -
         UserError: The image is damaged, too large, of another size or type, or has no scale.
     """
     node = Node(STRICT, where)
-    units = one_channel_of(node, shape, content, DEPTH_MODES)
+    units = decode_one_channel(node, shape, content, DEPTH_MODES)
     assert units is not None
     if np.isnan(depth_scale):
         node["image"].report("no depth_scale", "depth_scale (mm per unit) beside the image's cam_K")
@@ -121,12 +121,12 @@ def decode_mask(content: bytes, where: str, shape: Shape) -> Mask:
     Raises:
         UserError: The mask is damaged, too large, of another size, or has several channels.
     """
-    mask = one_channel_of(Node(STRICT, where), shape, content)
+    mask = decode_one_channel(Node(STRICT, where), shape, content)
     assert mask is not None
     return np.asarray(mask != 0)
 
 
-def one_channel_of(
+def decode_one_channel(
     node: Node, shape: Shape | None, content: bytes | None = None, modes: tuple[str, ...] = ()
 ) -> NDArray[Any] | None:
     """Decode a BOP depth image or mask; report a wrong image and return None."""
@@ -137,7 +137,7 @@ def one_channel_of(
         allowed = "one channel of 16-bit whole numbers" if modes else "one channel"
         node["channels"].report(f"pixels of type {image.mode}", allowed)
         return None
-    return one_channel(node, np.asarray(image), shape)
+    return check_one_channel(node, np.asarray(image), shape)
 
 
 def read_map(node: Node, shape: Shape | None, colour: bool = False) -> NDArray[Any] | None:
@@ -150,12 +150,12 @@ def read_map(node: Node, shape: Shape | None, colour: bool = False) -> NDArray[A
     """
     image = node["image"].attempt(lambda: pictures.read_image(Path(node.path)))
     if image is not None and image.ndim > 2 and colour:
-        one_channel(node, image[..., 0], shape)
+        check_one_channel(node, image[..., 0], shape)
         return None
-    return one_channel(node, image, shape)
+    return check_one_channel(node, image, shape)
 
 
-def one_channel(
+def check_one_channel(
     node: Node, image: NDArray[Any] | None, shape: tuple[int, ...] | None
 ) -> NDArray[Any] | None:
     """Return an image of one channel (a mask or a depth map); report a wrong one and return None.

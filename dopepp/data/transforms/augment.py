@@ -71,11 +71,11 @@ class Photometric(Checked):
         """Compose all colour changes into one affine map, so that pixels are rounded once."""
         angle = rng.uniform(-self.hue, self.hue)
         chroma = 1 + rng.uniform(-self.saturation, self.saturation)
-        turn = np.eye(3)
+        rotation = np.eye(3)
         cos, sin = chroma * np.cos(angle), chroma * np.sin(angle)
-        turn[1:, 1:] = [[cos, -sin], [sin, cos]]
+        rotation[1:, 1:] = [[cos, -sin], [sin, cos]]
         gain = 1 + rng.uniform(-self.colour_gain, self.colour_gain, 3)
         contrast = 1 + rng.uniform(-self.contrast, self.contrast)
-        linear = contrast * gain[:, None] * (_RGB @ turn @ _YIQ)
+        linear = contrast * gain[:, None] * (_RGB @ rotation @ _YIQ)
         offset = 127.5 * (1 - contrast) + 255 * rng.uniform(-self.brightness, self.brightness)
         return np.column_stack([linear, np.full(3, offset)])

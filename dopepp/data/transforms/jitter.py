@@ -40,12 +40,12 @@ class CameraJitter(Checked):
         size = np.array(sample.size)
         middle = (size - 1) / 2
         roll = np.radians(rng.uniform(-self.roll_deg, self.roll_deg))
-        turn = rotation_vector_to_matrix(np.array([0, 0, roll]))
+        R_roll = rotation_vector_to_matrix(np.array([0, 0, roll]))
         zoom = float(np.exp(rng.uniform(*np.log(self.zoom))))
         goal = middle + rng.uniform(-self.shift, self.shift, 2) * size
         K = np.diag([zoom, zoom, 1.0]) @ sample.K
         # The homography is affine, because the camera rolls about its axis.
-        warp = (K @ turn @ np.linalg.inv(sample.K))[:2]
+        warp = (K @ R_roll @ np.linalg.inv(sample.K))[:2]
         offset = goal - warp @ [*middle, 1.0]
         warp[:, 2] += offset
 
@@ -60,7 +60,7 @@ class CameraJitter(Checked):
                 mask = codes.astype(bool)
             shown = replace(
                 instance,
-                T_cam_obj=make_transform(turn, np.zeros(3)) @ instance.T_cam_obj,
+                T_cam_obj=make_transform(R_roll, np.zeros(3)) @ instance.T_cam_obj,
                 keypoints=instance.keypoints @ warp[:, :2].T + warp[:, 2],
                 mask=mask,
             )

@@ -32,7 +32,7 @@ from dopepp.experiment.results.frame import (
 )
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID
-from dopepp.metrics.pose import MEAN, Gathered, PoseMetrics, matching_radius
+from dopepp.metrics.pose import MEAN, EvaluatedInstances, PoseMetrics, matching_radius
 
 _log = logging.getLogger(__name__)
 
@@ -44,11 +44,11 @@ class Quantity(NamedTuple):
     """Quantity to sort instances by: heading with unit, value per instance, decimals in tables."""
 
     heading: str
-    of: Callable[[Gathered], Numbers]
+    of: Callable[[EvaluatedInstances], Numbers]
     decimals: int
 
 
-def sizes(instances: Gathered) -> Numbers:
+def sizes(instances: EvaluatedInstances) -> Numbers:
     """Return the square root of the area of the projected cuboid, in pixels of the original image.
 
     Occluded and truncated regions count. Unlike the distance, the size reveals that a flat part is
@@ -63,7 +63,7 @@ def sizes(instances: Gathered) -> Numbers:
     return np.sqrt(np.array(areas, np.float64))
 
 
-def view_angles(instances: Gathered) -> Numbers:
+def view_angles(instances: EvaluatedInstances) -> Numbers:
     """Return the angle between the object's +z axis and the direction to the camera, degrees.
 
     At 0° the +z face of the cuboid faces the camera; at 90° the face is seen edge-on.
@@ -73,7 +73,7 @@ def view_angles(instances: Gathered) -> Numbers:
     return np.asarray(np.degrees(np.arctan2(across, (axes * towards_camera).sum(axis=1))))
 
 
-def _centres(instances: Gathered) -> Float[np.ndarray, "n 3"]:
+def _centres(instances: EvaluatedInstances) -> Float[np.ndarray, "n 3"]:
     """Return the centres of the cuboids in the camera frame, metres."""
     T = instances.T_gt.numpy()
     return np.asarray(T[:, :3, :3] @ instances.part.cuboid[CENTROID] + T[:, :3, 3])

@@ -110,7 +110,7 @@ class NetworkCost:
         }
 
 
-class RehearsedEstimator(PoseEstimator):
+class SimulatedMapsEstimator(PoseEstimator):
     """Estimator that runs its network but recovers poses from given maps.
 
     Attributes:
@@ -144,7 +144,7 @@ def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
     source = held_out_source(config.data, parts, "test")
     # Pictures are prepared first so that frame times exclude reading and rendering.
     samples = [source.sample(index) for index in range(min(_NUM_PICTURES, len(source)))]
-    estimator = RehearsedEstimator(network, description, "cuda" if has_gpu else "cpu")
+    estimator = SimulatedMapsEstimator(network, description, "cuda" if has_gpu else "cpu")
     geometry = map_geometry(config.maps, network.stride)
     frames = time_frames(estimator, samples, geometry, config.cost.num_frames, config.seed)
     convolutions = [layer for layer in network.backbone.modules() if isinstance(layer, nn.Conv2d)]
@@ -178,7 +178,7 @@ def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
 
 
 def time_frames(
-    estimator: RehearsedEstimator,
+    estimator: SimulatedMapsEstimator,
     samples: Sequence[Sample],
     geometry: MapGeometry,
     num_frames: int,

@@ -24,7 +24,7 @@ from dopepp.drawing.curves import RateCurve
 from dopepp.experiment.config.data_config import DataConfig
 from dopepp.metrics.bootstrap import fewest_differing
 from dopepp.metrics.functional import coverage, wilson_interval
-from dopepp.metrics.pose import MEAN, Gathered
+from dopepp.metrics.pose import MEAN, EvaluatedInstances
 from dopepp.metrics.row import COLUMNS, NOT_AVAILABLE, Column, PoseRow, symmetry_transforms
 from dopepp.parts.part import Parts
 
@@ -254,7 +254,7 @@ def rate_curves(rates: Iterable[Value], per_unit: float = 1.0) -> dict[str, Rate
     return {method: RateCurve(*columns) for method, columns in arrays.items()}
 
 
-def coverage_curve(instances: Gathered) -> RateCurve | None:
+def coverage_curve(instances: EvaluatedInstances) -> RateCurve | None:
     """Return the observed coverage of an object's covariance regions over the nominal coverage.
 
     The curve covers matched poses with a covariance; None without any.
@@ -294,7 +294,7 @@ class PassRate:
         """Title of the rate's curves."""
         return heading(self.field).removesuffix(" %")
 
-    def passed(self, instances: Gathered) -> Bool[Tensor, "n"]:
+    def passed(self, instances: EvaluatedInstances) -> Bool[Tensor, "n"]:
         """Return which instances of an object pass."""
         unit = instances.part.diameter if self.relative else 1.0
         errors: Tensor = getattr(instances.errors, self.error)

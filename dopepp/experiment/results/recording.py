@@ -119,7 +119,7 @@ def measure_and_record(
         display.show_report(report, all_measures)
         if report.name in measured.bop:
             display.console.print(f"{report.name}: {measured.bop[report.name].in_words()}")
-    _show_silence(both, measured.silent, source)
+    _show_rejections(both, measured.silent, source)
     # Later comparisons use the unrefined result of the network, or the file if there is none.
     reports = of_networks(measured.reports, len(files) + len(views))
     refines = refine is not None and bool(estimators)
@@ -254,7 +254,7 @@ def _draw(run_dir: Path, measured: Measured, num_images: int) -> None:
         write_png(run_dir / "overlay.png", contact_sheet(measured.tiles))
 
 
-def _show_silence(
+def _show_rejections(
     methods: Mapping[str, Method], silent: Mapping[str, Sequence[int]], source: SampleSource
 ) -> None:
     """Print the number of images without detections of each estimator, with the reasons."""

@@ -123,7 +123,7 @@ class Scored:
 
 
 @dataclass(frozen=True)
-class Figures:
+class DetectionQuality:
     """Quality of scores and threshold."""
 
     calibration_error: float  # expected calibration error of the scores
@@ -138,8 +138,8 @@ class Tuning:
     """Tuned recovery options, and their effect on test images."""
 
     options: dict[str, float]  # changed RecoveryOptions
-    before: Figures  # network with the old options, without refinement
-    after: Figures  # estimator with the tuned options
+    before: DetectionQuality  # network with the old options, without refinement
+    after: DetectionQuality  # estimator with the tuned options
     num_images: tuple[int, int]  # test images with and without objects
     kept: str = ""  # why the old factors were kept; empty if they were replaced
 
@@ -161,13 +161,11 @@ def tune(
         UserError: There are no detections, all of them are correct or all wrong, or the covariances
             differ too much from the errors.
     """
-    old, memory = estimator.recovery, Memory()
-    estimator = memory.behind(estimator)
+    old, cache = estimator.recovery, TuningCache()
+    estimator = cache.with_cached_maps(estimator)
     count, rate = target.num_empty, target.false_positive_rate
-    validation, test = (memory.of(held_out_source(data, parts, split)) for split in HELD_OUT)
-    empty, empty_test = (
-        memory.of(negative_frames(data, parts, split, count)) for split in HELD_OUT
-    )
+    validation, test = (cache.of(held_out_source(data, parts, split)) for split in HELD_OUT)
+    empty, empty_test = (cache.of(negative_frames(data, parts, split, count)) for split in HELD_OUT)
     plain = _without_refinement(estimator)
     before = _measured(plain, parts, test, empty_test, old)
     new, shown, kept = _chosen_factors(estimator, parts, validation, empty, rate, old)
@@ -236,12 +234,12 @@ def _measured(
     test: SampleSource,
     empty: SampleSource,
     options: RecoveryOptions,
-) -> Figures:
+) -> DetectionQuality:
     """Return the figures of options on test images."""
     estimator.recovery = _without_thresholds(options)
     shown, without = (score_images(estimator, parts, source) for source in (test, empty))
     estimator.recovery = options
-    return _figures(shown, without, estimator.min_score)
+    return _quality(shown, without, estimator.min_score)
 
 
 def _without_refinement(estimator: PoseEstimator) -> PoseEstimator:
@@ -504,7 +502,7 @@ def _judge(
     return right, counts
 
 
-def _figures(test: Scored, empty: Scored, threshold: float) -> Figures:
+def _quality(test: Scored, empty: Scored, threshold: float) -> DetectionQuality:
     """Return the figures of detections on test images with and without objects."""
     scores, correct = torch.from_numpy(test.scores), torch.from_numpy(test.correct)
     error = expected_calibration_error(scores, correct)
@@ -516,49 +514,47 @@ def _figures(test: Scored, empty: Scored, threshold: float) -> Figures:
     elsewhere, lookalike = (
         float(loud[shown].sum()) / max(shown.sum(), 1) for shown in (~alike, alike)
     )
-    return Figures(error, elsewhere, lookalike, recall, precision)
+    return DetectionQuality(error, elsewhere, lookalike, recall, precision)
 
 
-class Memory:
+class TuningCache:
     """Cache for pictures and maps, which tuning uses several times.
 
     Args:
-        most_bytes: Size of the cache. Items that do not fit are computed each time.
+        max_bytes: Size of the cache. Items that do not fit are computed each time.
     """
 
-    def __init__(self, most_bytes: int = MAX_BYTES) -> None:
-        self._free = most_bytes
-        self._kept: dict[Hashable, Any] = {}
+    def __init__(self, max_bytes: int = MAX_BYTES) -> None:
+        self._free = max_bytes
+        self._items: dict[Hashable, Any] = {}
 
-    def recall(self, key: Hashable, make: Callable[[], Made], size: Callable[[Made], int]) -> Made:
+    def get(self, key: Hashable, make: Callable[[], Made], size: Callable[[Made], int]) -> Made:
         """Return the stored item of a key, or make it; ``size`` returns its bytes."""
-        if key in self._kept:
-            return self._kept[key]  # type: ignore[no-any-return]
-        made = make()
-        if size(made) <= self._free:
-            self._free -= size(made)
-            self._kept[key] = made
-        return made
+        if key in self._items:
+            return self._items[key]  # type: ignore[no-any-return]
+        item = make()
+        if size(item) <= self._free:
+            self._free -= size(item)
+            self._items[key] = item
+        return item
 
     def of(self, source: SampleSource) -> SampleSource:
         """Return a source that caches its items of epoch 0."""
-        return _RememberedSource(source, self, source.name)
+        return _CachedSource(source, self, source.name)
 
-    def behind(self, estimator: PoseEstimator) -> PoseEstimator:
+    def with_cached_maps(self, estimator: PoseEstimator) -> PoseEstimator:
         """Return a copy of an estimator that caches the maps of each picture."""
-        network, remembering = estimator.network, copy.copy(estimator)
-        remembering.network = _RememberedNetwork(
-            network, self, network.stride, network.size_multiple
-        )
-        return remembering
+        network, cached = estimator.network, copy.copy(estimator)
+        cached.network = _CachedNetwork(network, self, network.stride, network.size_multiple)
+        return cached
 
 
 @dataclass
-class _RememberedSource:
+class _CachedSource:
     """Source whose items of epoch 0 are cached."""
 
     source: SampleSource
-    memory: Memory
+    cache: TuningCache
     name: str
 
     def __len__(self) -> int:
@@ -568,15 +564,15 @@ class _RememberedSource:
         """Return an item, from the cache if possible."""
         if epoch:
             return self.source.sample(index, epoch)
-        return self.memory.recall((id(self), index), lambda: self.source.sample(index), _num_bytes)
+        return self.cache.get((id(self), index), lambda: self.source.sample(index), _num_bytes)
 
 
 @dataclass
-class _RememberedNetwork:
+class _CachedNetwork:
     """Network whose maps are cached by the pixels of the input."""
 
     network: Runtime
-    memory: Memory
+    cache: TuningCache
     stride: int
     size_multiple: int
 
@@ -584,7 +580,7 @@ class _RememberedNetwork:
         """Return the maps of images, from the cache if possible."""
         pixels = images.permute(0, 2, 3, 1).contiguous().cpu().numpy()
         key = (id(self), pixels.shape, hashlib.blake2b(pixels.tobytes()).digest())
-        return self.memory.recall(
+        return self.cache.get(
             key, lambda: self.network.maps(images), lambda maps: sum(part.nbytes for part in maps)
         )
 

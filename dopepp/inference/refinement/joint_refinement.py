@@ -71,27 +71,27 @@ class PosedPicture:
         """Return pose and covariance in the world, with the error of the camera's pose."""
         R = self.T_cam_world[:3, :3]
         T_world_obj = np.linalg.inv(self.T_cam_world) @ T_cam_obj
-        return T_world_obj, turned(R.T, covariance + self.error_at(T_cam_obj[:3, 3]))
+        return T_world_obj, rotate_covariance(R.T, covariance + self.error_at(T_cam_obj[:3, 3]))
 
     def to_camera(self, T_world_obj: Transform, covariance: PoseMatrix) -> Prior:
         """Return the distribution of a pose in the camera, with the error of the camera's pose."""
         T_cam_obj = self.pose(T_world_obj)
         error = self.error_at(T_cam_obj[:3, 3])
-        both = turned(self.T_cam_world[:3, :3], covariance) + error
+        both = rotate_covariance(self.T_cam_world[:3, :3], covariance) + error
         return Prior(T_cam_obj, np.linalg.inv(both))
 
 
-def turned(R: RotationMatrix, matrix: PoseMatrix) -> PoseMatrix:
+def rotate_covariance(R: RotationMatrix, matrix: PoseMatrix) -> PoseMatrix:
     """Rotate the axes of a covariance or information by R."""
-    turn = _turn(R)
-    return np.asarray(turn @ matrix @ turn.T)
+    R_step = _step_rotation(R)
+    return np.asarray(R_step @ matrix @ R_step.T)
 
 
-def _turn(R: RotationMatrix) -> PoseMatrix:
+def _step_rotation(R: RotationMatrix) -> PoseMatrix:
     """Return the 6×6 matrix that rotates both the rotation and the translation of a step."""
-    turn = np.zeros((6, 6))
-    turn[:3, :3] = turn[3:, 3:] = R
-    return turn
+    R_step = np.zeros((6, 6))
+    R_step[:3, :3] = R_step[3:, 3:] = R
+    return R_step
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,14 +103,14 @@ class ViewTerm:
 
     def __call__(self, pose: Transform, prior: NormalEquations, /) -> NormalEquations | None:
         """Linearise the term; see :class:`~dopepp.inference.refinement.solver.Term`."""
-        T_cam_obj, turn = self.view.pose(pose), _turn(self.view.T_cam_world[:3, :3])
+        T_cam_obj, R_step = self.view.pose(pose), _step_rotation(self.view.T_cam_world[:3, :3])
         error = self.view.error_at(T_cam_obj[:3, 3])
-        given = _widened(turn @ prior[0] @ turn.T, turn @ prior[1], error)
+        given = _widened(R_step @ prior[0] @ R_step.T, R_step @ prior[1], error)
         equations = self.term(T_cam_obj, given)
         if equations is None:
             return None
         H, g = _widened(*equations, error)
-        return turn.T @ H @ turn, turn.T @ g
+        return R_step.T @ H @ R_step, R_step.T @ g
 
 
 def _widened(H: PoseMatrix, g: Vector, covariance: PoseMatrix) -> NormalEquations:

@@ -107,8 +107,8 @@ def filled_mask(
     width, height = size
     mask = np.zeros((height, width), np.uint8)
     if mesh.is_closed:
-        turns = np.zeros((height, width + 1), np.int32)
-        _wind(posed_mesh.pixels, mesh.edges, mesh.sides, posed_mesh.front, turns, mask)
+        winding = np.zeros((height, width + 1), np.int32)
+        _wind(posed_mesh.pixels, mesh.edges, mesh.sides, posed_mesh.front, winding, mask)
     else:
         _fill(posed_mesh.pixels, mesh.faces, mask)
     return mask
@@ -225,7 +225,7 @@ def _fill(pixels: Array, faces: Array, mask: Array) -> None:
 
 @compiled()
 def _wind(
-    pixels: Array, edges: Array, sides: Array, front: Array, turns: Array, mask: Array
+    pixels: Array, edges: Array, sides: Array, front: Array, winding: Array, mask: Array
 ) -> None:
     """Set the pixels that the border of the triangles facing the camera winds around.
 
@@ -234,7 +234,7 @@ def _wind(
         edges: Vertices of each edge.
         sides: The two triangles of each edge.
         front: Whether each triangle faces the camera.
-        turns: Zeros, one column wider than the mask; filled with the changes of the winding number.
+        winding: Zeros, one column wider than the mask; filled with the winding number's changes.
         mask: Filled with 1 inside the border and 0 outside.
     """
     height, width = mask.shape
@@ -251,11 +251,11 @@ def _wind(
         low, high = max(0.0, math.ceil(y)), min(height - 1.0, math.ceil(pixels[j, 1]) - 1.0)
         for v in range(int(low), int(high) + 1):
             x = pixels[i, 0] + (pixels[j, 0] - pixels[i, 0]) / rise * (v - y)
-            turns[v, int(min(max(0.0, math.ceil(x)), width))] += way
+            winding[v, int(min(max(0.0, math.ceil(x)), width))] += way
     for v in range(height):
         count = 0
         for u in range(width):
-            count += turns[v, u]
+            count += winding[v, u]
             mask[v, u] = count != 0
 
 

@@ -175,7 +175,7 @@ class SurfaceOverlay:
         return np.asarray(is_beside & (np.abs(self.offset - adjacent) <= STEP * noise))
 
 
-def lay_over(
+def overlay_surface(
     view: DepthView, surface: SurfacePoints, is_visible: Visible, T_cam_obj: Transform
 ) -> SurfaceOverlay | None:
     """Compare every pixel of a depth view with the posed part's nearest visible point.

@@ -329,18 +329,18 @@ def poses_of_four(
     return poses
 
 
-def rehearse_pose() -> None:
+def warm_up_pose() -> None:
     """Solve for the pose of a box, which compiles the inner loops.
 
-    See :func:`~dopepp.core.compiled.compile_beside`.
+    See :func:`~dopepp.core.compiled.compile_in_background`.
     """
     corners, K, _, pixels = _box()
     pixels[0] += 20.0
     solve_pnp(corners, pixels, K, covariance_px=np.tile(np.eye(2), (8, 1, 1)))
 
 
-def rehearse_refinement() -> None:
-    """Refine the pose of a drawn box, which compiles the inner loops; see :func:`rehearse_pose`."""
+def warm_up_refinement() -> None:
+    """Refine the pose of a drawn box, which compiles the inner loops; see :func:`warm_up_pose`."""
     corners, K, T, pixels = _box()
     image = np.full((128, 128, 3), 40, np.uint8)
     cv2.fillConvexPoly(image, cv2.convexHull(np.rint(pixels).astype(np.int32)), (200, 160, 90))

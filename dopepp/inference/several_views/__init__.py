@@ -107,11 +107,11 @@ def _posed_pictures(
         if values is not None and len(values) != count:
             problem = f"{len(values)} {name} for {count} images"
             raise UserError(problem, f"{count}, one for each image", f"pass {count} {name}")
-    shift, turn = (
+    shift, rotation_error = (
         check(f"camera_error[{n}]", error, float, Range(0.0, 1.0))
         for n, error in enumerate(camera_error)
     )
-    error = np.diag(np.repeat([turn, shift], 3) ** 2)
+    error = np.diag(np.repeat([rotation_error, shift], 3) ** 2)
     return [
         _posed(image, cameras[n], T_world_cam[n], depths[n] if depths else None, error, names[n])
         for n, image in enumerate(images)

@@ -41,9 +41,9 @@ class _Conflict(NamedTuple):
         """Return the views, the part and the difference of its poses."""
         first, second = (detection.T_world_obj for detection in self.detections)
         shift = 1e3 * np.linalg.norm(first[:3, 3] - second[:3, 3])
-        turn = math.degrees(float(rotation_angle(first[:3, :3] @ second[:3, :3].T)))
+        angle = math.degrees(float(rotation_angle(first[:3, :3] @ second[:3, :3].T)))
         seen = " and ".join(names[view] for view in self.views)
-        return f"{seen} show {self.detections[0].object} {shift:.3g} mm and {turn:.2g}° apart"
+        return f"{seen} show {self.detections[0].object} {shift:.3g} mm and {angle:.2g}° apart"
 
 
 def contradictions(

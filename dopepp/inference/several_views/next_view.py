@@ -24,7 +24,7 @@ from dopepp.geometry.camera import (
     transform,
 )
 from dopepp.geometry.camera_formats import Size
-from dopepp.inference.refinement.joint_refinement import turned
+from dopepp.inference.refinement.joint_refinement import rotate_covariance
 from dopepp.inference.refinement.outline import (
     OutlineMesh,
     filled_mask,
@@ -86,9 +86,9 @@ def next_best_view(
         information = None
         if T_world_bench is None or _height(T_world_bench, T_world_cam) > 0:
             T_cam_world = invert_transform(T_world_cam)
-            given = turned(T_cam_world[:3, :3], prior)
+            given = rotate_covariance(T_cam_world[:3, :3], prior)
             seen = _information(mesh, T_cam_world @ T_world_obj, K, size, given, scale_error)
-            information = None if seen is None else turned(T_world_cam[:3, :3], seen)
+            information = None if seen is None else rotate_covariance(T_world_cam[:3, :3], seen)
         expected.append(
             math.inf
             if information is None
@@ -107,9 +107,9 @@ def point_error(mesh: OutlineMesh, T_world_obj: Transform, covariance: PoseMatri
     """Return the expected error of a part's points under a pose's covariance (RMS), metres."""
     arms = mesh.vertices @ T_world_obj[:3, :3].T
     moment = arms.T @ arms / len(arms)
-    turning = np.trace(moment) * np.eye(3) - moment  # mean of |ω × arm|² as a form of ω
+    inertia = np.trace(moment) * np.eye(3) - moment  # mean of |ω × arm|² as a form of ω
     cross = np.cross(np.eye(3), arms.mean(axis=0))  # mean of ω × arm as a map of ω
-    variance = np.trace(covariance[3:, 3:]) + (turning * covariance[:3, :3]).sum()
+    variance = np.trace(covariance[3:, 3:]) + (inertia * covariance[:3, :3]).sum()
     return math.sqrt(max(0.0, float(variance + 2 * (cross * covariance[:3, 3:]).sum())))
 
 

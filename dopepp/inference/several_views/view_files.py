@@ -133,9 +133,9 @@ def transform_of(value: object, where: str) -> Transform:
             T = np.array(fields["matrix"], np.float64).reshape(4, 4)
         else:
             if "rotation" in fields:
-                shift, turn = fields["translation"], fields["rotation"]
+                shift, orientation = fields["translation"], fields["rotation"]
                 position = [shift[axis] for axis in "xyz"]
-                quaternion = [turn[axis] for axis in "wxyz"]
+                quaternion = [orientation[axis] for axis in "wxyz"]
             else:
                 position = fields["position"]
                 x_first = fields.get("quaternion_xyzw")

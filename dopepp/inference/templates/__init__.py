@@ -38,9 +38,9 @@ from dopepp.inference.refinement.outline import filled_mask, make_outline_mesh, 
 from dopepp.inference.templates.matching import STRIDE, Matches, match
 from dopepp.inference.templates.ranking import (
     Features,
+    improve_views,
     learned_ranking,
     move_nearby,
-    turn_views,
 )
 from dopepp.inference.templates.responses import edge_responses
 from dopepp.inference.templates.views import NEAREST, joined, make_templates, view_rotations
@@ -240,8 +240,8 @@ class TemplateDetector:
         matches, before = move_nearby(matches, self._templates, responses, small, reach)
         best = np.argsort(-before @ learned_ranking().weights)[:NUM_TURNED]
         matches = matches.at(best)
-        turned, after = turn_views(matches, self._templates, responses, small)
-        both = _joined([matches, turned])
+        improved, after = improve_views(matches, self._templates, responses, small)
+        both = _joined([matches, improved])
         both.poses[:, [0, 1, 3]] /= scale
         # Better neighbouring views exist for wrong matches, too: half of the gain counts.
         return both, np.concatenate([before[best], (before[best] + after) / 2])
@@ -274,7 +274,7 @@ class TemplateDetector:
                 plane in radians, and projected diameter in pixels.
             K: Camera matrix, pixels.
         """
-        u, v, turns, sizes = poses.T
+        u, v, rolls, sizes = poses.T
         depths = self.part.diameter * focal_length(K) / sizes
         rays = np.column_stack(
             [(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(len(poses))]
@@ -283,8 +283,8 @@ class TemplateDetector:
         sines = np.linalg.norm(rays[:, :2], axis=1) / np.linalg.norm(rays, axis=1)
         axes = np.column_stack([-rays[:, 1], rays[:, 0], np.zeros(len(rays))])
         axes *= (np.arcsin(sines) / np.maximum(np.linalg.norm(axes, axis=1), 1e-12))[:, None]
-        turned = rotation_vector_to_matrix(turns[:, None] * np.array([0.0, 0.0, 1.0]))
-        rotations = rotation_vector_to_matrix(axes) @ turned @ self._templates.rotations[views]
+        rolled = rotation_vector_to_matrix(rolls[:, None] * np.array([0.0, 0.0, 1.0]))
+        rotations = rotation_vector_to_matrix(axes) @ rolled @ self._templates.rotations[views]
         shifts = depths[:, None] * rays - rotations @ self._centre
         transforms = np.tile(np.eye(4), (len(poses), 1, 1))
         transforms[:, :3, :3], transforms[:, :3, 3] = rotations, shifts

@@ -20,7 +20,7 @@ from dopepp.core.compiled import Array, compiled
 from dopepp.inference.templates.responses import Responses
 from dopepp.inference.templates.views import Templates
 
-NUM_TURNS: Final = 24  # in the image plane, 15 degrees apart
+NUM_ROLLS: Final = 24  # in the image plane, 15 degrees apart
 STRIDE: Final = 4  # pixels between positions
 CELL: Final = 0.2  # side of a cell, diameters
 NUM_KEPT: Final = 8  # best matches of each cell
@@ -63,19 +63,19 @@ def match(responses: Responses, templates: Templates, diameter_px: float) -> Mat
     side = max(1, round(CELL * diameter_px / STRIDE))
     shape = (-(-rows // side), -(-columns // side), NUM_KEPT)
     scores, best = np.full(shape, -np.inf), np.zeros((*shape, 3), np.int64)
-    moments = np.empty((len(templates.points), NUM_TURNS, 2))
+    moments = np.empty((len(templates.points), NUM_ROLLS, 2))
     lines = templates.points, templates.normals
     _match(phases, rows, columns, margin, *lines, diameter_px, side, scores, best, moments)
     filled = np.isfinite(scores)
-    views, turns, positions = best[filled].T
+    views, rolls, positions = best[filled].T
     v, u = np.divmod(positions, columns)
     poses = [
         STRIDE * u,
         STRIDE * v,
-        turns * (2 * math.pi / NUM_TURNS),
+        rolls * (2 * math.pi / NUM_ROLLS),
         np.full(u.shape, diameter_px),
     ]
-    means, deviations = moments[views, turns].T / templates.points.shape[1]
+    means, deviations = moments[views, rolls].T / templates.points.shape[1]
     return Matches(views, np.column_stack(poses), scores[filled], means, deviations)
 
 
@@ -138,14 +138,14 @@ def _match(
         moments: Filled with mean and standard deviation of each template's sums.
     """
     bins, length = len(phases) // (STRIDE * STRIDE), phases.shape[1]
-    turns, across = moments.shape[1], columns + 2 * margin
+    rolls, across = moments.shape[1], columns + 2 * margin
     first = margin * across + margin
     flat, starts = phases.reshape(-1), np.empty(points.shape[1], np.int64)
     total = np.empty((rows - 1) * across + columns, np.int16)
     highest, weakest = np.empty(columns, np.int16), np.zeros(scores.shape[:2], np.int64)
     for view in range(len(points)):
-        for turn in range(turns):
-            angle = 2 * math.pi * turn / turns
+        for roll in range(rolls):
+            angle = 2 * math.pi * roll / rolls
             c, s = scale * math.cos(angle), scale * math.sin(angle)
             for p in range(points.shape[1]):
                 u = int(np.rint(c * points[view, p, 0] - s * points[view, p, 1]))
@@ -165,7 +165,7 @@ def _match(
                 square += row_square
             mean /= rows * columns
             deviation = math.sqrt(max(square / (rows * columns) - mean * mean, 1.0))
-            moments[view, turn, 0], moments[view, turn, 1] = mean, deviation
+            moments[view, roll, 0], moments[view, roll, 1] = mean, deviation
             for i in range(scores.shape[0]):
                 top, bottom = i * side, min((i + 1) * side, rows)
                 highest[:] = total[top * across : top * across + columns]
@@ -187,6 +187,6 @@ def _match(
                             if total[r * across + k] == most:
                                 position = r * columns + k
                     scores[i, j, slot] = score
-                    best[i, j, slot, 0], best[i, j, slot, 1] = view, turn
+                    best[i, j, slot, 0], best[i, j, slot, 1] = view, roll
                     best[i, j, slot, 2] = position
                     weakest[i, j] = np.argmin(scores[i, j])

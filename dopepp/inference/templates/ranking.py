@@ -45,11 +45,11 @@ LEVEL: Final = 16.0  # difference of colours, grey levels, at which the contrast
 EVEN: Final = 64.0  # added to the variance of colours, so that noise counts as even
 MIN_INNER: Final = 8  # least number of inner points on the image; other matches get no features
 ACROSS: Final = (2.5, 0.03)  # pixels and diameters between the outline and the compared colours
-TURN: Final = math.radians(5.0)  # step of the turn in the grid search
+ROLL_STEP: Final = math.radians(5.0)  # step of the turn in the grid search
 GROWTH: Final = 0.03  # first relative step of the size
 FEW: Final = 32  # first points of a template, used in the grid search; they are far apart
 REACH_PX: Final = 1.5  # first step of the position after a change of view
-MAX_TURNS: Final = 4  # largest number of changes of a match's view
+MAX_CHANGES: Final = 4  # largest number of changes of a match's view
 
 
 Features = Float[np.ndarray, "matches features"]
@@ -98,7 +98,7 @@ def move_nearby(
     return matches, _features(matches, best, templates, responses, image)
 
 
-def turn_views(
+def improve_views(
     matches: Matches, templates: Templates, responses: Responses, image: Picture
 ) -> tuple[Matches, Features]:
     """Replace the views of matches by better neighbouring views.
@@ -107,7 +107,7 @@ def turn_views(
     """
     views, poses, best = matches.views.copy(), matches.poses.copy(), np.empty(len(matches.poses))
     lines = templates.points, templates.normals
-    _turn(responses, *lines, templates.neighbours, templates.twists, views, poses, best)
+    _improve_views(responses, *lines, templates.neighbours, templates.twists, views, poses, best)
     matches = matches._replace(views=views, poses=poses)
     return matches, _features(matches, best, templates, responses, image)
 
@@ -131,7 +131,7 @@ def _features(
 
 @compiled(fastmath=True)
 def _response(
-    maps: Array, points: Array, normals: Array, u: float, v: float, turn: float, scale: float
+    maps: Array, points: Array, normals: Array, u: float, v: float, roll: float, scale: float
 ) -> float:
     """Return the mean edge response at the points of a posed template.
 
@@ -141,17 +141,17 @@ def _response(
         normals: Direction of each point's normal, radians.
         u: Column of the template's centre, pixels.
         v: Row of the template's centre, pixels.
-        turn: Rotation in the image plane, radians.
+        roll: Rotation in the image plane, radians.
         scale: Projected diameter, pixels.
     """
     bins, height, width = maps.shape
-    c, s, total = scale * math.cos(turn), scale * math.sin(turn), 0
+    c, s, total = scale * math.cos(roll), scale * math.sin(roll), 0
     for p in range(len(points)):
         x = int(u + c * points[p, 0] - s * points[p, 1] + 0.5)
         y = int(v + s * points[p, 0] + c * points[p, 1] + 0.5)
         if 0 <= x < width and 0 <= y < height:
             # Angles are above −4π, and the remainder must not be negative.
-            total += maps[int((normals[p] + turn) * bins / math.pi + 8 * bins + 0.5) % bins, y, x]
+            total += maps[int((normals[p] + roll) * bins / math.pi + 8 * bins + 0.5) % bins, y, x]
     return total / len(points)
 
 
@@ -173,7 +173,7 @@ def _climb(
         The highest response.
     """
     most = _response(maps, points, normals, pose[0], pose[1], pose[2], pose[3])
-    steps = np.array([reach, reach, TURN / 2, GROWTH * pose[3]])
+    steps = np.array([reach, reach, ROLL_STEP / 2, GROWTH * pose[3]])
     for _ in range(rounds):
         for axis in range(4):
             for sign in (-1.0, 1.0):
@@ -211,21 +211,21 @@ def _search(
     for i in range(len(views)):
         edges, angles, scale = points[views[i]], normals[views[i]], poses[i, 3]
         few, directions = edges[:FEW], angles[:FEW]
-        u, v, turn, most = poses[i, 0], poses[i, 1], poses[i, 2], -1e9
-        at_u, at_v, at_turn = u, v, turn
+        u, v, roll, most = poses[i, 0], poses[i, 1], poses[i, 2], -1e9
+        at_u, at_v, at_roll = u, v, roll
         for k in range(-1, 2):
             for across in range(-2, 3):
                 for down in range(-2, 3):
-                    x, y, angle = u + across * reach / 2, v + down * reach / 2, turn + k * TURN
+                    x, y, angle = u + across * reach / 2, v + down * reach / 2, roll + k * ROLL_STEP
                     value = _response(maps, few, directions, x, y, angle, scale)
                     if value > most:
-                        most, at_u, at_v, at_turn = value, x, y, angle
-        poses[i, 0], poses[i, 1], poses[i, 2] = at_u, at_v, at_turn
+                        most, at_u, at_v, at_roll = value, x, y, angle
+        poses[i, 0], poses[i, 1], poses[i, 2] = at_u, at_v, at_roll
         best[i] = _climb(maps, edges, angles, poses[i], reach / 4, 3)
 
 
 @compiled(fastmath=True)
-def _turn(
+def _improve_views(
     maps: Array,
     points: Array,
     normals: Array,
@@ -251,7 +251,7 @@ def _turn(
     for i in range(len(views)):
         best[:] = poses[i]
         most = _climb(maps, points[views[i]], normals[views[i]], best, REACH_PX, 2)
-        for _ in range(MAX_TURNS):
+        for _ in range(MAX_CHANGES):
             view, chosen = views[i], views[i]
             poses[i] = best
             for k in range(neighbours.shape[1]):
@@ -296,8 +296,8 @@ def _describe(
     bins, height, width = maps.shape
     mean, colours = np.zeros(3), np.zeros((inner.shape[1], 3))
     for i in range(len(views)):
-        view, u, v, turn, scale = views[i], poses[i, 0], poses[i, 1], poses[i, 2], poses[i, 3]
-        c, s = scale * math.cos(turn), scale * math.sin(turn)
+        view, u, v, roll, scale = views[i], poses[i, 0], poses[i, 1], poses[i, 2], poses[i, 3]
+        c, s = scale * math.cos(roll), scale * math.sin(roll)
         count, texture = 0, 0.0
         mean[:] = 0.0
         for p in range(inner.shape[1]):
@@ -327,7 +327,7 @@ def _describe(
             y = v + s * points[view, p, 0] + c * points[view, p, 1]
             if not (0 <= x < width and 0 <= y < height):
                 continue
-            angle = normals[view, p] + turn
+            angle = normals[view, p] + roll
             b = int(angle * bins / math.pi + 8 * bins + 0.5) % bins
             supported += maps[b, int(y), int(x)] > SUPPORT
             shown += 1

@@ -38,7 +38,7 @@ Loudest = Callable[[Iterable[Picture], CameraMatrix], list[float]]
 """Function that returns the largest log odds of the verified poses on each picture."""
 
 
-def silent_level(
+def background_log_odds(
     part: Part, distances: tuple[float, float], tilt: float, loudest: Loudest
 ) -> float:
     """Return the log odds that verified poses on pictures without the part rarely exceed.

@@ -67,8 +67,8 @@ def view_rotations(
     """
     number = np.arange(NUM_VIEWS) + 0.5
     z = 1 - 2 * number / NUM_VIEWS
-    radius, turn = np.sqrt(1 - z * z), number * math.pi * (3 - math.sqrt(5))
-    directions = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), z])
+    radius, angle = np.sqrt(1 - z * z), number * math.pi * (3 - math.sqrt(5))
+    directions = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
     lowest = math.cos(math.radians(tilt_deg))
     directions = directions[z >= min(lowest, float(z.max())) - 1e-9]
     if group is not None:

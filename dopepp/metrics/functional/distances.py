@@ -228,9 +228,9 @@ def mahalanobis(
         return errors
     R_est, t_est, R_gt, t_gt, covariance = (tensor[valid] for tensor in inputs)
     for rotation, shift in zip(*_check_symmetries(symmetries, t_est), strict=True):
-        turns = Rotation.from_matrix((R_gt @ rotation @ R_est.mT).cpu().numpy()).as_rotvec()
+        rotations = Rotation.from_matrix((R_gt @ rotation @ R_est.mT).cpu().numpy()).as_rotvec()
         shifts = t_gt + R_gt @ shift - t_est
-        step = torch.cat([torch.from_numpy(turns).to(shifts), shifts], dim=1)
+        step = torch.cat([torch.from_numpy(rotations).to(shifts), shifts], dim=1)
         solved, _ = torch.linalg.solve_ex(covariance, step)
         squared = (step * solved).sum(dim=1)
         distances = torch.where(squared >= 0, squared.sqrt(), torch.inf)

@@ -101,7 +101,7 @@ def _squared(point: Array, R: Array, target: Array) -> float:
 
 
 @compiled(inline="always")
-def _to_box(box: Array, x: float, y: float, z: float) -> float:
+def _squared_box_distance(box: Array, x: float, y: float, z: float) -> float:
     """Return the squared distance to a box (smallest x, y, z, largest x, y, z); 0 inside."""
     dx = max(box[0] - x, x - box[3], 0.0)
     dy = max(box[1] - y, y - box[4], 0.0)
@@ -125,7 +125,7 @@ def _mean_distance(
 
     Args:
         points: Object points in the tree's order.
-        boxes: Box of every node (:func:`_to_box`).
+        boxes: Box of every node (:func:`_squared_box_distance`).
         firsts: Index of the first point of every leaf, then the number of points.
         R: Matrix of the estimated pose.
         targets: True points.
@@ -146,8 +146,8 @@ def _mean_distance(
             node = nodes[count]
             while 0 <= node < num_inner:
                 near, far = 2 * node + 1, 2 * node + 2
-                low = bound * _to_box(boxes[near], x, y, z)
-                high = bound * _to_box(boxes[far], x, y, z)
+                low = bound * _squared_box_distance(boxes[near], x, y, z)
+                high = bound * _squared_box_distance(boxes[far], x, y, z)
                 if high < low:
                     near, far, low, high = far, near, high, low
                 if high < best:
@@ -188,12 +188,12 @@ def least_farthest(
             it is the identity.
     """
     ordered = _probes_first(points.detach().cpu().numpy())
-    B, b, A, a, turns, shifts = (
+    B, b, A, a, rotations, shifts = (
         tensor.detach().cpu().contiguous().numpy() for tensor in (*estimated, *true, *symmetries)
     )
     errors = np.empty(len(a))
     num_probes = min(_NUM_PROBES, len(ordered))
-    _search(B, b, A, a, ordered, turns, shifts, num_probes, perspective, errors)
+    _search(B, b, A, a, ordered, rotations, shifts, num_probes, perspective, errors)
     return torch.from_numpy(errors).to(points.device)
 
 
@@ -249,7 +249,7 @@ def _search(
     A: Array,
     a: Array,
     points: Array,
-    turns: Array,
+    rotations: Array,
     shifts: Array,
     num_probes: int,
     perspective: bool,
@@ -263,27 +263,27 @@ def _search(
         A: Matrix of each true pose.
         a: Offset of each true pose.
         points: Points of the object, the probes first.
-        turns: Rotation of each symmetry.
+        rotations: Rotation of each symmetry.
         shifts: Translation of each symmetry.
         num_probes: Number of points that give a lower bound quickly.
         perspective: Whether points are divided by their depth.
         errors: Filled with the error of each pose; infinite for a point behind the camera.
     """
     targets = np.empty((len(points), 3))
-    P, p = np.empty((len(turns), 3, 3)), np.empty((len(turns), 3))
-    floors = np.empty(len(turns))
+    P, p = np.empty((len(rotations), 3, 3)), np.empty((len(rotations), 3))
+    floors = np.empty(len(rotations))
     for n in range(len(errors)):
         errors[n] = np.inf
         if not _set_targets(B[n], b[n], points, perspective, targets):
             continue
         _transform(shifts, A[n], a[n], p)
-        for s in range(len(turns)):
+        for s in range(len(rotations)):
             for r in range(3):
                 for c in range(3):
                     P[s, r, c] = (
-                        A[n, r, 0] * turns[s, 0, c]
-                        + A[n, r, 1] * turns[s, 1, c]
-                        + A[n, r, 2] * turns[s, 2, c]
+                        A[n, r, 0] * rotations[s, 0, c]
+                        + A[n, r, 1] * rotations[s, 1, c]
+                        + A[n, r, 2] * rotations[s, 2, c]
                     )
             floors[s] = 0.0
             for j in range(num_probes):

@@ -157,9 +157,9 @@ def _longest_of_directions(points: Points) -> Iterator[tuple[float, int]]:
 def half_sphere(num_directions: int) -> Float[np.ndarray, "directions 3"]:
     """Return unit vectors spread evenly over half a sphere, on a golden-angle spiral."""
     number = np.arange(num_directions) + 0.5
-    z, turn = number / num_directions, np.pi * (3 - np.sqrt(5)) * number
+    z, angle = number / num_directions, np.pi * (3 - np.sqrt(5)) * number
     ring = np.sqrt(1 - z * z)
-    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+    return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
 
 
 def hash_triangles(vertices: Vertices, faces: Faces) -> str:

@@ -97,8 +97,8 @@ def _surviving(corners: Faces) -> Int[np.ndarray, " kept"]:
     candidates = np.flatnonzero((a != b) & (b != c) & (c != a))
     a, b, c = corners[candidates].T
     # Each triangle starts at its lowest corner, so that equal triangles compare equal.
-    turn = np.where((b < a) & (b < c), 1, np.where((c < a) & (c < b), 2, 0))[:, None]
-    ordered = np.take_along_axis(corners[candidates], (turn + np.arange(3)) % 3, axis=1)
+    shift = np.where((b < a) & (b < c), 1, np.where((c < a) & (c < b), 2, 0))[:, None]
+    ordered = np.take_along_axis(corners[candidates], (shift + np.arange(3)) % 3, axis=1)
     order = np.lexsort(ordered.T)
     new = np.ones(len(order), bool)
     new[1:] = (np.diff(ordered[order], axis=0) != 0).any(axis=1)

@@ -188,12 +188,12 @@ def _checked(path: Path, raw: RawMesh) -> Mesh:
     if not topology.is_closed:
         message = "%s is not watertight: %d open edges, %d edges of more than two triangles"
         logger.info(message, path, topology.num_open, topology.num_crowded)
-    turned = opposed_faces(vertices, faces, topology)
-    if turned.any():
-        logger.info("%s: flipped %d triangles that faced the wrong way", path, turned.sum())
+    inverted = misoriented_faces(vertices, faces, topology)
+    if inverted.any():
+        logger.info("%s: flipped %d triangles that faced the wrong way", path, inverted.sum())
     return Mesh(
         vertices=vertices,
-        faces=turn_over(faces, turned).astype(np.int32),
+        faces=flip_faces(faces, inverted).astype(np.int32),
         uv=None if uv is None else np.asarray(uv, np.float64)[used],
         texture=texture,
         colours=None if raw.colours is None else raw.colours[used],
@@ -249,7 +249,7 @@ def find_topology(vertices: Vertices, faces: Faces) -> Topology:
     )
 
 
-def opposed_faces(
+def misoriented_faces(
     vertices: Vertices, faces: Faces, topology: Topology
 ) -> Bool[np.ndarray, " faces"]:
     """Find the triangles to flip so that every connected surface faces the same way.
@@ -258,19 +258,19 @@ def opposed_faces(
     unchanged. A closed surface that faces inwards is flipped, and then every body that faces
     inwards, except cavities, which lie in the box of another body.
     """
-    turned = np.zeros(len(faces), bool)
+    inverted = np.zeros(len(faces), bool)
     if topology.opposed.any():
-        turned = _minority(face_areas(vertices, faces), topology)
+        inverted = _minority(face_areas(vertices, faces), topology)
     if topology.is_closed:
-        if _signed_volumes(vertices, turn_over(faces, turned)).sum() < 0:
-            turned = ~turned
-        turned ^= _inverted_bodies(vertices, turn_over(faces, turned), topology)
-    return turned
+        if _signed_volumes(vertices, flip_faces(faces, inverted)).sum() < 0:
+            inverted = ~inverted
+        inverted ^= _inverted_bodies(vertices, flip_faces(faces, inverted), topology)
+    return inverted
 
 
-def turn_over(faces: Faces, turned: Bool[np.ndarray, " faces"]) -> Faces:
+def flip_faces(faces: Faces, inverted: Bool[np.ndarray, " faces"]) -> Faces:
     """Flip the marked triangles."""
-    return np.where(turned[:, None], faces[:, ::-1], faces)
+    return np.where(inverted[:, None], faces[:, ::-1], faces)
 
 
 def _minority(areas: Float[np.ndarray, " faces"], topology: Topology) -> Bool[np.ndarray, " faces"]:

@@ -245,10 +245,10 @@ def board_pose(sighting: Sighting, camera: Camera) -> BoardPose:
     """
     points, pixels = sighting.points, sighting.pixels
     lens = (camera.K, camera.coefficients)
-    _, turns, shifts, _ = cv2.solvePnPGeneric(points, pixels, *lens, flags=cv2.SOLVEPNP_IPPE)
+    _, rotations, shifts, _ = cv2.solvePnPGeneric(points, pixels, *lens, flags=cv2.SOLVEPNP_IPPE)
     poses = [
-        cv2.solvePnPRefineLM(points, pixels, *lens, turn.copy(), shift.copy())
-        for turn, shift in zip(turns, shifts, strict=True)
+        cv2.solvePnPRefineLM(points, pixels, *lens, rotation.copy(), shift.copy())
+        for rotation, shift in zip(rotations, shifts, strict=True)
     ]
     projections = [cv2.projectPoints(points, *pose, *lens)[0][:, 0] for pose in poses]
     errors = [float(np.square(projection - pixels).sum()) for projection in projections]
@@ -257,8 +257,8 @@ def board_pose(sighting: Sighting, camera: Camera) -> BoardPose:
         fix = "delete this picture, or take it again with the board facing the camera"
         raise UserError(problem, "a board that faces the camera", fix)
     error = min(errors)
-    turn, shift = poses[errors.index(error)]
-    T = make_transform(cv2.Rodrigues(turn)[0], shift.ravel())
+    rotation, shift = poses[errors.index(error)]
+    T = make_transform(cv2.Rodrigues(rotation)[0], shift.ravel())
     noise = max(PIXEL_NOISE**2, error / max(1, 2 * len(points) - 6))
     jacobian = _pose_jacobian(points, T, camera)
     covariance = np.linalg.inv(jacobian.T @ jacobian) * noise
@@ -275,9 +275,9 @@ def _pose_jacobian(
         sides = []
         for delta in (-step, step):
             moved = displaced(T[None], delta[None])[0]
-            turn = cv2.Rodrigues(moved[:3, :3])[0]
+            rotation = cv2.Rodrigues(moved[:3, :3])[0]
             lens = (camera.K, camera.coefficients)
-            sides.append(cv2.projectPoints(points, turn, moved[:3, 3], *lens)[0])
+            sides.append(cv2.projectPoints(points, rotation, moved[:3, 3], *lens)[0])
         columns.append((sides[1] - sides[0]).ravel() / (2 * step.max()))
     return np.stack(columns, axis=1)
 

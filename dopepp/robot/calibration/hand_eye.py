@@ -58,7 +58,7 @@ class HandEye:
     T_other_board: Transform  # T_base_board, or T_flange_board
     # Covariance of the camera's rotation about its origin (radians) and shift (metres)
     covariance: Float[np.ndarray, "6 6"]
-    turns: Float[np.ndarray, "poses"]  # rotation error of every pose, radians
+    rotation_errors: Float[np.ndarray, "poses"]  # rotation error of every pose, radians
     shifts: Float[np.ndarray, "poses"]  # translation error, metres
     inliers: Bool[np.ndarray, "poses"]  # poses that were not rejected
     robot_noise: tuple[float, float]  # estimated error of the robot, radians and metres
@@ -105,9 +105,9 @@ def calibrate_hand_eye(
         if inliers.sum() < MIN_POSES:
             inliers = distances <= np.sort(distances)[MIN_POSES - 1]
     residuals = _residuals(M, B, X, Y)
-    turns, shifts = (np.linalg.norm(residuals[:, k : k + 3], axis=1) for k in (0, 3))
+    rotation_errors, shifts = (np.linalg.norm(residuals[:, k : k + 3], axis=1) for k in (0, 3))
     noise = (float(robot[0]), float(robot[1]))
-    return HandEye(mount, X, Y, covariance, turns, shifts, inliers, noise)
+    return HandEye(mount, X, Y, covariance, rotation_errors, shifts, inliers, noise)
 
 
 def equations(
@@ -200,8 +200,8 @@ def _residuals(M: Transforms, B: Transforms, X: Transform, Y: Transform) -> Resi
         Y: Pose of the board.
     """
     expected = invert_transform(X) @ inverted(M) @ Y
-    turn = Rotation.from_matrix(B[:, :3, :3] @ expected[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
-    return np.concatenate([turn, B[:, :3, 3] - expected[:, :3, 3]], axis=1)
+    rotvec = Rotation.from_matrix(B[:, :3, :3] @ expected[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
+    return np.concatenate([rotvec, B[:, :3, 3] - expected[:, :3, 3]], axis=1)
 
 
 def _covariances(

@@ -182,14 +182,14 @@ def _solve(views: Sequence[Sighting], size: Size) -> _Solution:
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
     try:
-        error, K, lens, turns, _, deviations, _, errors = cv2.calibrateCameraExtended(
+        error, K, lens, rotations, _, deviations, _, errors = cv2.calibrateCameraExtended(
             points, pixels, size, None, None
         )
     except cv2.error as reason:
         problem = f"{len(views)} views of the board, which do not determine a camera ({reason.err})"
         allowed = "views tilted by 20 to 40° in several directions"
         raise UserError(problem, allowed, "take more pictures of the tilted board") from reason
-    normals = np.array([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
+    normals = np.array([cv2.Rodrigues(rotation)[0][:, 2] for rotation in rotations])
     tilt = float(np.linalg.norm(normals[:, :2].std(axis=0)))
     distortion, deviations = np.ravel(lens)[:5], np.ravel(deviations)[:4]
     return _Solution(float(error), np.asarray(K), distortion, deviations, np.ravel(errors), tilt)

@@ -29,8 +29,10 @@ from dopepp.robot.calibration.records import UNITS, PoseFormat, RobotPoses
 from dopepp.robot.calibration.tool import axis_name
 
 MIN_ROTATION: Final = np.radians(5.0)  # smallest valid rotation between the two farthest poses
-TURN: Final = np.radians(1.5)  # largest median rotation error under the correct convention
-SHIFT: Final = 0.01  # largest median translation error under the correct convention, metres
+MAX_ROTATION_ERROR: Final = np.radians(1.5)
+"""Largest median rotation error over pairs under the correct convention."""
+MAX_SHIFT_ERROR: Final = 0.01
+"""Largest median translation error over pairs under the correct convention, metres."""
 MOUNTS: Final[tuple[Mount, Mount]] = ("hand", "bench")
 SCALE: Final = 1.03  # largest negligible factor between robot's and camera's lengths
 MIN_POSES: Final = 8
@@ -39,7 +41,7 @@ MIN_DIVERSITY: Final = np.radians(15.0)
 """Smallest RMS rotation over pairs about the second most common axis."""
 
 MAX_ERROR: Final = 0.003  # largest standard deviation at the board's distance, metres
-MAX_TURN: Final = np.radians(0.5)
+MAX_ROTATION: Final = np.radians(0.5)  # largest standard deviation of the rotation
 MIN_USED: Final = 0.7  # share of poses that agree with each other
 
 
@@ -47,14 +49,14 @@ MIN_USED: Final = 0.7  # share of poses that agree with each other
 class Consistency:
     """Agreement between the motions of robot and board."""
 
-    turn: float  # median rotation error over pairs, radians
+    rotation: float  # median rotation error over pairs, radians
     shift: float  # median translation error, metres
     scale: float  # factor that corrects the robot's lengths
 
     @property
     def is_rigid(self) -> bool:
         """Whether a single mount explains all motions up to a common factor of the lengths."""
-        return self.turn < TURN and self.shift < SHIFT
+        return self.rotation < MAX_ROTATION_ERROR and self.shift < MAX_SHIFT_ERROR
 
     @property
     def is_right(self) -> bool:
@@ -80,7 +82,7 @@ def consistency(T_base_flange: Transforms, B: Transforms, mount: Mount) -> Consi
     for _ in range(5):
         weights = _robust_weights(np.linalg.norm(alpha - beta @ R.T, axis=1))
         R = nearest_rotation((weights[:, None] * alpha).T @ beta)
-    turn = float(np.median(np.linalg.norm(alpha - beta @ R.T, axis=1)))
+    rotation = float(np.median(np.linalg.norm(alpha - beta @ R.T, axis=1)))
     system = np.concatenate([P[:, :3, :3] - np.eye(3), P[:, :3, 3:]], axis=2)
     target = Q[:, :3, 3] @ R.T
     weights = np.ones(len(P))
@@ -90,7 +92,7 @@ def consistency(T_base_flange: Transforms, B: Transforms, mount: Mount) -> Consi
         solution = np.linalg.lstsq(weighted, (target * root).ravel(), rcond=None)[0]
         errors = np.linalg.norm(system @ solution - target, axis=1)
         weights = _robust_weights(errors)
-    return Consistency(turn, float(np.median(errors)), float(solution[3]))
+    return Consistency(rotation, float(np.median(errors)), float(solution[3]))
 
 
 def _robust_weights(errors: Float[np.ndarray, "pairs"]) -> Float[np.ndarray, "pairs"]:
@@ -148,8 +150,9 @@ def check_poses(
                 raise UserError(problem, "poses in the order of the pictures", fix)
     raise UserError(
         f"{poses.source}: rotations of robot and camera differ by "
-        f"{np.degrees(agreement.turn):.1f}° and {1000 * agreement.shift:.0f} mm (medians of pairs)",
-        f"at most {np.degrees(TURN):g}° and {1000 * SHIFT:g} mm",
+        f"{np.degrees(agreement.rotation):.1f}° and {1000 * agreement.shift:.0f} mm (medians over "
+        "pairs)",
+        f"at most {np.degrees(MAX_ROTATION_ERROR):g}° and {1000 * MAX_SHIFT_ERROR:g} mm",
         "record every pose with its picture, after the robot has come to rest, and record the "
         "pose of the flange, not of a tool",
     )
@@ -173,7 +176,7 @@ def _check_motion(T: Transforms, body: str, source: str) -> None:
         raise UserError(
             f"{source}: the {body} rotates by {np.degrees(largest):.1f}° over all {len(T)} poses",
             "rotations of at least 30° about different axes",
-            "turn the robot between pictures, and record each picture's pose",
+            "rotate the robot between pictures, and record each picture's pose",
         )
 
 
@@ -242,7 +245,7 @@ class CalibrationQuality:
     """Quality of a hand-eye calibration."""
 
     shift: float  # expected error of positions at the board's distance (1 σ), metres
-    turn: float  # expected error of the rotation (1 σ), radians
+    rotation: float  # expected error of the rotation (1 σ), radians
     leave_one_out: Float[np.ndarray, "poses"]  # change of the camera without each pose, metres
     diversity: Vector  # RMS rotation over pairs about the main axes, radians, descending
     weakest: Vector  # least certain direction of the camera's position, in the mount's frame
@@ -258,7 +261,7 @@ def assess(
     alpha = Rotation.from_matrix(pairs(M, B)[0][:, :3, :3]).as_rotvec()
     diversity = np.linalg.svd(alpha, compute_uv=False) / np.sqrt(len(alpha))
     distance = float(np.median([board.distance for board in boards]))
-    shift, turn = expected_error(calibration.covariance, distance)
+    shift, rotation = expected_error(calibration.covariance, distance)
     X, Y, used = calibration.T_mount_cam, calibration.T_other_board, calibration.inliers
     weakest = np.linalg.eigh(X[:3, :3] @ calibration.covariance[3:, 3:] @ X[:3, :3].T)[1][:, -1]
     mount = "flange" if calibration.mount == "hand" else "base"
@@ -274,8 +277,8 @@ def assess(
         f"the robot rotated about nearly parallel axes only: {next_pose}": (
             diversity[1] < MIN_DIVERSITY
         ),
-        f"expected error {1000 * shift:.1f} mm and {np.degrees(turn):.2f}° at the board's "
-        f"distance: {next_pose}": shift > MAX_ERROR or turn > MAX_TURN,
+        f"expected error {1000 * shift:.1f} mm and {np.degrees(rotation):.2f}° at the board's "
+        f"distance: {next_pose}": shift > MAX_ERROR or rotation > MAX_ROTATION,
     }
     changes = np.zeros(len(boards))
     indices = np.flatnonzero(used)
@@ -285,7 +288,7 @@ def assess(
         without, _, _ = refined(M[rest], B[rest], seen[rest], X, Y, noise)
         changes[index] = np.linalg.norm(without[:3, 3] - X[:3, 3])
     reasons = tuple(text for text, applies in findings.items() if applies)
-    return CalibrationQuality(shift, turn, changes, diversity, weakest, next_pose, reasons)
+    return CalibrationQuality(shift, rotation, changes, diversity, weakest, next_pose, reasons)
 
 
 def expected_error(covariance: Float[np.ndarray, "6 6"], distance: float) -> tuple[float, float]:

@@ -28,7 +28,7 @@ from dopepp.robot.calibration.board import (
     board_pose,
     displaced,
 )
-from dopepp.robot.calibration.lens import MIN_OUTLIER_PX, MAX_ERROR_PX, OUTLIER
+from dopepp.robot.calibration.lens import MAX_ERROR_PX, MIN_OUTLIER_PX, OUTLIER
 
 MIN_CAMERAS, MAX_CAMERAS = 2, 8
 MIN_SHARED: Final = 5  # moments at which a camera of a reliable rig sees the board with another
@@ -59,8 +59,8 @@ class Rig:
     def deviations(self) -> Float[np.ndarray, "cameras 2"]:
         """Standard deviations of each camera along and about an axis, metres and radians (RMS)."""
         variances = np.diagonal(self.covariances, axis1=1, axis2=2)
-        turns, shifts = variances[:, :3].mean(axis=1), variances[:, 3:].mean(axis=1)
-        return np.asarray(np.sqrt(np.stack([shifts, turns], axis=1)))
+        rotations, shifts = variances[:, :3].mean(axis=1), variances[:, 3:].mean(axis=1)
+        return np.asarray(np.sqrt(np.stack([shifts, rotations], axis=1)))
 
 
 def calibrate_rig(boards: Boards, cameras: Mapping[str, Camera]) -> Rig:

@@ -274,11 +274,11 @@ def sources_table(records: Sequence[Record]) -> list[str]:
     for name, rows in by_source(records).items():
         total = count_records(rows)
         errors = np.array([(row.error_mm, row.error_deg) for row in rows if row.seen])
-        shift, turn = np.median(errors, axis=0) if len(errors) else (np.nan, np.nan)
+        shift, rotation = np.median(errors, axis=0) if len(errors) else (np.nan, np.nan)
         failures = [str(sum(row.failure == failure for row in rows)) for failure in FAILURES]
         lines.append(
             f"| {name} | {total.trials} | {total.rate(total.recognised)} "
-            f"| {total.rate(total.caught)} | {shift:.2f} mm, {turn:.2f}° "
+            f"| {total.rate(total.caught)} | {shift:.2f} mm, {rotation:.2f}° "
             f"| {' | '.join(failures)} |"
         )
     return lines

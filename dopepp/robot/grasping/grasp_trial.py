@@ -125,7 +125,7 @@ class Record:
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class SceneObservation:
     """Result of the controller's observation of a scene."""
 
     poses: list[Transform]  # T_base_obj of the parts, the highest first
@@ -247,23 +247,23 @@ class Trials:
 
     def attempt(self, scene: TrialScene, source: PoseSource) -> Attempt:
         """Grasp a part of a scene by the poses of a source."""
-        look = self._look(scene, source)
-        if not look.poses:
-            return Attempt(self._record(scene, source, look, None, None))
+        observation = self._observe(scene, source)
+        if not observation.poses:
+            return Attempt(self._record(scene, source, observation, None, None))
         bench, hull = scene.calibrated.knowledge.T_base_bench, self.layout.body.hull
-        flat = [laid_flat(pose, hull, bench) for pose in look.poses][:MAX_OBSTACLES]
-        planner, estimate, outcome = self._planner(scene), look.poses[0], None
+        flat = [laid_flat(pose, hull, bench) for pose in observation.poses][:MAX_OBSTACLES]
+        planner, estimate, outcome = self._planner(scene), observation.poses[0], None
         for number, target in enumerate(flat):
             others = [*flat[:number], *flat[number + 1 :]]
-            plan = planner.plan([target, *others], self.grasps, look.joints)
+            plan = planner.plan([target, *others], self.grasps, observation.joints)
             if plan is not None:
-                estimate, state = look.poses[number], copy(scene.start)
+                estimate, state = observation.poses[number], copy(scene.start)
                 execution = Execution(scene.cell, state, self.gripper, scene.robot.zero)
-                if look.second_view:
-                    execution.move(np.stack([scene.joints, look.joints]))
+                if observation.second_view:
+                    execution.move(np.stack([scene.joints, observation.joints]))
                 outcome = execution.run(plan)
                 break
-        record = self._record(scene, source, look, estimate, outcome)
+        record = self._record(scene, source, observation, estimate, outcome)
         return Attempt(record, outcome or Outcome(), estimate)
 
     def _viewpoints(self, scene: TrialScene) -> ViewpointPlanner:
@@ -276,20 +276,20 @@ class Trials:
         count = 1 if self.task.layout == "single" else MAX_OBSTACLES
         return Planner(self.arm, self.gripper, self._parts_cell(count), scene.calibrated.knowledge)
 
-    def _look(self, scene: TrialScene, source: PoseSource) -> Look:
+    def _observe(self, scene: TrialScene, source: PoseSource) -> SceneObservation:
         """Return the poses of parts for the controller, from one picture or two."""
         rng = np.random.default_rng([self.task.seed, scene.number, 2])
         if source.kind == "random":
-            return Look([self.layout.draw_pose(rng)], scene.joints)
+            return SceneObservation([self.layout.draw_pose(rng)], scene.joints)
         if source.kind == "exact":
             poses = [_perturbed(pose, source.error, rng) for pose in scene.targets]
-            return Look(poses, scene.joints)
+            return SceneObservation(poses, scene.joints)
         estimator = self.templates if source.kind == "templates" else self.estimator
         lens, T_base_cam = scene.calibrated.camera, self._camera_pose(scene, source, scene.joints)
         if self.task.views == 1:
             detections = estimator.predict(scene.picture, lens.K, lens.coefficients)
             poses = [T_base_cam @ item.T_cam_obj for item in self._likely(detections)]
-            return Look(sorted(poses, key=_height, reverse=True), scene.joints)
+            return SceneObservation(sorted(poses, key=_height, reverse=True), scene.joints)
         result = estimator.predict_views([scene.picture], [lens], [T_base_cam])
         likely = self._likely(result.detections) or self._likely(result.weaker)[:1]
         likely.sort(key=lambda part: _height(part.T_world_obj), reverse=True)
@@ -303,7 +303,7 @@ class Trials:
             cameras = [T_base_cam, self._camera_pose(scene, source, joints)]
             result = estimator.predict_views([scene.picture, picture], [lens] * 2, cameras)
         poses = [part.T_world_obj for part in self._likely(result.detections)]
-        return Look(sorted(poses, key=_height, reverse=True), joints, reason)
+        return SceneObservation(sorted(poses, key=_height, reverse=True), joints, reason)
 
     def _likely(self, detections: Sequence[AnyDetection]) -> list[AnyDetection]:
         """Return the detections of the part with at least half the best score."""
@@ -324,13 +324,13 @@ class Trials:
         self,
         scene: TrialScene,
         source: PoseSource,
-        look: Look,
+        observation: SceneObservation,
         estimate: Transform | None,
         outcome: Outcome | None,
     ) -> Record:
         """Return the result of a trial."""
         robot = scene.calibrated
-        ends = (robot.hand_eye_mm, robot.hand_eye_deg, look.second_view)
+        ends = (robot.hand_eye_mm, robot.hand_eye_deg, observation.second_view)
         trial = (scene.number, source.name, source.error[0])
         if estimate is None:
             nan = float("nan")
@@ -338,7 +338,7 @@ class Trials:
         adds = [self._add(estimate, target) for target in scene.targets]
         add, target = min(adds), scene.targets[int(np.argmin(adds))]
         shift = float(np.linalg.norm(estimate[:3, 3] - target[:3, 3]))
-        turn = float(np.degrees(rotation_angle(estimate[:3, :3].T @ target[:3, :3])))
+        angle = float(np.degrees(rotation_angle(estimate[:3, :3].T @ target[:3, :3])))
         is_recognised = bool(add < RECOGNISED * self.part.diameter)
         parts = [index for index, item in enumerate(scene.placed) if item.body.part]
         is_caught = outcome is not None and outcome.held in parts
@@ -350,7 +350,7 @@ class Trials:
             failure = "no plan"
         else:
             failure = "collided" if outcome.collided else "slipped"
-        pose = (1000 * add, 1000 * shift, turn)
+        pose = (1000 * add, 1000 * shift, angle)
         return Record(*trial, True, is_recognised, *pose, is_caught, failure, *ends)
 
     def _add(self, estimate: Transform, target: Transform) -> float:
@@ -387,5 +387,5 @@ def _height(T_base_obj: Transform) -> float:
 def _perturbed(pose: Transform, error: tuple[float, float], rng: Generator) -> Transform:
     """Return a pose with an error in millimetres and degrees."""
     direction, axis = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
-    turn = Rotation.from_rotvec(np.radians(error[1]) * axis).as_matrix()
-    return make_transform(turn @ pose[:3, :3], pose[:3, 3] + 0.001 * error[0] * direction)
+    R = Rotation.from_rotvec(np.radians(error[1]) * axis).as_matrix()
+    return make_transform(R @ pose[:3, :3], pose[:3, 3] + 0.001 * error[0] * direction)

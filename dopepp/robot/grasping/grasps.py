@@ -92,9 +92,9 @@ class Grasp:
         """Distance between the approaching fingers, metres."""
         return min(self.width + 2 * CLEARANCE, WIDEST)
 
-    def T_obj_tool(self, turned: bool) -> Transform:  # noqa: N802
-        """Return the tool's pose with x = closing, z = approach; ``turned`` by 180° about z."""
-        x, z = -self.closing if turned else self.closing, self.approach
+    def T_obj_tool(self, flipped: bool) -> Transform:  # noqa: N802
+        """Return the tool's pose with x = closing, z = approach; ``flipped`` by 180° about z."""
+        x, z = -self.closing if flipped else self.closing, self.approach
         return make_transform(np.stack([x, np.cross(z, x), z], axis=1), self.point)
 
 
@@ -266,9 +266,9 @@ def _hits(
     with np.errstate(divide="ignore", invalid="ignore"):
         offset = origin - a
         u = np.einsum("ij,ij->i", offset, across) / scale
-        turned = np.cross(offset, side)
-        v = turned @ direction / scale
-        depth = np.einsum("ij,ij->i", other, turned) / scale
+        flipped = np.cross(offset, side)
+        v = flipped @ direction / scale
+        depth = np.einsum("ij,ij->i", other, flipped) / scale
     is_hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (depth > 1e-5)
     return np.asarray(depth[is_hit])
 
@@ -292,7 +292,7 @@ def _score(
 ) -> float:
     """Return the score of a grasp while ``up`` points upwards; 0 for an impossible grasp."""
     points, normals, area = surface
-    T = grasp.T_obj_tool(turned=False)
+    T = grasp.T_obj_tool(flipped=False)
     half = grasp.width / 2
     # As in the planner, the pads' ends go beyond the point as far as the bench allows.
     spread = abs(float(T[:3, 0] @ up)) * (half + 2 * PAD_HALF[0])

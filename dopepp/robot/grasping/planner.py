@@ -80,8 +80,8 @@ class Arm:
         """Return whether the current joints reach a pose within the tolerances."""
         current = self._cell.flange_pose(self._configuration.data)
         shift = np.linalg.norm(current[:3, 3] - T_base_flange[:3, 3])
-        turn = rotation_angle(current[:3, :3].T @ T_base_flange[:3, :3])
-        return bool(shift < POSITION_TOLERANCE and turn < ANGLE_TOLERANCE)
+        angle = rotation_angle(current[:3, :3].T @ T_base_flange[:3, :3])
+        return bool(shift < POSITION_TOLERANCE and angle < ANGLE_TOLERANCE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +131,7 @@ def measure_gripper() -> Gripper:
 
 
 @dataclass(frozen=True, eq=False)
-class Knowledge:
+class ControllerParameters:
     """Calibrated parameters of the controller."""
 
     T_flange_cam: Transform
@@ -166,10 +166,10 @@ def laid_flat(T_base_obj: Transform, hull: Hull, T_base_bench: Transform) -> Tra
     down = normals[int(np.argmin(normals @ up))]
     axis, cosine = np.cross(down, -up), float(-down @ up)
     sine = float(np.linalg.norm(axis))
-    turn = rotation_vector_to_matrix(axis * (np.arctan2(sine, cosine) / sine if sine else 0.0))
+    R = rotation_vector_to_matrix(axis * (np.arctan2(sine, cosine) / sine if sine else 0.0))
     centre = transform(T_base_obj, hull.centre)
-    position = centre + turn @ (T_base_obj[:3, 3] - centre)
-    flat = make_transform(turn @ T_base_obj[:3, :3], position)
+    position = centre + R @ (T_base_obj[:3, 3] - centre)
+    flat = make_transform(R @ T_base_obj[:3, :3], position)
     lowest = float(((transform(flat, hull.vertices) - T_base_bench[:3, 3]) @ up).min())
     if abs(lowest) > LOW:
         return T_base_obj
@@ -187,7 +187,9 @@ class Planner:
         knowledge: Calibrated parameters.
     """
 
-    def __init__(self, arm: Arm, gripper: Gripper, cell: Cell, knowledge: Knowledge) -> None:
+    def __init__(
+        self, arm: Arm, gripper: Gripper, cell: Cell, knowledge: ControllerParameters
+    ) -> None:
         self._arm, self._gripper, self._cell, self._knowledge = arm, gripper, cell, knowledge
         self._state = cell.data()
         model = cell.model
@@ -231,8 +233,8 @@ class Planner:
         half_width, half_pad = grasp.width / 2 + 2 * PAD_HALF[0], PAD_HALF[1]
         signs = [[-1, -1, 0], [-1, 1, 0], [1, -1, 0], [1, 1, 0]]
         ends = np.array(signs) * [half_width, half_pad, 0.0]
-        for turned in (False, True):
-            T = T_base_obj @ grasp.T_obj_tool(turned)
+        for flipped in (False, True):
+            T = T_base_obj @ grasp.T_obj_tool(flipped)
             steep = -float(T[:3, 2] @ up)
             if steep < np.cos(STEEPEST):
                 continue

@@ -33,7 +33,7 @@ from dopepp.robot.calibration.hand_eye import calibrate_hand_eye
 from dopepp.robot.calibration.lens import calibrate_lens
 from dopepp.robot.calibration.tool import find_bench, find_tip
 from dopepp.robot.grasping.cell import JOINTS, TRAY
-from dopepp.robot.grasping.planner import Arm, Joints, Knowledge
+from dopepp.robot.grasping.planner import Arm, ControllerParameters, Joints
 
 SIZE: Final[Size] = (640, 480)  # (width, height) of the camera's pictures, pixels
 FOCAL: Final = SIZE[0] / 2 / np.tan(np.radians(30.0))  # 60° across, as in the networks' training
@@ -65,7 +65,7 @@ class TrueRobot:
 class CalibratedRobot:
     """Results of a robot's calibrations, and their errors."""
 
-    knowledge: Knowledge
+    knowledge: ControllerParameters
     camera: Camera
     hand_eye_mm: float  # error of the camera's pose at the distance of the parts, millimetres
     hand_eye_deg: float  # rotation error of the hand-eye calibration, degrees
@@ -73,8 +73,8 @@ class CalibratedRobot:
 
 def draw_robot(rng: Generator, tip: Vector) -> TrueRobot:
     """Draw a robot's errors; ``tip`` is as in :class:`TrueRobot`."""
-    turn, shift = (rng.normal(0, spread, 3) for spread in BRACKET)
-    error = make_transform(Rotation.from_rotvec(turn).as_matrix(), shift)
+    angle, shift = (rng.normal(0, spread, 3) for spread in BRACKET)
+    error = make_transform(Rotation.from_rotvec(angle).as_matrix(), shift)
     return TrueRobot(rng.normal(0, ZERO, JOINTS), MOUNT @ error, tip)
 
 
@@ -85,9 +85,9 @@ def calibrate(robot: TrueRobot, arm: Arm, rng: Generator, distance: float) -> Ca
     camera, T_flange_cam = _calibrate_camera(robot, arm, rng)
     ahead = np.array([[0.0, 0.0, distance]])
     shift = transform(T_flange_cam, ahead) - transform(robot.T_flange_cam, ahead)
-    turn = rotation_angle(T_flange_cam[:3, :3].T @ robot.T_flange_cam[:3, :3])
-    errors = (1000 * float(np.linalg.norm(shift)), float(np.degrees(turn)))
-    return CalibratedRobot(Knowledge(T_flange_cam, tip, bench), camera, *errors)
+    angle = rotation_angle(T_flange_cam[:3, :3].T @ robot.T_flange_cam[:3, :3])
+    errors = (1000 * float(np.linalg.norm(shift)), float(np.degrees(angle)))
+    return CalibratedRobot(ControllerParameters(T_flange_cam, tip, bench), camera, *errors)
 
 
 FlangePair = tuple[Transform, Transform]
@@ -113,9 +113,9 @@ def _pivot_poses(robot: TrueRobot, arm: Arm, rng: Generator) -> Float[np.ndarray
     """Return the controller's flange poses while the tip touches a point above the tray."""
 
     def draw() -> FlangePair | None:
-        turn = Rotation.from_rotvec([*rng.uniform(-0.5, 0.5, 2), rng.uniform(-1, 1)]).as_matrix()
+        angle = Rotation.from_rotvec([*rng.uniform(-0.5, 0.5, 2), rng.uniform(-1, 1)]).as_matrix()
         touched = TRAY + np.array([0.0, 0.0, 0.05]) + rng.normal(0, TOUCH, 3)
-        return _move(robot, arm, make_transform(_DOWN @ turn, touched - _DOWN @ turn @ robot.tip))
+        return _move(robot, arm, make_transform(_DOWN @ angle, touched - _DOWN @ angle @ robot.tip))
 
     return np.stack([read for _, read in _draw_reachable(draw, TOUCHES)])
 
@@ -168,6 +168,6 @@ def looking_at(
         tilt: Rotation about the camera's x and y axes from straight down, radians.
         roll: Rotation about the camera's optical axis, radians.
     """
-    turn = Rotation.from_rotvec([*tilt, 0.0]) * Rotation.from_rotvec([0.0, 0.0, roll])
-    rotation = _DOWN @ turn.as_matrix()
+    angle = Rotation.from_rotvec([*tilt, 0.0]) * Rotation.from_rotvec([0.0, 0.0, roll])
+    rotation = _DOWN @ angle.as_matrix()
     return make_transform(rotation, point - distance * rotation[:, 2])

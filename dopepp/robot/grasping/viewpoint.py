@@ -20,7 +20,7 @@ from dopepp.inference.refinement.outline import OutlineMesh
 from dopepp.inference.several_views.next_view import next_best_view
 from dopepp.inference.several_views.views_result import WorldDetection
 from dopepp.robot.grasping.cell import TRAY
-from dopepp.robot.grasping.planner import Arm, Joints, Knowledge, Planner
+from dopepp.robot.grasping.planner import Arm, ControllerParameters, Joints, Planner
 from dopepp.robot.grasping.rehearsal import SIZE, looking_at
 
 TILTS: Final = np.radians([15.0, 25.0, 35.0])  # of the camera from straight down, radians
@@ -44,7 +44,9 @@ class ViewpointPlanner:
         camera: Calibrated camera.
     """
 
-    def __init__(self, arm: Arm, planner: Planner, knowledge: Knowledge, camera: Camera) -> None:
+    def __init__(
+        self, arm: Arm, planner: Planner, knowledge: ControllerParameters, camera: Camera
+    ) -> None:
         self._arm, self._planner, self._knowledge, self._camera = arm, planner, knowledge, camera
 
     def choose(
@@ -83,8 +85,8 @@ class ViewpointPlanner:
         if not reached:
             return None
         cosine = float(T_base_cam[:3, 2] @ cameras[number][:3, 2])
-        turn = np.degrees(np.arccos(min(1.0, cosine)))
-        reason = f"{turn:.0f}° beside the first, {reason}; best of {len(reached)} in reach"
+        angle = np.degrees(np.arccos(min(1.0, cosine)))
+        reason = f"{angle:.0f}° beside the first, {reason}; best of {len(reached)} in reach"
         return Viewpoint(reached[number], reason)
 
     def _camera_pose(self, joints: Joints) -> Transform:

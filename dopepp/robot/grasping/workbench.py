@@ -103,8 +103,10 @@ class Layout:
         upright = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0]
         yaw, azimuth = rng.uniform(-self._yaw, self._yaw), rng.uniform(0, 2 * np.pi)
         tilt = np.radians(rng.uniform(0, tilt_deg)) * np.array([np.cos(azimuth), np.sin(azimuth)])
-        turn = Rotation.from_rotvec([*tilt, 0.0]) * Rotation.from_rotvec([0.0, 0.0, yaw]) * upright
-        rotation = turn.as_matrix()
+        orientation = (
+            Rotation.from_rotvec([*tilt, 0.0]) * Rotation.from_rotvec([0.0, 0.0, yaw]) * upright
+        )
+        rotation = orientation.as_matrix()
         lowest = float((self.body.hull.vertices @ rotation[2]).min())
         centre = rotation @ self.part.cuboid[-1]
         offset = np.array([*_draw_in_disc(rng, spread), height - lowest])

@@ -16,7 +16,7 @@ from dopepp.experiment.assembly.build_system import build_untrained, map_geometr
 from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.results.cost import (
     WARM_UP,
-    RehearsedEstimator,
+    SimulatedMapsEstimator,
     likely_maps,
     measure_cost,
     time_frames,
@@ -58,12 +58,12 @@ def test_an_impossible_job_leaves_nothing(composed, tmp_path):
     assert not any(tmp_path.iterdir())
 
 
-def estimator_of(config: RunConfig) -> tuple[RehearsedEstimator, MapGeometry, DescribedSource]:
+def estimator_of(config: RunConfig) -> tuple[SimulatedMapsEstimator, MapGeometry, DescribedSource]:
     parts = build_parts(config.data)
     network, description = build_untrained(config, parts)
     geometry = map_geometry(config.maps, network.stride)
     return (
-        RehearsedEstimator(network, description),
+        SimulatedMapsEstimator(network, description),
         geometry,
         held_out_source(config.data, parts, "test"),
     )

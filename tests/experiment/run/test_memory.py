@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from dopepp.data.sample import Instance, Sample
-from dopepp.experiment.run.tuning import Memory
+from dopepp.experiment.run.tuning import TuningCache
 from dopepp.geometry.camera import camera_matrix
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.checkpoint import Checkpoint
@@ -36,8 +36,8 @@ class Noise:
 
 def test_a_sources_items_are_made_once_as_far_as_memory_goes():
     source, other = Noise(), Noise()
-    memory = Memory(most_bytes=2 * 64 * 64 * 4)  # of two pictures with their masks
-    remembered, its = memory.of(source), memory.of(other)
+    cache = TuningCache(max_bytes=2 * 64 * 64 * 4)  # of two pictures with their masks
+    remembered, its = cache.of(source), cache.of(other)
     assert len(remembered) == 3
     for _ in range(2):
         for index in range(3):
@@ -57,11 +57,11 @@ def test_a_network_runs_once_on_a_picture(tiny_spec):
     estimator = PoseEstimator(network, checkpoint)
     passes: list[int] = []
     estimator.network.register_forward_hook(lambda *_: passes.append(1))
-    remembering = Memory().behind(estimator)
+    cached = TuningCache().with_cached_maps(estimator)
     first, second = (Noise().sample(index).image for index in range(2))
     for image in (first, second, first, first[::-1].copy(), second):
-        for left, same in zip(remembering.maps(image), estimator.maps(image), strict=True):
+        for left, same in zip(cached.maps(image), estimator.maps(image), strict=True):
             torch.testing.assert_close(left, same, rtol=0, atol=0)
     assert len(passes) == 5 + 3
-    remembering.recovery = None  # its own: the estimator's stays
+    cached.recovery = None  # its own: the estimator's stays
     assert estimator.recovery is not None

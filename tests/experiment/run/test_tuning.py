@@ -14,10 +14,10 @@ from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample
 from dopepp.experiment.config.run_config import FalsePositiveTarget
 from dopepp.experiment.run.tuning import (
+    MAX_LOST,
     MIN_REFINED,
     MIN_REFINED_FACTOR,
     MIN_REFINED_SCORE,
-    MAX_LOST,
     Scored,
     WrongFocalLengths,
     choose,

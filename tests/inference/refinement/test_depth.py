@@ -13,7 +13,7 @@ from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
 from dopepp.inference.refinement.depth import DepthEvidence
 from dopepp.inference.refinement.depth.terms import outline_terms, plane_terms
 from dopepp.inference.refinement.part_surface import (
-    lay_over,
+    overlay_surface,
     surface_points,
     view_around,
     visible,
@@ -164,7 +164,7 @@ def test_planes_pull_by_what_is_measured_on_the_part(box):
     holes[:220] = 0.0
     for measured in (depth, hidden, holes):
         view = view_around(measured, K, transform(off, surface.points))
-        overlay = lay_over(view, surface, visible(surface, off), off)
+        overlay = overlay_surface(view, surface, visible(surface, off), off)
         H, g = plane_terms(view, overlay, off[:3, 3], surface.spacing, 0.02)
         assert_allclose(H, H.T)
         step = np.linalg.solve(H + np.diag([1e-6] * 3 + [1e2] * 3), g)
@@ -227,7 +227,7 @@ def test_outline_pulls_a_shifted_part_back(box):
         off[0, 3] += shift
         points = transform(off, surface.points)
         view = view_around(depth, K, points)
-        overlay = lay_over(view, surface, visible(surface, off), off)
+        overlay = overlay_surface(view, surface, visible(surface, off), off)
         H, g = outline_terms(view, overlay, off[:3, 3], surface.spacing, 0.02)
         moved = np.linalg.solve(H[3:5, 3:5], g[3:5])
         assert -2 * shift - 0.002 <= moved[0] <= 0.002 - shift / 2

@@ -19,7 +19,7 @@ from dopepp.geometry.camera import (
     transform,
 )
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
-from dopepp.inference.refinement.joint_refinement import PosedPicture, ViewTerm, turned
+from dopepp.inference.refinement.joint_refinement import PosedPicture, ViewTerm, rotate_covariance
 from dopepp.inference.refinement.solver import Prior, descend
 
 K = camera_matrix(600.0, 600.0, 319.5, 239.5)
@@ -128,4 +128,4 @@ def test_a_covariance_returns_from_the_world():
     assert_allclose(
         np.linalg.inv(view.to_camera(true, in_world).information), covariance, atol=1e-15
     )
-    assert_allclose(in_world, turned(view.T_cam_world[:3, :3].T, covariance), atol=1e-18)
+    assert_allclose(in_world, rotate_covariance(view.T_cam_world[:3, :3].T, covariance), atol=1e-18)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from trimesh.exchange.stl import export_stl
 
 from dopepp.parts import read_mesh, servoholder
-from dopepp.parts.mesh.read import find_topology, opposed_faces, turn_over
+from dopepp.parts.mesh.read import find_topology, flip_faces, misoriented_faces
 
 
 def arrays(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
@@ -17,7 +17,7 @@ def arrays(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
 
 def repaired(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     topology = find_topology(vertices, faces)
-    return turn_over(faces, opposed_faces(vertices, faces, topology))
+    return flip_faces(faces, misoriented_faces(vertices, faces, topology))
 
 
 def cyclic(faces: np.ndarray) -> set[tuple[int, ...]]:
@@ -48,7 +48,7 @@ def test_any_closed_solid_ends_up_facing_outwards(seed, share, whole):
     rng = np.random.default_rng(seed)
     mesh = trimesh.creation.annulus(0.3, 1.0, 0.5, sections=16)
     vertices, faces = arrays(mesh)
-    turned = turn_over(faces, rng.random(len(faces)) < share)
+    turned = flip_faces(faces, rng.random(len(faces)) < share)
     result = repaired(vertices, turned if whole else turned[rng.permutation(len(faces))])
     assert cyclic(result) == cyclic(faces)
 
@@ -57,8 +57,8 @@ def test_an_open_surface_follows_its_majority():
     vertices, faces = arrays(trimesh.creation.icosphere(subdivisions=2))
     bowl = faces[vertices[faces].mean(axis=1)[:, 2] < 0.3]
     wrong = np.arange(len(bowl)) % 5 == 0
-    assert cyclic(repaired(vertices, turn_over(bowl, wrong))) == cyclic(bowl)
-    inwards = turn_over(bowl, ~wrong)  # nothing tells the inside of a bowl from its outside
+    assert cyclic(repaired(vertices, flip_faces(bowl, wrong))) == cyclic(bowl)
+    inwards = flip_faces(bowl, ~wrong)  # nothing tells the inside of a bowl from its outside
     assert cyclic(repaired(vertices, inwards)) == cyclic(bowl[:, ::-1])
 
 
@@ -68,7 +68,7 @@ def test_every_body_is_repaired_by_itself_and_a_cavity_stays():
     hollow = trimesh.util.concatenate([outer, inner])
     vertices, faces = arrays(hollow)
     np.testing.assert_array_equal(repaired(vertices, faces), faces)
-    mixed = turn_over(faces, np.arange(len(faces)) % 7 == 0)
+    mixed = flip_faces(faces, np.arange(len(faces)) % 7 == 0)
     assert cyclic(repaired(vertices, mixed)) == cyclic(faces)
 
 
@@ -77,7 +77,7 @@ def test_one_body_of_several_that_faces_inwards_is_turned():
     beside = trimesh.creation.box((0.5, 0.5, 0.5))
     beside.apply_translation((2, 0, 0))
     vertices, faces = arrays(trimesh.util.concatenate([ball, beside]))
-    wrong = turn_over(faces, np.arange(len(faces)) >= len(ball.faces))
+    wrong = flip_faces(faces, np.arange(len(faces)) >= len(ball.faces))
     assert cyclic(repaired(vertices, wrong)) == cyclic(faces)
     assert cyclic(repaired(vertices, faces)) == cyclic(faces)
 
@@ -105,7 +105,7 @@ def test_a_moebius_strip_is_left_alone():
 )
 def test_a_file_that_faces_the_wrong_way_is_repaired(tmp_path, share, message, caplog, volume):
     ball = trimesh.creation.icosphere(subdivisions=2, radius=20)
-    ball.faces = turn_over(ball.faces, np.random.default_rng(0).random(len(ball.faces)) < share)
+    ball.faces = flip_faces(ball.faces, np.random.default_rng(0).random(len(ball.faces)) < share)
     (tmp_path / "a.stl").write_bytes(export_stl(ball))
     with caplog.at_level(logging.INFO):
         loaded = read_mesh(tmp_path / "a.stl", "mm")

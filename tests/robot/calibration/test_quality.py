@@ -128,7 +128,7 @@ def test_poses_that_are_not_those_of_the_pictures_are_recognised(
 
 def test_poses_of_another_day_are_refused(cell, tmp_path):
     path = write(tmp_path / "poses.csv", cell(9).T_base_flange)
-    with pytest.raises(UserError, match="medians of pairs"):
+    with pytest.raises(UserError, match="medians over"):
         judge(cell(2), path, PoseFormat(), "hand")
 
 

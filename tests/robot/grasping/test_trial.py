@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from dopepp.geometry.camera import make_transform
 from dopepp.robot.grasping.cell import HOME, STEP, TRAY
 from dopepp.robot.grasping.execution import SPEED, Execution, _timed
-from dopepp.robot.grasping.grasp_trial import Look, PoseSource, Trials
+from dopepp.robot.grasping.grasp_trial import PoseSource, SceneObservation, Trials
 from dopepp.robot.grasping.grasps import Grasp
 from dopepp.robot.grasping.planner import laid_flat
 
@@ -33,7 +33,7 @@ def test_a_part_at_a_known_pose_is_caught(trials, scene):
 
 def test_a_part_that_is_elsewhere_is_not_caught(trials, scene, monkeypatch):
     aside = [one @ make_transform(np.eye(3), [0.0, 0.05, 0.0]) for one in scene.targets]
-    monkeypatch.setattr(trials, "_look", lambda *_: Look(aside, scene.joints))
+    monkeypatch.setattr(trials, "_observe", lambda *_: SceneObservation(aside, scene.joints))
     record = trials.attempt(scene, PoseSource("exact")).record
     assert not record.caught
     assert not record.recognised
@@ -41,7 +41,7 @@ def test_a_part_that_is_elsewhere_is_not_caught(trials, scene, monkeypatch):
 
 
 def test_nothing_seen_is_a_failure_of_its_own(trials, scene, monkeypatch):
-    monkeypatch.setattr(trials, "_look", lambda *_: Look([], scene.joints))
+    monkeypatch.setattr(trials, "_observe", lambda *_: SceneObservation([], scene.joints))
     record = trials.attempt(scene, PoseSource("exact")).record
     assert (record.seen, record.caught, record.failure) == (False, False, "not seen")
 

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from dopepp.data.formats import STAGING, bop, staged_items
 from dopepp.data.formats.bop import MM, BopPoses, Nodes, Record
 from dopepp.data.formats.bop.bop_models import INFO_FILE, info_path, modelled, parse_models, part_of
-from dopepp.data.formats.images import COLOUR_MODES, DEPTH_MODES, one_channel_of, picture_shape
+from dopepp.data.formats.images import COLOUR_MODES, DEPTH_MODES, decode_one_channel, picture_shape
 from dopepp.data.formats.invariants import Box, check_box, check_translation, plausible_camera
 from dopepp.data.formats.problems import CheckReport, Node, mapping
 from dopepp.drawing.pictures import Mask, Shape
@@ -127,7 +127,7 @@ class _SceneCheck:
         shape = picture_shape(Node(report, path), modes=COLOUR_MODES)
         if self._depths:
             path = self._depths.get(image, folder / "depth" / f"{image:06d}.png")
-            one_channel_of(Node(report, path), shape, modes=DEPTH_MODES)
+            decode_one_channel(Node(report, path), shape, modes=DEPTH_MODES)
         objects = truths.get(image, [])
         masks = {name: by_image.get(image, {}) for name, by_image in self._masks.items()}
         for by_number in masks.values() if self._has_truth else ():
@@ -142,7 +142,7 @@ class _SceneCheck:
             if not self._masks[name]:
                 return None
             path = masks[name].get(number, folder / name / f"{image:06d}_{number:06d}.png")
-            mask = one_channel_of(Node(report, path), shape)
+            mask = decode_one_channel(Node(report, path), shape)
             return None if mask is None else mask != 0
 
         objects_infos = infos.get(image, [None] * len(objects))

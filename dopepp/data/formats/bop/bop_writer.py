@@ -23,7 +23,7 @@ from PIL import Image
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.core.json import read_json
-from dopepp.data.formats import STAGING, by_line, finalizing, read_object, stage, staged_items
+from dopepp.data.formats import STAGING, encode_by_key, finalizing, read_object, stage, staged_items
 from dopepp.data.formats.bop import MAX_SCENE_BYTES, MM
 from dopepp.data.formats.bop.bop_models import INFO_FILE, MODEL_FOLDERS, model_numbers, write_models
 from dopepp.data.formats.images import depth_units, encode_png
@@ -119,7 +119,7 @@ class BopWriter(BopFolder):
                 # Sorted, so that the bytes do not depend on the order of writing.
                 merged = dict(sorted(merged.items(), key=lambda entry: int(entry[0])))
                 if items:
-                    write_whole(path, by_line(merged))
+                    write_whole(path, encode_by_key(merged))
             if items:
                 image, camera = next(iter(merged.items()))
                 self._write_camera(chunk, int(image), camera)

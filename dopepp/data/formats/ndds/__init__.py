@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from dopepp.data.formats.images import one_channel, read_map
+from dopepp.data.formats.images import check_one_channel, read_map
 from dopepp.data.formats.problems import STRICT, Node, Problems, mapping
 from dopepp.drawing.pictures import DepthMap, Shape, read_image
 from dopepp.geometry.camera import CameraMatrix, camera_matrix
@@ -280,7 +280,7 @@ def read_labels(annotation: Path, shape: Shape) -> NDArray[Any] | None:
     path = companion(annotation, ".seg.png")
     image = read_image(path) if path.is_file() else None
     is_map = image is not None and image.ndim == 2
-    return one_channel(Node(STRICT, path), image, shape) if is_map else None
+    return check_one_channel(Node(STRICT, path), image, shape) if is_map else None
 
 
 def label_values(

@@ -127,21 +127,21 @@ class Observation:
     @cached_property
     def _corners(self) -> dict[Frame, NDArray[np.float64]]:
         """Corners in the mesh frame by object frame, in the file's order, metres."""
-        part_corners, front = self.part.cuboid[:8], _turned_corners(self.part, _FRONT_X)
+        part_corners, front = self.part.cuboid[:8], _rotated_corners(self.part, _FRONT_X)
         rotation = np.eye(3) if self.fixed is None else self.fixed[:3, :3]
-        fixed = _turned_corners(self.part, rotation)
+        fixed = _rotated_corners(self.part, rotation)
         return dict(
             zip(get_args(Frame), (part_corners, front, part_corners, fixed, fixed), strict=True)
         )
 
 
-def _turned_corners(part: Part, rotation: RotationMatrix) -> Float[np.ndarray, "8 3"]:
+def _rotated_corners(part: Part, rotation: RotationMatrix) -> Float[np.ndarray, "8 3"]:
     """Return the corners of the part's box along rotated axes, in NDDS order, part frame."""
     # For rotations other than by right angles, the box of the rotated cuboid is too large.
     quarter_turns = np.abs(np.abs(rotation).max(axis=0) - 1).max() < 1e-6
     shape = part.points if part.mesh is None else part.mesh.vertices
-    turned = (part.cuboid[:8] if quarter_turns else shape) @ rotation.T
-    return np.asarray(cuboid_keypoints(turned.min(axis=0), turned.max(axis=0))[:8] @ rotation)
+    rotated = (part.cuboid[:8] if quarter_turns else shape) @ rotation.T
+    return np.asarray(cuboid_keypoints(rotated.min(axis=0), rotated.max(axis=0))[:8] @ rotation)
 
 
 MAX_ERROR_PX: Final = 5.0

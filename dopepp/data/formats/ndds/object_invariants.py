@@ -202,9 +202,9 @@ class ObjectCheck:
                 self._add(name, f"not a rotation (mirrored or not) within {MATRIX_TOLERANCE}")
                 continue
             distances = [
-                _quarter_turn_distance(rotation.T @ turned)
+                _quarter_turn_distance(rotation.T @ rotated)
                 for rotation in rotations.values()
-                for turned in (upright, upright.T)
+                for rotated in (upright, upright.T)
             ]
             if distances and min(distances) > ORIENTATION_RAD:
                 self._add(name, "another rotation than quaternion_xyzw, in either order")

@@ -15,7 +15,7 @@ from dopepp.data.formats import STAGING
 from dopepp.data.formats import webdataset as shards
 from dopepp.data.formats.bop import BopPoses
 from dopepp.data.formats.bop.bop_invariants import Models, Oddities, check_image, load_models
-from dopepp.data.formats.images import COLOUR_MODES, DEPTH_MODES, one_channel_of, picture_shape
+from dopepp.data.formats.images import COLOUR_MODES, DEPTH_MODES, decode_one_channel, picture_shape
 from dopepp.data.formats.problems import CheckReport, Node
 from dopepp.data.formats.webdataset.webdataset_reader import ShardRecords
 from dopepp.drawing.pictures import Mask, Shape
@@ -84,7 +84,7 @@ def _check_image(
     else:
         report.report(f"{start}.rgb.png", "member", "missing")
     if name := names.get("depth"):
-        one_channel_of(Node(report, f"{start}.{name}"), shape, content[name], DEPTH_MODES)
+        decode_one_channel(Node(report, f"{start}.{name}"), shape, content[name], DEPTH_MODES)
     if "camera.json" not in content:
         report.report(f"{start}.camera.json", "member", "missing")
     if "gt.json" not in content:

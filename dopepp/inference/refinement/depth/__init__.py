@@ -26,7 +26,7 @@ from dopepp.inference.refinement.part_surface import (
     GATE,
     SurfacePoints,
     Visible,
-    lay_over,
+    overlay_surface,
     view_around,
     visible,
 )
@@ -168,7 +168,7 @@ class DepthEvidence:
     def _fit(self, pose: Transform, is_visible: Visible) -> Fit:
         """Measure the agreement of a pose with the depth."""
         view, spacing = self._view, self._surface.spacing
-        overlay = lay_over(view, self._surface, is_visible, pose)
+        overlay = overlay_surface(view, self._surface, is_visible, pose)
         if overlay is None:
             return Fit(0.0, 0.0, np.inf, 0.0)
         gate = GATE * view.noise

@@ -27,8 +27,8 @@ from dopepp.inference.refinement.part_surface import (
     SurfaceOverlay,
     SurfacePoints,
     Visible,
-    lay_over,
     nearest_zero,
+    overlay_surface,
 )
 from dopepp.inference.refinement.solver import NormalEquations
 
@@ -54,7 +54,7 @@ class DepthTerm:
     def __call__(self, pose: Transform, prior: NormalEquations, /) -> NormalEquations | None:
         """Linearise the term at a pose; None if no point is within the view."""
         view, origin, spacing = self.view, pose[:3, 3], self.surface.spacing
-        overlay = lay_over(view, self.surface, self.is_visible, pose)
+        overlay = overlay_surface(view, self.surface, self.is_visible, pose)
         if overlay is None:
             return None
         H, g = plane_terms(view, overlay, origin, spacing, self.reach)
