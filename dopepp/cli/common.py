@@ -42,7 +42,7 @@ Crop = Annotated[
 
 Distances = Annotated[
     tuple[float, float] | None,
-    Option("--distance", help="Range of the parts, metres (default: that of the training)."),
+    Option("--distance", help="Distance range of the parts, metres (default: the training range)."),
 ]
 
 Region = Annotated[str | None, Option("--refine", help="region: refine the poses on the picture.")]

@@ -17,7 +17,7 @@ class RenderCommand(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Reject names after the value of ``--negatives``, which would become targets."""
-        if args and not args[0].startswith("-"):  # the targets stand first
+        if args and not args[0].startswith("-"):  # the targets come first
             for option, value, word in zip(args, args[1:], args[2:], strict=False):
                 if option == "--negatives" and not word.startswith("-"):
                     ctx.fail(

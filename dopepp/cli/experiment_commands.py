@@ -70,7 +70,7 @@ def export(
     layout: Annotated[str, Option("--format", help="onnx, openvino or safetensors.")] = "onnx",
     precision: Annotated[str, Option(help="fp32, fp16 (weights) or int8.")] = "fp32",
     out: Annotated[
-        Path | None, Option(help="File or OpenVINO folder (default: beside the checkpoint).")
+        Path | None, Option(help="File or OpenVINO folder (default: next to the checkpoint).")
     ] = None,
     images: Annotated[int, Option(min=20, max=10_000, help="Number of renders.")] = 100,
 ) -> None:

@@ -32,7 +32,7 @@ class Output(Protocol):
     def begin(self, source: FrameSource) -> None:
         """Start the results of a source."""
 
-    def take(self, result: PoseResult) -> None:
+    def write(self, result: PoseResult) -> None:
         """Write a result."""
 
     def close(self) -> None:
@@ -49,9 +49,9 @@ class Outputs:
         """Start the results of a source."""
         self._each(lambda output: output.begin(source))
 
-    def take(self, result: PoseResult) -> None:
+    def write(self, result: PoseResult) -> None:
         """Write a result."""
-        self._each(lambda output: output.take(result))
+        self._each(lambda output: output.write(result))
 
     def _each(self, action: Callable[[Output], None]) -> None:
         """Call a method of every output."""
@@ -86,7 +86,7 @@ class OverlayFolder:
         self.close()
         self._source = source
 
-    def take(self, result: PoseResult) -> None:
+    def write(self, result: PoseResult) -> None:
         """Write the picture, or append it to the source's video."""
         assert self._source is not None
         if result.time is None:
@@ -135,7 +135,7 @@ class JsonLines:
         """Open the file at the first source."""
         self._file = self._file or self._partial.open("wb", buffering=0)
 
-    def take(self, result: PoseResult) -> None:
+    def write(self, result: PoseResult) -> None:
         """Append one line for the picture. A line that does not fit on the disk is removed again.
 
         Raises:
@@ -171,7 +171,7 @@ class BopCsv:
         """Start the next scene."""
         self._scene += 1
 
-    def take(self, result: PoseResult) -> None:
+    def write(self, result: PoseResult) -> None:
         """Keep the poses until the file is written."""
         from dopepp.data.formats.bop.bop_models import model_numbers
         from dopepp.data.formats.bop.bop_results import BopResult

@@ -233,7 +233,7 @@ class _Session:
             summary += f": {reason}" if reason else ""
             progress = f"{number}/{total or '…'} {Path(result.name).name}: " if total != 1 else ""
             typer.echo(f"{progress}{summary}; speed: {format_speed(result.speed)}", err=True)
-            outputs.take(result)
+            outputs.write(result)
 
     def _search_again(self, result: PoseResult, camera: Camera) -> tuple[PoseResult, str]:
         """Search at all distances after an empty result.

@@ -28,7 +28,7 @@ def compiled(**options: Any) -> Callable[[Function], Function]:
     Compiled functions release the GIL and are single-threaded, because data loaders fork. Division
     by zero follows IEEE 754, as in numpy; a check would prevent vectorised loops.
 
-    The machine code is cached beside the package, or in the user's cache folder if the package is
+    The machine code is cached next to the package, or in the user's cache folder if the package is
     read-only; ``NUMBA_CACHE_DIR`` overrides both. Plain loops compile many times faster than slice
     assignments, array expressions and calls with constants.
 

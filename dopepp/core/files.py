@@ -1,6 +1,6 @@
 """Atomic writing of files, pictures and CSV, and the user's cache folder.
 
-A file is written beside its path under the name of :func:`partial_path` and then renamed. A killed
+A file is written next to its path under the name of :func:`partial_path` and then renamed. A killed
 process leaves such a partial file, which :func:`is_abandoned` detects. Files are not synced: they
 survive the death of their process, but not a power cut within seconds.
 """
@@ -28,7 +28,7 @@ from dopepp.core.errors import UserError
 
 _SHIPPED: Final = Path(__file__).parents[1] / "conf"
 CONF: Final = _SHIPPED if _SHIPPED.is_dir() else Path(__file__).parents[2] / "conf"
-"""Folder of the config files: inside the package in a wheel, beside the package in a checkout."""
+"""Folder of the config files: inside the package in a wheel, next to the package in a checkout."""
 
 PICTURES: Final = (".png", ".jpg", ".jpeg")
 """Suffixes of the pictures that :func:`write_picture` writes."""
@@ -137,7 +137,7 @@ _ABANDONED_S: Final = 600.0  # age of an abandoned partial file of another machi
 
 
 def read_limited(path: Path, max_bytes: int) -> bytes:
-    """Read an untrusted file, which may grow or be endless.
+    """Read an untrusted file, which may grow or have no end.
 
     Raises:
         OSError: The file cannot be read.

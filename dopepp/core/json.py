@@ -81,7 +81,8 @@ def parse_json(text: str | bytes, where: str) -> object:
         return json.loads(
             text,
             object_pairs_hook=_object,
-            # Checking every number takes longer than everything else.
+            # Numbers are checked only if one may overflow, because the check would dominate the
+            # time.
             parse_float=_finite if _may_overflow(bare) else None,
             parse_constant=_finite,
         )

@@ -135,7 +135,7 @@ class Pool(ABC):
     def __exit__(self, failure: type[BaseException] | None, *_: object) -> None: ...
 
     @abstractmethod
-    def room(self) -> int:
+    def capacity(self) -> int:
         """Return how many items may be submitted at a time."""
 
     @abstractmethod
@@ -150,7 +150,7 @@ class Pool(ABC):
         """
         waiting, running = iter(items), dict[Future[Any], Item]()
         while True:
-            while len(running) < self.room() and (item := next(waiting, None)) is not None:
+            while len(running) < self.capacity() and (item := next(waiting, None)) is not None:
                 running[self.submit(item)] = item
             if not running:
                 return
@@ -201,7 +201,7 @@ class ProcessPool(Pool):
         for process in self._processes:
             process.join()
 
-    def room(self) -> int:
+    def capacity(self) -> int:
         """Return how many items may be submitted at a time."""
         return self._num_workers * _ITEMS_PER_WORKER
 
@@ -327,7 +327,7 @@ class ClusterPool(Pool):
         self._ray.shutdown()
         _log.info("Ray: %d tasks on %d nodes", self.num_tasks.total(), len(self.num_tasks))
 
-    def room(self) -> int:
+    def capacity(self) -> int:
         """Return how many items may be submitted at a time."""
         if time.monotonic() - self._asked_at >= _CORES_EVERY_S:
             cores = int(self._ray.cluster_resources().get("CPU", 0))
@@ -373,7 +373,7 @@ def _connect(address: str | None, num_workers: int, asked_by: str, option: str) 
     else:
         options["address"] = address
     try:
-        if address is not None:  # Ray itself would retry for many minutes
+        if address is not None:  # Ray would retry for many minutes
             host, _, port = address.rpartition(":")
             socket.create_connection((host, int(port)), timeout=5.0).close()
         ray.init(**options)

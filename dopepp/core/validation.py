@@ -215,10 +215,13 @@ def _ranged_fields(kind: Any) -> dict[str, Any]:
     }
 
 
-def shown(value: object, most: int = 100) -> str:
-    """Return a shortened value for a message; for an endless integer, its type."""
+def shown(value: object, max_length: int = 100) -> str:
+    """Return a value as text for a message, cut to ``max_length`` characters.
+
+    An integer with too many digits for a conversion to text is represented by its type.
+    """
     try:
-        return f"{value!r:.{most}}"
+        return f"{value!r:.{max_length}}"
     except ValueError:
         return type(value).__name__
 
@@ -277,7 +280,7 @@ def _mistakes(kind: type[Any], value: object, error: ValidationError) -> Iterato
 
 
 def _location(value: object, detail: ErrorDetails) -> tuple[str | int, ...]:
-    """Return the path into the value, without the names of union members that pydantic adds."""
+    """Return the location of an error in the value, without pydantic's names of union members."""
     location: list[str | int] = []
     for number, step in enumerate(detail["loc"]):
         is_missing = detail["type"].startswith("missing") and number == len(detail["loc"]) - 1

@@ -43,7 +43,7 @@ def check_dataset(root: Path) -> CheckReport:
     root = Path(root)
     allowed = (
         "a YCB-Video folder (data/, image_sets/), a BOP data set, split or scene (scene_gt.json), "
-        "BOP-WebDataset shards (*.tar), or an NDDS or FAT folder (000000.json beside 000000.png)"
+        "BOP-WebDataset shards (*.tar), or an NDDS or FAT folder (000000.json next to 000000.png)"
     )
     if not root.is_dir():
         fix = "pass the folder of the data set"

@@ -287,7 +287,7 @@ def begin(root: Path, record: Mapping[str, Any]) -> None:
 
 
 def _claim(root: Path, record: Mapping[str, Any]) -> None:
-    """Write the record of a job to a new folder, or compare it with that of the folder.
+    """Write the record of a job to a new folder, or compare it with the record in the folder.
 
     Raises:
         UserError: The folder contains other files, or belongs to a job with other settings.

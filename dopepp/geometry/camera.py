@@ -57,7 +57,7 @@ def moved(T_cam_obj: Transform, step: Step) -> Transform:
 
 
 def orbited_camera(point: Vector, angle: float, direction: float) -> Transform:
-    """Return T_new_cam of a camera that looks at a point from beside this camera.
+    """Return T_new_cam after this camera has orbited around a point.
 
     Args:
         point: The point in this camera, metres.

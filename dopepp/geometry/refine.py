@@ -250,7 +250,7 @@ def apply_rotation(step: Array, R: Array, out: Array) -> None:
     Args:
         step: The step: ω, and possibly further numbers, which are ignored.
         R: Rotation matrix.
-        out: Filled with the turned rotation matrix.
+        out: Filled with the resulting rotation matrix.
     """
     x, y, z = step[0], step[1], step[2]
     angle = math.sqrt(x * x + y * y + z * z)

@@ -59,7 +59,7 @@ class PoseEstimator:
         device: Device that runs the network, e.g. ``cpu`` or ``cuda``.
         refine: Evidence that refines poses: ``region`` (the image), ``depth`` (the depth image
             passed to :meth:`predict`), or both, ``("region", "depth")``. None: no refinement.
-        parts: The checkpoint's parts with other meshes (default: those in the checkpoint).
+        parts: The checkpoint's parts with other meshes (default: the meshes in the checkpoint).
         max_ms: Time limit for the refinement of an image, milliseconds. The best detections are
             refined first; detections beyond the limit keep the network's pose.
         scale_error: Largest relative error of the parts' size or of the focal length (default:
@@ -91,7 +91,7 @@ class PoseEstimator:
         self.recovery = RecoveryOptions.of({"sigma": checkpoint.sigma, **checkpoint.recovery})
 
     def _refine_by(self, refine: Refine | None, parts: Sequence[Part]) -> None:
-        """Set the refinement, and reset the spent time."""
+        """Set the refinement, and reset the measured times."""
         self.refine, self.refiner = refine, None
         if refine is not None:  # imported on demand, because its solvers are slow to import
             from dopepp.inference.refinement.refiner import Refiner
@@ -152,11 +152,12 @@ class PoseEstimator:
 
         Args:
             mesh: Mesh file, or name of a built-in part.
-            unit: Unit of the file: mm, cm, m or inch (default: that of its format, otherwise mm).
+            unit: Unit of the file: mm, cm, m or inch (default: the unit that the format states,
+                otherwise mm).
             working_distance: Nearest and farthest depth of the part, metres; required.
             tilt_deg: Largest angle between the part's z axis and the direction to the camera,
                 degrees.
-            name: Name of the part (default: that of the file).
+            name: Name of the part (default: the name of the file).
             symmetries: ``auto`` finds them on the mesh; None: the part has none.
             refine: See the class; must include ``region``, which also verifies the poses.
             max_ms: See the class.
@@ -191,7 +192,7 @@ class PoseEstimator:
     def depth_range(self, name: str) -> tuple[float, float] | None:
         """Return the nearest and farthest depth that are searched by default; None if unknown.
 
-        Depths are metres. A network's are those of training.
+        Depths are metres. For a network, this is the training range.
         """
         seen = self.checkpoint.seen.get(name)
         return None if seen is None else (seen.nearest, seen.farthest)
@@ -414,7 +415,7 @@ class PoseEstimator:
             depths: Depth of each image; see :meth:`predict`.
             distances: See :meth:`predict`.
             camera_error: Standard deviations of each camera's pose along and about each axis,
-                metres and radians (default: 0.2 mm and 0.02°, those of a hand-eye calibration).
+                metres and radians (default: 0.2 mm and 0.02°, as after a hand-eye calibration).
             names: Name of each image, for findings and files.
 
         Returns:
@@ -441,7 +442,7 @@ class PoseEstimator:
     ) -> list[Reason]:
         """Explain why :meth:`predict` detects no part, or no further part, on an image.
 
-        The arguments and errors are those of :meth:`predict`; the image has no distortion.
+        Arguments and errors are as in :meth:`predict`; the image has no distortion.
 
         Returns:
             A reason for each part without a candidate, and for each rejected candidate.

@@ -226,7 +226,7 @@ def _camera(kind: str, inputs: Sequence[Any], width: int, height: int) -> Camera
     if kind == FILE:
         if file is None:
             fix = "drop the camera file onto the page"
-            raise UserError("no camera file", "the calibration's file", fix)
+            raise UserError("no camera file", "a file of a calibrated camera", fix)
         return read_camera(file)
     for name, number in {"fx": fx, "fy": fy, "cx": cx, "cy": cy}.items():
         if number is None:

@@ -212,7 +212,8 @@ def network_views(
         multiple: The sides of the inputs are padded to multiples of this number.
         image: RGB, without distortion.
         K: Camera matrix, pixels.
-        distances: Expected depths of the parts (default: those of training).
+        distances: Nearest and farthest expected depth of the parts, metres (default: the training
+            range).
         roi: Region to process (default: the whole image).
 
     Raises:
@@ -260,8 +261,8 @@ def letterboxes(
 ) -> list[Letterbox]:
     """Return the sizes of an image that the network is run on, the smallest first.
 
-    By default, one group of sizes shows parts at the distances of training, and one size is that of
-    training images, for parts that fill the image. Both are equal for the camera of training. A
+    By default, one group of sizes shows parts at the training distances. A further size is the size
+    of training images, for parts that fill the image. Both are equal for the training camera. A
     checkpoint without distances has only the size of training images.
     """
     size = image.shape[1], image.shape[0]

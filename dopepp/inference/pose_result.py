@@ -1,7 +1,8 @@
 """PoseResult: the detections on one frame, which can be drawn, saved and exported.
 
-All poses are in the camera frame (:data:`FRAME`), which every output states. Drawn silhouettes are
-those of the part's mesh: at a right pose they end where the part ends, which a cuboid cannot show.
+All poses are in the camera frame (:data:`FRAME`), which every output states. Silhouettes are
+drawn from the part's mesh: at a correct pose they end at the part's outline, which a cuboid cannot
+show.
 """
 
 from __future__ import annotations

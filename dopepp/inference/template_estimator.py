@@ -1,7 +1,7 @@
 """Estimator without a network: its start poses come from templates of a mesh.
 
-The steps after the start poses are those of :class:`PoseEstimator`: refinement, verification and
-score.
+The steps after the start poses are the same as in :class:`PoseEstimator`: refinement, verification
+and score.
 """
 
 from __future__ import annotations

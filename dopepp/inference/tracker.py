@@ -52,8 +52,8 @@ ELSEWHERE: Final = 0.1
 OUTVOTED: Final = 2  # disagreeing detections in a row after which a track is moved to them
 
 DOUBTFUL: Final = 0.8
-"""Share of its usual agreement below which a track is doubtful: on rendered sequences, right poses
-kept 0.97 of it and poses that an occluder had drawn away half."""
+"""Share of its usual agreement below which a track is doubtful: on rendered sequences, correct
+poses kept 0.97 of it, and poses that an occluder had displaced kept half."""
 
 TRUSTED: Final = 0.6
 """Agreement below which a pose is rejected, except the first: half of a wrong pose's outline may
@@ -73,7 +73,7 @@ STILL: Final = (math.radians(0.05), 2e-4)
 axis, and metres per metre of distance. Smaller values reduce jitter."""
 
 SUDDEN: Final = (math.radians(4.0), 0.025)
-"""Like :data:`STILL`, for a part that a hand picks up or turns: half of 8° and of 5 % per frame."""
+"""Like :data:`STILL`, for a part that a hand lifts or rotates: half of 8° and of 5 % per frame."""
 
 SWERVE: Final = 0.6
 """Share of the speed, and of the last correction, by which the velocity may change in addition."""

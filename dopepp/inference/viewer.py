@@ -75,7 +75,7 @@ class Viewer:
     def begin(self, source: FrameSource) -> None:
         """Continue with another source on the same timeline."""
 
-    def take(self, result: PoseResult) -> None:
+    def write(self, result: PoseResult) -> None:
         """Add a frame: its picture, outlines, belief maps and poses."""
         import rerun as rr
 

@@ -67,7 +67,7 @@ def fit_peaks(
     count, side = len(cells), 2 * half + 1
     theta, hessian = np.zeros((count, 6)), np.zeros((count, 6, 6))
     noise, freedom = 0.0, 0.0
-    scores, work, room = np.empty(count), np.empty((5, 10)), np.empty((11, 6))
+    scores, work, workspace = np.empty(count), np.empty((5, 10)), np.empty((11, 6))
     windows, usable = np.empty((count, side, side)), np.empty((count, side, side), np.bool_)
     logarithms = np.empty((count, side, side))
     for i in range(count):
@@ -80,28 +80,32 @@ def fit_peaks(
     for i in range(count):
         _own_cells(i, windows, cells, position, scores, sigma, FIRST_MARGIN, usable[i])
     for i in range(count):
-        _fit_logarithm(windows[i], logarithms[i], usable[i], sigma, 0.0, work, room, theta[i])
+        _fit_logarithm(windows[i], logarithms[i], usable[i], sigma, 0.0, work, workspace, theta[i])
         u, v, _ = _mode(windows[i], theta[i])
         position[i, 0], position[i, 1] = cells[i, 0] + u, cells[i, 1] + v
     for i in range(count):
         _own_cells(i, windows, cells, position, scores, sigma, MARGIN, usable[i])
         squared, used = _linearised(
-            windows[i], usable[i], theta[i], 0.0, sigma, work, room[0], hessian[i]
+            windows[i], usable[i], theta[i], 0.0, sigma, work, workspace[0], hessian[i]
         )
         noise += squared * scores[i] ** 2
         freedom += max(used - 6.0, 0.0)
     noise /= max(freedom, 1.0)
     for i in range(count):
         relative = noise / scores[i] ** 2
-        _fit_logarithm(windows[i], logarithms[i], usable[i], sigma, relative, work, room, theta[i])
+        _fit_logarithm(
+            windows[i], logarithms[i], usable[i], sigma, relative, work, workspace, theta[i]
+        )
         for _ in range(STEPS if theta[i].any() else 0):
-            _linearised(windows[i], usable[i], theta[i], relative, sigma, work, room[0], hessian[i])
-            if _step(theta[i], hessian[i], room) < ARRIVED:
+            _linearised(
+                windows[i], usable[i], theta[i], relative, sigma, work, workspace[0], hessian[i]
+            )
+            if _step(theta[i], hessian[i], workspace) < ARRIVED:
                 break
         u, v, sound = _mode(windows[i], theta[i])
         position[i, 0], position[i, 1] = cells[i, 0] + u, cells[i, 1] + v
         if sound:
-            _covariance(theta[i], u, v, hessian[i], relative, sigma, room, covariance[i])
+            _covariance(theta[i], u, v, hessian[i], relative, sigma, workspace, covariance[i])
         else:
             covariance[i] = 0.0
             covariance[i, 0, 0] = covariance[i, 1, 1] = UNCERTAIN
@@ -232,7 +236,7 @@ def _fit_logarithm(
     sigma: float,
     noise: float,
     work: Array,
-    room: Array,
+    workspace: Array,
     theta: Array,
 ) -> None:
     """Fit the logarithm of a Gaussian to the cells of a window by weighted linear least squares.
@@ -244,7 +248,7 @@ def _fit_logarithm(
         sigma: Standard deviation of a perfect peak, cells.
         noise: Variance of a cell over the peak's squared belief, which weights the shape's prior.
         work: Workspace for sums, (5, 10).
-        room: Workspace, (11, 6).
+        workspace: Workspace, (11, 6).
         theta: Filled with the coefficients of (1, x, y, −x², −xy, −y²).
     """
     side, half, curvature = len(window), len(window) // 2, 0.5 / sigma**2
@@ -260,9 +264,9 @@ def _fit_logarithm(
                 _add(work, x - half, weight, weight * (expected - logarithm[y, x]))
         _end_row(work, y - half)
     hessian = np.empty((6, 6))
-    _system(work, theta, noise, sigma, hessian, room[0])
-    solve_inside(hessian, room[0], 0.0, room[1], room[4:])
-    theta += room[1]
+    _system(work, theta, noise, sigma, hessian, workspace[0])
+    solve_inside(hessian, workspace[0], 0.0, workspace[1], workspace[4:])
+    theta += workspace[1]
     if work[0, 0] == 0.0:  # a clamped top only, without slopes
         theta[:] = 0.0
 
@@ -315,13 +319,13 @@ def _linearised(
 
 
 @compiled()
-def _step(theta: Array, hessian: Array, room: Array) -> float:
-    """Take a Gauss–Newton step with the gradient in ``room[0]``; return its largest component."""
-    solve_inside(hessian, room[0], 0.0, room[1], room[4:])
+def _step(theta: Array, hessian: Array, workspace: Array) -> float:
+    """Take a Gauss–Newton step from the gradient in ``workspace[0]``; return its largest entry."""
+    solve_inside(hessian, workspace[0], 0.0, workspace[1], workspace[4:])
     farthest = 0.0
     for k in range(6):
-        theta[k] += room[1, k]
-        farthest = max(farthest, abs(room[1, k]))
+        theta[k] += workspace[1, k]
+        farthest = max(farthest, abs(workspace[1, k]))
     return farthest
 
 
@@ -410,7 +414,7 @@ def _covariance(
     hessian: Array,
     noise: float,
     sigma: float,
-    room: Array,
+    workspace: Array,
     out: Array,
 ) -> None:
     """Write the covariance of a sound peak's position; see :func:`fit_peaks`.
@@ -421,7 +425,7 @@ def _covariance(
     a, b, c = 2 * theta[3], theta[4], 2 * theta[5]
     determinant = a * c - b * b
     xx, xy, yy = c / determinant, -b / determinant, a / determinant
-    slopes, moved, mean = room[:2], room[2], room[3]
+    slopes, moved, mean = workspace[:2], workspace[2], workspace[3]
     for k in range(2):
         # The sign is negative, because the equations are solved for the negative.
         across, down = (-xx, -xy) if k == 0 else (-xy, -yy)
@@ -430,14 +434,14 @@ def _covariance(
         slopes[k, 4] = -y * across - x * down
         slopes[k, 5] = -2 * y * down
     for k in range(2):
-        solve_inside(hessian, slopes[k], 0.0, moved, room[4:])
+        solve_inside(hessian, slopes[k], 0.0, moved, workspace[4:])
         for m in range(2):
             out[k, m] = -noise * _product(slopes[m], moved)
     out[0, 1] = out[1, 0]
     # The relative uncertainty of the variance equals the relative uncertainty of (r + s)/2.
     mean[:] = 0.0
     mean[3] = mean[5] = -0.5
-    solve_inside(hessian, mean, 0.0, moved, room[4:])
+    solve_inside(hessian, mean, 0.0, moved, workspace[4:])
     relative = math.sqrt(-noise * _product(mean, moved)) / (0.25 * (a + c))
     angle = 0.5 * math.atan2(2 * xy, xx - yy)
     cosine, sine = math.cos(angle), math.sin(angle)

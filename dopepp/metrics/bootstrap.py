@@ -36,7 +36,7 @@ _BLOCK: Final = 4_000_000  # Count of numbers resampled at once: 32 MB
 
 @dataclass(frozen=True)
 class Difference:
-    """A method's figure minus the baseline's.
+    """Difference of a statistic between a method and the baseline.
 
     Attributes:
         value: The difference.
@@ -72,9 +72,9 @@ def paired_difference(
     few_seeds: bool = True,
     seed: int = 0,
 ) -> Difference | None:
-    """Return the difference between two methods' figures with its confidence interval.
+    """Return the difference of a statistic between two methods, with its confidence interval.
 
-    A figure is the statistic over instances, averaged over objects and seeds. With a single seed
+    The statistic over instances is averaged over objects and seeds. With a single seed
     the interval does not cover the noise of training.
 
     Args:
@@ -90,7 +90,7 @@ def paired_difference(
         seed: Seed of the resamples.
 
     Returns:
-        The difference, or None if a figure is undefined (a median without finite numbers).
+        The difference, or None if a statistic is undefined (a median without finite numbers).
 
     Raises:
         UserError: The counts of objects, instances or paired seeds differ or are zero, or the
@@ -209,12 +209,12 @@ def _resampled_difference(
     draws: Sequence[Draws],
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "resamples"]:
-    """Return the difference between the methods' figures in each resample, averaged over objects.
+    """Return the difference of the statistic in each resample, averaged over objects.
 
     Args:
         mine: Numbers of the method, by object: (seeds, instances).
         baseline: Numbers of the baseline.
-        compute: Returns the figure of resampled instances.
+        compute: Returns the statistic of resampled instances.
         draws: Weight of each seed in each resample, for both methods.
         rng: Random numbers, which draw the instances.
     """
@@ -227,7 +227,7 @@ def _resampled_difference(
             drawn = rng.integers(count, size=(len(total[rows]), count))
             for sign, values, weights in ((1, ours, draws[0]), (-1, theirs, draws[1])):
                 by_seed = compute(values[:, drawn]).T
-                # Seeds with weight 0 are excluded, because their figure may be NaN.
+                # Seeds with weight 0 are excluded, because their statistic may be NaN.
                 weighted = np.where(weights[rows] > 0, weights[rows] * by_seed, 0.0)
                 total[rows] += sign * weighted.sum(axis=1)
     return total / len(mine)

@@ -47,7 +47,7 @@ MAX_SIDE: Final = 8192  # Pixels; images are enlarged to the input size, which d
 _MAX_VALUES: Final = 4_000_000
 _MAX_DEPTH: Final = 32
 _MAX_BITS: Final = 128
-"""Limits of values, levels of nesting and bits of integers, above those of any real description."""
+"""Limits of values, nesting levels and bits of integers, above the needs of real descriptions."""
 
 _FOLDER_KEYS: Final = ("root", "cache_dir", "backgrounds")
 """Keys of a data configuration that name folders of the training machine."""

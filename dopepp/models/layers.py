@@ -128,6 +128,6 @@ def find_activation(name: object) -> Activation:
         UserError: No activation has this name.
     """
     if not isinstance(name, str) or name not in ACTIVATIONS:
-        fix = "set the activation of the loss"
+        fix = "choose a loss with one of these activations"
         raise UserError(f"activation {name!r:.100}", ", ".join(ACTIVATIONS), fix)
     return ACTIVATIONS[name]

@@ -202,7 +202,7 @@ _Row: TypeAlias = tuple[_Metres, _Metres, _Metres, _Metres]
 
 @dataclass(frozen=True)
 class _MeshRecord:
-    """Triangles of a record, and the largest move of a vertex, metres."""
+    """Triangles of a record, and the largest displacement of a vertex, metres."""
 
     __pydantic_config__ = STRICT
     vertices: Annotated[list[_Point], Field(min_length=3, max_length=3 * MAX_LIGHT_FACES)]
@@ -318,7 +318,7 @@ def make_part(
 
 
 def _renderable(mesh: Mesh, name: str) -> tuple[Mesh, float]:
-    """Return a mesh of at most ``MAX_FACES`` triangles, and the largest move of a vertex."""
+    """Return a mesh of at most ``MAX_FACES`` triangles, and the largest displacement, metres."""
     if len(mesh.faces) <= MAX_FACES:
         return mesh, 0.0
     values = mesh.uv if mesh.colours is None else mesh.colours.astype(np.float64)

@@ -32,7 +32,7 @@ CornerPeaks = Float[np.ndarray, "8 peaks 2"]
 Corners = Float[np.ndarray, "instances 8 2"]
 
 MIN_DEVIATION: Final = 0.05  # Smallest standard deviation of a vector's direction, radians
-POSITION_PX: Final = 1.0  # Error of positions that turns the direction from peak to centroid
+POSITION_PX: Final = 1.0  # Error of positions that rotates the direction from peak to centroid
 MIN_LENGTH: Final = 1e-3  # A shorter mean vector has no direction
 PREDICTION_PX: Final = 4.0  # Deviation of a keypoint from its prediction: half a cell of stride 8
 CANDIDATES: Final = 3  # Most likely peaks of a corner, by belief and direction, that are tried
@@ -163,8 +163,8 @@ def solve_group(group: KeypointGroup, cuboid: Cuboid, K: CameraMatrix) -> PnPRes
 def direction_evidence(peaks: ObjectPeaks, max_angle: float, coincident_px: float) -> Evidence:
     """Return how likely belief and direction make each corner peak a part of each instance.
 
-    The likelihood of the angle is divided by that of a uniform angle, so a vector without a
-    direction is neutral. Unit vectors whose angles deviate by σ have a mean of length exp(−σ²/2).
+    The likelihood of the angle is divided by the likelihood of a uniform angle, so a vector without
+    a direction is neutral. Unit vectors whose angles deviate by σ have a mean of length exp(−σ²/2).
 
     Args:
         peaks: Corner peaks and centroids.

@@ -45,7 +45,7 @@ REFINED_COVARIANCE_FACTORS: Final = (0.1, 4.0)
 """Range for refined poses. Refinement assumes errors that renders do not have, e.g. shadows and
 inaccurate meshes, so that its covariances on renders are too large."""
 
-PASSING: Final = 0.1  # ADD over the diameter below which a pose is right
+PASSING: Final = 0.1  # ADD over the diameter below which a pose is correct
 
 # Squared Mahalanobis distances in 6D that three quarters and a tenth exceed.
 _QUARTER: Final = 3.455
@@ -120,7 +120,7 @@ class RecoveryOptions:
         max_angle_deg: Largest angle between a corner's vector and its centroid, degrees.
         max_peaks: Maximum number of peaks per channel.
         min_score: Score from which a candidate is a detection. The default is for the mean belief
-            of untuned networks. It is the highest multiple of 0.05 that keeps 90 % of the right
+            of untuned networks. It is the highest multiple of 0.05 that keeps 90 % of the correct
             detections (ADD below a tenth of the diameter; mean of five networks) on one half of
             the frames. On the other half it kept 94 % of them and 6 % of the false candidates.
         distance_factor: Factor on the distance of every pose, set by ``evaluate.py tune=true``.
@@ -282,7 +282,7 @@ def detection_features(
 ) -> Float[np.ndarray, "features"]:
     """Return the features of a detection for the logistic model of its score.
 
-    The features are those of :data:`FEATURES` in their order. They do not depend on the present
+    The features are listed in :data:`FEATURES`, in this order, and do not depend on the present
     score.
 
     Args:
@@ -317,7 +317,7 @@ def _odds(probability: float, certain: float = _CERTAIN) -> float:
 def score(
     features: Float[np.ndarray, "*n features"], weights: Float[np.ndarray, "features"]
 ) -> Float[np.ndarray, "*n"]:
-    """Return the probability that each pose is right, in (0, 1)."""
+    """Return the probability that each pose is correct, in (0, 1)."""
     return np.asarray(1 / (1 + np.exp(-np.clip(features @ weights, -30, 30))))
 
 
@@ -334,12 +334,12 @@ def fit_distance_factor(
 def fit_covariance_factor(
     squared_distances: Float[np.ndarray, "n"], *, refined: bool = False
 ) -> float:
-    """Return the factor on covariances that matches the errors of the right poses.
+    """Return the factor on covariances that matches the errors of the correct poses.
 
-    The squared distances are a mixture of right poses, a multiple of χ² with six degrees of
+    The squared distances are a mixture of correct poses, a multiple of χ² with six degrees of
     freedom, and of wrong poses, whose logarithms are uniform. Expectation-maximisation separates
-    them. The factor matches the 90 % quantile of the right poses, because their tails are heavier
-    than those of a Gaussian, and refinement, whose prior this is, must reach the true pose.
+    them. The factor matches the 90 % quantile of the correct poses, because their tails are heavier
+    than Gaussian tails, and refinement, whose prior this is, must reach the true pose.
 
     Args:
         squared_distances: Squared Mahalanobis distances of true poses, with a factor of 1.
@@ -356,7 +356,7 @@ def fit_covariance_factor(
     factor, share = float(np.quantile(squared, 0.25)) / _QUARTER, 0.5
     for _ in range(_STEPS):
         ratio = squared / factor
-        # Densities of the logarithm: s·χ²₆(s), and that of the wrong poses.
+        # Densities of the logarithm: s·χ²₆(s) of correct poses, and a constant for incorrect poses.
         right = share * ratio**3 * np.exp(-ratio / 2) / 16
         certainty = right / (right + (1 - share) / _WRONG_RANGE)
         share = float(np.clip(certainty.mean(), 0.01, 0.99))
@@ -388,19 +388,19 @@ def fit_weights(
 
     Args:
         features: Features of the detections.
-        correct: Whether each pose is right; False for a detection without an instance.
+        correct: Whether each pose is correct; False for a detection without an instance.
         defaults: Weights toward which the ridge penalty pulls (default: 0).
 
     Raises:
-        ValueError: All or no detections are right.
+        ValueError: All or no detections are correct.
     """
     correct = np.asarray(correct, bool)
     if not correct.any() or correct.all():
-        raise ValueError("a score needs right and wrong detections to learn from")
+        raise ValueError("a score needs correct and incorrect detections to learn from")
     if defaults is None:
         defaults = np.zeros(features.shape[1])
         ridge = _RIDGE * np.eye(len(defaults))
-        ridge[0, 0] = 0.0  # the share of right detections is well determined
+        ridge[0, 0] = 0.0  # the share of correct detections is well determined
     else:
         ridge = _DEFAULTS_RIDGE * np.eye(len(defaults))
     weights = defaults.copy()

@@ -162,7 +162,7 @@ def explain(
     names: Sequence[str] | None = None,
     **options: float,
 ) -> list[Reason]:
-    """Return why objects and candidates are not detected; the arguments are those of `recover`."""
+    """Explain why objects and candidates are not detected; arguments are as in :func:`recover`."""
     reasons: list[Reason] = []
     camera = np.asarray(K)[None]
     recover_batch(belief[None], field[None], cuboids, camera, stride, names, reasons, **options)
@@ -194,7 +194,7 @@ def _check_shapes(belief: Beliefs, field: Fields, num_objects: int, K: Cameras) 
 def _no_centroid(
     beliefs: Float[Tensor, "9 height width"], name: str, options: RecoveryOptions
 ) -> Reason:
-    """Return the reason of an object without any centroid."""
+    """Explain why an object has no centroid peak."""
     best = torch.nan_to_num(beliefs.detach().float()).flatten(1).amax(1)
     highest, centroid = float(best.max()), float(best[CENTROID])
     if highest <= options.peak_threshold:
@@ -211,15 +211,18 @@ def _rejected(
     cells: tuple[int, int],
     stride: int,
 ) -> tuple[Kind, float, str]:
-    """Return kind, value and text of the reason that rejected a candidate.
+    """Explain why a candidate is rejected.
 
     Args:
         group: The candidate's keypoints.
         result: Its pose from PnP.
         detection: Its detection; None without a pose.
         options: Thresholds of the recovery.
-        cells: Size of the maps, cells.
+        cells: (width, height) of the maps, cells.
         stride: Input pixels per cell.
+
+    Returns:
+        Kind of the reason, the value compared with the threshold, and the explanation.
     """
     kind: Kind = "pose"
     best, text, points = float(np.nan_to_num(group.score[CENTROID])), result.reason, group.position
@@ -236,9 +239,9 @@ def _rejected(
     return kind, best, f"at pixel ({x:.0f}, {y:.0f}) of {size}: {text}"
 
 
-def rejected_refined(detection: Detection, least: float) -> Reason:
+def rejected_refined(detection: Detection, min_score: float) -> Reason:
     """Return why a refined detection was dropped."""
-    text = f"once refined, score {detection.score:.3f} below {least:.3g}"
+    text = f"once refined, score {detection.score:.3f} below {min_score:.3g}"
     text += f" ({detection.kept})" if detection.kept else ""
     return Reason(detection.object, "refined", detection.score, text)
 

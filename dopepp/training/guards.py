@@ -112,7 +112,7 @@ class FiniteSteps(Callback):
     def on_before_optimizer_step(
         self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
     ) -> None:
-        """Skip the step if a pass on any process was not finite.
+        """Skip the step if the loss, a gradient or a statistic is not finite on any process.
 
         Raises:
             RunError: Too many steps in a row were skipped, or the weights are not finite.

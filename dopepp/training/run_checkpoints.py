@@ -34,7 +34,7 @@ BEST: Final = "best.ckpt"
 
 _NEEDED: Final = frozenset({"global_step", "loops", "optimizer_states", "callbacks"})
 _NUM_FILES: Final = 4  # last, previous, best, and a file being written
-_WEIGHTS_PER_FILE: Final = 3  # the weights and an optimiser's two moments
+_WEIGHTS_PER_FILE: Final = 3  # tensors per weight: its value and the optimiser's two moments
 _ADVICE: Final = {
     errno.ENOSPC: "free some space there",
     errno.EDQUOT: "free some of your quota",

@@ -139,7 +139,7 @@ class PoseSystem(LightningModule):
         return ValidationOutput(loss, self.network.activate(logits.float()), field.float())
 
     def recover(self, output: ValidationOutput, batch: Batch) -> list[list[Detection]]:
-        """Recover all candidates, also weak candidates, on every image of a validation batch."""
+        """Recover all candidates, including weak ones, on every image of a validation batch."""
         cameras, names = batch.K.cpu().numpy(), [part.name for part in self.parts]
         maps = (output.belief, output.field, self.cuboids, cameras, self.geometry.stride)
         return recover_batch(*maps, names, **vars(replace(self.recovery, min_score=0.0)))
@@ -178,7 +178,7 @@ class PoseSystem(LightningModule):
         configs = self.trainer.lr_scheduler_configs
         present = [_without_progress(config.scheduler.state_dict()) for config in configs]
         if present == self._resumed_schedules:
-            return  # the optimiser's rates already equal those of this schedule
+            return  # the optimiser's rates already equal the rates of this schedule
         for config in configs:
             # A schedule that multiplies the last rate would stay at 0 after a shorter schedule.
             closed_form = getattr(config.scheduler, "_get_closed_form_lr", None)
@@ -188,7 +188,7 @@ class PoseSystem(LightningModule):
                     group["lr"] = rate
 
     def _apply_settings(self) -> None:
-        """Replace the optimiser settings of the checkpoint by those of the current config.
+        """Replace the optimiser settings of the checkpoint by the settings of the current config.
 
         Settings that a schedule sets in every step are kept.
         """
@@ -210,7 +210,7 @@ class PoseSystem(LightningModule):
 
 
 def _without_progress(state: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the part of a schedule's state that describes the schedule itself."""
+    """Return the part of a schedule's state that describes the schedule."""
     return {name: value for name, value in state.items() if name not in _SCHEDULE_PROGRESS}
 
 

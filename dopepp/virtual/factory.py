@@ -95,7 +95,8 @@ class Factory:
             epoch: Epoch of the image.
             index: Index of the image within the epoch.
             scale: Magnification of the targets, relative to the preset.
-            view: Number of the camera; 0 is the preset's, others are those of :meth:`camera`.
+            view: Number of the camera; 0 is the preset's camera; for other cameras see
+                :meth:`camera`.
 
         Raises:
             UserError: The preset cannot show the part, or the camera would be below the table.
@@ -242,7 +243,7 @@ def _all_negatives(parts: Sequence[Part], given: Sequence[Part]) -> tuple[Part, 
         if part.name in names or part.mesh_hash in hashes:
             raise UserError(
                 f"negative {part.name}, which is one of the targets {', '.join(sorted(names))}",
-                "parts whose names and meshes differ from those of the targets",
+                "parts whose names and meshes differ from the names and meshes of the targets",
                 f"leave {part.name} out of the negatives",
             )
     names |= {part.name for part in given}

@@ -29,7 +29,7 @@ class InlinePool(Pool):
 
     def __exit__(self, *_: object) -> None: ...
 
-    def room(self) -> int:
+    def capacity(self) -> int:
         return self._room
 
     def submit(self, item: object) -> Future[object]:
@@ -67,7 +67,7 @@ def test_no_more_is_handed_out_than_there_is_room():
         done = []
         for _, future in pool.run(items()):
             done.append(future.result())
-            assert len(read) <= len(done) + pool.room()
+            assert len(read) <= len(done) + pool.capacity()
         assert list(pool.run([])) == []
     assert sorted(done) == list(range(1, 51))
 

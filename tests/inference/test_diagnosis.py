@@ -85,8 +85,8 @@ def test_a_part_that_is_too_small_is_named_with_its_distance(estimator, factory)
     (wrong,) = [finding for finding in diagnose(case) if finding.fix]
     true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj[2, 3]
     assert wrong.subject == "size"
-    assert f"{case.elsewhere.T_cam_obj[2, 3]:.3g} m" in wrong.sentence
-    assert case.elsewhere.T_cam_obj[2, 3] == pytest.approx(true, rel=0.1)
+    assert f"{case.outside_range.T_cam_obj[2, 3]:.3g} m" in wrong.sentence
+    assert case.outside_range.T_cam_obj[2, 3] == pytest.approx(true, rel=0.1)
     near, far = map(float, wrong.fix.split("--distance ")[1].split()[:2])
     assert near < true < far
     again = first(estimator, rendered.image, rendered.scene.K, distances=(near, far))

@@ -33,9 +33,9 @@ def result(estimator):
 def test_a_recording_has_everything(estimator, result, tmp_path):
     path = tmp_path / "new" / "out.rrd"
     with Viewer(estimator, path) as viewer:
-        viewer.take(result)
+        viewer.write(result)
         nothing = PoseResult(result.image, result.K, [], {}, "clip.mp4", 4, 0.4)
-        viewer.take(nothing)
+        viewer.write(nothing)
         assert not path.exists()
     assert [file.name for file in path.parent.iterdir()] == ["out.rrd"]
     chunks = rerun.chunk.RrdReader(path).stream().to_chunks()

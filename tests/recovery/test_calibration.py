@@ -232,5 +232,5 @@ def test_the_fit_is_the_maximum_of_the_likelihood():
 
 @pytest.mark.parametrize("correct", [np.ones(5, bool), np.zeros(5, bool), np.zeros(0, bool)])
 def test_right_and_wrong_ones_are_needed(correct):
-    with pytest.raises(ValueError, match="right and wrong"):
+    with pytest.raises(ValueError, match="correct and incorrect"):
         fit_weights(np.ones((len(correct), 2)), correct)

@@ -129,7 +129,7 @@ def read_object(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
 
 
 def encode_by_key(content: Mapping[str, object]) -> bytes:
-    """Encode a JSON object with a line for each key."""
+    """Encode a JSON object with one line per key."""
     lines = [f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in content.items()]
     return ("{\n" + ",\n".join(lines) + "\n}\n").encode()
 

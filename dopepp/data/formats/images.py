@@ -111,7 +111,9 @@ def decode_depth(content: bytes, where: str, depth_scale: float, shape: Shape) -
     units = decode_one_channel(node, shape, content, DEPTH_MODES)
     assert units is not None
     if np.isnan(depth_scale):
-        node["image"].report("no depth_scale", "depth_scale (mm per unit) beside the image's cam_K")
+        node["image"].report(
+            "no depth_scale", "depth_scale (mm per unit) next to the image's cam_K"
+        )
     return (units.astype(np.float64) * (depth_scale / 1000)).astype(np.float32)
 
 
@@ -129,7 +131,17 @@ def decode_mask(content: bytes, where: str, shape: Shape) -> Mask:
 def decode_one_channel(
     node: Node, shape: Shape | None, content: bytes | None = None, modes: tuple[str, ...] = ()
 ) -> NDArray[Any] | None:
-    """Decode a BOP depth image or mask; report a wrong image and return None."""
+    """Decode an image of one channel: a BOP depth image or mask.
+
+    Args:
+        node: The file, which receives a report of an invalid image.
+        shape: Expected (height, width); None to allow any shape.
+        content: Bytes of the image; None to read the file of the node.
+        modes: Allowed Pillow modes; empty for all modes of one channel.
+
+    Returns:
+        The pixels, or None for an invalid image.
+    """
     image = picture(node, content)
     if image is None:
         return None
@@ -141,7 +153,7 @@ def decode_one_channel(
 
 
 def read_map(node: Node, shape: Shape | None, colour: bool = False) -> NDArray[Any] | None:
-    """Read a map (depth, labels) of YCB-Video, NDDS or FAT; report a wrong map and return None.
+    """Read a map (depth, labels) of YCB-Video, NDDS or FAT; report an invalid map and return None.
 
     Args:
         node: The file.
@@ -158,7 +170,7 @@ def read_map(node: Node, shape: Shape | None, colour: bool = False) -> NDArray[A
 def check_one_channel(
     node: Node, image: NDArray[Any] | None, shape: tuple[int, ...] | None
 ) -> NDArray[Any] | None:
-    """Return an image of one channel (a mask or a depth map); report a wrong one and return None.
+    """Check that an image has one channel and the expected size; if not, report it and return None.
 
     Args:
         node: Where to report several channels or a wrong size.

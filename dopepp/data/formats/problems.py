@@ -54,7 +54,7 @@ class Problems:
         parts = str(path), where.lstrip("."), message
         raise UserError(": ".join(filter(None, parts)), allowed, fix)
 
-    def take(self, path: Path | str, where: str, error: UserError) -> None:
+    def report_error(self, path: Path | str, where: str, error: UserError) -> None:
         """Report an error that another package raised.
 
         Args:
@@ -105,7 +105,7 @@ class CheckReport(Problems):
             shown = path.relative_to(self.root).as_posix() if is_inside else str(path)
             self.defects.append(" ".join(f"{shown}: {where}: {full_message}".split()))
 
-    def take(self, path: Path | str, where: str, error: UserError) -> None:
+    def report_error(self, path: Path | str, where: str, error: UserError) -> None:
         """Store an error as a defect, without the file's name in its message."""
         message = error.got.rpartition(str(path))[2].lstrip(" ,:") or error.got
         self.report(path, where, "missing" if where == "file" else message, error.allowed)
@@ -121,9 +121,9 @@ class CheckReport(Problems):
         if self.num_images % _IMAGES_A_LINE == 0:
             _log.info("%s images checked, %s defects", self.num_images, self.num_defects)
 
-    def lines(self, most: int = 100) -> list[str]:
-        """Return lines of the notes, of at most ``most`` defects, and of a summary."""
-        shown = self.defects[:most]
+    def lines(self, max_defects: int = 100) -> list[str]:
+        """Return lines of the notes, of at most ``max_defects`` defects, and of a summary."""
+        shown = self.defects[:max_defects]
         if self.num_defects > len(shown):
             shown.append(f"… and {self.num_defects - len(shown):,} more")
         kinds = ", ".join(f"{kind} {number:,}" for kind, number in self.counts.most_common())
@@ -162,7 +162,7 @@ class Node:
         try:
             return read()
         except UserError as error:
-            self.problems.take(self.path, "file" if is_missing else self.where, error)
+            self.problems.report_error(self.path, "file" if is_missing else self.where, error)
             return None
 
     def load(

@@ -256,7 +256,9 @@ def _baseline_notes(
     seeds = set(baseline.seeds)
     several = [entry for entry in alike if max(len(entry.seeds), len(seeds)) > 1]
     if unpaired := [entry.name for entry in several if set(entry.seeds) != seeds]:
-        reason = f"Not paired over seeds, because the seeds differ from those of {baseline.name}"
+        reason = (
+            f"Not paired over seeds, because the seeds differ from the seeds of {baseline.name}"
+        )
         yield f"{reason}: {', '.join(unpaired)}."
     if not baseline.test_set:
         sentence = f"Without Δ: the result of {baseline.name} does not identify its test images"

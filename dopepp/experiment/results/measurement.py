@@ -108,7 +108,7 @@ class EstimatorMethod:
         """Whether the estimator can estimate poses from several views."""
         return self.estimator.refiner is not None and self.estimator.refiner.verifies
 
-    def silence(self, sample: Sample) -> Reason | None:
+    def rejection(self, sample: Sample) -> Reason | None:
         """Return why the best candidate in an image without detections was rejected, if any."""
         reasons = furthest(
             self.estimator.explain(sample.image, sample.K, sample.depth, cropped=True)
@@ -131,7 +131,7 @@ class EstimatorMethod:
 
 
 class ViewsMethod(EstimatorMethod):
-    """Estimator that runs on all pictures of a static scene; poses are those in the first."""
+    """Estimator that runs on all pictures of a static scene; poses refer to the first picture."""
 
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
         """Run the estimator on all pictures and return the candidates of measured objects."""

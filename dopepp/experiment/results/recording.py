@@ -261,7 +261,7 @@ def _show_rejections(
     for name, numbers in silent.items():
         method = methods[name]
         if numbers and isinstance(method, EstimatorMethod) and method.estimator.has_network:
-            reasons = [method.silence(source.sample(number, 0)) for number in numbers]
+            reasons = [method.rejection(source.sample(number, 0)) for number in numbers]
             line = summary([reason for reason in reasons if reason is not None], len(source))
             display.console.print(f"{name}: {line}")
 

@@ -222,7 +222,7 @@ def _check_combination(options: EvaluationConfig) -> None:
         fix = "add ckpt_path=FILE for a checkpoint, results=FILE for a file of poses, or "
         fix += "templates=[0.3,0.5] for the meshes alone"
         allowed = "one or more of ckpt_path=…, results=… and templates=…"
-        raise UserError("no method to measure", allowed, fix)
+        raise UserError("nothing to evaluate", allowed, fix)
     if options.refine is not None and not has_network:
         allowed = "refine=… together with ckpt_path=… (poses from a file are not refined)"
         fix = "leave out refine, or add ckpt_path"

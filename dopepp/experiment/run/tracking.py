@@ -84,7 +84,7 @@ def _interrupted_id(run_dir: Path) -> str | None:
 
 
 def log_report(trackers: Sequence[GuardedLogger], report: Report, run_dir: Path) -> None:
-    """Log the result of a run: test figures, reference rows and pictures."""
+    """Log the result of a run: test metrics, reference rows and pictures."""
     figures = _figures("test", report.rows)
     for reference, rows in report.references.items():
         figures |= _figures(f"reference/{reference}", rows)

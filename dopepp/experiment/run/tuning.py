@@ -1,7 +1,7 @@
 """Tune the factors, scores and thresholds of a checkpoint on validation images.
 
 - Distance factor: median ratio of true to estimated distances.
-- Covariance factors: make the covariances match the errors of right poses. Network poses and
+- Covariance factors: make the covariances match the errors of correct poses. Network poses and
   refined poses have separate factors.
 - Score: probability that ADD(-S) is below a tenth of the diameter. The score of refined poses is a
   recalibration of the verification.
@@ -66,14 +66,14 @@ from dopepp.recovery.detection import (
 )
 
 MIN_REFINED_SCORE: Final = 0.1
-"""Lowest threshold of refined poses. Poses that are far more likely wrong than right are never
-reported, even if the pictures without the objects would permit it."""
+"""Lowest threshold of refined poses. Poses that are far more likely incorrect than correct are
+never reported, even if the pictures without the objects permit a lower threshold."""
 
 MIN_REFINED_FACTOR: Final = 0.5
 """Smallest covariance factor of refined poses. Smaller factors fit renders of the network's size,
 and make covariances too small on larger pictures and on real ones."""
 
-MIN_REFINED: Final = 20  # least number of right refined poses that a covariance factor is fit to
+MIN_REFINED: Final = 20  # smallest number of correct poses that determine a covariance factor
 
 MAX_LOST: Final = 0.01  # largest share of correct refined poses below the threshold
 SAME: Final = 0.005  # largest decrease of the average precision with fitted factors
@@ -149,7 +149,7 @@ def tune(
 ) -> Tuning:
     """Choose factors, weights and thresholds on validation images and measure them on test images.
 
-    The score of network poses is tuned first, then that of refined poses.
+    The score of network poses is tuned first, then the score of refined poses.
 
     Args:
         estimator: Estimator of the checkpoint.
@@ -235,7 +235,7 @@ def _measured(
     empty: SampleSource,
     options: RecoveryOptions,
 ) -> DetectionQuality:
-    """Return the figures of options on test images."""
+    """Measure the detection quality of options on test images."""
     estimator.recovery = _without_thresholds(options)
     shown, without = (score_images(estimator, parts, source) for source in (test, empty))
     estimator.recovery = options
@@ -288,11 +288,11 @@ class WrongFocalLengths:
 
 
 def fit_refined_factor(estimator: PoseEstimator, parts: Parts, source: SampleSource) -> float:
-    """Fit the covariance factor of refined poses to the errors of right poses.
+    """Fit the covariance factor of refined poses to the errors of correct poses.
 
     Returns:
         The factor, at least :data:`MIN_REFINED_FACTOR`; 1 if there are fewer than
-        :data:`MIN_REFINED` right poses.
+        :data:`MIN_REFINED` correct poses.
 
     Raises:
         UserError: The covariances differ too much from the errors.
@@ -300,7 +300,7 @@ def fit_refined_factor(estimator: PoseEstimator, parts: Parts, source: SampleSou
     matches = matched_poses(estimator, parts, source, only_right=True)
     pairs = [match for match in matches if match[0].agreement is not None]
     if len(pairs) < MIN_REFINED:
-        text = "covariances of refined poses keep a factor of 1: %d right poses, fewer than %d"
+        text = "covariances of refined poses keep a factor of 1: %d correct poses, fewer than %d"
         _log.warning(text, len(pairs), MIN_REFINED)
         return 1.0
     factor = fit_covariance_factor(squared_distances(pairs), refined=True)
@@ -340,8 +340,8 @@ def choose(
         empty: Detections on images without objects.
         false_positive_rate: Permitted share of the images without objects with a reported pose.
         refined: Whether the score of refined poses is chosen. The fewer refined poses there are,
-            the closer its weights stay to those of the verification. They stay equal if all poses
-            are correct or all wrong.
+            the closer its weights stay to the weights of the verification. They stay equal if all
+            poses are correct or all wrong.
 
     Returns:
         Values of :class:`RecoveryOptions`.
@@ -443,7 +443,7 @@ def matched_poses(
         only_right: Leave out poses with ADD(-S) above a tenth of the diameter.
 
     Returns:
-        Matched detections, each with the poses equivalent to that of its instance.
+        Matched detections, each with the poses equivalent to the pose of its instance.
     """
     matches = []
     for _, _, part, detections, instances in _by_object(estimator, parts, source):
@@ -503,7 +503,13 @@ def _judge(
 
 
 def _quality(test: Scored, empty: Scored, threshold: float) -> DetectionQuality:
-    """Return the figures of detections on test images with and without objects."""
+    """Measure the quality of detections on test images.
+
+    Args:
+        test: Detections on images of the parts.
+        empty: Detections on images without the parts.
+        threshold: Lowest score of a reported detection.
+    """
     scores, correct = torch.from_numpy(test.scores), torch.from_numpy(test.correct)
     error = expected_calibration_error(scores, correct)
     loud = empty.best_scores(np.where(empty.scores >= threshold, 1.0, 0.0))
@@ -511,10 +517,10 @@ def _quality(test: Scored, empty: Scored, threshold: float) -> DetectionQuality:
     right = float((test.correct & reported).sum())
     recall, precision = right / max(test.num_instances, 1), right / max(int(reported.sum()), 1)
     alike = empty.shows_lookalikes()
-    elsewhere, lookalike = (
+    unrelated, lookalike = (
         float(loud[shown].sum()) / max(shown.sum(), 1) for shown in (~alike, alike)
     )
-    return DetectionQuality(error, elsewhere, lookalike, recall, precision)
+    return DetectionQuality(error, unrelated, lookalike, recall, precision)
 
 
 class TuningCache:
@@ -529,7 +535,7 @@ class TuningCache:
         self._items: dict[Hashable, Any] = {}
 
     def get(self, key: Hashable, make: Callable[[], Made], size: Callable[[Made], int]) -> Made:
-        """Return the stored item of a key, or make it; ``size`` returns its bytes."""
+        """Return the cached item of a key, or make and cache it; ``size`` returns its bytes."""
         if key in self._items:
             return self._items[key]  # type: ignore[no-any-return]
         item = make()

@@ -77,12 +77,12 @@ def search(
 
     Raises:
         UserError: An option of the search is wrong, the study belongs to another command, or the
-            experiment itself sweeps over options (``swept``).
+            experiment already sweeps over options (``swept``).
     """
     if swept:
         raise UserError(
-            f"search=optuna with an experiment that sweeps over {', '.join(swept)} itself",
-            "an experiment of one training, such as experiment=quickstart",
+            f"search=optuna with an experiment that already sweeps over {', '.join(swept)}",
+            "an experiment without a sweep, such as experiment=quickstart",
             "leave out search=optuna, or choose another experiment",
         )
     options: Any = OmegaConf.to_container(config.search, resolve=True)

@@ -43,14 +43,14 @@ harmless, a blur of five measures 3.2 to 4.7 and costs a quarter of the parts.""
 
 # K is reported as wrong if a focal length that differs by FOCAL reduces the keypoint error by GAIN,
 # and its logarithm has a standard deviation below CERTAIN. The error decreases 0.9 to 2.3 times
-# with the right K, and 3 to 20 times on a third of the images with a focal length off by 2.
+# with the correct K, and 3 to 20 times on a third of the images with a focal length off by 2.
 FOCAL, GAIN, CERTAIN = 1.35, 3.0, 0.2
 
 PARTLY: Final = 0.3
 """Belief at a part's centre: 0.4 to 0.8 if half occluded, mostly below 0.2 on images without it."""
 
 MIN_SCORE: Final = 0.03
-"""Least score of a right detection; false positives of an untuned network score lower."""
+"""Smallest score of a correct detection; false positives of an untuned network score lower."""
 
 OFF: Final = 0.08
 """Reprojection error, share of the part's length on the image: up to 0.06 for good poses."""
@@ -146,7 +146,8 @@ def camera(case: Case) -> Diagnosis:
     ratio = _lens_ratio(case)
     if ratio is not None:
         other = f"{name} has a trained size and, by K, {ratio:.2g} times the trained distance"
-        fix = f"none if the focal length is {ratio:.2g} times that of training; otherwise {fix}"
+        same = f"none if the focal length is {ratio:.2g} times the training focal length"
+        fix = f"{same}; otherwise {fix}"
         return Diagnosis("camera", f"{sentence}; {other}", fix)
     return Diagnosis("camera", sentence)
 
@@ -162,7 +163,7 @@ def size(case: Case) -> Diagnosis:
         return Diagnosis("size", f"{name} was searched at {trained}, and nearer and farther")
     z = float(case.detection.T_cam_obj[2, 3])
     sentence = f"{name} is {case.length_px:.0f} pixels long at {z:.3g} m"
-    if case.elsewhere is None:
+    if case.outside_range is None:
         return Diagnosis("size", f"{sentence}; it is searched at {trained}")
     fix = f"move it to {trained}, or search there: --distance {0.9 * z:.2g} {1.1 * z:.2g}"
     if not _near(z / math.sqrt(near * far), 5):
@@ -206,17 +207,16 @@ def elsewhere(case: Case) -> Diagnosis:
         return Diagnosis(
             "elsewhere", "not checked, because neither --at nor --empty states where the parts are"
         )
-    if not case.stray:
+    if not case.unexpected:
         return Diagnosis("elsewhere", "no detections away from the parts")
-    best, threshold = case.stray[0], case.estimator.min_score
+    best, threshold = case.unexpected[0], case.estimator.min_score
     u, v = best.keypoints[CENTROID]
     where = "away from every part" if case.centres else "on a picture without the part"
-    counts = (
-        f"{len(case.stray)} of {len(case.reported)} detections above {threshold:.2g} are {where}"
-    )
-    best_stray = f"the best has the score {best.score:.2g}, at ({u:.0f}, {v:.0f})"
+    counts = f"{len(case.unexpected)} of {len(case.reported)} detections"
+    counts += f" above {threshold:.2g} are {where}"
+    best_score = f"the best has the score {best.score:.2g}, at ({u:.0f}, {v:.0f})"
     fix = TUNE if case.estimator.has_network else "raise the threshold: --conf, or train the part"
-    return Diagnosis("elsewhere", f"{counts}; {best_stray}", fix)
+    return Diagnosis("elsewhere", f"{counts}; {best_score}", fix)
 
 
 def pose(case: Case) -> Diagnosis:
@@ -229,7 +229,7 @@ def pose(case: Case) -> Diagnosis:
     if not case.estimator.has_network:
         sentence = f"{name} is {case.length_px:.0f} pixels long"
     if share > OFF:
-        fix = "check K and the mesh; if both are right, train longer or with more such pictures"
+        fix = "check K and the mesh; if both are correct, train longer or with more such pictures"
         return Diagnosis("pose", f"{sentence}, {share:.0%} of its length", fix)
     if refined is None:
         return Diagnosis("pose", f"{sentence}; without a mesh its outline is not checked")

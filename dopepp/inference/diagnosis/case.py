@@ -44,7 +44,7 @@ class Case:
         image: RGB, without distortion.
         K: Camera matrix, pixels.
         parts: The estimator's parts, with meshes where available.
-        distances: Nearest and farthest depth, metres (default: those of training).
+        distances: Nearest and farthest depth, metres (default: the training range).
         cropped: As in :meth:`PoseEstimator.predict`.
         centres: Pixel of each shown part's centre; empty if the image shows none of the parts, None
             if unknown.
@@ -75,8 +75,8 @@ class Case:
         return self.reported[0] if self.reported else None
 
     @cached_property
-    def stray(self) -> list[Detection]:
-        """Detections whose centre is over half a part length (pixels) from every known centre."""
+    def unexpected(self) -> list[Detection]:
+        """Detections farther than half a part length (pixels) from every given centre."""
         return [
             detection
             for detection in self.reported
@@ -87,8 +87,8 @@ class Case:
         ]
 
     @cached_property
-    def elsewhere(self) -> Detection | None:
-        """Best detection at other distances; None with a detection at the expected distances."""
+    def outside_range(self) -> Detection | None:
+        """Best detection outside the expected distances; None if there is a detection inside."""
         ranges = [self.estimator.depth_range(part.name) for part in self.estimator.parts]
         depths = [limits for limits in ranges if limits is not None]
         if self.expected is not None or not depths:
@@ -108,7 +108,7 @@ class Case:
     @property
     def detection(self) -> Detection | None:
         """Best detection at any distance."""
-        return self.expected or self.elsewhere
+        return self.expected or self.outside_range
 
     @cached_property
     def part(self) -> Part:
@@ -174,7 +174,7 @@ class Case:
         return strongest
 
     def _detections(self, distances: tuple[float, float] | None) -> list[Detection]:
-        """Return the detections at these distances (default: those of training)."""
+        """Return the detections in a range of distances, metres (default: the training range)."""
         return self.estimator.predict(self.image, self.K, distances=distances, cropped=self.cropped)
 
     def _length_px(self, detection: Detection) -> float:

@@ -1,8 +1,8 @@
 """Frames of ROS: image and camera messages, live or recorded, and recordings (extra ``bags``).
 
 Recordings are ``.bag`` of ROS 1, and ``.mcap``, ``.db3`` and folders of ROS 2. Their messages are
-decoded by ROS's own definitions, never by those in the file. Messages are accessed by field names,
-so any library may have created them.
+decoded by ROS's own definitions, never by definitions in the file. Messages are accessed by field
+names, so any library may have created them.
 """
 
 from __future__ import annotations
@@ -228,7 +228,7 @@ class Bag(FrameSource):
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
-        """Open the recording, and turn the library's errors about damaged files into UserError."""
+        """Open the recording, and convert the library's errors about damaged files to UserError."""
         from rosbags import rosbag1, rosbag2
 
         try:

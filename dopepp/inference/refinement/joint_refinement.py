@@ -238,7 +238,7 @@ class _ViewSearch:
 
 
 def _disagreements(end: Solution, prior: Prior, owners: Sequence[int]) -> dict[int, float]:
-    """Return the distance of each view's evidence from that of the other views and the prior.
+    """Return the distance of each view's evidence from the other views and the prior.
 
     Args:
         end: Pose with the equations of each term.

@@ -1,8 +1,8 @@
 """The outline of a mesh at a pose: its silhouette, and points on the silhouette's border.
 
-The mask of a closed mesh is that of its triangles that face the camera. Their common border winds
-around a pixel as often as they cover it, so only the few edges on this border are filled, row by
-row. In an open mesh, every triangle is filled.
+The mask of a closed mesh is the union of the triangles that face the camera. Their common border
+winds around a pixel as often as they cover it, so only the few edges on this border are filled, row
+by row. In an open mesh, every triangle is filled.
 
 An edge can belong to the outline if exactly one of its triangles faces the camera, or if it has one
 triangle only. The filled mask shows which of these edges do: the part ends there. Other edges have

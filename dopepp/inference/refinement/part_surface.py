@@ -76,7 +76,7 @@ def surface_points(points: Points) -> SurfacePoints:
     # With ρ points per unit of area, πρr² of them lie within r, one of which is the point itself.
     spacing = float(np.median(distances[:, -1])) * math.sqrt(math.pi / (count - 0.5))
     offsets = (points[neighbours[:, 1:]] - points[:, None]) / spacing
-    # The normal is that of the plane through a point and two neighbours that fits most neighbours:
+    # The normal belongs to the plane through a point and two neighbours that fits most neighbours:
     # a least-squares plane would mix the two faces of a thin plate.
     best, normals = np.full(len(offsets), np.inf), np.zeros((len(offsets), 3))
     for first, second in combinations(range(offsets.shape[1]), 2):
@@ -90,7 +90,7 @@ def surface_points(points: Points) -> SurfacePoints:
 
 
 def visible(surface: SurfacePoints, T_cam_obj: Transform) -> Visible:
-    """Return which points the part itself does not hide; all must be in front of the camera."""
+    """Return which points are not hidden by the part itself; all must be in front of the camera."""
     points = surface.points @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
     normals = surface.normals @ T_cam_obj[:3, :3].T
     rays = points / points[:, 2:]
@@ -160,7 +160,7 @@ class SurfaceOverlay:
         return np.asarray(self.offset[self.pixels[:, 1], self.pixels[:, 0]])
 
     def continues(self, noise: float, reach: float) -> Mask:
-        """Return the pixels beside the part whose depth continues the part's surface.
+        """Return the pixels next to the part whose depth continues the part's surface.
 
         Pixels are compared with the offset of the adjacent surface. Otherwise the table could look
         like a continuation of the part while the pose is still tilted.
@@ -178,12 +178,14 @@ class SurfaceOverlay:
 def overlay_surface(
     view: DepthView, surface: SurfacePoints, is_visible: Visible, T_cam_obj: Transform
 ) -> SurfaceOverlay | None:
-    """Compare every pixel of a depth view with the posed part's nearest visible point.
+    """Compute the depth offset between the measured surface and a posed part, pixel by pixel.
+
+    A pixel is compared with the nearest visible point of the part.
 
     Args:
         view: Crop of a depth image.
         surface: Points on the part's surface.
-        is_visible: Which points the part itself does not hide.
+        is_visible: Whether each point is visible, i.e. not hidden by the part itself.
         T_cam_obj: Pose of the part.
 
     Returns:

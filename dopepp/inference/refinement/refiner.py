@@ -67,8 +67,8 @@ if TYPE_CHECKING:
 TERMS: Final = ("region", "depth")
 
 LOOSER: Final = 3.0
-"""Factor on the deviations of a network's pose. Its covariance was fitted to images like those of
-training; errors are larger on other images."""
+"""Factor on the deviations of a network's pose. Its covariance was fitted to images like the
+training images; errors are larger on other images."""
 
 FEW: Final = 4  # number of keypoints that determine a pose
 NUM_QUADRUPLES: Final = 40  # nine keypoints have 126 quadruples
@@ -148,7 +148,7 @@ class Refiner:
     def verified(
         self, detection: Detection, image: Picture, K: CameraMatrix, moved: float = 0.0
     ) -> Detection:
-        """Return a detection with the probability that its pose is right, if poses are verified.
+        """Return a detection with the probability that its pose is correct, if poses are verified.
 
         ``moved`` is the Mahalanobis distance that refinement has moved the pose.
         """
@@ -306,7 +306,7 @@ def poses_of_four(
     """Solve for the pose from each of several sets of four keypoints; equal in every call.
 
     An occluder or a similar object displaces several keypoints together, which their covariances do
-    not show. Sets without these keypoints give the right pose.
+    not show. Sets without these keypoints give the correct pose.
 
     Args:
         cuboid: Keypoints of the part, metres.

@@ -1,6 +1,6 @@
-"""Verification: the probability that a pose is right, from the image at that pose.
+"""Verification: the probability that a pose is correct, from the image at that pose.
 
-A pose is right if ADD(-S) is below a tenth of the part's diameter. The features describe how well
+A pose is correct if ADD(-S) is below a tenth of the part's diameter. The features describe how well
 the part, drawn at the pose, explains the image: its outline, creases, colours and shading. No
 feature depends on a network, so a single small model serves all parts. It was learned from refined
 poses of procedural parts (``benchmarks/learn_verification.py``), and its numbers are in
@@ -40,16 +40,16 @@ if TYPE_CHECKING:
 
 EVIDENCE: Final = (
     "outline",  # mean response of the image's edges along the outline, in [0, 1]
-    "outline_gain",  # outline response minus that of shifted outlines, because clutter has edges
+    "outline_gain",  # outline response minus the response of shifted outlines on clutter
     "outline_weakest",  # mean response of the second weakest eighth of the outline
     "crease",  # mean response along visible creases
-    "crease_gain",  # crease response minus that of shifted creases
-    "creases",  # number of crease points relative to that of outline points, at most 1
+    "crease_gain",  # crease response minus the response of shifted creases
+    "creases",  # number of crease points over the number of outline points, at most 1
     "contrast",  # difference of the colours on both sides of the outline, in [0, 1]
     "inside",  # mean log odds of the colours inside the outline
     "outside",  # mean log odds of the colours around it
     "shading",  # share of the variance inside that a linear model of the normals explains
-    "residual",  # logarithm of the unexplained deviation inside over that of the surroundings
+    "residual",  # logarithm of the ratio of unexplained deviations, inside to surroundings
     "moved",  # Mahalanobis distance from the network's pose
     "spread",  # logarithm of the stated deviation of the part's points over a tenth of the diameter
     "size",  # logarithm of the extent on the image over 100 pixels
@@ -57,15 +57,17 @@ EVIDENCE: Final = (
 """Evidence about a pose, in this order."""
 
 LONGEST_PX: Final = 120  # approximate length of the part on the crop
-SPACING: Final = 80.0  # points along an extent
+SPACING: Final = 80.0  # number of sampled points along the part's extent
 NOISE: Final = 8.0  # gradient, grey levels per pixel, at which an edge has half its response
-SHARP: Final = math.cos(math.radians(40.0))  # cosine of the least angle between normals at a crease
-BESIDE: Final = 0.12  # distance of the outlines beside, share of the extent
-BESIDE_PX: Final = 2.5  # distance from the outline at which colours are compared
+SHARP: Final = math.cos(
+    math.radians(40.0)
+)  # cosine of the smallest angle between normals at a crease
+SHIFTED: Final = 0.12  # distance of the shifted outlines, share of the extent
+COLOUR_PX: Final = 2.5  # distance from the outline at which colours are compared
 RING: Final = 0.2  # width of the surroundings, share of the extent
-MAX_PIXELS: Final = 1500  # pixels for the fit of the shading model
+MAX_PIXELS: Final = 1500  # largest number of pixels for the fit of the shading model
 SECTORS: Final = 8
-MIN_POINTS: Final = 12  # least points of an outline on the image
+MIN_POINTS: Final = 12  # smallest number of outline points on the image
 SCHARR: Final = 1 / 32  # grey levels per pixel in a sum of Scharr's kernel
 
 Gradients = tuple[Int16[np.ndarray, "height width 3"], Int16[np.ndarray, "height width 3"]]
@@ -83,7 +85,7 @@ class VerificationModel(NamedTuple):
     bias: Float[np.ndarray, ""]
 
     def log_odds(self, evidence: Float[np.ndarray, "*n evidence"]) -> Float[np.ndarray, "*n"]:
-        """Return the logarithm of the odds that each pose is right."""
+        """Return the logarithm of the odds that each pose is correct."""
         inputs = np.clip((evidence - self.mean) / self.scale, -4.0, 4.0)
         return np.asarray(
             np.tanh(inputs @ self.hidden + self.hidden_bias) @ self.output + self.bias
@@ -164,7 +166,7 @@ class Verifier:
     def probability(
         self, detection: Detection, image: Picture, K: CameraMatrix, moved: float
     ) -> float:
-        """Return the probability that a detection's pose is right; 0 if it is not on the image.
+        """Return the probability that a detection's pose is correct; 0 if it is not on the image.
 
         ``moved`` is the Mahalanobis distance of the pose from that before refinement.
         """
@@ -211,19 +213,19 @@ class Verifier:
             return None
         gradients = _gradients(crop.colours)
         outline = _lines(contour)
-        along, beside = _responses(gradients, outline, BESIDE * crop.extent)
+        along, shifted_outline = _responses(gradients, outline, SHIFTED * crop.extent)
         creases = self._edges.visible(at, ids, spacing)
-        crease, crease_beside = _responses(gradients, creases, BESIDE * crop.extent)
+        crease, shifted_crease = _responses(gradients, creases, SHIFTED * crop.extent)
         ring = cv2.dilate(mask, None, iterations=round(RING * crop.extent)) - mask
         within = mask.astype(bool)
         explained, residual = self._shading(crop.colours, ids, ring, T_cam_obj)
         return np.array(
             [
                 along.mean(),
-                along.mean() - beside,
+                along.mean() - shifted_outline,
                 _weakest_sector(along, outline),
                 crease.mean() if len(crease) else 0.0,
-                crease.mean() - crease_beside if len(crease) else 0.0,
+                crease.mean() - shifted_crease if len(crease) else 0.0,
                 min(1.0, len(crease) / len(along)),
                 _contrast(crop.colours, outline),
                 odds[within].mean(),
@@ -318,7 +320,7 @@ def _contrast(colours: Picture, outline: Float[np.ndarray, "points 4"]) -> float
     """Return the mean difference of colours across an outline, relative to noise, in [0, 1]."""
     height, width = colours.shape[:2]
     sides = []
-    for side in (-BESIDE_PX, BESIDE_PX):
+    for side in (-COLOUR_PX, COLOUR_PX):
         pixels = np.rint(outline[:, :2] + side * outline[:, 2:]).astype(int)
         columns, rows = np.clip(pixels[:, 0], 0, width - 1), np.clip(pixels[:, 1], 0, height - 1)
         sides.append(colours[rows, columns].astype(np.float64))
@@ -397,7 +399,7 @@ def _walk_creases(edges: Array, sides: Array, pixels: Array, ids: Array, spacing
             share = left / length
             left += spacing
             u, v = x + share * dx, y + share * dy
-            # Both triangles are drawn beside a crease; an outline has one of them only.
+            # Both triangles are drawn next to a crease; an outline has one of them only.
             first = second = False
             for row in range(int(v) - 1, int(v) + 3):
                 for column in range(int(u) - 1, int(u) + 3):

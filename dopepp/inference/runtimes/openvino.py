@@ -59,7 +59,7 @@ def read_network(path: Path) -> OpenVinoNetwork:
 
     Raises:
         UserError: A file is missing, damaged or too large, the XML has content that ``dopepp
-            export`` does not write, or a constant lies outside the other file.
+            export`` does not write, or a constant exceeds the weights file.
     """
     file = path
     if path.is_dir():

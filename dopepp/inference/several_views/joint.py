@@ -30,8 +30,8 @@ SUPPORTING: Final = 0.2
 """Least probability at which a view supports a pose."""
 
 AGREEING: Final = 0.7
-"""Least agreement of the outline (:class:`OutlineAgreement`) at which a view supports a pose. At
-right poses it is above 0.9. If a camera is off by 4 mm at 20 cm, it is below 0.7 in one view."""
+"""Smallest agreement of the outline (:class:`OutlineAgreement`) at which a view supports a pose. At
+correct poses it is above 0.9. If a camera is off by 4 mm at 20 cm, it is below 0.7 in one view."""
 
 WEAKER: Final = (0.5, 0.15)
 """A view with its own detection also supports a pose that is a little worse than the detection:
@@ -107,7 +107,7 @@ class JointEstimator:
 
         Returns:
             The part with the sightings that agree with the joint pose. If no two views agree, the
-            pose is that of the best sighting.
+            pose is taken from the best sighting.
         """
         name, all_views = sightings[0].detection.object, set(range(len(self._views)))
         geometry = self._geometries[name]

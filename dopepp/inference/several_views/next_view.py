@@ -1,6 +1,6 @@
 """The next best view: the camera pose from which a picture reduces a pose's covariance most.
 
-The information that a view would add is that of the part's outline in this view. Every point of the
+The information that a view would add comes from the part's outline in this view. Every point of the
 outline counts as measured with a usual precision (:data:`USUAL_PX`), and the outline has the errors
 of offset and scale that refinement assumes. The part may hide itself; other objects are ignored.
 """

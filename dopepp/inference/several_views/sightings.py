@@ -27,7 +27,7 @@ from dopepp.recovery.detection import Detection
 
 GATE: Final = 4.5 * LOOSER
 """Largest Mahalanobis distance between detections of one part. It is generous, because covariances
-were fitted to images like those of training, and the joint pose is verified."""
+were fitted to images like the training images, and the joint pose is verified."""
 
 
 @dataclass(frozen=True, eq=False)

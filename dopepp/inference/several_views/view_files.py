@@ -206,5 +206,7 @@ def _lines(path: Path) -> list[str]:
         text = read_limited(path, MAX_COLMAP_BYTES).decode("utf-8")
     except (OSError, ValueError) as error:
         problem = f"{path}: {getattr(error, 'strerror', None) or error}"
-        raise UserError(problem, FORMATS, "pass images.txt with cameras.txt beside it") from error
+        raise UserError(
+            problem, FORMATS, "pass images.txt with cameras.txt in its folder"
+        ) from error
     return [line.strip() for line in text.splitlines() if not line.startswith("#")]

@@ -29,7 +29,7 @@ class ViewEvidence:
 
     view: str  # name of the view
     status: Status
-    probability: float  # probability that the pose is right, from this view alone
+    probability: float  # probability that the pose is correct, from this view alone
     detection: Detection  # the part's pose in this camera, for drawing
 
 
@@ -46,7 +46,7 @@ class WorldDetection:
     covariance: PoseMatrix
     evidence: Sequence[ViewEvidence]  # evidence of each view
     # Mahalanobis distance per √degree of freedom: the larger of the largest distance between the
-    # evidence of one view and that of the others, and the least distance between the joint pose and
+    # evidence of one view and of all others, and the smallest distance between the joint pose and
     # the pose of a single view
     disagreement: float = 0.0
 

@@ -2,8 +2,8 @@
 
 1. :mod:`~dopepp.inference.templates.views` draws the part from 600 directions.
 2. :mod:`~dopepp.inference.templates.responses` finds the image's edges by orientation.
-3. :mod:`~dopepp.inference.templates.matching` compares the drawings with these edges at every
-   fourth pixel. The drawings are turned in the image plane and resized to the working distances.
+3. :mod:`~dopepp.inference.templates.matching` compares the drawings with the edges at every
+   fourth pixel. The drawings are rotated in the image plane and resized to the working distances.
    Each small cell of the image keeps its best matches.
 4. :mod:`~dopepp.inference.templates.ranking` moves these matches, replaces their views by better
    neighbouring views, and ranks them.
@@ -279,7 +279,7 @@ class TemplateDetector:
         rays = np.column_stack(
             [(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(len(poses))]
         )
-        # Templates show the part on the optical axis: turn this axis to the ray of the match.
+        # Templates show the part on the optical axis: rotate this axis to the ray of the match.
         sines = np.linalg.norm(rays[:, :2], axis=1) / np.linalg.norm(rays, axis=1)
         axes = np.column_stack([-rays[:, 1], rays[:, 0], np.zeros(len(rays))])
         axes *= (np.arcsin(sines) / np.maximum(np.linalg.norm(axes, axis=1), 1e-12))[:, None]

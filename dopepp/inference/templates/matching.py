@@ -1,8 +1,8 @@
 """Matching of all templates at all positions of an image.
 
 The score of a template is the sum of the responses at its points. Responses are rearranged so that
-those of one point at all positions of a grid are contiguous in memory. The scores at all positions
-are then a sum of rows (Hinterstoisser et al. 2012).
+the responses of one point at all positions of a grid are contiguous in memory. The scores at all
+positions are then a sum of rows (Hinterstoisser et al. 2012).
 
 Scores are normalised by the mean and standard deviation of the template's scores over the image,
 because a template of a few straight lines scores high at many positions.
@@ -27,7 +27,7 @@ NUM_KEPT: Final = 8  # best matches of each cell
 TOGETHER: Final = 4  # rows that are added in one pass
 
 Pose2d = Float[np.ndarray, "matches 4"]
-"""Pixel of the part's centre, turn (radians) and projected diameter (pixels)."""
+"""Pixel of the part's centre, in-plane rotation (radians) and projected diameter (pixels)."""
 
 
 class Matches(NamedTuple):
@@ -45,10 +45,10 @@ class Matches(NamedTuple):
 
 
 def match(responses: Responses, templates: Templates, diameter_px: float) -> Matches:
-    """Return the best matches of all templates and turns in each cell of the image.
+    """Return the best matches of all templates and in-plane rotations in each cell of the image.
 
     Cells keep the matches diverse: a textured area can have thousands of matches with scores above
-    that of the part.
+    the part's score.
 
     Args:
         responses: Responses of the image.
@@ -122,7 +122,7 @@ def _match(
     best: Array,
     moments: Array,
 ) -> None:
-    """Write the best matches of all templates and turns in each cell of the image.
+    """Write the best matches of all templates and in-plane rotations in each cell of the image.
 
     Args:
         phases: Edge responses, rearranged by orientation and position modulo the stride.
@@ -134,7 +134,7 @@ def _match(
         scale: Projected diameter, pixels.
         side: Side of a cell, positions.
         scores: Filled with the scores of each cell's best matches.
-        best: Filled with view, turn and position of these matches.
+        best: Filled with view, in-plane rotation and position of each match.
         moments: Filled with mean and standard deviation of each template's sums.
     """
     bins, length = len(phases) // (STRIDE * STRIDE), phases.shape[1]

@@ -43,9 +43,9 @@ FEATURES: Final = (
 SUPPORT: Final = 30  # response above which a point counts as supported
 LEVEL: Final = 16.0  # difference of colours, grey levels, at which the contrast is 0.5
 EVEN: Final = 64.0  # added to the variance of colours, so that noise counts as even
-MIN_INNER: Final = 8  # least number of inner points on the image; other matches get no features
+MIN_INNER: Final = 8  # smallest number of inner points on the image for features of a match
 ACROSS: Final = (2.5, 0.03)  # pixels and diameters between the outline and the compared colours
-ROLL_STEP: Final = math.radians(5.0)  # step of the turn in the grid search
+ROLL_STEP: Final = math.radians(5.0)  # step of the in-plane rotation in the grid search
 GROWTH: Final = 0.03  # first relative step of the size
 FEW: Final = 32  # first points of a template, used in the grid search; they are far apart
 REACH_PX: Final = 1.5  # first step of the position after a change of view
@@ -59,7 +59,7 @@ class RankingModel(NamedTuple):
     """Learned model that ranks matches, and learned score of the poses refined from them."""
 
     weights: Float[np.ndarray, "features"]  # weight of each of FEATURES
-    bias: float  # weighted sum + bias: log odds that the best match of a picture is right
+    bias: float  # weighted sum + bias: log odds that the best match of a picture is correct
     score: dict[str, float]  # RecoveryOptions of refined poses
 
 
@@ -103,7 +103,7 @@ def improve_views(
 ) -> tuple[Matches, Features]:
     """Replace the views of matches by better neighbouring views.
 
-    Arguments and results are those of :func:`move_nearby`.
+    Arguments and results are as in :func:`move_nearby`.
     """
     views, poses, best = matches.views.copy(), matches.poses.copy(), np.empty(len(matches.poses))
     lines = templates.points, templates.normals
@@ -165,7 +165,7 @@ def _climb(
         maps: Edge responses by orientation, row and column.
         points: Points of the template, diameters.
         normals: Direction of each point's normal, radians.
-        pose: Column, row, turn and projected diameter, updated in place.
+        pose: Column, row, in-plane rotation and projected diameter, updated in place.
         reach: First step of column and row, pixels.
         rounds: Number of rounds; each has smaller steps.
 
@@ -204,7 +204,8 @@ def _search(
         points: Points of each view, diameters.
         normals: Direction of each point's normal, radians.
         views: View of each match.
-        poses: Column, row, turn and projected diameter of each match, updated in place.
+        poses: Column, row, in-plane rotation and projected diameter of each match, updated in
+            place.
         reach: Half the side of the grid, pixels.
         best: Filled with the response of each match.
     """
@@ -242,9 +243,10 @@ def _improve_views(
         points: Points of each view, diameters.
         normals: Direction of each point's normal, radians.
         neighbours: Neighbouring views of each view.
-        twists: Turn in the image plane that aligns each neighbour with the view, radians.
+        twists: In-plane rotation that aligns each neighbour with the view, radians.
         views: View of each match, updated in place.
-        poses: Column, row, turn and projected diameter of each match, updated in place.
+        poses: Column, row, in-plane rotation and projected diameter of each match, updated in
+            place.
         responses: Filled with the response of each match.
     """
     pose, best = np.empty(4), np.empty(4)
@@ -290,7 +292,7 @@ def _describe(
         is_outline: Whether each point is on the outline.
         inner: Points of each view inside the outline, diameters.
         views: View of each match.
-        poses: Column, row, turn and projected diameter of each match.
+        poses: Column, row, in-plane rotation and projected diameter of each match.
         features: Filled with the features.
     """
     bins, height, width = maps.shape

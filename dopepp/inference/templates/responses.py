@@ -48,7 +48,7 @@ def edge_responses(image: Picture, spread: int, surroundings: int) -> Responses:
 
 @compiled()
 def _orient(gx: Array, gy: Array, maps: Array) -> None:
-    """Write the response of each pixel to its own gradient, that of the strongest channel."""
+    """Write the response of each pixel to its strongest gradient over the channels."""
     bins, height, width = maps.shape
     cosines, sines = np.empty(bins), np.empty(bins)
     for b in range(bins):

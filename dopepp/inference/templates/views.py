@@ -1,7 +1,7 @@
 """Templates of a part: the edges that a camera sees from many directions.
 
 A template is drawn once for each direction of view. Its points are rotated, scaled and shifted for
-turns in the image plane, distances and positions on the image.
+in-plane rotations, distances and positions on the image.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from dopepp.inference.refinement.outline import OutlineMesh, find_contour, posed
 from dopepp.inference.refinement.verification import SharpEdges
 
 NUM_VIEWS: Final = 600  # directions on the sphere, about 8 degrees apart
-NUM_POINTS: Final = 64  # points on the edges of a view
-NUM_NEIGHBOURS: Final = 6  # neighbouring views of a view
-NUM_INNER: Final = 48  # points inside a view, far from its edges
+NUM_POINTS: Final = 64  # number of points on the edges of a view
+NUM_NEIGHBOURS: Final = 6  # number of neighbours of each view
+NUM_INNER: Final = 48  # number of points inside a view, far from its edges
 
 DRAWN_PX: Final = 96  # diameter of the part on the drawing of a view
 MARGIN_PX: Final = 4  # margin of the drawing
 SPACING_PX: Final = 1.5  # distance between the edge points that a template's points are chosen from
 INNER_PX: Final = 4.0  # distance of inner points from edges; smaller in views without such pixels
-MAX_INNER: Final = 400  # pixels that the inner points are chosen from
+MAX_INNER: Final = 400  # largest number of pixels from which inner points are chosen
 SLACK: Final = 0.02  # overlap of the regions that symmetries map to each other, cosine
-NEAREST: Final = 1.1  # least distance of a drawing, diameters
+NEAREST: Final = 1.1  # smallest distance of a drawing, diameters
 
 Rotations = Float[np.ndarray, "views 3 3"]
 
@@ -51,7 +51,7 @@ class Templates:
     inner: Float[np.ndarray, "views inner 2"]  # inside the outline
     extents: Float[np.ndarray, "views"]  # longer side of the bounding box
     neighbours: Int[np.ndarray, "views neighbours"]  # views from the nearest directions
-    # Turn in the image plane that aligns each neighbour with the view, radians
+    # In-plane rotation that aligns each neighbour with the view, radians
     twists: Float[np.ndarray, "views neighbours"]
 
 

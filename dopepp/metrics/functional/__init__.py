@@ -116,7 +116,7 @@ def region_levels(distances: Errors) -> Errors:
     """Return each pose's smallest level in [0, 1] whose region contains the true pose.
 
     The squared Mahalanobis distance x of a true pose from its estimate follows χ² with six degrees
-    of freedom if the covariance is right. The level is that distribution's value at x,
+    of freedom if the covariance is correct. The level is that distribution's value at x,
     1 − exp(−x/2)·(1 + x/2 + x²/8).
 
     Args:

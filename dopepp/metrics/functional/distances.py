@@ -64,7 +64,7 @@ def add_s(
 ) -> Errors:
     """Return the mean distance from true points to the nearest estimated points (ADD-S), metres.
 
-    The arguments are those of :func:`add`.
+    The arguments are as in :func:`add`.
     """
     R_est, t_est, R_gt, t_gt, points = _checked(R_est, t_est, R_gt, t_gt, points)
     valid = _all_finite(R_est, t_est, R_gt, t_gt)
@@ -293,7 +293,7 @@ def _chunks(num_poses: int, num_points: int) -> Iterator[slice]:
 
 
 def nan_is_miss(errors: Tensor) -> Tensor:
-    """Turn NaN into an infinite error."""
+    """Replace NaN by an infinite error."""
     return errors.nan_to_num(nan=torch.inf, posinf=torch.inf, neginf=-torch.inf)
 
 

@@ -132,10 +132,10 @@ def _count_pieces(model: bytes) -> int:
     return shown
 
 
-def _check_size(num_bytes: int, most: int = MAX_UNPACKED_BYTES) -> None:
+def _check_size(num_bytes: int, max_bytes: int = MAX_UNPACKED_BYTES) -> None:
     """Check that unpacked data are not too large."""
-    if num_bytes > min(most, MAX_UNPACKED_BYTES):
-        raise ValueError(f"{num_bytes / 1e6:.0f} MB of text, over {most / 1e6:.0f} MB")
+    if num_bytes > min(max_bytes, MAX_UNPACKED_BYTES):
+        raise ValueError(f"{num_bytes / 1e6:.0f} MB of text, over {max_bytes / 1e6:.0f} MB")
 
 
 def read_glb(path: Path) -> RawMesh:

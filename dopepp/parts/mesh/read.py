@@ -231,7 +231,7 @@ class Topology:
 
 
 def find_topology(vertices: Vertices, faces: Faces) -> Topology:
-    """Find the edges of triangles that all have an area."""
+    """Find the edges of triangles, none of which may have an area of 0."""
     positions, corners = weld(vertices, faces)
     start, end = corners.reshape(-1), corners[:, [1, 2, 0]].reshape(-1)
     # Both directions of an edge have the same number, which fits into an int64.

@@ -242,7 +242,14 @@ def match_pictures(poses: RobotPoses, pictures: Sequence[str]) -> list[tuple[int
 def write_calibration(
     path: Path, kind: str, values: Mapping[str, Any], findings: Sequence[str], force: bool
 ) -> None:
-    """Write a calibration; with ``force``, also write a doubtful calibration, with a mark.
+    """Write a calibration, unless findings contradict it.
+
+    Args:
+        path: YAML file to write.
+        kind: Kind of the calibration, e.g. ``hand-eye``.
+        values: Content of the file by field.
+        findings: Reasons not to trust the calibration.
+        force: Whether to write despite findings; the file is then marked as not trusted.
 
     Raises:
         UserError: There are findings and ``force`` is false, or the file cannot be written.

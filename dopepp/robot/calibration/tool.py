@@ -138,8 +138,10 @@ def bench_of_board(T_base_board: Sequence[Transform], board: Board) -> Bench:
         UserError: There is no pose.
     """
     if not len(T_base_board):
-        fix = "add the robot's poses of the pictures"
-        raise UserError("no picture with a robot pose", "at least one picture", fix)
+        fix = "record the robot's pose at every picture"
+        raise UserError(
+            "no picture with a robot pose", "at least one picture with a robot pose", fix
+        )
     poses, middle = np.stack(T_base_board), board.points.mean(axis=0)
     R = nearest_rotation(poses[:, :3, :3].sum(axis=0)) @ np.diag([1.0, -1.0, -1.0])
     centres = poses[:, :3, :3] @ middle + poses[:, :3, 3]

@@ -101,7 +101,7 @@ class Execution:
         return np.array([cell.pose(state, number)[2, 3] for number in range(cell.count)])
 
     def _rest(self, joints: Joints) -> None:
-        """Hold the arm at these joints for a short pause."""
+        """Hold the arm at the given joint angles, radians, for a short pause."""
         for _ in range(round(PAUSE_S / STEP)):
             self._advance(joints, np.zeros(JOINTS))
 

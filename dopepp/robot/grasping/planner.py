@@ -292,7 +292,7 @@ class Planner:
         return True
 
     def _collides(self, joints: Joints, opening: float) -> bool:
-        """Return whether the arm collides at these joints and this opening of the fingers."""
+        """Return whether the arm collides at the given joint angles and finger opening."""
         state, cell = self._state, self._cell
         state.qpos[:JOINTS] = joints
         state.qpos[cell.fingers] = self._gripper.fingers(opening)

@@ -86,11 +86,11 @@ class ViewpointPlanner:
             return None
         cosine = float(T_base_cam[:3, 2] @ cameras[number][:3, 2])
         angle = np.degrees(np.arccos(min(1.0, cosine)))
-        reason = f"{angle:.0f}° beside the first, {reason}; best of {len(reached)} in reach"
+        reason = f"{angle:.0f}° from the first, {reason}; best of {len(reached)} in reach"
         return Viewpoint(reached[number], reason)
 
     def _camera_pose(self, joints: Joints) -> Transform:
-        """Return the controller's T_base_cam at these joints."""
+        """Return the controller's T_base_cam at the given joint angles, radians."""
         return np.asarray(self._arm.flange(joints) @ self._knowledge.T_flange_cam)
 
     def _candidates(self, point: Vector, distance: float, start: Joints) -> Iterator[Joints]:

@@ -177,7 +177,7 @@ class _Node:
 
     def _answer(self, item: tuple[Any, Any | None]) -> None:
         """Process a picture and publish the answer, in the worker's thread."""
-        answer = self._worker.take(*item, self._topic)
+        answer = self._worker.process(*item, self._topic)
         if answer is None:
             return
         for message in self._formatter.messages(answer, self._is_wanted):

@@ -1,7 +1,7 @@
 """The node without ROS: lines of JSON on stdout or over UDP, and processing of recordings.
 
 A processed recording is an ``.mcap`` of ROS 2 with the node's topics and the pictures' stamps; a
-viewer opens it beside the original recording (extra ``bags``).
+viewer opens it together with the original recording (extra ``bags``).
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def process_bag(
     bag = Bag(source, topic)
     with draft(target) as path, _Recorder(path, name, worker) as recorder:
         for seconds, message, info in bag.messages():
-            answer = worker.take(message, info, bag.topic)
+            answer = worker.process(message, info, bag.topic)
             if answer is not None:
                 stamp = stamp_of(message.header.stamp)
                 if stamp == Stamp(0, 0):

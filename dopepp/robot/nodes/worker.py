@@ -61,7 +61,7 @@ class Answer:
     """Poses in a picture."""
 
     stamp: Stamp  # capture time of the picture
-    frame_id: str  # the camera's optical frame, in which the poses are
+    frame_id: str  # frame of the poses: the camera's optical frame
     result: PoseResult
 
     @property
@@ -134,7 +134,7 @@ class Worker:
             self._estimators[refine] = base.refining(term, base.solid_parts)
         return self._estimators[refine]
 
-    def take(self, message: Any, info: Any | None, topic: str) -> Answer | None:
+    def process(self, message: Any, info: Any | None, topic: str) -> Answer | None:
         """Process the picture of a ROS message.
 
         Args:

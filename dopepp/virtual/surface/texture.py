@@ -41,7 +41,7 @@ class Texture:
     levels: Int[np.ndarray, "levels 3"]
 
     def image(self, level: int = 0) -> UInt8[np.ndarray, "_ _ 3"]:
-        """Return a level as an image."""
+        """Return a level of the image pyramid as an RGB image; level 0 is the finest."""
         first, rows, columns = (int(value) for value in self.levels[level])
         return self.texels[first : first + rows * columns].reshape(rows, columns, 3)
 
@@ -100,7 +100,7 @@ def _halve(
         decode: Table from sRGB to linear light.
         encode: Table from linear light to sRGB.
         out: Filled with the texels of the next level.
-        out_share: Filled with the used share of these texels.
+        out_share: Filled with the used share of the texels.
     """
     rows, columns = source.shape[:2]
     height, width = rows / out.shape[0], columns / out.shape[1]

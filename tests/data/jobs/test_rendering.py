@@ -43,7 +43,7 @@ class InlinePool(Pool):
 
     def __exit__(self, *_: object) -> None: ...
 
-    def room(self) -> int:
+    def capacity(self) -> int:
         return 1
 
     def submit(self, item: object) -> Future[object]:

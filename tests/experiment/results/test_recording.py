@@ -128,7 +128,7 @@ def test_a_file_that_does_not_fit_the_data(root, composed, tmp_path):
 
 def test_an_evaluation_needs_something_to_measure(composed, tmp_path):
     with pytest.raises(
-        UserError, match=r"got no method to measure; allowed: one or more of ckpt_path=…"
+        UserError, match=r"got nothing to evaluate; allowed: one or more of ckpt_path=…"
     ):
         run_evaluation(composed(config="evaluate"), tmp_path)
     with pytest.raises(UserError, match=r"x\.csv, which contains no data config; .*data=…"):

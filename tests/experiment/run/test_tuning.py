@@ -246,7 +246,7 @@ def test_a_wrong_focal_length_keeps_the_line_of_sight_to_a_part_beside_the_axis(
 def test_few_refined_poses_keep_their_covariances(caplog):
     few = Refining(true=0.4)
     assert fit_refined_factor(few, [PART], Many(MIN_REFINED)) == 1.0  # type: ignore[arg-type]
-    assert f"12 right poses, fewer than {MIN_REFINED}" in caplog.text
+    assert f"12 correct poses, fewer than {MIN_REFINED}" in caplog.text
     with pytest.raises(UserError, match="refinement is far too confident"):
         fit_refined_factor(Refining(true=9.0), [PART], Many(250))  # type: ignore[arg-type]
 

@@ -186,7 +186,7 @@ def test_a_folder_of_another_study_or_command_is_refused(call_fast, tmp_path):
     [
         (["search.num_trials=0"], "search.num_trials=0"),
         (["search.num_parallel=x"], "search.num_parallel='x'"),
-        (["experiment=table6_dope_vs_dopepp"], "sweeps over model, data.parts itself"),
+        (["experiment=table6_dope_vs_dopepp"], "already sweeps over model, data.parts"),
         (["optimizer.lr=range(0.1,0.5,0.1)", "optimizer.lx=interval(0,1)"], "optimizer.lx"),
         (["optimizer.lr=tag(log, interval(0.0, 1.0))"], "optimizer.lr"),
         (["search.space=['optimizer.lr=1']"], "which is a single value"),

@@ -30,7 +30,7 @@ def take(worker, seen, messages):
         number=0, second=1.0, frame=messages.frame, info=True, topic=messages.topic, **changes
     ):
         beside = messages.info(seen.K, (320, 240), **changes) if info else None
-        return worker.take(messages.image(seen.pictures[number], second, frame), beside, topic)
+        return worker.process(messages.image(seen.pictures[number], second, frame), beside, topic)
 
     return take
 
@@ -83,7 +83,7 @@ def test_pictures_without_camera_info_are_told_after_a_few(take, said):
 
 def test_a_camera_that_is_given_takes_the_place_of_camera_info(estimator, seen, messages, said):
     worker = Worker(estimator, camera=Camera(None, seen.K, (), "--K"), warn=said.append)
-    answer = worker.take(messages.image(seen.pictures[0], 1), None, messages.topic)
+    answer = worker.process(messages.image(seen.pictures[0], 1), None, messages.topic)
     expected = estimator.predict(seen.pictures[0], seen.K)
     np.testing.assert_allclose(
         answer.result.detections[0].T_cam_obj, expected[0].T_cam_obj, atol=1e-9
@@ -120,7 +120,7 @@ def test_no_stamp_and_unreadable_pictures_are_told(worker, take, messages, seen,
     bad = messages.image(seen.pictures[0], 1)
     for change in ({"encoding": "16UC1"}, {"data": b"12"}, {"height": 10**9}):
         spoilt = SimpleNamespace(**vars(bad) | change)
-        assert worker.take(spoilt, messages.info(seen.K, (320, 240)), messages.topic) is None
+        assert worker.process(spoilt, messages.info(seen.K, (320, 240)), messages.topic) is None
     assert len(said) == 2
     assert "without a stamp" in said[0]
     assert "16UC1" in said[1]
@@ -133,7 +133,7 @@ def test_binned_and_cut_pictures_have_their_part_of_the_camera(worker, estimator
     K[:2, 2] += (40, 20)
     roi = SimpleNamespace(x_offset=40, y_offset=20, width=640, height=480)
     info = messages.info(K, (800, 600), d=[0.0] * 5, roi=roi, binning_x=2, binning_y=2)
-    answer = worker.take(messages.image(seen.pictures[0], 1), info, messages.topic)
+    answer = worker.process(messages.image(seen.pictures[0], 1), info, messages.topic)
     np.testing.assert_allclose(answer.result.K, seen.K, atol=1e-9)
     expected = estimator.predict(seen.pictures[0], seen.K)[0]
     np.testing.assert_allclose(answer.result.detections[0].T_cam_obj, expected.T_cam_obj, atol=1e-6)
@@ -161,7 +161,7 @@ def test_parts_that_are_followed_have_names_that_stay(estimator, seen, messages,
     tracking = Worker(estimator, WorkerSettings(refine=True), track=True, warn=said.append)
     info = messages.info(seen.K, (320, 240), d=[0.0] * 5)
     numbers = [
-        tracking.take(messages.image(seen.pictures[0], second), info, messages.topic).numbers
+        tracking.process(messages.image(seen.pictures[0], second), info, messages.topic).numbers
         for second in (1, 2, 3)
     ]
     assert numbers == [[0]] * 3

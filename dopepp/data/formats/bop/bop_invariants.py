@@ -69,7 +69,7 @@ def _is_scene(folder: Path) -> bool:
 
 def check_bop(report: CheckReport) -> None:
     """Check the models and every scene of a data set, a split, or a single scene."""
-    # The models lie beside the splits: in this folder, or above this split or scene.
+    # The models lie next to the splits: in this folder, or above this split or scene.
     models = load_models(report, (report.root, *report.root.resolve().parents[:2]))
     for folder in scene_folders(report.root):
         if folder != report.root and not bop.is_number(folder.name):

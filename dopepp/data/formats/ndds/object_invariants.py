@@ -300,7 +300,7 @@ class ObjectCheck:
         check_box(self._node["box"], points, K, seen, fraction, shape)
 
     def _check_projections(self, cuboid: Corners, K: CameraMatrix) -> None:
-        """Compare the annotated projections of the cuboid with those of the pose."""
+        """Compare the annotated projections of the cuboid with its projections at the pose."""
         expected = project(np.vstack([cuboid, cuboid.mean(axis=0)]), K)
         if not np.isfinite(expected).all():
             return  # projections of an object partly behind the camera are meaningless

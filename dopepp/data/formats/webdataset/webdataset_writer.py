@@ -57,7 +57,7 @@ class WebdatasetWriter(BopFolder):
         """Return the indices of the shard's complete images."""
         images = {int(path.stem) for path in self._staged(chunk)}
         if self._shard(chunk).exists():
-            images |= {_image(member.key) for member in members(self._shard(chunk))}
+            images |= {_image_number(member.key) for member in members(self._shard(chunk))}
         return {chunk * self.chunk_size + image for image in images}
 
     def finalize(self, chunk: int, indices: Sequence[int]) -> None:
@@ -127,7 +127,7 @@ def _merged(paths: Sequence[Path], chunk: int) -> Iterator[tuple[str, Content]]:
     for path in paths:
         if path.exists():
             for key, group in groupby(members(path), key=lambda member: member.key):
-                images[_image(key)] = path, list(group)
+                images[_image_number(key)] = path, list(group)
     for image, (path, listed) in sorted(images.items()):
         content = {m.extension: read_span(path, m.offset, m.size) for m in listed}
         yield f"{chunk:06d}_{image:06d}", content
@@ -150,6 +150,6 @@ def _add(archive: tarfile.TarFile, key: str, content: Content) -> None:
         archive.addfile(info, io.BytesIO(data))
 
 
-def _image(key: str) -> int:
+def _image_number(key: str) -> int:
     """Return the image number in a key."""
     return int(key.rpartition("_")[2])

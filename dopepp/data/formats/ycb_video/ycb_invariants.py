@@ -53,7 +53,7 @@ def _check_lists(report: CheckReport) -> None:
             try:
                 listed = ycb_video.read_image_set(report.root, path.stem, subset)
             except UserError as error:
-                report.take(path, "line", error)
+                report.report_error(path, "line", error)
                 break
             metas = (report.root / folder / f"{frame}-meta.mat" for frame in listed)
             num_absent += sum(not meta.is_file() for meta in metas)

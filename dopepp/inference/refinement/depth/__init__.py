@@ -43,7 +43,7 @@ FARTHEST: Final = 3.0
 
 MIN_INLIERS: Final = 0.5  # share of the unobstructed points with depth that must agree
 MIN_SEEN: Final = 0.25  # share of the visible points that must have agreeing depth
-MAX_RMS: Final = 2.0  # RMS offset in standard deviations of the depth; about 1 at a right pose
+MAX_RMS: Final = 2.0  # RMS offset in standard deviations of the depth; about 1 at a correct pose
 CLOSE: Final = 5.0  # distance in front of a part without other objects, spacings
 BESIDE: Final = 3.0  # spacings around the part in which its surface must not continue
 SEARCHED_POINTS: Final = 400  # points in the search
@@ -57,7 +57,7 @@ HIDDEN: Final = 0.5  # point that is occluded, or whose depth agrees only in par
 PENALTY: Final = 0.03
 """Share of the points that must gain by a shift of one standard deviation of the prior."""
 
-MIN_FOUND: Final = 20  # least number of points that agree with their depth
+MIN_FOUND: Final = 20  # smallest number of points that agree with their depth
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ class Fit:
     inliers: float  # share of the unobstructed points with depth that agree
     seen: float  # share of the visible points that agree
     rms: float  # RMS offset of agreeing points, standard deviations of the depth
-    uncovered: float  # area beside the part that continues its surface, relative to the part's
+    uncovered: float  # area next to the part that continues its surface, relative to the part's
 
     @property
     def score(self) -> float:

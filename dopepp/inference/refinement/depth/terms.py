@@ -3,7 +3,7 @@
 Point-to-plane terms: a pixel's residual is its distance from the plane of the visible point that it
 shows. Weights decrease to 0 at a limit, so occluders, background and outliers have no effect.
 
-Outline terms: a point with depth behind it, or a pixel beside the part that continues its surface,
+Outline terms: a point with depth behind it, or a pixel next to the part that continues its surface,
 moves the part across the viewing ray. Points inside both outlines have no such term, because they
 would hold the part in place.
 """
@@ -143,7 +143,7 @@ def _to_pixels(overlay: SurfaceOverlay, continues: Mask) -> Pulls:
 
     Args:
         overlay: Posed part on the depth.
-        continues: Pixels beside the part whose depth continues its surface.
+        continues: Pixels next to the part whose depth continues its surface.
     """
     rows, columns = np.nonzero(continues)
     nearest = overlay.nearest[rows, columns]
@@ -183,7 +183,7 @@ def _add_planes(
         noise: Standard deviation of the depth, metres.
         rough: Standard deviation of the part's surface, metres.
         H: Updated 6×6 matrix of the normal equations.
-        g: Updated right side of the normal equations.
+        g: Updated right-hand side of the normal equations.
 
     Returns:
         The sum of the weights.

@@ -50,18 +50,19 @@ FINE: Final = RegionStage(300, reach=0.25, steps=3, points=160, tiles=3)
 """The coarse stage is run from every start, the others from the best results only."""
 
 WIDENED: Final = 2.0
-"""Factor on the prior's deviations in the coarse round. Far from the right pose, the points of the
-outline contradict each other, so the image has too little weight against the prior."""
+"""Factor on the prior's deviations in the coarse round. Far from the correct pose, the points of
+the outline contradict each other, so the image has too little weight against the prior."""
 
 SURE: Final = 0.85
 """Agreement below which the search is extended, and least agreement of a pose that it accepts."""
 
-# Support that the extended search requires of a pose, and least gain over that of the first pose.
+# Support that the extended search requires of a pose, and its smallest gain over the first pose.
 SUPPORTED: Final = 0.35
 MORE: Final = 0.02
 
 FAR: Final = 3.0
-"""Additional deviations of the extended search, multiples of those of a pose without covariance."""
+"""Additional deviations of the extended search, as multiples of the deviations of a pose without
+covariance."""
 
 NUM_DRAWS: Final = 4  # poses that are drawn in the extended search
 NUM_STARTS: Final = 4  # most likely starts that are tried besides the given pose

@@ -8,7 +8,7 @@ All points share two errors, which are unknowns with a prior:
   errors up to a limit are equally likely. The pose is corrected by the expected error: a precise
   prior keeps its distance while prior and outline differ by less than the limit, and a broad prior
   leaves the distance to the outline. A normally distributed error would move every distance, even
-  a right one, part of the way to that of the outline.
+  a correct one, part of the way to the outline's distance.
 
 Neighbouring points have errors in common, and outliers get a small weight.
 """
@@ -39,7 +39,8 @@ ALIKE: Final = 0.5
 
 OFFSET_PX: Final = 0.5
 """Standard deviation of the offset that all points share: blur, a halo, an error of the mesh.
-Measured outlines lie 0.2 pixels outside those of published poses on real frames of two parts."""
+Measured outlines lie 0.2 pixels outside the outlines of published poses on real frames of two
+parts."""
 
 SCALE_ERROR: Final = 0.005
 """Default of the largest relative error of the part's size or of the focal length."""
@@ -162,7 +163,7 @@ def _terms(
         independent: Number of measurements that a point represents if errors are small.
         alike: Number of neighbouring points that share an error otherwise.
         H: Filled with the 7×7 matrix of the normal equations.
-        g: Filled with their right side.
+        g: Filled with their right-hand side.
     """
     squares, valid, weights = np.empty(len(rows)), np.empty(len(rows)), np.empty(len(rows))
     num_valid = 0
@@ -244,7 +245,7 @@ def _add(rows: Array, means: Array, weights: Array, H: Array, g: Array) -> None:
         means: Measured shift of the outline at each point, pixels.
         weights: Weight of each point.
         H: Filled with the 7×7 matrix of the normal equations.
-        g: Filled with their right side.
+        g: Filled with their right-hand side.
     """
     row = np.ones(7)
     for c in range(7):

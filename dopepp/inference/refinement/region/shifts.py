@@ -7,8 +7,9 @@ the likelihood of d, up to a constant.
 Edges also increase the likelihood: it is higher where the image changes more than on average. They
 separate a part from surroundings of its own colour, and locate its end with subpixel accuracy.
 
-The result is the mean of the shift and its information: the inverse of its variance, minus that of
-a uniform distribution. If all shifts are equally likely, the information is zero.
+The result is the mean of the shift and its information: the inverse of its variance, minus the
+inverse variance of a uniform distribution. If all shifts are equally likely, the information is
+zero.
 """
 
 from __future__ import annotations
