@@ -29,7 +29,7 @@ def refuse_options(options: dict[str, object]) -> None:
     """
     if given := [name for name, value in options.items() if value]:
         problem = f"--views with {', '.join(given)}"
-        raise UserError(problem, "--views without them", f"leave out {', '.join(given)}")
+        raise UserError(problem, "--views without these options", f"leave out {', '.join(given)}")
 
 
 def predict_scene(

@@ -246,7 +246,7 @@ def _json(value: object, name: str) -> str:
     except (TypeError, ValueError, RecursionError) as error:
         problem = f"{name}: {error}" if name else str(error)
         allowed = "null, true/false, numbers, text, and lists and mappings of them"
-        raise UserError(problem, allowed, "write only such values") from None
+        raise UserError(problem, allowed, "write only values of these kinds") from None
 
 
 def _user_error(mistake: _Mistake, root: str, fix: str) -> UserError:

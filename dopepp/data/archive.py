@@ -167,6 +167,6 @@ def _unpack(tar: tarfile.TarFile, member: tarfile.TarInfo, path: Path) -> None:
 
 def _refused(archive: Path, reason: str) -> UserError:
     """Return the error for an archive that is not unpacked."""
-    allowed = "a whole tar file of plain files and folders that stay inside its own folder"
+    allowed = "a complete tar file of plain files and folders that stay inside its own folder"
     fix = "do not trust the file; download it again from its source"
     return UserError(f"archive {archive}: {reason}", allowed, fix)

@@ -73,7 +73,7 @@ def download(name: str, folder: Path | str, progress: Progress | None = None) ->
     """
     source = SOURCES.get(name)
     if source is None:
-        fix = "pass a name of this list"
+        fix = "pass one of these names"
         raise UserError(f"unknown data set {name!r}", ", ".join(SOURCES), fix)
     target = Path(folder) / name
     photos = target / source.photos
@@ -123,7 +123,7 @@ def fetch(
     except OSError as error:
         allowed = f"a writable folder with {num_bytes} bytes of free space"
         fix = "pass another folder, or free space; the next call resumes the download"
-        raise UserError(f"{path}: cannot write the file: {error}", allowed, fix) from error
+        raise UserError(f"{path}, which cannot be written: {error}", allowed, fix) from error
 
 
 def _receive(url: str, partial: Path, num_bytes: int, progress: Progress | None) -> None:

@@ -184,7 +184,7 @@ def _in_camera(
     if path is None or distance is None:
         missing = "--camera FILE" if path is None else "--working-distance 0.3,0.8"
         given = "--working-distance" if path is None else "--camera"
-        raise UserError(f"{given} alone", "both options, or neither", f"add {missing}")
+        raise UserError(f"{given} without {missing}", "both options, or neither", f"add {missing}")
     try:
         nearest, farthest = (float(end) for end in distance.strip("[]").split(","))
     except ValueError as error:

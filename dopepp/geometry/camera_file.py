@@ -170,7 +170,7 @@ def _text(path: Path) -> str:
     except (OSError, ValueError) as error:  # ValueError also for a null character in its name
         problem = f"camera file {path!s:.200}: {getattr(error, 'strerror', None) or error}"
         allowed = f"a UTF-8 camera file of at most {MAX_BYTES / 1e3:g} kB: {FORMATS}"
-        raise UserError(problem, allowed, "pass such a camera file") from error
+        raise UserError(problem, allowed, "pass a file in one of these formats") from error
 
 
 def _cut(K: CameraMatrix, calibrated: Size | None, size: Size, crop: Crop) -> CameraMatrix:

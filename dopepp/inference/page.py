@@ -109,7 +109,7 @@ def make_page(estimator: PoseEstimator, folder: Path) -> gr.Blocks:
     def find_poses(path: str | None, kind: str, *camera: Any) -> Outputs:
         try:
             if path is None:
-                raise UserError("no picture", "a picture's file", "drop a picture onto the page")
+                raise UserError("no picture", "an image file", "drop a picture onto the page")
             return _outputs(estimator, Path(path), kind, camera, folder)
         except UserError as error:
             message = str(error)

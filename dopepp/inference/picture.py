@@ -332,7 +332,7 @@ def _scales(seen: Seen, reach: float, depths: tuple[float, float]) -> Sequence[f
     Args:
         seen: Sizes of the part in the training images.
         reach: Length of the part's image at a depth of one metre, pixels.
-        depths: Least and greatest depth of the part, metres.
+        depths: Smallest and largest depth of the part, metres.
     """
     near, far = depths
     learned = math.log(MARGIN**2 * seen.largest_px / seen.smallest_px)

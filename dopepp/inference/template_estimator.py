@@ -312,5 +312,5 @@ def load_solid_part(
 def _networks_only(noun: str) -> UserError:
     """Return the error about a feature that only networks have."""
     fix = "train the part (python train.py experiment=my_part), and pass the checkpoint"
-    problem = f"{noun}, which an estimator by templates does not have"
+    problem = f"{noun}, which a template estimator does not provide"
     return UserError(problem, "an estimator with a trained network", fix)

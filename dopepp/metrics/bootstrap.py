@@ -192,7 +192,7 @@ def _check(mine: Numbers, baseline: Numbers, statistic: str, same_seeds: bool) -
         raise UserError(
             f"arrays of shapes {shapes[0]} for the method and {shapes[1]} for the baseline",
             "shape (seeds, instances) for each object, with the same instances in both methods",
-            "measure both methods on the same test set",
+            "evaluate both methods on the same test set",
         )
     if same_seeds and seeds[0] != seeds[1]:
         problem = f"{seeds[0].pop()} seeds against {seeds[1].pop()}"

@@ -295,7 +295,7 @@ def _read_released(path: Path) -> tuple[dict[str, Any], int]:
     """Return the content of a released file, with float32 weights, and the weights' size, bytes."""
     tensors, metadata = read_safetensors(path)
     if KEY not in metadata:
-        allowed = "a file of `dopepp release` or `dopepp export`"
+        allowed = "a file written by `dopepp release` or `dopepp export`"
         raise UserError(
             f"{path} without a description under {KEY!r}", allowed, "download the file again"
         )

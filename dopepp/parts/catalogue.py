@@ -110,7 +110,7 @@ def load_part(path_or_name: str | Path, unit: str | None = None) -> Part:
     path = Path(path_or_name)
     if path.suffix.lower() not in READERS:
         allowed = f"{', '.join(BUILTIN)}, or a path to {'/'.join(READERS)}"
-        fix = "write a built-in name of this list, or pass a mesh file"
+        fix = "write one of these names, or pass a mesh file"
         raise UserError(f"unknown part {text!r}", allowed, fix)
     mesh, file_unit = read_in_unit(path, unit)
     part = replace(make_part(path.stem, mesh, unit=file_unit), unit=file_unit)

@@ -58,7 +58,7 @@ _RIDGE: Final = 0.1  # Weight of the squared weights, in detections, which keeps
 _DEFAULTS_RIDGE: Final = 1.0  # Weight of the squared distance from default weights, in detections
 _STEPS: Final = 50  # Maximum number of Newton steps
 _MEAN_BELIEF: Final = tuple(float(name == "belief") for name in FEATURES)
-_VERIFIED: Final = 1e-4  # least distance of a verified probability from 0 and 1
+_VERIFIED: Final = 1e-4  # smallest distance of a verified probability from 0 and 1
 
 
 @dataclass(frozen=True)

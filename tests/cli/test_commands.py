@@ -131,8 +131,11 @@ def test_render_shows_a_users_camera(run, tmp_path, caplog):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--camera", "{camera}"], "got --camera alone; allowed: both"),
-        (["--working-distance", "0.3,0.8"], "got --working-distance alone"),
+        (
+            ["--camera", "{camera}"],
+            "got --camera without --working-distance 0.3,0.8; allowed: both",
+        ),
+        (["--working-distance", "0.3,0.8"], "got --working-distance without --camera"),
         (["--camera", "{camera}", "--working-distance", "0.8,0.3"], "got working_distance=[0.8, 0"),
         (["--camera", "{camera}", "--working-distance", "near"], "got --working-distance near; al"),
         (["--camera", "/nowhere", "--working-distance", "0.5,1"], "got camera file /nowhere: No"),

@@ -178,7 +178,7 @@ def test_no_network_is_one_line(tmp_path):
 
 def test_a_folder_that_cannot_be_written_is_one_line(server, tmp_path):
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(UserError, match=r"file/f: cannot write the file"):
+    with pytest.raises(UserError, match=r"file/f, which cannot be written"):
         fetch(url(server, "good"), tmp_path / "file" / "f", len(CONTENT), SHA256)
 
 

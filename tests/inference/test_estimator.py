@@ -210,7 +210,7 @@ def test_bad_input(estimator, checkpoint_path, bad, message):
     with pytest.raises(UserError, match=message) as caught:
         estimator.predict(**{"image": image(640, 480), "K": K_VGA, **bad})
     assert "\n" not in str(caught.value)
-    with pytest.raises(UserError, match=r"refine='icp'.*region, depth, several of them, or none"):
+    with pytest.raises(UserError, match=r"refine='icp'.*one or more of region, depth, or none"):
         PoseEstimator.load(checkpoint_path, refine="icp")
 
 

@@ -125,9 +125,9 @@ def test_wrong_options_are_refused(near_truth, tmp_path, options, words):
 
 @pytest.mark.parametrize("name", ["network", "checkpoint"])
 def test_what_only_networks_have_is_refused(estimator, rendered, name):
-    with pytest.raises(UserError, match=f"a {name}, which an estimator by templates.*train"):
+    with pytest.raises(UserError, match=f"a {name}, which a template estimator.*train"):
         getattr(estimator, name)
-    with pytest.raises(UserError, match="belief maps, which an estimator"):
+    with pytest.raises(UserError, match="belief maps, which a template estimator"):
         estimator.maps(rendered.image)
     with pytest.raises(UserError, match="inputs of a network"):
         estimator.views(rendered.image, rendered.scene.K)

@@ -124,7 +124,9 @@ def read_object(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
     content = read_json(path, max_bytes) if path.exists() else {}
     if not isinstance(content, dict):
         fix = "restore the file from a copy, or choose another folder"
-        raise UserError(f"{path}, which is not a JSON object", "a file of `dopepp render`", fix)
+        raise UserError(
+            f"{path}, which is not a JSON object", "a file written by `dopepp render`", fix
+        )
     return content
 
 

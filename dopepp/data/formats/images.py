@@ -55,7 +55,7 @@ def picture(
     except ValueError as error:
         problem = f"unreadable or truncated, {len(content):,} bytes ({error})"
         most = f"{pictures.MAX_PIXELS / 1e6:.0f} megapixels"
-        allowed = f"a whole {', '.join(FORMATS)} image of at most {most}"
+        allowed = f"a complete {', '.join(FORMATS)} image of at most {most}"
         node["image"].report(problem, allowed)
         return None
     if modes and image.mode not in modes:

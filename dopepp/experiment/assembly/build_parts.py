@@ -54,7 +54,7 @@ def _ycb_parts(root: Path, objects: Sequence[str] | None) -> list[Part]:
     names = PAPER_OBJECTS if objects is None else objects
     unknown = [name for name in names if name not in classes]
     if unknown:
-        fix = "set data.objects to names of this list"
+        fix = "set data.objects to one or more of these names"
         raise UserError(f"data.objects with {unknown[0]!r}", ", ".join(classes), fix)
     return [ycb_part(root, name) for name in names]
 

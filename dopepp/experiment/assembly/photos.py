@@ -62,7 +62,7 @@ def held_out_photos(data: DataConfig, split: Literal["val", "test"]) -> PhotoBac
         return photos
     raise UserError(
         f"virtual.backgrounds={data.virtual.backgrounds} with {len(photos.paths)} photos, too few "
-        "to keep some of them for tuning",
+        "to reserve some for tuning",
         _NEEDED,
         "add photos, leave out virtual.backgrounds (procedural backgrounds), or set tune=false",
     )

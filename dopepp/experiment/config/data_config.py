@@ -107,7 +107,7 @@ class VirtualConfig:
             missing = "camera=FILE" if self.camera is None else "working_distance=[0.3,0.8]"
             given = "working_distance" if self.camera is None else "camera"
             allowed = "camera and working_distance together, or neither"
-            raise UserError(f"{given} alone", allowed, f"add {missing}")
+            raise UserError(f"{given} without {missing}", allowed, f"add {missing}")
         lens = self.camera
         K = camera_matrix(lens.fx, lens.fy, lens.cx, lens.cy)
         return View((lens.width, lens.height), K, self.working_distance)
@@ -268,7 +268,7 @@ class DataConfig:
         if chosen is None:
             raise UserError(
                 f"data.image_sets.{split}=null with data.real_fraction={self.real_fraction:g}",
-                "an image set, or renders alone",
+                "an image set, or only renders",
                 f"set data.image_sets.{split}=FOLDER, or data.real_fraction=0",
             )
         return chosen

@@ -246,7 +246,7 @@ def _check_combination(options: EvaluationConfig) -> None:
         )
     if options.tune and (options.protocols or options.negatives is not None or options.templates):
         problem = "tune=true with shading, scale, by, negatives or templates"
-        fix = "tune first, then measure"
+        fix = "tune first, then evaluate"
         raise UserError(problem, "tune=true without these options", fix)
 
 
@@ -273,7 +273,7 @@ def _tune_only(
         raise UserError(
             "tune=true with shading, scale or by",
             "tune=true without these options",
-            "tune first, then measure the tuned checkpoint with these options",
+            "tune first, then evaluate the tuned checkpoint with these options",
         )
     if options.ckpt_path is None or len(loaded) > 1:
         is_missing = options.ckpt_path is None

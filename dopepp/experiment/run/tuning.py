@@ -158,8 +158,8 @@ def tune(
         target: Number of pictures without objects, and permitted rate of false positives.
 
     Raises:
-        UserError: There are no detections, all of them are correct or all wrong, or the covariances
-            differ too much from the errors.
+        UserError: There are no detections, all of them are correct, all are incorrect, or the
+            covariances differ too much from the errors.
     """
     old, cache = estimator.recovery, TuningCache()
     estimator = cache.with_cached_maps(estimator)
@@ -341,13 +341,13 @@ def choose(
         false_positive_rate: Permitted share of the images without objects with a reported pose.
         refined: Whether the score of refined poses is chosen. The fewer refined poses there are,
             the closer its weights stay to the weights of the verification. They stay equal if all
-            poses are correct or all wrong.
+            poses are correct or all are incorrect.
 
     Returns:
         Values of :class:`RecoveryOptions`.
 
     Raises:
-        UserError: There are no detections of the network, or all are correct or all wrong.
+        UserError: There are no detections of the network, or all are correct or all are incorrect.
     """
     features = np.concatenate([shown.features, empty.features])
     correct = np.concatenate([shown.correct, empty.correct])
@@ -355,12 +355,12 @@ def choose(
     if refined and (not correct.any() or correct.all()):
         weights = np.array(RecoveryOptions().refined_weights)
     elif not correct.any() or correct.all():
-        kind = "right" if correct.any() else "wrong"
+        kind = "correct" if correct.any() else "incorrect"
         raise UserError(
             f"{len(correct)} validation detections, all of them {kind}"
             if len(correct)
             else "no detection on any validation image",
-            "right and wrong detections to learn from",
+            "correct and incorrect detections to learn from",
             "train longer, or raise data.num_val and num_empty",
         )
     else:

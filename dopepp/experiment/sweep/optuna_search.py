@@ -116,7 +116,7 @@ class _Trials:
         if foreign:  # a trial must not resume the job of another study
             raise UserError(
                 f"{folder} with the jobs {', '.join(sorted(foreign))} of another study",
-                f"a folder of the study {study.study_name} alone",
+                f"a folder that holds only jobs of the study {study.study_name}",
                 "set another search.study=NAME, or move the folder away",
             )
 

@@ -23,7 +23,7 @@ from dopepp.recovery.detection import Detection
 NEARER, FARTHER = 2.0, 4.0  # factors on the expected distances for a further search
 
 BELIEVED: Final = (0.4, 6)
-"""Least mean belief and number of keypoints of a detection outside the expected distances."""
+"""Smallest mean belief and number of keypoints of a detection outside the expected distances."""
 
 MIN_PX: Final = 24  # smallest side of an image whose sharpness can be measured
 

@@ -25,7 +25,7 @@ from dopepp.inference.refinement.solver import UndecidedError
 
 SMALLEST_PX: Final = 12  # length below which a part shows no outline
 MARGIN: Final = 0.35  # margin of a crop, share of the part's extent
-EDGE_PX: Final = 6.0  # additional margin: the least search distance of an outline
+EDGE_PX: Final = 6.0  # additional margin: the smallest search distance of an outline
 STEPS: Final = 16  # bins per channel
 UNSEEN: Final = 0.3  # initial count of each colour in both histograms
 
@@ -36,7 +36,7 @@ MOST: Final = 3.0
 """Bound of the log odds (20 to 1), because neighbouring pixels are not independent."""
 
 LONGEST_PX: Final = 250  # length above which the pixels of a crop are subsampled
-FEWEST: Final = 60  # least number of pixels of a histogram
+FEWEST: Final = 60  # smallest number of pixels of a histogram
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from dopepp.parts.mesh import Faces, Vertices, face_areas, weld
 from dopepp.parts.mesh.decimate import decimate
 from dopepp.parts.part import MAX_LIGHT_FACES
 
-NEAR: Final = 1e-3  # least depth of every vertex, metres
+NEAR: Final = 1e-3  # smallest depth of every vertex, metres
 
 WINDOW_PX: Final = 3.0
 """Radius of the disc of the mask that determines a point's outward direction."""
@@ -33,7 +33,7 @@ BESIDE_PX: Final = 1.25
 """Distance from the outline at which the mask must differ on both sides."""
 
 LONG_PX: Final = 4.0
-"""Least length of an edge that determines the normal; shorter edges zigzag."""
+"""Smallest length of an edge that determines the normal; shorter edges zigzag."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,12 +27,12 @@ Visible = Bool[np.ndarray, "points"]
 
 # Lengths are in spacings of the surface points unless stated otherwise.
 MAX_POINTS: Final = 3000  # further points slow refinement without improving accuracy
-MIN_POINTS: Final = 100  # least points that describe a surface
+MIN_POINTS: Final = 100  # smallest number of points that describe a surface
 NEIGHBOURS: Final = 12  # points that a normal is estimated from
 FLAT: Final = 0.3  # neighbours farther from a plane belong to another face
 SLIVER: Final = 0.3  # twice the area (squared spacings) of a triangle that determines a plane
 DISC: Final = 1.5  # radius of a disc: of random points, fewer than 1 in 1,000 discs is empty
-CLEARANCE: Final = 0.4  # least distance between a point and a disc that hides it
+CLEARANCE: Final = 0.4  # smallest distance between a point and a disc that hides it
 STEEPEST: Final = 0.2  # cosine between ray and normal below which a disc counts as a point
 LONGEST_PX: Final = 112  # longer crops are subsampled: 10,000 pixels determine six numbers
 MARGIN: Final = 0.3  # margin of a crop, share of the part's extent

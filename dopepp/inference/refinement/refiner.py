@@ -94,7 +94,7 @@ class Refiner:
         scale_error = check("scale_error", scale_error, float, Range(0.0, 0.1))
         terms = (refine,) if isinstance(refine, str) else tuple(refine)
         if not terms or not set(terms) <= set(TERMS):
-            allowed = f"{', '.join(TERMS)}, several of them, or none"
+            allowed = f"one or more of {', '.join(TERMS)}, or none"
             raise UserError(f"refine={refine!r}", allowed, "use only these words")
         self._refiners = {part.name: PartRefiner(part, terms, scale_error) for part in parts}
         self._cuboids = {part.name: part.cuboid for part in parts}

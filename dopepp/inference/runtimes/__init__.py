@@ -193,7 +193,7 @@ def invalid_export(path: Path, problem: object, allowed: str = "") -> UserError:
     reason = " ".join(str(problem).split()) or type(problem).__name__
     return UserError(
         f"{path}: {reason:.300}",
-        allowed or "a whole file written by `dopepp export`",
+        allowed or "a complete file written by `dopepp export`",
         f"{_FIX}; load no file that you do not trust",
     )
 

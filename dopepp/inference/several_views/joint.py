@@ -27,7 +27,7 @@ from dopepp.inference.several_views.views_result import Status, ViewEvidence, Wo
 from dopepp.recovery.detection import log_odds
 
 SUPPORTING: Final = 0.2
-"""Least probability at which a view supports a pose."""
+"""Smallest probability at which a view supports a pose."""
 
 AGREEING: Final = 0.7
 """Smallest agreement of the outline (:class:`OutlineAgreement`) at which a view supports a pose. At

@@ -49,7 +49,7 @@ from dopepp.recovery.detection import Detection
 
 COARSE_PX: Final = 80.0  # largest diameter of the part on the image that is searched everywhere
 FINE_PX: Final = 140.0  # largest diameter of the part on the image that matches are ranked on
-SMALLEST_PX: Final = 12.0  # least diameter that templates can detect
+SMALLEST_PX: Final = 12.0  # smallest diameter that templates can detect
 SCALE_STEP: Final = 1.13  # ratio of neighbouring distances
 PERSPECTIVE: Final = 0.15  # step of diameter over distance between two sets of drawings
 OCTAVE: Final = 2.0  # ratio of the diameters that are ranked on one image

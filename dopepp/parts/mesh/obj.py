@@ -215,7 +215,7 @@ def read_texture(path: Path) -> Picture:
     try:
         return read_picture(path)
     except ValueError as error:
-        allowed = f"a whole {', '.join(FORMATS)} image of at most {MAX_SIDE}×{MAX_SIDE} pixels"
+        allowed = f"a complete {', '.join(FORMATS)} image of at most {MAX_SIDE}×{MAX_SIDE} pixels"
         fix = "save the texture again in this form"
         raise UserError(f"texture {path}: {error}", allowed, fix) from error
 

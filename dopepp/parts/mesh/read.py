@@ -137,7 +137,7 @@ def ycb_part(root: str | Path, name: str) -> Part:
             "set data.root to the root of YCB-Video, or unpack YCB_Video_Models into it",
         )
     if name not in names:
-        fix = "set data.objects to names of this list"
+        fix = "set data.objects to one or more of these names"
         raise UserError(f"unknown object {name!r}", ", ".join(names), fix)
     points_path, mesh_path = models / name / "points.xyz", models / name / "textured.obj"
     mesh = read_mesh(mesh_path, unit="m") if mesh_path.exists() else None
@@ -204,7 +204,7 @@ def _checked(path: Path, raw: RawMesh) -> Mesh:
 def _damaged(path: Path, problem: str, fix: str = "export the mesh again") -> UserError:
     """Return the error for a mesh file that is damaged or too large."""
     content = "triangles, finite coordinates and colours of their range"
-    allowed = f"a whole mesh with {content}, under {MAX_BYTES / 1e6:.0f} MB"
+    allowed = f"a complete mesh with {content}, under {MAX_BYTES / 1e6:.0f} MB"
     return UserError(f"mesh {path} with {problem}", allowed, fix)
 
 

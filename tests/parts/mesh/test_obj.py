@@ -86,7 +86,7 @@ def test_a_vertex_on_a_seam_is_split(tmp_path, write):
         ("map_Kd maps/../../out.png\n", r"map_Kd 'maps/\.\./\.\./out\.png' lies outside of its"),
         ("map_Kd C:\\out.png\n", "lies outside of its folder"),
         ("map_Kd \n", "does not exist"),
-        ("map_Kd cut.png\n", r"texture .*cut\.png: .*a whole BMP, JPEG"),
+        ("map_Kd cut.png\n", r"texture .*cut\.png: .*a complete BMP, JPEG"),
         ("map_Kd cut.jpg\n", r"texture .*cut\.jpg: .*truncated"),
         ("map_Kd wide.png\n", r"8193×1 pixels; .*at most 8192×8192"),
         ("map_Kd a.mtl\n", r"texture .*a\.mtl: cannot identify"),

@@ -87,7 +87,7 @@ def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Pa
     for name in wanted:
         if name not in by_name:
             problem, allowed = f"data.objects with {name!r}", ", ".join(by_name)
-            raise UserError(problem, allowed, "set data.objects to names of this list")
+            raise UserError(problem, allowed, "set data.objects to one or more of these names")
     return [part_of(by_name[name]) for name in wanted]
 
 
@@ -106,7 +106,7 @@ def parts_by_id(root: Path, parts: Sequence[Part]) -> dict[int, Part]:
             raise UserError(
                 f"part {part.name!r}, which is not in the data set {root}",
                 ", ".join(names) or f"obj_NNNNNN, as there is no {MODEL_FOLDERS[0]}/{INFO_FILE}",
-                f'choose a part of this list, or write "name": "{part.name}" into {INFO_FILE}',
+                f'choose one of these parts, or write "name": "{part.name}" into {INFO_FILE}',
             )
         numbered[number] = part
     return numbered

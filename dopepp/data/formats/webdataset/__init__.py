@@ -34,7 +34,7 @@ KEY_FILE: Final = "key_to_shard.json"
 _IMAGE: Final = re.compile(r"(rgb|gray)\.(png|jpe?g|tiff?)")
 _DEPTH: Final = re.compile(r"depth\.(png|tiff?)")
 _ALLOWED: Final = (
-    f"a whole uncompressed tar of plain files KEY.EXTENSION, each once and of at most "
+    f"a complete uncompressed tar of plain files KEY.EXTENSION, each once and of at most "
     f"{MAX_MEMBER_BYTES / 1e6:.0f} MB, with rgb (or gray) and camera.json for every key"
 )
 

@@ -52,7 +52,7 @@ def read_image_set(root: Path, image_set: str, subset: Subset) -> list[str]:
     path = root / "image_sets" / f"{image_set}.txt"
     if not path.is_file():
         lists = sorted(p.stem for p in path.parent.glob("*.txt") if p.stem != "classes")
-        fix = f"set data.image_sets to a name of this list, or add {path}"
+        fix = f"set data.image_sets to one of these names, or add {path}"
         raise UserError(f"image set {image_set!r}", f"one of {lists}", fix)
     frames = []
     for line in path.read_text().split():

@@ -78,7 +78,7 @@ class YcbVideoReader:
         unknown = [part.name for part in parts if part.name not in classes]
         if unknown:
             allowed = f"the names in classes.txt: {classes}"
-            fix = "set data.objects to names of this list"
+            fix = "set data.objects to one or more of these names"
             raise UserError(f"objects {unknown}", allowed, fix)
         self._parts = {classes.index(part.name) + 1: part for part in parts}
         if image_set is not None:

@@ -54,7 +54,7 @@ WIDENED: Final = 2.0
 the outline contradict each other, so the image has too little weight against the prior."""
 
 SURE: Final = 0.85
-"""Agreement below which the search is extended, and least agreement of a pose that it accepts."""
+"""Agreement below which the search is extended, and smallest agreement of an accepted pose."""
 
 # Support that the extended search requires of a pose, and its smallest gain over the first pose.
 SUPPORTED: Final = 0.35

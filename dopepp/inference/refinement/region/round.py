@@ -41,15 +41,15 @@ from dopepp.inference.refinement.solver import (
 
 RING: Final = 0.2  # width of the part's surroundings, share of its extent
 SAMPLES: Final = 7  # steps on each side of a normal, which are 1 to 4 pixels
-MIN_POINTS: Final = 24  # least outline points that determine a pose
+MIN_POINTS: Final = 24  # smallest number of outline points that determine a pose
 
 MIN_GAIN: Final = 2.0
-"""Least increase of the information's log determinant; below it, the image is uninformative."""
+"""Smallest increase of the information's log determinant; below it, the image is uninformative."""
 
 FIRM: Final = (math.radians(1.0), 5e-3)
 """Standard deviations of a precise pose: radians, and metres per metre of distance."""
 
-MIN_AGREEING: Final = 0.3  # least agreement of a refined outline that is accepted
+MIN_AGREEING: Final = 0.3  # smallest agreement of a refined outline that is accepted
 AGREE_PX: Final = 2.0  # largest distance from the image's outline of a point that agrees
 
 INFORMATIVE: Final = 0.1  # pixels⁻²: information of a point that counts as support

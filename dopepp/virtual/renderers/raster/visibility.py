@@ -308,7 +308,7 @@ def _clear_to_plane(
         inverse: Coefficients (a, b, c) of the plane's inverse depth a u + b v + c, 1/metres.
         origin: Column and row of the buffer's first pixel.
         samples: Offsets of the samples from the pixel's centre, shape (S, 2).
-        near: Least depth that is drawn, metres.
+        near: Smallest depth that is drawn, metres.
         inverse_depth: The buffer, shape (height, width, S).
     """
     height, width, num_samples = inverse_depth.shape
