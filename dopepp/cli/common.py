@@ -166,7 +166,7 @@ def report_errors() -> Iterator[None]:
 
 @contextmanager
 def resumable(advice: str = RESUME) -> Iterator[None]:
-    """Report errors, and exit in order on Ctrl-C or SIGTERM.
+    """Report errors, and exit cleanly on Ctrl-C or SIGTERM.
 
     Args:
         advice: Recommendation in the message of an interruption.

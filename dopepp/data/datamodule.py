@@ -293,7 +293,7 @@ class PoseLoader(DataLoader[Any]):
             yield batch
         else:
             return
-        # This ends the workers in order. Otherwise the exception's traceback keeps them in a
+        # This ends the workers cleanly. Otherwise the exception's traceback keeps them in a
         # reference cycle, and the collector closes their queues before waiting for them.
         self._iterator = None
         raise batch

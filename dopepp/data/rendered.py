@@ -95,7 +95,7 @@ class RenderedSource:
 
 
 def rendered_sample(rendered: Rendered, source: str, key: str) -> Sample:
-    """Turn a rendered image into a sample of all its targets, even hidden targets."""
+    """Turn a rendered image into a sample of all its targets, including hidden targets."""
     scene = rendered.scene
     instances = [
         Instance(

@@ -59,7 +59,7 @@ FILES: Final = {
     "scale.png": "pass rate at other camera distances (`scale.csv`)",
     "scale_examples.png": "the same scenes at every scale, drawn as in `overlay.png`",
     "compare.md": "the methods side by side (numbers in `compare.csv`)",
-    "table.md": "the methods in the layout of the paper, with the paper's figures (`table.csv`)",
+    "table.md": "the methods in the layout of the paper, with the paper's values (`table.csv`)",
     "lr_finder.png": "loss against learning rate (numbers in `lr_finder.csv`)",
     "cost.json": "parameters, operations, and times of whole frames and of the network alone",
     "frame_rate.png": "frames per second over time; dashed: the network alone (`frames.csv`)",

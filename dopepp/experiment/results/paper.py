@@ -1,4 +1,4 @@
-"""Write the runs of a sweep as a table in the paper's layout, next to the paper's figures.
+"""Write the runs of a sweep as a table in the paper's layout, next to the paper's values.
 
 A config describes its table under ``table`` (see ``conf/experiment/``).
 
@@ -58,7 +58,7 @@ TEXT_FILE: Final = "table.md"
 TABLE_FILE: Final = "table.csv"
 
 Printed = Mapping[str, Mapping[str, Mapping[str, int | float]]]
-"""Printed figures by label, object and measure."""
+"""Printed values by label, object and measure."""
 
 _LABELS: Final = ("method", "object", "measure")
 """Headings of text columns."""
@@ -66,7 +66,7 @@ _LABELS: Final = ("method", "object", "measure")
 _METHOD, _OBJECT, _MEASURE = _LABELS
 _STRICT: Final = "add_01d"
 _NETWORK: Final = "network"
-"""Key of the whole network's figures, in place of an object."""
+"""Key of the whole network's values, in place of an object."""
 _PAPER: Final = "the paper"
 
 _PASS_FIELDS: Final = {rate.threshold: rate.field for rate in (ADD_5CM, ADD_10CM)}
@@ -84,9 +84,9 @@ class PaperTable:
         kind: A key of :data:`KINDS`.
         threshold: Threshold of the paper's pass rate: 0.05 m for parts, 0.1 m for YCB-Video.
         labels: Label in the paper for each override; several labels are joined.
-        paper: Figures that the paper prints, by label, object and measure. A measure is a field of
+        paper: Values that the paper prints, by label, object and measure. A measure is a field of
             ``PoseRow`` (``pass`` for the paper's pass rate) or a heading. Rates are in percent.
-        recomputed: Figures of other methods, measured with the functions of this project.
+        recomputed: Values of other methods, measured with the functions of this project.
         notes: Notes below the table.
     """
 
@@ -136,11 +136,11 @@ class PaperTable:
         return _PASS_FIELDS[self.threshold]
 
     def field(self, key: str) -> str:
-        """Return the field of ``PoseRow`` for a key of a config's figures."""
+        """Return the field of ``PoseRow`` for a key of a config's values."""
         return self.pass_field if key == "pass" else key
 
     def printed(self, label: str, measure: str) -> str:
-        """Return the text of a figure that the paper prints for a network."""
+        """Return the text of a value that the paper prints for a network."""
         return _number(self.paper.get(label, {}).get(_NETWORK, {}).get(measure))
 
     def methods(self, entries: Sequence[Entry]) -> dict[str, Entry]:
@@ -196,7 +196,7 @@ def _notes(table: PaperTable, entries: Sequence[Entry]) -> list[str]:
             option = "model.backbone.weights_path=FILE"
             notes.append(f"{sentence}; {option} starts it from a file of torchvision's.")
     if not table.paper:
-        notes.append("The paper has no table of these figures.")
+        notes.append("The paper has no table of these values.")
     return notes
 
 
@@ -225,7 +225,7 @@ def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
         texts.setdefault((value.method, value.object), {})[value.measure] = value.summary
     measured = [entry for entry in methods.values() if entry.reports]
     objects = list(dict.fromkeys(name for entry in measured for name in entry.objects))
-    if not objects:  # without measurements, show the paper's figures and the reasons
+    if not objects:  # without measurements, show the paper's values and the reasons
         objects = list(dict.fromkeys(name for row in layout.paper.values() for name in row))
     rows = []
     for name in objects:
@@ -257,14 +257,14 @@ def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
 def _pose_row(
     layout: PaperTable, method: str, name: str, texts: Row, printed: Mapping[str, float]
 ) -> Row:
-    """Return a table row with every measure, the paper's figure for it, and Δ to the baseline.
+    """Return a table row with every measure, the paper's value for it, and Δ to the baseline.
 
     Args:
         layout: Layout of the paper's table.
         method: The method.
         name: Name of the object.
         texts: Text of each measure and Δ, by field.
-        printed: Figures that the paper prints, by key of the layout.
+        printed: Values that the paper prints, by key of the layout.
     """
     row = {_METHOD: method, _OBJECT: name}
     for key in ("pass", "auc_10cm", _STRICT, "median_rotation_deg"):
@@ -284,7 +284,7 @@ def _number(value: float | None) -> str:
 
 
 def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
-    """Return the pass rates at every share with the paper's figures and Δ, and plot their curves.
+    """Return the pass rates at every share with the paper's values and Δ, and plot their curves.
 
     Rates are means over seeds. Δ refers to the first method at the same share, or to the first
     refined method for refined poses. The interval of Δ is Student's t interval of the differences

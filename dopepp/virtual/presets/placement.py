@@ -41,7 +41,7 @@ class FreeTurning(Checked):
     kind: Literal["free"] = "free"
 
     def draw(self, rng: Generator) -> RotationMatrix:
-        """Return a rotation from the object to the camera frame."""
+        """Draw a rotation from the object to the camera frame."""
         return random_rotation(rng)
 
 
@@ -62,7 +62,7 @@ class FacingTurning(Checked):
     kind: Literal["facing"] = "facing"
 
     def draw(self, rng: Generator) -> RotationMatrix:
-        """Return a rotation from the object to the camera frame."""
+        """Draw a rotation from the object to the camera frame."""
         in_plane = np.radians(rng.uniform(-self.in_plane_deg, self.in_plane_deg))
         tilt = np.arccos(rng.uniform(np.cos(np.radians(self.tilt_deg)), 1.0))
         azimuth = rng.uniform(0.0, 2 * np.pi)
@@ -90,7 +90,7 @@ class UprightTurning(Checked):
     kind: Literal["upright"] = "upright"
 
     def draw(self, rng: Generator) -> RotationMatrix:
-        """Return a rotation from the object to the camera frame."""
+        """Draw a rotation from the object to the camera frame."""
         elevation = np.radians(rng.uniform(*self.elevation_deg))
         roll = np.radians(rng.uniform(-self.roll_deg, self.roll_deg))
         azimuth = rng.uniform(0.0, 2 * np.pi)
@@ -170,7 +170,7 @@ class OffsetPlacement(_Placement):
             )
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
-        """Return the object's origin in the camera frame, metres."""
+        """Draw the object's origin in the camera frame, metres."""
         x, y = rng.uniform(-self.lateral, self.lateral, 2)
         return np.array([x, y, self._draw_depth(rng)])
 
@@ -201,7 +201,7 @@ class DistancePlacement(_Placement):
     kind: Literal["distance"] = "distance"
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
-        """Return the object's origin in the camera frame, metres."""
+        """Draw the object's origin in the camera frame, metres."""
         depth = rng.uniform(self.nearest, self.farthest)
         pixel = rng.uniform(self.margin, 1 - self.margin, 2) * size - 0.5
         return np.asarray(depth * np.linalg.solve(K, [*pixel, 1.0]))
@@ -272,7 +272,7 @@ class WorkingPlacement(_Placement):
     kind: Literal["working"] = "working"
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
-        """Return the object's origin in the camera frame, metres."""
+        """Draw the object's origin in the camera frame, metres."""
         depth, offset = rng.uniform(self.nearest, self.farthest), rng.uniform(-0.5, 0.5, 2)
         lower, upper = rotated_hull.min(axis=0), rotated_hull.max(axis=0)
         # The front of the part appears larger than its middle.

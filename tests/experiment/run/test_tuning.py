@@ -81,7 +81,7 @@ def test_the_threshold_lets_no_more_pass_than_it_may():
     assert choose(scored(6, 300), NOTHING)["min_score"] < 1e-300  # silence needs no threshold
 
 
-@pytest.mark.parametrize(("correct", "what"), [(False, "wrong"), (True, "right")])
+@pytest.mark.parametrize(("correct", "what"), [(False, "incorrect"), (True, "correct")])
 def test_nothing_to_learn_from_is_said(correct, what):
     with pytest.raises(UserError, match=f"all of them {what}"):
         choose(replace(scored(7, 50), correct=np.full(50, correct)), NOTHING)
