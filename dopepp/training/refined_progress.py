@@ -79,7 +79,8 @@ class RefinedProgress(Callback):
     def _measure_and_report(self, trainer: Trainer, system: PoseSystem) -> bool:
         """Measure, log, print and draw; return whether the goal is reached."""
         estimator = self._estimator(system)
-        metrics = PoseMetrics(system.parts)
+        # Only the first process measures, so nothing is gathered.
+        metrics = PoseMetrics(system.parts, sync_on_compute=False)
         share, count, precision = self._measure(estimator, metrics, 0, NUM_PICTURES)
         if self.stop_at is not None and share >= self.stop_at:
             share, count, precision = self._measure(

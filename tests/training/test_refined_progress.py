@@ -129,3 +129,16 @@ def test_the_estimator_has_the_networks_present_weights(make_system, pictures):
     expected = system.network.eval().maps(pixels[None])
     for mine, theirs in zip((belief, field), expected, strict=True):
         np.testing.assert_allclose(mine.numpy(), theirs[0].detach().numpy(), atol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.ddp
+def test_two_processes_stop_together(command, tmp_path):
+    done = command(
+        "train.py", "experiment=quickstart", "trainer=ddp", "trainer.accelerator=cpu", "stop_at=0",
+        "data.samples_per_epoch=128", "data.num_val=4", "data.num_test=2", "data.num_workers=0",
+        "tune=false", f"hydra.run.dir={tmp_path / 'run'}", timeout=240, code=0,
+    )  # fmt: skip
+    assert done.out.count("stop_at=0 is reached") == 1
+    epochs = {row["epoch"] for row in read_csv(tmp_path / "run" / "metrics.csv")}
+    assert epochs - {""} == {"0"}
