@@ -24,7 +24,8 @@ PICTURE: Final = "refined.png"  # curve in the run folder
 
 NUM_PICTURES: Final = 40
 NUM_CONFIRMING: Final = 100  # pictures on which a reached goal is confirmed
-LEAST_SCORE: Final = 0.5  # reported poses are more likely right than wrong
+MIN_SCORE: Final = 0.5  # reported poses are more likely correct than incorrect
+MAX_SHARE: Final = 0.1  # largest share of the time that measurements take
 
 
 class RefinedProgress(Callback):
@@ -38,7 +39,8 @@ class RefinedProgress(Callback):
         pictures: Held-out pictures, at the camera's resolution.
         refine: Evidence that refines the poses.
         stop_at: Share that ends the training, once it is confirmed on more pictures; None: never.
-        every_s: Least time between two measurements, seconds.
+        every_s: Shortest time between two measurements, seconds. It is longer if measurements would
+            take more than a tenth of the time.
     """
 
     def __init__(
@@ -51,7 +53,7 @@ class RefinedProgress(Callback):
         self.pictures, self.refine, self.stop_at, self.every_s = pictures, refine, stop_at, every_s
         self.curve: list[tuple[float, float, float, float]] = []
         """Minutes of training, share, and the ends of its interval."""
-        self._minutes_before, self._begin, self._last = 0.0, 0.0, -every_s
+        self._minutes_before, self._begin, self._due = 0.0, 0.0, 0.0
 
     def state_dict(self) -> dict[str, Any]:
         """Return the curve and the minutes of training."""
@@ -64,16 +66,16 @@ class RefinedProgress(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clock."""
-        self._begin = time.monotonic()
-        self._last = self._begin - self.every_s
+        self._begin = self._due = time.monotonic()
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Measure the network, unless a measurement was made recently; stop at the goal."""
         assert isinstance(pl_module, PoseSystem)
-        reached, waited_s = False, time.monotonic() - self._last
-        if trainer.is_global_zero and not trainer.sanity_checking and waited_s >= self.every_s:
+        reached, start = False, time.monotonic()
+        if trainer.is_global_zero and not trainer.sanity_checking and start >= self._due:
             reached = self._measure_and_report(trainer, pl_module)
-            self._last = time.monotonic()
+            end = time.monotonic()
+            self._due = end + max(self.every_s, (end - start) / MAX_SHARE)
         trainer.should_stop = trainer.should_stop or trainer.strategy.broadcast(reached)
 
     def _measure_and_report(self, trainer: Trainer, system: PoseSystem) -> bool:
@@ -108,7 +110,7 @@ class RefinedProgress(Callback):
         checkpoint = parse_description(system.payload)
         network = system.network.for_inference()
         estimator = PoseEstimator(network, checkpoint, system.device, self.refine, system.parts)
-        return estimator.reporting(LEAST_SCORE)
+        return estimator.reporting(MIN_SCORE)
 
     def _measure(
         self, estimator: PoseEstimator, metrics: PoseMetrics, first: int, end: int

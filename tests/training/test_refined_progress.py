@@ -10,6 +10,7 @@ from dopepp.drawing.pictures import read_rgb
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.functional import wilson_interval
 from dopepp.recovery.detection import Detection
+from dopepp.training import refined_progress
 from dopepp.training.refined_progress import NUM_CONFIRMING, NUM_PICTURES, RefinedProgress
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import PRESETS
@@ -98,12 +99,16 @@ def test_the_goal_ends_the_training(measure, capsys):
     assert "stop_at=0.95 is reached" in shown
 
 
-def test_measurements_keep_their_distance_in_time(measure):
+def test_measurements_keep_their_distance_in_time(measure, monkeypatch):
+    monkeypatch.setattr(refined_progress, "MAX_SHARE", 1e9)
     progress, _, known = measure(lambda number: False, epochs=3, every_s=0.0)
     assert (len(progress.curve), known.asked) == (3, 3 * NUM_PICTURES)
     minutes = [point[0] for point in progress.curve]
     assert minutes == sorted(minutes)
     progress, _, _ = measure(lambda number: False, epochs=3, every_s=1e6)
+    assert len(progress.curve) == 1
+    monkeypatch.setattr(refined_progress, "MAX_SHARE", 1e-9)  # a measurement takes too long
+    progress, _, _ = measure(lambda number: False, epochs=3, every_s=0.0)
     assert len(progress.curve) == 1
 
 
