@@ -22,7 +22,6 @@ import torch
 import trimesh
 from manifold3d import CrossSection, Manifold
 from runtimes import config_of
-from safetensors.torch import save_file
 
 from dopepp.data.batch import Batch
 from dopepp.data.datamodule import PoseDataModule
@@ -30,6 +29,8 @@ from dopepp.experiment.assembly.build_parts import build_parts
 from dopepp.experiment.assembly.build_sources import build_datamodule
 from dopepp.experiment.assembly.build_system import build_system
 from dopepp.models.network import PoseNetwork
+from dopepp.models.start import output_tensors
+from dopepp.models.storage import write_safetensors
 from dopepp.training.system import PoseSystem
 
 DIAMETERS_MM = (35.0, 60.0)
@@ -145,13 +146,13 @@ def _endless(data: PoseDataModule) -> Iterator[Batch]:
 
 def save_start(network: PoseNetwork, path: Path) -> None:
     """Write the weights of all layers except the output layers, in half precision."""
-    outputs = {tensor.data_ptr() for layer in network.head.outputs for tensor in layer.parameters()}
+    outputs = output_tensors(network)
     weights = {
         name: value.half() if value.is_floating_point() else value
         for name, value in network.state_dict().items()
-        if value.data_ptr() not in outputs
+        if name not in outputs
     }
-    save_file({name: value.cpu().contiguous() for name, value in weights.items()}, path)
+    write_safetensors(path, weights, {})
 
 
 def main() -> None:

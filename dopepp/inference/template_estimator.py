@@ -29,7 +29,7 @@ from dopepp.inference.picture import (
     checked_region,
     merge_scales,
 )
-from dopepp.inference.refinement.refiner import Refine
+from dopepp.inference.refinement.refiner import Refine, refine_terms
 from dopepp.inference.templates import TemplateDetector
 from dopepp.inference.templates.ranking import learned_ranking
 from dopepp.inference.templates.silence import background_log_odds
@@ -111,8 +111,7 @@ class TemplateEstimator(PoseEstimator):
 
     def _refine_by(self, refine: Refine | None, parts: Sequence[Part]) -> None:
         """Set the refinement, which must include the image region."""
-        terms = (refine,) if isinstance(refine, str) else refine or ()
-        if "region" not in terms:
+        if "region" not in refine_terms(refine):
             fix = "leave out refine, or set it to one of these"
             raise UserError(f"templates with refine={refine}", "region, or region and depth", fix)
         super()._refine_by(refine, parts)

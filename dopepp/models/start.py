@@ -33,7 +33,7 @@ def start_from_parts(network: PoseNetwork) -> bool:
     """
     weights, _ = read_safetensors(_FILE)
     of_attention = {name for name in network.state_dict() if name.startswith("attention.")}
-    return _copy(network, weights, _output_tensors(network) | of_attention)
+    return _copy(network, weights, output_tensors(network) | of_attention)
 
 
 def start_from_checkpoint(network: PoseNetwork, path: Path) -> None:
@@ -48,7 +48,7 @@ def start_from_checkpoint(network: PoseNetwork, path: Path) -> None:
     weights = checkpoint.state_dict
     others: set[str] = set()
     if len(checkpoint.parts) != network.num_objects:
-        others = _output_tensors(network)
+        others = output_tensors(network)
         weights = {name: value for name, value in weights.items() if name not in others}
     if not _copy(network, weights, others):
         raise UserError(
@@ -71,7 +71,7 @@ def _copy(network: PoseNetwork, weights: Mapping[str, Tensor], others: set[str])
     return True
 
 
-def _output_tensors(network: PoseNetwork) -> set[str]:
+def output_tensors(network: PoseNetwork) -> set[str]:
     """Return the names of the weights that belong to single objects."""
     layers = {id(layer) for layer in network.head.outputs}
     return {

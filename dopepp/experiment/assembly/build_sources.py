@@ -54,7 +54,7 @@ _DIVIDED: Final = ("bop", "ndds", "webdataset")  # formats whose folders `share_
 def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModule:
     """Build the DataModule: training images from ``seed``, others from ``data.eval_seed``."""
     backgrounds = training_backgrounds(data)
-    val = held_out_source(data, parts, "val")
+    val = val_pictures = held_out_source(data, parts, "val")
     if data.virtual.view is not None and isinstance(val, RenderedSource):
         val = validation_windows(data, parts)
     return PoseDataModule(
@@ -70,6 +70,7 @@ def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModul
         masking=build_optional("masking", RandomMask, data.masking),
         augment=build_optional("augmentation", Photometric, data.augment),
         backgrounds=backgrounds,
+        val_pictures=val_pictures,
     )
 
 

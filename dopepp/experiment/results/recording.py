@@ -38,7 +38,7 @@ from dopepp.experiment.results.measurement import (
 )
 from dopepp.experiment.results.report import Report
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.refinement.refiner import Refine
+from dopepp.inference.refinement.refiner import Refine, refine_terms
 from dopepp.metrics.pose import PoseMetrics
 from dopepp.parts.part import Parts
 from dopepp.recovery.recover import summary
@@ -174,8 +174,7 @@ def with_refining(
     for name, estimator in estimators.items():
         pairs[name] = estimator
         if refine is not None and estimator.has_network:
-            terms = " + ".join([refine] if isinstance(refine, str) else refine)
-            pairs[f"{name} + {terms}"] = refining(estimator, refine, parts)
+            pairs[" + ".join([name, *refine_terms(refine)])] = refining(estimator, refine, parts)
     return pairs
 
 

@@ -25,11 +25,7 @@ from dopepp.core.errors import Interruption, RunError, UserError
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment import program
 from dopepp.experiment.assembly.build_parts import build_parts
-from dopepp.experiment.assembly.build_sources import (
-    build_datamodule,
-    fitted_to_camera,
-    held_out_source,
-)
+from dopepp.experiment.assembly.build_sources import build_datamodule, fitted_to_camera
 from dopepp.experiment.assembly.build_system import (
     build_system,
     build_trainer,
@@ -62,6 +58,7 @@ from dopepp.experiment.run.resume import (
 )
 from dopepp.experiment.run.tracking import log_report, tracked
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.refinement.refiner import refine_terms
 from dopepp.parts.part import Parts
 from dopepp.training.loggers import GuardedLogger
 from dopepp.training.pose_validation import EarlyStop
@@ -166,7 +163,7 @@ def _train(
     system = build_system(config, parts, fingerprint, images, datamodule.seen(parts))
     resume_from, changes = _resume_path(config, system)
     # Lightning may reject the options, so the trainer is built before anything is written.
-    trainer = build_trainer(config, run_dir, trackers, _progress(config, parts))
+    trainer = build_trainer(config, run_dir, trackers, _progress(config, datamodule))
     weights = system.network.state_dict().values()
     check_free_space(run_dir, sum(value.numel() * value.element_size() for value in weights))
     display.show_config(config.plain)
@@ -197,16 +194,14 @@ def _train(
     return report
 
 
-def _progress(config: RunConfig, parts: Parts) -> list[Callback]:
+def _progress(config: RunConfig, datamodule: PoseDataModule) -> list[Callback]:
     """Return the measurement of refined poses during the training, if poses are refined.
 
     Raises:
         UserError: ``stop_at`` is set without ``refine=region``, which verifies the poses.
     """
-    terms = (config.refine,) if isinstance(config.refine, str) else config.refine or ()
-    if "region" in terms:
-        pictures = held_out_source(config.data, parts, "val")
-        return [RefinedProgress(pictures, terms, config.stop_at)]
+    if "region" in (terms := refine_terms(config.refine)):
+        return [RefinedProgress(datamodule.val_pictures, terms, config.stop_at)]
     if config.stop_at is not None:
         raise UserError(
             f"stop_at={config.stop_at:g} with refine={config.refine}",

@@ -76,6 +76,11 @@ NUM_QUADRUPLES: Final = 40  # nine keypoints have 126 quadruples
 Refine = str | Sequence[str]  # name or names in TERMS
 
 
+def refine_terms(refine: Refine | None) -> tuple[str, ...]:
+    """Return the names in ``refine``; none without a refinement."""
+    return (refine,) if isinstance(refine, str) else tuple(refine or ())
+
+
 class Refiner:
     """Refines the detections of several parts.
 
@@ -92,7 +97,7 @@ class Refiner:
         self, refine: Refine, parts: Sequence[Part], scale_error: float = SCALE_ERROR
     ) -> None:
         scale_error = check("scale_error", scale_error, float, Range(0.0, 0.1))
-        terms = (refine,) if isinstance(refine, str) else tuple(refine)
+        terms = refine_terms(refine)
         if not terms or not set(terms) <= set(TERMS):
             allowed = f"one or more of {', '.join(TERMS)}, or none"
             raise UserError(f"refine={refine!r}", allowed, "use only these words")
