@@ -1,9 +1,9 @@
-"""How exact calibrations are, from drawn pictures of a ChArUco board to the hand-eye matrix.
+"""How exact calibrations are, from drawn images of a ChArUco board to the hand-eye matrix.
 
     python benchmarks/calibration.py --seeds 100
 
-Twenty-four pictures a seed, noise of 4 grey levels, a robot that is off by 0.3 mm and 0.03°; the
-lens is calibrated from the same pictures.
+Twenty-four images a seed, noise of 4 grey levels, a robot that is off by 0.3 mm and 0.03°; the
+lens is calibrated from the same images.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""What ``dopepp doctor`` finds first on rendered pictures with known faults.
+"""What ``dopepp doctor`` finds first on rendered images with known faults.
 
     python benchmarks/doctor.py [--images 40] [--seed 81] [--preset quickstart] [--size 640 480]
                                 [--model pretrained/pivconnector] [--faults blur dark …]
 
-A row a fault: on how many pictures nothing was wrong, and what was wrong first on the others.
+A row a fault: on how many images nothing was wrong, and what was wrong first on the others.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from dopepp import PoseEstimator
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, project_keypoints
 from dopepp.inference.diagnosis import Case, diagnose
 from dopepp.parts.catalogue import load_part
@@ -29,14 +29,14 @@ from dopepp.virtual.sensor import Sensor, capture, defocus
 
 
 class Taken(NamedTuple):
-    """A picture and what is said of its camera."""
+    """An image and what is said of its camera."""
 
-    image: Picture
+    image: RGBImage
     K: CameraMatrix
 
 
 class Studio:
-    """Renders pictures of one part, with it and without."""
+    """Renders images of one part, with it and without."""
 
     def __init__(self, part: str, preset: Preset, seed: int) -> None:
         parts = [load_part(part)]
@@ -45,7 +45,7 @@ class Studio:
         self.empty = Factory(parts, replace(preset, targets_per_image=(0, 0)), seed + 1)
 
     def good(self, index: int) -> Taken:
-        """Return a picture without a fault."""
+        """Return an image without a fault."""
         return _taken(self.factory.render(0, index))
 
     def absent(self, index: int) -> Taken:
@@ -53,11 +53,11 @@ class Studio:
         return _taken(self.empty.render(0, index))
 
     def sized(self, scale: float) -> Callable[[int], Taken]:
-        """Return pictures with the part so many times as large."""
+        """Return images with the part so many times as large."""
         return lambda index: _taken(self.factory.render(0, index, scale))
 
     def hidden(self, index: int) -> Taken:
-        """Cover two thirds of the part's box with another picture's background."""
+        """Cover two thirds of the part's box with another image's background."""
         rendered = self.factory.render(0, index)
         scene, image = rendered.scene, rendered.image.copy()
         T = scene.objects[scene.targets[0]].T_cam_obj
@@ -71,7 +71,7 @@ class Studio:
         return Taken(image, scene.K)
 
     def lens(self, factor: float) -> Callable[[int], Taken]:
-        """Return good pictures with a K whose focal lengths are so many times as long."""
+        """Return good images with a K whose focal lengths are so many times as long."""
 
         def taken(index: int) -> Taken:
             image, K = self.good(index)
@@ -81,8 +81,8 @@ class Studio:
 
         return taken
 
-    def spoilt(self, how: Callable[[Picture], Picture]) -> Callable[[int], Taken]:
-        """Return good pictures after something was done to them."""
+    def spoilt(self, how: Callable[[RGBImage], RGBImage]) -> Callable[[int], Taken]:
+        """Return good images after something was done to them."""
 
         def taken(index: int) -> Taken:
             image, K = self.good(index)
@@ -91,7 +91,7 @@ class Studio:
         return taken
 
     def faults(self) -> dict[str, Callable[[int], Taken]]:
-        """Return how a picture with each fault is taken."""
+        """Return how an image with each fault is taken."""
         return {
             "none": self.good,
             "blur of 2 px": self.spoilt(lambda image: defocus(image, 2.0)),

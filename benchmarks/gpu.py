@@ -2,8 +2,8 @@
 
     python benchmarks/gpu.py [--out outputs/gpu] [--minutes 40] [--device cuda]
 
-Of ``dope``, ``dopepp`` and ``dopepp_fast``, untrained, at 416×416: milliseconds of one picture's
-maps (median, 95th percentile), pictures a second in batches of 64, training images a second
+Of ``dope``, ``dopepp`` and ``dopepp_fast``, untrained, at 416×416: milliseconds of one image's
+maps (median, 95th percentile), images a second in batches of 64, training images a second
 (targets, forward, loss, backward, optimiser), images a second that the loader renders on its cores,
 and training images a second while it does. Rows are written one by one to ``rows.json`` and
 ``rows.md`` in ``--out``. After an interruption, or where the time was short, the same command
@@ -52,7 +52,7 @@ Values = dict[str, float | str]
 
 
 class Size(NamedTuple):
-    """How large all is: pixels, pictures, images of a training batch, seconds a measurement."""
+    """How large all is: pixels, images, images of a training batch, seconds a measurement."""
 
     pixels: int
     batch: int
@@ -104,7 +104,7 @@ class Workshop:
             yield Row("training on renders", setting, partial(self.fed, model, cores))
 
     def inference(self, model: str, precision: str, compiled: bool) -> Values:
-        """Time one picture, and batches, from pixels on the device to maps on the device."""
+        """Time one image, and batches, from pixels on the device to maps on the device."""
         network = runtimes.placed(self._system(model)[0].network, self.device)
         network = network.to(DTYPES[precision])
         if compiled:
@@ -120,7 +120,7 @@ class Workshop:
                 p50, p95 = np.percentile(seconds, (50, 95))
                 values |= {"ms": 1000 * p50, "ms, p95": 1000 * p95}
             else:
-                values[f"pictures/s, batch {count}"] = count / float(np.median(seconds))
+                values[f"images/s, batch {count}"] = count / float(np.median(seconds))
         return values
 
     def training(self, model: str, precision: str, compiled: bool) -> Values:
@@ -271,7 +271,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("outputs/gpu"))
     parser.add_argument("--minutes", type=float, default=35, help="no row begins after these")
     parser.add_argument("--device", default="cuda")
-    parser.add_argument("--quick", action="store_true", help="small networks and pictures")
+    parser.add_argument("--quick", action="store_true", help="small networks and images")
     asked = parser.parse_args()
     if asked.device.startswith("cuda") and not torch.cuda.is_available():
         raise SystemExit("PyTorch sees no GPU here: --device cpu --quick tries the command")

@@ -38,11 +38,11 @@ RATIO = 1.5  # of the working distances
 RIGHT_TURN, RIGHT_PLACE, RIGHT_DEPTH = 12.0, 0.08, 0.06  # degrees, diameters, relative
 HELD_OUT = 4  # every fourth part judges the models
 RIDGE = 1e-2
-KEPT = 6  # refined poses of each picture
+KEPT = 6  # refined poses of each image
 
 
 def samples(number: int, num_scenes: int, seed: int) -> list[dict[str, np.ndarray]]:
-    """Return the features and labels of the matches and refined poses of one part's pictures."""
+    """Return the features and labels of the matches and refined poses of one part's images."""
     rng = np.random.default_rng([seed, number, 1])
     part = random_part(rng, f"part{number}")
     assert part.mesh is not None
@@ -106,7 +106,7 @@ def _near(transforms: np.ndarray, T: Transform, diameter: float) -> np.ndarray:
 
 
 def fit_ranking(rows: list[dict[str, np.ndarray]]) -> np.ndarray:
-    """Return weights that maximise the share of right matches under a softmax over each picture."""
+    """Return weights that maximise the share of right matches under a softmax over each image."""
     shown = [(row["features"], row["is_right"]) for row in rows if row["is_right"].any()]
     table = np.concatenate([features for features, _ in shown])
     scale = table.std(axis=0) + 1e-9
@@ -128,7 +128,7 @@ def fit_ranking(rows: list[dict[str, np.ndarray]]) -> np.ndarray:
 
 
 def fit_bias(rows: list[dict[str, np.ndarray]], weights: np.ndarray) -> float:
-    """Return the bias that makes the best score of a picture the log odds that it is right."""
+    """Return the bias that makes the best score of an image the log odds that it is right."""
     best = [(row["features"] @ weights).argmax() for row in rows]
     scores = [float(row["features"][i] @ weights) for row, i in zip(rows, best, strict=True)]
     labels = [bool(row["is_right"][i]) for row, i in zip(rows, best, strict=True)]
@@ -187,7 +187,7 @@ def report(
     ranks = np.array(
         [row["is_right"][np.argsort(-row["features"] @ weights)].argmax() for row in shown]
     )
-    print(f"{len(rows)} pictures; a right match in {len(shown)}, at rank", end="")
+    print(f"{len(rows)} images; a right match in {len(shown)}, at rank", end="")
     for limit in (1, 10, 60, 300):
         print(f" < {limit}: {np.mean(ranks < limit):.1%}", end="")
     odds = np.concatenate([row["odds"] for row in rows])

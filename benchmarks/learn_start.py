@@ -3,7 +3,7 @@
     python benchmarks/learn_start.py data/start --minutes 6 [--parts 160] [--from auto]
 
 Random parts are bodies with bosses, ribs, holes and slots, as machined or printed parts have. One
-network learns the poses of all, at any turn in the picture and tilts of up to 60°. The weights of
+network learns the poses of all, at any turn in the image and tilts of up to 60°. The weights of
 all layers except the output layers, which belong to the parts, are written as
 ``dopepp_fast.safetensors`` to the folder, beside the parts' meshes. Needs a GPU.
 """

@@ -190,11 +190,11 @@ def starts(
     ):  # fmt: skip
         turn = rng.normal(size=3)
         turn *= math.radians(turn_deg) * rng.uniform(0.2, 1.0) / np.linalg.norm(turn)
-        # The ray of sight is near z in these pictures.
+        # The ray of sight is near z in these images.
         shift = np.array([*(across * part.diameter * rng.normal(size=2)), along * depth])
         shift[2] *= rng.normal() if along < 0.3 else rng.uniform(-1.0, 1.0)
         start = moved(T, np.concatenate([turn, shift]))
-        if across >= 1.0:  # anywhere on the picture
+        if across >= 1.0:  # anywhere on the image
             pixel = rng.uniform(0.15, 0.85, 2) * SIZE
             start[:2, 3] = (pixel - K[:2, 2]) / FOCAL * start[2, 3]
         stated = rng.uniform(0.5, 2.0) * np.array([math.radians(7.0), 0.03, 0.04])
@@ -280,7 +280,7 @@ def errors(
 def fit(inputs: np.ndarray, labels: np.ndarray, seed: int = 0) -> VerificationModel:
     """Learn the model by maximum likelihood; it is monotone in what is evidence for or against.
 
-    Real pictures have weaker creases and less regular shading than renders, so both are weakened
+    Real images have weaker creases and less regular shading than renders, so both are weakened
     at random, and all evidence is blurred.
     """
     torch.manual_seed(seed)

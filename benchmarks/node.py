@@ -2,9 +2,9 @@
 
     python benchmarks/node.py --pictures 300 --rate 30
 
-Then the node is killed and started again while the camera goes on. Received are the pictures that
+Then the node is killed and started again while the camera goes on. Received are the images that
 reached the node; of these it leaves out those that a newer one replaced while it was busy. Late is
-from publishing a picture to having its poses back here.
+from publishing an image to having its poses back here.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ NODE_NAME = "dope"
 
 
 class Camera:
-    """Publishes pictures in turn, and hears the node's answers."""
+    """Publishes images in turn, and hears the node's answers."""
 
     def __init__(self, size: tuple[int, int]) -> None:
         import rclpy
@@ -99,7 +99,7 @@ class Camera:
         return {key: int(self.told[key]) for key in ("received", "replaced by newer")}
 
     def send(self, number: int) -> None:
-        """Publish a picture with its camera_info."""
+        """Publish an image with its camera_info."""
         message = self.images[number % len(self.images)]
         now = self.node.get_clock().now()
         message.header.stamp = self.info.header.stamp = now.to_msg()
@@ -132,7 +132,7 @@ def wait_for(what: str, holds: Callable[[], bool], seconds: float = START_S) -> 
 
 
 def measure(camera: Camera, count: int, rate: float) -> str:
-    """Return a row: pictures sent, received, replaced, answered, and how late answers were."""
+    """Return a row: images sent, received, replaced, answered, and how late answers were."""
     camera.late.clear()
     wait_for("the node", lambda: camera.publisher.get_subscription_count() > 0)
     number = 0

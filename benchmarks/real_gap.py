@@ -22,7 +22,7 @@ import torch
 from dopepp.core.yaml import read_yaml
 from dopepp.data.batch import collate
 from dopepp.data.sample import Sample, crop_sample, resize_sample
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.experiment.assembly.build_parts import build_parts
 from dopepp.experiment.assembly.build_sources import fitted_to_camera, labelled_images
 from dopepp.experiment.assembly.build_system import build_system
@@ -101,7 +101,7 @@ def variants(config: RunConfig, parts: Parts, rng: np.random.Generator) -> dict[
     return made
 
 
-def laid(part: Picture, opaque: np.ndarray, behind: Picture) -> Picture:
+def laid(part: RGBImage, opaque: np.ndarray, behind: RGBImage) -> RGBImage:
     """Lay a part over what is to be behind it."""
     return np.asarray(np.rint(opaque * part + (1 - opaque) * behind), np.uint8)
 

@@ -1,4 +1,4 @@
-"""Refinement on virtual pictures: errors before and after, and time a detection.
+"""Refinement on virtual images: errors before and after, and time a detection.
 
     python benchmarks/refine.py [--images 20] [--seed 77] [--presets wide table …] [--parts NAME …]
                                 [--refine region,depth]

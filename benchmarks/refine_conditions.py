@@ -1,11 +1,11 @@
-"""Refinement where something is wrong: camera, CAD, material, colour, blur, size of the picture.
+"""Refinement where something is wrong: camera, CAD, material, colour, blur, size of the image.
 
     python benchmarks/refine_conditions.py [--checkpoint pretrained/NAME] [--images 60]
 
-Poses are those that the network finds on rendered pictures that it was not trained on, the same
+Poses are those that the network finds on rendered images that it was not trained on, the same
 scenes in every row, and those that it finds with refinement. Degrees, millimetres and "worse" are
 of parts that both find. Two parts of one kind, of one
-material, stand side by side in pictures twice as wide and high, the network's size of parts.
+material, stand side by side in images twice as wide and high, the network's size of parts.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def camouflaged(scene: Scene) -> Scene:
 
 
 def blurred(scene: Scene) -> Scene:
-    """Move the picture by 5 pixels during the exposure."""
+    """Move the image by 5 pixels during the exposure."""
     return replace(scene, sensor=replace(scene.sensor, motion_px=(5.0, 0.0)))
 
 
@@ -79,7 +79,7 @@ SCENES: dict[str, Callable[[Scene], Scene]] = {
     "background of the part's colour": camouflaged,
     "motion blur 5 px": blurred,
 }
-"""What is wrong with the picture."""
+"""What is wrong with the image."""
 
 SIZES = ((640, 480), (1920, 1080))
 PAIRS = {"two touching parts of one kind": 0.0, "the same, one under the other by 15 %": 0.15}
@@ -143,7 +143,7 @@ def measure(
     scenes: list[Scene],
     focal: float = 1.0,
 ) -> tuple[str, list[Tile]]:
-    """Return one row of the table, and pictures: truth green, network blue, refined yellow."""
+    """Return one row of the table, and images: truth green, network blue, refined yellow."""
     rows, tiles, kept = [], [], 0
     for scene in scenes:
         image = capture(render(scene).image, scene.sensor)

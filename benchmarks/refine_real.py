@@ -4,7 +4,7 @@
 
 Starts are the detections of a network (``--checkpoint``), or else drawn around the published poses:
 10 mm off in a random direction and turned by 5° about a random axis. With ``--from-truth`` they are
-the published poses: with ``--scale-errors 1e-6``, how far pictures and annotation agree. RGB alone,
+the published poses: with ``--scale-errors 1e-6``, how far images and annotation agree. RGB alone,
 objects that are at least half visible; errors are to the nearest of equivalent published poses.
 
 "Distance" is the error along the viewing ray. If refined poses have it in common, the annotation
@@ -32,7 +32,7 @@ from dopepp.core.json import read_json
 from dopepp.data.formats.bop.bop_models import bop_parts, parts_by_id
 from dopepp.data.sample import Instance
 from dopepp.drawing.overlay import BLUE, GREEN, YELLOW, Wireframe, overlay
-from dopepp.drawing.pictures import Picture, read_rgb
+from dopepp.drawing.pictures import RGBImage, read_rgb
 from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.geometry.camera import (
     CameraMatrix,
@@ -68,7 +68,7 @@ TITLES = (
 class Frame(NamedTuple):
     """One frame with its sufficiently visible objects, by the number of the model."""
 
-    image: Picture
+    image: RGBImage
     K: CameraMatrix
     objects: list[tuple[int, Transform]]
 

@@ -2,7 +2,7 @@
 
 ``python benchmarks/runtimes.py`` exports ``pretrained/pivconnector`` at 128×128 and the untrained
 ``dopepp_fast`` at 416×416 in every format and precision (int8 on random pixels: speed does not
-depend on them) and times one picture after the other, in one process: the first frame after
+depend on them) and times one image after the other, in one process: the first frame after
 loading, median and 95th percentile, and the ratio to PyTorch's float32. ``--isa AVX2`` limits
 PyTorch and OpenVINO to an instruction set and proves it by the kernels they choose; onnxruntime has
 no such limit. ``--dope`` times DOPE at 416×416 as well. ``OMP_NUM_THREADS`` sets the threads.
@@ -111,7 +111,7 @@ def candidates(network, checkpoint, size: int, folder: Path) -> Iterator[tuple[s
 
 
 def torch_run(network, size: int) -> Callable[[], None]:
-    """Return one picture's way through a network of PyTorch's."""
+    """Return one image's way through a network of PyTorch's."""
     import torch
 
     from dopepp.inference import runtimes

@@ -10,7 +10,7 @@ from collections import defaultdict
 
 import numpy as np
 
-from dopepp.data.negatives import PictureFrames
+from dopepp.data.negatives import PhotoFrames
 from dopepp.data.sample import SampleSource
 from dopepp.experiment.assembly.build_parts import build_parts
 from dopepp.experiment.assembly.negative_frames import frame_view, negative_frames
@@ -33,7 +33,7 @@ def main() -> None:
     if isinstance(photos, PhotoBackgrounds):
         view = frame_view(data, parts)
         count = min(len(photos.paths), options.num_frames)
-        sources.append(PictureFrames(photos, view.K, view.size, count, "photos of the training"))
+        sources.append(PhotoFrames(photos, view.K, view.size, count, "photos of the training"))
     for estimator in (network, network.refining("region", parts)):
         loudest, reported = defaultdict(list), defaultdict(list)
         for source in sources:

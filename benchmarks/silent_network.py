@@ -3,7 +3,7 @@
     python benchmarks/silent_network.py FOLDER --checkpoint pretrained/pivconnector_wide
 
 FOLDER is a BOP data set with one part, as ``dopepp render`` writes it. The network's poses are
-refined and have to pass its threshold. On the pictures where none does, templates of the same part
+refined and have to pass its threshold. On the images where none does, templates of the same part
 search the distances of the data set.
 """
 
@@ -57,18 +57,18 @@ def main() -> None:
     frames = list(chain.from_iterable(read_frames(scene, HALVES["both"]) for scene in scenes))
     depths = [float(T[2, 3]) for frame in frames for _, T in frame.objects]
     templates = TemplateEstimator.of_parts([part], (min(depths) / SLACK, max(depths) * SLACK))
-    print("| method | pictures | right | wrong |\n| --- | ---: | ---: | ---: |")
+    print("| method | images | right | wrong |\n| --- | ---: | ---: | ---: |")
     silent = []
     for name, estimator in (("network", network), ("templates", templates)):
-        pictures = frames if estimator is network else silent
+        images = frames if estimator is network else silent
         right = wrong = 0
-        for frame in pictures:
+        for frame in images:
             detections = estimator.predict(frame.image, frame.K)
             correct = count_right(part, detections, [T for _, T in frame.objects])
             right, wrong = right + correct, wrong + len(detections) - correct
             if estimator is network and not detections:
                 silent.append(frame)
-        print(f"| {name} | {len(pictures)} | {right} | {wrong} |", flush=True)
+        print(f"| {name} | {len(images)} | {right} | {wrong} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -79,14 +79,14 @@ def main() -> None:
         "data",
     ]
     subprocess.run(render, cwd=folder, check=True, capture_output=True)
-    (picture,) = map(str, (folder / "data").glob("**/rgb/*.*"))
+    (image,) = map(str, (folder / "data").glob("**/rgb/*.*"))
     commands = {
         "import torch": ([sys.executable, "-c", "import torch; print(1)"], False),
         "dopepp --version": ([*DOPEPP, "--version"], False),
         "dopepp train sed=1 (a typo)": ([*DOPEPP, "train", "sed=1"], False),
         "dopepp train": ([*DOPEPP, "train", "experiment=quickstart"], True),
-        "dopepp predict": ([*PREDICT, picture, *K], False),
-        "dopepp predict --refine region": ([*PREDICT, picture, *K, "--refine", "region"], False),
+        "dopepp predict": ([*PREDICT, image, *K], False),
+        "dopepp predict --refine region": ([*PREDICT, image, *K, "--refine", "region"], False),
     }
     torch_s = 0.0
     print(f"{'':34}first line s    end s    CPU s   CPU / import torch")

@@ -49,7 +49,7 @@ LEAST_VISIBLE = 0.3
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame: the picture, its camera, the true pose and what is visible of the part."""
+    """One frame: the image, its camera, the true pose and what is visible of the part."""
 
     image: np.ndarray
     K: np.ndarray
@@ -123,7 +123,7 @@ def is_right(pose: np.ndarray | None, true: np.ndarray) -> bool:
 
 
 def measure(
-    estimator: PoseEstimator, part: Part, seed: int, frames: int, pictures: Path | None
+    estimator: PoseEstimator, part: Part, seed: int, frames: int, images: Path | None
 ) -> str:
     """Return one row of the table."""
     tracker = PoseTracker(estimator)
@@ -143,13 +143,13 @@ def measure(
             resting.append(pose)
         if recovery is None and number >= COVERED.stop and good:
             recovery = number - COVERED.stop + 1
-        if pictures is not None and (number % 10 == 0 or not good):
+        if images is not None and (number % 10 == 0 or not good):
             true = Wireframe(project_keypoints(part.cuboid, frame.T, frame.K), GREEN, "true")
             seen = [
                 Wireframe(track.detection.keypoints, YELLOW, f"{track.identity}")
                 for track in tracks
             ]
-            write_png(pictures / f"{seed}_{number:03d}.png", overlay(frame.image, [true, *seen]))
+            write_png(images / f"{seed}_{number:03d}.png", overlay(frame.image, [true, *seen]))
     # Steps from frame to frame over √2: a slow drift is no trembling.
     shifts = [
         float(np.linalg.norm(after[:3, 3] - before[:3, 3])) for before, after in pairwise(resting)

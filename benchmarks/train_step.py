@@ -1,9 +1,9 @@
-"""Speed of the quickstart with each network: a training step, and one picture's maps.
+"""Speed of the quickstart with each network: a training step, and one image's maps.
 
 ``python benchmarks/train_step.py`` runs ``experiment=quickstart`` with every model below in turn in
 one process: images a second of forward, loss and backward in the precision that a training here
 takes, with and without glibc keeping freed memory, with memory kept in float32 and in bf16, and
-milliseconds of one picture's maps in float32, memory not kept, as in a user's program.
+milliseconds of one image's maps in float32, memory not kept, as in a user's program.
 The first model is what the others are compared with. Other models:
 ``python benchmarks/train_step.py dopepp dopepp_fast …``.
 """
@@ -34,7 +34,7 @@ from dopepp.models.network import PoseNetwork, network_cost
 CONF = Path(__file__).parents[1] / "conf"
 MODELS = ("dopepp", "dopepp_fast")
 BATCH, SIZE = 32, 128
-STEPS, PICTURES, ROUNDS = 5, 10, 4
+STEPS, IMAGES, ROUNDS = 5, 10, 4
 
 
 def make_network(model: str) -> PoseNetwork:
@@ -63,7 +63,7 @@ def make_step(network: PoseNetwork, half: bool) -> Callable[[], None]:
 
 
 def make_prediction(network: PoseNetwork) -> Callable[[], None]:
-    """Return one picture's way through a network, in float32."""
+    """Return one image's way through a network, in float32."""
     image = torch.randint(0, 256, (1, 3, SIZE, SIZE), dtype=torch.uint8)
 
     def predict() -> None:
@@ -102,13 +102,13 @@ def main(models: tuple[str, ...]) -> None:
         for model, network in networks.items()
     }
     half = choose_precision("auto", "cpu")[0].startswith("bf16")
-    # Of each model: a step and a picture with glibc's default, steps with memory kept.
+    # Of each model: a step and an image with glibc's default, steps with memory kept.
     times: dict[str, list[tuple[float, float, float, float]]] = {model: [] for model in models}
     for _ in range(ROUNDS):
         for model, (single_step, half_step, predict) in calls.items():
             return_freed_memory()
             default = seconds(half_step if half else single_step, STEPS)
-            picture = seconds(predict, PICTURES)
+            picture = seconds(predict, IMAGES)
             keep_freed_memory()
             kept = seconds(single_step, STEPS), seconds(half_step, STEPS)
             times[model].append((default, picture, *kept))
@@ -128,7 +128,7 @@ def main(models: tuple[str, ...]) -> None:
             f"{model:12} {num_parameters / 1e6:.2f} M weights, {gmacs:.3f} GMACs; training: "
             f"{BATCH / default:.1f} images/s, memory kept {BATCH / kept:.1f} "
             f"({first[0] / kept:.2f}×), float32 {BATCH / single_s:.1f}, bf16 {BATCH / half_s:.1f} "
-            f"({single_s / half_s:.2f}×); one picture: {1000 * picture:.1f} ms "
+            f"({single_s / half_s:.2f}×); one image: {1000 * picture:.1f} ms "
             f"({first[1] / picture:.2f}×)"
         )
 

@@ -25,7 +25,7 @@ import numpy as np
 from refine_real import read_frames
 
 from dopepp.data.formats.bop.bop_models import bop_parts, parts_by_id
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Transform, moved
 from dopepp.inference.refinement import verification
 from dopepp.inference.refinement.refiner import PartRefiner
@@ -37,7 +37,7 @@ RENDERED = ("pivconnector", "servoholder")
 COVARIANCE = np.diag(np.repeat([math.radians(1.0), 0.002], 3) ** 2)
 REPEATS = 5  # the fastest run counts
 
-Case = tuple[str, Part, Picture, CameraMatrix, Transform]
+Case = tuple[str, Part, RGBImage, CameraMatrix, Transform]
 
 
 def real_cases(folder: Path) -> Iterator[Case]:

@@ -6,7 +6,7 @@
 The first camera is the preset's, at 640×480. The second looks at the part from ``--angle`` degrees
 beside it in a random direction, the third from as far in a direction at right angles. The scene is
 static: objects and lamps stay, the background is infinitely far away. ``--hidden`` covers a share
-of the part in every picture (``dopepp.data.transforms.shading_protocol``). ``--perturbed`` moves
+of the part in every image (``dopepp.data.transforms.shading_protocol``). ``--perturbed`` moves
 every camera by 0.3 mm and 0.05° along and about each axis (standard deviations, which the estimator
 gets). Errors are those of right poses in the world, which is the first camera's frame without
 perturbation; "along" is along the first camera's line of sight. A pose is right if ADD is below a
@@ -27,7 +27,7 @@ import torch
 
 from dopepp.data.sample import Instance, Sample
 from dopepp.data.transforms.shading_protocol import shade
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import (
     CameraMatrix,
     Transform,
@@ -53,9 +53,9 @@ TITLES = (
 
 
 class StaticScene(NamedTuple):
-    """Pictures of a static scene."""
+    """Images of a static scene."""
 
-    images: list[Picture]
+    images: list[RGBImage]
     K: CameraMatrix
     T_world_cam: list[Transform]
     T_world_obj: Transform

@@ -71,7 +71,7 @@ class Frames:
             }
 
     def image(self, frame: str) -> np.ndarray:
-        """Read a picture."""
+        """Read an image."""
         return read_rgb(next((self.scene / "rgb").glob(f"{int(frame):06d}.*")))
 
     def relative(self, first: str, other: str, left_out: int, parts: dict[int, Part]) -> Transform:

@@ -1,4 +1,4 @@
-"""The picture on top of the README: STL → renders → belief maps → pose, each by its own function.
+"""The image on top of the README: STL → renders → belief maps → pose, each by its own function.
 
 python docs/make_chain_picture.py
 """
@@ -12,10 +12,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dopepp import PoseEstimator
-from dopepp.core.files import write_picture
+from dopepp.core.files import write_image
 from dopepp.data.rendered import RenderedSource
 from dopepp.drawing.overlay import Wireframe, overlay
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.drawing.sheet import Tile, contact_sheet, grid, heat_picture
 from dopepp.geometry.camera import camera_matrix, make_transform
 from dopepp.geometry.cuboid import CENTROID
@@ -33,7 +33,7 @@ SEED, INDEX = 2024, 12
 """Of a scene that no training has seen."""
 
 
-def alone(part: Part) -> Picture:
+def alone(part: Part) -> RGBImage:
     """Draw a part on white, from above its face."""
     assert part.mesh is not None
     K = camera_matrix(2.6 * SIDE, 2.6 * SIDE, (SIDE - 1) / 2, (SIDE - 1) / 2)
@@ -49,8 +49,8 @@ def alone(part: Part) -> Picture:
     return find_renderer("raster")(scene).image
 
 
-def chain() -> Picture:
-    """Make the picture."""
+def chain() -> RGBImage:
+    """Make the image."""
     part, preset = pivconnector(), PRESETS["quickstart"]
     estimator = PoseEstimator.load("pretrained/pivconnector", refine="region")
     training = Factory([part], preset.resized(SIDE // 2, SIDE // 2), seed=1)
@@ -63,11 +63,11 @@ def chain() -> Picture:
         Tile(alone(part), "an STL"),
         Tile(renders, "renders, which a network learns"),
         Tile(heat_picture(scene.image, beliefs, SIDE // beliefs.shape[0]),
-             "where it believes corners on a new picture"),
+             "where it believes corners on a new image"),
         Tile(overlay(scene.image, [Wireframe(pose.keypoints)], SIDE), "the pose, refined"),
     ]  # fmt: skip
     return contact_sheet(tiles, columns=4, tile_width=SIDE)
 
 
 if __name__ == "__main__":
-    write_picture(TARGET, chain())
+    write_image(TARGET, chain())

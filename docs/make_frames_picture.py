@@ -28,7 +28,7 @@ SIZE: Final = (1280, 720)
 WATCH: Final = camera_matrix(1750, 1750, 620, 400)
 """Of the one who looks at camera and part."""
 
-PICTURE: Final = (320, 240)
+IMAGE: Final = (320, 240)
 K: Final = camera_matrix(420, 420, 159.5, 119.5)
 AXES: Final = (("x", (240, 60, 60)), ("y", (60, 200, 70)), ("z", (80, 130, 255)))
 WHITE: Final = (235, 235, 235)
@@ -91,18 +91,18 @@ def write(
 
 def seen() -> np.ndarray:
     """Return what the camera sees, with the part's cuboid."""
-    image = np.full((PICTURE[1], PICTURE[0], 3), 95, np.uint8)
+    image = np.full((IMAGE[1], IMAGE[0], 3), 95, np.uint8)
     draw_part(image, T_CAM_OBJ, K)
     keypoints = project_keypoints(pivconnector().cuboid, T_CAM_OBJ, K)
     return draw_wireframe(image, keypoints, YELLOW)
 
 
 def main() -> None:
-    """Draw and write the picture."""
+    """Draw and write the image."""
     canvas = np.full((SIZE[1], SIZE[0], 3), 45, np.uint8)
     T_watch_cam = look_at(np.array([0.36, -0.25, -0.14]), np.array([0.0, 0.01, 0.12]))
-    # The picture hangs in front of the camera, where a ray through each pixel crosses it.
-    depth, (width, height) = 0.11, PICTURE
+    # The image hangs in front of the camera, where a ray through each pixel crosses it.
+    depth, (width, height) = 0.11, IMAGE
     corners = np.array([[-0.5, -0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5],
                         [-0.5, height - 0.5]])  # fmt: skip
     rays = np.column_stack([corners, np.ones(4)]) @ np.linalg.inv(K).T

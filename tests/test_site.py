@@ -57,9 +57,9 @@ def test_the_notebook_and_its_page_say_the_same():
         source = "".join(cell["source"]).strip()
         assert source in page
         assert not cell.get("outputs")
-    pictures = list((ROOT / "docs" / "tutorials" / "from_stl_to_poses").glob("*.jpg"))
-    assert pictures
-    assert sum(path.stat().st_size for path in pictures) < 300_000
+    images = list((ROOT / "docs" / "tutorials" / "from_stl_to_poses").glob("*.jpg"))
+    assert images
+    assert sum(path.stat().st_size for path in images) < 300_000
 
 
 def test_what_scripts_and_the_notebook_import_is_there():

@@ -16,7 +16,7 @@ from dopepp.core.errors import Interruption, UserError, interruptible
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from dopepp.drawing.pictures import Picture, Size
+    from dopepp.drawing.pictures import RGBImage, Size
     from dopepp.geometry.camera import Transform
     from dopepp.robot.calibration.board import Board, BoardPose, Sighting
     from dopepp.robot.calibration.hand_eye import HandEye
@@ -31,7 +31,7 @@ BOARD: Final = "charuco:8x11:20:15, chess:7x10:25 or circles:4x11:40 (columns ×
 Out = Annotated[Path, Option(help="YAML file to write.")]
 Force = Annotated[bool, Option("--force", help="Also write a doubtful calibration, with a mark.")]
 BoardSpec = Annotated[str, Option("--board", help=BOARD)]
-Pictures = Annotated[Path, Argument(help="Folder with pictures of the board.")]
+Pictures = Annotated[Path, Argument(help="Folder with images of the board.")]
 Poses = Annotated[
     Path, Argument(help="CSV, JSON or YAML: x y z and a quaternion, rotation vector or angles.")
 ]
@@ -62,7 +62,7 @@ def camera(
     source: Annotated[
         str,
         Argument(
-            help="Pictures of the board: a folder, a video, a ROS bag, or the number or address of "
+            help="Images of the board: a folder, a video, a ROS bag, or the number or address of "
             "a camera (Ctrl-C ends the recording)."
         ),
     ],
@@ -70,7 +70,7 @@ def camera(
     out: Out,
     force: Force = False,
 ) -> None:
-    """Calibrate a camera from pictures of a board, and write the file for --camera."""
+    """Calibrate a camera from images of a board, and write the file for --camera."""
     from dopepp.core.files import check_target
     from dopepp.robot.calibration.board import parse_board
     from dopepp.robot.calibration.lens import calibrate_lens, write_camera
@@ -124,7 +124,7 @@ def bench(
     source: Annotated[
         Path,
         Argument(
-            help="CSV with x, y, z of points that the tip touched, or a folder with pictures of a "
+            help="CSV with x, y, z of points that the tip touched, or a folder with images of a "
             "board on the bench."
         ),
     ],
@@ -159,7 +159,7 @@ def bench(
         elif source.is_dir():
             problem = f"{source}, which is a folder, without --board"
             fix = "describe the board, e.g. --board charuco:8x11:20:15"
-            raise UserError(problem, "a CSV, or pictures with --board", fix)
+            raise UserError(problem, "a CSV, or images with --board", fix)
         else:
             result = find_bench(read_points(source, check_unit(unit)))
             names = [f"point {number}" for number in range(1, len(result.residuals) + 1)]
@@ -172,7 +172,7 @@ def bench(
 
 @app.command()
 def handeye(
-    pictures: Pictures,
+    images: Pictures,
     poses: Poses,
     board: BoardSpec,
     camera: Annotated[Path, Option(help="Camera file.")],
@@ -184,21 +184,21 @@ def handeye(
     direction: Direction = "flange-to-base",
     force: Force = False,
 ) -> None:
-    """Calibrate the camera's pose on the robot from pictures of a board and the robot's poses."""
+    """Calibrate the camera's pose on the robot from images of a board and the robot's poses."""
     from dopepp.core.files import check_target
     from dopepp.geometry.camera_file import read_camera
     from dopepp.robot.calibration.board import board_pose, parse_board
     from dopepp.robot.calibration.hand_eye import calibrate_hand_eye, check_mount
     from dopepp.robot.calibration.quality import assess, check_poses
-    from dopepp.robot.calibration.records import match_pictures, read_robot_poses, write_calibration
+    from dopepp.robot.calibration.records import match_images, read_robot_poses, write_calibration
 
     with report_errors():
         check_target(out, (".yaml", ".yml"))
         checked_mount = check_mount(mount)
         pose_format = _pose_format(unit, angles, quaternion, direction)
-        robot, names = read_robot_poses(poses), _picture_names(pictures)
-        pairs = match_pictures(robot, names)
-        sightings, size = _folder_sightings(pictures, parse_board(board))
+        robot, names = read_robot_poses(poses), _image_names(images)
+        pairs = match_images(robot, names)
+        sightings, size = _folder_sightings(images, parse_board(board))
         lens = read_camera(camera).for_picture(size)
         rows = {names[picture]: row for row, picture in pairs}
         boards = [board_pose(seen, lens) for seen in sightings if seen.name in rows]
@@ -217,8 +217,8 @@ def rig(
     folder: Annotated[
         Path,
         Argument(
-            help="For each camera NAME, a folder NAME with pictures of the board and a camera file "
-            "NAME.yaml. Pictures of one name show the same moment."
+            help="For each camera NAME, a folder NAME with images of the board and a camera file "
+            "NAME.yaml. Images of one name show the same moment."
         ),
     ],
     board: BoardSpec,
@@ -246,11 +246,11 @@ def rig(
         target = parse_board(board)
         T_base_first = np.eye(4) if hand_eye is None else read_transform(hand_eye, "T_base_cam")
         boards, cameras = {}, {}
-        for pictures in sorted(path for path in folder.glob("*") if path.is_dir()):
-            sightings, size = _folder_sightings(pictures, target)
-            boards[pictures.name] = {sighting.name: sighting for sighting in sightings}
-            lens = read_camera(pictures.with_name(f"{pictures.name}.yaml"))
-            cameras[pictures.name] = lens.for_picture(size)
+        for images in sorted(path for path in folder.glob("*") if path.is_dir()):
+            sightings, size = _folder_sightings(images, target)
+            boards[images.name] = {sighting.name: sighting for sighting in sightings}
+            lens = read_camera(images.with_name(f"{images.name}.yaml"))
+            cameras[images.name] = lens.for_picture(size)
         calibration = calibrate_rig(boards, cameras)
         _show_rig(calibration)
         record = _rig_record(calibration, T_base_first, folder, out)
@@ -273,38 +273,38 @@ def _pose_format(unit: str, angles: str, quaternion: str, direction: str) -> Pos
     return PoseFormat(check_unit(unit), angles == "deg", quaternion, direction == "base-to-flange")
 
 
-def _picture_names(folder: Path) -> list[str]:
-    """Return the names of a folder's pictures, sorted.
+def _image_names(folder: Path) -> list[str]:
+    """Return the names of a folder's images, sorted.
 
     Raises:
-        UserError: The folder has no pictures.
+        UserError: The folder has no images.
     """
-    from dopepp.core.files import PICTURES
+    from dopepp.core.files import IMAGES
 
-    suffixes = (*PICTURES, ".tif", ".tiff")
+    suffixes = (*IMAGES, ".tif", ".tiff")
     names = sorted(path.name for path in folder.glob("*") if path.suffix.lower() in suffixes)
     if not names:
         allowed = f"a folder with {', '.join(suffixes)}"
-        fix = "pass the folder that holds the pictures"
-        raise UserError(f"{folder} without pictures", allowed, fix)
+        fix = "pass the folder that holds the images"
+        raise UserError(f"{folder} without images", allowed, fix)
     return names
 
 
 def _folder_sightings(folder: Path, board: Board) -> tuple[list[Sighting], Size]:
-    """Find the board in a folder's pictures, which must have one size."""
+    """Find the board in a folder's images, which must have one size."""
     from dopepp.drawing.pictures import read_photo
 
     sightings: list[Sighting] = []
-    first_size, names = None, _picture_names(folder)
+    first_size, names = None, _image_names(folder)
     for name in names:
         picture = read_photo(folder / name)
         size = (picture.shape[1], picture.shape[0])
         first_size = first_size or size
         if size != first_size:
-            problem = f"{folder / name} of {size[0]}×{size[1]} pixels among pictures of "
+            problem = f"{folder / name} of {size[0]}×{size[1]} pixels among images of "
             problem += f"{first_size[0]}×{first_size[1]}"
-            fix = "delete the pictures of the other size"
-            raise UserError(problem, "pictures of one size", fix)
+            fix = "delete the images of the other size"
+            raise UserError(problem, "images of one size", fix)
         sighting = _find_board(board, picture, name, quiet=False)
         if sighting is not None:
             sightings.append(sighting)
@@ -337,12 +337,12 @@ def _stream_sightings(source: str, board: Board) -> tuple[list[Sighting], Size]:
                 if views.is_full:
                     break
     sightings = _check_sightings(views.kept, first_size, source, count)
-    typer.echo(f"{len(views.kept)} distinct views in {count} pictures", err=True)
+    typer.echo(f"{len(views.kept)} distinct views in {count} images", err=True)
     return sightings
 
 
-def _find_board(board: Board, picture: Picture, name: str, quiet: bool) -> Sighting | None:
-    """Find the board in a picture; report a missing (unless quiet) or second board."""
+def _find_board(board: Board, picture: RGBImage, name: str, quiet: bool) -> Sighting | None:
+    """Find the board in an image; report a missing (unless quiet) or second board."""
     try:
         sighting = board.find(picture, name)
     except UserError as error:
@@ -356,11 +356,11 @@ def _find_board(board: Board, picture: Picture, name: str, quiet: bool) -> Sight
 def _check_sightings(
     sightings: list[Sighting], size: Size | None, source: str, count: int
 ) -> tuple[list[Sighting], Size]:
-    """Return the detected boards and the pictures' size; reject pictures without any board."""
+    """Return the detected boards and the images' size; reject images without any board."""
     if not sightings or size is None:
         raise UserError(
-            f"{source}: no board in any of {count} pictures",
-            "pictures of the board described by --board",
+            f"{source}: no board in any of {count} images",
+            "images of the board described by --board",
             "compare --board with the board: kind, numbers of columns and rows, dictionary",
         )
     return sightings, size
@@ -374,11 +374,11 @@ def _bench_from_board(
     poses: Path | None,
     pose_format: PoseFormat,
 ) -> tuple[Bench, list[str]]:
-    """Calibrate the bench from pictures of a board; return the bench and the pictures' names."""
+    """Calibrate the bench from images of a board; return the bench and the images' names."""
     from dopepp.core.yaml import read_yaml
     from dopepp.geometry.camera_file import read_camera
     from dopepp.robot.calibration.board import board_pose, parse_board
-    from dopepp.robot.calibration.records import match_pictures, read_robot_poses, read_transform
+    from dopepp.robot.calibration.records import match_images, read_robot_poses, read_transform
     from dopepp.robot.calibration.tool import bench_of_board
 
     if camera is None or hand_eye is None:
@@ -400,8 +400,8 @@ def _bench_from_board(
     boards = {seen.name: board_pose(seen, lens).T_cam_board for seen in sightings}
     T_base_cam = dict.fromkeys(boards, T_mount_cam)
     if poses is not None:
-        robot, names = read_robot_poses(poses), _picture_names(folder)
-        flanges, pairs = robot.transforms(pose_format), match_pictures(robot, names)
+        robot, names = read_robot_poses(poses), _image_names(folder)
+        flanges, pairs = robot.transforms(pose_format), match_images(robot, names)
         T_base_cam = {names[picture]: flanges[row] @ T_mount_cam for row, picture in pairs}
     used = [name for name in boards if name in T_base_cam]
     bench = bench_of_board([T_base_cam[name] @ boards[name] for name in used], board)
@@ -411,12 +411,12 @@ def _bench_from_board(
 
 
 def _show_lens(calibration: LensCalibration) -> None:
-    """Print the errors per picture, the covered part of the picture, and the camera matrix."""
+    """Print the errors per image, the covered part of the image, and the camera matrix."""
     for name, error in zip(calibration.names, calibration.errors_px, strict=True):
         typer.echo(f"{name}: {error:.3f} px")
     for name in calibration.outliers:
         typer.echo(f"{name}: rejected, because its error is far above the median")
-    typer.echo(f"points cover {calibration.coverage:.0%} of the picture:")
+    typer.echo(f"points cover {calibration.coverage:.0%} of the image:")
     for row in calibration.covered:
         typer.echo("  " + "".join("■ " if cell else "· " for cell in row))
     K = calibration.camera.K
@@ -432,7 +432,7 @@ def _show_lens(calibration: LensCalibration) -> None:
 def _show_hand_eye(
     boards: Sequence[BoardPose], calibration: HandEye, quality: CalibrationQuality
 ) -> None:
-    """Print each picture's errors, the robot's estimated error, and advice on further poses."""
+    """Print each image's errors, the robot's estimated error, and advice on further poses."""
     from math import degrees
 
     for number, board in enumerate(boards):
@@ -454,13 +454,13 @@ def _show_hand_eye(
 
 
 def _show_rig(calibration: Rig) -> None:
-    """Print the rejected pictures and each camera's errors and deviations."""
+    """Print the rejected images and each camera's errors and deviations."""
     from math import degrees, hypot
 
     for moment in calibration.outliers:
-        typer.echo(f"{moment}: rejected, because it contradicts the other pictures")
+        typer.echo(f"{moment}: rejected, because it contradicts the other images")
     for number, name in enumerate(calibration.names):
-        seen = f"{name}: {calibration.shared[number]} pictures with another camera, "
+        seen = f"{name}: {calibration.shared[number]} images with another camera, "
         seen += f"{calibration.errors_px[number]:.3f} px"
         if number:
             distance_mm = 1000 * hypot(*calibration.T_world_cam[number][:3, 3])

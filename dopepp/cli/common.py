@@ -45,7 +45,7 @@ Distances = Annotated[
     Option("--distance", help="Distance range of the parts, metres (default: the training range)."),
 ]
 
-Region = Annotated[str | None, Option("--refine", help="region: refine the poses on the picture.")]
+Region = Annotated[str | None, Option("--refine", help="region: refine the poses on the image.")]
 
 Conf = Annotated[
     float | None,
@@ -53,7 +53,7 @@ Conf = Annotated[
 ]
 
 MaxMs = Annotated[
-    float | None, Option(help="Time limit of the refinement per picture, milliseconds.")
+    float | None, Option(help="Time limit of the refinement per image, milliseconds.")
 ]
 
 ScaleError = Annotated[

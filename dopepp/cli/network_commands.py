@@ -36,13 +36,13 @@ from dopepp.core.errors import UserError
 if TYPE_CHECKING:
     from dopepp.inference.benchmark import Timing
 
-NUM_SCENES: Final = 10  # number of rendered pictures that the benchmark cycles through
-SIZE: Final = (640, 480)  # width and height of rendered pictures
+NUM_SCENES: Final = 10  # number of rendered images that the benchmark cycles through
+SIZE: Final = (640, 480)  # width and height of rendered images
 
 
 def benchmark(
     models: Annotated[list[Path], Argument(help="Checkpoints, exported files and meshes.")],
-    image: Annotated[Path | None, Option(help="Picture (default: renders).")] = None,
+    image: Annotated[Path | None, Option(help="Image (default: renders).")] = None,
     intrinsics: Intrinsics = None,
     refine: Region = None,
     frames: Annotated[int, Option("-n", min=1, max=100_000, help="Frames.")] = 50,
@@ -51,7 +51,7 @@ def benchmark(
     tilt: Tilt = None,
     device: Device = "cpu",
 ) -> None:
-    """Time the steps from a picture to its poses, in milliseconds per frame."""
+    """Time the steps from an image to its poses, in milliseconds per frame."""
     with report_errors():
         from dopepp.core.pool import num_threads
         from dopepp.drawing.pictures import read_photo
@@ -67,18 +67,18 @@ def benchmark(
         for path in models:
             estimator = load_estimator(path, device, unit, working_distance, tilt)
             if image is not None and intrinsics is not None:
-                pictures = [(read_photo(image), camera_matrix(*intrinsics))]
+                images = [(read_photo(image), camera_matrix(*intrinsics))]
             elif not estimator.has_network:
-                fix = "pass a picture and its camera: --image FILE --K FX FY CX CY"
-                raise UserError(f"{path} without --image", "a picture, which a mesh requires", fix)
+                fix = "pass an image and its camera: --image FILE --K FX FY CX CY"
+                raise UserError(f"{path} without --image", "an image, which a mesh requires", fix)
             else:
                 source = validation_renders(estimator.checkpoint, path, NUM_SCENES, SIZE)
                 samples = map(source.sample, range(NUM_SCENES))
-                pictures = [(sample.image, sample.K) for sample in samples]
+                images = [(sample.image, sample.K) for sample in samples]
             if refine is not None:
                 estimator = estimator.refining(refine, with_meshes(estimator.parts))
-            rows.append(_row(path, time_frames(estimator, pictures, frames)))
-        height, width, _ = pictures[-1][0].shape
+            rows.append(_row(path, time_frames(estimator, images, frames)))
+        height, width, _ = images[-1][0].shape
         typer.echo(f"{width}×{height} pixels, {frames} frames, {num_threads()} threads; ms")
         _print_table(rows)
 
@@ -108,7 +108,7 @@ def _print_table(rows: list[dict[str, str]]) -> None:
 
 
 def doctor(
-    image: Annotated[Path, Argument(help="Picture (PNG, JPEG or TIFF).")],
+    image: Annotated[Path, Argument(help="Image (PNG, JPEG or TIFF).")],
     model: Annotated[Path, Option(help=MODEL_HELP)],
     intrinsics: Intrinsics = None,
     camera: CameraFile = None,
@@ -122,12 +122,12 @@ def doctor(
     tilt: Tilt = None,
     centres: Annotated[
         list[str] | None,
-        Option("--at", help="u,v: pixel of a part's centre; repeat for every part in the picture."),
+        Option("--at", help="u,v: pixel of a part's centre; repeat for every part in the image."),
     ] = None,
-    empty: Annotated[bool, Option("--empty", help="The picture shows none of the parts.")] = False,
+    empty: Annotated[bool, Option("--empty", help="The image shows none of the parts.")] = False,
     device: Device = "cpu",
 ) -> None:
-    """Diagnose a picture, its camera and its part, one finding with its remedy per line.
+    """Diagnose an image, its camera and its part, one finding with its remedy per line.
 
     Problems come first, ordered by cause, then the passed checks. Exit codes: 0 no problem; 1
     problems; 2 wrong input.
@@ -192,7 +192,7 @@ def serve(
     tilt: Tilt = None,
     device: Device = "cpu",
 ) -> None:
-    """Open a local web page that estimates poses on uploaded pictures.
+    """Open a local web page that estimates poses on uploaded images.
 
     The page is reachable from this machine only and loads nothing from the network.
     """

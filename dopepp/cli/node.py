@@ -53,7 +53,7 @@ def node(
     params: Annotated[Path | None, Option(help="With --ros2: YAML of parameters.")] = None,
     intrinsics: Intrinsics = None,
     camera: Annotated[Path | None, Option(help="Camera file, for camera_info.")] = None,
-    frame: Annotated[str | None, Option(help="Optical frame (default: the pictures').")] = None,
+    frame: Annotated[str | None, Option(help="Optical frame (default: the images').")] = None,
     conf: Conf = None,
     refine: Region = None,
     max_ms: MaxMs = None,
@@ -65,7 +65,7 @@ def node(
     tilt: Tilt = None,
     device: Device = "cpu",
 ) -> None:
-    """Publish the poses in every picture of a camera, until Ctrl-C.
+    """Publish the poses in every image of a camera, until Ctrl-C.
 
     Exit codes: 0 done; 1 stopped (the camera stream ended); 2 wrong input; 130 or 143 interrupted.
     """
@@ -112,7 +112,7 @@ def node(
             skipped = len(counts) - len(processed)
             note = f", {skipped} skipped" if skipped else ""
             note += f"; {weaker} weaker candidates" if weaker else ""
-            typer.echo(f"{out}: {poses} poses in {len(processed)} pictures{note}")
+            typer.echo(f"{out}: {poses} poses in {len(processed)} images{note}")
 
 
 def _counts(result: PoseResult) -> tuple[int, int]:
@@ -130,11 +130,11 @@ def _check_transport(
         raise UserError(problem, allowed, "pass one of these options and leave out the others")
     transport = chosen[0]
     if transport in LINES and not words:
-        sources = "a camera, a video, pictures, …"
+        sources = "a camera, a video, images, …"
         fix = "write the source after the network, e.g. 0 for the first camera"
         raise UserError(f"{transport} without a source", sources, fix)
     if transport not in LINES and words:
-        allowed = "no source: the pictures come from --topic or from the recording"
+        allowed = "no source: the images come from --topic or from the recording"
         problem, fix = f"{transport} with the source {words[0]}", f"leave out {words[0]}"
         raise UserError(problem, allowed, fix)
     if (transport == "--bag") != (out is not None):

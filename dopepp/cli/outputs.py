@@ -1,4 +1,4 @@
-"""Files that ``dopepp predict`` writes: pictures and videos with drawn poses, JSON and CSV.
+"""Files that ``dopepp predict`` writes: images and videos with drawn poses, JSON and CSV.
 
 To add an output, write a class with the methods of :class:`Output`.
 """
@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Final, Protocol
 
 from dopepp.core.errors import RunError, UserError, system_failure
-from dopepp.core.files import PICTURES, check_target, partial_path
+from dopepp.core.files import IMAGES, check_target, partial_path
 
 if TYPE_CHECKING:
     from dopepp.data.formats.bop.bop_results import BopResult
@@ -72,7 +72,7 @@ class Outputs:
 
 
 class OverlayFolder:
-    """A folder with a picture for each input picture, and a video for each video or camera."""
+    """A folder with an image for each input image, and a video for each video or camera."""
 
     def __init__(self, folder: Path, stride: int = 1) -> None:
         check_target(folder / "picture.png")
@@ -87,11 +87,11 @@ class OverlayFolder:
         self._source = source
 
     def write(self, result: PoseResult) -> None:
-        """Write the picture, or append it to the source's video."""
+        """Write the image, or append it to the source's video."""
         assert self._source is not None
         if result.time is None:
             path = Path(result.name)
-            suffix = path.suffix if path.suffix.lower() in PICTURES else ".png"
+            suffix = path.suffix if path.suffix.lower() in IMAGES else ".png"
             result.save(self._new_path(path.stem, suffix, path))
             return
         if self._video is None:
@@ -124,7 +124,7 @@ class OverlayFolder:
 
 
 class JsonLines:
-    """A file with a line of JSON for each picture, with or without detections."""
+    """A file with a line of JSON for each image, with or without detections."""
 
     def __init__(self, path: Path) -> None:
         check_target(path)
@@ -136,7 +136,7 @@ class JsonLines:
         self._file = self._file or self._partial.open("wb", buffering=0)
 
     def write(self, result: PoseResult) -> None:
-        """Append one line for the picture. A line that does not fit on the disk is removed again.
+        """Append one line for the image. A line that does not fit on the disk is removed again.
 
         Raises:
             OSError: The disk is full.
@@ -155,7 +155,7 @@ class JsonLines:
 
 
 class BopCsv:
-    """A BOP challenge file: a scene for each source, an image for each picture.
+    """A BOP challenge file: a scene for each source, an image for each image.
 
     Objects are numbered from 1 in the checkpoint's order. If all names look like BOP's files
     (``obj_000005``), their numbers are used.

@@ -1,4 +1,4 @@
-"""``dopepp predict``: estimate poses in pictures, videos and camera streams."""
+"""``dopepp predict``: estimate poses in images, videos and camera streams."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def predict(
     source: Annotated[
         list[str],
         Argument(
-            help="Pictures, folders, 'frames/*.png', videos, ROS bags (.bag, .mcap, a folder), "
+            help="Images, folders, 'frames/*.png', videos, ROS bags (.bag, .mcap, a folder), "
             "a camera number, or an rtsp:// or http:// stream."
         ),
     ],
@@ -75,27 +75,25 @@ def predict(
     views: Annotated[
         Path | None,
         Option(
-            help="Camera poses, if all pictures show one static scene: views.yaml, BOP's "
+            help="Camera poses, if all images show one static scene: views.yaml, BOP's "
             "scene_camera.json or COLMAP's images.txt."
         ),
     ] = None,
     verify: Annotated[
-        bool, Option("--verify", help="Compare rendered parts with the picture.")
+        bool, Option("--verify", help="Compare rendered parts with the image.")
     ] = False,
     parts: Meshes = None,
     unit: Unit = None,
     working_distance: WorkingDistance = None,
     tilt: Tilt = None,
     device: Device = "cpu",
-    save: Annotated[Path | None, Option(help="Folder for drawn pictures and videos.")] = None,
-    json_file: Annotated[
-        Path | None, Option("--json", help="File with a line per picture.")
-    ] = None,
+    save: Annotated[Path | None, Option(help="Folder for drawn images and videos.")] = None,
+    json_file: Annotated[Path | None, Option("--json", help="File with a line per image.")] = None,
     csv: Annotated[Path | None, Option(help="Poses in the format of the BOP challenge.")] = None,
     rerun: Annotated[Path | None, Option(help="Recording for the Rerun viewer, .rrd")] = None,
     show: Annotated[bool, Option("--show", help="Open the Rerun viewer.")] = False,
 ) -> None:
-    """Estimate poses in pictures and print one line of JSON per detection.
+    """Estimate poses in images and print one line of JSON per detection.
 
     Progress goes to stderr, with the reason if nothing was detected. Exit codes: 0 success; 1
     stopped (the camera stream ended, the disk is full); 2 wrong input; 130 or 143 interrupted.
@@ -206,7 +204,7 @@ class _Session:
     Args:
         estimator: Estimates the poses.
         options: Options for all sources.
-        verified: Parts to render and compare with the picture; None for no verification.
+        verified: Parts to render and compare with the image; None for no verification.
     """
 
     def __init__(
@@ -215,7 +213,7 @@ class _Session:
         self._estimator, self._options, self._verified = estimator, options, verified
 
     def run(self, source: FrameSource, camera: Camera, outputs: Outputs) -> None:
-        """Print and write the poses in every picture of a source."""
+        """Print and write the poses in every image of a source."""
         from dopepp.inference.pose_result import format_speed
 
         total = source.count and math.ceil(source.count / self._options["stride"])

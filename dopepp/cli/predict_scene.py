@@ -1,4 +1,4 @@
-"""``dopepp predict --views``: poses in the world from several pictures of one static scene."""
+"""``dopepp predict --views``: poses in the world from several images of one static scene."""
 
 from __future__ import annotations
 
@@ -45,15 +45,15 @@ def predict_scene(
 
     Args:
         estimator: Estimator that refines by region.
-        sources: Pictures of the scene.
+        sources: Images of the scene.
         views: File of the camera poses.
-        camera: Camera of the pictures for which ``views`` names no camera.
+        camera: Camera of the images for which ``views`` names no camera.
         distances: Nearest and farthest depth of the parts, metres, or ``any``.
-        save: Folder for drawn pictures; None writes none.
+        save: Folder for drawn images; None writes none.
         json_file: File for a line of JSON; None writes none.
 
     Raises:
-        UserError: There are fewer than two pictures, a source is not a still picture, or a picture
+        UserError: There are fewer than two images, a source is not a still image, or an image
             has no pose or no camera.
     """
     from dopepp.core.files import write_whole
@@ -62,13 +62,13 @@ def predict_scene(
     poses = read_camera_poses(views)
     frames = [frame for source in sources for frame in source.frames()]
     if len(frames) < 2 or any(source.rate is not None for source in sources):
-        problem = f"--views with {len(frames)} picture{'s' * (len(frames) != 1)}"
+        problem = f"--views with {len(frames)} image{'s' * (len(frames) != 1)}"
         if any(source.rate is not None for source in sources):
             problem = "--views with a video, a recording or a camera"
-        raise UserError(problem, "two pictures or more", "pass the pictures of one static scene")
+        raise UserError(problem, "two images or more", "pass the images of one static scene")
     paths = [Path(frame.name) for frame in frames]
     names = [path.name for path in paths]
-    if len(set(names)) < len(names):  # pictures of one moment, in a folder for each camera
+    if len(set(names)) < len(names):  # images of one moment, in a folder for each camera
         names = ["/".join(path.parts[-2:]) for path in paths]
     shots = [poses.of(path) for path in paths]
     cameras: list[Camera] = []
@@ -76,7 +76,7 @@ def predict_scene(
         lens = shot.camera or camera
         if lens is None:
             fix = f"add `camera: FILE` to {views}, or pass --camera or --K"
-            raise UserError(f"no camera of {frame.name}", "a camera for every picture", fix)
+            raise UserError(f"no camera of {frame.name}", "a camera for every image", fix)
         cameras.append(lens)
     result = estimator.predict_views(
         [frame.image for frame in frames],

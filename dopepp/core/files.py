@@ -1,4 +1,4 @@
-"""Atomic writing of files, pictures and CSV, and the user's cache folder.
+"""Atomic writing of files, images and CSV, and the user's cache folder.
 
 A file is written next to its path under the name of :func:`partial_path` and then renamed. A killed
 process leaves such a partial file, which :func:`is_abandoned` detects. Files are not synced: they
@@ -30,8 +30,8 @@ _SHIPPED: Final = Path(__file__).parents[1] / "conf"
 CONF: Final = _SHIPPED if _SHIPPED.is_dir() else Path(__file__).parents[2] / "conf"
 """Folder of the config files: inside the package in a wheel, next to the package in a checkout."""
 
-PICTURES: Final = (".png", ".jpg", ".jpeg")
-"""Suffixes of the pictures that :func:`write_picture` writes."""
+IMAGES: Final = (".png", ".jpg", ".jpeg")
+"""Suffixes of the images that :func:`write_image` writes."""
 
 
 def write_png(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> None:
@@ -45,14 +45,14 @@ def write_png(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> N
     write_whole(path, _encoded(image, ".png"))
 
 
-def write_picture(path: Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
-    """Write an RGB image in the format of the path's suffix, one of :data:`PICTURES`."""
+def write_image(path: Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
+    """Write an RGB image in the format of the path's suffix, one of :data:`IMAGES`."""
     write_whole(path, _encoded(image, path.suffix.lower()))
 
 
 def _encoded(image: UInt8[np.ndarray, "height width 3"], suffix: str) -> bytes:
     """Return an image encoded in the format of a suffix."""
-    import cv2  # takes a tenth of a second, and not every command writes pictures
+    import cv2  # takes a tenth of a second, and not every command writes images
 
     return bytes(cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes())
 

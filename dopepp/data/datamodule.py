@@ -55,8 +55,8 @@ class PoseDataModule(LightningDataModule):
 
     Args:
         input_size: (width, height) of the network's input, pixels.
-        backgrounds: Images for masks on objects that fill their picture; required with ``masking``.
-        val_pictures: Whole pictures of the camera, if ``val`` shows windows of them (default:
+        backgrounds: Images for masks on objects that fill their image; required with ``masking``.
+        val_images: Whole images of the camera, if ``val`` shows windows of them (default:
             ``val``).
 
     Raises:
@@ -78,17 +78,17 @@ class PoseDataModule(LightningDataModule):
         masking: RandomMask | None = None,
         augment: Photometric | None = None,
         backgrounds: Backgrounds | None = None,
-        val_pictures: DescribedSource | None = None,
+        val_images: DescribedSource | None = None,
     ) -> None:
         super().__init__()
         if masking is not None and backgrounds is None:
-            raise ValueError("masking requires backgrounds, for objects that fill their picture")
+            raise ValueError("masking requires backgrounds, for objects that fill their image")
         if len(train) < batch_size:
             problem = f"{len(train)} training images for batches of {batch_size}"
             fix = "lower data.batch_size or raise data.samples_per_epoch"
             raise UserError(problem, "at least one full batch per epoch", fix)
         self.train_source, self.val_source, self.test_source = train, val, test
-        self.val_pictures = val if val_pictures is None else val_pictures
+        self.val_images = val if val_images is None else val_images
         self.object_names, self.input_size = list(object_names), input_size
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
         self._jitter, self._masking, self._augment = jitter, masking, augment

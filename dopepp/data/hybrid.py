@@ -151,16 +151,16 @@ class WindowedSource:
 
     Networks that train on windows of renders need windows of photographs as well. Each epoch draws
     object and window again, uniformly among the windows that contain the object's centre, or among
-    all windows without an object. Smaller pictures are padded, as for prediction.
+    all windows without an object. Smaller images are padded, as for prediction.
 
     Args:
-        picture: (width, height) that the source's images are resized to fit, pixels.
+        image: (width, height) that the source's images are resized to fit, pixels.
         window: (width, height) of the windows, pixels.
     """
 
-    def __init__(self, source: DescribedSource, picture: Size, window: Size, seed: int) -> None:
+    def __init__(self, source: DescribedSource, image: Size, window: Size, seed: int) -> None:
         self._source, self.name = source, source.name
-        self._picture, self._window, self._seed = picture, window, seed
+        self._picture, self._window, self._seed = image, window, seed
 
     def __len__(self) -> int:
         return len(self._source)

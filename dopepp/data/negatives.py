@@ -1,4 +1,4 @@
-"""Sources of camera frames without the objects: pictures, scenes, and a mix of several kinds.
+"""Sources of camera frames without the objects: images, scenes, and a mix of several kinds.
 
 Every sample is a whole frame without instances; its ``source`` names the kind.
 """
@@ -15,34 +15,34 @@ from dopepp.geometry.camera import CameraMatrix
 from dopepp.virtual.backgrounds import PhotoBackgrounds
 
 
-class PictureFrames:
-    """Whole pictures as frames of a camera.
+class PhotoFrames:
+    """Whole images as frames of a camera.
 
-    Pictures are scaled to cover the frame and cropped at the centre; pictures of the camera itself
-    stay unchanged. If there are more frames than pictures, the second round is mirrored, and
+    Images are scaled to cover the frame and cropped at the centre; images of the camera itself
+    stay unchanged. If there are more frames than images, the second round is mirrored, and
     further rounds show random regions.
 
     Args:
-        pictures: Pictures of a folder or of one split of a folder.
-        num_frames: Number of frames (default: the number of pictures).
+        images: Images of a folder or of one split of a folder.
+        num_frames: Number of frames (default: the number of images).
         K: Camera matrix, pixels.
         size: (width, height) of the frames, pixels.
-        seed: Seed of the pictures' order and regions.
+        seed: Seed of the images' order and regions.
     """
 
     def __init__(
         self,
-        pictures: PhotoBackgrounds,
+        images: PhotoBackgrounds,
         K: CameraMatrix,
         size: Size,
         num_frames: int | None = None,
         name: str = "pictures",
         seed: int = 0,
     ) -> None:
-        self.pictures, self.K, self.size, self.name = pictures, K, size, name
-        self._length = len(pictures.paths) if num_frames is None else num_frames
+        self.pictures, self.K, self.size, self.name = images, K, size, name
+        self._length = len(images.paths) if num_frames is None else num_frames
         self._seed = seed
-        self._order = item_rng(seed, Purpose.SHUFFLE, 0).permutation(len(pictures.paths))
+        self._order = item_rng(seed, Purpose.SHUFFLE, 0).permutation(len(images.paths))
 
     def __len__(self) -> int:
         return self._length
@@ -65,11 +65,11 @@ class PictureFrames:
         return Sample(image, self.K.copy(), [], None, self.name, key)
 
     def contains(self, label: str) -> bool:
-        """Return False: the pictures show no object."""
+        """Return False: the images show no object."""
         return False
 
     def describe(self) -> list[SourceInfo]:
-        """Return the identity of the pictures and the camera."""
+        """Return the identity of the images and the camera."""
         identity = {
             "pictures": self.pictures.identity(),
             "K": self.K.tolist(),

@@ -176,7 +176,7 @@ def named_part(text: str, unit: str | None) -> Part:
 def _in_camera(
     scenes: Preset, parts: Sequence[Part], path: str | Path | None, distance: str | None
 ) -> Preset:
-    """Return the preset with the camera of a file, and log the parts' sizes in its pictures.
+    """Return the preset with the camera of a file, and log the parts' sizes in its images.
 
     Raises:
         UserError: Only the camera or only the distance is given, or the distance is not a pair.

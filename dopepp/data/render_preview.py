@@ -15,7 +15,7 @@ from dopepp.data.render_job import Job
 from dopepp.data.rendered import rendered_sample
 from dopepp.data.sample import Sample
 from dopepp.drawing.overlay import Wireframe, overlay
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.drawing.sheet import (
     COLOURS,
     Tile,
@@ -60,7 +60,7 @@ def write_preview(job: Job, out: Path) -> Path:
     return path
 
 
-def preview_sheet(factory: Factory, num_scenes: int = NUM_SCENES) -> Picture:
+def preview_sheet(factory: Factory, num_scenes: int = NUM_SCENES) -> RGBImage:
     """Render a job's first images into rows of image and labels, below a line per part."""
     tiles: list[Tile] = []
     for index in range(num_scenes):
@@ -93,7 +93,7 @@ def scene_tiles(rendered: Rendered, name: str) -> Iterator[Tile]:
     yield Tile(*depth_panel(rendered.depth, rendered.instances >= 0))
 
 
-def _posed(rendered: Rendered, sample: Sample) -> Picture:
+def _posed(rendered: Rendered, sample: Sample) -> RGBImage:
     """Draw cuboids in the masks' colours, and the axes of the object frames."""
     frames = [
         Wireframe(instance.keypoints, COLOURS[number % len(COLOURS)])

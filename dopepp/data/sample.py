@@ -17,7 +17,7 @@ from jaxtyping import Float
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from dopepp.drawing.pictures import DepthMap, Mask, Picture, Shape, Size
+from dopepp.drawing.pictures import DepthMap, Mask, RGBImage, Shape, Size
 from dopepp.geometry.camera import CameraMatrix, Letterbox, Transform, crop_camera
 
 
@@ -55,10 +55,10 @@ class Sample:
         source: Name of the source, e.g. ``ycb_video/data``.
         key: The item within its source, e.g. ``0050/000003``.
         T_world_cam: Pose of the camera in a static scene; None if unknown.
-        others: Further pictures of the static scene, with their cameras' poses.
+        others: Further images of the static scene, with their cameras' poses.
     """
 
-    image: Picture
+    image: RGBImage
     K: CameraMatrix
     instances: list[Instance] = field(default_factory=list)
     depth: DepthMap | None = None

@@ -1,1 +1,1 @@
-"""Pictures for people: wireframes, belief maps, contact sheets and curves, on numpy images."""
+"""Images for people: wireframes, belief maps, contact sheets and curves, on numpy images."""

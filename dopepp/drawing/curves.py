@@ -18,7 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from dopepp.core.files import write_csv, write_png
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 
 MAX_THRESHOLD: Final = 0.1
 """Largest threshold of accuracy-threshold curves, metres (paper Fig. 4)."""
@@ -99,7 +99,7 @@ def figure_with_axes(x_label: str, y_label: str, title: str = "") -> tuple[Figur
     return figure, axes
 
 
-def figure_image(figure: Figure) -> Picture:
+def figure_image(figure: Figure) -> RGBImage:
     """Render a figure to RGB without a window, for files and loggers."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()  # type: ignore[no-untyped-call]

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import resize_points
 from dopepp.geometry.cuboid import CENTROID, CORNER_SIGNS, EDGES
 
@@ -60,7 +60,7 @@ class Wireframe:
 
 
 def overlay(
-    image: Picture, wireframes: Sequence[Wireframe], min_width_px: int = MIN_WIDTH_PX
+    image: RGBImage, wireframes: Sequence[Wireframe], min_width_px: int = MIN_WIDTH_PX
 ) -> UInt8[np.ndarray, "out_height out_width 3"]:
     """Draw wireframes and their legend on a copy of the image, enlarged if it is narrow.
 
@@ -81,8 +81,11 @@ def overlay(
 
 
 def draw_wireframe(
-    image: Picture, keypoints: Float[np.ndarray, "9 2"], colour: Colour = YELLOW, thickness: int = 1
-) -> Picture:
+    image: RGBImage,
+    keypoints: Float[np.ndarray, "9 2"],
+    colour: Colour = YELLOW,
+    thickness: int = 1,
+) -> RGBImage:
     """Draw a cuboid, anti-aliased, on a copy of the image.
 
     Args:
@@ -108,7 +111,7 @@ def draw_wireframe(
     return canvas
 
 
-def enlarge(image: Picture, factor: int) -> UInt8[np.ndarray, "out_height out_width 3"]:
+def enlarge(image: RGBImage, factor: int) -> UInt8[np.ndarray, "out_height out_width 3"]:
     """Enlarge a copy of the image by an integer factor (``resize_points`` scales keypoints)."""
     if factor == 1:
         return np.ascontiguousarray(image).copy()
@@ -117,7 +120,7 @@ def enlarge(image: Picture, factor: int) -> UInt8[np.ndarray, "out_height out_wi
 
 
 def draw_line(
-    canvas: Picture,
+    canvas: RGBImage,
     start: Float[np.ndarray, "2"],
     end: Float[np.ndarray, "2"],
     colour: tuple[int, ...],
@@ -159,7 +162,11 @@ def _clip(
 
 
 def draw_text(
-    image: Picture, text: str, position: tuple[int, int], size_px: int, colour: tuple[int, int, int]
+    image: RGBImage,
+    text: str,
+    position: tuple[int, int],
+    size_px: int,
+    colour: tuple[int, int, int],
 ) -> None:
     """Write a line IN PLACE on a darkened box, cut off at the border.
 
@@ -169,18 +176,18 @@ def draw_text(
     box = image[row : row + size_px, column:]
     coverage = text_coverage(text, size_px)[: box.shape[0], : box.shape[1], None]
     box = box[:, : coverage.shape[1]]
-    # Darkening keeps any colour readable on any picture.
+    # Darkening keeps any colour readable on any image.
     box[:] = np.rint(0.5 * box * (1 - coverage) + np.array(colour) * coverage)
 
 
-def draw_caption(image: Picture, text: str) -> None:
+def draw_caption(image: RGBImage, text: str) -> None:
     """Write a line of text IN PLACE in the bottom left corner; an empty text draws nothing."""
     size = max(12, round(max(image.shape[:2]) / 50))
     if text:
         draw_text(image, text, (0, max(image.shape[0] - size, 0)), size, WHITE)
 
 
-def draw_tags(image: Picture, tags: Sequence[tuple[str, tuple[float, float], Colour]]) -> None:
+def draw_tags(image: RGBImage, tags: Sequence[tuple[str, tuple[float, float], Colour]]) -> None:
     """Write a line of text IN PLACE above each of several points, without overlap.
 
     A tag is a text, a point (column, row) in pixels and a colour; texts of points outside the image

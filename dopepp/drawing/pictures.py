@@ -1,4 +1,4 @@
-"""Picture and video files: strict decoding of pictures, and crash-safe writing of videos.
+"""Image and video files: strict decoding of images, and crash-safe writing of videos.
 
 All photos, textures, frames, depth images and masks are decoded here, completely or not at all.
 Pillow, unlike OpenCV, rejects truncated files and reports the size before decoding; the checksums
@@ -29,7 +29,7 @@ from dopepp.core.files import partial_path, read_limited
 # OpenCV reads this once, before its first video: FFmpeg must not write to the terminal.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
-Picture = UInt8[np.ndarray, "height width 3"]
+RGBImage = UInt8[np.ndarray, "height width 3"]
 """RGB, first row on top."""
 
 Size = tuple[int, int]
@@ -68,23 +68,23 @@ USUAL_RATE: Final = 25.0
 """Frames per second if a file or a camera does not state the rate."""
 
 LONGEST_GAP_S: Final = 2.0
-"""Longest time for which a picture is repeated if the next is late, seconds."""
+"""Longest time for which an image is repeated if the next is late, seconds."""
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _JPEG: Final = b"\xff\xd8"
 _JPEG_END: Final = b"\xff\xd9"
 
 
-def read_picture(path: Path, longest_px: int | None = None) -> Picture:
-    """Return a picture in one of :data:`FORMATS` as RGB.
+def read_picture(path: Path, longest_px: int | None = None) -> RGBImage:
+    """Return an image in one of :data:`FORMATS` as RGB.
 
     Args:
         path: File, with any suffix.
-        longest_px: Longest side; larger pictures are reduced (a JPEG is then decoded at a fraction
+        longest_px: Longest side; larger images are reduced (a JPEG is then decoded at a fraction
             of its size and time).
 
     Raises:
-        ValueError: The file is missing, damaged or not a picture, or exceeds :data:`MAX_SIDE`.
+        ValueError: The file is missing, damaged or not an image, or exceeds :data:`MAX_SIDE`.
     """
     try:
         with _opened(read_limited(path, MAX_BYTES), FORMATS) as image:
@@ -100,7 +100,7 @@ def read_picture(path: Path, longest_px: int | None = None) -> Picture:
         raise ValueError(_reason(error)) from error
 
 
-def whole_picture(content: bytes, formats: tuple[str, ...] = FORMATS) -> Image.Image:
+def whole_image(content: bytes, formats: tuple[str, ...] = FORMATS) -> Image.Image:
     """Decode a file's content with its original depth and channels.
 
     Raises:
@@ -126,7 +126,7 @@ def read_content(path: Path) -> bytes:
         return read_limited(path, MAX_BYTES)
     except (OSError, ValueError) as error:
         reason, allowed = str(error), f"at most {MAX_BYTES / 1e6:.0f} MB"
-        fix = "save the picture with fewer pixels"
+        fix = "save the image with fewer pixels"
         if isinstance(error, OSError):
             reason, allowed = str(error.strerror), "a readable file"
             fix = "pass the path of an existing file, or make it readable"
@@ -141,7 +141,7 @@ def read_image(path: Path) -> NDArray[Any]:
     """
     content = read_content(path)
     try:
-        image = whole_picture(content, FRAME_FORMATS)
+        image = whole_image(content, FRAME_FORMATS)
     except ValueError as error:
         raise UserError(
             f"image {path} of {len(content)} bytes: {error}",
@@ -161,7 +161,7 @@ def read_image(path: Path) -> NDArray[Any]:
     return np.asarray(image)
 
 
-def read_rgb(path: Path) -> Picture:
+def read_rgb(path: Path) -> RGBImage:
     """Read an 8-bit frame as RGB; alpha is dropped, grey becomes three channels.
 
     Raises:
@@ -176,8 +176,8 @@ def read_rgb(path: Path) -> Picture:
     return np.ascontiguousarray(image[..., :3])
 
 
-def read_photo(path: Path) -> Picture:
-    """Read a picture in one of :data:`FORMATS` as upright 8-bit RGB, with OpenCV's values.
+def read_photo(path: Path) -> RGBImage:
+    """Read an image in one of :data:`FORMATS` as upright 8-bit RGB, with OpenCV's values.
 
     The EXIF orientation is applied, alpha dropped, grey repeated, and 16 bits cut to the upper 8.
 
@@ -185,11 +185,11 @@ def read_photo(path: Path) -> Picture:
         UserError: The file is missing, damaged, too large, of another format or multi-page, its
             values do not have 8 or 16 bits, or its 16-bit values are too dark.
     """
-    allowed = "a picture (PNG, JPEG, TIFF, BMP, WEBP) of 8 or 16 bits a channel"
+    allowed = "an image (PNG, JPEG, TIFF, BMP, WEBP) of 8 or 16 bits a channel"
     save = f"save it as PNG, e.g. with ImageMagick: magick {path.name} picture.png"
     content = read_content(path)
     try:
-        image = whole_picture(content)
+        image = whole_image(content)
         is_grey16 = image.mode.startswith("I") and _is_deep(image, content)
         if getattr(image, "n_frames", 1) > 1 or (image.mode[0] in "IF" and not is_grey16):
             raise ValueError(f"of mode {image.mode}, {getattr(image, 'n_frames', 1)} pages")
@@ -212,7 +212,7 @@ def read_photo(path: Path) -> Picture:
 
 
 def _opened(content: bytes, formats: tuple[str, ...]) -> Image.Image:
-    """Open a picture and check its container, without decoding."""
+    """Open an image and check its container, without decoding."""
     damage = "" if content else "an empty file"
     if content.startswith(_PNG):
         damage = _png_damage(content)
@@ -267,7 +267,7 @@ def _reason(error: Exception) -> str:
 class VideoFile(AbstractContextManager["VideoFile"]):
     """An MP4 file (MPEG-4 part 2), written to a partial file that is renamed on close.
 
-    Pictures are repeated or dropped to match their times, and resized to the first picture's size.
+    Images are repeated or dropped to match their times, and resized to the first image's size.
     Odd sides are padded by one pixel, as the format requires even sides.
 
     Args:
@@ -284,8 +284,8 @@ class VideoFile(AbstractContextManager["VideoFile"]):
         self._start = 0.0
         self._written = 0
 
-    def write(self, picture: Picture, time: float) -> None:
-        """Add a picture taken at a time in seconds.
+    def write(self, picture: RGBImage, time: float) -> None:
+        """Add an image taken at a time in seconds.
 
         Raises:
             RunError: The disk is full, or this OpenCV cannot write MP4.

@@ -1,4 +1,4 @@
-"""Contact sheets of captioned pictures, and their panels: masks, depth, axes and messages."""
+"""Contact sheets of captioned images, and their panels: masks, depth, axes and messages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.drawing.overlay import Colour, draw_line, draw_text, text_coverage
-from dopepp.drawing.pictures import DepthMap, Mask, Picture
+from dopepp.drawing.pictures import DepthMap, Mask, RGBImage
 from dopepp.geometry.cuboid import CENTROID
 
 _CAPTION_PX: Final = 18
@@ -34,13 +34,13 @@ _COVER: Final = 0.65
 
 @dataclass(frozen=True)
 class Tile:
-    """A picture of a contact sheet, with an optional line of text below."""
+    """An image of a contact sheet, with an optional line of text below."""
 
-    image: Picture
+    image: RGBImage
     caption: str = ""
 
 
-def contact_sheet(tiles: Sequence[Tile], columns: int = 4, tile_width: int = 320) -> Picture:
+def contact_sheet(tiles: Sequence[Tile], columns: int = 4, tile_width: int = 320) -> RGBImage:
     """Lay tiles out row by row on white, each scaled to ``tile_width`` pixels.
 
     Raises:
@@ -54,8 +54,8 @@ def contact_sheet(tiles: Sequence[Tile], columns: int = 4, tile_width: int = 320
     return np.pad(grid(drawn, columns), ((0, gap), (0, gap), (0, 0)), constant_values=255)
 
 
-def _draw_tile(tile: Tile, width: int) -> Picture:
-    """Scale the picture and add its caption, shrunk to fit."""
+def _draw_tile(tile: Tile, width: int) -> RGBImage:
+    """Scale the image and add its caption, shrunk to fit."""
     scale = width / tile.image.shape[1]
     height = max(1, round(tile.image.shape[0] * scale))
     # Area averaging suits shrinking; cubic interpolation suits enlarging.
@@ -64,7 +64,7 @@ def _draw_tile(tile: Tile, width: int) -> Picture:
     return np.concatenate([picture, text_line(tile.caption, width)]) if tile.caption else picture
 
 
-def text_line(text: str, width: int) -> Picture:
+def text_line(text: str, width: int) -> RGBImage:
     """Return a line of black text on a white strip of ``width`` pixels, shrunk to fit."""
     # Hinted glyphs do not scale exactly with the size, so sizes are tried in descending order.
     lines = (text_coverage(text, px) for px in range(_CAPTION_PX, _MIN_CAPTION_PX, -1))
@@ -75,15 +75,15 @@ def text_line(text: str, width: int) -> Picture:
     return strip
 
 
-def grid(pictures: Sequence[Picture], columns: int) -> Picture:
-    """Arrange pictures row by row on white.
+def grid(images: Sequence[RGBImage], columns: int) -> RGBImage:
+    """Arrange images row by row on white.
 
     Raises:
-        ValueError: There are no pictures or no columns.
+        ValueError: There are no images or no columns.
     """
-    if not pictures or columns < 1:
-        raise ValueError(f"a grid needs pictures and columns, got {len(pictures)} and {columns}")
-    rows = [pictures[i : i + columns] for i in range(0, len(pictures), columns)]
+    if not images or columns < 1:
+        raise ValueError(f"a grid needs images and columns, got {len(images)} and {columns}")
+    rows = [images[i : i + columns] for i in range(0, len(images), columns)]
     width = max(sum(picture.shape[1] for picture in row) for row in rows)
     bands = []
     for row in rows:
@@ -96,8 +96,8 @@ def grid(pictures: Sequence[Picture], columns: int) -> Picture:
     return np.concatenate(bands)
 
 
-def message_picture(width: int, height: int, text: str) -> Picture:
-    """Return a grey picture with a message; lines beyond its height are cut."""
+def message_image(width: int, height: int, text: str) -> RGBImage:
+    """Return a grey image with a message; lines beyond its height are cut."""
     picture = np.full((height, width, 3), 225, np.uint8)
     size = max(10, int(0.05 * width))
     # On average, a character is half as wide as the line is high.
@@ -111,7 +111,7 @@ def message_picture(width: int, height: int, text: str) -> Picture:
 
 
 def belief_tiles(
-    image: Picture, beliefs: Float[np.ndarray, "9 map_height map_width"], stride: int, name: str
+    image: RGBImage, beliefs: Float[np.ndarray, "9 map_height map_width"], stride: int, name: str
 ) -> list[Tile]:
     """Return tiles of the corners' and the centroid's beliefs over an image, with their maxima.
 
@@ -125,8 +125,8 @@ def belief_tiles(
 
 
 def heat_picture(
-    image: Picture, channel: Float[np.ndarray, "map_height map_width"], stride: int = 8
-) -> Picture:
+    image: RGBImage, channel: Float[np.ndarray, "map_height map_width"], stride: int = 8
+) -> RGBImage:
     """Blend a belief map into the dimmed image, with the belief (clipped to [0, 1]) as opacity.
 
     The image has the scale of the network's input, ``stride`` pixels per cell of the map.
@@ -136,12 +136,12 @@ def heat_picture(
     share = np.clip(large[: image.shape[0], : image.shape[1]], 0.0, 1.0)
     heat = cv2.applyColorMap(np.rint(255 * share).astype(np.uint8), cv2.COLORMAP_JET)
     weight = (0.8 * share)[..., None]
-    # Dim the picture, so that a faint belief is visible on a bright background.
+    # Dim the image, so that a faint belief is visible on a bright background.
     blended = (1 - weight) * 0.6 * image + weight * heat[..., ::-1]
     return np.asarray(np.rint(blended), np.uint8)
 
 
-def mask_panel(image: Picture, masks: Sequence[Mask | None]) -> Picture:
+def mask_panel(image: RGBImage, masks: Sequence[Mask | None]) -> RGBImage:
     """Paint each instance's visible pixels on the darkened grey image."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[..., None].repeat(3, axis=2)
     panel = 0.35 * grey.astype(np.float64)
@@ -152,7 +152,7 @@ def mask_panel(image: Picture, masks: Sequence[Mask | None]) -> Picture:
     return np.asarray(np.rint(panel), np.uint8)
 
 
-def depth_panel(depth: DepthMap, shown: Mask) -> tuple[Picture, str]:
+def depth_panel(depth: DepthMap, shown: Mask) -> tuple[RGBImage, str]:
     """Colour depth from near (red) to far (blue), unknown depth black, and describe the scale.
 
     The scale spans the ``shown`` pixels (the objects), because a plane may reach far behind them.
@@ -172,7 +172,7 @@ def depth_panel(depth: DepthMap, shown: Mask) -> tuple[Picture, str]:
     return np.asarray(panel, np.uint8), f"depth: red {near:.3f} m to blue {far:.3f} m"
 
 
-def draw_axes(image: Picture, ends: Float[np.ndarray, "4 2"], thickness: int = 2) -> None:
+def draw_axes(image: RGBImage, ends: Float[np.ndarray, "4 2"], thickness: int = 2) -> None:
     """Draw the object frame's axes IN PLACE, except for ends that are not finite or far outside.
 
     ``ends`` are the projections of the origin and of the tips of x, y and z, pixels.

@@ -66,22 +66,22 @@ class Camera:
         return np.array(self.distortion) if self.distortion else None
 
     def undistorted(
-        self, picture: UInt8[np.ndarray, "height width 3"]
+        self, image: UInt8[np.ndarray, "height width 3"]
     ) -> UInt8[np.ndarray, "height width 3"]:
-        """Return a picture of this camera without distortion, with the same K."""
+        """Return an image of this camera without distortion, with the same K."""
         if self.coefficients is None:
-            return picture
-        return np.asarray(cv2.undistort(picture, self.K, self.coefficients))
+            return image
+        return np.asarray(cv2.undistort(image, self.K, self.coefficients))
 
     def for_picture(
         self, size: Size, K_size: Size | None = None, crop: Crop | None = None
     ) -> Camera:
-        """Return the camera of a picture, after checking K against the picture's size.
+        """Return the camera of an image, after checking K against the image's size.
 
         Args:
-            size: (width, height) of the picture.
-            K_size: Size of the calibrated picture, if this picture was resized.
-            crop: Region of the calibrated picture, if this picture was cropped.
+            size: (width, height) of the image.
+            K_size: Size of the calibrated image, if this image was resized.
+            crop: Region of the calibrated image, if this image was cropped.
 
         Raises:
             UserError: K belongs to another size and neither option explains it, or an option is
@@ -93,7 +93,7 @@ class Camera:
         if K_size is not None:
             stated = f"--K-size {K_size[0]} {K_size[1]}"
             if min(K_size) < 1:
-                fix = "pass the size of the calibrated picture, e.g. --K-size 1920 1080"
+                fix = "pass the size of the calibrated image, e.g. --K-size 1920 1080"
                 raise UserError(stated, "width and height above 0", fix)
             if self.size is not None and K_size != self.size:
                 allowed = f"the file's own size, {_by(self.size)}"
@@ -108,9 +108,9 @@ class Camera:
             K = check_camera(self.K, size, self.source, WHOLE)
         elif K_size is None or not _equal_aspect(size, calibrated):
             problem = (
-                f"{self.source}, whose K is for {_by(calibrated)}, with a picture of {_by(size)}"
+                f"{self.source}, whose K is for {_by(calibrated)}, with an image of {_by(size)}"
             )
-            allowed = "K for the picture's size, or an option that explains the difference"
+            allowed = "K for the image's size, or an option that explains the difference"
             raise UserError(problem, allowed, _fix(size, calibrated))
         else:
             K = resize_camera(self.K, size[0] / calibrated[0], size[1] / calibrated[1])
@@ -174,17 +174,17 @@ def _text(path: Path) -> str:
 
 
 def _cut(K: CameraMatrix, calibrated: Size | None, size: Size, crop: Crop) -> CameraMatrix:
-    """Return K of a crop of the calibrated picture."""
+    """Return K of a crop of the calibrated image."""
     x, y, width, height = crop
     stated = "--crop " + " ".join(map(str, crop))
     if (width, height) != size:
-        problem = f"{stated} with a picture of {_by(size)}"
+        problem = f"{stated} with an image of {_by(size)}"
         fix = f"pass --crop {x} {y} {size[0]} {size[1]}"
-        raise UserError(problem, "x y followed by the picture's width and height", fix)
+        raise UserError(problem, "x y followed by the image's width and height", fix)
     exceeds = calibrated is not None and (x + width > calibrated[0] or y + height > calibrated[1])
     if min(x, y) < 0 or exceeds:
-        inside = f"inside the calibrated picture{f' of {_by(calibrated)}' if calibrated else ''}"
-        fix = "pass the position of the crop in the calibrated picture"
+        inside = f"inside the calibrated image{f' of {_by(calibrated)}' if calibrated else ''}"
+        fix = "pass the position of the crop in the calibrated image"
         raise UserError(stated, f"x y width height {inside}", fix)
     return crop_camera(K, x, y)
 
@@ -195,16 +195,14 @@ def _equal_aspect(a: Size, b: Size) -> bool:
 
 
 def _fix(size: Size, calibrated: Size) -> str:
-    """Return advice for a picture whose size differs from the calibrated size."""
+    """Return advice for an image whose size differs from the calibrated size."""
     fits = size[0] <= calibrated[0] and size[1] <= calibrated[1]
     cut = f"--crop X Y {size[0]} {size[1]} if it was cropped" if fits else ""
     if _equal_aspect(size, calibrated):
-        resized = f"--K-size {calibrated[0]} {calibrated[1]} if the picture was resized"
+        resized = f"--K-size {calibrated[0]} {calibrated[1]} if the image was resized"
         return f"{resized}, {cut}" if cut else resized
     if size == calibrated[::-1]:
-        return (
-            "rotate the picture back, or calibrate rotated pictures (EXIF orientation is applied)"
-        )
+        return "rotate the image back, or calibrate rotated images (EXIF orientation is applied)"
     return cut or f"calibrate the camera at {_by(size)}"
 
 

@@ -29,9 +29,9 @@ FORMATS: Final = (
     "ROS camera_info, OpenCV FileStorage, BOP camera.json, COLMAP cameras.txt, "
     "3×3 numbers, or the four numbers fx fy cx cy"
 )
-_UNDISTORT: Final = "undistort the pictures and pass their new K"
+_UNDISTORT: Final = "undistort the images and pass their new K"
 
-_SIDE: Final = Range(1, 65_536, "pixels")  # Side of a calibrated picture
+_SIDE: Final = Range(1, 65_536, "pixels")  # Side of a calibrated image
 _COLMAP_MODELS: Final = {
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
@@ -89,7 +89,7 @@ def _colmap(lines: Sequence[Sequence[str]], source: str) -> Calibration:
     """Parse the line CAMERA_ID MODEL WIDTH HEIGHT PARAMS[] of ``cameras.txt``."""
     if len(lines) > 1:
         numbers = ", ".join(words[0][:20] for words in lines[:10]) + ", …" * (len(lines) > 10)
-        fix = "keep the line of the camera that took the picture"
+        fix = "keep the line of the camera that took the image"
         raise UserError(f"{source} with {len(lines)} cameras ({numbers})", "one camera", fix)
     _, model, *rest = lines[0]
     if model not in _COLMAP_MODELS:
@@ -203,7 +203,7 @@ def _key(name: str) -> str:
 
 
 def _size(fields: _Fields) -> Size | None:
-    """Return the picture's size in the fields of a file; None if the file has no size.
+    """Return the image's size in the fields of a file; None if the file has no size.
 
     Raises:
         UserError: The size is incomplete or invalid.

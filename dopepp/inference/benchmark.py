@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.inference.estimator import PoseEstimator
@@ -27,7 +27,7 @@ MAX_MAPS: Final = 1e-4
 MAX_MM: Final = 0.1
 MAX_DEG: Final = 0.05
 
-Pictures = Sequence[tuple[Picture, CameraMatrix]]
+Pictures = Sequence[tuple[RGBImage, CameraMatrix]]
 """Images with their camera matrices."""
 
 
@@ -41,12 +41,12 @@ class Timing:
     num_found: float  # mean number of poses per frame
 
 
-def time_frames(estimator: PoseEstimator, pictures: Pictures, num_frames: int) -> Timing:
+def time_frames(estimator: PoseEstimator, images: Pictures, num_frames: int) -> Timing:
     """Time a freshly loaded estimator on images, which are used in turn."""
     rows, num_found = [], []
-    for picture, K in islice(cycle(pictures), 1 + WARM_UP + num_frames):
+    for image, K in islice(cycle(images), 1 + WARM_UP + num_frames):
         before, start = estimator.spent_ms.copy(), time.perf_counter()
-        num_found.append(len(estimator.predict(picture, K, cropped=True)))
+        num_found.append(len(estimator.predict(image, K, cropped=True)))
         frame = 1000 * (time.perf_counter() - start)
         rows.append([frame, *(estimator.spent_ms[step] - before[step] for step in STEPS)])
     frame, *steps = np.array(rows[1 + WARM_UP :]).T
@@ -77,19 +77,19 @@ class ExportAgreement:
             difference = f"{self.position_mm:.3g} mm and {self.rotation_deg:.3g}°"
             poses = f"{self.num_poses} poses within {difference}"
         single = f", {self.num_single} found by one alone" if self.num_single else ""
-        return f"maps within {self.maps:.1e}, {poses}{single}, on {self.num_pictures} pictures"
+        return f"maps within {self.maps:.1e}, {poses}{single}, on {self.num_pictures} images"
 
 
 def compare_export(
-    exported: PoseEstimator, original: PoseEstimator, pictures: Pictures
+    exported: PoseEstimator, original: PoseEstimator, images: Pictures
 ) -> ExportAgreement:
     """Compare maps, and the best-scored pose of each object on each image.
 
     Poses with lower scores are ignored, because rounding decides between equal scores in clutter.
     """
     maps, differences, num_single = [0.0], [(0.0, 0.0)], 0
-    for picture, K in pictures:
-        for view in network_views(original.checkpoint, original.network.size_multiple, picture, K):
+    for image, K in images:
+        for view in network_views(original.checkpoint, original.network.size_multiple, image, K):
             pairs = zip(exported.maps(view.pixels), original.maps(view.pixels), strict=True)
             for values, expected in pairs:
                 scale = expected.abs().max().clamp(min=1.0)
@@ -99,7 +99,7 @@ def compare_export(
         poses, expected_poses = (
             {
                 detection.object: detection.T_cam_obj
-                for detection in reversed(network.predict(picture, K, cropped=True))
+                for detection in reversed(network.predict(image, K, cropped=True))
             }
             for network in (exported, original)
         )
@@ -110,6 +110,4 @@ def compare_export(
         num_single += len(poses.keys() ^ expected_poses.keys())
     positions, rotations = zip(*differences, strict=True)
     largest_pose = max(positions), max(rotations)
-    return ExportAgreement(
-        max(maps), *largest_pose, len(differences) - 1, num_single, len(pictures)
-    )
+    return ExportAgreement(max(maps), *largest_pose, len(differences) - 1, num_single, len(images))

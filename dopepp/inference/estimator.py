@@ -18,7 +18,7 @@ from dopepp.core.compiled import compile_in_background
 from dopepp.core.errors import UserError
 from dopepp.core.extensions import enable
 from dopepp.core.validation import Range, check
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.inference import runtimes
 from dopepp.inference.picture import (
@@ -223,7 +223,7 @@ class PoseEstimator:
 
     def predict(
         self,
-        image: Picture,
+        image: RGBImage,
         K: CameraMatrix,
         distortion: Coefficients | None = None,
         depth: Depth | None = None,
@@ -265,7 +265,7 @@ class PoseEstimator:
 
     def candidates(
         self,
-        image: Picture,
+        image: RGBImage,
         K: CameraMatrix,
         distortion: Coefficients | None = None,
         depth: Depth | None = None,
@@ -286,7 +286,7 @@ class PoseEstimator:
         return self._recalibrated(self.refined(detections, image, K, depth), by_depth)
 
     def _start_detections(
-        self, image: Picture, K: CameraMatrix, distances: Distances | None, roi: Region | None
+        self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
     ) -> list[Detection]:
         """Return the detections before refinement, best score first."""
         with self._timed("pre"):
@@ -352,7 +352,7 @@ class PoseEstimator:
     def refined(
         self,
         detections: Sequence[Detection],
-        image: Picture,
+        image: RGBImage,
         K: CameraMatrix,
         depth: Depth | None = None,
     ) -> list[Detection]:
@@ -398,7 +398,7 @@ class PoseEstimator:
 
     def predict_views(
         self,
-        images: Sequence[Picture],
+        images: Sequence[RGBImage],
         cameras: Sequence[Camera | CameraMatrix],
         T_world_cam: Sequence[Transform],
         depths: Sequence[Depth] | None = None,
@@ -406,7 +406,7 @@ class PoseEstimator:
         camera_error: tuple[float, float] | None = None,
         names: Sequence[str] | None = None,
     ) -> ViewsResult:
-        """Estimate poses in the world from several pictures of a static scene.
+        """Estimate poses in the world from several images of a static scene.
 
         Args:
             images: RGB, uint8, of any sizes.
@@ -433,7 +433,7 @@ class PoseEstimator:
 
     def explain(
         self,
-        image: Picture,
+        image: RGBImage,
         K: CameraMatrix,
         depth: Depth | None = None,
         distances: Distances | None = None,
@@ -456,7 +456,7 @@ class PoseEstimator:
         return reasons + [rejected_refined(candidate, self.min_score) for candidate in rejected]
 
     def _missing(
-        self, image: Picture, K: CameraMatrix, distances: Distances | None, roi: Region | None
+        self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
     ) -> list[Reason]:
         """Return the reasons why there are no further start detections."""
         stride, options = self.network.stride, self._recovery_options(self.min_score)
@@ -468,7 +468,7 @@ class PoseEstimator:
 
     def views(
         self,
-        image: Picture,
+        image: RGBImage,
         K: CameraMatrix,
         distances: Distances | None = None,
         roi: Region | None = None,
@@ -477,7 +477,7 @@ class PoseEstimator:
         multiple = self.network.size_multiple
         return network_views(self.checkpoint, multiple, image, K, distances, roi)
 
-    def maps(self, image: Picture) -> Maps:
+    def maps(self, image: RGBImage) -> Maps:
         """Run the network on an RGB image; its sides must be multiples of ``size_multiple``."""
         pixels = torch.from_numpy(image).to(self.device).permute(2, 0, 1)[None]
         with torch.inference_mode():

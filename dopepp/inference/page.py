@@ -26,7 +26,7 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.core.validation import Range, check
-from dopepp.drawing.pictures import Picture, read_photo
+from dopepp.drawing.pictures import RGBImage, read_photo
 from dopepp.drawing.sheet import belief_tiles, contact_sheet
 from dopepp.geometry.camera import MAX_VIEW_DEG, MIN_VIEW_DEG, CameraMatrix, camera_matrix
 from dopepp.geometry.camera_file import Camera, read_camera
@@ -73,7 +73,7 @@ LAUNCH: Final[dict[str, Any]] = {
 }
 """Settings of Gradio's server."""
 
-Outputs = tuple[Picture | None, str, list[list[object]], Any, Picture | None]
+Outputs = tuple[RGBImage | None, str, list[list[object]], Any, RGBImage | None]
 """Outputs of the page: drawn poses, message, table, download button, belief maps."""
 
 
@@ -109,7 +109,7 @@ def make_page(estimator: PoseEstimator, folder: Path) -> gr.Blocks:
     def find_poses(path: str | None, kind: str, *camera: Any) -> Outputs:
         try:
             if path is None:
-                raise UserError("no picture", "an image file", "drop a picture onto the page")
+                raise UserError("no image", "an image file", "drop an image onto the page")
             return _outputs(estimator, Path(path), kind, camera, folder)
         except UserError as error:
             message = str(error)
@@ -123,13 +123,13 @@ def make_page(estimator: PoseEstimator, folder: Path) -> gr.Blocks:
         gr.Markdown(f"# DOPE++\nlooks for {parts}")
         with gr.Row():
             with gr.Column(scale=1, min_width=320):
-                formats = "Picture: PNG, JPEG, TIFF, BMP or WEBP"
+                formats = "Image: PNG, JPEG, TIFF, BMP or WEBP"
                 picture = gr.File(label=formats, height=160, elem_id="picture")
                 camera = _camera_inputs()
                 button = gr.Button("Find poses", variant="primary")
                 maps = _image("Belief maps", "maps", estimator.has_network)
             with gr.Column(scale=2, min_width=480):
-                greeting = _message("Drop a picture, specify its camera, and find the poses.")
+                greeting = _message("Drop an image, specify its camera, and find the poses.")
                 message = gr.HTML(greeting, padding=False)
                 drawn = _image("Poses", "poses")
                 table = gr.Dataframe(headers=COLUMNS, label=FRAME, interactive=False)
@@ -155,7 +155,7 @@ def _image(label: str, name: str, is_visible: bool = True) -> gr.Image:
 def _camera_inputs() -> list[Any]:
     """Return the input fields of all camera types, and show only the chosen type's fields."""
     kind = gr.Radio([VIEW, NUMBERS, FILE], value=VIEW, label="Camera")
-    view = gr.Number(label="Degrees across the picture's width", placeholder="60")
+    view = gr.Number(label="Degrees across the image's width", placeholder="60")
     with gr.Row(visible=False) as row:
         numbers = [
             gr.Number(label=name, placeholder="pixels", min_width=80)
@@ -234,7 +234,7 @@ def _camera(kind: str, inputs: Sequence[Any], width: int, height: int) -> Camera
     return Camera(None, camera_matrix(fx, fy, cx, cy), (), "K")
 
 
-def belief_sheet(estimator: PoseEstimator, image: Picture, K: CameraMatrix) -> Picture:
+def belief_sheet(estimator: PoseEstimator, image: RGBImage, K: CameraMatrix) -> RGBImage:
     """Draw the belief maps over the image, in every size that the network is run on."""
     tiles = []
     for view in estimator.views(image, K):

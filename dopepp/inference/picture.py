@@ -20,7 +20,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from dopepp.core.errors import UserError
 from dopepp.core.validation import Span, check
-from dopepp.drawing.pictures import Picture, Size, read_image
+from dopepp.drawing.pictures import RGBImage, Size, read_image
 from dopepp.geometry.camera import (
     ANYWHERE,
     WHOLE,
@@ -58,12 +58,12 @@ MARGIN: Final = 1.1  # size ratio that a network does not notice
 
 
 def prepare_image(
-    image: Picture,
+    image: RGBImage,
     K: CameraMatrix,
     distortion: Coefficients | None = None,
     depth: Depth | None = None,
     cropped: bool = False,
-) -> tuple[Picture, CameraMatrix, Depth32 | None]:
+) -> tuple[RGBImage, CameraMatrix, Depth32 | None]:
     """Check the arguments of a prediction and remove the lens distortion.
 
     Args:
@@ -157,7 +157,7 @@ def read_depth_image(path: Path, scale: float) -> Depth32:
         raise UserError(
             f"depth image {path} of type {units.dtype} and shape {units.shape}",
             "a PNG with one channel of 16 bits",
-            "save the raw depth, not a coloured picture of it",
+            "save the raw depth, not a coloured image of it",
         )
     return (units * scale).astype(np.float32)
 
@@ -200,7 +200,7 @@ class NetworkView:
 def network_views(
     checkpoint: Checkpoint,
     multiple: int,
-    image: Picture,
+    image: RGBImage,
     K: CameraMatrix,
     distances: Distances | None = None,
     roi: Region | None = None,
@@ -231,7 +231,7 @@ def network_views(
     ]
 
 
-def checked_region(roi: Region | None, image: Picture) -> Region | None:
+def checked_region(roi: Region | None, image: RGBImage) -> Region | None:
     """Return a region of an image in whole pixels.
 
     Raises:
@@ -248,7 +248,7 @@ def checked_region(roi: Region | None, image: Picture) -> Region | None:
 
 
 def letterboxed(
-    image: Picture, letterbox: Letterbox, multiple: int
+    image: RGBImage, letterbox: Letterbox, multiple: int
 ) -> UInt8[np.ndarray, "rows columns 3"]:
     """Resize an image into a letterbox and pad its sides to a multiple, at the right and bottom."""
     image = letterbox.image(image)
@@ -257,7 +257,7 @@ def letterboxed(
 
 
 def letterboxes(
-    checkpoint: Checkpoint, K: CameraMatrix, image: Picture, distances: Distances | None = None
+    checkpoint: Checkpoint, K: CameraMatrix, image: RGBImage, distances: Distances | None = None
 ) -> list[Letterbox]:
     """Return the sizes of an image that the network is run on, the smallest first.
 

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Int
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import PICTURES, check_target, write_picture
+from dopepp.core.files import IMAGES, check_target, write_image
 from dopepp.drawing.overlay import (
     MIN_WIDTH_PX,
     YELLOW,
@@ -31,7 +31,7 @@ from dopepp.drawing.overlay import (
     draw_wireframe,
     enlarge,
 )
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import (
     CameraMatrix,
     Transform,
@@ -99,7 +99,7 @@ def make_shape(part: Part) -> Shape:
 class PoseResult:
     """The detections on one frame."""
 
-    image: Picture = field(repr=False)  # RGB, without lens distortion: keypoints and K refer to it
+    image: RGBImage = field(repr=False)  # RGB, without lens distortion: keypoints and K refer to it
     K: CameraMatrix  # camera matrix, pixels
     detections: Sequence[Detection]  # best score first; from a tracker, sorted by identity
     speed: Mapping[str, float]  # milliseconds of each of STEPS
@@ -128,7 +128,7 @@ class PoseResult:
         poses = f"{count} pose{'s' * (count > 1)}" if count else "nothing found"
         return f"{poses}; {self.weaker_in_words}" if self.weaker else poses
 
-    def plot(self) -> Picture:
+    def plot(self) -> RGBImage:
         """Return the image with every part's silhouette, cuboid, axes, name and score.
 
         A caption states the number of weaker candidates. An image below 640 pixels in width is
@@ -148,8 +148,8 @@ class PoseResult:
         Raises:
             UserError: The suffix is neither PNG's nor JPEG's, or the file cannot be written.
         """
-        check_target(Path(path), PICTURES)
-        write_picture(Path(path), self.plot())
+        check_target(Path(path), IMAGES)
+        write_image(Path(path), self.plot())
 
     def records(self) -> list[dict[str, Any]]:
         """Return each detection as plain values, with the name of its image and its frame."""
@@ -237,12 +237,12 @@ def spent_between(before: Mapping[str, float], after: Mapping[str, float]) -> di
 
 
 def draw_poses(
-    image: Picture,
+    image: RGBImage,
     K: CameraMatrix,
     detections: Sequence[Detection],
     labels: Sequence[str],
     shapes: Mapping[str, Shape],
-) -> Picture:
+) -> RGBImage:
     """Return a copy of the image with poses drawn on it, enlarged if it is narrow."""
     factor = max(1, -(-MIN_WIDTH_PX // image.shape[1]))
     canvas, K = enlarge(image, factor), resize_camera(K, factor, factor)
@@ -265,7 +265,7 @@ def draw_poses(
 
 
 def silhouette_contours(
-    shape: Shape, T_cam_obj: Transform, K: CameraMatrix, image: Picture
+    shape: Shape, T_cam_obj: Transform, K: CameraMatrix, image: RGBImage
 ) -> list[Int[np.ndarray, "points 1 2"]]:
     """Return the closed contours of a posed mesh on an image, pixels.
 
@@ -289,7 +289,7 @@ def silhouette_contours(
 
 
 def _draw_axes(
-    canvas: Picture, T_cam_obj: Transform, K: CameraMatrix, diameter: float, width: int
+    canvas: RGBImage, T_cam_obj: Transform, K: CameraMatrix, diameter: float, width: int
 ) -> None:
     """Draw the object's axes in place, the farthest first."""
     ends = transform(T_cam_obj, np.vstack([np.zeros(3), AXIS * diameter * np.eye(3)]))

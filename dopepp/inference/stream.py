@@ -72,9 +72,9 @@ def stream(
     for opened in open_sources([source], options.get("topic")):
         lens = Lens(choose_camera(K, camera, opened), options.get("K_size"), options.get("crop"))
         if options.get("depth") is not None and opened.count != 1:
-            problem = f"--depth with {opened.count or 'many'} pictures"
-            fix = "pass only the picture that the depth belongs to"
-            raise UserError(problem, "one picture", fix)
+            problem = f"--depth with {opened.count or 'many'} images"
+            fix = "pass only the image that the depth belongs to"
+            raise UserError(problem, "one image", fix)
         tracker = PoseTracker(estimator) if options.get("track") else None
         for frame in opened.frames(stride):
             yield replace(_process(estimator, tracker, frame, lens, options), shapes=shapes)

@@ -17,7 +17,7 @@ import torch
 
 from dopepp.core.errors import UserError
 from dopepp.core.validation import Range, check
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.picture import (
@@ -135,7 +135,7 @@ class TemplateEstimator(PoseEstimator):
         return "templates of meshes"
 
     def _start_detections(
-        self, image: Picture, K: CameraMatrix, distances: Distances | None, roi: Region | None
+        self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
     ) -> list[Detection]:
         """Return start poses of all parts, best score first."""
         with self._timed("decode"):
@@ -150,7 +150,7 @@ class TemplateEstimator(PoseEstimator):
     def refined(
         self,
         detections: Sequence[Detection],
-        image: Picture,
+        image: RGBImage,
         K: CameraMatrix,
         depth: Depth | None = None,
     ) -> list[Detection]:
@@ -189,7 +189,7 @@ class TemplateEstimator(PoseEstimator):
         return merge_scales([[detection] for detection in scored])
 
     def _missing(
-        self, image: Picture, K: CameraMatrix, distances: Distances | None, roi: Region | None
+        self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
     ) -> list[Reason]:
         """Return a reason for each part without a start detection."""
         near, far = self._range(distances)
@@ -225,7 +225,7 @@ class TemplateEstimator(PoseEstimator):
 
     def views(
         self,
-        image: Picture,
+        image: RGBImage,
         K: CameraMatrix,
         distances: Distances | None = None,
         roi: Region | None = None,
@@ -237,7 +237,7 @@ class TemplateEstimator(PoseEstimator):
         """
         raise _networks_only("inputs of a network")
 
-    def maps(self, image: Picture) -> NoReturn:
+    def maps(self, image: RGBImage) -> NoReturn:
         """Not available.
 
         Raises:
@@ -262,7 +262,7 @@ def _silhouette_handicap(detector: TemplateDetector, detection: Detection) -> fl
 def _largest_log_odds(
     detector: TemplateDetector,
     distances: tuple[float, float],
-    images: Iterable[Picture],
+    images: Iterable[RGBImage],
     K: CameraMatrix,
 ) -> list[float]:
     """Return the largest log odds of verified poses on each image.

@@ -24,7 +24,7 @@ from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.core.validation import Range, check
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import (
     CameraMatrix,
     Step,
@@ -201,7 +201,7 @@ class PoseTracker:
         self._frame = 0
         self._identities = 0
 
-    def track(self, image: Picture, K: CameraMatrix, cropped: bool = False) -> list[Track]:
+    def track(self, image: RGBImage, K: CameraMatrix, cropped: bool = False) -> list[Track]:
         """Track and detect the parts on the next frame.
 
         Args:
@@ -235,7 +235,7 @@ class PoseTracker:
         unsure = _agreement(state.track.detection) < SURE and self._frame % OFTEN == 0
         return bool(unsure or state.unseen or state.doubts or state.disagreements)
 
-    def _follow(self, state: _State, image: Picture, K: CameraMatrix) -> None:
+    def _follow(self, state: _State, image: RGBImage, K: CameraMatrix) -> None:
         """Refine a part's predicted pose; continue its motion if no pose is accepted."""
         previous, forecast = state.track.detection, state.motion.predict()
         rejected = None
@@ -260,7 +260,7 @@ class PoseTracker:
         state.follow(forecast, replace(rejected, keypoints=keypoints))
         state.doubts += 1
 
-    def _detect(self, image: Picture, K: CameraMatrix, roi: Region | None = None) -> None:
+    def _detect(self, image: RGBImage, K: CameraMatrix, roi: Region | None = None) -> None:
         """Run the network, and assign its detections to tracked, lost and new parts."""
         candidates = self.estimator.candidates(image, K, roi=roi, cropped=True)  # checked before
         detections, self.weaker = self.estimator.split(candidates)
@@ -319,7 +319,7 @@ class PoseTracker:
         return float(distance / self._diameters[tracked.object])
 
 
-def _region_around(detections: Sequence[Detection], image: Picture) -> Region | None:
+def _region_around(detections: Sequence[Detection], image: RGBImage) -> Region | None:
     """Return a region around detections; None for the whole image."""
     points = np.concatenate([detection.keypoints for detection in detections])
     margin = AROUND * max(np.ptp(detection.keypoints, axis=0).max() for detection in detections)

@@ -21,7 +21,7 @@ import numpy as np
 
 from dopepp.core.errors import RunError, UserError, require
 from dopepp.core.files import check_target, partial_path
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import crop_camera
 from dopepp.geometry.cuboid import CENTROID, EDGES
 from dopepp.geometry.rotation import matrix_to_quaternion
@@ -76,7 +76,7 @@ class Viewer:
         """Continue with another source on the same timeline."""
 
     def write(self, result: PoseResult) -> None:
-        """Add a frame: its picture, outlines, belief maps and poses."""
+        """Add a frame: its image, outlines, belief maps and poses."""
         import rerun as rr
 
         log, distance = self._recording.log, self._distance(result)
@@ -96,7 +96,7 @@ class Viewer:
         log("world/camera/picture", rr.Image(result.image).compress(JPEG_QUALITY))
         log("world/camera/outlines", _outlines(result))
         log("summary", rr.TextDocument(result.summary))
-        for name, belief in belief_pictures(self._estimator, result).items():
+        for name, belief in belief_images(self._estimator, result).items():
             log(f"beliefs/{name}", rr.Image(belief))
         # With a tracker, a detection has the same name on every frame.
         numbers = result.identities or range(len(result.detections))
@@ -195,7 +195,7 @@ class Viewer:
         log(f"world/uncertainty/{name}", ellipsoid)
 
 
-def belief_pictures(estimator: PoseEstimator, result: PoseResult) -> Mapping[str, Picture]:
+def belief_images(estimator: PoseEstimator, result: PoseResult) -> Mapping[str, RGBImage]:
     """Return the strongest belief of each part's keypoints as colours; none without a network.
 
     The network is run again, on the largest of its image sizes.
@@ -208,11 +208,11 @@ def belief_pictures(estimator: PoseEstimator, result: PoseResult) -> Mapping[str
     levels = np.rint(255 * by_part.max(axis=1).clip(0, 1)).astype(np.uint8)
     stride = estimator.network.stride
     rows, columns = -(-view.box.height // stride), -(-view.box.width // stride)
-    pictures = {}
+    images = {}
     for part, level in zip(estimator.parts, levels, strict=True):
         colours = cv2.applyColorMap(level[:rows, :columns], cv2.COLORMAP_INFERNO)
-        pictures[part.name] = np.asarray(colours[..., ::-1])
-    return pictures
+        images[part.name] = np.asarray(colours[..., ::-1])
+    return images
 
 
 def _is_listening(port: int) -> bool:

@@ -18,7 +18,7 @@ from pydantic import Field
 
 from dopepp.core.errors import UserError
 from dopepp.core.validation import STRICT, parse
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.rotation import is_rigid
 from dopepp.geometry.symmetry import ContinuousSymmetry
@@ -70,7 +70,7 @@ class Mesh:
     vertices: Vertices
     faces: Faces
     uv: Float[np.ndarray, "vertices 2"] | None = None
-    texture: Picture | None = None
+    texture: RGBImage | None = None
     colours: Colours | None = None
     normals: Float[np.ndarray, "vertices 3"] | None = None
 

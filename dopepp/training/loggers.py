@@ -18,7 +18,7 @@ from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from lightning.pytorch.utilities import rank_zero_only
 
 from dopepp.core.files import write_csv
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -143,7 +143,7 @@ class GuardedLogger(Logger):
         """Forward to the logger."""
         self._forward(lambda inner: inner.finalize(status))
 
-    def log_picture(self, name: str, image: Picture, step: int | None = None) -> None:
+    def log_picture(self, name: str, image: RGBImage, step: int | None = None) -> None:
         """Log an RGB image to TensorBoard or Weights & Biases."""
         inner = self.inner
         if isinstance(inner, TensorBoardLogger):

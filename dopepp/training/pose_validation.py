@@ -26,7 +26,7 @@ from dopepp.data.batch import Batch
 from dopepp.data.sample import Instance
 from dopepp.drawing.curves import figure_image, save_accuracy_curves
 from dopepp.drawing.overlay import GREEN, YELLOW, Wireframe, overlay
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.drawing.sheet import Tile, belief_tiles, contact_sheet
 from dopepp.geometry.cuboid import NUM_KEYPOINTS
 from dopepp.metrics.pose import MEAN, PoseMetrics
@@ -216,8 +216,8 @@ class BeliefMaps(ValidationSheet):
         return tiles
 
 
-def _log_picture(trainer: Trainer, name: str, image: Picture) -> None:
-    """Send a picture to every logger that accepts pictures."""
+def _log_picture(trainer: Trainer, name: str, image: RGBImage) -> None:
+    """Send an image to every logger that accepts images."""
     for logger in trainer.loggers:
         if isinstance(logger, GuardedLogger):
             logger.log_picture(name, image, trainer.global_step)

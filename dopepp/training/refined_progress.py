@@ -20,37 +20,37 @@ from dopepp.models.checkpoint import parse_description
 from dopepp.training.pose_validation import best_effort
 from dopepp.training.system import PoseSystem
 
-PICTURE: Final = "refined.png"  # curve in the run folder
+IMAGE: Final = "refined.png"  # curve in the run folder
 
 NUM_PICTURES: Final = 40
-NUM_CONFIRMING: Final = 100  # pictures on which a reached goal is confirmed
+NUM_CONFIRMING: Final = 100  # images on which a reached goal is confirmed
 MIN_SCORE: Final = 0.5  # reported poses are more likely correct than incorrect
 MAX_SHARE: Final = 0.1  # largest share of the time that measurements take
 
 
 class RefinedProgress(Callback):
-    """Measures reported refined poses on whole pictures of the camera after validations.
+    """Measures reported refined poses on whole images of the camera after validations.
 
     A measurement is logged as ``val/refined`` (share of the instances with a reported pose whose
     ADD(-S) is below a tenth of the diameter) and ``val/refined_precision``, printed with its 95 %
     interval, and drawn in ``refined.png`` over the minutes of training.
 
     Args:
-        pictures: Held-out pictures, at the camera's resolution.
+        images: Held-out images, at the camera's resolution.
         refine: Evidence that refines the poses.
-        stop_at: Share that ends the training, once it is confirmed on more pictures; None: never.
+        stop_at: Share that ends the training, once it is confirmed on more images; None: never.
         every_s: Shortest time between two measurements, seconds. It is longer if measurements would
             take more than a tenth of the time.
     """
 
     def __init__(
         self,
-        pictures: SampleSource,
+        images: SampleSource,
         refine: Refine,
         stop_at: float | None = None,
         every_s: float = 120.0,
     ) -> None:
-        self.pictures, self.refine, self.stop_at, self.every_s = pictures, refine, stop_at, every_s
+        self.pictures, self.refine, self.stop_at, self.every_s = images, refine, stop_at, every_s
         self.curve: list[tuple[float, float, float, float]] = []
         """Minutes of training, share, and the ends of its interval."""
         self._minutes_before, self._begin, self._due = 0.0, 0.0, 0.0
@@ -101,7 +101,7 @@ class RefinedProgress(Callback):
         )
         reached = self.stop_at is not None and share >= self.stop_at
         system.print(f"{line}; stop_at={self.stop_at:g} is reached" if reached else line)
-        with best_effort(PICTURE):
+        with best_effort(IMAGE):
             self._draw(Path(trainer.default_root_dir))
         return reached
 
@@ -115,13 +115,13 @@ class RefinedProgress(Callback):
     def _measure(
         self, estimator: PoseEstimator, metrics: PoseMetrics, first: int, end: int
     ) -> tuple[float, int, float]:
-        """Add pictures to the metrics; return recall, number of instances and precision.
+        """Add images to the metrics; return recall, number of instances and precision.
 
         Args:
             estimator: Estimator of the network.
-            metrics: Metrics of the pictures before the first.
-            first: First picture to add.
-            end: Picture after the last.
+            metrics: Metrics of the images before the first.
+            first: First image to add.
+            end: Image after the last.
         """
         for index in range(first, min(end, len(self.pictures))):
             sample = self.pictures.sample(index)
@@ -140,4 +140,4 @@ class RefinedProgress(Callback):
         panels = {"refined and reported poses": {"ADD(-S)-0.1d": RateCurve(x, rate, low, high)}}
         figure = rates_figure(panels, "minutes of training", columns=1)
         figure.axes[0].set_xlim(0, None)
-        write_png(folder / PICTURE, figure_image(figure))
+        write_png(folder / IMAGE, figure_image(figure))

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from dopepp.drawing.pictures import Mask, Picture, Size
+from dopepp.drawing.pictures import Mask, RGBImage, Size
 from dopepp.geometry.camera import CameraMatrix, Transform, transform
 from dopepp.virtual.renderers.raster.visibility import draw_alone, project_object
 from dopepp.virtual.scene import NEAR, SceneObject
@@ -24,7 +24,7 @@ MAX_POINTS: Final = 1500  # largest number of evaluated contour pixels
 FLOOR: Final = 2.0  # gradient of noise, grey levels per pixel
 
 
-def agreement(image: Picture, K: CameraMatrix, T_cam_obj: Transform, surface: Surface) -> float:
+def agreement(image: RGBImage, K: CameraMatrix, T_cam_obj: Transform, surface: Surface) -> float:
     """Return the agreement of a part's outline and creases with an image, in [0, 1].
 
     1 means that all edges lie on the contour. A part that is not in front of the camera, or has no
@@ -96,7 +96,7 @@ def _normals(edges: Mask) -> Float[np.ndarray, "height width 2"]:
 
 
 def _profiles(
-    image: Picture, contour: Float[np.ndarray, "points 4"], reach: int
+    image: RGBImage, contour: Float[np.ndarray, "points 4"], reach: int
 ) -> Float[np.ndarray, "points offsets"]:
     """Return the squared gradient along the normals, from ``-reach`` to ``reach`` pixels."""
     # Blurred by a pixel against noise.

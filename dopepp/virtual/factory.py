@@ -166,7 +166,7 @@ class Factory:
                 T_cam_table = arrange_heap(composition, preset.table, pile, targets, drawing)
             shift = approach(composition.objects, scale)
             lights, ambient = preset.lighting.draw(rng, T_cam_table[:3, 3], T_cam_table[:3, 2])
-            picture = preset.table.draw_picture(rng, backgrounds, K, size, T_cam_table)
+            picture = preset.table.draw_image(rng, backgrounds, K, size, T_cam_table)
             T_cam_table = _moved(T_cam_table, shift)
             plane = plane_of(T_cam_table)
             if plane.offset >= 0:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int16
 
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
 from dopepp.geometry.cuboid import NUM_KEYPOINTS
 from dopepp.parts.part import Part
@@ -140,7 +140,7 @@ class Scene:
     """Objects, lights, background and camera of one image."""
 
     K: CameraMatrix
-    background: Picture
+    background: RGBImage
     objects: tuple[SceneObject, ...] = ()
     lights: tuple[Light, ...] = ()
     ambient: Ambient = field(default_factory=Ambient)
@@ -160,7 +160,7 @@ class Scene:
     def seen_from(self, T_new_cam: Transform) -> Scene:
         """Return the static scene in another camera with the same lens and sensor.
 
-        The background is the plane's picture, or infinitely far away; beyond its border it is
+        The background is the plane's image, or infinitely far away; beyond its border it is
         reflected.
 
         Args:
@@ -210,7 +210,7 @@ class Rendered:
         visible_fractions: Visible share of every object's whole silhouette.
     """
 
-    image: Picture
+    image: RGBImage
     depth: Float32[np.ndarray, "height width"]
     instances: Int16[np.ndarray, "height width"]
     visible_fractions: Float[np.ndarray, "objects"]

@@ -1,4 +1,4 @@
-"""The sensor: exposure, lens blur, noise and compression of an ideal picture; sRGB and tone curve.
+"""The sensor: exposure, lens blur, noise and compression of an ideal image; sRGB and tone curve.
 
 To add an effect, write a function, add its parameter to :class:`Sensor` and its probability and
 range to :class:`Sensors`, and call it in :func:`capture` (order: exposure, lens, chip, file).
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.core.validation import Checked, Pair, Range, Span
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 
 Probability = Annotated[float, Range(0.0, 1.0, "probability")]
 
@@ -30,7 +30,7 @@ _NOISE_RUN: Final = 1024  # values read in a row; then the hash chooses another 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A camera's effects, applied to the whole picture after rendering.
+    """A camera's effects, applied to the whole image after rendering.
 
     Attributes:
         exposure_ev: Exposure in stops; 1 doubles the light.
@@ -80,7 +80,7 @@ class Sensors(Checked):
     jpeg_quality: Annotated[tuple[int, int], Span(1, 100, "JPEG quality")] = (70, 95)
 
     def resized(self, scale: float) -> Sensors:
-        """Return the same camera for pictures scaled by a factor."""
+        """Return the same camera for images scaled by a factor."""
         blur, motion = ((scale * low, scale * high) for low, high in (self.blur_px, self.motion_px))
         return replace(self, blur_px=blur, motion_px=motion)
 
@@ -105,14 +105,14 @@ class Sensors(Checked):
         )
 
 
-def capture(image: Picture, sensor: Sensor) -> Picture:
-    """Apply a sensor's effects to an ideal picture; the default sensor has none.
+def capture(image: RGBImage, sensor: Sensor) -> RGBImage:
+    """Apply a sensor's effects to an ideal image; the default sensor has none.
 
     Exposure works on linear light; both blurs work on sRGB and spread highlights slightly less.
     """
     if sensor.exposure_ev:
         image = np.asarray(cv2.LUT(image, _exposure_curve(sensor.exposure_ev)))
-    if sensor.blur_px >= 0.1:  # narrower blur does not change 8-bit pictures
+    if sensor.blur_px >= 0.1:  # narrower blur does not change 8-bit images
         image = defocus(image, sensor.blur_px)
     if any(sensor.motion_px):
         image = motion_blur(image, sensor.motion_px)
@@ -123,18 +123,18 @@ def capture(image: Picture, sensor: Sensor) -> Picture:
     return image
 
 
-def defocus(image: Picture, sigma_px: float) -> Picture:
+def defocus(image: RGBImage, sigma_px: float) -> RGBImage:
     """Blur with a Gaussian of a standard deviation in pixels."""
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px))
 
 
-def motion_blur(image: Picture, motion_px: tuple[float, float]) -> Picture:
-    """Average the picture along a displacement (x, y) in pixels, centred on each pixel."""
+def motion_blur(image: RGBImage, motion_px: tuple[float, float]) -> RGBImage:
+    """Average the image along a displacement (x, y) in pixels, centred on each pixel."""
     kernel = _line_kernel(*motion_px)
     return np.asarray(cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REFLECT_101))
 
 
-def add_noise(image: Picture, read: float, shot: float, seed: int) -> Picture:
+def add_noise(image: RGBImage, read: float, shot: float, seed: int) -> RGBImage:
     """Add Gaussian noise, independent per pixel and channel.
 
     ``read`` and ``shot`` are as in :class:`Sensor`; ``seed`` (0 to 2³² − 1) fixes the noise.
@@ -146,7 +146,7 @@ def add_noise(image: Picture, read: float, shot: float, seed: int) -> Picture:
     return noisy
 
 
-def compress(image: Picture, quality: int) -> Picture:
+def compress(image: RGBImage, quality: int) -> RGBImage:
     """Compress to JPEG (quality 1 to 100) and back."""
     # The codec expects B, G, R.
     bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)

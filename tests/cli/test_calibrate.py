@@ -1,4 +1,4 @@
-"""The commands as they are typed, on drawn pictures."""
+"""The commands as they are typed, on drawn images."""
 
 import csv
 import shutil
@@ -23,7 +23,7 @@ BOARD = "charuco:8x6:25:19"
 
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory):
-    """A folder with ten pictures, poses.csv and camera.yaml, and where the camera truly is."""
+    """A folder with ten images, poses.csv and camera.yaml, and where the camera truly is."""
     folder, rng = tmp_path_factory.mktemp("cell"), np.random.default_rng(0)
     camera = Camera((640, 480), camera_matrix(560, 560, 322, 236), (0.05, -0.1, 0, 0, 0), "true")
     board = parse_board(BOARD)
@@ -111,7 +111,7 @@ def test_a_tip_and_a_bench_are_written(run, tmp_path):
 
 @pytest.fixture(scope="module")
 def video(cell):
-    """The cell's pictures as a video, in which each is in sight for three frames."""
+    """The cell's images as a video, in which each is in sight for three frames."""
     path = cell[0] / "board.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (640, 480))
     for number in range(10):
@@ -124,7 +124,7 @@ def video(cell):
 def test_of_a_video_the_views_that_differ_are_taken(run, cell, video, tmp_path):
     out = tmp_path / "camera.yaml"
     done = run("calibrate", "camera", video, "--board", BOARD, "--out", out, "--force")
-    assert "10 distinct views in 15 pictures" in done.stderr
+    assert "10 distinct views in 15 images" in done.stderr
     assert read_camera(out).K[0, 0] == pytest.approx(cell[2].K[0, 0], rel=0.02)
 
 
@@ -159,7 +159,7 @@ def test_a_bench_is_found_from_a_board_on_it(run, refused, cell, tmp_path):
     [
         (("board", "chess:8x6:20", "--out", "b.pdf"), "one even and one odd"),
         (("board", "chess:8x5:20", "--out", "b.txt"), ".pdf"),
-        (("camera", ".", "--board", BOARD, "--out", "c.yaml"), "without pictures"),
+        (("camera", ".", "--board", BOARD, "--out", "c.yaml"), "without images"),
         (("camera", ".", "--board", BOARD, "--out", "c.json"), ".yaml"),
         (("tcp", "none.csv", "--out", "t.yaml"), "none.csv"),
         (("tcp", "none.csv", "--out", "t.yaml", "--unit", "feet"), "--unit feet"),
@@ -185,12 +185,12 @@ def test_pictures_without_the_board_are_told(run, cell, tmp_path):
         tmp_path / "c.yaml",
         code=2,
     )
-    assert "no board in any of 10 pictures" in done.output
+    assert "no board in any of 10 images" in done.output
 
 
 @pytest.fixture(scope="module")
 def rig_folder(tmp_path_factory):
-    """Pictures of two cameras at five moments, their camera files, and the second's true pose."""
+    """Images of two cameras at five moments, their camera files, and the second's true pose."""
     folder, rng = tmp_path_factory.mktemp("rig"), np.random.default_rng(1)
     camera = Camera((640, 480), camera_matrix(560, 560, 322, 236), (0.05, -0.1, 0, 0, 0), "true")
     board, names = parse_board(BOARD), ("left", "right")
@@ -216,7 +216,7 @@ def test_a_rig_is_calibrated_for_several_views(run, rig_folder, tmp_path):
     write_calibration(tmp_path / "hand_eye.yaml", "hand-eye", hand_eye, (), False)
     words = ("--board", BOARD, "--out", tmp_path / "rig.yaml")
     done = run("calibrate", "rig", folder, *words, "--hand-eye", tmp_path / "hand_eye.yaml")
-    assert "right: 5 pictures with another camera" in done.output
+    assert "right: 5 images with another camera" in done.output
     poses = read_camera_poses(tmp_path / "rig.yaml")
     left, right = (poses.of(Path(f"{name}.png")) for name in ("left", "right"))
     np.testing.assert_allclose(left.T_world_cam, T_base_left, atol=1e-9)
@@ -236,7 +236,7 @@ def test_a_faulty_rig_is_refused_with_the_name_of_its_camera(run, refused, rig_f
     assert not (tmp_path / "rig.yaml").exists()
     for path in (tmp_path / "rig" / "right").iterdir():
         path.rename(path.with_stem(f"other_{path.stem}"))
-    assert "right without a picture of the board together with left" in refused(*words)
+    assert "right without an image of the board together with left" in refused(*words)
     (tmp_path / "rig" / "right.yaml").unlink()
     assert "right.yaml" in refused(*words)
     shutil.rmtree(tmp_path / "rig" / "right")

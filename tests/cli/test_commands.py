@@ -81,7 +81,7 @@ def test_predict_follows_parts_through_a_folder(run, refused, tmp_path):
     for record in records:
         assert np.linalg.norm(np.array(record["T_cam_obj"])[:3, 3] - true[:3, 3]) < 0.003
     assert len(list(drawn.iterdir())) == 3
-    assert "without a picture" in refused("predict", released, drawn.parent, "--K", *camera)
+    assert "without an image" in refused("predict", released, drawn.parent, "--K", *camera)
 
 
 def test_compare_tells_an_unfinished_run(run, refused, tmp_path):

@@ -31,7 +31,7 @@ def rendered():
 
 @pytest.fixture(scope="module")
 def files(rendered, tmp_path_factory):
-    """A video of the part standing still, and a picture of it and one without it."""
+    """A video of the part standing still, and an image of it and one without it."""
     folder = tmp_path_factory.mktemp("files")
     writer = cv2.VideoWriter(
         str(folder / "clip.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (320, 240)

@@ -46,7 +46,7 @@ def four(K):
 
 @pytest.fixture(scope="module")
 def folder(rendered, K, tmp_path_factory):
-    """Pictures of one part, each spoilt or taken in another way, and files of their cameras."""
+    """Images of one part, each spoilt or taken in another way, and files of their cameras."""
     folder = tmp_path_factory.mktemp("pictures")
     picture = rendered.image[..., ::-1]
     pixels = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), -1).reshape(-1, 1, 2)
@@ -110,7 +110,7 @@ def test_the_lens_counts(poses, folder, rendered, tmp_path):
     without = poses(picture, "--camera", folder / "K.txt", *refine)
     assert all(np.linalg.norm(item[:3, 3] - true) > 0.001 for item in without)
     drawn = tmp_path / "lens.png"
-    # Drawn on the picture as a pinhole sees it, which is the rendered one.
+    # Drawn on the image as a pinhole sees it, which is the rendered one.
     shown = cv2.imread(str(drawn))[200:450, 20:300, ::-1].astype(float)
     assert np.abs(shown - rendered.image[200:450, 20:300]).mean() < 12
 
@@ -123,7 +123,7 @@ def test_the_lens_counts(poses, folder, rendered, tmp_path):
         ("whole.png", ["--camera", "none.yaml"], "none.yaml: No such file"),
         ("whole.png", ["--camera", "whole.png"], "camera file"),
         ("half.png", ["--camera", "K.txt"], "at 100% of its width"),
-        ("half.png", ["--camera", "plain.json"], "--K-size 640 480 if the picture was resized"),
+        ("half.png", ["--camera", "plain.json"], "--K-size 640 480 if the image was resized"),
         ("cut.png", ["--camera", "plain.json"], "--crop X Y 632 400 if it was cropped"),
         ("4k.png", ["--camera", "plain.json"], "calibrate the camera at 3840×2160"),
         ("4k.png", ["--camera", "K.txt"], "likely of 640×480"),
@@ -213,9 +213,9 @@ def test_several_views_of_a_scene(run, tmp_path):
     np.savetxt(tmp_path / "K.txt", scene.K)
     path = tmp_path / "views.yaml"
     path.write_text(json.dumps({"camera": "K.txt", "views": views}))  # JSON is YAML
-    pictures = [tmp_path / name for name in views]
+    images = [tmp_path / name for name in views]
     outputs = ("--save", tmp_path / "out", "--json", tmp_path / "scene.json")
-    done = run("predict", RELEASED, *pictures, "--views", path, *outputs)
+    done = run("predict", RELEASED, *images, "--views", path, *outputs)
     record = json.loads(done.stdout)
     assert np.linalg.norm(np.array(record["T_world_obj"]) - target, axis=0)[3] < 5e-4
     assert [view["status"] for view in record["views"]] == ["supports", "supports"]
@@ -233,12 +233,10 @@ def test_several_views_of_a_scene(run, tmp_path):
     assert [view["image"] for view in json.loads(again.stdout)["views"]] == ["a/7.png", "b/7.png"]
     views["b.png"]["T_world_cam"]["matrix"][0][3] += 0.05
     path.write_text(json.dumps({"camera": "K.txt", "views": views}))
-    done = run("predict", RELEASED, *pictures, "--views", path)
+    done = run("predict", RELEASED, *images, "--views", path)
     assert done.stdout == ""
     assert "a camera pose is wrong" in done.stderr
-    assert (
-        "--track" in run("predict", RELEASED, *pictures, "--views", path, "--track", code=2).stderr
-    )
-    assert "two pictures" in run("predict", RELEASED, pictures[0], "--views", path, code=2).stderr
+    assert "--track" in run("predict", RELEASED, *images, "--views", path, "--track", code=2).stderr
+    assert "two images" in run("predict", RELEASED, images[0], "--views", path, code=2).stderr
     path.write_text(json.dumps({"views": views}))
-    assert "--camera" in run("predict", RELEASED, *pictures, "--views", path, code=2).stderr
+    assert "--camera" in run("predict", RELEASED, *images, "--views", path, code=2).stderr

@@ -10,10 +10,10 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import (
-    PICTURES,
+    IMAGES,
     check_target,
     read_limited,
-    write_picture,
+    write_image,
     write_png,
     write_whole,
 )
@@ -60,9 +60,9 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monke
 
 @pytest.mark.parametrize(("name", "head"), [("a.png", b"\x89PNG"), ("b.JPG", b"\xff\xd8")])
 def test_a_pictures_suffix_decides_its_format(name, head, tmp_path):
-    check_target(tmp_path / "new" / name, PICTURES)
+    check_target(tmp_path / "new" / name, IMAGES)
     assert list((tmp_path / "new").iterdir()) == []
-    write_picture(tmp_path / "new" / name, np.full((4, 6, 3), (200, 100, 50), np.uint8))
+    write_image(tmp_path / "new" / name, np.full((4, 6, 3), (200, 100, 50), np.uint8))
     assert (tmp_path / "new" / name).read_bytes().startswith(head)
     back = cv2.imread(str(tmp_path / "new" / name))[..., ::-1]
     assert np.abs(back.astype(int) - (200, 100, 50)).max() < 4
@@ -83,4 +83,4 @@ def test_where_nothing_can_be_written(name, message, tmp_path):
     (tmp_path / "folder.png").mkdir()
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match=message):
-        check_target(tmp_path / name, PICTURES)
+        check_target(tmp_path / name, IMAGES)

@@ -121,6 +121,6 @@ def test_photos_that_are_refused_say_what_to_do(tmp_path, image):
     refused("raw.png", "-auto-level")
     cv2.imwrite(str(tmp_path / "colours.png"), 16 * image.astype(np.uint16))
     refused("colours.png", "-auto-level")
-    (tmp_path / "text.png").write_text("no picture")
+    (tmp_path / "text.png").write_text("no image")
     refused("text.png", "save it as PNG")
     refused("missing.png", "pass the path of an existing file")

@@ -1,4 +1,4 @@
-"""Panels and contact sheets: every picture where it belongs, in its colours."""
+"""Panels and contact sheets: every image where it belongs, in its colours."""
 
 from dataclasses import replace
 
@@ -67,22 +67,22 @@ def test_smoothing_keeps_length_level_and_straight_lines(num, slope):
 
 
 def test_pictures_stand_in_rows():
-    pictures = [np.full((2 + i, 3 + i, 3), 10 * i, np.uint8) for i in range(3)]
-    rows = sheet.grid(pictures, 2)
+    images = [np.full((2 + i, 3 + i, 3), 10 * i, np.uint8) for i in range(3)]
+    rows = sheet.grid(images, 2)
     assert rows.shape == (3 + 4, 3 + 4, 3)
     assert (rows[:3, 3:7] == 10).all()
     assert (rows[3:, :5] == 20).all()
     assert (rows[2, :3] == 255).all()
-    for wrong in (([], 1), (pictures, 0)):
+    for wrong in (([], 1), (images, 0)):
         with pytest.raises(ValueError, match="a grid needs"):
             sheet.grid(*wrong)
 
 
 def test_a_message_is_cut_where_the_picture_ends():
-    picture = sheet.message_picture(120, 60, "no file anywhere " * 50)
+    picture = sheet.message_image(120, 60, "no file anywhere " * 50)
     assert picture.shape == (60, 120, 3)
     assert picture.std() > 1
-    assert (sheet.message_picture(40, 30, "")[0] == picture[0, :40]).all()
+    assert (sheet.message_image(40, 30, "")[0] == picture[0, :40]).all()
 
 
 def test_masks_are_painted_in_their_colours_on_the_darkened_image():
@@ -180,7 +180,7 @@ def test_a_caption_is_written_below_its_picture(caption):
 
 @pytest.mark.parametrize("arguments", [([], 2, 10), ([Tile(plain(RED))], 0, 10)])
 def test_an_empty_sheet_is_refused(arguments):
-    with pytest.raises(ValueError, match="a grid needs pictures and columns"):
+    with pytest.raises(ValueError, match="a grid needs images and columns"):
         contact_sheet(*arguments)
 
 

@@ -1,4 +1,4 @@
-"""Videos that are written: every picture at its time, playable however the writing ends."""
+"""Videos that are written: every image at its time, playable however the writing ends."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ def test_pictures_stand_at_their_times(tmp_path):
 
 @pytest.mark.parametrize("size", [(47, 31), (48, 31)])
 def test_odd_sides_lose_nothing(tmp_path, size):
-    picture = level(2, size)
-    picture[:, -1] = picture[-1] = 240
+    image = level(2, size)
+    image[:, -1] = image[-1] = 240
     with VideoFile(tmp_path / "clip.mp4", 10) as video:
-        video.write(picture, 0)
+        video.write(image, 0)
     (shown,) = frames(video.path)
     assert shown.shape == (32, 48, 3)
     assert shown[size[1] - 1 :].mean() > 200

@@ -46,7 +46,7 @@ def test_a_mistake_in_the_overrides(overrides, expected, train):
 
 
 def damage_image(root: Path) -> None:
-    """Cut the picture in the middle, where OpenCV alone would return half of it."""
+    """Cut the image in the middle, where OpenCV alone would return half of it."""
     path = root / "data" / "0050" / "000003-color.png"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 

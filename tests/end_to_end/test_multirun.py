@@ -155,8 +155,8 @@ def test_every_job_is_a_run_and_the_comparison_one_more(sweep):
     table = json.loads(file.read_text())
     assert table["columns"][:2] == ["method", "object"]
     assert [row[0] for row in table["data"]][:2] == ["dope", "dopepp"]
-    pictures = sweep.glob("wandb/offline-run-*/files/media/images/*.png")
-    assert {picture.name.rsplit("_", 2)[0] for picture in pictures} == {
+    images = sweep.glob("wandb/offline-run-*/files/media/images/*.png")
+    assert {image.name.rsplit("_", 2)[0] for image in images} == {
         "compare_auc", "compare_pictures", "compare_loss",
     }  # fmt: skip
 

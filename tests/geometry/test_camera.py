@@ -163,7 +163,7 @@ def test_how_far_off_the_middle_the_principal_point_may_be(off_centre, principal
 
 @pytest.mark.parametrize("scale", [0.25, 0.5, 1.5, 2.0])
 def test_the_k_of_another_resolution_is_told_with_its_likely_size(scale):
-    """A lens like real ones', its picture a quarter to twice as large as that of its K."""
+    """A lens like real ones', its image a quarter to twice as large as that of its K."""
     own = camera_matrix(600, 610, 310.5, 245.25)
     size = (round(640 / scale), round(480 / scale))
     with pytest.raises(UserError) as caught:
@@ -182,7 +182,7 @@ def test_a_picture_sees_5_to_150_degrees(degrees, good):
         return
     with pytest.raises(UserError, match=f"field of view {degrees:g}°"):
         check_camera(K, (640, 480), "test", WHOLE)
-    if degrees < 5:  # what was cut out of a picture may see as little as that
+    if degrees < 5:  # what was cut out of an image may see as little as that
         check_camera(K, (640, 480), "test", ANYWHERE)
 
 

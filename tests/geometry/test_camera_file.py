@@ -212,12 +212,12 @@ def test_its_lens_projects_as_opencvs(tmp_path):
 BAD = {
     "empty": ("", "without any fields"),
     "text": ("The camera is on the left.", "without any fields"),
-    "a picture": ("\x89PNG\r\n", "'utf-8' codec"),
+    "an image": ("\x89PNG\r\n", "'utf-8' codec"),
     "seven numbers": ("1 2 3 4 5 6 7", "7 numbers; allowed: nine"),
     "no pinhole": ("601 5 318 0 602 242 0 0 1", "3×3 pinhole"),
     "transposed": ("601 0 0 0 602 0 318 242 1", "3×3 pinhole"),
     "never calibrated": (ECHOED.replace("601.25", "0.0").replace("602.5", "0.0"), "calibrate the"),
-    "fisheye in ROS": (ROS.replace("plumb_bob", "equidistant"), "undistort the pictures"),
+    "fisheye in ROS": (ROS.replace("plumb_bob", "equidistant"), "undistort the images"),
     "fisheye in OpenCV": (OPENCV_2.replace("model: 0", "model: 1"), "fisheye_model=1"),
     "fisheye in COLMAP": (COLMAP.format("FOV 640 480 600 600 320 240 1"), "camera model FOV"),
     "two cameras": (COLMAP.format("PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1"), "2 cameras ("),
@@ -252,7 +252,7 @@ BAD = {
 def test_a_bad_file_is_one_line(name, tmp_path):
     text, message = BAD[name]
     path = tmp_path / "camera.yaml"
-    path.write_bytes(text.encode("latin-1" if name == "a picture" else "utf-8"))
+    path.write_bytes(text.encode("latin-1" if name == "an image" else "utf-8"))
     start = time.perf_counter()
     with pytest.raises(UserError) as caught:
         read_camera(path)
@@ -310,7 +310,7 @@ UNSAID = Camera(None, K, (), "--K")
 
 @pytest.mark.parametrize("camera", [CAMERA, UNSAID])
 def test_the_camera_of_a_picture(camera):
-    """As a picture is resized or cut, so is where its camera sees a point, lens and all."""
+    """As an image is resized or cut, so is where its camera sees a point, lens and all."""
     whole = seen(POINTS, camera)
     assert_array_equal(camera.for_picture((640, 480)).K, K)
     half = camera.for_picture((320, 240), K_size=(640, 480))
@@ -325,11 +325,11 @@ def test_the_camera_of_a_picture(camera):
 @pytest.mark.parametrize(
     ("camera", "size", "options", "message"),
     [
-        (CAMERA, (320, 240), {}, "K is for 640×480, with a picture of 320×240"),
-        (CAMERA, (320, 240), {}, "--K-size 640 480 if the picture was resized, --crop X Y 320 240"),
-        (CAMERA, (1280, 960), {}, "fix: --K-size 640 480 if the picture was resized$"),
+        (CAMERA, (320, 240), {}, "K is for 640×480, with an image of 320×240"),
+        (CAMERA, (320, 240), {}, "--K-size 640 480 if the image was resized, --crop X Y 320 240"),
+        (CAMERA, (1280, 960), {}, "fix: --K-size 640 480 if the image was resized$"),
         (CAMERA, (640, 360), {}, "fix: --crop X Y 640 360 if it was cropped"),
-        (CAMERA, (480, 640), {}, "fix: rotate the picture back"),
+        (CAMERA, (480, 640), {}, "fix: rotate the image back"),
         (CAMERA, (1280, 720), {}, "fix: calibrate the camera at 1280×720"),
         (CAMERA, (1280, 720), {"K_size": (640, 480)}, "fix: calibrate the camera at 1280×720"),
         (CAMERA, (320, 240), {"K_size": (1280, 960)}, "--K-size 1280 960 with lens.yaml"),
@@ -337,8 +337,8 @@ def test_the_camera_of_a_picture(camera):
         (UNSAID, (320, 240), {"K_size": (0, 5)}, "--K-size 0 5; allowed: width and height above"),
         (UNSAID, (1280, 960), {}, "1280×960 image of --K: principal point at 25% of its width"),
         (CAMERA, (9, 9), {"K_size": (640, 480), "crop": (0, 0, 9, 9)}, "--K-size with --crop"),
-        (CAMERA, (9, 9), {"crop": (0, 0, 10, 9)}, "--crop 0 0 10 9 with a picture of 9×9"),
-        (CAMERA, (9, 9), {"crop": (632, 0, 9, 9)}, "inside the calibrated picture of 640×480"),
+        (CAMERA, (9, 9), {"crop": (0, 0, 10, 9)}, "--crop 0 0 10 9 with an image of 9×9"),
+        (CAMERA, (9, 9), {"crop": (632, 0, 9, 9)}, "inside the calibrated image of 640×480"),
         (UNSAID, (9, 9), {"crop": (-1, 0, 9, 9)}, "--crop -1 0 9 9; allowed"),
         (Camera((64, 48), K, (), "x"), (64, 48), {}, "64×48 image of x: principal point at 499%"),
     ],
@@ -351,13 +351,13 @@ def test_a_k_of_another_picture_is_refused(camera, size, options, message):
 def test_the_lens_is_taken_out_of_a_picture():
     """A dot where the lens puts a point comes to lie where the pinhole puts it."""
     point = np.array([[0.45, -0.3, 1.0]])
-    picture = np.zeros((480, 640, 3), np.uint8)
+    image = np.zeros((480, 640, 3), np.uint8)
     x, y = seen(point, CAMERA)[0]
-    cv2.circle(picture, (round(x * 16), round(y * 16)), 4 * 16, (255, 255, 255), -1, shift=4)
-    straight = CAMERA.undistorted(picture)[..., 0].astype(float)
+    cv2.circle(image, (round(x * 16), round(y * 16)), 4 * 16, (255, 255, 255), -1, shift=4)
+    straight = CAMERA.undistorted(image)[..., 0].astype(float)
     rows, columns = np.mgrid[:480, :640]
     result = np.array([(straight * columns).sum(), (straight * rows).sum()]) / straight.sum()
     expected = seen(point, UNSAID)[0]
     assert_allclose(result, expected, atol=0.3)
     assert np.linalg.norm(expected - (x, y)) > 5
-    assert UNSAID.undistorted(picture) is picture
+    assert UNSAID.undistorted(image) is image

@@ -1,4 +1,4 @@
-"""What a diagnosis names first on rendered pictures whose fault is known."""
+"""What a diagnosis names first on rendered images whose fault is known."""
 
 import re
 from collections import Counter
@@ -55,7 +55,7 @@ def test_good_pictures_raise_no_alarm(estimator, factory):
     for index in range(8):
         rendered = factory.render(0, index)
         firsts[first(estimator, rendered.image, rendered.scene.K)] += 1
-    # Of a hundred pictures a few are lost, and those are told.
+    # Of a hundred images a few are lost, and those are told.
     assert firsts[""] >= 7, firsts
     assert not set(firsts) - {"", "visibility", "pose"}
 
@@ -130,7 +130,7 @@ def test_detections_beside_the_part_and_on_pictures_without_it_are_named(estimat
     named = re.search(r"at \((\d+), (\d+)\)", beside.sentence)
     assert list(map(float, named.groups())) == pytest.approx([u, v], abs=3)
     assert "virtual.negative_photos" in beside.fix
-    assert "on a picture without the part" in elsewhere(rendered.image).sentence
+    assert "on an image without the part" in elsewhere(rendered.image).sentence
     without = empty.render(0, 0)
     findings = diagnose(
         Case(estimator, without.image, without.scene.K, estimator.parts, centres=())
@@ -178,7 +178,7 @@ def test_a_part_without_mesh_or_sizes_is_diagnosed(factory):
 
 
 def shapes(noise: float = 0.0) -> np.ndarray:
-    """Return a sharp picture of large shapes."""
+    """Return a sharp image of large shapes."""
     image = np.full((240, 320, 3), 60, np.uint8)
     cv2.rectangle(image, (30, 40), (140, 190), (180, 170, 90), -1)
     cv2.circle(image, (230, 120), 60, (90, 200, 220), -1)
@@ -216,7 +216,7 @@ def test_highlights_and_white_are_shares_of_the_picture():
 
 @pytest.mark.slow
 def test_the_faults_of_many_pictures_are_named(estimator, factory, empty):
-    """Each on forty pictures, as docs/how-to/doctor.md lists them."""
+    """Each on forty images, as docs/how-to/doctor.md lists them."""
     right = Counter()
     for index in range(40):
         rendered, without = factory.render(0, index), empty.render(0, index)

@@ -97,8 +97,8 @@ def test_a_renamed_file_is_the_same_estimator(exported, original, tmp_path):
     theirs, ours = (PoseEstimator.load(item, refine="region") for item in (moved, original))
     assert replace(theirs.checkpoint, state_dict={}).to_payload() == ours.checkpoint.to_payload()
     assert theirs.recovery == ours.recovery
-    picture = pictures(96, 128, 3).numpy()
-    detections, expected = (estimator.predict(picture, K) for estimator in (theirs, ours))
+    image = pictures(96, 128, 3).numpy()
+    detections, expected = (estimator.predict(image, K) for estimator in (theirs, ours))
     assert len(detections) == len(expected)
     for detection, other in zip(detections, expected, strict=True):
         assert_allclose(detection.T_cam_obj, other.T_cam_obj, atol=1e-4)

@@ -18,7 +18,7 @@ from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.catalogue import pivconnector
 
 K = camera_matrix(130, 130, 63.5, 47.5)
-PICTURE = np.zeros((96, 128, 3), np.uint8)
+IMAGE = np.zeros((96, 128, 3), np.uint8)
 
 
 def pose(x=0.0, z=0.3, degrees=0.0, name="pivconnector"):
@@ -37,7 +37,7 @@ class Answer:
         default_factory=lambda: Checkpoint({}, {}, [pivconnector()], (128, 96), 8, 1.0)
     )
 
-    def predict(self, picture, K, cropped):
+    def predict(self, image, K, cropped):
         return self.found
 
     def maps(self, pixels):
@@ -45,7 +45,7 @@ class Answer:
 
 
 def compared(theirs, ours=None, maps_of=0.5):
-    return compare_export(Answer(theirs, maps_of), Answer(ours or [pose()]), [(PICTURE, K)] * 2)
+    return compare_export(Answer(theirs, maps_of), Answer(ours or [pose()]), [(IMAGE, K)] * 2)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_maps(value, is_exact):
 
 
 def test_maps_that_are_not_numbers_and_no_poses():
-    agreement = compare_export(Answer([], math.nan), Answer([]), [(PICTURE, K)])
+    agreement = compare_export(Answer([], math.nan), Answer([]), [(IMAGE, K)])
     assert agreement.maps == math.inf
     assert not agreement.is_exact
     assert "no pose found by both" in str(agreement)

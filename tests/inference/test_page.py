@@ -34,12 +34,12 @@ sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> Path:
-    """A picture with the part, one without, files that are no picture, and the camera's numbers."""
+    """An image with the part, one without, files that are no image, and the camera's numbers."""
     folder = tmp_path_factory.mktemp("files")
     rendered = Factory([pivconnector()], PRESETS["quickstart"].reframed(640, 480), 2).render(0, 9)
     cv2.imwrite(str(folder / "part.png"), rendered.image[..., ::-1])
     cv2.imwrite(str(folder / "empty.png"), np.full((480, 640, 3), 90, np.uint8))
-    (folder / "words.png").write_text("no picture")
+    (folder / "words.png").write_text("no image")
     np.savetxt(folder / "K.txt", rendered.scene.K)
     return folder
 

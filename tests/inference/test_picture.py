@@ -1,4 +1,4 @@
-"""Scales of a picture: what is looked for is shown in sizes that the network has learned."""
+"""Scales of an image: what is looked for is shown in sizes that the network has learned."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_every_distance_is_looked_at_in_a_size_that_was_learned(focal, near, rat
     native = 0.1 * focal / (near * ratio**share)
     shown = [native * box.scale_x for box in result]
     fits = any(48 / MARGIN**2 <= item <= 98 * MARGIN**2 for item in shown)
-    # Farther away than the largest picture shows.
+    # Farther away than the largest image shows.
     too_small = native * np.sqrt(MAX_PIXELS / (1280 * 960)) < 98 * MARGIN**2
     assert fits or too_small
     assert all(box.width * box.height <= 1.01 * MAX_PIXELS for box in result)

@@ -1,4 +1,4 @@
-"""Poses from several pictures of one static scene."""
+"""Poses from several images of one static scene."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def true(scene):
 
 @pytest.fixture(scope="module")
 def views(scene, true):
-    """Pictures from three cameras, with the poses of the cameras in the frame of the first."""
+    """Images from three cameras, with the poses of the cameras in the frame of the first."""
     poses = [np.eye(4), beside(true, (0.0, 1.0, 0.0)), beside(true, (1.0, 0.0, 0.0))]
     images = []
     for T_new_cam in poses:
@@ -100,7 +100,7 @@ def test_the_world_is_any_frame(estimator, scene, views):
 
 
 def predicted(estimator, scene, views, order=(0, 1), **changes):
-    """Predict on some of the pictures, with other pictures or camera poses."""
+    """Predict on some of the images, with other images or camera poses."""
     images, poses = views
     given = {"images": [images[n] for n in order], "poses": [poses[n] for n in order]} | changes
     cameras = given.get("cameras", [scene.K] * len(order))
@@ -165,7 +165,7 @@ def test_a_moved_part_is_not_averaged(estimator, scene, views, true):
     images = [images[0], capture(render(seen).image, seen.sensor)]
     result = predicted(estimator, scene, views, images=images)
     assert result.detections == []
-    assert "the part was moved between the pictures" in result.findings[0]
+    assert "the part was moved between the images" in result.findings[0]
 
 
 def test_a_view_without_the_part_leaves_the_single_view(estimator, scene, views):

@@ -14,15 +14,15 @@ DISTANCES = (0.2, 0.3)
 
 @pytest.fixture
 def measured(monkeypatch, tmp_path):
-    """Use an empty cache folder, and return the pictures that are measured."""
+    """Use an empty cache folder, and return the images that are measured."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return []
 
 
 def level_of(measured, values, part=None, distances=DISTANCES, tilt=180.0):
-    def loudest(pictures, K):
-        shown = list(pictures)
-        measured.extend((picture, K) for picture in shown)
+    def loudest(images, K):
+        shown = list(images)
+        measured.extend((image, K) for image in shown)
         return [values[number % len(values)] for number in range(len(shown))]
 
     return silence.background_log_odds(part or pivconnector(), distances, tilt, loudest)
@@ -32,10 +32,10 @@ def test_level_is_mean_and_deviations_of_different_photos(measured):
     values = list(np.random.default_rng(0).normal(2.0, 0.5, silence.NUM_PHOTOS))
     level = level_of(measured, values)
     assert level == pytest.approx(np.mean(values) + silence.MARGIN * np.std(values))
-    pictures = [picture for picture, _ in measured]
-    assert len(pictures) == silence.NUM_PHOTOS
-    assert {picture.shape for picture in pictures} == {(*silence.SIZE[::-1], 3)}
-    assert len({picture.tobytes() for picture in pictures}) == silence.NUM_PHOTOS
+    images = [image for image, _ in measured]
+    assert len(images) == silence.NUM_PHOTOS
+    assert {image.shape for image in images} == {(*silence.SIZE[::-1], 3)}
+    assert len({image.tobytes() for image in images}) == silence.NUM_PHOTOS
     focal = measured[0][1][0, 0]
     shown = focal * pivconnector().diameter / math.sqrt(0.2 * 0.3)
     assert shown == pytest.approx(silence.PART_PX)

@@ -78,7 +78,7 @@ def test_a_track_begins_with_a_pose_that_passes_the_threshold(estimator, clip, K
         ({"K": np.eye(3), "stride": 0}, "stride=0"),
         ({"K": np.eye(3), "min_score": 2}, "min_score=2"),
         ({"K": np.eye(3), "track": True, "roi": (0, 0, 9, 9)}, "leave out --track or --roi"),
-        ({"K": np.eye(3), "depth": "d.png"}, "--depth with 4 pictures"),
+        ({"K": np.eye(3), "depth": "d.png"}, "--depth with 4 images"),
     ],
 )
 def test_what_cannot_be_is_refused(estimator, clip, options, message):

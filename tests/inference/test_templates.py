@@ -1,4 +1,4 @@
-"""Templates: closed forms of views, responses and matches; detection on rendered pictures."""
+"""Templates: closed forms of views, responses and matches; detection on rendered images."""
 
 from dataclasses import replace
 

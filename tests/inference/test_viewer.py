@@ -8,7 +8,7 @@ import pytest
 from dopepp import PoseEstimator
 from dopepp.core.errors import UserError
 from dopepp.inference.pose_result import PoseResult, make_shape
-from dopepp.inference.viewer import Viewer, belief_pictures
+from dopepp.inference.viewer import Viewer, belief_images
 from dopepp.parts.catalogue import pivconnector
 
 rerun = pytest.importorskip("rerun")
@@ -51,7 +51,7 @@ def test_a_recording_has_everything(estimator, result, tmp_path):
 
 
 def test_beliefs_peak_where_the_part_is(estimator, result):
-    (picture,) = belief_pictures(estimator, result).values()
+    (picture,) = belief_images(estimator, result).values()
     hottest = np.array(np.unravel_index(picture.sum(axis=2).argmax(), picture.shape[:2]))[::-1]
     scale = np.array(result.image.shape[1::-1]) / picture.shape[1::-1]
     nearest = np.abs((hottest + 0.5) * scale - result.detections[0].keypoints).sum(axis=1).min()

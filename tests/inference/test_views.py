@@ -1,4 +1,4 @@
-"""One scene in many pictures: what is done to a picture and to its K leaves the metric pose."""
+"""One scene in many images: what is done to an image and to its K leaves the metric pose."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from dopepp import PoseEstimator
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, project_keypoints
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.parts.catalogue import pivconnector
@@ -22,17 +22,17 @@ SIZE = (1920, 1080)
 MOST_MM, MOST_DEG = 1.0, 0.4
 AROUND_PX = 40
 LENS = np.array([-0.18, 0.06, 0.0015, -0.001, 0.01])
-"""Up to 40 pixels off at the corners of the whole picture."""
+"""Up to 40 pixels off at the corners of the whole image."""
 
 
 @dataclass(frozen=True)
 class View:
-    """What is done to the picture, in this order.
+    """What is done to the image, in this order.
 
     Attributes:
         cut: Shares of width and height that go left, above, right and below, as far as the part
             and some pixels around it stay.
-        scale: Pixels per pixel; the picture is resized to whole pixels, so that fx and fy differ.
+        scale: Pixels per pixel; the image is resized to whole pixels, so that fx and fy differ.
         turns: Quarter turns, anticlockwise.
         lens: Whether a lens distorts it.
         flipped: Whether its channels lie in memory the other way round, as in ``bgr[..., ::-1]``.
@@ -74,7 +74,7 @@ def estimator():
 
 @pytest.fixture(scope="module")
 def whole(estimator, scene, picture):
-    """The pose on the whole picture."""
+    """The pose on the whole image."""
     (detection,) = estimator.predict(picture, scene.K)
     assert not detection.kept
     return detection.T_cam_obj
@@ -101,9 +101,9 @@ def test_the_metric_pose_stays(estimator, scene, picture, whole, view):
 
 
 def made(
-    view: View, picture: Picture, K: CameraMatrix, keypoints: np.ndarray
-) -> tuple[Picture, CameraMatrix]:
-    """Return the picture of a view and its K, by formulas of this file's own."""
+    view: View, picture: RGBImage, K: CameraMatrix, keypoints: np.ndarray
+) -> tuple[RGBImage, CameraMatrix]:
+    """Return the image of a view and its K, by formulas of this file's own."""
     limit = np.array(picture.shape[1::-1])
     lower, upper = keypoints.min(0) - AROUND_PX, keypoints.max(0) + AROUND_PX
     left, top = np.clip(np.minimum(view.cut[:2] * limit, lower), 0, limit).astype(int)
@@ -130,13 +130,13 @@ def made(
 
 
 def quarter_turn(turns: int) -> np.ndarray:
-    """Return what turns the camera's axes as the picture is turned, anticlockwise."""
+    """Return what turns the camera's axes as the image is turned, anticlockwise."""
     once = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     return np.linalg.matrix_power(once, turns % 4)
 
 
-def distorted(picture: Picture, K: CameraMatrix) -> Picture:
-    """Return a picture as the lens shows it: each of its pixels is read where the ray ends."""
+def distorted(picture: RGBImage, K: CameraMatrix) -> RGBImage:
+    """Return an image as the lens shows it: each of its pixels is read where the ray ends."""
     rows, columns = picture.shape[:2]
     pixels = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).reshape(-1, 1, 2)
     straight = cv2.undistortPoints(pixels.astype(np.float64), K, LENS, P=K)

@@ -37,7 +37,7 @@ def test_the_way_down_is_the_published_networks(published, pretrained):
         result = blocks(features)
         for block in published._blocks[first : last + 1]:
             expected = block(expected)
-        # Beyond a picture's edge the first convolution sees another grey: 127, not the mean colour.
+        # Beyond an image's edge the first convolution sees another grey: 127, not the mean colour.
         inside = slice(14, -14) if first == 0 else slice(None)
         difference = (result - expected)[..., inside, inside].abs().max()
         assert difference < 1e-4 * expected.abs().max()
@@ -49,8 +49,8 @@ def test_it_tells_a_cat_from_a_cup(published, pretrained):
     """What it learned is there: the published classifier on top of these features."""
     data = pytest.importorskip("skimage.data")
     mean, std = torch.tensor(IMAGENET_MEAN), torch.tensor(IMAGENET_STD)
-    for picture, classes in ((data.chelsea(), range(281, 286)), (data.coffee(), (504, 967, 968))):
-        pixels = (torch.from_numpy(picture).float() - mean) / std
+    for image, classes in ((data.chelsea(), range(281, 286)), (data.coffee(), (504, 967, 968))):
+        pixels = (torch.from_numpy(image).float() - mean) / std
         images = nn.functional.interpolate(
             pixels.permute(2, 0, 1)[None], (224, 224), mode="bilinear", antialias=True
         )

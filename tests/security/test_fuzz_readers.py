@@ -148,7 +148,7 @@ def read_finite_mesh(path: Path) -> None:
 
 
 def images(path: Path) -> tuple[Callable[[Path], object], ...]:
-    """The ways to read a picture."""
+    """The ways to read an image."""
 
     def picture(folder: Path) -> object:
         try:
@@ -307,7 +307,7 @@ def fuzz(target: Target, folder: Path, num_files: int, *, repeat: bool) -> None:
     """Damage a good file in many ways."""
     good = (target.folder / target.file).read_bytes()
     num_taken = examine(target, good, folder)
-    # Not every way to read a picture takes every format.
+    # Not every way to read an image takes every format.
     assert num_taken == len(target.reads) or (num_taken and len(target.reads) > 2)
 
     @settings(

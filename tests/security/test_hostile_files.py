@@ -1,4 +1,4 @@
-"""Pictures, meshes, archives, tables and records from anybody: attacks beside plain damage."""
+"""Images, meshes, archives, tables and records from anybody: attacks beside plain damage."""
 
 import gzip
 import io
@@ -68,7 +68,7 @@ def tiff(**fields: tuple[int, int, int]) -> bytes:
 TIFF_SIZE = {"t256": (4, 1, 10**9), "t257": (4, 1, 10**9), "t258": (3, 1, 8), "t259": (3, 1, 1)}
 SMALL = Image.new("RGB", (16, 16))
 
-PICTURES: dict[str, Any] = {  # bytes, or what makes them, where that takes long
+IMAGES: dict[str, Any] = {  # bytes, or what makes them, where that takes long
     "a PNG of terapixels": png(2**31 - 1, 2**31 - 1, chunk(b"IDAT", zlib.compress(bytes(9)))),
     "a PNG of gigapixels in one row": png(2**31 - 1, 1, chunk(b"IDAT", zlib.compress(bytes(9)))),
     "a PNG without pixels": png(0, 0, chunk(b"IDAT", b"")),
@@ -113,10 +113,10 @@ def made(content: Any) -> bytes:
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
-@pytest.mark.parametrize("name", PICTURES)
+@pytest.mark.parametrize("name", IMAGES)
 def test_pictures_that_explode_or_are_none(name, suffix, tmp_path, refused, bounded):
     path = tmp_path / f"image{suffix}"
-    content = made(PICTURES[name])
+    content = made(IMAGES[name])
     path.write_bytes(content)
     reads = (
         lambda: read_rgb(path),
@@ -370,7 +370,7 @@ def test_numbers_tables_and_records_of_anybody(file, name, tmp_path, refused):
 
 
 RENDER = "render servoholder --out out -n 1"
-BOMB = PICTURES["a PNG of terapixels"]
+BOMB = IMAGES["a PNG of terapixels"]
 ARGUMENTS = {
     "check: a folder of records that nest": ("check set", {
         "set/_camera_settings.json": b"[" * 100_000,

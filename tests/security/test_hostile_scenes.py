@@ -59,16 +59,16 @@ def array(**changes: Any) -> list[dict[str, Any]]:
     return [item | changes, item]
 
 
-def textured(picture: bytes) -> bytes:
+def textured(image: bytes) -> bytes:
     """A triangle whose texture lies behind its corners."""
     views = [
         {"buffer": 0, "byteLength": 36},
         {"buffer": 0, "byteOffset": 36, "byteLength": 24},
-        {"buffer": 0, "byteOffset": 60, "byteLength": len(picture)},
+        {"buffer": 0, "byteOffset": 60, "byteLength": len(image)},
     ]
     attributes = {"POSITION": 0, "TEXCOORD_0": 1}
     return glb(
-        BINARY + picture,
+        BINARY + image,
         bufferViews=views,
         meshes=[{"primitives": [{"attributes": attributes, "material": 0}]}],
         materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],

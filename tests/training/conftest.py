@@ -118,7 +118,7 @@ def batch(make_datamodule):
 
 
 class Noise:
-    """A source of pictures that are others in every epoch and cost nothing."""
+    """A source of images that are others in every epoch and cost nothing."""
 
     name = "noise"
 
@@ -143,7 +143,7 @@ class Noise:
 
 @pytest.fixture(scope="session")
 def make_noise(part):
-    """Eight training and four validation pictures of noise in batches of two."""
+    """Eight training and four validation images of noise in batches of two."""
 
     def make() -> PoseDataModule:
         sources = [Noise(number, part) for number in (8, 4, 1)]

@@ -84,7 +84,7 @@ def test_figures_pictures_and_throughput(validate, make_system, make_datamodule,
     # Neither all nor nothing, or the comparison would say little.
     assert 0 < recorder.logged["val/auc_10cm"] < 1
 
-    # Curves and sheet are whole pictures, the curve's table agrees with the figures.
+    # Curves and sheet are whole images, the curve's table agrees with the figures.
     assert read_rgb(tmp_path / "val_auc.png").std() > 0
     curve = read_csv(tmp_path / "val_auc.csv")
     assert curve[0]["threshold_m"] == "0"

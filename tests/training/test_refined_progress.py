@@ -17,10 +17,10 @@ from dopepp.virtual.presets import PRESETS
 
 
 class Known:
-    """Returns the true pose of every picture, or one that is 5 cm off where ``wrong`` says so."""
+    """Returns the true pose of every image, or one that is 5 cm off where ``wrong`` says so."""
 
-    def __init__(self, pictures, wrong):
-        self.pictures, self.wrong, self.asked = pictures, wrong, 0
+    def __init__(self, images, wrong):
+        self.pictures, self.wrong, self.asked = images, wrong, 0
 
     def predict(self, image, K):
         (instance,) = self.pictures.sample(self.asked).instances
@@ -32,7 +32,7 @@ class Known:
 
 
 class Repeated:
-    """As many pictures as one likes from one render, moved by nothing."""
+    """As many images as one likes from one render, moved by nothing."""
 
     name = "repeated"
 
@@ -47,19 +47,19 @@ class Repeated:
 
 
 @pytest.fixture(scope="session")
-def pictures(part):
+def images(part):
     factory = Factory([part], PRESETS["quickstart"], seed=0)
     return Repeated(RenderedSource(factory, 1, "val").sample(0), 120)
 
 
 @pytest.fixture
-def measure(monkeypatch, make_trainer, make_system, make_datamodule, pictures, tmp_path):
+def measure(monkeypatch, make_trainer, make_system, make_datamodule, images, tmp_path):
     """Fit with a measurement after every validation; return the callback, trainer and estimator."""
 
     def measure(wrong, epochs=1, **options):
-        known = Known(pictures, wrong)
+        known = Known(images, wrong)
         monkeypatch.setattr(RefinedProgress, "_estimator", lambda self, system: known)
-        progress = RefinedProgress(pictures, "region", **options)
+        progress = RefinedProgress(images, "region", **options)
         trainer = make_trainer(tmp_path, [progress], max_epochs=epochs)
         trainer.fit(make_system(), make_datamodule())
         return progress, trainer, known
@@ -112,23 +112,23 @@ def test_measurements_keep_their_distance_in_time(measure, monkeypatch):
     assert len(progress.curve) == 1
 
 
-def test_a_resumed_training_continues_the_curve(pictures):
-    before = RefinedProgress(pictures, "region")
+def test_a_resumed_training_continues_the_curve(images):
+    before = RefinedProgress(images, "region")
     before.on_train_start(None, None)
     before.curve = [(1.0, 0.2, 0.1, 0.3)]
-    after = RefinedProgress(pictures, "region")
+    after = RefinedProgress(images, "region")
     after.load_state_dict({**before.state_dict(), "minutes": 7.0})
     after.on_train_start(None, None)
     assert after.curve == before.curve
     assert after.state_dict()["minutes"] == pytest.approx(7.0, abs=0.1)
 
 
-def test_the_estimator_has_the_networks_present_weights(make_system, pictures):
+def test_the_estimator_has_the_networks_present_weights(make_system, images):
     system = make_system()
-    estimator = RefinedProgress(pictures, "region")._estimator(system)
+    estimator = RefinedProgress(images, "region")._estimator(system)
     assert isinstance(estimator, PoseEstimator)
     assert (estimator.refine, estimator.min_score) == ("region", 0.5)
-    image = pictures.sample(0).image
+    image = images.sample(0).image
     belief, field = estimator.maps(image)
     pixels = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
     expected = system.network.eval().maps(pixels[None])

@@ -1,4 +1,4 @@
-"""Equal pictures get equal maps, and at a sector's border the network may choose."""
+"""Equal images get equal maps, and at a sector's border the network may choose."""
 
 from collections.abc import Sequence
 from dataclasses import replace

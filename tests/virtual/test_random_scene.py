@@ -19,7 +19,7 @@ SCALES = (0.5, 1.7)
 
 
 class Waves:
-    """A picture so smooth that resampling it hardly changes a colour."""
+    """An image so smooth that resampling it hardly changes a colour."""
 
     def identity(self) -> list[str]:
         return ["waves"]
@@ -106,7 +106,7 @@ def test_the_picture_on_a_table_stays_where_it_lies(scale):
         others = near.background[tuple(moved[inside, ::-1].T)].astype(int)
         differences += np.abs(colours - others).max(axis=1).tolist()
     assert len(differences) > 200
-    # Half a pixel of a smooth picture; more only at the few points that are seen at a flat angle.
+    # Half a pixel of a smooth image; more only at the few points that are seen at a flat angle.
     assert np.quantile(differences, 0.95) <= 6
 
 

@@ -26,7 +26,7 @@ class Constant:
 
 
 class Ramp:
-    """A picture whose red is its column and whose green is its row, over 256 px."""
+    """An image whose red is its column and whose green is its row, over 256 px."""
 
     def draw(self, rng: np.random.Generator, width: int, height: int) -> np.ndarray:
         ramp = np.zeros((height, width, 3), np.uint8)
@@ -131,7 +131,7 @@ def test_the_background_is_a_picture_that_lies_on_the_plane(parts):
         v, u = np.mgrid[10:250:7, 10:250:7].reshape(2, -1)
         rays = np.stack([u, v, np.ones(u.shape)], axis=1) @ np.linalg.inv(scene.K).T
         points = rays * (scene.plane.offset / (rays @ normal))[:, None]
-        # Any two axes in the plane: the map from it to the picture must be one similarity.
+        # Any two axes in the plane: the map from it to the image must be one similarity.
         first = np.cross(normal, [0.3, 0.5, 0.7])
         first /= np.linalg.norm(first)
         plane_xy = np.stack([points @ first, points @ np.cross(normal, first), np.ones(u.shape)], 1)

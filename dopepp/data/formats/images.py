@@ -19,7 +19,7 @@ from PIL import Image
 
 from dopepp.data.formats.problems import STRICT, Node, mapping
 from dopepp.drawing import pictures
-from dopepp.drawing.pictures import DepthMap, Mask, Picture, Shape
+from dopepp.drawing.pictures import DepthMap, Mask, RGBImage, Shape
 
 FORMATS: Final = ("PNG", "JPEG", "TIFF")
 """Formats of BOP's images."""
@@ -51,7 +51,7 @@ def picture(
     if content is None:
         return None
     try:
-        image = pictures.whole_picture(content, FORMATS)
+        image = pictures.whole_image(content, FORMATS)
     except ValueError as error:
         problem = f"unreadable or truncated, {len(content):,} bytes ({error})"
         most = f"{pictures.MAX_PIXELS / 1e6:.0f} megapixels"
@@ -64,7 +64,7 @@ def picture(
     return image
 
 
-def picture_shape(
+def image_shape(
     node: Node, content: bytes | None = None, modes: Sequence[str] = ()
 ) -> Shape | None:
     """Return the (height, width) of an image after decoding it like :func:`picture`."""
@@ -84,7 +84,7 @@ def stated_shape(file: Path | io.BytesIO) -> Shape | None:
     return (height, width) if 0 < width * height <= pictures.MAX_PIXELS else None
 
 
-def decode_rgb(content: bytes, where: str) -> Picture:
+def decode_rgb(content: bytes, where: str) -> RGBImage:
     """Decode a colour or grey image as RGB, without an alpha channel.
 
     Raises:

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from numpy.random import Generator
 
 from dopepp.core.validation import Checked, Pair, Range, Share, Span
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.virtual.sensor import add_noise, compress, defocus
 
 # BT.601 luma weights: grey keeps its brightness when saturation or hue changes.
@@ -56,7 +56,7 @@ class Photometric(Checked):
     jpeg_probability: Share = 0.1
     jpeg_quality: _Changes = (40, 95)
 
-    def __call__(self, image: Picture, rng: Generator) -> Picture:
+    def __call__(self, image: RGBImage, rng: Generator) -> RGBImage:
         """Return a changed copy of an RGB image."""
         image = cv2.transform(image, self._colour_matrix(rng))
         if rng.random() < self.blur_probability:

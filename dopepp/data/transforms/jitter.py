@@ -1,6 +1,6 @@
-"""Jitter the camera: roll, zoom and shift the picture a little.
+"""Jitter the camera: roll, zoom and shift the image a little.
 
-A training uses each render many times; jitter keeps the network from memorising pictures. Image,
+A training uses each render many times; jitter keeps the network from memorising images. Image,
 camera matrix, poses and keypoints follow exactly: a camera that rolls about its optical axis and
 zooms sees the same rays at other pixels.
 """
@@ -23,12 +23,12 @@ from dopepp.geometry.rotation import rotation_vector_to_matrix
 
 @dataclass(frozen=True)
 class CameraJitter(Checked):
-    """Roll, zoom and shift the camera's picture at random; new pixels repeat the border.
+    """Roll, zoom and shift the camera's image at random; new pixels repeat the border.
 
     Attributes:
-        roll_deg: Largest rotation of the picture about its centre, in either direction.
+        roll_deg: Largest rotation of the image about its centre, in either direction.
         zoom: Range of the factor on the focal length, log-uniform.
-        shift: Largest shift in each direction, as a share of the picture's sides.
+        shift: Largest shift in each direction, as a share of the image's sides.
     """
 
     roll_deg: Annotated[float, Range(0, 180, "degrees")] = 20.0

@@ -20,14 +20,14 @@ from numpy.random import Generator
 
 from dopepp.core.validation import Checked, Share
 from dopepp.data.sample import Instance, Sample, silhouette
-from dopepp.drawing.pictures import Mask, Picture, Size
+from dopepp.drawing.pictures import Mask, RGBImage, Size
 from dopepp.virtual.backgrounds import Backgrounds
 
 MIN_PATCH_PX: Final = 2  # A patch of one pixel is always a solid colour.
 MIN_CONTRAST: Final = 3.0
 """Smallest standard deviation of a colour channel of a crop that is not solid, grey levels."""
 
-MAX_DRAWS: Final = 8  # Largest number of crops to draw from a picture.
+MAX_DRAWS: Final = 8  # Largest number of crops to draw from an image.
 
 
 class BackgroundCrops:
@@ -40,7 +40,7 @@ class BackgroundCrops:
 
     def __init__(
         self,
-        image: Picture,
+        image: RGBImage,
         silhouettes: Sequence[Mask],
         min_contrast: float = MIN_CONTRAST,
         max_draws: int = MAX_DRAWS,
@@ -51,7 +51,7 @@ class BackgroundCrops:
             occupied |= seen
         self._integral = cv2.integral(occupied.astype(np.uint8))
 
-    def draw(self, size: Size, rng: Generator) -> Picture | None:
+    def draw(self, size: Size, rng: Generator) -> RGBImage | None:
         """Return a crop of (height, width), or None if no draw has contrast."""
         windows = np.flatnonzero(self._is_free(size).ravel())
         for _ in range(self.max_draws if len(windows) else 0):
@@ -60,7 +60,7 @@ class BackgroundCrops:
                 return crop
         return None
 
-    def search(self, size: Size, rng: Generator) -> Picture | None:
+    def search(self, size: Size, rng: Generator) -> RGBImage | None:
         """Return a random crop of (height, width) that has contrast.
 
         Without such a crop, return a crop with at least two colours, or None.
@@ -79,7 +79,7 @@ class BackgroundCrops:
                 return self._crop(int(rng.choice(windows)), size)
         return None
 
-    def largest(self, size: Size, rng: Generator) -> Picture | None:
+    def largest(self, size: Size, rng: Generator) -> RGBImage | None:
         """Return a crop of (height, width), halved until it fits the background, or None."""
         height, width = size
         while True:
@@ -100,7 +100,7 @@ class BackgroundCrops:
         sums, squares = cv2.integral2(self.image, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
         return sums, squares
 
-    def _crop(self, window: int, size: Size) -> Picture:
+    def _crop(self, window: int, size: Size) -> RGBImage:
         """Return a window by its number, counted row by row."""
         row, column = divmod(window, self.image.shape[1] - size[1] + 1)
         return self.image[row : row + size[0], column : column + size[1]]
@@ -117,7 +117,7 @@ def _windows(integral: np.ndarray, size: Size) -> np.ndarray:
     )
 
 
-def has_contrast(crop: Picture, min_contrast: float) -> bool:
+def has_contrast(crop: RGBImage, min_contrast: float) -> bool:
     """Return whether a crop is more than a solid colour."""
     return float(crop.reshape(-1, 3).std(axis=0).max()) >= min_contrast
 
@@ -146,7 +146,7 @@ class RandomMask(Checked):
         max_height: Largest patch height as a share of the object's box height (paper: 0.8).
         max_width: Largest patch width as a share of the object's box width (paper: 0.8).
         min_contrast: Grey levels of standard deviation that a crop needs in a colour channel.
-        max_draws: Number of crops to try per picture; the instance stays uncovered if all fail.
+        max_draws: Number of crops to try per image; the instance stays uncovered if all fail.
     """
 
     probability: Share = 0.5
@@ -192,8 +192,8 @@ class RandomMask(Checked):
 
     def _crop(
         self, crops: BackgroundCrops, size: Size, rng: Generator, other: Backgrounds
-    ) -> Picture | None:
-        """Draw a crop from the image's background, else from another picture."""
+    ) -> RGBImage | None:
+        """Draw a crop from the image's background, else from another image."""
         crop = crops.largest(size, rng)
         if crop is not None:
             return crop

@@ -21,7 +21,7 @@ from numpy.random import Generator
 
 from dopepp.data.sample import Instance, Purpose, Sample, item_rng, silhouette
 from dopepp.data.transforms.masking import MIN_PATCH_PX, BackgroundCrops, covered_instances
-from dopepp.drawing.pictures import Mask, Picture
+from dopepp.drawing.pictures import Mask, RGBImage
 
 TOLERANCE: Final = 0.02  # Allowed difference of the covered share from the requested share.
 _SIDES: Final = (0.15, 0.5)
@@ -146,7 +146,7 @@ class _Cover:
         """Return the number of pixels to cover for a share."""
         return round(share * self._num_seen)
 
-    def _draw_crop(self, crops: BackgroundCrops, rng: Generator) -> Picture | None:
+    def _draw_crop(self, crops: BackgroundCrops, rng: Generator) -> RGBImage | None:
         """Draw a crop of random size, reduced to fit the background, or None."""
         extent = self._seen.shape
         if min(extent) < MIN_PATCH_PX:
@@ -156,7 +156,7 @@ class _Cover:
         )
         return crops.largest((height, width), rng)
 
-    def _lay(self, crop: Picture, pixel: Int[np.ndarray, "2"], rng: Generator) -> None:
+    def _lay(self, crop: RGBImage, pixel: Int[np.ndarray, "2"], rng: Generator) -> None:
         """Draw a crop below earlier crops, at a random position that covers ``pixel``."""
         slices = []
         for position, length, extent in zip(pixel, crop.shape, self.order.shape, strict=False):

@@ -54,7 +54,7 @@ _DIVIDED: Final = ("bop", "ndds", "webdataset")  # formats whose folders `share_
 def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModule:
     """Build the DataModule: training images from ``seed``, others from ``data.eval_seed``."""
     backgrounds = training_backgrounds(data)
-    val = val_pictures = held_out_source(data, parts, "val")
+    val = val_images = held_out_source(data, parts, "val")
     if data.virtual.view is not None and isinstance(val, RenderedSource):
         val = validation_windows(data, parts)
     return PoseDataModule(
@@ -70,7 +70,7 @@ def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModul
         masking=build_optional("masking", RandomMask, data.masking),
         augment=build_optional("augmentation", Photometric, data.augment),
         backgrounds=backgrounds,
-        val_pictures=val_pictures,
+        val_images=val_images,
     )
 
 
@@ -133,9 +133,9 @@ def _real_frames(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
     if view is None:
         return with_cache(frames, data, data.cache, data.network_input)
     box = Letterbox.scaled(view.size, data.virtual.camera_scale or 1.0)
-    picture = box.width, box.height
-    whole = with_cache(frames, data, data.cache, picture)
-    return WindowedSource(whole, picture, data.network_input, seed)
+    image = box.width, box.height
+    whole = with_cache(frames, data, data.cache, image)
+    return WindowedSource(whole, image, data.network_input, seed)
 
 
 def labelled_images(data: DataConfig, parts: Parts, seed: int, split: Split) -> DescribedSource:
@@ -259,7 +259,7 @@ def fitted_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
     Raises:
         UserError: A part is larger than ``data.input_size``, or the working distance is unknown.
     """
-    config = _with_camera_of_pictures(config, parts)
+    config = _with_camera_of_images(config, parts)
     data, virtual = config.data, config.data.virtual
     view = virtual.view
     if view is None:
@@ -285,8 +285,8 @@ def fitted_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
     return replace(config, plain=plain, data=seen)
 
 
-def _with_camera_of_pictures(config: RunConfig, parts: Parts) -> RunConfig:
-    """Return a config with the camera and the distances of the BOP test pictures.
+def _with_camera_of_images(config: RunConfig, parts: Parts) -> RunConfig:
+    """Return a config with the camera and the distances of the BOP test images.
 
     The config changes only if training uses renders and neither a camera nor, with real images, an
     input size is given.

@@ -13,7 +13,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from dopepp.data.negatives import FrameMix, PictureFrames, UnlabelledRenders
+from dopepp.data.negatives import FrameMix, PhotoFrames, UnlabelledRenders
 from dopepp.data.rendered import RenderedSource
 from dopepp.data.sample import DescribedSource
 from dopepp.drawing.pictures import Size
@@ -32,12 +32,12 @@ from dopepp.virtual.presets.view import View
 PHOTOS: Final = "photos"
 SCENES: Final = "scenes"
 LOOKALIKES: Final = "look-alikes"
-OWN: Final = "own pictures"
+OWN: Final = "own images"
 KINDS: Final = {
     PHOTOS: "photos, whole",
     SCENES: "renders of clutter, distractors and other parts",
     LOOKALIKES: "renders of look-alikes of the parts in front of photos",
-    OWN: "the user's own pictures without the parts",
+    OWN: "the user's own images without the parts",
 }
 """Content of each kind of frame, in the order of the frames.
 
@@ -45,7 +45,7 @@ A threshold that rejects look-alikes would reject the part as well, so tables sh
 separate row."""
 
 FRAME: Final[Size] = (640, 480)
-"""(width, height) of the frames if there is no camera and the preset's pictures are smaller."""
+"""(width, height) of the frames if there is no camera and the preset's images are smaller."""
 
 _MAX_DISTRACTORS: Final = 12  # in a frame, which bounds the time to render it
 _LOOKALIKES_SHOWN: Final = (1, 3)  # in a frame
@@ -79,8 +79,8 @@ def negative_frames(
         preset = replace(preset, table=replace(preset.table, pile=None))
     share = math.ceil(num_images / (3 if user_photos is None else 4))
 
-    def whole(pictures: PhotoBackgrounds, kind: str) -> PictureFrames:
-        return PictureFrames(pictures, view.K, view.size, share, kind, data.eval_seed)
+    def whole(images: PhotoBackgrounds, kind: str) -> PhotoFrames:
+        return PhotoFrames(images, view.K, view.size, share, kind, data.eval_seed)
 
     def rendered(factory: Factory, kind: str) -> UnlabelledRenders:
         return UnlabelledRenders(RenderedSource(factory, share, split, kind))
@@ -110,7 +110,7 @@ def negative_frames(
 def frame_view(data: DataConfig, parts: Parts) -> View:
     """Return the camera of the frames and the distances of the parts.
 
-    The camera is the user's camera or the camera of the labelled pictures. Otherwise the camera has
+    The camera is the user's camera or the camera of the labelled images. Otherwise the camera has
     the preset's focal length and at least :data:`FRAME` pixels.
     """
     if data.virtual.view is not None:

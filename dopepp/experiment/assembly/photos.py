@@ -23,7 +23,7 @@ from dopepp.virtual.backgrounds.photo_backgrounds import MIN_PHOTOS, PhotoSplit
 
 _log = logging.getLogger(__name__)
 
-_OWN_SHARE: Final = 0.25  # share of the user's pictures in the training backgrounds
+_OWN_SHARE: Final = 0.25  # share of the user's images in the training backgrounds
 _NEEDED: Final = f"at least {3 * MIN_PHOTOS} different photos"
 
 
@@ -69,10 +69,10 @@ def held_out_photos(data: DataConfig, split: Literal["val", "test"]) -> PhotoBac
 
 
 def own_photos(data: DataConfig, split: PhotoSplit) -> PhotoBackgrounds | None:
-    """Return a split of the user's own pictures without the parts, or None without a folder.
+    """Return a split of the user's own images without the parts, or None without a folder.
 
     Raises:
-        UserError: There are too few pictures to be divided.
+        UserError: There are too few images to be divided.
     """
     folder = data.virtual.negative_photos
     if folder is None:
@@ -81,7 +81,7 @@ def own_photos(data: DataConfig, split: PhotoSplit) -> PhotoBackgrounds | None:
     if photos.is_divided:
         return photos
     raise UserError(
-        f"virtual.negative_photos={folder} with {len(photos.paths)} pictures",
+        f"virtual.negative_photos={folder} with {len(photos.paths)} images",
         _NEEDED,
-        "take more pictures of the workplace without the part",
+        "take more images of the workplace without the part",
     )

@@ -115,7 +115,7 @@ def with_cache(
 
 
 def seen_preset(data: DataConfig) -> Preset:
-    """Return the preset at the network's input size: resized, or in windows of the pictures."""
+    """Return the preset at the network's input size: resized, or in windows of the images."""
     preset, view = data.preset, data.virtual.view
     if view is not None:
         return view.window(preset, data.virtual.camera_scale or 1.0, data.network_input)

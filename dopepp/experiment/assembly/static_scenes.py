@@ -1,6 +1,6 @@
-"""Test images of static scenes, each with further pictures of its scene.
+"""Test images of static scenes, each with further images of its scene.
 
-Of a scene's pictures, those are chosen whose cameras look from about :data:`ANGLE_DEG` beside the
+Of a scene's images, those are chosen whose cameras look from about :data:`ANGLE_DEG` beside the
 others.
 """
 
@@ -27,10 +27,10 @@ class StaticScenes:
 
     Args:
         reader: The images; every folder is a static scene.
-        num_views: Number of pictures of each item, with its own.
+        num_views: Number of images of each item, with its own.
 
     Raises:
-        UserError: A scene has no camera poses, or too few pictures.
+        UserError: A scene has no camera poses, or too few images.
     """
 
     def __init__(self, reader: BopReader, num_views: int) -> None:
@@ -62,7 +62,7 @@ class StaticScenes:
         return replace(first, others=others)
 
     def _beside(self, index: int) -> Sequence[int]:
-        """Return the indices of further pictures of an image's scene.
+        """Return the indices of further images of an image's scene.
 
         The optical axis of each camera is about ``ANGLE_DEG`` from the nearest axis chosen before.
         """
@@ -85,7 +85,7 @@ class StaticScenes:
 
 
 def with_views(source: DescribedSource, num_views: int) -> DescribedSource:
-    """Return test images with further pictures of their scenes.
+    """Return test images with further images of their scenes.
 
     Raises:
         UserError: The images are not a BOP data set with camera poses, or a scene has too few

@@ -41,7 +41,7 @@ class LensConfig:
     """Camera of the application. ``camera=FILE`` sets all of these values.
 
     Attributes:
-        width, height: Picture size, pixels.
+        width, height: Image size, pixels.
         fx, fy: Focal lengths, pixels.
         cx, cy: Principal point, pixels.
     """
@@ -63,15 +63,15 @@ class VirtualConfig:
         preset: Name of the scene preset (:mod:`dopepp.virtual.presets`); None selects ``ycb`` with
             a ``data.root``, else ``paper``.
         scene: Changed fields of the preset (:class:`~dopepp.virtual.presets.Preset`).
-        backgrounds: Folder of photos, or ``skimage`` for its photos; None uses procedural pictures.
-        negative_photos: Folder of the user's own pictures without the parts. Like ``backgrounds``,
+        backgrounds: Folder of photos, or ``skimage`` for its photos; None uses procedural images.
+        negative_photos: Folder of the user's own images without the parts. Like ``backgrounds``,
             it is divided between training, tuning and test.
         negatives: Parts to show that must not be detected: built-in names or mesh files. Models of
             a BOP data set that are not in ``data.objects`` are always shown.
         renderer: ``raster`` or ``photoreal``.
         camera: Camera of the application; None uses the camera of the preset.
         working_distance: Nearest and farthest distance of the parts from the camera, metres.
-        camera_scale: Scale of the camera's pictures at the network's input; None selects it.
+        camera_scale: Scale of the camera's images at the network's input; None selects it.
     """
 
     __pydantic_config__ = STRICT
@@ -150,7 +150,7 @@ class DataConfig:
             and ``test``; None for renders. Splits may share a folder.
         targets: BOP's list of test images; None for all images, ``auto`` for the root's list, if
             present.
-        views: Number of pictures of a static scene from which an evaluation also estimates poses.
+        views: Number of images of a static scene from which an evaluation also estimates poses.
         classes: Part names by class name in NDDS files, if the names differ.
         download_dir: Folder for downloaded shards; None downloads nothing.
         jitter: Node of the camera jitter, if any.

@@ -151,7 +151,7 @@ class CostConfig:
     """Options of ``job=cost``.
 
     Attributes:
-        num_frames: Number of timed frames, from picture to poses.
+        num_frames: Number of timed frames, from image to poses.
         batch_size: Images per pass when the network is timed alone.
     """
 
@@ -275,7 +275,7 @@ class MeasurementConfig(FalsePositiveTarget):
             (default: none).
         num_bins: Number of bins of each quantity in ``by``.
         tune: Whether to tune a distance factor, a score and its threshold before the measurement.
-        refine: Refinement to measure, and to tune, in addition: ``region`` on the picture,
+        refine: Refinement to measure, and to tune, in addition: ``region`` on the image,
             ``depth`` on the depth image, or a list of both.
         output_dir: Folder of the run folders.
         extensions: User packages whose code may be used (:mod:`dopepp.core.extensions`).
@@ -316,7 +316,7 @@ class RunConfig(MeasurementConfig):
         compile: Whether to compile the network with torch.
         ema: Decay of an exponential moving average of the weights; None disables it.
         stop_at: Share of the parts with a right refined pose that ends the training, once it is
-            confirmed on held-out pictures; None: the training has its full length.
+            confirmed on held-out images; None: the training has its full length.
         keep_checkpoints: Whether to keep the checkpoints after the measurement.
         resume: Folder of the interrupted run to resume.
         resume_anyway: Whether to resume even if the training data or the loss have changed.
@@ -388,8 +388,8 @@ class EvaluationConfig(MeasurementConfig):
         results: BOP challenge CSV with the poses of another method.
         templates: Nearest and farthest distance of the parts, metres, at which templates of their
             meshes are measured; None for no templates.
-        negatives: Folder of pictures that show none of the parts.
-        negatives_camera: Camera file of these pictures; None for the camera of the data.
+        negatives: Folder of images that show none of the parts.
+        negatives_camera: Camera file of these images; None for the camera of the data.
         method: Name of that method; None derives it from the file name.
         data: Data to measure on: a whole node, or changes to the data of the checkpoint; see
             :func:`~dopepp.experiment.config.data_config.chosen_data`.

@@ -27,8 +27,8 @@ from dopepp.drawing.curves import (
     save_accuracy_curves,
 )
 from dopepp.drawing.overlay import BLUE, GREEN, MIN_WIDTH_PX, YELLOW, Wireframe, overlay
-from dopepp.drawing.pictures import Picture
-from dopepp.drawing.sheet import Tile, contact_sheet, grid, message_picture
+from dopepp.drawing.pictures import RGBImage
+from dopepp.drawing.sheet import Tile, contact_sheet, grid, message_image
 from dopepp.experiment.assembly.build_parts import build_parts
 from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.config.data_config import chosen_data, trained_on
@@ -160,9 +160,9 @@ def compare_runs(
 ) -> list[Entry]:
     """Compare runs, print and write the comparison, and return the methods.
 
-    A method that was also measured with refinement counts as two methods. Pictures and training
+    A method that was also measured with refinement counts as two methods. Images and training
     curves show the networks only. The table is written first, so it exists even if drawing curves
-    or pictures fails.
+    or images fails.
 
     Raises:
         UserError: The baseline is not among the methods.
@@ -177,7 +177,7 @@ def compare_runs(
     page = write_comparison(entries, folder)
     panels = _panels(entries, folder)
     shown = num_pictures if any(entry.reports for entry in networks) else 0
-    tiles, missing = picture_tiles(networks, shown) if shown else ([], "")
+    tiles, missing = image_tiles(networks, shown) if shown else ([], "")
     if tiles:
         write_png(folder / PICTURES_FILE, contact_sheet(tiles, len(networks)))
         width = 2 * max([panel.shape[1] for panel in panels], default=_PANEL_PX)
@@ -203,7 +203,7 @@ def compare_runs(
     return entries
 
 
-def _panels(entries: Sequence[Entry], folder: Path) -> list[Picture]:
+def _panels(entries: Sequence[Entry], folder: Path) -> list[RGBImage]:
     """Draw the available loss, validation and accuracy curves, with one colour per method."""
     colours = {entry.name: f"C{number % 10}" for number, entry in enumerate(entries)}
     panels = []
@@ -252,7 +252,7 @@ def logged(path: Path, column: str) -> dict[int, float]:
     return {step: number for step, number in numbers.items() if math.isfinite(number)}
 
 
-def picture_tiles(entries: Sequence[Entry], num: int = NUM_PICTURES) -> tuple[list[Tile], str]:
+def image_tiles(entries: Sequence[Entry], num: int = NUM_PICTURES) -> tuple[list[Tile], str]:
     """Predict on the first test images of the first method whose images can be opened.
 
     The first seed of each method is shown. Networks of different parts have separate rows.
@@ -319,7 +319,7 @@ class _Model:
         if self.estimator is None or reason:
             width, height = sample.size
             factor = max(1, -(-MIN_WIDTH_PX // width))
-            return Tile(message_picture(width * factor, height * factor, reason), self.name)
+            return Tile(message_image(width * factor, height * factor, reason), self.name)
         names = {part.name for part in self.estimator.parts}
         truths = [instance for instance in sample.instances if instance.label in names]
         wireframes = [Wireframe(truth.keypoints, GREEN, "true") for truth in truths]
@@ -341,7 +341,7 @@ def _rows(models: Sequence[_Model], num: int) -> tuple[list[Tile], str]:
         except UserError as error:
             reasons.append(f"{model.name}: {error}")
     if not samples:
-        return [], f"No pictures of common test images. {'; '.join(reasons)}" if num else ""
+        return [], f"No images of common test images. {'; '.join(reasons)}" if num else ""
     return [
         model.tile(sample, BLUE if model is loaded[0] and len(models) > 1 else YELLOW)
         for sample in samples

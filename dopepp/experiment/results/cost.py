@@ -1,10 +1,10 @@
 """Measure the parameters, operations and time of a network (``job=cost``, paper Tables 4 and 8).
 
 The network is not trained. Each frame passes through
-:meth:`~dopepp.inference.estimator.PoseEstimator.predict`, from a test picture at its own resolution
+:meth:`~dopepp.inference.estimator.PoseEstimator.predict`, from a test image at its own resolution
 to poses. An untrained network would detect nothing, and recovery would take no time. Therefore the
 network's maps are computed, timed and discarded, and poses are recovered from the true maps of the
-picture plus the noise of a trained network (:data:`BELIEF_NOISE`).
+image plus the noise of a trained network (:data:`BELIEF_NOISE`).
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ COST_FILE: Final = "cost.json"
 FRAMES_FILE: Final = "frames.csv"
 
 NOTE: Final = (
-    "ms/frame: time from a test picture to poses. The untrained network would detect nothing, so "
-    "poses are recovered from the picture's true maps with the noise of a trained network."
+    "ms/frame: time from a test image to poses. The untrained network would detect nothing, so "
+    "poses are recovered from the image's true maps with the noise of a trained network."
 )
 """Note below tables with times."""
 
@@ -60,7 +60,7 @@ as on the maps of trained networks (``benchmarks/decode.py``)."""
 WARM_UP: Final = 3
 """Number of untimed passes, which allocate memory, select kernels and compile."""
 
-_NUM_PICTURES: Final = 8
+_NUM_IMAGES: Final = 8
 _BATCHES: Final = 3
 
 
@@ -71,9 +71,9 @@ class NetworkCost:
     Attributes:
         backbone_weights: Weights of the backbone's convolutions without biases, as in the paper.
         gmacs: Multiply-accumulates for one image of the input size, 10⁹.
-        picture_size: Size of the timed pictures before they are scaled to the input size.
+        picture_size: Size of the timed images before they are scaled to the input size.
         threads: Number of CPU threads.
-        ms_per_frame: Median time from a picture to its poses, milliseconds.
+        ms_per_frame: Median time from an image to its poses, milliseconds.
         network_ms: Share of the network in ``ms_per_frame``.
         recovery_ms: Share of the recovery (maps to poses) in ``ms_per_frame``.
         frames_per_s: Throughput of the network alone in batches of ``batch_size``, fastest batch.
@@ -142,8 +142,8 @@ def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
     network, description = build_untrained(config, parts)
     parameters, gmacs = network_cost(network, description.input_size)
     source = held_out_source(config.data, parts, "test")
-    # Pictures are prepared first so that frame times exclude reading and rendering.
-    samples = [source.sample(index) for index in range(min(_NUM_PICTURES, len(source)))]
+    # Images are prepared first so that frame times exclude reading and rendering.
+    samples = [source.sample(index) for index in range(min(_NUM_IMAGES, len(source)))]
     estimator = SimulatedMapsEstimator(network, description, "cuda" if has_gpu else "cpu")
     geometry = map_geometry(config.maps, network.stride)
     frames = time_frames(estimator, samples, geometry, config.cost.num_frames, config.seed)
@@ -184,17 +184,17 @@ def time_frames(
     num_frames: int,
     seed: int,
 ) -> pd.DataFrame:
-    """Time frames from picture to poses, after :data:`WARM_UP` untimed frames.
+    """Time frames from image to poses, after :data:`WARM_UP` untimed frames.
 
     Args:
         estimator: Estimator to time.
-        samples: Pictures, which are used in turn.
+        samples: Images, which are used in turn.
         geometry: Geometry of the maps.
         num_frames: Number of timed frames.
         seed: Seed of the noise on the maps.
 
     Returns:
-        Per frame, the ``seconds`` from picture to poses, of which ``network_seconds`` for the
+        Per frame, the ``seconds`` from image to poses, of which ``network_seconds`` for the
         network and ``recovery_seconds`` for the recovery.
     """
     generator = torch.Generator().manual_seed(seed)
@@ -215,7 +215,7 @@ def time_frames(
 def likely_maps(
     sample: Sample, estimator: PoseEstimator, geometry: MapGeometry, generator: torch.Generator
 ) -> Maps:
-    """Simulate the maps of a trained network: true maps of a picture with noise.
+    """Simulate the maps of a trained network: true maps of an image with noise.
 
     The maps have the input size of the estimator and are on its device.
     """
@@ -235,7 +235,7 @@ def likely_maps(
 def save_frame_rates(path: Path, frames: Mapping[str, pd.DataFrame]) -> None:
     """Draw frames per second over time as a PNG (paper Fig. 13).
 
-    Each network has a solid curve (picture to poses) and a dashed curve (network alone).
+    Each network has a solid curve (image to poses) and a dashed curve (network alone).
     """
     lines = []
     for number, (name, times) in enumerate(frames.items()):
@@ -243,7 +243,7 @@ def save_frame_rates(path: Path, frames: Mapping[str, pd.DataFrame]) -> None:
         whole, network_rate = (
             1 / times[[name]].to_numpy().T for name in ("seconds", "network_seconds")
         )
-        lines.append(PlotLine(f"{name}, picture to poses", seconds, whole, colour, False))
+        lines.append(PlotLine(f"{name}, image to poses", seconds, whole, colour, False))
         lines.append(PlotLine(f"{name}, network alone", seconds, network_rate, colour, True))
     write_png(path, figure_image(lines_figure(lines, "time (s)", "frames a second")))
 

@@ -1,6 +1,6 @@
-"""Count false detections of estimators on pictures that show none of their parts.
+"""Count false detections of estimators on images that show none of their parts.
 
-The user provides the pictures, taken with the camera of the test data or with another camera, whose
+The user provides the images, taken with the camera of the test data or with another camera, whose
 file the user names.
 """
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from dopepp.data.negatives import PictureFrames
+from dopepp.data.negatives import PhotoFrames
 from dopepp.data.sample import Sample, SampleSource
 from dopepp.drawing.overlay import YELLOW, Wireframe, overlay
 from dopepp.drawing.pictures import read_picture
@@ -26,23 +26,23 @@ from dopepp.metrics.row import NOT_AVAILABLE
 from dopepp.parts.part import Parts
 from dopepp.virtual.backgrounds import PhotoBackgrounds
 
-TITLE: Final = "Pictures without the part"
+TITLE: Final = "Images without the part"
 KEY: Final = "without_part"
 """Key of a report's details."""
 
 NUM_LOUDEST: Final = 6
-"""Number of pictures with the highest scores to name and to draw."""
+"""Number of images with the highest scores to name and to draw."""
 
 
 @dataclass(frozen=True)
 class FalseAlarms:
-    """Detections of an estimator on pictures without its parts.
+    """Detections of an estimator on images without its parts.
 
     Attributes:
-        num_pictures: Number of pictures.
-        per_picture: Reported detections per picture.
+        num_pictures: Number of images.
+        per_picture: Reported detections per image.
         threshold: Minimum score of a reported detection.
-        loudest: Highest score of a candidate by picture, for the pictures with the highest scores,
+        loudest: Highest score of a candidate by image, for the images with the highest scores,
             in descending order. Scores below the threshold count as well.
     """
 
@@ -57,18 +57,18 @@ class FalseAlarms:
         return {
             "method": method,
             "pictures": f"{self.num_pictures:,}",
-            "detections per picture": f"{self.per_picture:.3f}",
+            "detections per image": f"{self.per_picture:.3f}",
             "threshold": f"{self.threshold:.3g}",
             "highest score": NOT_AVAILABLE if best is None else f"{best:.3g}",
-            "highest-scoring pictures": ", ".join(self.loudest),
+            "highest-scoring images": ", ".join(self.loudest),
         }
 
 
 @dataclass
 class UndistortedFrames:
-    """Pictures of a camera, without its lens distortion."""
+    """Images of a camera, without its lens distortion."""
 
-    frames: PictureFrames
+    frames: PhotoFrames
     camera: Camera
     name: str = TITLE
 
@@ -76,7 +76,7 @@ class UndistortedFrames:
         return len(self.frames)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Return a picture without instances, with its path as key."""
+        """Return an image without instances, with its path as key."""
         sample = self.frames.sample(index, epoch)
         key = sample.key.rpartition("/")[0]
         return replace(sample, image=self.camera.undistorted(sample.image), key=key)
@@ -85,11 +85,11 @@ class UndistortedFrames:
 def frames_without_parts(
     folder: Path, camera: Path | None, data: DataConfig, parts: Parts
 ) -> UndistortedFrames:
-    """Open a folder of pictures that show none of the parts.
+    """Open a folder of images that show none of the parts.
 
     Args:
         folder: Folder of photos, searched recursively.
-        camera: Camera file; None for the camera of the data. Pictures are scaled and cropped to
+        camera: Camera file; None for the camera of the data. Images are scaled and cropped to
             the camera's size.
         data: Test data.
         parts: Parts of the estimators.
@@ -97,7 +97,7 @@ def frames_without_parts(
     Raises:
         UserError: The folder has no photos, or the camera file cannot be read.
     """
-    pictures = PhotoBackgrounds(folder)
+    images = PhotoBackgrounds(folder)
     if camera is None:
         view = frame_view(data, parts)
         lens = Camera(view.size, view.K, (), "the camera of the test data")
@@ -105,18 +105,18 @@ def frames_without_parts(
         lens = read_camera(camera)
     size = lens.size
     if size is None:
-        height, width = read_picture(pictures.paths[0]).shape[:2]
+        height, width = read_picture(images.paths[0]).shape[:2]
         size = (width, height)
-    return UndistortedFrames(PictureFrames(pictures, lens.K, size), lens)
+    return UndistortedFrames(PhotoFrames(images, lens.K, size), lens)
 
 
 def count_false_alarms(
     estimators: Mapping[str, PoseEstimator], frames: SampleSource
 ) -> tuple[dict[str, FalseAlarms], list[Tile]]:
-    """Run estimators on pictures without their parts.
+    """Run estimators on images without their parts.
 
     Returns:
-        The counts by estimator, and tiles of the last estimator's pictures with the highest
+        The counts by estimator, and tiles of the last estimator's images with the highest
         scores, with their best candidate.
     """
     alarms, tiles = {}, []
@@ -141,14 +141,14 @@ def count_false_alarms(
 
 
 def _tile(estimator: PoseEstimator, sample: Sample) -> Tile:
-    """Draw the best false detection on a picture."""
+    """Draw the best false detection on an image."""
     best = estimator.candidates(sample.image, sample.K, cropped=True)[0]
     label = f"{best.object} {best.score:.3g}"
     return Tile(overlay(sample.image, [Wireframe(best.keypoints, YELLOW, label)]), sample.key)
 
 
 def alarm_rows(report: Report) -> list[Row]:
-    """Return the table of a method and its refined poses; empty without pictures."""
+    """Return the table of a method and its refined poses; empty without images."""
     reports = [report] if report.refined is None else [report, report.refined]
     return [
         FalseAlarms(**each.details[KEY]).row(each.name) for each in reports if KEY in each.details

@@ -131,10 +131,10 @@ class EstimatorMethod:
 
 
 class ViewsMethod(EstimatorMethod):
-    """Estimator that runs on all pictures of a static scene; poses refer to the first picture."""
+    """Estimator that runs on all images of a static scene; poses refer to the first image."""
 
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
-        """Run the estimator on all pictures and return the candidates of measured objects."""
+        """Run the estimator on all images and return the candidates of measured objects."""
         pictures = [sample, *sample.others]
         poses = [view.T_world_cam for view in pictures if view.T_world_cam is not None]
         depths = [view.depth for view in pictures if view.depth is not None]
@@ -266,7 +266,7 @@ class Measured:
 
     Attributes:
         reports: One report per method.
-        tiles: Pictures of the first images.
+        tiles: Images of the first images.
         poses: Candidates of each method with their image and the seconds per image, or None if
             unknown.
         metrics: Accumulator of each method.
@@ -292,7 +292,7 @@ def measure(
     """Run methods over the same images at their native size.
 
     AP, BOP scores and files of poses include all candidates; every other measure includes the
-    reported poses only. Pictures show the ground truth in green, predictions of the
+    reported poses only. Images show the ground truth in green, predictions of the
     last method in yellow and predictions of other methods in blue (paper Fig. 14).
 
     Args:

@@ -48,7 +48,7 @@ FILES: Final = {
     "metrics.csv": "losses, rates and validation over the steps",
     "config.yaml": "all options, resolved",
     "versions.json": "command, commit, packages, hardware, seed and fingerprint of the data",
-    "without_part.png": "highest-scoring pictures without the part, with the best candidates",
+    "without_part.png": "highest-scoring images without the part, with the best candidates",
     "overlay.png": "test images: truth in green, prediction in yellow",
     "coverage.png": "share of true poses inside their covariance region, over its level",
     "auc.png": "share of test instances below each error (numbers in `auc.csv`)",
@@ -74,8 +74,8 @@ FILES: Final = {
 }
 """Files that a run may write, ordered by relevance."""
 
-_PICTURES: Final = [name for name in FILES if name.endswith(".png") and name != "val_auc.png"]
-"""Pictures that a run's README shows."""
+_IMAGES: Final = [name for name in FILES if name.endswith(".png") and name != "val_auc.png"]
+"""Images that a run's README shows."""
 
 MAX_BYTES: Final = 8_000_000
 """Maximum size of a released file, which is part of the package."""
@@ -193,7 +193,7 @@ def write_run_readme(
             report=report,
             result_table=_result_table,
             alarms=markdown(rows) if report and (rows := alarm_rows(report)) else "",
-            pictures={name: FILES[name] for name in _PICTURES if (folder / name).is_file()},
+            images={name: FILES[name] for name in _IMAGES if (folder / name).is_file()},
             next_commands=next_commands,
             is_trial=is_trial,
             files={name: text for name, text in FILES.items() if (folder / name).exists()},
@@ -223,7 +223,7 @@ def write_multirun_readme(folder: Path, command: Sequence[str], jobs: Mapping[st
             "multirun",
             command=program.line(command),
             has_table=(folder / "compare.md").is_file(),
-            has_picture=(folder / "compare.png").is_file(),
+            has_image=(folder / "compare.png").is_file(),
             jobs=markdown(rows) if rows else "",
         )
 

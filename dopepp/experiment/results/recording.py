@@ -1,4 +1,4 @@
-"""Measure methods and write tables, curves, pictures and poses into the run folder."""
+"""Measure methods and write tables, curves, images and poses into the run folder."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def measure_and_record(
     refine: Refine | None = None,
     without_parts: SampleSource | None = None,
 ) -> list[Report]:
-    """Measure methods on a test set; print and write tables, curves and pictures.
+    """Measure methods on a test set; print and write tables, curves and images.
 
     ``metrics.json`` describes the last estimator, with its refined poses under ``refined``, or the
     file of poses if there is no estimator.
@@ -76,7 +76,7 @@ def measure_and_record(
         all_measures: Whether to print symmetric measures of objects without symmetries.
         protocols: Further protocols to measure.
         refine: Refinement to measure in addition, for every estimator.
-        without_parts: Pictures without the parts, on which detections are counted.
+        without_parts: Images without the parts, on which detections are counted.
 
     Returns:
         A report per estimator, then per file.
@@ -230,7 +230,7 @@ def _record_coverage(run_dir: Path, measured: Measured) -> None:
 def _record_false_alarms(
     run_dir: Path, methods: Mapping[str, Method], reports: Sequence[Report], frames: SampleSource
 ) -> None:
-    """Measure the estimators on pictures without their parts, and add the counts to the reports."""
+    """Measure the estimators on images without their parts, and add the counts to the reports."""
     of_methods = {n: m.estimator for n, m in methods.items() if isinstance(m, EstimatorMethod)}
     alarms, tiles = count_false_alarms(of_methods, frames)
     for report in reports:

@@ -240,7 +240,7 @@ def _check_combination(options: EvaluationConfig) -> None:
             fix,
         )
     if options.negatives is not None and not has_network and options.templates is None:
-        fix = "add ckpt_path, or leave out negatives (a file has no poses on these pictures)"
+        fix = "add ckpt_path, or leave out negatives (a file has no poses on these images)"
         raise UserError(
             f"negatives={options.negatives} without ckpt_path", "both options together", fix
         )

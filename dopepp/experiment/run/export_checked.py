@@ -29,7 +29,7 @@ from dopepp.models.network import network_cost
 
 _log = logging.getLogger(__name__)
 
-NUM_CHECKED: Final = 20  # rendered pictures on which the export is compared with PyTorch
+NUM_CHECKED: Final = 20  # rendered images on which the export is compared with PyTorch
 NUM_IMAGES: Final = 100  # scenes to calibrate on, and further scenes to measure on
 
 
@@ -143,7 +143,7 @@ def _target(path: Path, layout: str, precision: str, out: Path | None) -> Path:
 
 
 def _seen(estimator: PoseEstimator, sample: Sample) -> list[Pixels]:
-    """Return a picture at the input sizes of the network."""
+    """Return an image at the input sizes of the network."""
     views = estimator.views(sample.image, sample.K)
     return [np.ascontiguousarray(view.pixels.transpose(2, 0, 1)[None]) for view in views]
 

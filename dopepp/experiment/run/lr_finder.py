@@ -172,7 +172,7 @@ def smooth(values: Steps) -> Steps:
 
 
 def _report(rates: Steps, losses: Steps, run_dir: Path) -> Suggestion | None:
-    """Write the table and the picture, print the suggestion and return it."""
+    """Write the table and the image, print the suggestion and return it."""
     smoothed = smooth(losses)
     rows = [
         {"step": step, "learning_rate": rate, "loss": loss, "smoothed_loss": mean}

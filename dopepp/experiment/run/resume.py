@@ -6,7 +6,7 @@ network and the kind of optimiser must not change, because the saved state would
 options may change, such as the duration, the device and the callbacks.
 
 Files, meshes or the rendering code may change while the options stay the same. Therefore a
-checkpoint describes the sources and the first image of every split: its labels and a picture of
+checkpoint describes the sources and the first image of every split: its labels and an image of
 16 × 12 pixels, which is robust against rounding on other machines.
 """
 
@@ -212,7 +212,7 @@ def _listed(differences: Sequence[ConfigDifference]) -> str:
 
 _THUMBNAIL_SIZE: Final = (16, 12)
 _MAX_LEVELS: Final = 2.0
-"""Mean difference of two small pictures, in grey levels, above which they count as different."""
+"""Mean difference of two small images, in grey levels, above which they count as different."""
 _MAX_LABEL: Final = 1e-4
 """Difference of camera matrices (relative) or poses (metres) that counts as a change."""
 _LONG: Final = 40
@@ -247,7 +247,7 @@ def differing_images(stored: Mapping[str, Any], present: Mapping[str, Any]) -> l
         for name in ("K", "T_cam_obj")
     ):
         lines.append("labels of the first image")
-    if _picture_difference(before, now) > _MAX_LEVELS:
+    if _image_difference(before, now) > _MAX_LEVELS:
         lines.append("pixels of the first image")
     return lines
 
@@ -265,15 +265,15 @@ def _thumbnail(sample: Sample) -> dict[str, Any]:
     }
 
 
-def _picture_difference(stored: Mapping[str, Any], present: Mapping[str, Any]) -> float:
+def _image_difference(stored: Mapping[str, Any], present: Mapping[str, Any]) -> float:
     """Return the mean absolute difference in grey levels; infinite for different sizes."""
     if stored["size"] != present["size"]:
         return np.inf
-    pictures = (
+    images = (
         np.frombuffer(bytes.fromhex(record["pixels"]), np.uint8).astype(float)
         for record in (stored, present)
     )
-    return float(np.abs(np.subtract(*pictures)).mean())
+    return float(np.abs(np.subtract(*images)).mean())
 
 
 def _shown(value: object) -> str:

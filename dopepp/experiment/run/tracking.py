@@ -29,8 +29,8 @@ from dopepp.metrics.row import COLUMNS, PoseRow
 from dopepp.models.registry import TARGET
 from dopepp.training.loggers import GuardedLogger
 
-_PICTURES: Final = ("overlay", "auc", "shading", "shading_examples")
-"""Pictures of a run's test images to log, without ``.png``."""
+_IMAGES: Final = ("overlay", "auc", "shading", "shading_examples")
+"""Images of a run's test images to log, without ``.png``."""
 _COMPARISON: Final = "comparison"
 
 _UNSAID: Final = ("experiment=", "scale=", "logger", "model=", "data=", "resume", "table")
@@ -84,13 +84,13 @@ def _interrupted_id(run_dir: Path) -> str | None:
 
 
 def log_report(trackers: Sequence[GuardedLogger], report: Report, run_dir: Path) -> None:
-    """Log the result of a run: test metrics, reference rows and pictures."""
+    """Log the result of a run: test metrics, reference rows and images."""
     figures = _figures("test", report.rows)
     for reference, rows in report.references.items():
         figures |= _figures(f"reference/{reference}", rows)
     for tracker in trackers:
         tracker.log_summary(figures)
-        _send_pictures(tracker, {f"test/{name}": run_dir / f"{name}.png" for name in _PICTURES})
+        _send_images(tracker, {f"test/{name}": run_dir / f"{name}.png" for name in _IMAGES})
 
 
 def _figures(prefix: str, rows: Mapping[str, PoseRow]) -> dict[str, float]:
@@ -113,15 +113,15 @@ def log_comparison(nodes: Mapping[str, Any] | None, folder: Path) -> None:
                     text = (folder / file).with_suffix(".md").read_text()
                     tracker.log_table(Path(file).stem, rows, text)
             names = (CURVES_FILE, PICTURES_FILE, LOSS_FILE, "table_shading.png", "frame_rate.png")
-            _send_pictures(tracker, {Path(name).stem: folder / name for name in names})
+            _send_images(tracker, {Path(name).stem: folder / name for name in names})
 
 
-def _send_pictures(tracker: GuardedLogger, paths: Mapping[str, Path]) -> None:
-    """Log the pictures that exist and are complete."""
+def _send_images(tracker: GuardedLogger, paths: Mapping[str, Path]) -> None:
+    """Log the images that exist and are complete."""
     for name, path in paths.items():
         try:
-            picture = read_rgb(path) if path.is_file() else None
+            image = read_rgb(path) if path.is_file() else None
         except UserError:  # the file is truncated, for example by a full disk
-            picture = None
-        if picture is not None:
-            tracker.log_picture(name, picture)
+            image = None
+        if image is not None:
+            tracker.log_picture(name, image)

@@ -201,7 +201,7 @@ def _progress(config: RunConfig, datamodule: PoseDataModule) -> list[Callback]:
         UserError: ``stop_at`` is set without ``refine=region``, which verifies the poses.
     """
     if "region" in (terms := refine_terms(config.refine)):
-        return [RefinedProgress(datamodule.val_pictures, terms, config.stop_at)]
+        return [RefinedProgress(datamodule.val_images, terms, config.stop_at)]
     if config.stop_at is not None:
         raise UserError(
             f"stop_at={config.stop_at:g} with refine={config.refine}",

@@ -5,7 +5,7 @@
   refined poses have separate factors.
 - Score: probability that ADD(-S) is below a tenth of the diameter. The score of refined poses is a
   recalibration of the verification.
-- Thresholds: the lowest scores with at most the permitted rate of false positives on pictures
+- Thresholds: the lowest scores with at most the permitted rate of false positives on images
   without the objects.
 
 The old factors are kept if the new ones rank the validation poses worse. The result is measured on
@@ -67,11 +67,11 @@ from dopepp.recovery.detection import (
 
 MIN_REFINED_SCORE: Final = 0.1
 """Lowest threshold of refined poses. Poses that are far more likely incorrect than correct are
-never reported, even if the pictures without the objects permit a lower threshold."""
+never reported, even if the images without the objects permit a lower threshold."""
 
 MIN_REFINED_FACTOR: Final = 0.5
 """Smallest covariance factor of refined poses. Smaller factors fit renders of the network's size,
-and make covariances too small on larger pictures and on real ones."""
+and make covariances too small on larger images and on real ones."""
 
 MIN_REFINED: Final = 20  # smallest number of correct poses that determine a covariance factor
 
@@ -81,7 +81,7 @@ SAME: Final = 0.005  # largest decrease of the average precision with fitted fac
 HELD_OUT: Final[tuple[Literal["val"], Literal["test"]]] = ("val", "test")
 
 MAX_BYTES: Final = 2**30
-"""Size of the cache, bytes: 1,400 pictures of 400×400 pixels with the maps of one part."""
+"""Size of the cache, bytes: 1,400 images of 400×400 pixels with the maps of one part."""
 
 _WEIGHTS: Final = ("score_", "refined_")
 
@@ -155,7 +155,7 @@ def tune(
         estimator: Estimator of the checkpoint.
         data: Data sources.
         parts: Parts of the checkpoint.
-        target: Number of pictures without objects, and permitted rate of false positives.
+        target: Number of images without objects, and permitted rate of false positives.
 
     Raises:
         UserError: There are no detections, all of them are correct, all are incorrect, or the
@@ -524,7 +524,7 @@ def _quality(test: Scored, empty: Scored, threshold: float) -> DetectionQuality:
 
 
 class TuningCache:
-    """Cache for pictures and maps, which tuning uses several times.
+    """Cache for images and maps, which tuning uses several times.
 
     Args:
         max_bytes: Size of the cache. Items that do not fit are computed each time.
@@ -549,7 +549,7 @@ class TuningCache:
         return _CachedSource(source, self, source.name)
 
     def with_cached_maps(self, estimator: PoseEstimator) -> PoseEstimator:
-        """Return a copy of an estimator that caches the maps of each picture."""
+        """Return a copy of an estimator that caches the maps of each image."""
         network, cached = estimator.network, copy.copy(estimator)
         cached.network = _CachedNetwork(network, self, network.stride, network.size_multiple)
         return cached

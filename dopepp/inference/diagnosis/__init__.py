@@ -58,13 +58,13 @@ OFF: Final = 0.08
 AGREEING: Final = 0.6  # share of the outline that agrees: 0.68 to 1 in good renders
 
 ABSENT: Final = (
-    "check that it is on the picture, uncovered, with a side that training showed; else its "
+    "check that it is on the image, uncovered, with a side that training showed; else its "
     "appearance differs from training: train with such materials, light and backgrounds"
 )
 
 
 TUNE: Final = (
-    "tune with pictures that do not show the part: python evaluate.py ckpt_path=MODEL tune=true "
+    "tune with images that do not show the part: python evaluate.py ckpt_path=MODEL tune=true "
     "virtual.negative_photos=FOLDER"
 )
 
@@ -137,7 +137,7 @@ def camera(case: Case) -> Diagnosis:
     sentence = f"K sees {across:.0f}° × {down:.0f}°"
     if case.detection is None:
         return Diagnosis("camera", sentence)
-    fix = "check K: its picture size (--K-size), the crop (--crop), the calibration"
+    fix = "check K: its image size (--K-size), the crop (--crop), the calibration"
     detection, name = case.detection, case.part.name
     lens = focal_factor(case.part.cuboid, detection.peaks, detection.T_cam_obj, case.K)
     if lens and lens.gain > GAIN and lens.deviation < CERTAIN and not _near(lens.factor, FOCAL):
@@ -178,7 +178,7 @@ def visibility(case: Case) -> Diagnosis:
         if case.detection is not None:
             return Diagnosis("visibility", f"{name} is seen, score {case.detection.score:.2g}")
         problem = f"no pose of {name} passes the verification"
-        fix = "check that all of it is on the picture and uncovered; add light from the side, or "
+        fix = "check that all of it is on the image and uncovered; add light from the side, or "
         fix += "train it (experiment=my_part): a network sees more in clutter"
         return Diagnosis("visibility", problem, fix)
     if case.detection is not None:
@@ -197,7 +197,7 @@ def visibility(case: Case) -> Diagnosis:
         "visibility",
         f"{name} is only partly visible: a belief of {centre:.2g} in its centre and {count} of 9 "
         "keypoints, which determine no reliable pose",
-        "uncover it, and keep all of it within the picture, not nearer than in training",
+        "uncover it, and keep all of it within the image, not nearer than in training",
     )
 
 
@@ -211,7 +211,7 @@ def elsewhere(case: Case) -> Diagnosis:
         return Diagnosis("elsewhere", "no detections away from the parts")
     best, threshold = case.unexpected[0], case.estimator.min_score
     u, v = best.keypoints[CENTROID]
-    where = "away from every part" if case.centres else "on a picture without the part"
+    where = "away from every part" if case.centres else "on an image without the part"
     counts = f"{len(case.unexpected)} of {len(case.reported)} detections"
     counts += f" above {threshold:.2g} are {where}"
     best_score = f"the best has the score {best.score:.2g}, at ({u:.0f}, {v:.0f})"
@@ -229,7 +229,7 @@ def pose(case: Case) -> Diagnosis:
     if not case.estimator.has_network:
         sentence = f"{name} is {case.length_px:.0f} pixels long"
     if share > OFF:
-        fix = "check K and the mesh; if both are correct, train longer or with more such pictures"
+        fix = "check K and the mesh; if both are correct, train longer or with more such images"
         return Diagnosis("pose", f"{sentence}, {share:.0%} of its length", fix)
     if refined is None:
         return Diagnosis("pose", f"{sentence}; without a mesh its outline is not checked")

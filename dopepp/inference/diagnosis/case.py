@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Letterbox, focal_length
 from dopepp.geometry.cuboid import CENTROID, NUM_KEYPOINTS
 from dopepp.inference.estimator import PoseEstimator
@@ -53,7 +53,7 @@ class Case:
     def __init__(
         self,
         estimator: PoseEstimator,
-        image: Picture,
+        image: RGBImage,
         K: CameraMatrix,
         parts: Sequence[Part],
         distances: tuple[float, float] | None = None,
@@ -150,7 +150,7 @@ class Case:
         estimator = self.estimator.refining("region", self.parts)
         return estimator.refined([self.detection], self.image, self.K)[0]
 
-    def around(self) -> Picture:
+    def around(self) -> RGBImage:
         """Return a crop around the detected part in the size of :attr:`box`, or the whole image."""
         picture = self.box.image(self.image)
         if self.detection is None:
@@ -188,7 +188,7 @@ def num_keypoints(detection: Detection) -> int:
     return int(np.isfinite(detection.peaks[:, 0]).sum())
 
 
-def edge_width(picture: Picture) -> float | None:
+def edge_width(picture: RGBImage) -> float | None:
     """Return the blur's standard deviation at the strongest edges, pixels; None without edges.
 
     A step blurred by σ, and then by s, has a gradient proportional to 1/√(σ² + s²). The ratio of
@@ -206,12 +206,12 @@ def edge_width(picture: Picture) -> float | None:
     return max(NARROWEST, math.sqrt((4 - ratio) / (ratio - 1)))
 
 
-def highlights(picture: Picture) -> float:
+def highlights(picture: RGBImage) -> float:
     """Return the 99th percentile of the grey levels."""
     return float(np.percentile(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), 99))
 
 
-def clipped(picture: Picture) -> float:
+def clipped(picture: RGBImage) -> float:
     """Return the share of clipped pixels."""
     return float((picture.min(axis=2) >= WHITE).mean())
 

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from dopepp.core.errors import RunError, UserError
-from dopepp.drawing.pictures import MAX_PIXELS, USUAL_RATE, Picture, read_photo
+from dopepp.drawing.pictures import MAX_PIXELS, USUAL_RATE, RGBImage, read_photo
 from dopepp.inference.frames.ros import BAGS, is_bag_folder
 from dopepp.inference.frames.source import CameraFrame, FrameSource
 
@@ -82,7 +82,7 @@ def list_images(path: Path) -> list[Path] | None:
     if not images:
         allowed = f"a folder with images ({', '.join(SUFFIXES)})"
         fix = "pass the folder that holds the images"
-        raise UserError(f"{path} without a picture", allowed, fix)
+        raise UserError(f"{path} without an image", allowed, fix)
     return images
 
 
@@ -214,7 +214,7 @@ class Live(FrameSource):
                 frame = reader.wait(timeout)
                 if frame is None:
                     since = "" if num_requests else " since it was opened"
-                    reason = f"{self.name}: no picture for {timeout:g} s{since}"
+                    reason = f"{self.name}: no image for {timeout:g} s{since}"
                     raise RunError(f"{reason}; check its cable or network")
                 if num_requests % stride == 0:
                     yield frame
@@ -248,7 +248,7 @@ class _NewestFrame:
         self._stopped.set()
 
     def _read(self) -> None:
-        """Read pictures in a thread, of which only the newest is kept."""
+        """Read images in a thread, of which only the newest is kept."""
         number = 0
         while not self._stopped.is_set():
             delivered, image = False, None
@@ -299,7 +299,7 @@ def _open_capture(source: Any, *options: Any) -> cv2.VideoCapture:
         cv2.utils.logging.setLogLevel(level)
 
 
-def _as_rgb(image: UInt8[np.ndarray, "height width *channels"]) -> Picture:
+def _as_rgb(image: UInt8[np.ndarray, "height width *channels"]) -> RGBImage:
     """Convert a grey or BGR frame of OpenCV to RGB."""
     code = cv2.COLOR_GRAY2RGB if image.ndim == 2 else cv2.COLOR_BGR2RGB
     return np.asarray(cv2.cvtColor(image, code))

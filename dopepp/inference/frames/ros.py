@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from dopepp.core.errors import UserError, require
-from dopepp.drawing.pictures import MAX_PIXELS, Picture, whole_picture
+from dopepp.drawing.pictures import MAX_PIXELS, RGBImage, whole_image
 from dopepp.geometry.camera import crop_camera, resize_camera
 from dopepp.geometry.camera_file import Camera, Crop, camera_of_fields
 from dopepp.inference.frames.source import CameraFrame, FrameSource
@@ -51,14 +51,14 @@ ENCODINGS: Final[dict[str, tuple[int, int | None]]] = {
 """Bytes per pixel, and OpenCV's conversion to RGB."""
 
 
-def decode_image(message: Any) -> Picture:
+def decode_image(message: Any) -> RGBImage:
     """Return the RGB image of a message.
 
     Raises:
         ValueError: The encoding is not supported, or the image's size is inconsistent or too large.
     """
     if hasattr(message, "format"):
-        picture = whole_picture(bytes(message.data), ("JPEG", "PNG"))
+        picture = whole_image(bytes(message.data), ("JPEG", "PNG"))
         return np.ascontiguousarray(np.asarray(picture.convert("RGB")))
     if message.encoding not in ENCODINGS:
         supported = ", ".join(ENCODINGS)
@@ -181,7 +181,7 @@ class Bag(FrameSource):
             try:
                 image = decode_image(message)
             except Exception as error:  # untrusted messages can raise any exception
-                raise self._unreadable(f"picture {number} of {self.topic}: {error}") from error
+                raise self._unreadable(f"image {number} of {self.topic}: {error}") from error
             yield CameraFrame(image, self.name, number, seconds)
 
     @cached_property
@@ -249,10 +249,10 @@ class Bag(FrameSource):
         names = sorted({link.topic for link in links})
         if topic in names or (topic is None and len(names) == 1):
             return topic or names[0]
-        problem = f"with pictures on {len(names)} topics" if names else "without pictures"
-        problem = problem if topic is None else f"without pictures on {topic}"
+        problem = f"with images on {len(names)} topics" if names else "without images"
+        problem = problem if topic is None else f"without images on {topic}"
         allowed = f"one of {', '.join(names)}" if names else f"a topic of {RAW} or {COMPRESSED}"
-        fix = f"pass --topic {names[0]}" if names else "record a topic of pictures"
+        fix = f"pass --topic {names[0]}" if names else "record a topic of images"
         raise UserError(f"{self._path} {problem}", allowed, fix)
 
     def _unreadable(self, reason: str) -> UserError:

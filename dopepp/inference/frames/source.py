@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dopepp.core.errors import UserError
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.camera_file import Camera, Crop, read_camera
 from dopepp.geometry.camera_formats import Size
@@ -19,7 +19,7 @@ from dopepp.inference.picture import Depth32, read_depth_image, undistorted_dept
 class CameraFrame:
     """One frame of a source."""
 
-    image: Picture  # RGB, with the lens distortion of the camera
+    image: RGBImage  # RGB, with the lens distortion of the camera
     name: str  # image file, or name of a source of many frames
     number: int  # index in the source, or the number in the name of every image file (BOP)
     time: float | None = None  # seconds since a video's start or since 1970; None of an image
@@ -58,7 +58,7 @@ class Lens:
     K_size: Size | None = None  # (width, height) that K belongs to, if images were resized
     crop: Crop | None = None  # region of the calibrated image, if images were cropped
 
-    def undistort(self, image: Picture) -> tuple[Picture, CameraMatrix]:
+    def undistort(self, image: RGBImage) -> tuple[RGBImage, CameraMatrix]:
         """Return the image without lens distortion, and its K.
 
         Raises:

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
 from dopepp.core.compiled import Array, Scalar, compiled
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, crop_camera, resize_camera
 from dopepp.inference.refinement.solver import UndecidedError
 
@@ -43,7 +43,7 @@ FEWEST: Final = 60  # smallest number of pixels of a histogram
 class Crop:
     """A part and its surroundings, cut from an image and shrunk."""
 
-    colours: Picture  # RGB
+    colours: RGBImage  # RGB
     K: CameraMatrix  # camera matrix of the crop, pixels
     extent: float  # longer side of the part, pixels of the crop
     scale: float  # crop pixels per image pixel: 1/n for an integer n
@@ -60,7 +60,7 @@ class Crop:
 
 
 def crop_around(
-    image: Picture,
+    image: RGBImage,
     K: CameraMatrix,
     corners: Float[np.ndarray, "2 2"],
     longest_px: int,
@@ -85,7 +85,7 @@ def crop_around(
     left, top = np.clip(np.floor(lower - edge), 0, limit).astype(int)
     right, bottom = np.clip(np.ceil(upper + edge) + 1, 0, limit).astype(int)
     if min(right - left, bottom - top) < SMALLEST_PX:
-        raise UndecidedError("the part lies outside the picture")
+        raise UndecidedError("the part lies outside the image")
     # Shrinking by an integer is exact, and much faster than by other factors.
     most = min(right - left, bottom - top) // SMALLEST_PX
     factor = min(max(1, round(extent / longest_px)), most)
@@ -100,7 +100,7 @@ def crop_around(
     return Crop(colours, K, extent / factor, 1 / factor)
 
 
-def colour_bins(image: Picture) -> Int[np.ndarray, "height width"]:
+def colour_bins(image: RGBImage) -> Int[np.ndarray, "height width"]:
     """Return each pixel's colour bin, below 4096."""
     bins = np.empty(image.shape[:2], np.int16)
     _bins(image, bins)

@@ -1,6 +1,6 @@
-"""Refinement of one pose on several pictures of a static scene with known camera poses.
+"""Refinement of one pose on several images of a static scene with known camera poses.
 
-The unknown is the part's pose in the world. Every view contributes the terms of a single picture,
+The unknown is the part's pose in the world. Every view contributes the terms of a single image,
 with its own errors of offset and scale. A step of the solver is a rotation about the object's
 origin and a shift of the origin. To apply it in a camera, only its axes are turned.
 
@@ -17,7 +17,7 @@ from typing import Final
 
 import numpy as np
 
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.geometry.rotation import RotationMatrix, Vector
 from dopepp.inference.picture import Depth
@@ -40,10 +40,10 @@ NEGLIGIBLE: Final = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class PosedPicture:
-    """A picture with its camera matrix and the pose of its camera."""
+class PosedImage:
+    """An image with its camera matrix and the pose of its camera."""
 
-    image: Picture  # RGB, without lens distortion
+    image: RGBImage  # RGB, without lens distortion
     K: CameraMatrix
     T_cam_world: Transform
     # Covariance of the camera's pose: rotation vector about the camera's centre and shift of the
@@ -99,7 +99,7 @@ class ViewTerm:
     """A term of one view, as a term of the pose in the world."""
 
     term: Term
-    view: PosedPicture
+    view: PosedImage
 
     def __call__(self, pose: Transform, prior: NormalEquations, /) -> NormalEquations | None:
         """Linearise the term; see :class:`~dopepp.inference.refinement.solver.Term`."""
@@ -121,7 +121,7 @@ def _widened(H: PoseMatrix, g: Vector, covariance: PoseMatrix) -> NormalEquation
 
 @dataclass(frozen=True, eq=False)
 class JointRefinement:
-    """Result of refining a pose on several pictures."""
+    """Result of refining a pose on several images."""
 
     T_world_obj: Transform
     covariance: PoseMatrix  # rotation vector about the object's origin and shift, world axes
@@ -132,7 +132,7 @@ class JointRefinement:
 
 def refine_views(
     region: RegionRefiner,
-    views: Sequence[PosedPicture],
+    views: Sequence[PosedImage],
     start: Prior,
     prior: Prior,
     surface: SurfacePoints | None = None,
@@ -141,9 +141,9 @@ def refine_views(
 
     Args:
         region: Refiner of the part.
-        views: Pictures with the poses of their cameras.
+        views: Images with the poses of their cameras.
         start: Pose in the world from which the search starts; its information limits the search.
-        prior: Distribution of the pose before the pictures' outlines are used.
+        prior: Distribution of the pose before the images' outlines are used.
         surface: Surface points of the part, for views with depth.
 
     Raises:
@@ -167,7 +167,7 @@ def refine_views(
         steps = max((search.round(stages_left).stage.steps for search in searches), default=0)
         solution = descend(end.T_cam_obj, prior, terms, steps)
         if solution is None or not terms:
-            raise UndecidedError("the part's outline left the picture")
+            raise UndecidedError("the part's outline left the image")
         end = solution
     agreements: list[OutlineAgreement | None] = [None] * len(views)
     for search in searches:
@@ -183,13 +183,13 @@ class _ViewSearch:
     """The rounds of one view.
 
     Raises:
-        UndecidedError: Too little of the outline is on the picture.
+        UndecidedError: Too little of the outline is on the image.
     """
 
     def __init__(
         self,
         number: int,
-        view: PosedPicture,
+        view: PosedImage,
         region: RegionRefiner,
         T_world_obj: Transform,
         covariance: PoseMatrix,

@@ -26,7 +26,7 @@ from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.core.validation import Range, check
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import (
     CameraMatrix,
     Transform,
@@ -43,7 +43,7 @@ from dopepp.inference.picture import Depth
 from dopepp.inference.refinement.depth import DepthEvidence
 from dopepp.inference.refinement.joint_refinement import (
     JointRefinement,
-    PosedPicture,
+    PosedImage,
     refine_views,
 )
 from dopepp.inference.refinement.outline import OutlineMesh
@@ -114,7 +114,7 @@ class Refiner:
         return None if verifier is None else verifier.mesh
 
     def __call__(
-        self, detection: Detection, image: Picture, K: CameraMatrix, depth: Depth | None
+        self, detection: Detection, image: RGBImage, K: CameraMatrix, depth: Depth | None
     ) -> Detection:
         """Return the refined, verified detection, or the detection with the reason for failure."""
         refiner, cuboid = self._refiners[detection.object], self._cuboids[detection.object]
@@ -145,13 +145,13 @@ class Refiner:
         return self.verified(end, image, K, moved)
 
     def refine_views(
-        self, name: str, views: Sequence[PosedPicture], start: Prior, prior: Prior
+        self, name: str, views: Sequence[PosedImage], start: Prior, prior: Prior
     ) -> JointRefinement:
         """Refine the pose of a part in the world; see :meth:`PartRefiner.refine_views`."""
         return self._refiners[name].refine_views(views, start, prior)
 
     def verified(
-        self, detection: Detection, image: Picture, K: CameraMatrix, moved: float = 0.0
+        self, detection: Detection, image: RGBImage, K: CameraMatrix, moved: float = 0.0
     ) -> Detection:
         """Return a detection with the probability that its pose is correct, if poses are verified.
 
@@ -195,18 +195,18 @@ class PartRefiner:
         self._surface = surface_points(part.points) if has_surface else None
 
     def refine_views(
-        self, views: Sequence[PosedPicture], start: Prior, prior: Prior
+        self, views: Sequence[PosedImage], start: Prior, prior: Prior
     ) -> JointRefinement:
-        """Refine a pose in the world on several pictures.
+        """Refine a pose in the world on several images.
 
         Args:
-            views: Pictures with the poses of their cameras.
+            views: Images with the poses of their cameras.
             start: Pose in the world from which the search starts; its information limits the
                 search.
-            prior: Distribution of the pose before the pictures' outlines are used.
+            prior: Distribution of the pose before the images' outlines are used.
 
         Raises:
-            UndecidedError: The pictures do not determine the pose.
+            UndecidedError: The images do not determine the pose.
         """
         if self._region is None:
             raise UndecidedError("several views are refined only with refine=region")
@@ -215,7 +215,7 @@ class PartRefiner:
 
     def refine(
         self,
-        image: Picture,
+        image: RGBImage,
         K: CameraMatrix,
         T_cam_obj: Transform,
         covariance: PoseMatrix | None = None,
@@ -266,7 +266,7 @@ def _checked(evidence: DepthEvidence, end: Solution) -> Refinement:
 
 def _refine_with_both(
     region: RegionRefiner,
-    image: Picture,
+    image: RGBImage,
     K: CameraMatrix,
     by_image: Refinement,
     evidence: DepthEvidence,

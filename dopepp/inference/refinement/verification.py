@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float, Int, Int16, UInt8
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.inference.refinement.colour import SMALLEST_PX, crop_around, log_odds
 from dopepp.inference.refinement.outline import (
@@ -164,7 +164,7 @@ class Verifier:
         self._moment = spread.T @ spread / len(spread)
 
     def probability(
-        self, detection: Detection, image: Picture, K: CameraMatrix, moved: float
+        self, detection: Detection, image: RGBImage, K: CameraMatrix, moved: float
     ) -> float:
         """Return the probability that a detection's pose is correct; 0 if it is not on the image.
 
@@ -178,7 +178,7 @@ class Verifier:
 
     def evidence(
         self,
-        image: Picture,
+        image: RGBImage,
         K: CameraMatrix,
         T_cam_obj: Transform,
         covariance: PoseMatrix,
@@ -240,7 +240,7 @@ class Verifier:
 
     def _shading(
         self,
-        colours: Picture,
+        colours: RGBImage,
         ids: Int[np.ndarray, "height width"],
         ring: UInt8[np.ndarray, "height width"],
         T_cam_obj: Transform,
@@ -273,7 +273,7 @@ def _lines(contour: Contour) -> Float[np.ndarray, "points 4"]:
     return np.column_stack([contour.pixels, contour.normals])
 
 
-def _gradients(colours: Picture) -> Gradients:
+def _gradients(colours: RGBImage) -> Gradients:
     """Return the derivatives of every channel."""
     soft = cv2.GaussianBlur(colours, (3, 3), 0.8)
     return cv2.Scharr(soft, cv2.CV_16S, 1, 0), cv2.Scharr(soft, cv2.CV_16S, 0, 1)
@@ -316,7 +316,7 @@ def _weakest_sector(
     return float(np.sort(means)[min(1, len(means) - 1)])
 
 
-def _contrast(colours: Picture, outline: Float[np.ndarray, "points 4"]) -> float:
+def _contrast(colours: RGBImage, outline: Float[np.ndarray, "points 4"]) -> float:
     """Return the mean difference of colours across an outline, relative to noise, in [0, 1]."""
     height, width = colours.shape[:2]
     sides = []

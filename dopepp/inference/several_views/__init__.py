@@ -1,4 +1,4 @@
-"""Poses of parts from several pictures of a static scene with known camera poses.
+"""Poses of parts from several images of a static scene with known camera poses.
 
 1. Each view is searched alone.
 2. Detections of several views that agree in the world are joined to a part
@@ -22,13 +22,13 @@ import numpy as np
 
 from dopepp.core.errors import UserError
 from dopepp.core.validation import Range, check
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Transform, invert_transform
 from dopepp.geometry.camera_file import Camera
 from dopepp.geometry.rotation import is_rigid
 from dopepp.inference.picture import Depth, Distances, prepare_image
 from dopepp.inference.pose_result import PoseResult, Shape, spent_between
-from dopepp.inference.refinement.joint_refinement import PosedPicture
+from dopepp.inference.refinement.joint_refinement import PosedImage
 from dopepp.inference.several_views.contradictions import contradictions
 from dopepp.inference.several_views.joint import JointEstimator
 from dopepp.inference.several_views.sightings import PartGeometry, PartSighting, associate, sight
@@ -44,7 +44,7 @@ These are the errors after a hand-eye calibration."""
 
 def predict_views(
     estimator: PoseEstimator,
-    images: Sequence[Picture],
+    images: Sequence[RGBImage],
     cameras: Sequence[Camera | CameraMatrix],
     T_world_cam: Sequence[Transform],
     depths: Sequence[Depth] | None = None,
@@ -52,7 +52,7 @@ def predict_views(
     camera_error: tuple[float, float] = CAMERA_ERROR,
     names: Sequence[str] | None = None,
 ) -> ViewsResult:
-    """Estimate the poses of parts from several pictures of a static scene.
+    """Estimate the poses of parts from several images of a static scene.
 
     The arguments and the result are described in :meth:`PoseEstimator.predict_views`.
 
@@ -66,7 +66,7 @@ def predict_views(
         problem = f"several views with refine={estimator.refine}"
         raise UserError(problem, "refine='region', or region and depth", fix)
     names = names or [f"view {number}" for number in range(len(images))]
-    views = _posed_pictures(images, cameras, T_world_cam, depths, camera_error, names)
+    views = _posed_images(images, cameras, T_world_cam, depths, camera_error, names)
     sightings, speeds = _search(estimator, views, distances)
     start = time.perf_counter()
     geometries = {part.name: PartGeometry.of(part) for part in estimator.solid_parts}
@@ -92,14 +92,14 @@ def predict_views(
     return ViewsResult(passed, findings, results, weaker, joint_ms)
 
 
-def _posed_pictures(
-    images: Sequence[Picture],
+def _posed_images(
+    images: Sequence[RGBImage],
     cameras: Sequence[Camera | CameraMatrix],
     T_world_cam: Sequence[Transform],
     depths: Sequence[Depth] | None,
     camera_error: tuple[float, float],
     names: Sequence[str],
-) -> list[PosedPicture]:
+) -> list[PosedImage]:
     """Check the arguments of all views and remove the lens distortion."""
     count = len(images)
     lengths = {"cameras": cameras, "T_world_cam": T_world_cam, "depths": depths, "names": names}
@@ -119,7 +119,7 @@ def _posed_pictures(
 
 
 def _search(
-    estimator: PoseEstimator, views: Sequence[PosedPicture], distances: Distances | None
+    estimator: PoseEstimator, views: Sequence[PosedImage], distances: Distances | None
 ) -> tuple[list[list[PartSighting]], list[dict[str, float]]]:
     """Search each view alone; return its sightings and the spent milliseconds by step."""
     sightings, speeds = [], []
@@ -132,13 +132,13 @@ def _search(
 
 
 def _posed(
-    image: Picture,
+    image: RGBImage,
     camera: Camera | CameraMatrix,
     T_world_cam: Transform,
     depth: Depth | None,
     error: np.ndarray,
     name: str,
-) -> PosedPicture:
+) -> PosedImage:
     """Check the arguments of a view and remove the lens distortion."""
     distortion = None
     if isinstance(camera, Camera):
@@ -149,4 +149,4 @@ def _posed(
     if not is_rigid(T):
         problem = f"T_world_cam of {name}: {T.tolist()!s:.200}"
         raise UserError(problem, "a rigid 4×4 transform", "pass the camera's pose in the world")
-    return PosedPicture(image, K, invert_transform(T), error, depth)
+    return PosedImage(image, K, invert_transform(T), error, depth)

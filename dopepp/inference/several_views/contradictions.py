@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from dopepp.geometry.rotation import rotation_angle
-from dopepp.inference.refinement.joint_refinement import PosedPicture
+from dopepp.inference.refinement.joint_refinement import PosedImage
 from dopepp.inference.several_views.joint import CONSISTENT
 from dopepp.inference.several_views.sightings import PartSighting, separation, sight
 from dopepp.inference.several_views.views_result import WorldDetection
@@ -49,7 +49,7 @@ class _Conflict(NamedTuple):
 def contradictions(
     detections: Sequence[WorldDetection],
     sightings: Views,
-    pictures: Sequence[PosedPicture],
+    images: Sequence[PosedImage],
     names: Sequence[str],
     associated: Associate,
 ) -> tuple[list[WorldDetection], list[str]]:
@@ -58,7 +58,7 @@ def contradictions(
     Args:
         detections: Detections that pass the threshold.
         sightings: Sightings of each view that pass the threshold.
-        pictures: Pictures with the poses of their cameras.
+        images: Images with the poses of their cameras.
         names: Name of each view.
         associated: Function that joins the sightings of several views.
 
@@ -78,17 +78,17 @@ def contradictions(
         views, text = conflict.views, conflict.describe(names)
         if (min(views), max(views)) in confirmed:
             if conflict.is_mutual:
-                cause = "it was moved between the pictures, or each picture hides one of two parts"
+                cause = "it was moved between the images, or each image hides one of two parts"
                 findings.append(f"{text}: {cause}")
             continue
         blamed = [n for n in (0, 1) if views[n] not in trusted]
         blamed = blamed if len(blamed) == 1 else [0, 1]
         rejected += [conflict.detections[number] for number in blamed]
-        swapped = swapped or _swapped(sightings, pictures, associated)
+        swapped = swapped or _swapped(sightings, images, associated)
         if len(blamed) == 1:
             cause = f"the camera pose of {names[views[blamed[0]]]} is wrong"
         else:
-            cause = "a camera pose is wrong, or the part was moved between the pictures"
+            cause = "a camera pose is wrong, or the part was moved between the images"
         if swapped is not None:
             pair = " and ".join(names[view] for view in swapped)
             cause = f"the camera poses of {pair} are swapped"
@@ -123,7 +123,7 @@ def _conflict(first: WorldDetection, second: WorldDetection) -> _Conflict | None
 
 
 def _swapped(
-    sightings: Views, pictures: Sequence[PosedPicture], associated: Associate
+    sightings: Views, images: Sequence[PosedImage], associated: Associate
 ) -> tuple[int, int] | None:
     """Return the two views whose detections agree better if their camera poses are exchanged.
 
@@ -133,8 +133,8 @@ def _swapped(
 
     def agreeing(order: Sequence[int]) -> int:
         views = [
-            replace(picture, T_cam_world=pictures[other].T_cam_world)
-            for picture, other in zip(pictures, order, strict=True)
+            replace(image, T_cam_world=images[other].T_cam_world)
+            for image, other in zip(images, order, strict=True)
         ]
         moved_sightings = [
             [sight(item.view, item.detection, views[item.view]) for item in view]
@@ -142,7 +142,7 @@ def _swapped(
         ]
         return sum(len(cluster) - 1 for cluster in associated(moved_sightings))
 
-    order = list(range(len(pictures)))
+    order = list(range(len(images)))
     exchanged = {}
     for first, second in combinations(order, 2):
         other = order.copy()

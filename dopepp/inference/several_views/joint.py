@@ -18,7 +18,7 @@ from jaxtyping import Float
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.picture import are_same
-from dopepp.inference.refinement.joint_refinement import PosedPicture
+from dopepp.inference.refinement.joint_refinement import PosedImage
 from dopepp.inference.refinement.refiner import LOOSER, Refiner
 from dopepp.inference.refinement.region.round import OutlineAgreement
 from dopepp.inference.refinement.solver import Prior, UndecidedError
@@ -64,7 +64,7 @@ class JointEstimator:
 
     Args:
         refiner: Refines and verifies poses on the image.
-        views: Pictures of the scene.
+        views: Images of the scene.
         names: Name of each view.
         geometries: Geometry of each part.
         slope: Weight of the verification's log odds in the score.
@@ -73,7 +73,7 @@ class JointEstimator:
     def __init__(
         self,
         refiner: Refiner,
-        views: Sequence[PosedPicture],
+        views: Sequence[PosedImage],
         names: Sequence[str],
         geometries: Mapping[str, PartGeometry],
         slope: float,
@@ -252,7 +252,7 @@ def _probability(odds: float) -> float:
     return 1.0 / (1.0 + math.exp(-odds))
 
 
-def _is_inside(pixel: Float[np.ndarray, "2"], view: PosedPicture) -> bool:
+def _is_inside(pixel: Float[np.ndarray, "2"], view: PosedImage) -> bool:
     """Return whether a view's image contains a pixel."""
     height, width = view.image.shape[:2]
     return bool((pixel >= 0).all() and pixel[0] < width and pixel[1] < height)

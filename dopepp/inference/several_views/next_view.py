@@ -1,4 +1,4 @@
-"""The next best view: the camera pose from which a picture reduces a pose's covariance most.
+"""The next best view: the camera pose from which an image reduces a pose's covariance most.
 
 The information that a view would add comes from the part's outline in this view. Every point of the
 outline counts as measured with a usual precision (:data:`USUAL_PX`), and the outline has the errors
@@ -39,7 +39,7 @@ from dopepp.inference.refinement.solver import PoseMatrix
 USUAL_PX: Final = 0.7
 """Standard deviation of a point of the outline, pixels."""
 
-LONGEST_PX: Final = 200  # length of the drawn part above which the picture is shrunk
+LONGEST_PX: Final = 200  # length of the drawn part above which the image is shrunk
 NUM_POINTS: Final = 100  # approximate number of points on the outline
 
 
@@ -64,7 +64,7 @@ def next_best_view(
     T_world_bench: Transform | None = None,
     scale_error: float = SCALE_ERROR,
 ) -> NextView:
-    """Choose the camera pose whose picture is expected to reduce a pose's error most.
+    """Choose the camera pose whose image is expected to reduce a pose's error most.
 
     Args:
         mesh: Mesh of the part, as :func:`~dopepp.inference.refinement.outline.make_outline_mesh`
@@ -73,7 +73,7 @@ def next_best_view(
         covariance: Its covariance, world axes; see :class:`WorldDetection`.
         candidates: Camera poses that can be reached, ``T_world_cam``.
         K: Camera matrix, pixels.
-        size: (width, height) of the picture, pixels.
+        size: (width, height) of the image, pixels.
         T_world_bench: Pose of a bench, whose plane z = 0 must be below the cameras; None without a
             bench.
         scale_error: Largest relative error of the part's size or of the focal length.

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from dopepp.geometry.camera import Transform, moved, transform
 from dopepp.geometry.cuboid import Cuboid
 from dopepp.geometry.symmetry import symmetry_group
-from dopepp.inference.refinement.joint_refinement import PosedPicture
+from dopepp.inference.refinement.joint_refinement import PosedImage
 from dopepp.inference.refinement.refiner import LOOSER
 from dopepp.inference.refinement.solver import PoseMatrix, Prior
 from dopepp.parts.part import Part
@@ -75,18 +75,18 @@ class PartSighting:
     start: Prior  # pose before refinement, with a covariance that admits the refined pose
 
 
-def sight(view: int, detection: Detection, picture: PosedPicture) -> PartSighting:
+def sight(view: int, detection: Detection, image: PosedImage) -> PartSighting:
     """Express a detection in the world."""
-    pose = _in_world(picture, detection.T_cam_obj, detection.covariance)
+    pose = _in_world(image, detection.T_cam_obj, detection.covariance)
     assert detection.start is not None
-    start = _in_world(picture, *detection.start)
+    start = _in_world(image, *detection.start)
     surprise = max(1.0, start.squared_distance(pose.T_cam_obj) / 6)
     return PartSighting(view, detection, pose, Prior(start.T_cam_obj, start.information / surprise))
 
 
-def _in_world(picture: PosedPicture, T_cam_obj: Transform, covariance: PoseMatrix) -> Prior:
+def _in_world(image: PosedImage, T_cam_obj: Transform, covariance: PoseMatrix) -> Prior:
     """Express a pose and its covariance in the world, with the error of the camera's pose."""
-    T_world_obj, in_world = picture.to_world(T_cam_obj, covariance)
+    T_world_obj, in_world = image.to_world(T_cam_obj, covariance)
     return Prior(T_world_obj, np.linalg.inv(in_world))
 
 

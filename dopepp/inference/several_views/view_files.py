@@ -1,8 +1,8 @@
-"""Files of camera poses: which camera took which picture from where.
+"""Files of camera poses: which camera took which image from where.
 
-- YAML with a mapping ``views`` from each picture to its pose ``T_world_cam``, in one of the forms
+- YAML with a mapping ``views`` from each image to its pose ``T_world_cam``, in one of the forms
   that :func:`transform_of` reads. With ``hand_eye``, a file that ``dopepp calibrate handeye``
-  wrote, pictures have the robot's pose ``T_base_flange`` instead. ``camera`` is a camera file, for
+  wrote, images have the robot's pose ``T_base_flange`` instead. ``camera`` is a camera file, for
   all views or for a single view.
 - BOP's ``scene_camera.json``, with ``cam_R_w2c`` and ``cam_t_w2c``.
 - COLMAP's ``images.txt``, with ``cameras.txt`` in the same folder.
@@ -43,7 +43,7 @@ MAX_COLMAP_BYTES: Final = 64_000_000
 
 @dataclass(frozen=True, eq=False)
 class CameraPose:
-    """The camera of a picture."""
+    """The camera of an image."""
 
     T_world_cam: Transform
     camera: Camera | None  # None if the file names no camera
@@ -51,10 +51,10 @@ class CameraPose:
 
 @dataclass(frozen=True, eq=False)
 class CameraPoses:
-    """The cameras of several pictures.
+    """The cameras of several images.
 
     Attributes:
-        poses: Camera of each picture, by the picture's name without folder (BOP: by its number).
+        poses: Camera of each image, by the image's name without folder (BOP: by its number).
         error: Standard deviations of the poses, metres and radians; None if the file states none.
         source: Path of the file.
     """
@@ -63,20 +63,20 @@ class CameraPoses:
     error: tuple[float, float] | None
     source: str
 
-    def of(self, picture: Path) -> CameraPose:
-        """Return the camera of a picture, named by the picture, its number or its folder.
+    def of(self, image: Path) -> CameraPose:
+        """Return the camera of an image, named by the image, its number or its folder.
 
         Raises:
-            UserError: The file has no pose of the picture.
+            UserError: The file has no pose of the image.
         """
-        number = picture.stem.lstrip("0") or "0"
-        for name in (picture.name, picture.stem, number, picture.parent.name):
+        number = image.stem.lstrip("0") or "0"
+        for name in (image.name, image.stem, number, image.parent.name):
             if name in self.poses:
                 return self.poses[name]
         names = ", ".join(list(self.poses)[:5]) + ", …" * (len(self.poses) > 5)
-        fix = "add the picture to the file, or correct its name"
-        problem = f"{self.source} without a camera pose for {picture.name}"
-        raise UserError(problem, names or "names of pictures", fix)
+        fix = "add the image to the file, or correct its name"
+        problem = f"{self.source} without a camera pose for {image.name}"
+        raise UserError(problem, names or "names of images", fix)
 
 
 def read_camera_poses(path: Path) -> CameraPoses:
@@ -179,7 +179,7 @@ def _bop(path: Path) -> CameraPoses:
 def _colmap(path: Path) -> CameraPoses:
     """Read ``images.txt``.
 
-    Each picture has two lines: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and its points.
+    Each image has two lines: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and its points.
     """
     lines = _lines(path)
     cameras = {

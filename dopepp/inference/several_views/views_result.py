@@ -20,7 +20,7 @@ WORLD_FRAME: Final = "world, the frame of the camera poses; metres"
 
 Status = Literal["supports", "hidden", "outside"]
 """Whether a view shows the part at its pose (``supports``) or something else (``hidden``), or the
-pose is not on the picture (``outside``)."""
+pose is not on the image (``outside``)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,10 +110,10 @@ class ViewsResult:
         return json.dumps(content, ensure_ascii=False, allow_nan=False)
 
     def save(self, folder: Path | str) -> None:
-        """Draw the poses on the picture of each view, and write the pictures to a folder.
+        """Draw the poses on the image of each view, and write the images to a folder.
 
         Raises:
-            UserError: A picture cannot be written.
+            UserError: An image cannot be written.
         """
         for number, view in enumerate(self.views):
             stem = Path(view.name).stem or f"view_{number}"

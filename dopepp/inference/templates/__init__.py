@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.errors import UserError
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import (
     CameraMatrix,
     Transform,
@@ -112,7 +112,7 @@ class TemplateDetector:
 
     def detect(
         self,
-        image: Picture,
+        image: RGBImage,
         K: CameraMatrix,
         distances: tuple[float, float] | None = None,
         roi: Region | None = None,
@@ -175,7 +175,7 @@ class TemplateDetector:
         return max(area, 1) / SILHOUETTE_PX**2
 
     def ranked(
-        self, image: Picture, K: CameraMatrix, distances: tuple[float, float]
+        self, image: RGBImage, K: CameraMatrix, distances: tuple[float, float]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Find the best matches at all distances.
 
@@ -205,7 +205,7 @@ class TemplateDetector:
         return matches.views, matches.poses, np.concatenate(features)
 
     def _sizes(
-        self, image: Picture, K: CameraMatrix, distances: tuple[float, float]
+        self, image: RGBImage, K: CameraMatrix, distances: tuple[float, float]
     ) -> Float[np.ndarray, "sizes"]:
         """Return the projected diameters to search, pixels, largest first.
 
@@ -226,7 +226,7 @@ class TemplateDetector:
             )
         return np.asarray(sizes)
 
-    def _ranked_octave(self, image: Picture, matches: Matches) -> tuple[Matches, Features]:
+    def _ranked_octave(self, image: RGBImage, matches: Matches) -> tuple[Matches, Features]:
         """Move matches of similar size, and replace views of the best by neighbouring views.
 
         Returns:
@@ -246,7 +246,7 @@ class TemplateDetector:
         # Better neighbouring views exist for wrong matches, too: half of the gain counts.
         return both, np.concatenate([before[best], (before[best] + after) / 2])
 
-    def _matches(self, image: Picture, size: float, nearness: float) -> Matches:
+    def _matches(self, image: RGBImage, size: float, nearness: float) -> Matches:
         """Return the best matches of all templates at one distance.
 
         Args:
@@ -318,7 +318,7 @@ def _distinct(
     return chosen
 
 
-def _resized(image: Picture, scale: float) -> Picture:
+def _resized(image: RGBImage, scale: float) -> RGBImage:
     """Shrink an image by a factor; factors of 1 and above leave it unchanged."""
     if scale >= 1.0:
         return image

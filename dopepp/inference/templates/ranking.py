@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.inference.templates.matching import Matches
 from dopepp.inference.templates.responses import Responses
 from dopepp.inference.templates.views import Templates
@@ -59,7 +59,7 @@ class RankingModel(NamedTuple):
     """Learned model that ranks matches, and learned score of the poses refined from them."""
 
     weights: Float[np.ndarray, "features"]  # weight of each of FEATURES
-    bias: float  # weighted sum + bias: log odds that the best match of a picture is correct
+    bias: float  # weighted sum + bias: log odds that the best match of an image is correct
     score: dict[str, float]  # RecoveryOptions of refined poses
 
 
@@ -78,7 +78,7 @@ def learned_ranking() -> RankingModel:
 
 
 def move_nearby(
-    matches: Matches, templates: Templates, responses: Responses, image: Picture, reach: float
+    matches: Matches, templates: Templates, responses: Responses, image: RGBImage, reach: float
 ) -> tuple[Matches, Features]:
     """Move matches to the best position nearby.
 
@@ -99,7 +99,7 @@ def move_nearby(
 
 
 def improve_views(
-    matches: Matches, templates: Templates, responses: Responses, image: Picture
+    matches: Matches, templates: Templates, responses: Responses, image: RGBImage
 ) -> tuple[Matches, Features]:
     """Replace the views of matches by better neighbouring views.
 
@@ -117,7 +117,7 @@ def _features(
     best: Float[np.ndarray, "matches"],
     templates: Templates,
     responses: Responses,
-    image: Picture,
+    image: RGBImage,
 ) -> Features:
     """Return the features of matches; ``best`` are the mean responses of their points."""
     features = np.zeros((len(best), len(FEATURES)))

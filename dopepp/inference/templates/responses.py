@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Int16
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 
 BINS: Final = 16  # orientations, modulo 180 degrees
 NOISE: Final = 8.0  # gradient, grey levels per pixel, at which an edge has half its response
@@ -25,7 +25,7 @@ FAINT: Final = 12.0  # response below which a pixel does not count as an edge
 Responses = Int16[np.ndarray, "bins height width"]
 
 
-def edge_responses(image: Picture, spread: int, surroundings: int) -> Responses:
+def edge_responses(image: RGBImage, spread: int, surroundings: int) -> Responses:
     """Return the response of each pixel to edges of each orientation.
 
     Args:

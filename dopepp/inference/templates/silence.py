@@ -21,7 +21,7 @@ import numpy as np
 from dopepp.core.errors import UserError
 from dopepp.core.files import cache_folder, write_whole
 from dopepp.core.json import read_json
-from dopepp.drawing.pictures import Picture, read_rgb
+from dopepp.drawing.pictures import RGBImage, read_rgb
 from dopepp.geometry.camera import CameraMatrix, camera_matrix
 from dopepp.parts.part import Part
 
@@ -34,20 +34,20 @@ MARGIN: Final = 2.5  # distance of the level from the photos' mean, standard dev
 LOWEST: Final = 0.0  # lower bound of the level, log odds
 VERSION: Final = 6  # part of the cache's key; increase it when search or verification change
 
-Loudest = Callable[[Iterable[Picture], CameraMatrix], list[float]]
-"""Function that returns the largest log odds of the verified poses on each picture."""
+Loudest = Callable[[Iterable[RGBImage], CameraMatrix], list[float]]
+"""Function that returns the largest log odds of the verified poses on each image."""
 
 
 def background_log_odds(
     part: Part, distances: tuple[float, float], tilt: float, loudest: Loudest
 ) -> float:
-    """Return the log odds that verified poses on pictures without the part rarely exceed.
+    """Return the log odds that verified poses on images without the part rarely exceed.
 
     Args:
         part: Part.
         distances: Nearest and farthest depth, metres.
         tilt: Largest angle between the part's z axis and the direction to the camera, degrees.
-        loudest: Measures pictures without the part; called if the cache has no level of the part.
+        loudest: Measures images without the part; called if the cache has no level of the part.
     """
     symmetries = [part.symmetries_discrete, part.symmetries_continuous]
     key = repr((VERSION, MARGIN, part.mesh_hash, part.diameter, distances, tilt, symmetries))
@@ -71,7 +71,7 @@ def background_log_odds(
     return level
 
 
-def _photos() -> Iterator[Picture]:
+def _photos() -> Iterator[RGBImage]:
     """Yield photos that ship with the package, resized and cropped to SIZE."""
     folder = Path(str(files("dopepp").joinpath("virtual", "backgrounds", "photos")))
     paths = sorted(folder.glob("*.jpg"))

@@ -16,7 +16,7 @@ import scipy  # SciPy loads its submodules on first use
 from jaxtyping import Float, Int, UInt8
 from numpy.random import Generator
 
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 
 Vertices = Float[np.ndarray, "vertices 3"]
 Faces = Int[np.ndarray, "faces 3"]
@@ -47,7 +47,7 @@ class RawMesh(NamedTuple):
     vertices: Vertices
     faces: Faces
     uv: Float[np.ndarray, "vertices 2"] | None = None
-    texture: Picture | None = None
+    texture: RGBImage | None = None
     unit: str | None = None
     colours: Colours | None = None
     normals: Float[np.ndarray, "vertices 3"] | None = None

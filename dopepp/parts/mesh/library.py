@@ -23,7 +23,7 @@ from typing import Any, Final
 import numpy as np
 
 from dopepp.core.errors import UserError
-from dopepp.drawing.pictures import whole_picture
+from dopepp.drawing.pictures import whole_image
 from dopepp.geometry.camera import Transform
 from dopepp.parts.mesh import RawMesh, Vertices, weld
 
@@ -154,22 +154,22 @@ def read_glb(path: Path) -> RawMesh:
     primitives = [p for mesh in header.get("meshes", ()) for p in mesh["primitives"]]
     _check(header, primitives, len(binary))
     drawn = [p for p in primitives if p.get("mode", _TRIANGLES) >= _TRIANGLES]
-    pictures = {_picture(header, primitive) for primitive in drawn}
-    if len(pictures) > 1:
-        problem = f"mesh {path} with faces of {len(pictures)} textures"
+    images = {_picture(header, primitive) for primitive in drawn}
+    if len(images) > 1:
+        problem = f"mesh {path} with faces of {len(images)} textures"
         fix = "bake them into one texture, or remove them"
         raise UserError(problem, "one texture for all faces, or none", fix)
-    picture = next(iter(pictures), None)
+    picture = next(iter(images), None)
     texture = None
     if picture is not None:
         view = header["bufferViews"][header["images"][picture]["bufferView"]]
         start = view.get("byteOffset", 0)
         try:
-            image = whole_picture(binary[start : start + view["byteLength"]])
+            image = whole_image(binary[start : start + view["byteLength"]])
         except ValueError as error:
             raise ValueError(f"a texture that cannot be read: {error}") from error
         texture = np.asarray(image.convert("RGB"))
-    # trimesh would open pictures of any kind; texture coordinates only need a material.
+    # trimesh would open images of any kind; texture coordinates only need a material.
     header |= {"images": [], "materials": [{} for _ in header.get("materials", ())]}
     mesh, _ = read_scene(_packed(header, binary), "glb")
     return mesh._replace(uv=None if texture is None else mesh.uv, texture=texture, unit="m")

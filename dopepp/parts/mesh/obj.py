@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from dopepp.core.errors import UserError
-from dopepp.drawing.pictures import FORMATS, MAX_SIDE, Picture, read_picture
+from dopepp.drawing.pictures import FORMATS, MAX_SIDE, RGBImage, read_picture
 from dopepp.parts.mesh import Faces, RawMesh, Vertices
 
 MAX_OFF_BYTES: Final = 50_000_000  # size of an OFF file; parsing needs 15 times as much
@@ -124,7 +124,7 @@ def _index(word: str, count: int) -> int:
     return index - 1 if index > 0 else count + index
 
 
-def _texture(obj: ObjFile, path: Path) -> Picture | None:
+def _texture(obj: ObjFile, path: Path) -> RGBImage | None:
     """Read the texture of the used materials; None without a texture.
 
     Raises:
@@ -206,7 +206,7 @@ def companion_path(mesh_path: Path, name: str, statement: str) -> Path:
     return path
 
 
-def read_texture(path: Path) -> Picture:
+def read_texture(path: Path) -> RGBImage:
     """Return an image as RGB.
 
     Raises:

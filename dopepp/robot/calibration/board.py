@@ -1,7 +1,7 @@
-"""Calibration boards: printing at true scale, detection in pictures, and their poses.
+"""Calibration boards: printing at true scale, detection in images, and their poses.
 
 A board's frame has its origin at the first point, x along the columns, y along the rows and z
-into the board. :func:`draw_view` renders pictures of a board for simulated calibrations. To add a
+into the board. :func:`draw_view` renders images of a board for simulated calibrations. To add a
 kind of board, extend :meth:`Board.points`, :meth:`Board.drawing` and the ``_find_`` methods.
 """
 
@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import check_target, write_whole
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import Transform, make_transform
 from dopepp.geometry.camera_file import Camera
 
@@ -48,18 +48,18 @@ Grey = UInt8[np.ndarray, "height width"]
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """A board detected in a picture."""
+    """A board detected in an image."""
 
-    name: str  # of the picture
+    name: str  # of the image
     points: Float[np.ndarray, "n 3"]  # detected points in the board's frame, metres
-    pixels: Float[np.ndarray, "n 2"]  # positions of the points in the picture
+    pixels: Float[np.ndarray, "n 2"]  # positions of the points in the image
 
 
 @dataclass(frozen=True, eq=False)
 class BoardPose:
-    """A board's pose in a picture."""
+    """A board's pose in an image."""
 
-    name: str  # name of the picture
+    name: str  # name of the image
     T_cam_board: Transform
     # Covariance of the rotation about the board's origin (radians) and shift (metres), camera axes.
     covariance: Float[np.ndarray, "6 6"]
@@ -89,8 +89,8 @@ class Board:
             x, y = x + (row % 2) * self.spacing / 2, y / 2
         return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
 
-    def find(self, picture: Picture, name: str) -> Sighting | None:
-        """Detect the board in an RGB picture.
+    def find(self, image: RGBImage, name: str) -> Sighting | None:
+        """Detect the board in an RGB image.
 
         Returns:
             The detection, or None if fewer than 8 points are visible.
@@ -98,7 +98,7 @@ class Board:
         Raises:
             UserError: Two ChArUco boards of the same kind are visible.
         """
-        grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         indices, pixels = getattr(self, f"_find_{self.kind}")(grey)
         if len(indices) < MIN_POINTS:
             return None
@@ -156,8 +156,8 @@ class Board:
         """Return indices and pixels of the visible ChArUco corners."""
         pixels, indices, _, markers = self._detector.detectBoard(grey)
         if markers is not None and len(np.unique(markers)) < len(markers):
-            problem = "a picture of two boards with the same markers"
-            fix = "cover or remove the second board and take the picture again"
+            problem = "an image of two boards with the same markers"
+            fix = "cover or remove the second board and take the image again"
             raise UserError(problem, "one visible board", fix)
         return ([], []) if indices is None else (np.ravel(indices), pixels)
 
@@ -238,7 +238,7 @@ def _allowed_instead(board: Board) -> str:
 
 
 def board_pose(sighting: Sighting, camera: Camera) -> BoardPose:
-    """Estimate a board's pose from its points in a picture of a calibrated camera.
+    """Estimate a board's pose from its points in an image of a calibrated camera.
 
     Raises:
         UserError: The points determine no pose.
@@ -254,7 +254,7 @@ def board_pose(sighting: Sighting, camera: Camera) -> BoardPose:
     errors = [float(np.square(projection - pixels).sum()) for projection in projections]
     if not errors or not np.isfinite(min(errors)):
         problem = f"{sighting.name}, from which no pose of the board can be estimated"
-        fix = "delete this picture, or take it again with the board facing the camera"
+        fix = "delete this image, or take it again with the board facing the camera"
         raise UserError(problem, "a board that faces the camera", fix)
     error = min(errors)
     rotation, shift = poses[errors.index(error)]
@@ -296,7 +296,7 @@ def draw_view(
     camera: Camera,
     rng: np.random.Generator,
     noise: float = 4.0,
-) -> Picture:
+) -> RGBImage:
     """Render a board at a pose, with the camera's distortion and noise (grey levels).
 
     Every pixel averages 2×2 rays, which are intersected with the board's plane.

@@ -11,7 +11,7 @@ for a camera on the bench, with the board on the flange,
 for all poses i: M_i X B_i = Y with the unknown poses X of the camera and Y of the board.
 Park and Martin (1994) eliminate Y by pairs of poses (AX = XB); Shah (2013) solves for X and Y
 together (AX = ZB). Both methods have closed forms, rotation first. The better solution initialises
-a joint refinement, which weights every pose by the covariances of picture and robot, and rejects
+a joint refinement, which weights every pose by the covariances of image and robot, and rejects
 outliers.
 """
 
@@ -79,7 +79,7 @@ def check_mount(mount: str) -> Mount:
 def calibrate_hand_eye(
     T_base_flange: Transforms, boards: Sequence[BoardPose], mount: Mount
 ) -> HandEye:
-    """Estimate the camera's pose from poses of the flange and of the board in its pictures.
+    """Estimate the camera's pose from poses of the flange and of the board in its images.
 
     Raises:
         UserError: There are fewer than three poses.
@@ -207,7 +207,7 @@ def _residuals(M: Transforms, B: Transforms, X: Transform, Y: Transform) -> Resi
 def _covariances(
     M: Transforms, X: Transform, Y: Transform, B_cov: Covariances, robot: Noise
 ) -> Covariances:
-    """Return the covariances of the residuals: the sum of picture and robot covariances."""
+    """Return the covariances of the residuals: the sum of image and robot covariances."""
     # Jacobian of the board's pose, in camera axes, with respect to a small rotation (about the
     # origin of the camera's mount) and translation of the robot's pose.
     to_cam = X[:3, :3].T

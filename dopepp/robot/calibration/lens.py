@@ -1,4 +1,4 @@
-"""Camera calibration from pictures of a board (Zhang 2000, by OpenCV), and its quality."""
+"""Camera calibration from images of a board (Zhang 2000, by OpenCV), and its quality."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ OUTLIER: Final = 3.0  # smallest error of a rejected view, as a multiple of the 
 MIN_OUTLIER_PX: Final = 0.5
 
 MIN_SHIFT: Final = 0.04
-"""Mean shift of the points between two distinct views, as a share of the picture's width."""
+"""Mean shift of the points between two distinct views, as a share of the image's width."""
 
 MAX_VIEWS: Final = 60
 CHECKS_PER_S: Final = 5.0  # searched frames of a video, per second
@@ -42,7 +42,7 @@ class Views:
     In a video, sharp frames of pauses therefore replace frames with motion blur.
 
     Args:
-        width: Width of the pictures, pixels.
+        width: Width of the images, pixels.
     """
 
     def __init__(self, width: int) -> None:
@@ -86,10 +86,10 @@ class LensCalibration:
 
     camera: Camera
     error_px: float  # RMS reprojection error over all used views, pixels
-    names: tuple[str, ...]  # picture of each view used in the calibration
+    names: tuple[str, ...]  # image of each view used in the calibration
     errors_px: Float[np.ndarray, "views"]  # RMS reprojection error of each view, pixels
     outliers: tuple[str, ...]  # names of views rejected for large errors
-    coverage: float  # share of the picture's cells (8×6) with points
+    coverage: float  # share of the image's cells (8×6) with points
     covered: Bool[np.ndarray, "rows columns"]  # cells of the image that contain board points
     deviations: Float[np.ndarray, "4"]  # standard deviations of fx, fy, cx, cy, pixels
     findings: tuple[str, ...]  # reasons not to trust the calibration, with remedies
@@ -101,18 +101,18 @@ def calibrate_lens(sightings: Sequence[Sighting], size: Size) -> LensCalibration
     Views with far larger errors than the others are rejected, in a single pass.
 
     Args:
-        sightings: The board's points in the pictures.
-        size: Width and height of the pictures, pixels.
+        sightings: The board's points in the images.
+        size: Width and height of the images, pixels.
 
     Raises:
         UserError: There are fewer than three views, or the views determine no camera.
     """
     if len(sightings) < 3:
         raise UserError(
-            f"{len(sightings)} pictures with the board",
+            f"{len(sightings)} images with the board",
             f"at least 3, better {MIN_VIEWS} or more",
-            "take more pictures, with the board tilted by 20 to 40° in all directions and moved "
-            "into the corners of the picture",
+            "take more images, with the board tilted by 20 to 40° in all directions and moved "
+            "into the corners of the image",
         )
     views = list(sightings)
     lens = _solve(views, size)
@@ -188,7 +188,7 @@ def _solve(views: Sequence[Sighting], size: Size) -> _Solution:
     except cv2.error as reason:
         problem = f"{len(views)} views of the board, which do not determine a camera ({reason.err})"
         allowed = "views tilted by 20 to 40° in several directions"
-        raise UserError(problem, allowed, "take more pictures of the tilted board") from reason
+        raise UserError(problem, allowed, "take more images of the tilted board") from reason
     normals = np.array([cv2.Rodrigues(rotation)[0][:, 2] for rotation in rotations])
     tilt = float(np.linalg.norm(normals[:, :2].std(axis=0)))
     distortion, deviations = np.ravel(lens)[:5], np.ravel(deviations)[:4]
@@ -199,7 +199,7 @@ def _findings(num_views: int, coverage: float, tilt: float, error_px: float) -> 
     """Return reasons not to trust a calibration."""
     findings = {
         f"only {num_views} views: take at least {MIN_VIEWS}": num_views < MIN_VIEWS,
-        f"points cover {coverage:.0%} of the picture: move the board to its borders and corners, "
+        f"points cover {coverage:.0%} of the image: move the board to its borders and corners, "
         "also close to the camera": coverage < MIN_COVERAGE,
         "the board is almost parallel in all views, which leaves the focal length uncertain: "
         "tilt it by 20 to 40° to the left, right, up and down": tilt < MIN_TILT,

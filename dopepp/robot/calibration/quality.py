@@ -1,6 +1,6 @@
 """Checks of robot poses before a hand-eye calibration, and the quality of its result.
 
-A motion rotates robot and camera by equal angles, for any mount of the camera. Therefore, pictures
+A motion rotates robot and camera by equal angles, for any mount of the camera. Therefore, images
 and poses can be compared under every pose convention before the calibration.
 """
 
@@ -113,14 +113,14 @@ def check_poses(
         poses: The robot's poses.
         chosen: Index of the pose that belongs to each board.
         pose_format: Conventions of the robot's poses.
-        boards: The board's poses in the pictures.
+        boards: The board's poses in the images.
         mount: Mount of the camera.
 
     Returns:
         T_base_flange of the chosen poses.
 
     Raises:
-        UserError: The robot or the board did not move, or poses and pictures contradict each other.
+        UserError: The robot or the board did not move, or poses and images contradict each other.
             The message names the conventions that fit, if any.
     """
     B = np.stack([board.T_cam_board for board in boards])
@@ -143,17 +143,15 @@ def check_poses(
             ("previous", flanges[1:], B[:-1]),
         ):
             if consistency(rows, seen, mount).is_right:
-                problem = f"{poses.source}: the poses fit the {which} picture"
-                fix = (
-                    "shift the list of poses by one, or name each pose's picture in a column `name`"
-                )
-                raise UserError(problem, "poses in the order of the pictures", fix)
+                problem = f"{poses.source}: the poses fit the {which} image"
+                fix = "shift the list of poses by one, or name each pose's image in a column `name`"
+                raise UserError(problem, "poses in the order of the images", fix)
     raise UserError(
         f"{poses.source}: rotations of robot and camera differ by "
         f"{np.degrees(agreement.rotation):.1f}° and {1000 * agreement.shift:.0f} mm (medians over "
         "pairs)",
         f"at most {np.degrees(MAX_ROTATION_ERROR):g}° and {1000 * MAX_SHIFT_ERROR:g} mm",
-        "record every pose with its picture, after the robot has come to rest, and record the "
+        "record every pose with its image, after the robot has come to rest, and record the "
         "pose of the flange, not of a tool",
     )
 
@@ -176,7 +174,7 @@ def _check_motion(T: Transforms, body: str, source: str) -> None:
         raise UserError(
             f"{source}: the {body} rotates by {np.degrees(largest):.1f}° over all {len(T)} poses",
             "rotations of at least 30° about different axes",
-            "rotate the robot between pictures, and record each picture's pose",
+            "rotate the robot between images, and record each image's pose",
         )
 
 
@@ -207,7 +205,7 @@ def _format_error(
         changes.append(f"lengths of {scale:.4g} times the robot's")
     elif unit != pose_format.unit:
         changes.append(f"--unit {unit}")
-    problem = f"{source}, whose poses contradict the pictures"
+    problem = f"{source}, whose poses contradict the images"
     allowed = f"poses that fit, such as {', and '.join(changes)}"
     return UserError(problem, allowed, "run the command again with these options")
 

@@ -2,7 +2,7 @@
 
 Poses of a robot's flange are read from CSV, JSON or YAML, one record per pose. A record has x, y, z
 and a rotation: qw, qx, qy, qz; or rx, ry, rz (rotation vector); or roll, pitch, yaw (about the
-fixed x, then y, then z). ``name`` is the name of the picture. In JSON and YAML, a ``matrix`` of 4×4
+fixed x, then y, then z). ``name`` is the name of the image. In JSON and YAML, a ``matrix`` of 4×4
 numbers, row by row, may replace position and rotation.
 """
 
@@ -40,7 +40,7 @@ MAX_BYTES: Final = 4_000_000
 
 FORMAT: Final = (
     "one record per pose with x, y, z and qw, qx, qy, qz or rx, ry, rz or roll, pitch, yaw "
-    "(and the picture's name)"
+    "(and the image's name)"
 )
 
 Record = Mapping[object, object]
@@ -60,7 +60,7 @@ class PoseFormat:
 class RobotPoses:
     """The poses of a file, in the file's conventions."""
 
-    names: tuple[str, ...]  # file name of each picture, empty if the record has none
+    names: tuple[str, ...]  # file name of each image, empty if the record has none
     positions: Float[np.ndarray, "poses 3"]  # x, y, z
     kind: str  # a key of `ROTATIONS`, or `matrix`
     rotations: Float[np.ndarray, "poses numbers"]  # the numbers of this kind
@@ -164,7 +164,7 @@ def _read_csv(path: Path) -> list[Record]:
 
 
 def _records(content: object, path: Path) -> list[Record]:
-    """Return the records of a list, or of a mapping from pictures' names."""
+    """Return the records of a list, or of a mapping from images' names."""
     if isinstance(content, Mapping):
         content = [
             {"name": name, **record} if isinstance(record, Mapping) else record
@@ -210,33 +210,33 @@ def _matrix(record: Record, row: int, path: Path) -> Transform:
     return T
 
 
-def match_pictures(poses: RobotPoses, pictures: Sequence[str]) -> list[tuple[int, int]]:
-    """Pair poses with pictures: by name if the poses have names, otherwise in order.
+def match_images(poses: RobotPoses, images: Sequence[str]) -> list[tuple[int, int]]:
+    """Pair poses with images: by name if the poses have names, otherwise in order.
 
     Returns:
-        Pairs of indices (pose, picture).
+        Pairs of indices (pose, image).
 
     Raises:
-        UserError: A named picture is missing, or there are no names and the numbers of poses and
-            pictures differ.
+        UserError: A named image is missing, or there are no names and the numbers of poses and
+            images differ.
     """
     if any(poses.names):
-        indices = {name: index for index, name in enumerate(pictures)}
-        indices |= {name.rpartition(".")[0]: index for index, name in enumerate(pictures)}
+        indices = {name: index for index, name in enumerate(images)}
+        indices |= {name.rpartition(".")[0]: index for index, name in enumerate(images)}
         missing = [name for name in poses.names if name not in indices]
         if missing:
             raise UserError(
-                f"{poses.source}: {len(missing)} poses without a picture, the first "
+                f"{poses.source}: {len(missing)} poses without an image, the first "
                 f"{missing[0]!r:.80}",
-                f"names such as {pictures[0] if pictures else '…'!r}",
-                "write the names of the pictures' files, or pass the folder with these pictures",
+                f"names such as {images[0] if images else '…'!r}",
+                "write the names of the images' files, or pass the folder with these images",
             )
         return [(row, indices[name]) for row, name in enumerate(poses.names)]
-    if len(poses.names) != len(pictures):
-        problem = f"{len(poses.names)} poses and {len(pictures)} pictures"
-        fix = "add a column `name` with the picture of every pose"
-        raise UserError(problem, "one pose for every picture", fix)
-    return [(index, index) for index in range(len(pictures))]
+    if len(poses.names) != len(images):
+        problem = f"{len(poses.names)} poses and {len(images)} images"
+        fix = "add a column `name` with the image of every pose"
+        raise UserError(problem, "one pose for every image", fix)
+    return [(index, index) for index in range(len(images))]
 
 
 def write_calibration(

@@ -1,6 +1,6 @@
 """Calibration of a rig: the poses of several fixed cameras that look at one moving board.
 
-Pictures of one name show the board at the same moment. The poses of cameras and boards are refined
+Images of one name show the board at the same moment. The poses of cameras and boards are refined
 together on all points (bundle adjustment). The world is the frame of the first camera.
 """
 
@@ -37,7 +37,7 @@ START_PX: Final = 5.0  # smallest error of a moment that is rejected before refi
 MAX_STEPS: Final = 30  # a solution takes about ten
 
 Boards = Mapping[str, Mapping[str, Sighting]]
-"""Sightings of the board by camera and moment, the name of a picture."""
+"""Sightings of the board by camera and moment, the name of an image."""
 
 BoardPoses = Mapping[str, Mapping[str, BoardPose]]  # by camera and moment
 
@@ -64,7 +64,7 @@ class Rig:
 
 
 def calibrate_rig(boards: Boards, cameras: Mapping[str, Camera]) -> Rig:
-    """Estimate the poses of cameras from pictures of a board that they see together.
+    """Estimate the poses of cameras from images of a board that they see together.
 
     Args:
         boards: Sightings of the board by each camera.
@@ -111,7 +111,7 @@ def calibrate_rig(boards: Boards, cameras: Mapping[str, Camera]) -> Rig:
     if errors_px.max() > MAX_ERROR_PX:
         name = names[int(errors_px.argmax())]
         findings.append(
-            f"the reprojection error of {name} is {errors_px.max():.2f} px: check that pictures of "
+            f"the reprojection error of {name} is {errors_px.max():.2f} px: check that images of "
             "one name show the same moment, and calibrate the cameras again"
         )
     solution = adjustment.T_world_cam, adjustment.covariances
@@ -134,10 +134,10 @@ def _linked(poses: BoardPoses) -> dict[str, Transform]:
         }
         anchor, name = max(shared, key=lambda pair: len(shared[pair]))
         if not shared[anchor, name]:
-            problem = f"{', '.join(others)} without a picture of the board together with "
+            problem = f"{', '.join(others)} without an image of the board together with "
             problem += ", ".join(linked)
-            allowed = "pictures of the same name that show the board to both cameras"
-            fix = "hold the board where a calibrated camera sees it too, and take pictures again"
+            allowed = "images of the same name that show the board to both cameras"
+            fix = "hold the board where a calibrated camera sees it too, and take images again"
             raise UserError(problem, allowed, fix)
         steps = np.stack(
             [

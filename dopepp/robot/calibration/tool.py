@@ -127,21 +127,19 @@ def bench_of_board(T_base_board: Sequence[Transform], board: Board) -> Bench:
     """Estimate the frame of the bench from a board that lies flat on it.
 
     The bench frame has the board's origin and x axis; its z axis points out of the board. A
-    residual is the distance along z between the board's centre in a picture and the mean of all
-    pictures.
+    residual is the distance along z between the board's centre in an image and the mean of all
+    images.
 
     Args:
-        T_base_board: Pose of the board in the base frame, one per picture.
+        T_base_board: Pose of the board in the base frame, one per image.
         board: The board.
 
     Raises:
         UserError: There is no pose.
     """
     if not len(T_base_board):
-        fix = "record the robot's pose at every picture"
-        raise UserError(
-            "no picture with a robot pose", "at least one picture with a robot pose", fix
-        )
+        fix = "record the robot's pose at every image"
+        raise UserError("no image with a robot pose", "at least one image with a robot pose", fix)
     poses, middle = np.stack(T_base_board), board.points.mean(axis=0)
     R = nearest_rotation(poses[:, :3, :3].sum(axis=0)) @ np.diag([1.0, -1.0, -1.0])
     centres = poses[:, :3, :3] @ middle + poses[:, :3, 3]
@@ -152,12 +150,12 @@ def bench_of_board(T_base_board: Sequence[Transform], board: Board) -> Bench:
     findings = []
     if len(poses) == 1:
         findings.append(
-            "a single picture cannot be verified: take two more, from other poses if the camera is "
+            "a single image cannot be verified: take two more, from other poses if the camera is "
             "on the flange"
         )
     if distances[worst] > MAX_RESIDUAL:
         findings.append(
-            f"picture {worst + 1} shows the board {1000 * distances[worst]:.1f} mm from its mean "
+            f"image {worst + 1} shows the board {1000 * distances[worst]:.1f} mm from its mean "
             "position: check that it was not moved, and that the hand-eye calibration is current"
         )
     return Bench(make_transform(R, origin), offsets @ R[:, 2], tuple(findings))

@@ -144,7 +144,7 @@ def _model(
 
 
 def _add_lights(spec: Any) -> None:
-    """Add lamps, a sky and the wrist's camera for pictures."""
+    """Add lamps, a sky and the wrist's camera for images."""
     for light in spec.lights:
         light.active = False
     for position in ([0.5, -0.2, 1.6], [-0.8, 0.1, 1.4]):

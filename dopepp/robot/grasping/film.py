@@ -1,4 +1,4 @@
-"""Films of trials: a video, a strip of pictures, a Rerun recording, and pictures of failures."""
+"""Films of trials: a video, a strip of images, a Rerun recording, and images of failures."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import mujoco
 import numpy as np
 
 from dopepp.core.errors import require
-from dopepp.core.files import draft, write_picture
+from dopepp.core.files import draft, write_image
 from dopepp.drawing.overlay import Wireframe, overlay
-from dopepp.drawing.pictures import Picture, VideoFile
+from dopepp.drawing.pictures import RGBImage, VideoFile
 from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.geometry.camera import invert_transform, project_keypoints
 from dopepp.robot.grasping.cell import TRAY, Cell
@@ -25,13 +25,13 @@ from dopepp.robot.grasping.workbench import has_gl, open_gl
 VIDEO_SIZE: Final = (640, 480)
 STRIDE: Final = 2  # recorded states per frame of a video
 STRIP: Final = (0.0, 0.3, 0.42, 0.53, 0.72, 1.0)
-"""Times of a strip's pictures, as shares of the motion."""
+"""Times of a strip's images, as shares of the motion."""
 
 
 def show(
     task: GraspTask, records: Sequence[Record], folder: Path, video: Path | None, rerun: Path | None
 ) -> None:
-    """Write a picture of each kind of failure, and the requested films of the first trial.
+    """Write an image of each kind of failure, and the requested films of the first trial.
 
     The trials are repeated, because they depend on the seed alone.
     """
@@ -43,13 +43,13 @@ def show(
     trials = Trials(task)
     for failure, number in examples.items():
         scene = trials.scene(number)
-        picture = strip(trials, scene, trials.attempt(scene, first))
-        write_picture(folder / f"{failure.replace(' ', '_')}.jpg", picture)
+        image = strip(trials, scene, trials.attempt(scene, first))
+        write_image(folder / f"{failure.replace(' ', '_')}.jpg", image)
     if video is not None or rerun is not None:
         scene = trials.scene(0)
         attempt = trials.attempt(scene, first)
         if video is not None and video.suffix == ".jpg":
-            write_picture(video, strip(trials, scene, attempt))
+            write_image(video, strip(trials, scene, attempt))
         elif video is not None:
             write_video(video, trials, scene, attempt)
         if rerun is not None:
@@ -68,7 +68,7 @@ class SideView:
         self._camera.lookat[:] = TRAY + np.array([0.0, 0.0, 0.1])
         self._camera.distance, self._camera.azimuth, self._camera.elevation = 0.66, 155.0, -18.0
 
-    def draw(self, positions: Any) -> Picture:
+    def draw(self, positions: Any) -> RGBImage:
         """Render a recorded state, given by MuJoCo's ``qpos``."""
         self._state.qpos[:] = positions
         mujoco.mj_forward(self._cell.model, self._state)
@@ -76,19 +76,19 @@ class SideView:
         return np.ascontiguousarray(self._renderer.render())
 
 
-def draw_estimate(trials: Trials, scene: TrialScene, attempt: Attempt) -> Picture:
-    """Return the camera's picture with the estimated pose of the part."""
+def draw_estimate(trials: Trials, scene: TrialScene, attempt: Attempt) -> RGBImage:
+    """Return the camera's image with the estimated pose of the part."""
     if attempt.estimate is None:
-        return scene.picture
+        return scene.image
     flange = trials.arm.flange(scene.joints)
     T_base_cam = flange @ scene.calibrated.knowledge.T_flange_cam
     T_cam_obj = invert_transform(T_base_cam) @ attempt.estimate
     keypoints = project_keypoints(trials.part.cuboid, T_cam_obj, TRUE_K)
-    return overlay(scene.picture, [Wireframe(keypoints)])
+    return overlay(scene.image, [Wireframe(keypoints)])
 
 
-def strip(trials: Trials, scene: TrialScene, attempt: Attempt) -> Picture:
-    """Return six pictures of a trial, the camera's first; without OpenGL, only the camera's."""
+def strip(trials: Trials, scene: TrialScene, attempt: Attempt) -> RGBImage:
+    """Return six images of a trial, the camera's first; without OpenGL, only the camera's."""
     states = attempt.outcome.states
     tiles = [Tile(draw_estimate(trials, scene, attempt))]
     if states and has_gl():
@@ -99,9 +99,9 @@ def strip(trials: Trials, scene: TrialScene, attempt: Attempt) -> Picture:
 
 
 def write_video(path: Path, trials: Trials, scene: TrialScene, attempt: Attempt) -> None:
-    """Write a video of a trial with the camera's picture in a corner."""
-    view, picture = SideView(scene), draw_estimate(trials, scene, attempt)
-    inset = cv2.resize(picture, (213, 160), interpolation=cv2.INTER_AREA)
+    """Write a video of a trial with the camera's image in a corner."""
+    view, image = SideView(scene), draw_estimate(trials, scene, attempt)
+    inset = cv2.resize(image, (213, 160), interpolation=cv2.INTER_AREA)
     outcome = attempt.outcome
     states = list(zip(outcome.times, outcome.states, strict=True))[::STRIDE]
     with VideoFile(path, 1 / (STRIDE * FRAME_S)) as video:
@@ -120,8 +120,8 @@ def write_rerun(path: Path, trials: Trials, scene: TrialScene, attempt: Attempt)
     with draft(path) as partial:
         recording.save(partial)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        picture = draw_estimate(trials, scene, attempt)
-        recording.log("picture", rr.Image(picture), static=True)
+        image = draw_estimate(trials, scene, attempt)
+        recording.log("picture", rr.Image(image), static=True)
         model = Cell([item.solid for item in scene.placed], "all", T_flange_cam=MOUNT).model
         state = mujoco.MjData(model)
         bodies = _log_shapes(recording, model)

@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 
 from dopepp.core.errors import RunError, UserError
-from dopepp.core.files import check_target, write_csv, write_picture, write_whole
+from dopepp.core.files import check_target, write_csv, write_image, write_whole
 from dopepp.core.pool import LostWorkerError, ProcessPool, available_cores
 from dopepp.core.validation import Range, check
 from dopepp.parts.catalogue import load_part
@@ -113,7 +113,7 @@ def make_experiment(
     rerun: Path | None,
     report_progress: Callable[[str], object],
 ) -> str:
-    """Run trials and write their report and pictures.
+    """Run trials and write their report and images.
 
     Args:
         task: A task from :func:`check_task`.
@@ -128,7 +128,7 @@ def make_experiment(
         The tables in Markdown.
 
     Raises:
-        UserError: A file cannot be written, a picture cannot be rendered, or no grasp is reachable.
+        UserError: A file cannot be written, an image cannot be rendered, or no grasp is reachable.
     """
     targets = ((folder / "grasps.md", (".md",)), (video, (".mp4", ".jpg")), (rerun, (".rrd",)))
     for path, suffixes in targets:
@@ -314,7 +314,7 @@ def write_report(folder: Path, records: Sequence[Record], facts: Mapping[str, An
     if any(record.off for record in records):
         from dopepp.drawing.curves import figure_image
 
-        write_picture(folder / "curve.png", figure_image(curve(records)))
+        write_image(folder / "curve.png", figure_image(curve(records)))
 
 
 def curve(records: Sequence[Record]) -> Any:

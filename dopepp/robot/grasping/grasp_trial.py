@@ -1,4 +1,4 @@
-"""A trial: a picture of the bench, a pose, a motion of the arm, and the outcome.
+"""A trial: an image of the bench, a pose, a motion of the arm, and the outcome.
 
 A task and the records of its trials are plain values, so that they can be sent to processes.
 """
@@ -17,7 +17,7 @@ from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import Transform, invert_transform, make_transform, transform
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.geometry.symmetry import symmetry_group
@@ -99,7 +99,7 @@ class GraspTask:
     yaw_deg: float = 180.0  # largest rotation of parts to either side
     rest: str = "front"  # faces that point upwards; see `Layout`
     seed: int = 0
-    views: int = 1  # pictures of the network or templates, 1 or 2
+    views: int = 1  # images of the network or templates, 1 or 2
     sources: tuple[PoseSource, ...] = (PoseSource(),)
 
 
@@ -121,7 +121,7 @@ class Record:
     failure: str  # one of `FAILURES`, or empty
     hand_eye_mm: float  # error of the hand-eye calibration at the part's distance
     hand_eye_deg: float  # rotation error of the hand-eye calibration, degrees
-    second_view: str = ""  # where the camera took a second picture, and why
+    second_view: str = ""  # where the camera took a second image, and why
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ class SceneObservation:
     """Result of the controller's observation of a scene."""
 
     poses: list[Transform]  # T_base_obj of the parts, the highest first
-    joints: Joints  # joints of the arm at the last picture, radians
+    joints: Joints  # joints of the arm at the last image, radians
     second_view: str = ""  # as of :class:`Record`
 
 
@@ -144,10 +144,10 @@ class TrialScene:
     poses: list[Transform]  # T_base_obj of every object at rest
     robot: TrueRobot
     calibrated: CalibratedRobot
-    joints: Joints  # measured joint angles at the time of the picture, radians
+    joints: Joints  # measured joint angles at the time of the image, radians
     T_base_cam: Transform  # the true pose of the camera
-    picture: Picture
-    photograph: Photographer  # takes further pictures
+    image: RGBImage
+    photograph: Photographer  # takes further images
 
     @property
     def targets(self) -> list[Transform]:
@@ -222,7 +222,7 @@ class Trials:
         return robot, calibrate(robot, self.arm, rng, float(np.mean(self.distance)))
 
     def scene(self, number: int) -> TrialScene:
-        """Set up a trial and take its picture."""
+        """Set up a trial and take its image."""
         rng = np.random.default_rng([self.task.seed, number])
         robot, calibrated = self.robot(number // BLOCK)
         placed = self.layout.draw(rng)
@@ -277,7 +277,7 @@ class Trials:
         return Planner(self.arm, self.gripper, self._parts_cell(count), scene.calibrated.knowledge)
 
     def _observe(self, scene: TrialScene, source: PoseSource) -> SceneObservation:
-        """Return the poses of parts for the controller, from one picture or two."""
+        """Return the poses of parts for the controller, from one image or two."""
         rng = np.random.default_rng([self.task.seed, scene.number, 2])
         if source.kind == "random":
             return SceneObservation([self.layout.draw_pose(rng)], scene.joints)
@@ -287,10 +287,10 @@ class Trials:
         estimator = self.templates if source.kind == "templates" else self.estimator
         lens, T_base_cam = scene.calibrated.camera, self._camera_pose(scene, source, scene.joints)
         if self.task.views == 1:
-            detections = estimator.predict(scene.picture, lens.K, lens.coefficients)
+            detections = estimator.predict(scene.image, lens.K, lens.coefficients)
             poses = [T_base_cam @ item.T_cam_obj for item in self._likely(detections)]
             return SceneObservation(sorted(poses, key=_height, reverse=True), scene.joints)
-        result = estimator.predict_views([scene.picture], [lens], [T_base_cam])
+        result = estimator.predict_views([scene.image], [lens], [T_base_cam])
         likely = self._likely(result.detections) or self._likely(result.weaker)[:1]
         likely.sort(key=lambda part: _height(part.T_world_obj), reverse=True)
         assert estimator.refiner is not None
@@ -299,9 +299,9 @@ class Trials:
         view = self._viewpoints(scene).choose(scene.joints, likely, mesh)
         joints, reason = (scene.joints, "none in reach") if view is None else view
         if view is not None:
-            picture = scene.photograph(self._true_camera_pose(scene.robot, joints), rng)
+            image = scene.photograph(self._true_camera_pose(scene.robot, joints), rng)
             cameras = [T_base_cam, self._camera_pose(scene, source, joints)]
-            result = estimator.predict_views([scene.picture, picture], [lens] * 2, cameras)
+            result = estimator.predict_views([scene.image, image], [lens] * 2, cameras)
         poses = [part.T_world_obj for part in self._likely(result.detections)]
         return SceneObservation(sorted(poses, key=_height, reverse=True), joints, reason)
 

@@ -153,7 +153,7 @@ class Plan:
 def laid_flat(T_base_obj: Transform, hull: Hull, T_base_bench: Transform) -> Transform:
     """Align the estimated pose of a part with the bench.
 
-    A picture from above determines tilt and height poorly; the bench determines both well. A
+    An image from above determines tilt and height poorly; the bench determines both well. A
     part whose height differs by more than :data:`LOW` leans on an obstacle, so its pose is kept.
 
     Args:

@@ -2,7 +2,7 @@
 
 The arm's joints differ from the controller's readings, and the camera's bracket differs from its
 drawing. Tool, bench, lens and hand-eye are calibrated by :mod:`dopepp.robot.calibration`, from
-touched points and pictures of a board.
+touched points and images of a board.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from dopepp.robot.calibration.tool import find_bench, find_tip
 from dopepp.robot.grasping.cell import JOINTS, TRAY
 from dopepp.robot.grasping.planner import Arm, ControllerParameters, Joints
 
-SIZE: Final[Size] = (640, 480)  # (width, height) of the camera's pictures, pixels
+SIZE: Final[Size] = (640, 480)  # (width, height) of the camera's images, pixels
 FOCAL: Final = SIZE[0] / 2 / np.tan(np.radians(30.0))  # 60° across, as in the networks' training
 TRUE_K: Final[CameraMatrix] = camera_matrix(FOCAL, FOCAL, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
 
@@ -133,7 +133,7 @@ def _touch_bench(
 
 
 def _calibrate_camera(robot: TrueRobot, arm: Arm, rng: Generator) -> tuple[Camera, Transform]:
-    """Calibrate lens and hand-eye from pictures of a board on the bench."""
+    """Calibrate lens and hand-eye from images of a board on the bench."""
     board, true_camera = parse_board(BOARD), Camera(SIZE, TRUE_K, (), "simulation")
     middle = board.points.mean(axis=0)
     T_base_board = make_transform(_DOWN, TRAY - _DOWN @ middle)
@@ -147,8 +147,8 @@ def _calibrate_camera(robot: TrueRobot, arm: Arm, rng: Generator) -> tuple[Camer
     sightings, flanges = [], []
     for number, (flange, read) in enumerate(_draw_reachable(draw, VIEWS)):
         T_cam_board = invert_transform(flange @ robot.T_flange_cam) @ T_base_board
-        picture = draw_view(board, T_cam_board, true_camera, rng)
-        sighting = board.find(picture, f"{number}")
+        image = draw_view(board, T_cam_board, true_camera, rng)
+        sighting = board.find(image, f"{number}")
         if sighting is not None:
             sightings.append(sighting)
             flanges.append(read)

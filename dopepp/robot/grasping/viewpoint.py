@@ -1,7 +1,7 @@
-"""The second view of a grasp: where the arm moves its camera after the first picture.
+"""The second view of a grasp: where the arm moves its camera after the first image.
 
 Candidates lie on rings around the part at the first camera's distance. The arm must reach them
-without a collision. Of these, the best is the one whose picture is expected to reduce the error of
+without a collision. Of these, the best is the one whose image is expected to reduce the error of
 the part's pose most.
 """
 
@@ -28,7 +28,7 @@ NUM_AZIMUTHS: Final = 8  # candidates on each ring
 
 
 class Viewpoint(NamedTuple):
-    """Joints at which the camera takes the second picture, and why."""
+    """Joints at which the camera takes the second image, and why."""
 
     joints: Joints  # as the controller reads them
     reason: str
@@ -55,8 +55,8 @@ class ViewpointPlanner:
         """Return the best view of the first part; without a part, any other view of the tray.
 
         Args:
-            start: Joints at the first picture.
-            parts: Parts that the first picture shows, T_base_obj; the first is to be grasped.
+            start: Joints at the first image.
+            parts: Parts that the first image shows, T_base_obj; the first is to be grasped.
             mesh: Mesh of the part.
 
         Returns:

@@ -1,4 +1,4 @@
-"""The bench of a trial: the solids on it, and the camera's picture of them.
+"""The bench of a trial: the solids on it, and the camera's image of them.
 
 To add a layout, write a method of :class:`Layout` and add its name to :data:`LAYOUTS`.
 """
@@ -17,7 +17,7 @@ from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import Transform, invert_transform, make_transform
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.parts.part import Part
@@ -43,17 +43,17 @@ DISTRACTOR_AREA: Final = 0.11  # radius within which distractors are placed, met
 COLOUR: Final = (0.93, 0.55, 0.14)
 
 RENDERERS: Final = ("raster", "raster-shadows", "mujoco")
-"""Renderers of the camera's pictures: ``raster``, as in the training of the released networks, has
+"""Renderers of the camera's images: ``raster``, as in the training of the released networks, has
 a bench without shadows; ``raster-shadows`` adds the shadows of parts."""
 
 STYLE: Final = PRESETS["wide"]
 """Preset of the released networks: light, materials and camera errors."""
 
 UPRIGHT: Final = np.radians([90.0, -90.0, 0.0, -90.0, 0.0, 0.0])
-"""Joints of an arm that points at the ceiling, outside the picture."""
+"""Joints of an arm that points at the ceiling, outside the image."""
 
-Photographer = Callable[[Transform, Generator], Picture]
-"""Takes a picture of objects at rest by a camera at T_base_cam; the generator draws the errors of
+Photographer = Callable[[Transform, Generator], RGBImage]
+"""Takes an image of objects at rest by a camera at T_base_cam; the generator draws the errors of
 the camera's sensor."""
 
 _log = logging.getLogger(__name__)
@@ -160,7 +160,7 @@ def _draw_in_disc(rng: Generator, radius: float) -> tuple[float, float]:
 
 
 class RasterView:
-    """The project's renderer: random materials and lights, a random picture on the bench.
+    """The project's renderer: random materials and lights, a random image on the bench.
 
     Args:
         shadows: Whether parts cast shadows on the bench.
@@ -170,7 +170,7 @@ class RasterView:
         self._shadows = shadows
         self._render = find_renderer("raster")
         self._backgrounds = ProceduralBackgrounds()
-        # The preset's blur and motion are for pictures of the preset's height.
+        # The preset's blur and motion are for images of the preset's height.
         self._sensors = STYLE.sensors.resized(SIZE[1] / STYLE.height)
 
     def arrange(
@@ -180,7 +180,7 @@ class RasterView:
         T_base_cam: Transform,
         rng: Generator,
     ) -> Photographer:
-        """Draw the materials of objects on the bench, the lights and the bench's picture.
+        """Draw the materials of objects on the bench, the lights and the bench's image.
 
         Args:
             bodies: Objects on the bench.
@@ -198,7 +198,7 @@ class RasterView:
             objects.append(SceneObject(body.surface, T_cam_base @ pose, material, body.part))
         T_cam_table = table_pose(T_base_cam)
         lights, ambient = STYLE.lighting.draw(rng, T_cam_table[:3, 3], T_cam_table[:3, 2])
-        picture = Table().draw_picture(rng, self._backgrounds, TRUE_K, SIZE, T_cam_table)
+        picture = Table().draw_image(rng, self._backgrounds, TRUE_K, SIZE, T_cam_table)
         background = picture.seen(TRUE_K, SIZE, T_cam_table)
         plane = plane_of(T_cam_table)
         scene = Scene(TRUE_K, background, tuple(objects), lights, ambient, plane)
@@ -206,7 +206,7 @@ class RasterView:
 
     def _take(
         self, scene: Scene, T_base_first: Transform, T_base_cam: Transform, rng: Generator
-    ) -> Picture:
+    ) -> RGBImage:
         """Render the arranged scene from a camera pose, with the sensor's effects."""
         seen = scene.seen_from(invert_transform(T_base_cam) @ T_base_first)
         seen = seen if self._shadows else replace(seen, plane=None)
@@ -233,7 +233,7 @@ class MujocoView:
         """Like :meth:`RasterView.arrange`; nothing is drawn at random."""
         return partial(self._take, poses)
 
-    def _take(self, poses: Sequence[Transform], T_base_cam: Transform, rng: Generator) -> Picture:
+    def _take(self, poses: Sequence[Transform], T_base_cam: Transform, rng: Generator) -> RGBImage:
         """Render the scene from a camera pose, with the solids at these poses."""
         model, state = self._cell.model, self._state
         for number, pose in enumerate(poses):
@@ -244,7 +244,7 @@ class MujocoView:
         state.qpos[:JOINTS] = UPRIGHT
         mujoco.mj_forward(model, state)
         self._renderer.update_scene(state, camera=CAMERA)
-        picture: Picture = np.ascontiguousarray(self._renderer.render())
+        picture: RGBImage = np.ascontiguousarray(self._renderer.render())
         return capture(picture, self._sensors.draw(rng))
 
 
@@ -261,13 +261,13 @@ def has_gl() -> bool:
     try:
         open_gl(Cell(shown="solids").model, (64, 64)).close()
     except UserError as error:
-        _log.warning("pictures of failures show the camera's view only: %s", error.got)
+        _log.warning("images of failures show the camera's view only: %s", error.got)
         return False
     return True
 
 
 def open_gl(model: Any, size: tuple[int, int]) -> Any:
-    """Return a MuJoCo renderer for pictures of (width, height).
+    """Return a MuJoCo renderer for images of (width, height).
 
     Raises:
         UserError: OpenGL is not available.
@@ -276,7 +276,7 @@ def open_gl(model: Any, size: tuple[int, int]) -> Any:
         return mujoco.Renderer(model, size[1], size[0])
     except Exception as error:  # drivers raise many types
         raise UserError(
-            f"MuJoCo pictures without OpenGL ({type(error).__name__}: {error!s:.100})",
+            f"MuJoCo images without OpenGL ({type(error).__name__}: {error!s:.100})",
             "a display, or EGL (libegl1 and a driver)",
             "install EGL (apt install libegl1), or leave out --video and --renderer mujoco",
         ) from error

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.errors import UserError
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import Transform
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.inference.pose_result import COLOURS
@@ -30,7 +30,7 @@ MARKER_FACES: Final = 1000  # triangles of a marker, whose message has 36 kB
 
 TRIANGLE_LIST, ADD, DELETE_ALL = 11, 0, 3  # type and actions of visualization_msgs/Marker
 OK, WARN = 0, 1  # levels of diagnostic_msgs/DiagnosticStatus
-OVERLAY: Final = "rgb_points"  # topic of the pictures with drawn poses
+OVERLAY: Final = "rgb_points"  # topic of the images with drawn poses
 DIAGNOSTICS: Final = ("/diagnostics", "diagnostic_msgs/DiagnosticArray")  # topic and type
 
 VISION: Final = {
@@ -155,7 +155,7 @@ class AnswerFormatter:
         return {"transforms": transforms}
 
     def _markers(self, answer: Answer, header: Fields) -> Fields:
-        """Return the parts' triangles, which replace the markers of the last picture."""
+        """Return the parts' triangles, which replace the markers of the last image."""
         markers: list[Fields] = [{"header": header, "action": DELETE_ALL}]
         for index, detection in enumerate(answer.result.detections):
             red, green, blue = (np.array(COLOURS[index % len(COLOURS)]) / 255).tolist()
@@ -187,8 +187,8 @@ def diagnosis(stamp: Stamp, name: str, problem: str, values: dict[str, str]) -> 
     return Message(*DIAGNOSTICS, {"header": header, "status": [status]})
 
 
-def image_fields(image: Picture, header: Fields) -> Fields:
-    """Return an RGB picture as ``sensor_msgs/Image``."""
+def image_fields(image: RGBImage, header: Fields) -> Fields:
+    """Return an RGB image as ``sensor_msgs/Image``."""
     height, width = image.shape[:2]
     size = {"height": height, "width": width, "step": 3 * width}
     layout = {"encoding": "rgb8", "is_bigendian": 0}

@@ -1,7 +1,7 @@
 """A ROS 2 node, with the wheels of the extra ``ros2`` or the rclpy of an installed ROS.
 
 The subscription is RELIABLE unless the camera only offers best effort, which loses large messages.
-The queue is short. A camera is faster than a network, so the latest picture waits in a
+The queue is short. A camera is faster than a network, so the latest image waits in a
 :class:`Slot` while its predecessor is processed. Topics whose messages are not installed
 (``vision_msgs``, ``tf2_msgs``) are skipped with a warning.
 """
@@ -37,15 +37,15 @@ from dopepp.robot.nodes.messages import (
 from dopepp.robot.nodes.worker import Stamp, Worker
 
 QUEUE_IN: Final = 5
-"""Shorter input queues lose pictures on a busy machine; longer queues start with old pictures."""
+"""Shorter input queues lose images on a busy machine; longer queues start with old images."""
 
 QUEUE_OUT: Final = 10
 WAIT_S: Final = 0.2  # seconds between two checks whether the node should stop
-PATIENCE_S: Final = 5.0  # seconds to wait for the end of a picture when the node stops
+PATIENCE_S: Final = 5.0  # seconds to wait for the end of an image when the node stops
 CHECKPOINTS: Final = -1.0
 """Value of the parameter ``confidence`` that selects the checkpoint's threshold."""
 
-RECENT: Final = 100  # number of pictures over which rates and latencies are reported
+RECENT: Final = 100  # number of images over which rates and latencies are reported
 
 logger = logging.getLogger(__name__)
 
@@ -53,11 +53,11 @@ Item = TypeVar("Item")
 
 
 def run(worker: Worker, topic: str, name: str, params: Path | None = None) -> None:
-    """Process the pictures on a topic until the process is interrupted.
+    """Process the images on a topic until the process is interrupted.
 
     Args:
         worker: Estimates the poses.
-        topic: Topic of the pictures.
+        topic: Topic of the images.
         name: Name of the node.
         params: YAML file of ROS 2 parameters.
 
@@ -79,7 +79,7 @@ def run(worker: Worker, topic: str, name: str, params: Path | None = None) -> No
         node = _Node(worker, topic, name)
         executor = SingleThreadedExecutor()
         executor.add_node(node.handle)
-        logger.info("%s: pictures of %s, poses on /%s/…", name, topic, name)
+        logger.info("%s: images of %s, poses on /%s/…", name, topic, name)
         while True:
             executor.spin_once(timeout_sec=WAIT_S)
     finally:
@@ -89,7 +89,7 @@ def run(worker: Worker, topic: str, name: str, params: Path | None = None) -> No
 
 
 class _Node:
-    """Subscribes to pictures and publishes the worker's answers."""
+    """Subscribes to images and publishes the worker's answers."""
 
     def __init__(self, worker: Worker, topic: str, name: str) -> None:
         import rclpy
@@ -151,7 +151,7 @@ class _Node:
         self._publishers[topic] = self.handle.create_publisher(message, full, QUEUE_OUT)
 
     def _subscribe(self) -> None:
-        """Subscribe to the pictures and their ``camera_info``."""
+        """Subscribe to the images and their ``camera_info``."""
         from rclpy.qos import QoSProfile, ReliabilityPolicy
 
         policy = ReliabilityPolicy.RELIABLE if self._is_reliable else ReliabilityPolicy.BEST_EFFORT
@@ -161,22 +161,22 @@ class _Node:
         qos = QoSProfile(depth=QUEUE_IN, reliability=policy)
         for subscription in self._subscriptions:
             self.handle.destroy_subscription(subscription)
-        # This order delivers the camera_info before its picture.
+        # This order delivers the camera_info before its image.
         self._subscriptions = [
             self.handle.create_subscription(info, info_topic(self._topic), self._take_info, qos),
-            self.handle.create_subscription(image, self._topic, self._take_picture, qos),
+            self.handle.create_subscription(image, self._topic, self._take_image, qos),
         ]
 
     def _take_info(self, message: Any) -> None:
         """Store the newest ``camera_info``."""
         self._info = message  # valid until the next message
 
-    def _take_picture(self, message: Any) -> None:
-        """Pass a picture with the newest ``camera_info`` to the worker's thread."""
+    def _take_image(self, message: Any) -> None:
+        """Pass an image with the newest ``camera_info`` to the worker's thread."""
         self.slot.put((message, self._info))
 
     def _answer(self, item: tuple[Any, Any | None]) -> None:
-        """Process a picture and publish the answer, in the worker's thread."""
+        """Process an image and publish the answer, in the worker's thread."""
         answer = self._worker.process(*item, self._topic)
         if answer is None:
             return
@@ -186,21 +186,21 @@ class _Node:
         self._summary = answer.result.summary
 
     def _tick(self) -> None:
-        """Publish the diagnosis once a second, and warn if no pictures arrive."""
+        """Publish the diagnosis once a second, and warn if no images arrive."""
         self._publish(self._diagnosis())
         if self.slot.received:
             return
         self._silent_s += 1
         if self._is_reliable and self._offers_less():
             self._is_reliable = False
-            logger.warning("%s is published best effort: pictures may be lost", self._topic)
+            logger.warning("%s is published best effort: images may be lost", self._topic)
             self._subscribe()
         elif self._silent_s == 5:
             overlay, kind = f"/{self._name}/{OVERLAY}", "sensor_msgs/msg/Image"
             topics = self.handle.get_topic_names_and_types()
             names = [name for name, kinds in topics if kind in kinds and name != overlay]
             others = ", ".join(names) or "none"
-            text = "no picture on %s for 5 s; topics with pictures: %s (--topic)"
+            text = "no image on %s for 5 s; topics with images: %s (--topic)"
             logger.warning(text, self._topic, others)
 
     def _diagnosis(self) -> Message:
@@ -208,16 +208,16 @@ class _Node:
         self.slot.check()
         counts = {"received": self.slot.received, "replaced by newer": self.slot.replaced}
         values = {key: str(value) for key, value in counts.items()} | self._pace.values()
-        values["last picture"] = self._summary
+        values["last image"] = self._summary
         now = self._now()
         stamp = Stamp(int(now), int(1e9 * (now % 1)))
         problem = self._worker.problem
         if not self.slot.received:
-            problem = problem or f"no picture on {self._topic}"
+            problem = problem or f"no image on {self._topic}"
         return diagnosis(stamp, self._name, problem, values)
 
     def _offers_less(self) -> bool:
-        """Return whether a publisher of the pictures offers best-effort delivery only."""
+        """Return whether a publisher of the images offers best-effort delivery only."""
         from rclpy.qos import ReliabilityPolicy
 
         offers = self.handle.get_publishers_info_by_topic(self._topic)
@@ -260,10 +260,10 @@ def _ros_errors(source: str) -> Iterator[None]:
 
 
 class Slot(Generic[Item]):
-    """Passes pictures to a thread; a new picture replaces a picture that is still waiting.
+    """Passes images to a thread; a new image replaces an image that is still waiting.
 
     Args:
-        handle: Processes a picture in the thread. An exception ends the thread and is raised again
+        handle: Processes an image in the thread. An exception ends the thread and is raised again
             by :meth:`put` and :meth:`check`.
     """
 
@@ -277,7 +277,7 @@ class Slot(Generic[Item]):
         self._thread.start()
 
     def put(self, item: Item) -> None:
-        """Store a picture for the thread, replacing a waiting picture."""
+        """Store an image for the thread, replacing a waiting image."""
         self.check()
         with self._fresh:
             self.received += 1
@@ -295,14 +295,14 @@ class Slot(Generic[Item]):
             raise self._error
 
     def stop(self) -> None:
-        """Stop after the current picture."""
+        """Stop after the current image."""
         with self._fresh:
             self._stopped = True
             self._fresh.notify()
         self._thread.join(PATIENCE_S)
 
     def _run(self) -> None:
-        """Process the newest picture until the slot is stopped."""
+        """Process the newest image until the slot is stopped."""
         try:
             while True:
                 with self._fresh:
@@ -324,7 +324,7 @@ class Pace:
         self._answered = 0
 
     def count(self, latency_s: float) -> None:
-        """Count an answer; ``latency_s`` is the age of its picture."""
+        """Count an answer; ``latency_s`` is the age of its image."""
         self._times.append(self._clock())
         self._latencies.append(1000 * latency_s)
         self._answered += 1

@@ -1,6 +1,6 @@
 """The node without ROS: lines of JSON on stdout or over UDP, and processing of recordings.
 
-A processed recording is an ``.mcap`` of ROS 2 with the node's topics and the pictures' stamps; a
+A processed recording is an ``.mcap`` of ROS 2 with the node's topics and the images' stamps; a
 viewer opens it together with the original recording (extra ``bags``).
 """
 
@@ -36,11 +36,11 @@ logger = logging.getLogger(__name__)
 def send_lines(
     worker: Worker, sources: Iterable[tuple[FrameSource, Camera]], address: str | None = None
 ) -> None:
-    """Send the poses in every picture as a line of JSON, like ``dopepp predict --json``.
+    """Send the poses in every image as a line of JSON, like ``dopepp predict --json``.
 
     Args:
         worker: Estimates the poses.
-        sources: Sources of pictures with their cameras.
+        sources: Sources of images with their cameras.
         address: ``host:port`` of a UDP receiver (default: stdout).
 
     Raises:
@@ -106,17 +106,17 @@ def _parse_address(text: str) -> tuple[str, int]:
 def process_bag(
     worker: Worker, source: Path, target: Path, topic: str | None, name: str
 ) -> Iterator[Answer | None]:
-    """Write a recording of the answers to a recording's pictures.
+    """Write a recording of the answers to a recording's images.
 
     Args:
         worker: Estimates the poses.
         source: A recording of ROS 1 or 2.
         target: The ``.mcap`` to write.
-        topic: Topic of the pictures, if the recording has several.
+        topic: Topic of the images, if the recording has several.
         name: Name of the node, which prefixes its topics.
 
     Yields:
-        The answer to every picture, None if the picture was not processed.
+        The answer to every image, None if the image was not processed.
 
     Raises:
         UserError: The recording is unreadable, or the target cannot be written.
@@ -174,7 +174,7 @@ class _Recorder:
             next(self._folder.glob(f"*{SUFFIX}")).replace(self._path)
 
     def write(self, answer: Answer, stamp: Stamp) -> None:
-        """Write the messages of an answer at the time of its picture."""
+        """Write the messages of an answer at the time of its image."""
         for message in self._formatter.messages(answer, self._topics.__contains__):
             kind = _ros2_kind(message.kind)
             content = self._store.serialize_cdr(_filled(self._store, kind, message.fields), kind)

@@ -1,7 +1,7 @@
-"""Worker: processes the pictures of a node, for any transport.
+"""Worker: processes the images of a node, for any transport.
 
-An invalid picture or camera does not stop the node. The worker warns once, with a remedy, and
-continues with the next picture.
+An invalid image or camera does not stop the node. The worker warns once, with a remedy, and
+continues with the next image.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from dopepp.inference.pose_result import PoseResult, make_shape, spent_between
 from dopepp.inference.tracker import PoseTracker
 
 PATIENCE: Final = 5
-"""Number of consecutive pictures without ``camera_info`` before the warning."""
+"""Number of consecutive images without ``camera_info`` before the warning."""
 
 OPTICAL: Final = "optical"  # part of the name of a frame whose z axis points forward (REP 103)
 
@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 
 
 class Stamp(NamedTuple):
-    """Time of a picture as in ROS: seconds since 1970 and nanoseconds."""
+    """Time of an image as in ROS: seconds since 1970 and nanoseconds."""
 
     sec: int
     nanosec: int
@@ -46,8 +46,8 @@ class WorkerSettings:
     """Settings that may change while a node runs."""
 
     confidence: float | None = None  # minimum score of a pose; None: the checkpoint's threshold
-    refine: bool = False  # whether poses are refined on the picture
-    overlay: bool = False  # whether pictures with drawn poses are published
+    refine: bool = False  # whether poses are refined on the image
+    overlay: bool = False  # whether images with drawn poses are published
 
     def __post_init__(self) -> None:
         if self.confidence is not None:
@@ -58,9 +58,9 @@ class WorkerSettings:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Poses in a picture."""
+    """Poses in an image."""
 
-    stamp: Stamp  # capture time of the picture
+    stamp: Stamp  # capture time of the image
     frame_id: str  # frame of the poses: the camera's optical frame
     result: PoseResult
 
@@ -78,12 +78,12 @@ class Answer:
 
 
 class Worker:
-    """Processes pictures in order.
+    """Processes images in order.
 
     Args:
         estimator: Estimates the poses.
         settings: Initial settings (see :meth:`update`).
-        camera: Camera of all pictures, in place of their ``camera_info``.
+        camera: Camera of all images, in place of their ``camera_info``.
         frame_id: The camera's optical frame, in place of the frame in the messages.
         track: Track the parts from frame to frame; this includes refinement.
         warn: Receives warnings.
@@ -109,7 +109,7 @@ class Worker:
         self._number = self._num_without_info = 0
         self._shapes = {part.name: make_shape(part) for part in estimator.solid_parts}
         self.problem = ""
-        """The problem with the last picture, or an empty string."""
+        """The problem with the last image, or an empty string."""
         self.parts = estimator.solid_parts
         self.settings = WorkerSettings()
         self.update(settings or WorkerSettings(refine=track or estimator.refiner is not None))
@@ -135,21 +135,21 @@ class Worker:
         return self._estimators[refine]
 
     def process(self, message: Any, info: Any | None, topic: str) -> Answer | None:
-        """Process the picture of a ROS message.
+        """Process the image of a ROS message.
 
         Args:
-            message: The picture.
-            info: The ``camera_info`` of the picture.
-            topic: Topic of the picture.
+            message: The image.
+            info: The ``camera_info`` of the image.
+            topic: Topic of the image.
 
         Returns:
-            The answer, or None after a warning if the picture cannot be processed.
+            The answer, or None after a warning if the image cannot be processed.
         """
         try:
             image = decode_image(message)
         except Exception as error:  # a message of any sender may cause any error
             fix = "configure the driver to send rgb8, bgr8 or JPEG"
-            self._reject("picture", f"a picture of {topic}: {error!s:.300}; fix: {fix}")
+            self._reject("picture", f"an image of {topic}: {error!s:.300}; fix: {fix}")
             return None
         try:
             lens = None if info is None else CameraInfo.from_message(info)
@@ -159,7 +159,7 @@ class Worker:
         if lens is None and self._camera is None:
             self._num_without_info += 1
             if self._num_without_info == PATIENCE:
-                problem = f"pictures on {topic} without camera_info: let the driver publish it, or "
+                problem = f"images on {topic} without camera_info: let the driver publish it, or "
                 problem += "pass --camera camera.yaml (from `dopepp calibrate camera`)"
                 self._reject("no info", problem)
             return None
@@ -180,11 +180,11 @@ class Worker:
         return Answer(stamp, frame_id, result)
 
     def result(self, frame: CameraFrame, camera: Camera, cropped: bool = False) -> PoseResult:
-        """Estimate the poses in a picture.
+        """Estimate the poses in an image.
 
         Args:
-            frame: The picture.
-            camera: Camera that took the picture.
+            frame: The image.
+            camera: Camera that took the image.
             cropped: Whether the principal point may be far from the centre.
 
         Raises:
@@ -192,10 +192,10 @@ class Worker:
         """
         size = (frame.image.shape[1], frame.image.shape[0])
         if camera.size is not None and camera.size != size:
-            sizes = f"{camera.size[0]}×{camera.size[1]}, and pictures of {size[0]}×{size[1]}"
-            fix = "let the driver publish the camera_info of these pictures, or calibrate the "
+            sizes = f"{camera.size[0]}×{camera.size[1]}, and images of {size[0]}×{size[1]}"
+            fix = "let the driver publish the camera_info of these images, or calibrate the "
             fix += "camera at this size"
-            raise UserError(f"{camera.source} of {sizes}", "a camera of the pictures' size", fix)
+            raise UserError(f"{camera.source} of {sizes}", "a camera of the images' size", fix)
         estimator = self._estimator(self.settings.refine).reporting(self.settings.confidence)
         before, start = dict(estimator.spent_ms), time.perf_counter()
         image = camera.undistorted(frame.image)
@@ -226,15 +226,15 @@ class Worker:
         """Return the frame of the poses; warn if the frame is not an optical frame."""
         if self._frame_id is not None:
             return self._frame_id
-        pictures = f"pictures on {topic} are in frame {frame_id!r:.80}"
+        images = f"images on {topic} are in frame {frame_id!r:.80}"
         fix = "name the camera's optical frame: --frame camera_optical_frame"
         if OPTICAL not in frame_id:
             problem = (
-                f"{pictures}, which is not named as an optical frame; a pose's frame has x right, "
+                f"{images}, which is not named as an optical frame; a pose's frame has x right, "
             )
             self._warn("frame", f"{problem}y down and z forward; {fix}")
         elif info is not None and info.frame_id not in ("", frame_id):
-            problem = f"{pictures}, their camera_info in {info.frame_id!r:.80}; the pictures' frame"
+            problem = f"{images}, their camera_info in {info.frame_id!r:.80}; the images' frame"
             self._warn("frame", f"{problem} is used; {fix}")
         return frame_id
 
@@ -242,7 +242,7 @@ class Worker:
         """Warn about missing or decreasing stamps; after a decrease, restart the tracking."""
         last, self._last = self._last, stamp
         if stamp == Stamp(0, 0):
-            problem = f"pictures on {topic} without a stamp, which TF needs: "
+            problem = f"images on {topic} without a stamp, which TF needs: "
             self._warn("no stamp", f"{problem}let the driver set header.stamp")
         elif last is not None and stamp < last:
             decrease_s = last.seconds - stamp.seconds
@@ -255,7 +255,7 @@ class Worker:
                 self._tracker = PoseTracker(self._estimator(True))
 
     def _reject(self, kind: str, problem: str) -> None:
-        """Record why a picture is not processed, and warn."""
+        """Record why an image is not processed, and warn."""
         self.problem = problem
         self._warn(kind, problem)
 

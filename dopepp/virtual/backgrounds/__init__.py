@@ -13,7 +13,7 @@ from typing import Final, Literal, Protocol
 from numpy.random import Generator
 
 from dopepp.core.errors import UserError
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.virtual.backgrounds.photo_backgrounds import PhotoBackgrounds, PhotoSplit
 from dopepp.virtual.backgrounds.procedural import ProceduralBackgrounds
 
@@ -30,7 +30,7 @@ BUNDLED: Final = (
     "astronaut.png", "brick.png", "camera.png", "chelsea.png", "coffee.png", "coins.png",
     "grass.png", "gravel.png", "motorcycle_left.png", "motorcycle_right.png", "rocket.jpg",
 )  # fmt: skip
-"""Photos in scikit-image's wheel; its other pictures are drawings, scans and microscopy."""
+"""Photos in scikit-image's wheel; its other images are drawings, scans and microscopy."""
 
 _SHIPPED: Final = Path(__file__).parent / "photos"
 
@@ -38,7 +38,7 @@ _SHIPPED: Final = Path(__file__).parent / "photos"
 class Backgrounds(Protocol):
     """Draws background images."""
 
-    def draw(self, rng: Generator, width: int, height: int) -> Picture:
+    def draw(self, rng: Generator, width: int, height: int) -> RGBImage:
         """Return an RGB image, a pure function of the generator's state."""
 
     def identity(self) -> list[str]:
@@ -72,7 +72,7 @@ class MixedBackgrounds:
         """Return the identities of both sources, and the share."""
         return [*self.usual.identity(), f"mixed {self.share:g}", *self.other.identity()]
 
-    def draw(self, rng: Generator, width: int, height: int) -> Picture:
+    def draw(self, rng: Generator, width: int, height: int) -> RGBImage:
         """Draw a background from one of the two sources."""
         chosen = self.other if rng.random() < self.share else self.usual
         return chosen.draw(rng, width, height)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.random import Generator
 
 from dopepp.core.errors import UserError
-from dopepp.drawing.pictures import MAX_SIDE, Picture, Size, read_picture
+from dopepp.drawing.pictures import MAX_SIDE, RGBImage, Size, read_picture
 
 logger = logging.getLogger(__name__)
 
@@ -67,7 +67,7 @@ class PhotoBackgrounds:
             fix = "pass a folder of photos, or leave it out to use procedural backgrounds"
             raise UserError(f"no photo in the background folder {folder}", allowed, fix)
         self.bad: dict[Path, str] = {}
-        self._photos: OrderedDict[Path, list[Picture]] = OrderedDict()
+        self._photos: OrderedDict[Path, list[RGBImage]] = OrderedDict()
         self._kept_bytes = 0
 
     def __getstate__(self) -> dict[str, Any]:
@@ -116,7 +116,7 @@ class PhotoBackgrounds:
         """Whether the photos belong to a single split."""
         return self.split != "all"
 
-    def draw(self, rng: Generator, width: int, height: int) -> Picture:
+    def draw(self, rng: Generator, width: int, height: int) -> RGBImage:
         """Return a crop of the image's aspect ratio that covers 40 % to 100 % of a photo's side."""
         sizes = None
         while sizes is None:
@@ -139,7 +139,7 @@ class PhotoBackgrounds:
 
     def frame(
         self, rng: Generator, number: int, size: Size, share: float = 1.0, mirrored: bool = False
-    ) -> tuple[Picture, Path]:
+    ) -> tuple[RGBImage, Path]:
         """Return a photo that covers a frame, and its path.
 
         Args:
@@ -176,7 +176,7 @@ class PhotoBackgrounds:
         interpolation = cv2.INTER_AREA if crop_width > width else cv2.INTER_LINEAR
         return np.asarray(cv2.resize(crop, size, interpolation=interpolation), np.uint8), path
 
-    def _photo(self, path: Path) -> list[Picture] | None:
+    def _photo(self, path: Path) -> list[RGBImage] | None:
         """Return a reduced photo and its halvings from the cache or file; None if damaged."""
         if path in self._photos:
             self._photos.move_to_end(path)
@@ -215,7 +215,7 @@ class PhotoBackgrounds:
         logger.warning(text, path, damage, len(self.bad), most)
 
 
-def _halvings(photo: Picture) -> list[Picture]:
+def _halvings(photo: RGBImage) -> list[RGBImage]:
     """Return a photo and its successive halvings."""
     sizes = [photo]
     while min(sizes[-1].shape[:2]) >= 2 * _SMALLEST_PX:

@@ -2,7 +2,7 @@
 
 Photos of landscapes and people have few sharp outlines of the size of a part. A network trained on
 these photos alone detects the part all over a real desk; clutter therefore adds pieces of other
-pictures. To add a pattern, write a function like ``_checker`` and name it in ``_PATTERNS``.
+images. To add a pattern, write a function like ``_checker`` and name it in ``_PATTERNS``.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32, UInt8
 from numpy.random import Generator
 
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 
 if TYPE_CHECKING:
     from dopepp.virtual.backgrounds import Backgrounds
@@ -33,7 +33,7 @@ class ProceduralBackgrounds:
         """Return the kind alone: procedural backgrounds are drawn without files."""
         return ["procedural"]
 
-    def draw(self, rng: Generator, width: int, height: int) -> Picture:
+    def draw(self, rng: Generator, width: int, height: int) -> RGBImage:
         """Return one texture, or two blended by a third, with 0 to 12 shapes scattered over it."""
         image = _texture(rng, width, height)
         if rng.random() < 0.4:
@@ -46,7 +46,7 @@ class ProceduralBackgrounds:
         return np.asarray(image, np.uint8)
 
 
-def _texture(rng: Generator, width: int, height: int) -> Picture:
+def _texture(rng: Generator, width: int, height: int) -> RGBImage:
     """Return a random pattern in a random palette of two to five colours."""
     pattern = _PATTERNS[int(rng.integers(len(_PATTERNS)))]
     scale = 1.0
@@ -175,7 +175,7 @@ _Pattern = Callable[[Generator, int, int], Field]
 _PATTERNS: Final[Sequence[_Pattern]] = (_clouds, _gradient, _checker, _bricks, _wood, _speckle)
 
 
-def _scatter(rng: Generator, image: Picture, count: int) -> None:
+def _scatter(rng: Generator, image: RGBImage, count: int) -> None:
     """Draw random ellipses, polygons, lines and circles over an image in place."""
     height, width = image.shape[:2]
     # Draw all numbers at once; single draws would take longer than the shapes.
@@ -200,17 +200,17 @@ def _scatter(rng: Generator, image: Picture, count: int) -> None:
 
 _PLAIN_SHARE: Final = 0.4  # share of pieces of one colour with a brightness gradient
 _PRINTED_SHARE: Final = 0.2  # share of pieces with dark and light cells, like markers
-_WIDTHS: Final = (0.04, 0.4)  # of a piece over the picture's, log-uniform: most objects are small
+_WIDTHS: Final = (0.04, 0.4)  # of a piece over the image's, log-uniform: most objects are small
 _FINE_BITS: Final = 4  # outlines are drawn in sixteenths of a pixel
 
 
 class ClutteredBackgrounds:
-    """Backgrounds with pieces of other pictures: polygons, rotated boxes, ellipses and rings.
+    """Backgrounds with pieces of other images: polygons, rotated boxes, ellipses and rings.
 
     Args:
         behind: Backgrounds, from which some of the pieces are cut as well.
         number: Smallest and largest number of pieces.
-        contrast: Smallest and largest factor on the whole picture's contrast, about its mean.
+        contrast: Smallest and largest factor on the whole image's contrast, about its mean.
     """
 
     def __init__(
@@ -225,7 +225,7 @@ class ClutteredBackgrounds:
         """Return the identity of the backgrounds, the number of pieces and the contrast."""
         return [*self.behind.identity(), "cluttered", *map(str, (*self.number, *self.contrast))]
 
-    def draw(self, rng: Generator, width: int, height: int) -> Picture:
+    def draw(self, rng: Generator, width: int, height: int) -> RGBImage:
         """Return a background with pieces."""
         image = self.behind.draw(rng, width, height).copy()
         for _ in range(int(rng.integers(self.number[0], self.number[1] + 1))):
@@ -236,12 +236,12 @@ class ClutteredBackgrounds:
         image = image * np.float32(factor) + np.float32((1 - factor) * image.mean())
         return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
 
-    def _add_piece(self, rng: Generator, image: Picture) -> None:
-        """Paint a piece on a picture, clipped at the border."""
+    def _add_piece(self, rng: Generator, image: RGBImage) -> None:
+        """Paint a piece on an image, clipped at the border."""
         rows, columns = image.shape[:2]
         size = columns * math.exp(rng.uniform(*np.log(_WIDTHS)))
         outline = _outline(rng) * size / 2
-        # Draw only the part within the picture.
+        # Draw only the part within the image.
         corner = np.floor(rng.uniform(0, 1, 2) * (columns, rows) - size / 2).astype(int)
         first, last = np.maximum(corner, 0), np.minimum(corner + math.ceil(size), (columns, rows))
         if (last - first < 2).any():
@@ -273,8 +273,8 @@ def _outline(rng: Generator) -> Float[np.ndarray, "loops points 2"]:
     return np.stack([loop, inner * loop]) if kind == 3 else loop[None]
 
 
-def _plain(rng: Generator, width: int, height: int) -> Picture:
-    """Return a picture of one colour with a brightness gradient."""
+def _plain(rng: Generator, width: int, height: int) -> RGBImage:
+    """Return an image of one colour with a brightness gradient."""
     colour = rng.uniform(0, 255, 3)
     grey = colour.mean()
     colour = grey + rng.uniform(0, 1) * (colour - grey)
@@ -284,7 +284,7 @@ def _plain(rng: Generator, width: int, height: int) -> Picture:
     return np.asarray(np.clip(colour * light, 0, 255), np.uint8)
 
 
-def _printed(rng: Generator, width: int, height: int) -> Picture:
+def _printed(rng: Generator, width: int, height: int) -> RGBImage:
     """Return a rotated pattern of dark and light cells."""
     columns, rows = rng.integers(1, 9, 2)
     dark, light = rng.uniform((0, 140), (90, 255))

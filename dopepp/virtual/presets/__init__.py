@@ -57,10 +57,10 @@ class Preset(Checked):
             are left out. On images without targets, a network learns to detect nothing.
         min_visible_fraction: Smallest visible fraction of every target.
         centroid_inside: Whether the image must contain every target's cuboid centre.
-        window: (width, height) of the rendered part of the picture, around a random point; None
-            renders the whole picture.
+        window: (width, height) of the rendered part of the image, around a random point; None
+            renders the whole image.
         depths: Smallest and largest depth of the targets' cuboid centres; None for any.
-        clutter: Number of flat pieces of other pictures on the background.
+        clutter: Number of flat pieces of other images on the background.
         background_contrast: Factor on the background's contrast.
 
     Raises:
@@ -110,10 +110,10 @@ class Preset(Checked):
         return camera_matrix(focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)
 
     def draw_camera(self, rng: Generator) -> tuple[CameraMatrix, Size]:
-        """Return K and (width, height) of the rendered picture or window.
+        """Return K and (width, height) of the rendered image or window.
 
-        A window is centred on a uniformly drawn point, then shifted into the picture. A window
-        larger than the picture is centred on the picture.
+        A window is centred on a uniformly drawn point, then shifted into the image. A window
+        larger than the image is centred on the image.
         """
         K, size = self.K, (self.width, self.height)
         if self.window is None:
@@ -124,14 +124,14 @@ class Preset(Checked):
         return crop_camera(K, *corner), self.window
 
     def resized(self, width: int, height: int) -> Preset:
-        """Return the preset for another picture size; another aspect ratio stretches pictures."""
+        """Return the preset for another image size; another aspect ratio stretches images."""
         K = resize_camera(self.K, width / self.width, height / self.height)
         return self._with_camera(K, width, height, width / self.width)
 
     def reframed(self, width: int, height: int) -> Preset:
-        """Return the preset for another picture size, with the pixels' aspect ratio kept.
+        """Return the preset for another image size, with the pixels' aspect ratio kept.
 
-        The field of view along the shorter side stays. Along the longer side the picture is cropped
+        The field of view along the shorter side stays. Along the longer side the image is cropped
         or extended equally at both ends.
         """
         side, new_side = min(self.width, self.height), min(width, height)

@@ -257,7 +257,7 @@ class FillPlacement(_Placement):
 class WorkingPlacement(_Placement):
     """Uniform in depth and over the lateral positions at which the whole part is visible.
 
-    A position is the centre of the rotated part's bounding box. Parts larger than the picture are
+    A position is the centre of the rotated part's bounding box. Parts larger than the image are
     centred.
 
     Attributes:
@@ -281,7 +281,7 @@ class WorkingPlacement(_Placement):
         room = np.maximum(size - extent, 0.0)
         pixel = np.array(size) / 2 - 0.5 + offset * room
         hull = rotated_hull - (lower + upper) / 2
-        # Perspective moves near points outwards: shift the part back into the picture.
+        # Perspective moves near points outwards: shift the part back into the image.
         for _ in range(10):
             middle = depth * np.linalg.solve(K, [*pixel, 1.0])
             image = project(hull + middle, K)

@@ -1,4 +1,4 @@
-"""The table: views of a supporting plane, resting orientations of parts, the plane's picture."""
+"""The table: views of a supporting plane, resting orientations of parts, the plane's image."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy.random import Generator
 
 from dopepp.core.validation import Checked, Pair, Range, Share, Span
-from dopepp.drawing.pictures import Mask, Picture, Size
+from dopepp.drawing.pictures import Mask, RGBImage, Size
 from dopepp.geometry.camera import CameraMatrix, Transform, make_transform
 from dopepp.geometry.rotation import Vector, rotation_to_z, rotation_vector_to_matrix
 from dopepp.virtual.backgrounds import Backgrounds
@@ -59,8 +59,8 @@ class Table(Checked):
         heaped: Whether objects are dropped onto a heap instead of lying side by side.
         heap_radius: Radius within which a heap's objects are dropped.
         pile: Heaps dropped by physics, in place of single objects; None for no physics.
-        picture_width: Width of the plane that the background's picture covers; outside, the
-            picture is mirrored.
+        picture_width: Width of the plane that the background's image covers; outside, the
+            image is mirrored.
     """
 
     distance: Annotated[Pair, Span(0.02, 100.0, "metres")] = (0.25, 0.60)
@@ -101,7 +101,7 @@ class Table(Checked):
             rotation = rotation_vector_to_matrix(tilt * axis) @ rotation
         return np.asarray(rotation), float((hull.vertices @ rotation[2]).min())
 
-    def draw_picture(
+    def draw_image(
         self,
         rng: Generator,
         backgrounds: Backgrounds,
@@ -109,7 +109,7 @@ class Table(Checked):
         size: Size,
         T_cam_table: Transform,
     ) -> TablePicture:
-        """Draw the plane's picture and, if the plane's end is in view, the surroundings."""
+        """Draw the plane's image and, if the plane's end is in view, the surroundings."""
         width, height = size
         picture = backgrounds.draw(rng, width, height)
         metres = rng.uniform(*self.picture_width) * T_cam_table[2, 3]
@@ -125,20 +125,20 @@ class Table(Checked):
 
 @dataclass(frozen=True, eq=False)
 class TablePicture:
-    """The picture of the plane, and the surroundings beyond the plane's end.
+    """The image of the plane, and the surroundings beyond the plane's end.
 
     Attributes:
-        picture_table: Homography from (x, y) in the table frame, metres, to the picture's pixels.
+        picture_table: Homography from (x, y) in the table frame, metres, to the image's pixels.
         end: Depth at which the plane ends, metres.
         surroundings: Camera image beyond the end; None if the end is out of view.
     """
 
-    picture: Picture
+    picture: RGBImage
     picture_table: Float[np.ndarray, "3 3"]
     end: float
-    surroundings: Picture | None
+    surroundings: RGBImage | None
 
-    def seen(self, K: CameraMatrix, size: Size, T_cam_table: Transform) -> Picture:
+    def seen(self, K: CameraMatrix, size: Size, T_cam_table: Transform) -> RGBImage:
         """Return the camera image of the empty plane."""
         # A point (x, y, 0) of the plane projects to K [r1 r2 t] (x, y, 1).
         picture_image = self.picture_table @ np.linalg.inv(K @ T_cam_table[:3, [0, 1, 3]])

@@ -1,7 +1,7 @@
-"""A working camera: the scale and windows of training pictures, from lens, distances and parts.
+"""A working camera: the scale and windows of training images, from lens, distances and parts.
 
 The network's input is scaled down until parts have sizes in pixels that networks learn well.
-Training uses windows, because a part covers a small share of a large picture.
+Training uses windows, because a part covers a small share of a large image.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from dopepp.virtual.presets.placement import WorkingPlacement
 
 _log = logging.getLogger(__name__)
 
-# Diameters of a part in the network's picture. Networks fail below ``MIN_PX`` and learn well
+# Diameters of a part in the network's image. Networks fail below ``MIN_PX`` and learn well
 # from 45 to 110 pixels (geometric mean 70). Ranges wider than ``_WIDE_RATIO`` take much longer to
 # learn.
 MIN_PX: Final = 25.0
@@ -33,7 +33,7 @@ _WIDE_RATIO: Final = 3.5
 
 _ROOM: Final = 1.3  # ratio of a window's shorter side to the diameter of the largest part
 _MULTIPLE: Final = 32  # both sides of a window are multiples of this number, pixels
-_MAX_BLUR: Final = 10.0  # largest factor on the blur in large pictures
+_MAX_BLUR: Final = 10.0  # largest factor on the blur in large images
 _BEYOND: Final = (
     1.25  # ratio of a part's largest depth on a table to the depth of the table's origin
 )
@@ -44,13 +44,13 @@ class View:
     """A camera and its working distances.
 
     Attributes:
-        size: (width, height) of the camera's pictures, pixels.
+        size: (width, height) of the camera's images, pixels.
         K: Camera matrix, pixels.
         distance: Nearest and farthest distance of a part's middle, along the optical axis, metres.
         source: Origin of the camera, for messages.
 
     Raises:
-        UserError: K does not fit the picture size, or the distances are not a range.
+        UserError: K does not fit the image size, or the distances are not a range.
     """
 
     size: Size
@@ -69,17 +69,17 @@ class View:
             raise UserError(f"working_distance={list(self.distance)}", allowed, fix)
 
     def sizes_px(self, parts: Sequence[Part], scale: float = 1.0) -> tuple[float, float]:
-        """Return the smallest and largest diameter of parts in scaled pictures, pixels."""
+        """Return the smallest and largest diameter of parts in scaled images, pixels."""
         diameters = [part.diameter for part in parts]
         near, far = self.distance
         focal = scale * focal_length(self.K)
         return focal * min(diameters) / far, focal * max(diameters) / near
 
     def check(self, parts: Sequence[Part], scale: float = 1.0) -> None:
-        """Check the size of parts in the camera's and the scaled pictures.
+        """Check the size of parts in the camera's and the scaled images.
 
         Raises:
-            UserError: A part is larger than the picture, or too small for the network.
+            UserError: A part is larger than the image, or too small for the network.
         """
         smallest, largest = self.sizes_px(parts)
         width, height = self.size
@@ -87,17 +87,17 @@ class View:
             nearest = math.ceil(1000 * self.distance[0] * largest / min(width, height)) / 1000
             raise UserError(
                 f"working_distance from {self.distance[0]:g} m, where {_named(parts, max)} has "
-                f"{largest:.0f} pixels in pictures of {width}×{height}",
-                "parts that fit into the picture in any orientation",
+                f"{largest:.0f} pixels in images of {width}×{height}",
+                "parts that fit into the image in any orientation",
                 f"start working_distance at {nearest:g}",
             )
         if scale * smallest < MIN_PX:
             farthest = math.floor(1000 * self.distance[1] * scale * smallest / MIN_PX) / 1000
             raise UserError(
                 f"working_distance to {self.distance[1]:g} m, where {_named(parts, min)} has "
-                f"{scale * smallest:.0f} pixels in the camera's picture scaled by {scale:g}",
+                f"{scale * smallest:.0f} pixels in the camera's image scaled by {scale:g}",
                 f"at least {MIN_PX:g} pixels",
-                f"end working_distance at {farthest:g}, or use a longer lens or larger pictures",
+                f"end working_distance at {farthest:g}, or use a longer lens or larger images",
             )
 
     def scale_for(self, parts: Sequence[Part], window: Size | None = None) -> float:
@@ -134,7 +134,7 @@ class View:
         )
 
     def whole(self, preset: Preset, scale: float) -> Preset:
-        """Return a preset's scenes in whole pictures, with blur matched to the scaled windows."""
+        """Return a preset's scenes in whole images, with blur matched to the scaled windows."""
         sensors = preset.sensors.resized(min(1 / scale, _MAX_BLUR))
         return replace(self.window(preset, 1.0, None), sensors=sensors)
 
@@ -165,7 +165,7 @@ class View:
             lines.append(
                 f"parts are small: networks miss more parts below {_FINE_PX:g} pixels across; stay "
                 f"within {self.distance[1] * smallest / _FINE_PX:.2g} m, or use a longer lens or "
-                "larger pictures"
+                "larger images"
             )
         if largest > _WIDE_RATIO * smallest:
             lines.append(
@@ -176,7 +176,7 @@ class View:
 
 
 def read_lens(path: str | Path) -> tuple[Size, CameraMatrix]:
-    """Read a camera file and return the size of its pictures and K, pixels.
+    """Read a camera file and return the size of its images and K, pixels.
 
     Raises:
         UserError: The file cannot be read, or does not state the size.
@@ -184,7 +184,7 @@ def read_lens(path: str | Path) -> tuple[Size, CameraMatrix]:
     camera = read_camera(path)
     if camera.size is None:
         raise UserError(
-            f"{camera.source}, which does not state the size of its pictures",
+            f"{camera.source}, which does not state the size of its images",
             "a camera file with width and height",
             "add the size in pixels to the file, e.g. image_width: 640 and image_height: 480",
         )

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.drawing.pictures import Picture, Shape
+from dopepp.drawing.pictures import RGBImage, Shape
 from dopepp.parts.mesh import Faces
 from dopepp.virtual.sensor import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
 from dopepp.virtual.triangles import CENTRE_SAMPLE, edge_functions, rasterise
@@ -46,7 +46,7 @@ class Texture:
         return self.texels[first : first + rows * columns].reshape(rows, columns, 3)
 
 
-def make_texture(image: Picture, uv: Float[np.ndarray, "vertices 2"], faces: Faces) -> Texture:
+def make_texture(image: RGBImage, uv: Float[np.ndarray, "vertices 2"], faces: Faces) -> Texture:
     """Build the image pyramid of a mesh's texture."""
     shapes = [image.shape[:2]]
     while max(shapes[-1]) > 1:

@@ -39,7 +39,7 @@ class Case(NamedTuple):
     """A damage: what is spoilt, with what, and what the check says of it.
 
     ``place`` is a file, with a colon and the keys of a value in its JSON. A ``value`` of None
-    removes it, a function changes it, an array is a picture. The reader refuses the damage with
+    removes it, a function changes it, an array is an image. The reader refuses the damage with
     file and field unless ``is_read``.
     """
 

@@ -167,7 +167,7 @@ def test_another_job_in_the_folder_is_refused_by_its_field(tmp_path, small_job, 
 def test_changed_photos_and_meshes_are_another_job(tmp_path, small_job):
     photos, mesh = tmp_path / "photos", tmp_path / "box.stl"
     photos.mkdir()
-    picture = np.random.default_rng(0).integers(0, 255, (40, 40, 3), np.uint8)
+    image = np.random.default_rng(0).integers(0, 255, (40, 40, 3), np.uint8)
 
     def write_mesh(scale):
         trimesh.creation.box(np.array([90, 80, 70]) * scale).export(mesh)
@@ -178,7 +178,7 @@ def test_changed_photos_and_meshes_are_another_job(tmp_path, small_job):
         render_dataset(job, tmp_path / "out", 1, InlinePool)
 
     write_mesh(1)
-    cv2.imwrite(str(photos / "a.png"), picture)
+    cv2.imwrite(str(photos / "a.png"), image)
     render()
     write_mesh(1.1)
     with pytest.raises(UserError, match=r"parts\[0\]\.diameter is 0\.139.* there and 0\.153.* now"):
@@ -186,7 +186,7 @@ def test_changed_photos_and_meshes_are_another_job(tmp_path, small_job):
     write_mesh(1)
     with pytest.raises(UserError, match='unit is "mm" there and "cm" now'):
         render("cm")
-    cv2.imwrite(str(photos / "b.png"), picture)
+    cv2.imwrite(str(photos / "b.png"), image)
     with pytest.raises(UserError, match=r'backgrounds\[1\] is "1" there and "2" now'):
         render()
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.data.negatives import FrameMix, PictureFrames
+from dopepp.data.negatives import FrameMix, PhotoFrames
 from dopepp.geometry.camera import camera_matrix
 from dopepp.virtual.backgrounds import PhotoBackgrounds
 
@@ -15,7 +15,7 @@ SIZE = 64, 48
 
 @pytest.fixture
 def folder(tmp_path):
-    """Pictures of the camera's own size, which fast compression leaves as they are."""
+    """Images of the camera's own size, which fast compression leaves as they are."""
     rng = np.random.default_rng(0)
     for number in range(4):
         noise = rng.integers(0, 256, (SIZE[1], SIZE[0], 3), np.uint8)
@@ -24,7 +24,7 @@ def folder(tmp_path):
 
 
 def test_pictures_of_the_camera_stay_as_they_are(folder):
-    source = PictureFrames(PhotoBackgrounds(folder), K, SIZE, name="desk")
+    source = PhotoFrames(PhotoBackgrounds(folder), K, SIZE, name="desk")
     assert len(source) == 4
     samples = [source.sample(index) for index in range(4)]
     assert sorted(sample.key for sample in samples) == [f"{number}.png/0" for number in range(4)]
@@ -39,7 +39,7 @@ def test_pictures_of_the_camera_stay_as_they_are(folder):
 
 
 def test_later_rounds_are_mirrored_and_then_regions(folder):
-    source = PictureFrames(PhotoBackgrounds(folder), K, SIZE, num_frames=12)
+    source = PhotoFrames(PhotoBackgrounds(folder), K, SIZE, num_frames=12)
     for index in range(4):
         whole, mirrored, region = (source.sample(index + 4 * lap) for lap in range(3))
         np.testing.assert_array_equal(mirrored.image, whole.image[:, ::-1])
@@ -53,7 +53,7 @@ def test_a_larger_picture_covers_the_frame_from_its_middle(tmp_path):
     y, x = np.mgrid[0:480, 0:800]
     picture = np.stack([x / 4, y / 4, 0 * x], axis=2).astype(np.uint8)
     assert cv2.imwrite(str(tmp_path / "wide.png"), picture[..., ::-1])
-    image = PictureFrames(PhotoBackgrounds(tmp_path), K, SIZE).sample(0).image.astype(float)
+    image = PhotoFrames(PhotoBackgrounds(tmp_path), K, SIZE).sample(0).image.astype(float)
     # The frame's aspect ratio is 4:3, of 480 rows these are 640 columns from column 80 on.
     np.testing.assert_allclose(image[0, 0, :2], (20, 0), atol=2)
     np.testing.assert_allclose(image[-1, -1, :2], (180, 120), atol=2)
@@ -64,20 +64,20 @@ def test_a_damaged_picture_is_replaced_and_too_many_are_an_error(tmp_path):
     for number in range(120):
         noise = rng.integers(0, 256, (12, 16, 3), np.uint8)
         assert cv2.imwrite(str(tmp_path / f"{number:03}.png"), noise)
-    (tmp_path / "050.png").write_bytes(b"no picture")
-    source = PictureFrames(PhotoBackgrounds(tmp_path), K, (16, 12))
+    (tmp_path / "050.png").write_bytes(b"no image")
+    source = PhotoFrames(PhotoBackgrounds(tmp_path), K, (16, 12))
     keys = [source.sample(index).key for index in range(120)]
     assert "050.png/0" not in keys
     assert len(set(keys)) == 119
-    (tmp_path / "051.png").write_bytes(b"no picture")
-    source = PictureFrames(PhotoBackgrounds(tmp_path), K, (16, 12))
+    (tmp_path / "051.png").write_bytes(b"no image")
+    source = PhotoFrames(PhotoBackgrounds(tmp_path), K, (16, 12))
     with pytest.raises(UserError, match="2 damaged of 120"):
         [source.sample(index) for index in range(120)]
 
 
 def test_the_index_decides_the_kind(folder):
     photos = PhotoBackgrounds(folder)
-    sources = [PictureFrames(photos, K, SIZE, name=name) for name in "abc"]
+    sources = [PhotoFrames(photos, K, SIZE, name=name) for name in "abc"]
     mix = FrameMix(sources, 10)
     assert "".join(mix.sample(index).source for index in range(len(mix))) == "abcabcabca"
     np.testing.assert_array_equal(mix.sample(4).image, sources[1].sample(1).image)

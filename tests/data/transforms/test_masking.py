@@ -17,7 +17,7 @@ SIZE = (72, 96)
 
 
 class Stripes:
-    """Another picture that is told from any other by its colours 200 and 220."""
+    """Another image that is told from any other by its colours 200 and 220."""
 
     calls = 0
 
@@ -82,7 +82,7 @@ def test_bounds_share_and_origin_of_the_patch(mask, limit, seed):
         assert left <= start < stop <= right
         assert last - first <= limit * (bottom - top)
         assert stop - start <= limit * (right - left)
-        # Background never holds the object's colour, neither does another picture.
+        # Background never holds the object's colour, neither does another image.
         patch = result.image[first:last, start:stop]
         assert (patch != (255, 0, 255)).any(axis=2).all()
         assert patch.reshape(-1, 3).std(axis=0).max() > 0

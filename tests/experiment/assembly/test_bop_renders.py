@@ -1,4 +1,4 @@
-"""Renders of a BOP data set's models learned, its own pictures measured: ``data=bop_renders``."""
+"""Renders of a BOP data set's models learned, its own images measured: ``data=bop_renders``."""
 
 import json
 import re
@@ -33,7 +33,7 @@ SCENE = {"width": 96, "height": 64, "intrinsics_px": [210.0, 211.0, 47.0, 30.0],
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    """Two coloured boxes and four pictures with depth, no training images, no masks."""
+    """Two coloured boxes and four images with depth, no training images, no masks."""
     folder = tmp_path_factory.mktemp("bop") / "set"
     parts = []
     for name, size in (("red", 0.08), ("blue", 0.09)):

@@ -136,7 +136,7 @@ def test_a_mistake_is_one_line(distance, overrides, got, my_part):
 
 def test_a_camera_without_a_size_is_refused(my_part, camera):
     camera.write_text("\n".join(CAMERA.splitlines()[:2] + CAMERA.splitlines()[4:]) + "\n")
-    with pytest.raises(UserError, match="does not state the size of its pictures"):
+    with pytest.raises(UserError, match="does not state the size of its images"):
         my_part()
 
 

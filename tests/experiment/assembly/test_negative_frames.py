@@ -87,7 +87,7 @@ def test_own_pictures_are_learned_tuned_on_and_tested(tiny, photos):
     assert identity[2:4] == ["train photos", "8"]
     for number in range(7):
         (photos / f"{number}.png").unlink()
-    with pytest.raises(UserError, match=r"negative_photos=.* with 5 pictures; .*at least 6"):
+    with pytest.raises(UserError, match=r"negative_photos=.* with 5 images; .*at least 6"):
         training_backgrounds(config.data)
 
 

@@ -24,7 +24,7 @@ NUM_SCENES, NUM_VIEWS = 2, 3
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    """A data set of three scenes with three pictures each."""
+    """A data set of three scenes with three images each."""
     folder = tmp_path_factory.mktemp("scenes") / "data"
     job = make_job(["pivconnector"], preset="wide", size="320x240", views=NUM_VIEWS)
     render_dataset(job, folder, NUM_SCENES * NUM_VIEWS, InlinePool)

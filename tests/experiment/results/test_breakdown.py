@@ -141,8 +141,8 @@ def test_rates_of_bins_are_those_of_their_instances(measured, tmp_path):
         assert float(row["miss_rate"]) == pytest.approx(np.mean([np.isnan(o) for *_, o in inside]))
         if row["median_rotation_deg"]:
             assert float(row["median_rotation_deg"]) == pytest.approx(0, abs=1e-6)
-    picture = cv2.imread(str(tmp_path / "by_distance.png"))
-    assert picture.std() > 0
+    image = cv2.imread(str(tmp_path / "by_distance.png"))
+    assert image.std() > 0
 
 
 def test_numbers_that_are_printed_alike_share_a_bin(measured, monkeypatch):

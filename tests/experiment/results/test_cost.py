@@ -1,4 +1,4 @@
-"""``job=cost``: counts of an untrained network, and times from picture to poses."""
+"""``job=cost``: counts of an untrained network, and times from image to poses."""
 
 import json
 
@@ -96,7 +96,7 @@ def test_an_untrained_networks_frames_end_in_the_pictures_poses(parsed):
 
 @pytest.mark.parametrize("size", ["[128,128]", "[96,64]"])
 def test_the_exchanged_maps_have_the_networks_own_shape(parsed, size):
-    """Pictures are padded no further than the network needs, not to the whole input."""
+    """Images are padded no further than the network needs, not to the whole input."""
     config = parsed(
         "scale=laptop", "model.width=0.0625", "virtual.preset=paper", f"data.input_size={size}",
         "data.parts=[servoholder,pivconnector]",

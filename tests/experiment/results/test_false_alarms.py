@@ -1,4 +1,4 @@
-"""Detections on pictures without the part: counted by hand, and the camera of the pictures."""
+"""Detections on images without the part: counted by hand, and the camera of the images."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -29,7 +29,7 @@ distortion_coefficients: {rows: 1, cols: 5, data: [-0.3, 0, 0, 0, 0]}
 
 @pytest.fixture
 def folder(tmp_path):
-    """Nine pictures whose grey level is 20 times their number."""
+    """Nine images whose grey level is 20 times their number."""
     (tmp_path / "photos").mkdir()
     for number in range(9):
         picture = np.full((48, 64, 3), 20 * number, np.uint8)
@@ -39,7 +39,7 @@ def folder(tmp_path):
 
 
 class Estimator:
-    """Gives picture k candidates of the scores k/10 and k/20, from picture 1 on."""
+    """Gives image k candidates of the scores k/10 and k/20, from image 1 on."""
 
     min_score = 0.39
 
@@ -58,7 +58,7 @@ def test_detections_are_counted_from_the_threshold_on(folder, tiny):
     frames = frames_without_parts(folder / "photos", camera, tiny().data, [])
     estimators: Any = {"dopepp": Estimator()}
     alarms, tiles = count_false_alarms(estimators, frames)
-    # The better candidates of pictures 4 to 8 and the weaker of picture 8 reach 0.39.
+    # The better candidates of images 4 to 8 and the weaker of image 8 reach 0.39.
     assert alarms["dopepp"].per_picture == pytest.approx(6 / 9)
     loudest = {f"{number}.png": number / 10 for number in range(8, 8 - NUM_LOUDEST, -1)}
     assert alarms["dopepp"].loudest == pytest.approx(loudest)

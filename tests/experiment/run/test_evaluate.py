@@ -116,8 +116,8 @@ def test_pictures_without_the_part_are_counted(composed, tmp_path, capsys):
     counts = read_json(tmp_path / "run" / METRICS_FILE)["without_part"]
     assert counts == report.details["without_part"]
     assert (counts["num_pictures"], counts["per_picture"]) == (1, 0)
-    assert "Pictures without the part" in capsys.readouterr().out
-    assert "## Pictures without the part\n\n| method |" in (tmp_path / "run/README.md").read_text()
+    assert "Images without the part" in capsys.readouterr().out
+    assert "## Images without the part\n\n| method |" in (tmp_path / "run/README.md").read_text()
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What tuning makes once: pictures and maps; and that it is the same as made anew."""
+"""What tuning makes once: images and maps; and that it is the same as made anew."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ K = camera_matrix(100, 100, 31.5, 31.5)
 
 
 class Noise:
-    """Pictures of noise, and how often each was asked for."""
+    """Images of noise, and how often each was asked for."""
 
     name = "noise"
 
@@ -36,7 +36,7 @@ class Noise:
 
 def test_a_sources_items_are_made_once_as_far_as_memory_goes():
     source, other = Noise(), Noise()
-    cache = TuningCache(max_bytes=2 * 64 * 64 * 4)  # of two pictures with their masks
+    cache = TuningCache(max_bytes=2 * 64 * 64 * 4)  # of two images with their masks
     remembered, its = cache.of(source), cache.of(other)
     assert len(remembered) == 3
     for _ in range(2):

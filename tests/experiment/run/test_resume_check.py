@@ -54,9 +54,9 @@ def test_a_description_of_images_tells_what_is_another():
     rounded = describe_images(Pictures(101, 1e-7, files="ab" * 32, parts={"a": "1"}))
     assert (differing_images(first, again), differing_images(first, rounded)) == ([], [])
     for other, expected in (
-        (Pictures(files="cd" * 32, parts={"a": "1"}), "0 pictures.files: abab"),
-        (Pictures(files="ab" * 32, parts={"a": "2"}), "0 pictures.parts.a: 1 → 2"),
-        (Pictures(files="ab" * 32), "0 pictures.parts.a: 1 → None"),
+        (Pictures(files="cd" * 32, parts={"a": "1"}), "0 images.files: abab"),
+        (Pictures(files="ab" * 32, parts={"a": "2"}), "0 images.parts.a: 1 → 2"),
+        (Pictures(files="ab" * 32), "0 images.parts.a: 1 → None"),
         (Pictures(100, 0.01, files="ab" * 32, parts={"a": "1"}), "labels of the first image"),
         (Pictures(110, 0.0, files="ab" * 32, parts={"a": "1"}), "pixels of the first image"),
     ):
@@ -74,7 +74,7 @@ def test_a_preset_with_a_new_field_and_equal_images_is_the_same_preset():
 
 def test_a_part_that_is_called_preset_is_compared():
     first, other = (describe_images(Pictures(parts={"preset": mesh})) for mesh in "12")
-    assert differing_images(first, other) == ["0 pictures.parts.preset: 1 → 2"]
+    assert differing_images(first, other) == ["0 images.parts.preset: 1 → 2"]
 
 
 @pytest.fixture

@@ -175,7 +175,7 @@ def test_the_factors_of_a_network_that_is_too_near_and_too_sure():
 
 
 class Many:
-    """Pictures of the part on the optical axis, each with its number in the first pixel."""
+    """Images of the part on the optical axis, each with its number in the first pixel."""
 
     name = "many"
 

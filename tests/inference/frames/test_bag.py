@@ -1,4 +1,4 @@
-"""ROS recordings, as ``rosbags`` writes them: every picture in RGB, and the camera that took it."""
+"""ROS recordings, as ``rosbags`` writes them: every image in RGB, and the camera that took it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 K = [600.0, 0, 31.5, 0, 601.0, 23.5, 0, 0, 1]
 P = [500.0, 0, 31.5, 0, 0, 501.0, 23.5, 0, 0, 0, 1, 0]
 LENS = [-0.2, 0.1, 0.001, 0.002, 0.0]
-PICTURE = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
+IMAGE = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
 
 
 class Recording:
@@ -77,7 +77,7 @@ def test_pictures_times_and_camera_of_a_recording(kind, tmp_path):
         bag.camera("/cam/camera_info")
         bag.camera("/other/camera_info", width=640)
         for second in (1, 2, 3):
-            bag.picture("/cam/image_raw", "bgr8", PICTURE[..., ::-1] // second, second)
+            bag.picture("/cam/image_raw", "bgr8", IMAGE[..., ::-1] // second, second)
     paths = [bag.path] if kind == "bag" else [bag.path, next(bag.path.glob("run*.*3")
              if kind == "sqlite3" else bag.path.glob("*.mcap"))]  # fmt: skip
     for path in paths:
@@ -85,7 +85,7 @@ def test_pictures_times_and_camera_of_a_recording(kind, tmp_path):
         frames = list(source.frames())
         assert [one.time for one in frames] == [1.5, 2.5, 3.5]
         for second, frame in enumerate(frames, 1):
-            np.testing.assert_array_equal(frame.image, PICTURE // second)
+            np.testing.assert_array_equal(frame.image, IMAGE // second)
         assert (source.count, source.rate) == (3, pytest.approx(1, abs=1e-6))
         assert source.camera.size == (64, 48)
         np.testing.assert_allclose(source.camera.K.ravel(), K)
@@ -96,7 +96,7 @@ def test_pictures_times_and_camera_of_a_recording(kind, tmp_path):
 @pytest.mark.parametrize("encoding", ["rgb8", "rgba8", "bgra8", "mono8", "8UC3", "bayer_rggb8",
                                       "yuv422_yuy2", "png", "jpeg"])  # fmt: skip
 def test_every_encoding_is_rgb(encoding, tmp_path):
-    smooth = cv2.resize(PICTURE[:6, :8], (64, 48), interpolation=cv2.INTER_CUBIC)
+    smooth = cv2.resize(IMAGE[:6, :8], (64, 48), interpolation=cv2.INTER_CUBIC)
     expected, tolerance = smooth, 0.0
     with Recording("mcap", tmp_path) as bag:
         if encoding in ("png", "jpeg"):
@@ -116,7 +116,7 @@ def test_every_encoding_is_rgb(encoding, tmp_path):
 
 
 def coded_as(encoding: str, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return a picture's bytes, what they show, and how far off a decoder may be on average."""
+    """Return an image's bytes, what they show, and how far off a decoder may be on average."""
     if encoding == "mono8":
         grey = rgb[..., 1]
         return grey[..., None], np.repeat(grey[..., None], 3, 2), 0.0
@@ -139,22 +139,22 @@ def coded_as(encoding: str, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray, fl
 def test_rectified_pictures_have_the_lens_of_p(tmp_path):
     with Recording("mcap", tmp_path) as bag:
         bag.camera("/cam/camera_info")
-        bag.picture("/cam/image_rect_color", "rgb8", PICTURE)
+        bag.picture("/cam/image_rect_color", "rgb8", IMAGE)
     (source,) = open_sources([bag.path])
     assert (source.camera.K[0, 0], source.camera.distortion) == (500, ())
 
 
 def test_several_topics_must_be_named(tmp_path):
     with Recording("bag", tmp_path) as bag:
-        bag.picture("/left/image_raw", "rgb8", PICTURE)
-        bag.picture("/right/image_raw", "rgb8", PICTURE // 2)
+        bag.picture("/left/image_raw", "rgb8", IMAGE)
+        bag.picture("/right/image_raw", "rgb8", IMAGE // 2)
         bag.camera("/right/camera_info")
     (source,) = open_sources([bag.path], "/right/image_raw")
-    np.testing.assert_array_equal(next(source.frames()).image, PICTURE // 2)
+    np.testing.assert_array_equal(next(source.frames()).image, IMAGE // 2)
     assert source.camera is not None
     (left,) = open_sources([bag.path], "/left/image_raw")
     assert left.camera is None  # the other's would be a guess
-    for topic, said in ((None, "on 2 topics"), ("/nowhere", "without pictures on /nowhere")):
+    for topic, said in ((None, "on 2 topics"), ("/nowhere", "without images on /nowhere")):
         with pytest.raises(UserError, match=said) as raised:
             open_sources([bag.path], topic)
         assert "/left/image_raw, /right/image_raw" in str(raised.value)
@@ -162,8 +162,8 @@ def test_several_topics_must_be_named(tmp_path):
 
 def test_damaged_recordings_are_told_in_one_line(tmp_path):
     with Recording("mcap", tmp_path) as bag:
-        bag.picture("/cam/image_raw", "mono16", PICTURE[..., :2])
-        bag.picture("/odd/image_raw", "rgb8", PICTURE)
+        bag.picture("/cam/image_raw", "mono16", IMAGE[..., :2])
+        bag.picture("/odd/image_raw", "rgb8", IMAGE)
         bag.camera("/cam/camera_info", distortion_model="equidistant")
     (source,) = open_sources([bag.path], "/cam/image_raw")
     with pytest.raises(UserError, match="encoding 'mono16'"):

@@ -1,4 +1,4 @@
-"""Pictures, folders, patterns and videos: all frames, in order, or one line that names the file."""
+"""Images, folders, patterns and videos: all frames, in order, or one line that names the file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def grey(level: int, size: tuple[int, int] = (32, 24)) -> np.ndarray:
 def folder(tmp_path):
     for number in (0, 2, 10):
         cv2.imwrite(str(tmp_path / f"frame{number}.png"), grey(20 * number))
-    (tmp_path / "notes.txt").write_text("no picture")
+    (tmp_path / "notes.txt").write_text("no image")
     return tmp_path
 
 
@@ -121,7 +121,7 @@ def test_a_turned_picture_is_upright(tmp_path):
         ("none.png", None, "none.png, no such"),
         ("*.png", None, "matches no file"),
         ("rtmp://u:secret@host/x", None, "address rtmp://host/x"),
-        (".", None, "without a picture"),
+        (".", None, "without an image"),
         ("empty.mp4", b"", "an empty file"),
         ("noise.mp4", b"\x01\x02" * 500, "does not begin like a video"),
         ("list.mp4", b"#EXTM3U\nfile:///etc/passwd\n", "does not begin like a video"),

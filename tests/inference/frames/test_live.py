@@ -1,4 +1,4 @@
-"""Cameras: the newest picture each time, whatever OpenCV and the driver have kept."""
+"""Cameras: the newest image each time, whatever OpenCV and the driver have kept."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ INFERENCE = 0.2
 
 
 class Camera:
-    """Thirty pictures a second by a clock of its own; what nobody has read waits in a buffer."""
+    """Thirty images a second by a clock of its own; what nobody has read waits in a buffer."""
 
     def __init__(self) -> None:
         self._buffer: queue.Queue[int] = queue.Queue()
@@ -28,7 +28,7 @@ class Camera:
         return self._now
 
     def taken(self, image: np.ndarray) -> float:
-        """Return when a picture was taken, which is written on it."""
+        """Return when an image was taken, which is written on it."""
         return (int(image[0, 0, 0]) + 256 * int(image[0, 0, 1])) * PERIOD
 
     def advance(self, seconds: float, wait: bool = True) -> None:
@@ -96,7 +96,7 @@ def test_frames_tell_when_they_came():
 
 
 class Dead(Camera):
-    """Delivers ``alive`` pictures and then nothing, or never answers."""
+    """Delivers ``alive`` images and then nothing, or never answers."""
 
     def __init__(self, alive: int, hangs: bool) -> None:
         super().__init__()
@@ -112,12 +112,12 @@ class Dead(Camera):
 
 
 @pytest.mark.parametrize("hangs", [False, True])
-@pytest.mark.parametrize(("alive", "said"), [(0, "since it was opened"), (1, "no picture for")])
+@pytest.mark.parametrize(("alive", "said"), [(0, "since it was opened"), (1, "no image for")])
 def test_a_camera_that_delivers_no_more_is_told(hangs, alive, said):
     source = Live(3, lambda _: Dead(alive, hangs), first_s=0.2, stalled_s=0.2)
     with pytest.raises(RunError, match=said) as raised:
         list(source.frames())
-    assert str(raised.value).startswith("camera 3: no picture for 0.2 s")
+    assert str(raised.value).startswith("camera 3: no image for 0.2 s")
 
 
 def test_what_does_not_open_is_one_line_without_the_password(capfd):

@@ -40,7 +40,7 @@ def box() -> Part:
 
 
 def seen(part: Part, T: np.ndarray, wall: float = 0.9) -> tuple[np.ndarray, np.ndarray]:
-    """Return picture and noisy depth of a part before a wall."""
+    """Return image and noisy depth of a part before a wall."""
     body = make_body(part, is_target=True)
     objects, plane = (SceneObject(body.surface, T, part=part),), Plane((0.0, 0.0, -1.0), -wall)
     rendered = render(Scene(K, np.full_like(BLACK, (40, 110, 60)), objects, plane=plane))
@@ -140,7 +140,7 @@ def test_picture_and_depth_refine_in_one_and_each_without_the_other(picture, mea
 
 
 def test_depth_is_followed_where_the_outline_is_too_large():
-    """A print or a focal length that is off by 4 % makes the picture put the part too near."""
+    """A print or a focal length that is off by 4 % makes the image put the part too near."""
     part = pivconnector()
     nearer = TRUE.copy()
     nearer[:3, 3] *= 0.96

@@ -19,7 +19,7 @@ from dopepp.geometry.camera import (
     transform,
 )
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
-from dopepp.inference.refinement.joint_refinement import PosedPicture, ViewTerm, rotate_covariance
+from dopepp.inference.refinement.joint_refinement import PosedImage, ViewTerm, rotate_covariance
 from dopepp.inference.refinement.solver import Prior, descend
 
 K = camera_matrix(600.0, 600.0, 319.5, 239.5)
@@ -63,7 +63,7 @@ def scene(seed: int, error: np.ndarray, num_views: int = 2):
         # The camera is elsewhere than stated: T_cam_world is off by a draw of the error.
         draw = np.linalg.cholesky(error + 1e-30 * np.eye(6)) @ rng.normal(size=6)
         off = make_transform(rotation_vector_to_matrix(draw[:3]), draw[3:])
-        views.append(PosedPicture(BLANK, K, invert_transform(off) @ T_cam_world, error))
+        views.append(PosedImage(BLANK, K, invert_transform(off) @ T_cam_world, error))
     return true, views, pixels
 
 

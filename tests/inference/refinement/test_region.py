@@ -1,4 +1,4 @@
-"""Pose refinement on the picture alone."""
+"""Pose refinement on the image alone."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_winding_border_fills_what_all_triangles_fill(seed: int) -> None:
     part = servoholder().mesh
     mesh = make_outline_mesh(part.vertices, part.faces)
     assert mesh.is_closed
-    # Near and beside the picture too: clipped on all sides.
+    # Near and beside the image too: clipped on all sides.
     shift = rng.uniform([-0.1, -0.1, 0.08], [0.1, 0.1, 0.5])
     at = posed(mesh, make_transform(rotation_vector_to_matrix(rng.normal(size=3)), shift), K)
     if at is None:
@@ -217,7 +217,7 @@ def test_a_bounded_error_of_the_scale_has_its_expected_value(enlarged: float) ->
 
 
 def straight_edge() -> tuple[Contour, np.ndarray]:
-    """Return a square's outline in a picture of 64 pixels, and which points are right."""
+    """Return a square's outline in an image of 64 pixels, and which points are right."""
     mesh = make_outline_mesh(
         np.array([[-1, -1, 0], [0, -1, 0], [0, 1, 0], [-1, 1, 0.0]]),
         np.array([[0, 1, 2], [0, 2, 3]]),
@@ -280,7 +280,7 @@ def test_crop_keeps_places(extent: float) -> None:
     crop = crop_around(image, K, box, 120)
     assert crop.extent <= 1.5 * 120
     assert crop.extent == pytest.approx(extent * crop.scale)
-    # A pixel of the crop shows what the picture shows at the place that has the same ray.
+    # A pixel of the crop shows what the image shows at the place that has the same ray.
     rays = np.stack(np.meshgrid(*(np.linspace(5, size - 6, 9) for size in crop.size)), -1)
     rays = (rays - crop.K[:2, 2]) / np.diag(crop.K)[:2]
     own, whole = (
@@ -408,7 +408,7 @@ def test_part_behind_an_occluder_and_over_the_border(refiner: RegionRefiner) -> 
         (picture(pivconnector(), around=PART_COLOUR), started(1), "too alike"),
         (np.random.default_rng(0).integers(0, 256, (416, 416, 3), np.uint8), TRUE, "alike"),
         (picture(pivconnector()), np.full((4, 4), np.nan), "not finite"),
-        (np.zeros((1, 1, 3), np.uint8), TRUE, "outside the picture"),
+        (np.zeros((1, 1, 3), np.uint8), TRUE, "outside the image"),
         (picture(pivconnector()), make_transform(TURNED, np.array([0.5, 0, 0.24])), "outside"),
         (picture(pivconnector()), make_transform(TURNED, np.array([0, 0, 0.01])), "behind"),
         (picture(pivconnector()), make_transform(TURNED, np.array([0, 0, -0.3])), "behind"),
@@ -449,7 +449,7 @@ def test_tight_prior_needs_the_last_round_only(refiner: RegionRefiner) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_pose_that_was_known_well_is_not_given_up(refiner: RegionRefiner, seed: int) -> None:
-    # A picture adds little to it, and moves it by a fraction of a pixel either way.
+    # An image adds little to it, and moves it by a fraction of a pixel either way.
     deviations = np.repeat([math.radians(0.05), 0.00005], 3)
     start = moved(TRUE, np.random.default_rng(seed).normal(size=6) * deviations)
     refined = refiner.refine(
@@ -515,7 +515,7 @@ def test_far_from_a_covariance_that_is_too_sure_the_part_is_found_where_it_is_as
     # Nothing there: the given pose stays, however far one looks.
     nothing = refiner.refine(np.full_like(image, 128), K, start, sure, starts=list)
     assert "alike" in nothing.reason
-    # Where the picture agrees near the given pose, nobody asks.
+    # Where the image agrees near the given pose, nobody asks.
     asked: list[int] = []
     refiner.refine(
         picture(pivconnector()), K, started(2), np.diag(DEVIATIONS**2),

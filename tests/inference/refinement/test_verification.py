@@ -66,7 +66,7 @@ def evidence(image: np.ndarray, K: np.ndarray, T: Transform, part: Part = PART) 
 
 
 def drawn_box(shade: tuple[int, int, int]) -> np.ndarray:
-    """Return a picture of a cube in one colour on black, drawn by ray casting."""
+    """Return an image of a cube in one colour on black, drawn by ray casting."""
     v, u = np.mgrid[:240, :320].reshape(2, -1)
     rays = np.column_stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.size)])
     start, directions = -POSE[:3, :3].T @ POSE[:3, 3], rays @ POSE[:3, :3]  # object frame
@@ -85,7 +85,7 @@ def test_a_flat_silhouette_has_an_outline_and_no_creases():
     assert values["outline"] > 0.85
     assert values["contrast"] > 0.9
     assert values["crease"] < 0.3
-    assert values["creases"] > 0.2  # the box has visible creases, where the picture shows nothing
+    assert values["creases"] > 0.2  # the box has visible creases, where the image shows nothing
     assert values["residual"] == pytest.approx(0.0, abs=0.01)  # no deviation on either side
 
 

@@ -150,8 +150,8 @@ def repacked(content: bytes, edit: Callable[[bytes], bytes]) -> bytes:
 def textured_square(size: float = 0.1) -> trimesh.Trimesh:
     """A square whose texture, 2×2 pixels, shows at its corners."""
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64)
-    picture = Image.fromarray(np.arange(12, dtype=np.uint8).reshape(2, 2, 3))
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture)
+    image = Image.fromarray(np.arange(12, dtype=np.uint8).reshape(2, 2, 3))
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=image)
     return trimesh.Trimesh(
         size * np.column_stack([corners, np.zeros(4)]),
         [[0, 1, 2], [0, 2, 3]],

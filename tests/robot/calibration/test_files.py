@@ -7,7 +7,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.robot.calibration.records import PoseFormat, match_pictures, read_robot_poses
+from dopepp.robot.calibration.records import PoseFormat, match_images, read_robot_poses
 
 TURN = Rotation.from_euler("xyz", [0.3, -0.5, 1.2])
 AT = [0.4, -0.1, 0.3]
@@ -76,10 +76,10 @@ def test_a_file_that_is_none_is_refused_in_one_line(tmp_path, name, text, said):
 def test_poses_go_with_their_pictures(tmp_path):
     path = tmp_path / "p.csv"
     path.write_text("image,x,y,z,rx,ry,rz\nb,1,2,3,0,0,0\na,1,2,3,0,0,0\n")
-    assert match_pictures(read_robot_poses(path), ["a.png", "b.png", "c.png"]) == [(0, 1), (1, 0)]
+    assert match_images(read_robot_poses(path), ["a.png", "b.png", "c.png"]) == [(0, 1), (1, 0)]
     with pytest.raises(UserError, match="the first 'b'"):
-        match_pictures(read_robot_poses(path), ["a.png"])
+        match_images(read_robot_poses(path), ["a.png"])
     path.write_text("x,y,z,rx,ry,rz\n1,2,3,0,0,0\n")
-    assert match_pictures(read_robot_poses(path), ["a.png"]) == [(0, 0)]
-    with pytest.raises(UserError, match="1 poses and 2 pictures"):
-        match_pictures(read_robot_poses(path), ["a.png", "b.png"])
+    assert match_images(read_robot_poses(path), ["a.png"]) == [(0, 0)]
+    with pytest.raises(UserError, match="1 poses and 2 images"):
+        match_images(read_robot_poses(path), ["a.png", "b.png"])

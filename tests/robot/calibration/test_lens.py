@@ -12,7 +12,7 @@ from dopepp.robot.calibration.lens import MAX_VIEWS, Views, calibrate_lens, writ
 
 @pytest.fixture(scope="module")
 def views(cell):
-    """Views with the board near and far, out to the picture's corners."""
+    """Views with the board near and far, out to the image's corners."""
     result = cell(3, num=4)
     camera, rng = result.camera, np.random.default_rng(1)
     board = parse_board("charuco:9x7:25:18")

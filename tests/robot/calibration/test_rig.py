@@ -1,4 +1,4 @@
-"""Rigs of simulated cameras: poses against the truth, honest deviations, and faulty pictures."""
+"""Rigs of simulated cameras: poses against the truth, honest deviations, and faulty images."""
 
 from dataclasses import replace
 
@@ -30,7 +30,7 @@ POSES = {
 
 
 def rig_pictures(seed=0, moments=8, names=tuple(POSES)):
-    """Return the sightings of a board at random poses, in the cameras' pictures."""
+    """Return the sightings of a board at random poses, in the cameras' images."""
     rng = np.random.default_rng(seed)
     boards = {name: {} for name in names}
     for moment in range(moments):
@@ -89,7 +89,7 @@ def test_a_camera_is_linked_through_another():
 def test_a_camera_that_never_shares_the_board_is_named():
     boards = rig_pictures()
     boards["top"] = {f"other {name}": seen for name, seen in boards["top"].items()}
-    with pytest.raises(UserError, match="top without a picture of the board together with left"):
+    with pytest.raises(UserError, match="top without an image of the board together with left"):
         calibrate_rig(boards, LENSES)
 
 

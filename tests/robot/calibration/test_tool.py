@@ -94,5 +94,5 @@ def test_a_bench_is_found_under_a_board():
     assert np.allclose(result.T_base_bench, flipped, atol=5e-4)
     assert np.abs(result.residuals).max() < 1e-3
     seen[3] = make_transform(T[:3, :3], T[:3, 3] + [0, 0, 0.01])
-    assert any("picture 4" in finding for finding in bench_of_board(seen, board).findings)
+    assert any("image 4" in finding for finding in bench_of_board(seen, board).findings)
     assert "cannot be verified" in bench_of_board(seen[:1], board).findings[0]

@@ -1,4 +1,4 @@
-"""The cell: convex pieces that fill a part, poses that are put and read, layouts, pictures."""
+"""The cell: convex pieces that fill a part, poses that are put and read, layouts, images."""
 
 from dataclasses import replace
 
@@ -94,11 +94,11 @@ def test_a_picture_shows_the_part_and_repeats_with_its_seed(trials, scene, shado
         photograph = view.arrange(bodies, poses, scene.T_base_cam, rng)
         return photograph(scene.T_base_cam, rng)
 
-    picture = take(scene.poses)
-    assert picture.shape == (SIZE[1], SIZE[0], 3)
-    np.testing.assert_array_equal(take(scene.poses), picture)
+    image = take(scene.poses)
+    assert image.shape == (SIZE[1], SIZE[0], 3)
+    np.testing.assert_array_equal(take(scene.poses), image)
     aside = [pose @ make_transform(np.eye(3), [0.0, 0.02, 0.0]) for pose in scene.poses]
-    changed = (take(aside).astype(int) - picture).any(axis=2).mean()
+    changed = (take(aside).astype(int) - image).any(axis=2).mean()
     assert 0.005 < changed < 0.9
 
 
@@ -110,12 +110,12 @@ def test_a_second_camera_shows_the_part_at_its_place(trials, scene, shadows):
         middle + np.array([0.03, 0.02, 0.0]), 0.2, np.radians([20.0, -15.0]), 0.3
     )
     away = [make_transform(np.eye(3), [5.0, 5.0, 0.0])]
-    pictures = []
+    images = []
     for poses in (scene.poses, away):
         rng = np.random.default_rng(1)
         photograph = view.arrange(bodies, poses, scene.T_base_cam, rng)
-        pictures.append(photograph(T_base_cam, rng).astype(int))
-    changed = np.abs(pictures[0] - pictures[1]).max(axis=2) > 40
+        images.append(photograph(T_base_cam, rng).astype(int))
+    changed = np.abs(images[0] - images[1]).max(axis=2) > 40
     rows, columns = np.nonzero(changed)
     T_cam_base = invert_transform(T_base_cam)
     expected = project_keypoints(trials.part.cuboid, T_cam_base @ scene.poses[0], TRUE_K)[-1]

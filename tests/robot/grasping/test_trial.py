@@ -49,7 +49,7 @@ def test_nothing_seen_is_a_failure_of_its_own(trials, scene, monkeypatch):
 def test_one_seed_makes_one_trial(trials, scene):
     trials.scene(1)  # what came between does not matter
     again = trials.scene(0)
-    np.testing.assert_array_equal(again.picture, scene.picture)
+    np.testing.assert_array_equal(again.image, scene.image)
     np.testing.assert_array_equal(again.T_base_cam, scene.T_base_cam)
     first, second = (trials.attempt(one, PoseSource("exact")).outcome for one in (scene, again))
     np.testing.assert_array_equal(first.states[-1], second.states[-1])

@@ -1,4 +1,4 @@
-"""Pictures of a part as a camera's driver sends them, as messages and as a recording."""
+"""Images of a part as a camera's driver sends them, as messages and as a recording."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,9 +20,9 @@ LENS = [-0.05, 0.01, 0.001, -0.001, 0.0]
 
 @dataclass
 class Seen:
-    """Pictures of one camera, and a folder with the same."""
+    """Images of one camera, and a folder with the same."""
 
-    pictures: list[np.ndarray]
+    images: list[np.ndarray]
     K: np.ndarray
     folder: Path
 
@@ -73,7 +73,7 @@ def messages():
 
 @pytest.fixture(scope="session")
 def recording(seen, tmp_path_factory):
-    """Return a recording of ROS 2 whose first ``camera_info`` comes after the first picture."""
+    """Return a recording of ROS 2 whose first ``camera_info`` comes after the first image."""
     rosbag2 = pytest.importorskip("rosbags.rosbag2")
     from rosbags.typesys import Stores, get_typestore
 

@@ -1,4 +1,4 @@
-"""From a recording to a recording: the poses that ``dopepp predict`` finds on its pictures."""
+"""From a recording to a recording: the poses that ``dopepp predict`` finds on its images."""
 
 import json
 
@@ -27,7 +27,7 @@ def answered(recording, tmp_path_factory):
     out = tmp_path_factory.mktemp("out") / "poses.mcap"
     done = call("node", MODEL, "--bag", recording, "--out", out, "--overlay")
     assert done.exit_code == 0, done.output
-    assert "3 pictures" in done.output
+    assert "3 images" in done.output
     assert [path.name for path in out.parent.iterdir()] == ["poses.mcap"]
     store = get_typestore(Stores.ROS2_HUMBLE)
     for kind, text in VISION.items():
@@ -63,9 +63,9 @@ def test_poses_equal_those_of_predict(answered, recording):
 def test_every_topic_is_stamped_as_its_picture(answered):
     for topic in ("/dope/poses_pivconnector", "/dope/detections", "/tf", "/dope/markers"):
         assert [at for at, _ in answered[topic]] == [10**9, 2 * 10**9, 3 * 10**9]
-    picture = answered["/dope/rgb_points"][0][1]
-    assert (picture.encoding, picture.header.frame_id) == ("rgb8", "camera_optical_frame")
-    assert len(picture.data) == picture.height * picture.step
+    image = answered["/dope/rgb_points"][0][1]
+    assert (image.encoding, image.header.frame_id) == ("rgb8", "camera_optical_frame")
+    assert len(image.data) == image.height * image.step
 
 
 def test_what_cannot_be_is_one_line(recording, tmp_path):

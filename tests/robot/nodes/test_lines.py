@@ -26,8 +26,8 @@ def test_lines_are_the_estimators_poses(seen, four, estimator):
     assert done.exit_code == 0, done.output
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert [row["number"] for row in lines] == [0, 1, 2]
-    for line, picture in zip(lines, seen.pictures, strict=True):
-        expected = [detection.T_cam_obj for detection in estimator.predict(picture, seen.K)]
+    for line, image in zip(lines, seen.pictures, strict=True):
+        expected = [detection.T_cam_obj for detection in estimator.predict(image, seen.K)]
         assert len(line["detections"]) == len(expected)
         for record, T in zip(line["detections"], expected, strict=True):
             np.testing.assert_allclose(record["T_cam_obj"], T, atol=1e-9)
@@ -61,7 +61,7 @@ def test_datagrams_hold_a_line_each(seen, four):
     ],
 )
 def test_what_does_not_go_together_is_one_line(seen, words, said):
-    done = call(MODEL, *(str(word).format(pictures=seen.folder) for word in words))
+    done = call(MODEL, *(str(word).format(images=seen.folder) for word in words))
     assert done.exit_code == 2
     assert said in done.stderr
     assert done.stderr.count("\n") == 1

@@ -91,7 +91,7 @@ def test_boxes_and_markers_enclose_the_part(answer, parts):
     T = transform(box["center"])
     inside = (world - T[:3, 3]) @ T[:3, :3]
     assert np.abs(inside).max(axis=0) == pytest.approx(size / 2, rel=0.03)
-    # Those of the last picture go first.
+    # Those of the last image go first.
     assert said["markers"].fields["markers"][0]["action"] == 3
 
 

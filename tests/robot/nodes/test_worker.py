@@ -1,4 +1,4 @@
-"""What a node makes of pictures: the estimator's poses, and one warning for each problem."""
+"""What a node makes of images: the estimator's poses, and one warning for each problem."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -24,7 +24,7 @@ def worker(estimator, said):
 
 @pytest.fixture
 def take(worker, seen, messages):
-    """Hand a picture to the worker as messages, spoilt as is said."""
+    """Hand an image to the worker as messages, spoilt as is said."""
 
     def take(
         number=0, second=1.0, frame=messages.frame, info=True, topic=messages.topic, **changes
@@ -53,7 +53,7 @@ def test_poses_are_the_estimators_on_the_picture_without_distortion(
     ("spoilt", "said_of_it", "fix"),
     [
         ({"k": [0.0] * 9}, "a K of zeros", "dopepp calibrate camera"),
-        ({"width": 640, "height": 480}, "640×480, and pictures of 320×240", "camera_info of these"),
+        ({"width": 640, "height": 480}, "640×480, and images of 320×240", "camera_info of these"),
         ({"distortion_model": "equidistant"}, "equidistant", "undistort"),
         ({"d": [0.1] * 3}, "3 distortion coefficients", "zeros"),
         ({"k": [float("nan")] * 9}, "K=nan", "fix"),

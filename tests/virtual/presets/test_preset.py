@@ -85,7 +85,7 @@ def test_what_the_camera_does_not_see_of_the_papers_box_skews_no_place_across_no
         assert np.abs(aside).mean() == pytest.approx(0.075, abs=0.003)
     # A sphere's area is uniform over its height.
     assert kstest((T[:, 2, 2] + 1) / 2, "uniform").pvalue > 0.05
-    # At 90° the picture shows the box's whole width where y is small and z large: no skew there.
+    # At 90° the image shows the box's whole width where y is small and z large: no skew there.
     whole = (np.abs(y) < 0.05) & (np.abs(x) < 0.05)
     assert z[whole].mean() == pytest.approx(0.2, abs=0.02)
     assert z.mean() == pytest.approx(0.219, abs=0.005)
@@ -95,7 +95,7 @@ def test_a_place_that_no_depth_suits_is_given_up(sized_box):
     preset = replace(PRESETS["paper"].resized(80, 60), placement=OffsetPlacement(lateral=0.25))
     factory = Factory([sized_box("large", 3)], preset, seed=0)
     places = np.array([factory.scene(0, n).objects[0].T_cam_obj[:3, 3] for n in range(20)])
-    # Of the drawn ones, a tenth is never in the picture.
+    # Of the drawn ones, a tenth is never in the image.
     assert (np.abs(places[:, 1]) < 0.225).all()
 
 
@@ -159,7 +159,7 @@ def test_windows_lie_in_the_picture_all_over_it():
     corners = np.array(corners)
     assert corners.min() == 0
     np.testing.assert_array_equal(corners.max(axis=0), [640 - 224, 480 - 160])
-    # A point of the window is anywhere in the picture, at its borders half as often.
+    # A point of the window is anywhere in the image, at its borders half as often.
     points = corners + rng.uniform(0, 1, corners.shape) * (224, 160)
     shares = np.histogram(points[:, 0], 8, (0, 640))[0] / 2000
     assert 0.06 < shares.min() < shares.max() < 0.2

@@ -115,9 +115,7 @@ def test_a_camera_must_say_how_large_its_pictures_are(tmp_path, caplog):
         np.testing.assert_array_equal(read_lens(path)[1], camera_matrix(600, 610, 320, 240))
     assert "cam.yaml: its distortion is not rendered" in caplog.text
     path.write_text(rest)
-    with pytest.raises(
-        UserError, match=r"cam\.yaml, which does not state the size of its pictures"
-    ):
+    with pytest.raises(UserError, match=r"cam\.yaml, which does not state the size of its images"):
         read_lens(path)
     with pytest.raises(UserError, match="principal point inside the image"):
         view(size=(640, 360))
@@ -165,7 +163,7 @@ def test_scenes_show_the_parts_at_work(name):
 
 
 def test_a_window_shows_what_the_whole_picture_has_there():
-    """The window's K is that of the camera's picture, scaled and moved by whole pixels."""
+    """The window's K is that of the camera's image, scaled and moved by whole pixels."""
     item = view()
     scene = Factory([servoholder()], item.window(PRESETS["wide"], 0.4, (224, 128)), 1).scene(0, 0)
     scaled = camera_matrix(0.4 * FOCAL, 0.4 * FOCAL, 0.4 * 650.5 - 0.5, 0.4 * 350.5 - 0.5)

@@ -40,7 +40,7 @@ _ROUNDING: Final = 1e-3
 MAX_SCENE_BYTES: Final = 128_000_000
 """Largest JSON file of a scene: 40,000 images with ten objects each."""
 
-PICTURES: Final = ("rgb", "gray"), (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+IMAGES: Final = ("rgb", "gray"), (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 DEPTHS: Final = ("depth",), (".png", ".tif", ".tiff")
 """Alternative folders and suffixes of a scene's images; the first existing folder is used."""
 
@@ -234,7 +234,7 @@ def image_files(
 
     Args:
         scene: Folder of the scene.
-        kind: :data:`PICTURES` or :data:`DEPTHS`, the allowed folders and suffixes.
+        kind: :data:`IMAGES` or :data:`DEPTHS`, the allowed folders and suffixes.
         problems: Receiver of an image that is present twice.
     """
     folders, suffixes = kind
@@ -322,7 +322,7 @@ def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int
     return BopScene(
         folder,
         np.array(images, np.int64),
-        _relative_files(folder, PICTURES, images),
+        _relative_files(folder, IMAGES, images),
         _relative_files(folder, DEPTHS, images),
         K,
         scales,

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from dopepp.data.formats import STAGING, bop, staged_items
 from dopepp.data.formats.bop import MM, BopPoses, Nodes, Record
 from dopepp.data.formats.bop.bop_models import INFO_FILE, info_path, modelled, parse_models, part_of
-from dopepp.data.formats.images import COLOUR_MODES, DEPTH_MODES, decode_one_channel, picture_shape
+from dopepp.data.formats.images import COLOUR_MODES, DEPTH_MODES, decode_one_channel, image_shape
 from dopepp.data.formats.invariants import Box, check_box, check_translation, plausible_camera
 from dopepp.data.formats.problems import CheckReport, Node, mapping
 from dopepp.drawing.pictures import Mask, Shape
@@ -82,7 +82,7 @@ class _SceneCheck:
 
     def __init__(self, report: CheckReport, folder: Path, models: Models | None) -> None:
         self._report, self._folder, self._models = report, folder, models
-        self._pictures, self._depths = map(self._image_files, (bop.PICTURES, bop.DEPTHS))
+        self._pictures, self._depths = map(self._image_files, (bop.IMAGES, bop.DEPTHS))
         self._masks = {name: _mask_files(folder / name) for name in _MASKS}
         self._records = bop.read_records(folder, report)
         self._has_truth = (folder / _TRUTH).is_file()
@@ -124,7 +124,7 @@ class _SceneCheck:
         """Check the files and annotations of an image; return its poses."""
         report, folder, (cameras, truths, infos) = self._report, self._folder, self._records
         path = self._pictures.get(image, folder / "rgb" / f"{image:06d}.png")
-        shape = picture_shape(Node(report, path), modes=COLOUR_MODES)
+        shape = image_shape(Node(report, path), modes=COLOUR_MODES)
         if self._depths:
             path = self._depths.get(image, folder / "depth" / f"{image:06d}.png")
             decode_one_channel(Node(report, path), shape, modes=DEPTH_MODES)

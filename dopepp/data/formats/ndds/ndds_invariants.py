@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from dopepp.data.formats import ndds
-from dopepp.data.formats.images import picture_shape, read_map
+from dopepp.data.formats.images import image_shape, read_map
 from dopepp.data.formats.invariants import plausible_camera
 from dopepp.data.formats.ndds import IMAGE_SUFFIXES, NddsSettings, Objects
 from dopepp.data.formats.ndds.object_invariants import Majority, ObjectCheck
@@ -73,17 +73,17 @@ def _twice(values: Iterable[Hashable]) -> list[Hashable]:
 
 
 def _check_unannotated(report: CheckReport, annotations: list[Path]) -> None:
-    """Report pictures without an annotation, in folders with annotations."""
+    """Report images without an annotation, in folders with annotations."""
     stems: dict[Path, set[str]] = {}
     for path in annotations:
         stems.setdefault(path.parent, set()).add(path.name.removesuffix(".json"))
     for folder, annotated in sorted(stems.items()):
         for path in sorted(folder.iterdir()):
             stem = path.stem
-            is_picture = path.suffix in IMAGE_SUFFIXES and not path.name.startswith((".", "_"))
+            is_image = path.suffix in IMAGE_SUFFIXES and not path.name.startswith((".", "_"))
             starts = (stem[:end] for end, character in enumerate(stem) if character == ".")
             belongs = stem in annotated or not annotated.isdisjoint(starts)
-            if is_picture and not belongs and not stem.endswith(_DERIVED):
+            if is_image and not belongs and not stem.endswith(_DERIVED):
                 report.report(path, "annotation", f"missing: no {stem}.json in the folder")
 
 
@@ -92,7 +92,7 @@ def _check_item(
 ) -> None:
     """Check an annotation, its image and the required ``maps``, given by suffix."""
     image = ndds.image_of(path)
-    shape = None if image is None else picture_shape(Node(report, image))
+    shape = None if image is None else image_shape(Node(report, image))
     images = {
         suffix: read_map(Node(report, ndds.companion(path, suffix)), shape, colour=True)
         for suffix in maps

@@ -87,7 +87,7 @@ def index_shard(path: Path) -> ShardIndex:
     """Index a shard's images.
 
     Raises:
-        UserError: :func:`members` reports a problem, an image lacks its picture or camera, or a
+        UserError: :func:`members` reports a problem, an image lacks its image or camera, or a
             member is repeated.
     """
     node = Node(STRICT, path, "archive")

@@ -15,7 +15,7 @@ from dopepp.data.formats import STAGING
 from dopepp.data.formats import webdataset as shards
 from dopepp.data.formats.bop import BopPoses
 from dopepp.data.formats.bop.bop_invariants import Models, Oddities, check_image, load_models
-from dopepp.data.formats.images import COLOUR_MODES, DEPTH_MODES, decode_one_channel, picture_shape
+from dopepp.data.formats.images import COLOUR_MODES, DEPTH_MODES, decode_one_channel, image_shape
 from dopepp.data.formats.problems import CheckReport, Node
 from dopepp.data.formats.webdataset.webdataset_reader import ShardRecords
 from dopepp.drawing.pictures import Mask, Shape
@@ -80,7 +80,7 @@ def _check_image(
     names = {shards.field_of(name): name for name in reversed(content)}
     shape: Shape | None = None
     if name := names.get("image"):
-        shape = picture_shape(Node(report, f"{start}.{name}"), content[name], COLOUR_MODES)
+        shape = image_shape(Node(report, f"{start}.{name}"), content[name], COLOUR_MODES)
     else:
         report.report(f"{start}.rgb.png", "member", "missing")
     if name := names.get("depth"):

@@ -91,7 +91,7 @@ class WebdatasetReader:
         shard, image = self._shards[self._items[index, 0]], int(self._items[index, 1])
         records = _records(shard, image)
         content = shard.read(image, "image")
-        assert content is not None  # every indexed image has a picture
+        assert content is not None  # every indexed image has an image
         picture = decode_rgb(content, records.start)
         shape: Shape = picture.shape[:2]
         K, scales = bop.read_cameras([records.json("camera")], records.nodes)

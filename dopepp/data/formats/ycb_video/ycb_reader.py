@@ -18,7 +18,7 @@ from dopepp.core.errors import UserError
 from dopepp.data.formats import make_instance, ycb_video
 from dopepp.data.formats.ycb_video import FrameMeta, Subset
 from dopepp.data.sample import Purpose, Sample, SourceInfo, item_rng
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import camera_matrix, check_camera
 from dopepp.parts.part import Part
 from dopepp.virtual.backgrounds import Backgrounds
@@ -50,7 +50,7 @@ class YcbVideoReader:
         image_set: Name of the list in ``image_sets/``; exclusive with ``frames``.
         subset: ``real`` reads ``data/``, ``synthetic`` reads ``data_syn/``.
         frames: Frames instead of a list: ``0050/000003`` (real) or ``000000`` (synthetic).
-        backgrounds: Pictures for the transparent background of synthetic frames.
+        backgrounds: Images for the transparent background of synthetic frames.
         seed: Seed of the backgrounds, which change with the epoch.
 
     Raises:
@@ -137,7 +137,7 @@ class YcbVideoReader:
         """Read the ground truth of a frame."""
         return ycb_video.read_meta(Path(f"{self._start(frame)}-meta.mat"))
 
-    def _rgb(self, image: NDArray[Any], frame: str, epoch: int) -> Picture:
+    def _rgb(self, image: NDArray[Any], frame: str, epoch: int) -> RGBImage:
         """Composite a synthetic frame on a background drawn by (seed, epoch, frame)."""
         if self.subset == "real" or self._backgrounds is None:
             return image

@@ -25,7 +25,7 @@ from typing import Final
 
 import numpy as np
 
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.inference.refinement.colour import EDGE_PX, crop_around
 from dopepp.inference.refinement.depth import DepthEvidence
@@ -102,7 +102,7 @@ class RegionRefiner:
 
     def refine(
         self,
-        image: Picture,
+        image: RGBImage,
         K: CameraMatrix,
         T_cam_obj: Transform,
         covariance: PoseMatrix | None = None,
@@ -132,7 +132,7 @@ class RegionRefiner:
             return Refinement(given, reason=str(undecided))
 
     def refine_with(
-        self, image: Picture, K: CameraMatrix, depth: DepthEvidence, start: Solution
+        self, image: RGBImage, K: CameraMatrix, depth: DepthEvidence, start: Solution
     ) -> Outcome:
         """Refine on image and depth together, from the end of a descent on one of them.
 
@@ -149,7 +149,7 @@ class RegionRefiner:
 
     def rounds(
         self,
-        image: Picture,
+        image: RGBImage,
         K: CameraMatrix,
         pose: Transform,
         weights: Weights = FOUND,
@@ -331,7 +331,7 @@ def search_distance(coarse: Round, prior: Prior) -> float:
     """
     contour = coarse.contour(prior.T_cam_obj)
     if contour is None:
-        raise UndecidedError("too little of the part's outline is on the picture")
+        raise UndecidedError("too little of the part's outline is on the image")
     crop = coarse.crop
     rows = outline_rows(contour, prior.T_cam_obj, crop.K)
     covariance = np.linalg.inv(prior.information)

@@ -123,7 +123,7 @@ class Round:
         if silhouette is not None:
             odds = log_odds(self.crop.bins, silhouette[1], 0.5 * reach, ring, self.stage.tiles)
         if odds is None:
-            raise UndecidedError("too few pixels of the part and around it are on the picture")
+            raise UndecidedError("too few pixels of the part and around it are on the image")
         self._odds = self._smooth_odds = odds
         step = round(_step(reach))
         if step >= 2:
@@ -146,7 +146,7 @@ class Round:
         # The outline term is last, because its distance counts relative to the other terms.
         end = descend(start, prior, [*self._more, self.term(reach)], self.stage.steps)
         if end is None:
-            raise UndecidedError("the part's outline left the picture")
+            raise UndecidedError("the part's outline left the image")
         return end
 
     def term(self, reach: float) -> Term:
@@ -200,7 +200,7 @@ class Round:
             raise UndecidedError("colours inside and around the part are too alike")
         if agreement.share < MIN_AGREEING:
             share = f"{agreement.share:.0%}"
-            raise UndecidedError(f"only {share} of the outline agrees with the picture")
+            raise UndecidedError(f"only {share} of the outline agrees with the image")
         distance = math.sqrt(prior.squared_distance(end.T_cam_obj))
         if distance > FARTHEST:
             limit = f"more than {FARTHEST:g}"
@@ -212,7 +212,7 @@ class Round:
         if not is_near and not self._more:
             after = self.log_likelihood(end.T_cam_obj, prior)
             if after <= self.log_likelihood(prior.T_cam_obj, prior):
-                raise UndecidedError("the picture agrees as well with the given pose")
+                raise UndecidedError("the image agrees as well with the given pose")
         return agreement
 
     def reach(self, reach: float) -> float:
@@ -227,7 +227,7 @@ class Round:
         """Return the outline at a pose, or raise :class:`UndecidedError` if it is not visible."""
         contour = self.contour(pose)
         if contour is None:
-            raise UndecidedError("the part's outline left the picture")
+            raise UndecidedError("the part's outline left the image")
         return contour
 
     def _agreement(self, contour: Contour, reach: float) -> OutlineAgreement:

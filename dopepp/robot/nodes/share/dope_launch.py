@@ -6,7 +6,7 @@ from launch.substitutions import LaunchConfiguration
 
 ARGUMENTS = {
     "model": ("pretrained/pivconnector", "checkpoint (best.ckpt of a run) or released network"),
-    "topic": ("/camera/image_raw", "topic of the pictures"),
+    "topic": ("/camera/image_raw", "topic of the images"),
     "name": ("dope", "name of the node"),
     "params": (__file__.replace("_launch.py", ".yaml"), "YAML file of parameters"),
 }

@@ -1,9 +1,9 @@
 """The photoreal renderer: path tracing by Mitsuba 3, denoised by Intel's Open Image Denoise.
 
 Lights match the rasteriser's, but lamps have a size, objects light each other, and surfaces mirror
-their surroundings. The traced picture is composited over the background in linear light.
+their surroundings. The traced image is composited over the background in linear light.
 
-A matt disc represents the supporting plane, whose picture is the background. The disc's radiance,
+A matt disc represents the supporting plane, whose image is the background. The disc's radiance,
 divided by its radiance without objects, multiplies the background (shadows, reflected light).
 
 A scene renders to the same bytes on the same machine for any number of threads. Workers must be
@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from dopepp.core.errors import require
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.rotation import Vector
 from dopepp.virtual.renderers.photoreal import mitsuba, num_threads
 from dopepp.virtual.renderers.photoreal.mitsuba_scene import (
@@ -68,7 +68,7 @@ _RADIANCE_OF_CODE: Final = np.interp(
 ).astype(np.float32)
 """Radiance of every code 0–255 under the tone curve."""
 
-_ALBEDO: Final = (0.05, 0.8)  # bounds of the disc's albedo, estimated from its picture and light
+_ALBEDO: Final = (0.05, 0.8)  # bounds of the disc's albedo, estimated from its image and light
 _MIN_LIGHT: Final = 1e-3  # radiance of a white table below which shadows are not estimated
 _SPREAD_PX: Final = 2.0  # width over which a shadow is extrapolated under an object's rim
 _FLOAT3: Final = 3  # OIDN_FORMAT_FLOAT3
@@ -151,7 +151,7 @@ class Tracer:
         traced[..., :3] = denoise(traced[..., :3], guides[..., :3], guides[..., 3:6])
         return traced
 
-    def paint_on_table(self, window: Box | None, plane: Depth, image: Picture) -> None:
+    def paint_on_table(self, window: Box | None, plane: Depth, image: RGBImage) -> None:
         """Paint objects and their shadows; ``plane`` is the plane's depth."""
         table = TableTop(self._scene, plane)
         window = table.window(window)
@@ -186,8 +186,8 @@ class Tracer:
         return np.array(self._mi.render(loaded, seed=self._seed), np.float32)
 
 
-def _over(light: Colours, alpha: Depth, behind: Picture) -> Picture:
-    """Composite light over a picture in linear light; ``alpha`` is the coverage."""
+def _over(light: Colours, alpha: Depth, behind: RGBImage) -> RGBImage:
+    """Composite light over an image in linear light; ``alpha`` is the coverage."""
     alpha = np.clip(alpha, 0.0, 1.0)[..., None]
     total = light + (1 - alpha) * _RADIANCE_OF_CODE[behind]
     steps = np.minimum(total * CODE_STEPS + 0.5, len(TONE_CURVE) - 1).astype(np.int32)
@@ -261,7 +261,7 @@ class TableTop:
         return light
 
     def _estimated_albedo(self) -> Vector:
-        """Return the albedo at which the disc is as bright as its picture, within limits."""
+        """Return the albedo at which the disc is as bright as its image, within limits."""
         seen = self._away < 1
         if not seen.any():
             return np.full(3, np.mean(_ALBEDO))
@@ -293,18 +293,18 @@ def split_light(light: Colours, alpha: Depth, unshadowed: Colours) -> tuple[Colo
     return np.where(alpha[..., None] > 0, np.maximum(objects, 0), 0).astype(np.float32), light_share
 
 
-def shadowed(picture: Picture, light_share: Colours) -> Picture:
-    """Multiply a picture's linear light by the shares ``light_share`` in shadows."""
+def shadowed(picture: RGBImage, light_share: Colours) -> RGBImage:
+    """Multiply an image's linear light by the shares ``light_share`` in shadows."""
     steps = np.minimum(SRGB_TO_LINEAR[picture] * light_share * CODE_STEPS + 0.5, CODE_STEPS)
     changed = (LINEAR_TO_SRGB[steps.astype(np.int32)] + 0.5).astype(np.uint8)
     return np.where(light_share == 1.0, picture, changed)
 
 
 def denoise(colour: Colours, albedo: Colours, normal: Colours) -> Colours:
-    """Denoise a picture in linear light.
+    """Denoise an image in linear light.
 
     Args:
-        colour: The picture, float32 like the guides.
+        colour: The image, float32 like the guides.
         albedo: Share of light that the surface scatters, in [0, 1].
         normal: Unit vectors in any frame, 0 on the background.
 

@@ -1,4 +1,4 @@
-"""Shadows of objects on the picture of a supporting plane.
+"""Shadows of objects on the image of a supporting plane.
 
 The background shows the plane in full light and is multiplied by the share of light (sky and lamps)
 that objects leave. Homographies map the plane to each shadow map and to the grid of its sky, so
@@ -34,7 +34,7 @@ from dopepp.virtual.scene import NEAR, Plane, Scene, SceneObject
 from dopepp.virtual.sensor import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
 from dopepp.virtual.triangles import NUM_COLOUR_SAMPLES, scratch
 
-_VISIBLE: Final = np.float32(0.005)  # smallest share of hidden light that changes an 8-bit picture
+_VISIBLE: Final = np.float32(0.005)  # smallest share of hidden light that changes an 8-bit image
 
 _SKY_DIRECTIONS: Final = 32  # sampled directions of the sky, one bit each
 
@@ -62,7 +62,7 @@ class _LitPlane(NamedTuple):
 def darken_plane(
     scene: Scene, plane: Plane, lights: Sequence[ShadowMap], samples: Samples, image: Array
 ) -> None:
-    """Darken the plane's picture in place, except for pixels that objects fill."""
+    """Darken the plane's image in place, except for pixels that objects fill."""
     # Camera frame to (x, y) on the plane and the height above it, metres.
     rotation = rotation_to_z(np.array(plane.normal, np.float64))
     frame = np.column_stack([rotation, [0.0, 0.0, -plane.offset]])
@@ -256,7 +256,7 @@ def _darken(
     samples: Samples,
     image: Array,
 ) -> None:
-    """Multiply the picture by the remaining share of the plane's light.
+    """Multiply the image by the remaining share of the plane's light.
 
     Args:
         corner: First pixel of ``shades``.

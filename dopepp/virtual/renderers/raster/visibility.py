@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Int16
 
 from dopepp.core.compiled import Array, Scalar, compiled
-from dopepp.drawing.pictures import Picture, Size
+from dopepp.drawing.pictures import RGBImage, Size
 from dopepp.geometry.camera import make_transform, transform
 from dopepp.geometry.rotation import Vector, rotation_to_z
 from dopepp.virtual.scene import NEAR, Ambient, Light, Plane, Scene, SceneObject
@@ -155,7 +155,7 @@ def draw_alone(
 
 def backdrop(
     scene: Scene,
-) -> tuple[Picture, Float32[np.ndarray, "height width"], Int16[np.ndarray, "height width"]]:
+) -> tuple[RGBImage, Float32[np.ndarray, "height width"], Int16[np.ndarray, "height width"]]:
     """Return image, depth and instances of a scene without its objects."""
     depth = np.zeros(scene.background.shape[:2], np.float32)
     if scene.plane is not None:

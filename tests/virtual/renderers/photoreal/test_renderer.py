@@ -1,4 +1,4 @@
-"""Path-traced pictures: labels as the rasteriser's, light that is plausible."""
+"""Path-traced images: labels as the rasteriser's, light that is plausible."""
 
 import importlib
 import pickle
@@ -55,7 +55,7 @@ def test_labels_agree_with_the_rasteriser(photoreal, preset, seed):
     # The labels are not the rasteriser's by construction: each renderer casts its own.
     assert (result.image.dtype, result.depth.dtype) == (np.uint8, np.float32)
     assert result.instances.dtype == np.int16
-    # The same lamps and colours, so about the same picture.
+    # The same lamps and colours, so about the same image.
     assert abs(result.image.astype(float).mean() - expected.image.mean()) < 12
 
 
@@ -158,7 +158,7 @@ def test_pixels_that_are_not_square(photoreal, box_part, scene_of):
     expected, result = render(scene), photoreal(scene)
     assert_same_labels(result, expected)
     covered = expected.instances == 0
-    # The picture stands where the labels do.
+    # The image stands where the labels do.
     changed = (result.image != scene.background).any(axis=2)
     assert (changed & covered).sum() > 0.97 * covered.sum()
     near = cv2.dilate(covered.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0

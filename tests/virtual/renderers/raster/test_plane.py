@@ -1,4 +1,4 @@
-"""The supporting plane: depth, what it hides, and the shadows on its picture."""
+"""The supporting plane: depth, what it hides, and the shadows on its image."""
 
 from dataclasses import replace
 
