@@ -186,7 +186,7 @@ def compare_runs(
         panels = [*([grid(panels, 2)] if panels else []), sheet]
     if panels:
         write_png(folder / PANELS_FILE, grid(panels, 1 if tiles else 2))
-        page["picture"] = PANELS_FILE
+        page["image"] = PANELS_FILE
     if missing:
         display.console.print(missing)
     origins = [

@@ -158,7 +158,7 @@ class RunReadme:
             ]
         return [
             *lines,
-            f"dopepp predict {best} PICTURE.png --K FX FY CX CY",
+            f"dopepp predict {best} IMAGE.png --K FX FY CX CY",
             f"dopepp compare {run} OTHER_RUN",
         ]
 

@@ -173,5 +173,5 @@ def _commands(path: Path, checkpoint: Checkpoint) -> tuple[str, str]:
     parts = [str(part) for part in config.get("parts") or ()]
     if not config.get("root") and any(Path(part).suffix for part in parts):
         words.append(f"data.parts=[{','.join(parts)}]")
-    predict = f"dopepp predict {shlex.quote(str(path))} PICTURE --K FX FY CX CY"
+    predict = f"dopepp predict {shlex.quote(str(path))} IMAGE --K FX FY CX CY"
     return predict, " ".join([typed("evaluate"), *map(shlex.quote, words)])

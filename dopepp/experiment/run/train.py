@@ -276,7 +276,7 @@ def template_commands(data: DataConfig) -> list[str]:
     if tilt_deg is not None and data.preset.table is None:
         words += ["--tilt", f"{tilt_deg:g}"]
     return [
-        shlex.join(["dopepp", "predict", part, "PICTURE", *words, "--save", "out"])
+        shlex.join(["dopepp", "predict", part, "IMAGE", *words, "--save", "out"])
         for part in data.parts
     ]
 

@@ -56,11 +56,11 @@ def my_part(parsed, camera):
 def test_the_command_that_needs_no_training_is_printed(my_part):
     lens = my_part().data.virtual.camera
     K = " ".join(f"{value:g}" for value in (lens.fx, lens.fy, lens.cx, lens.cy))
-    end = f"PICTURE --K {K} --working-distance 0.4,0.7 --tilt 60 --save out"
+    end = f"IMAGE --K {K} --working-distance 0.4,0.7 --tilt 60 --save out"
     assert template_commands(my_part().data) == [f"dopepp predict pivconnector {end}"]
     data = replace(my_part().data, parts=("my part.stl",), unit="inch")
     (command,) = template_commands(data)
-    assert command.startswith("dopepp predict 'my part.stl' PICTURE --K ")
+    assert command.startswith("dopepp predict 'my part.stl' IMAGE --K ")
     assert " --unit inch " in command
     assert template_commands(replace(data, virtual=replace(data.virtual, camera=None))) == []
 

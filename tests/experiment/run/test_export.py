@@ -29,7 +29,7 @@ def test_a_released_checkpoint_for_pytorch(tmp_path):
     assert done.agreement.is_exact
     assert done.agreement.num_poses > 0
     assert done.commands == (
-        "dopepp predict pivconnector.safetensors PICTURE --K FX FY CX CY",
+        "dopepp predict pivconnector.safetensors IMAGE --K FX FY CX CY",
         "dopepp evaluate ckpt_path=pivconnector.safetensors",
     )
     again = export(done.path, "safetensors", "fp16", tmp_path / "half.safetensors")
