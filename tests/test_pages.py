@@ -1,4 +1,4 @@
-"""The pages keep the measurable rules of their language, and the generated ones are up to date."""
+"""Tests of docs/check_pages.py on all pages, and of the generated reference pages."""
 
 import runpy
 from pathlib import Path
@@ -18,7 +18,7 @@ def test_a_user_page_keeps_the_rules(page):
     ("text", "problem"),
     [
         ("line\n" * 121, "121 lines"),
-        ("word " * 41 + ".", "a sentence of 42 words"),
+        ("word " * 25 + ".", "a sentence of 26 words"),
         ("a" * 161, "a line of 161 characters"),
         ("| a | b | c | d | e | f | g |\n| --- |", "a table of 7 columns"),
         ("| a |\n| --- |\n" + "| b |\n" * 11, "a table of 11 rows"),
