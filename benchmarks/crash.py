@@ -1,10 +1,11 @@
-"""Kill a training at random moments, resume it each time, and compare it with one left in peace.
+"""Kill a training at random moments, resume it, and compare it with an uninterrupted training.
 
     python benchmarks/crash.py --kills 50
 
-Prints in which phase the kills fell, how many runs were lost, and whether weights, best checkpoint
-and metrics of every run are those of the undisturbed one, to the last bit. Every life of a run is a
-process of its own, forked when the libraries are imported, which takes longer than the training.
+The script prints in which phase the runs were killed, how many runs were lost, and whether weights,
+best checkpoint and metrics of each run equal those of the uninterrupted run, to the last bit. Each
+start of a run is a separate process, forked after importing the libraries, which takes longer than
+the training.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from pathlib import Path
 
 import torch
 
-import dopepp.experiment.run.train  # noqa: F401 -- the libraries, once
+import dopepp.experiment.run.train  # noqa: F401 -- import the libraries before forking
 from dopepp.parts.catalogue import BUILTIN
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import PRESETS
@@ -53,19 +54,19 @@ SMALL = (
     "callbacks.last.max_share=1",
 )
 TIMES = frozenset({"throughput/images_per_s", "throughput/loader_wait"})
-"""Columns that no two runs share."""
+"""Columns that differ between equal runs."""
 PATIENCE_S = 600
 
 
 @dataclass
 class Tally:
-    """What has happened.
+    """Results of all kills.
 
     Attributes:
-        phases: In which phase each kill fell.
+        phases: Number of kills per phase.
         lost: Runs that could not be resumed, with the reason.
-        different: Runs that ended differently, with what differs.
-        finished: Runs that ended.
+        different: Differences between finished runs and the uninterrupted run.
+        finished: Number of finished runs.
     """
 
     phases: Counter[str] = field(default_factory=Counter)
@@ -75,14 +76,14 @@ class Tally:
 
 
 def start(*arguments: str, log: Path) -> Process:
-    """Start ``train.py`` in a process of its own, its output at the end of a file."""
+    """Start ``train.py`` in a separate process, which appends its output to a file."""
     process = get_context("fork").Process(target=train, args=(arguments, log))
     process.start()
     return process
 
 
 def train(arguments: tuple[str, ...], log: Path) -> None:
-    """Run ``train.py`` with arguments as the shell would."""
+    """Run ``train.py`` with command-line arguments."""
     stream = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     for number in (1, 2):
         os.dup2(stream, number)
@@ -92,13 +93,13 @@ def train(arguments: tuple[str, ...], log: Path) -> None:
 
 
 def ends_well(process: Process) -> bool:
-    """Wait for a run that is left in peace."""
+    """Wait for a run, and return whether it succeeded."""
     process.join(PATIENCE_S)
     return process.exitcode == 0
 
 
 def table(run: Path) -> list[dict[str, str]]:
-    """Return the metrics without the columns of time; of these only whether they are there."""
+    """Return the metrics; times are replaced by whether the cell has a value."""
     path = run / "metrics.csv"
     if not path.is_file():
         return []
@@ -108,12 +109,12 @@ def table(run: Path) -> list[dict[str, str]]:
 
 
 def is_saving(run: Path, pid: int) -> bool:
-    """Tell whether a process is writing a checkpoint; killed ones have left their halves."""
+    """Return whether a process is writing a checkpoint; earlier processes may have left files."""
     return any((run / "checkpoints").glob(f".*-{pid}.partial"))
 
 
 def phase(run: Path, pid: int, begun: bool) -> str:
-    """Tell from the files what a stopped process was doing."""
+    """Return the phase of a stopped process, determined from its files."""
     if is_saving(run, pid):
         return "saving"
     if not begun:
@@ -124,23 +125,25 @@ def phase(run: Path, pid: int, begun: bool) -> str:
 
 
 def differences(run: Path, whole: Path) -> Iterator[str]:
-    """Name what a run left that the undisturbed one did not."""
+    """Yield the differences between a run and the uninterrupted run."""
     if table(run) != table(whole):
         yield "metrics.csv"
     for name in ("last.ckpt", "best.ckpt"):
-        killed, undisturbed = (
+        killed, expected = (
             torch.load(folder / "checkpoints" / name, weights_only=True) for folder in (run, whole)
         )
-        if killed["global_step"] != undisturbed["global_step"]:
-            yield f"{name}: step {killed['global_step']} for {undisturbed['global_step']}"
-        for key, value in undisturbed["state_dict"].items():
+        if killed["global_step"] != expected["global_step"]:
+            yield f"{name}: step {killed['global_step']} for {expected['global_step']}"
+        for key, value in expected["state_dict"].items():
             if not torch.equal(killed["state_dict"][key], value):
                 yield f"{name}: {key}"
                 break
 
 
-def live(run: Path, arguments: list[str], rng: random.Random, tally: Tally, log: Path) -> bool:
-    """Start a run or go on with it, and kill it; return whether it ended before that."""
+def start_and_kill(
+    run: Path, arguments: list[str], rng: random.Random, tally: Tally, log: Path
+) -> bool:
+    """Start or resume a run, and kill it; return whether the run ended before the kill."""
     path = run / "metrics.csv"
     before = path.stat().st_mtime_ns if path.is_file() else 0
     process = start(*arguments, log=log)
@@ -155,7 +158,7 @@ def live(run: Path, arguments: list[str], rng: random.Random, tally: Tally, log:
     assert process.pid is not None
     if begun():
         time.sleep(rng.uniform(0, 2))
-        # Writing takes a hundredth of the time, so a random moment would hardly ever meet it.
+        # Saving takes a hundredth of the time, so random moments would rarely hit it.
         deadline = time.monotonic() + (5 if rng.random() < 0.4 else 0)
         while time.monotonic() < deadline and not is_saving(run, process.pid):
             time.sleep(0.001)
@@ -171,39 +174,40 @@ def live(run: Path, arguments: list[str], rng: random.Random, tally: Tally, log:
 
 
 def crash(folder: Path, kills: int, max_epochs: int, seed: int) -> Tally:
-    """Kill runs until there have been enough kills, and let the last one end."""
+    """Kill runs until the number of kills is reached, and let the last run end."""
     rng, tally = random.Random(seed), Tally()
     small = [*SMALL, f"trainer.max_epochs={max_epochs}"]
     whole, log = folder / "whole", folder / "log.txt"
     if not ends_well(start(*small, f"hydra.run.dir={whole}", log=log)):
-        raise SystemExit(f"the undisturbed run failed, see {log}")
+        raise SystemExit(f"the uninterrupted run failed, see {log}")
     number = 0
     while sum(tally.phases.values()) < kills:
         run, ended = folder / f"run{number}", False
         begin = [*small, f"hydra.run.dir={run}"]
         while not ended and sum(tally.phases.values()) < kills:
             again = (run / ".hydra" / "resume.json").is_file()
-            ended = live(run, [f"resume={run}"] if again else begin, rng, tally, log)
+            words = [f"resume={run}"] if again else begin
+            ended = start_and_kill(run, words, rng, tally, log)
             print(dict(tally.phases), flush=True)
         if not ended and not ends_well(start(f"resume={run}", log=log)):
             tally.lost.append(f"{run.name}: the last resume failed")
         if not any(text.startswith(f"{run.name}:") for text in tally.lost):
             tally.finished += 1
-            tally.different += [f"{run.name}: {what}" for what in differences(run, whole)]
+            tally.different += [f"{run.name}: {entry}" for entry in differences(run, whole)]
         number += 1
     return tally
 
 
 def main() -> None:
-    """Run it and print what came of it."""
+    """Print the kills per phase, and lost and different runs; exit with 1 if there are any."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--epochs", type=int, default=12)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--folder", type=Path, help="kept; a temporary one if left out")
+    parser.add_argument("--folder", type=Path, help="folder to keep the runs in")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    Factory([BUILTIN["pivconnector"]()], PRESETS["paper"], 0)  # what it bakes is kept
+    Factory([BUILTIN["pivconnector"]()], PRESETS["paper"], 0)  # the surface is cached
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.folder or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
@@ -211,7 +215,7 @@ def main() -> None:
     kills = ", ".join(f"{count} in {name}" for name, count in sorted(tally.phases.items()))
     print(f"{sum(tally.phases.values())} kills: {kills}")
     print(f"{tally.finished} runs ended, {len(tally.lost)} lost {tally.lost}")
-    print(f"differences from the undisturbed run: {tally.different or 'none'}")
+    print(f"differences from the uninterrupted run: {tally.different or 'none'}")
     raise SystemExit(bool(tally.lost or tally.different))
 
 

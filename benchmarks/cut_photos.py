@@ -39,7 +39,7 @@ THEMES: Final = {
 
 
 def main(themes: Path) -> None:
-    """Cut every photo in the middle, reduce it and write it as JPEG without metadata."""
+    """Crop each photo to its middle, reduce it, and write it as JPEG without metadata."""
     skimage = importlib.util.find_spec("skimage")
     assert skimage is not None
     assert skimage.origin is not None

@@ -1,4 +1,4 @@
-"""How long it takes from maps to poses: one thread, process time; 50×50 maps, and real networks'.
+"""CPU time from maps to poses on one thread, for drawn maps of 50×50 and for released networks.
 
 python benchmarks/decode.py
 """
@@ -6,13 +6,12 @@ python benchmarks/decode.py
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 import torch
-from scipy.ndimage import gaussian_filter
+from common import timed
 from scipy.spatial.transform import Rotation
 
 from dopepp.data.rendered import RenderedSource
@@ -36,7 +35,7 @@ CRACKER_BOX = cuboid_keypoints(
 
 
 def scene(count: int, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-    """Maps of instances on a grid, 110 px in size."""
+    """Return the maps of instances on a grid, 110 px in size."""
     places = [(x, y) for y in (60.0, 155.0, 250.0, 345.0) for x in (70.0, 200.0, 330.0)]
     keypoints = []
     for u, v in places[:count]:
@@ -54,8 +53,8 @@ def scene(count: int, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Ten
     return belief[0], field[0]
 
 
-def disturbed(rng: np.random.Generator, wrong: bool) -> tuple[torch.Tensor, torch.Tensor]:
-    """Maps of one instance with noise, of right keypoints or of wrong ones."""
+def noisy_maps(rng: np.random.Generator, wrong: bool) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the maps of one instance with noise, for correct or wrong keypoints."""
     t = np.array([*rng.uniform(-0.1, 0.1, 2), rng.uniform(0.8, 1.2)])
     T = make_transform(Rotation.random(random_state=rng).as_matrix(), t)
     keypoints = project_keypoints(CRACKER_BOX, T, K)[None]
@@ -74,14 +73,9 @@ def disturbed(rng: np.random.Generator, wrong: bool) -> tuple[torch.Tensor, torc
 
 
 def milliseconds(call: Callable[[], object], repeats: int = REPEATS) -> float:
-    """Median over repeats, after two to warm up."""
+    """Return the median CPU time of a call, after two calls to warm up."""
     call(), call()
-    times = []
-    for _ in range(repeats):
-        start = time.process_time_ns()
-        call()
-        times.append(time.process_time_ns() - start)
-    return float(np.median(times)) / 1e6
+    return float(np.median([timed(call)[1] for _ in range(repeats)]))
 
 
 def main() -> None:
@@ -91,22 +85,19 @@ def main() -> None:
     seed = parser.parse_args().seed
     rng = np.random.default_rng(seed)
     torch.set_num_threads(1)
-    head = ("instances", "found", "recover ms", "peaks ms", "filter ms", "ratio")
-    print("".join(f"{word:>11}" for word in head))
+    print("".join(f"{word:>11}" for word in ("instances", "found", "recover ms", "peaks ms")))
     for count in (1, 3, 10):
         print("".join(f"{value:>11}" for value in row(count, *scene(count, rng))))
-    print(
-        "\nOne instance: noise on its maps (belief 0.02, field 0.05), and keypoints that are wrong:"
-    )
-    print("each by 3 px (standard deviation), one by up to 40 px more; milliseconds")
+    print("\nOne instance, milliseconds: noise on its maps (belief 0.02, field 0.05), and wrong")
+    print("keypoints: each off by 3 px (standard deviation), one by up to 40 px more")
     print(f"{'':>16}{'median':>10}{'9 of 10':>10}")
     for name, wrong in (("noisy maps", False), ("wrong keypoints", True)):
         spent = [
             milliseconds(partial(recover, *maps, CRACKER_BOX[None], K, STRIDE), repeats=3)
-            for maps in (disturbed(rng, wrong) for _ in range(NOISY))
+            for maps in (noisy_maps(rng, wrong) for _ in range(NOISY))
         ]
         print(f"{name:>16}{np.median(spent):10.2f}{np.quantile(spent, 0.9):10.2f}")
-    print("\nTest images: on the network's own maps, and on true ones with the noise of job=cost")
+    print("\nTest images: the network's own maps, and true maps with the noise of job=cost")
     print(f"{'network':>20}{'own ms':>10}{'peaks':>8}{'noisy ms':>10}{'peaks':>8}")
     for name, preset in RELEASED.items():
         clean, own_peaks, noisy, noisy_peaks = released(name, preset, seed)
@@ -114,7 +105,7 @@ def main() -> None:
 
 
 def released(name: str, preset: str, seed: int) -> tuple[float, ...]:
-    """Time recovery behind a released network: medians and mean peaks of both kinds of maps."""
+    """Return median ms and mean number of peaks on a network's maps, then on noisy true maps."""
     estimator = PoseEstimator.load(f"pretrained/{name}")
     geometry = MapGeometry(estimator.network.stride, estimator.recovery.sigma)
     part = BUILTIN[estimator.parts[0].name]()
@@ -122,7 +113,7 @@ def released(name: str, preset: str, seed: int) -> tuple[float, ...]:
     generator = torch.Generator().manual_seed(seed)
     rows = []
     for index in range(IMAGES):
-        sample = source.sample(index)  # of the network's own size: nothing to resize
+        sample = source.sample(index)
         maps = estimator.maps(sample.image)
         noisy = likely_maps(sample, estimator, geometry, generator)
         rows.append([*decoding(maps, sample.K, estimator), *decoding(noisy, sample.K, estimator)])
@@ -131,7 +122,7 @@ def released(name: str, preset: str, seed: int) -> tuple[float, ...]:
 
 
 def decoding(maps: Maps, K: np.ndarray, estimator: PoseEstimator) -> tuple[float, int]:
-    """Time recovery from an image's maps, and count their peaks."""
+    """Return the milliseconds of recovery from maps, and the number of peaks."""
     options, stride = estimator.recovery, estimator.network.stride
     geometry = MapGeometry(stride, options.sigma)
     peaks = find_peaks(maps[0][None], geometry, options.peak_threshold)
@@ -140,17 +131,15 @@ def decoding(maps: Maps, K: np.ndarray, estimator: PoseEstimator) -> tuple[float
 
 
 def row(count: int, belief: torch.Tensor, field: torch.Tensor) -> tuple[str, ...]:
-    """Time the whole way, peak finding alone, and smoothing the nine maps as a yardstick."""
-    geometry, maps = MapGeometry(STRIDE), belief.numpy()
+    """Return the numbers of instances and detections, and ms of recovery and of peak finding."""
+    geometry = MapGeometry(STRIDE)
 
-    def whole() -> int:
+    def num_detections() -> int:
         return len(recover(belief, field, CRACKER_BOX[None], K, STRIDE))
 
-    spent = milliseconds(whole)
+    spent = milliseconds(num_detections)
     peaks = milliseconds(lambda: find_peaks(belief[None], geometry, 0.02, 16, field[None]))
-    smoothing = milliseconds(lambda: [gaussian_filter(belief_map, 3.0) for belief_map in maps])
-    times = (spent, peaks, smoothing, spent / smoothing)
-    return str(count), str(whole()), *(f"{value:.2f}" for value in times)
+    return str(count), str(num_detections()), f"{spent:.2f}", f"{peaks:.2f}"
 
 
 if __name__ == "__main__":

@@ -1,25 +1,26 @@
-"""Depth refinement: ADD before and after, on virtual depth and on real frames.
+"""Refinement on depth: ADD before and after, on rendered depth and on real frames.
 
     python benchmarks/depth.py [--poses 200] [--seed 41] [--ycb FOLDER] [--draws 10]
 
-Virtual: a part in mid-air with nothing behind it, before a wall, or flat on a table; depth with the
-noise of a structured-light camera (σ = 1.5 mm at 0.75 m, growing with the square of the distance,
-1 mm quantisation, no depth at edges and at grazing angles), half of the images with an occluder in
-front; starts 12–16 mm off, mostly along the viewing ray, and turned by 3–5°.
-Real: starts 10 mm off in a random direction and turned by 5° about a
-random axis. Times are process time of one thread.
+Rendered: the part is in mid-air without a background, in front of a wall, or flat on a table. The
+depth has the noise of a structured-light camera: σ = 1.5 mm at 0.75 m, growing with the square of
+the distance, steps of 1 mm, no depth at edges and at grazing angles. Half of the images have an
+occluder. Start poses are shifted by 12–16 mm, mostly along the viewing ray, and rotated by 3–5°.
+
+Real: start poses are shifted by 10 mm and rotated by 5°, both in random directions. Times are CPU
+times of one thread.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
+from common import pose_errors, print_head, print_row, timed
 from scipy.spatial import KDTree
 
 from dopepp.data.formats.ycb_video import read_classes
@@ -37,12 +38,12 @@ from dopepp.virtual.scene import Plane, Scene, SceneObject
 SIZE = (640, 480)
 PLACES = ("air", "wall", "table")
 LEAST_VISIBLE = 0.3
-NO_PICTURE = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+BLACK = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
 Array = np.ndarray
 
 
 def box() -> Part:
-    """Return a box of a cracker box's size (no data set is needed for it)."""
+    """Return a box of the size of YCB's cracker box."""
     half = np.array([0.082, 0.107, 0.036])
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7],
@@ -50,27 +51,27 @@ def box() -> Part:
     return make_part("box", Mesh(signs * half, np.array(faces, np.int32)))
 
 
-def sensed(depth: Array, rng: np.random.Generator) -> Array:
-    """Return depth as a structured-light camera measures it, metres, 0 where it sees nothing."""
+def structured_light(depth: Array, rng: np.random.Generator) -> Array:
+    """Return a depth image with the noise of a structured-light camera, metres; 0 is unknown."""
     noisy = depth + rng.normal(size=depth.shape) * 1.5e-3 * (depth / 0.75) ** 2
     noisy = np.round(noisy, 3)
     step_x = np.abs(np.gradient(depth, axis=1))
     step_y = np.abs(np.gradient(depth, axis=0))
-    # Between neighbours a depth step of four pixel widths is an edge or a surface seen at 76°.
+    # A depth step of four pixel widths between neighbours is an edge, or a surface seen at 76°.
     wide = 4 * depth / 600
     lost = ((step_x > wide) | (step_y > wide)) & (rng.random(depth.shape) < 0.9)
     lost |= rng.random(depth.shape) < 0.02
     return np.where(lost | (depth <= 0), 0, noisy).astype(np.float32)
 
 
-def started(
+def start_pose(
     T: Array,
     rng: np.random.Generator,
     shift: tuple[float, float],
     turn_deg: tuple[float, float],
     along: float,
 ) -> Array:
-    """Return a pose off by a shift (metres) and a turn; ``along`` weighs the viewing ray."""
+    """Return a shifted (metres) and rotated pose; ``along`` weights the viewing ray."""
     ray = T[:3, 3] / np.linalg.norm(T[:3, 3])
     direction = rng.normal(size=3)
     direction += (along - 1) * ray * (direction @ ray)
@@ -83,10 +84,9 @@ def started(
 def scenes(
     part: Part, setting: str, count: int, seed: int
 ) -> Iterator[tuple[Array, Array, Array, np.random.Generator]]:
-    """Yield (noisy depth, K, true pose, generator) of a part."""
+    """Yield noisy depth, K, true pose and random generator of scenes with a part."""
     body, other = (make_body(solid, is_target=False) for solid in (part, servoholder()))
     K = camera_matrix(600, 600, SIZE[0] / 2 - 0.5, SIZE[1] / 2 - 0.5)
-    background = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
     number, num_scenes = 0, 0
     while num_scenes < count:
         rng = np.random.default_rng([seed, number, PLACES.index(setting)])
@@ -99,19 +99,19 @@ def scenes(
         if rng.random() < 0.5:
             angle = rng.uniform(0, 2 * math.pi)
             aside = part.diameter * rng.uniform(0.3, 0.6)
-            place_of_other = t + aside * np.array([math.cos(angle), math.sin(angle), 0])
-            T_other = make_transform(random_rotation(rng), place_of_other * rng.uniform(0.75, 0.9))
+            position = t + aside * np.array([math.cos(angle), math.sin(angle), 0])
+            T_other = make_transform(random_rotation(rng), position * rng.uniform(0.75, 0.9))
             objects.append(SceneObject(other.surface, T_other))
-        rendered = render(Scene(K, background, tuple(objects), plane=plane))
+        rendered = render(Scene(K, BLACK, tuple(objects), plane=plane))
         if rendered.visible_fractions[0] >= LEAST_VISIBLE:
             num_scenes += 1
-            yield sensed(rendered.depth, rng), K, T, rng
+            yield structured_light(rendered.depth, rng), K, T, rng
 
 
 def _posed(
     part: Part, t: Array, setting: str, rng: np.random.Generator
 ) -> tuple[Array, Plane | None]:
-    """Return a pose at t and the plane behind or under the part."""
+    """Return a pose at a position, and the plane behind or under the part."""
     T = make_transform(random_rotation(rng), t)
     if setting == "air":
         return T, None
@@ -120,7 +120,7 @@ def _posed(
     tilt, azimuth = math.radians(rng.uniform(0, 50)), rng.uniform(0, 2 * math.pi)
     across = math.sin(tilt) * np.array([math.cos(azimuth), math.sin(azimuth)])
     normal = np.array([*across, -math.cos(tilt)])
-    # The part lies on its front or its back, turned about the table's normal.
+    # The part lies on its front or back, with a random rotation about the table's normal.
     x = np.cross(normal, [0.0, 1.0, 0.2])
     x /= np.linalg.norm(x)
     flat = np.stack([x, np.cross(normal, x), normal], axis=1)
@@ -133,32 +133,26 @@ def _posed(
     )
 
 
-def add(part: Part, pose: Array, other: Array) -> float:
-    """Return the mean distance of the part's points under two poses, metres."""
-    off = transform(pose, part.points) - transform(other, part.points)
-    return float(np.linalg.norm(off, axis=1).mean())
-
-
-def virtual(part: Part, setting: str, count: int, seed: int) -> str:
-    """Return a row for a part at a place."""
+def rendered_row(part: Part, setting: str, count: int, seed: int) -> list[str]:
+    """Return the table's row for a part in mid-air, in front of a wall or on a table."""
     refiner, rows = PartRefiner(part, ["depth"]), []
     for depth, K, T, rng in scenes(part, setting, count, seed):
-        start = started(T, rng, (0.012, 0.016), (3, 5), along=4)
-        begin = time.process_time()
-        refined = refiner.refine(NO_PICTURE, K, start, depth=depth)
-        took = 1000 * (time.process_time() - begin)
-        both = add(part, start, T), add(part, refined.T_cam_obj, T)
-        rows.append((*both, took, bool(refined.reason)))
+        start = start_pose(T, rng, (0.012, 0.016), (3, 5), along=4)
+        refined, milliseconds = timed(
+            lambda K=K, start=start, depth=depth: refiner.refine(BLACK, K, start, depth=depth)
+        )
+        adds = [pose_errors(pose, T, part.points).add for pose in (start, refined.T_cam_obj)]
+        rows.append((*adds, milliseconds, bool(refined.reason)))
     before, after, took, kept = np.array(rows).T
-    limit = 0.05 * part.diameter
-    accuracy = f"{np.mean(before < limit):.2f} | {np.mean(after < limit):.2f}"
-    medians = f"{1000 * np.median(before):.1f} | {1000 * np.median(after):.1f}"
-    rest = f"{np.mean(after > before):.1%} | {np.mean(kept):.0%} | {np.median(took):.1f}"
-    return f"| {part.name} | {setting} | {accuracy} | {medians} | {rest} |"
+    limit = 50 * part.diameter
+    shares = [f"{np.mean(errors < limit):.2f}" for errors in (before, after)]
+    medians = [f"{np.median(errors):.1f}" for errors in (before, after)]
+    rest = f"{np.mean(after > before):.1%}", f"{np.mean(kept):.0%}", f"{np.median(took):.1f}"
+    return [part.name, setting, *shares, *medians, *rest]
 
 
-def real(root: Path, draws: int, seed: int) -> Iterator[str]:
-    """Yield a row for every object of the frames of a YCB-Video folder."""
+def real_rows(root: Path, draws: int, seed: int) -> Iterator[list[str]]:
+    """Yield a row for each object in the frames of a YCB-Video folder."""
     parts = {name: ycb_part(root, name) for name in read_classes(root)}
     frames = sorted(
         str(path.relative_to(root / "data"))[: -len("-color.png")]
@@ -173,47 +167,43 @@ def real(root: Path, draws: int, seed: int) -> Iterator[str]:
             part, errors = parts[instance.label], []
             for draw in range(draws):
                 rng = np.random.default_rng([seed, number, draw])
-                start = started(instance.T_cam_obj, rng, (0.01, 0.01), (5, 5), along=1)
+                start = start_pose(instance.T_cam_obj, rng, (0.01, 0.01), (5, 5), along=1)
                 refined = refiners[part.name].refine(
                     sample.image, sample.K, start, depth=sample.depth
                 )
-                poses = start, refined.T_cam_obj
-                close = [add_s(part, pose, instance.T_cam_obj) for pose in poses]
-                errors.append([*(add(part, pose, instance.T_cam_obj) for pose in poses), *close])
-            before, after, before_s, after_s = 1000 * np.median(errors, axis=0)
-            yield (
-                f"| {sample.key} | {part.name} | {before:.1f} | {after:.1f} | {before_s:.1f} | "
-                f"{after_s:.1f} |"
-            )
+                both = [(pose, instance.T_cam_obj) for pose in (start, refined.T_cam_obj)]
+                adds = [pose_errors(pose, true, part.points).add for pose, true in both]
+                errors.append([*adds, *(add_s_mm(part, pose, true) for pose, true in both)])
+            yield [sample.key, part.name, *(f"{value:.1f}" for value in np.median(errors, axis=0))]
 
 
-def add_s(part: Part, estimate: Array, truth: Array) -> float:
-    """Return ADD-S, metres."""
+def add_s_mm(part: Part, estimate: Array, truth: Array) -> float:
+    """Return ADD-S in millimetres."""
     nearest = KDTree(transform(estimate, part.points)).query(transform(truth, part.points))[0]
-    return float(np.mean(nearest))
+    return 1e3 * float(np.mean(nearest))
 
 
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--poses", type=int, default=200, help="a part and place")
+    parser.add_argument("--poses", type=int, default=200, help="poses per row")
     parser.add_argument("--seed", type=int, default=41)
-    parser.add_argument("--ycb", type=Path, help="a YCB-Video folder for the second table")
-    parser.add_argument("--draws", type=int, default=10, help="starts of every real object")
-    arguments = parser.parse_args()
+    parser.add_argument("--ycb", type=Path, help="YCB-Video folder, for the second table")
+    parser.add_argument("--draws", type=int, default=10, help="start poses per real object")
+    options = parser.parse_args()
     cv2.setNumThreads(1)
-    print(
-        "| part | place | ADD-0.05d before | after | median mm before | after | worse | kept | ms |"
-    )
-    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    print_head(
+        "part", "place", "ADD-0.05d before", "after", "median mm before", "after", "worse", "kept",
+        "ms",
+    )  # fmt: skip
     for part in (box(), servoholder(), pivconnector()):
         for setting in PLACES:
-            print(virtual(part, setting, arguments.poses, arguments.seed), flush=True)
-    if arguments.ycb is not None:
-        print("\n| frame | object | ADD mm before | after | ADD-S before | after |")
-        print("| --- | --- | --- | --- | --- | --- |")
-        for row in real(arguments.ycb, arguments.draws, arguments.seed):
-            print(row, flush=True)
+            print_row(*rendered_row(part, setting, options.poses, options.seed))
+    if options.ycb is not None:
+        print()
+        print_head("frame", "object", "ADD mm before", "after", "ADD-S mm before", "after")
+        for row in real_rows(options.ycb, options.draws, options.seed):
+            print_row(*row)
 
 
 if __name__ == "__main__":

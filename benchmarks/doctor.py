@@ -1,9 +1,10 @@
-"""What ``dopepp doctor`` finds first on rendered images with known faults.
+"""First finding of ``dopepp doctor`` on rendered images with a known fault.
 
     python benchmarks/doctor.py [--images 40] [--seed 81] [--preset quickstart] [--size 640 480]
                                 [--model pretrained/pivconnector] [--faults blur dark …]
 
-A row a fault: on how many images nothing was wrong, and what was wrong first on the others.
+Each row has a fault, the number of images without a finding, and how often each check was the
+first finding.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from common import print_head, print_row
 
 from dopepp import PoseEstimator
 from dopepp.drawing.pictures import RGBImage
@@ -28,15 +30,21 @@ from dopepp.virtual.scene import Rendered
 from dopepp.virtual.sensor import Sensor, capture, defocus
 
 
-class Taken(NamedTuple):
-    """An image and what is said of its camera."""
+class FaultyImage(NamedTuple):
+    """An image and the camera matrix that is passed to the doctor."""
 
     image: RGBImage
     K: CameraMatrix
 
 
-class Studio:
-    """Renders images of one part, with it and without."""
+class FaultRenderer:
+    """Renders images of one part with each fault.
+
+    Args:
+        part: Built-in part.
+        preset: Preset of the scenes.
+        seed: Seed of the scenes.
+    """
 
     def __init__(self, part: str, preset: Preset, seed: int) -> None:
         parts = [load_part(part)]
@@ -44,20 +52,20 @@ class Studio:
         self.factory = Factory(parts, preset, seed)
         self.empty = Factory(parts, replace(preset, targets_per_image=(0, 0)), seed + 1)
 
-    def good(self, index: int) -> Taken:
+    def good(self, index: int) -> FaultyImage:
         """Return an image without a fault."""
-        return _taken(self.factory.render(0, index))
+        return _image_and_camera(self.factory.render(0, index))
 
-    def absent(self, index: int) -> Taken:
-        """Return one without the part."""
-        return _taken(self.empty.render(0, index))
+    def absent(self, index: int) -> FaultyImage:
+        """Return an image without the part."""
+        return _image_and_camera(self.empty.render(0, index))
 
-    def sized(self, scale: float) -> Callable[[int], Taken]:
-        """Return images with the part so many times as large."""
-        return lambda index: _taken(self.factory.render(0, index, scale))
+    def sized(self, scale: float) -> Callable[[int], FaultyImage]:
+        """Return a function that renders the part larger by a factor."""
+        return lambda index: _image_and_camera(self.factory.render(0, index, scale))
 
-    def hidden(self, index: int) -> Taken:
-        """Cover two thirds of the part's box with another image's background."""
+    def hidden(self, index: int) -> FaultyImage:
+        """Return an image with two thirds of the part's box covered by another background."""
         rendered = self.factory.render(0, index)
         scene, image = rendered.scene, rendered.image.copy()
         T = scene.objects[scene.targets[0]].T_cam_obj
@@ -68,36 +76,36 @@ class Studio:
         x, y = np.random.default_rng(index).integers(low, high - cover + 1)
         region = np.s_[y : y + cover[1], x : x + cover[0]]
         image[region] = self.empty.render(0, index).image[region]
-        return Taken(image, scene.K)
+        return FaultyImage(image, scene.K)
 
-    def lens(self, factor: float) -> Callable[[int], Taken]:
-        """Return good images with a K whose focal lengths are so many times as long."""
+    def lens(self, factor: float) -> Callable[[int], FaultyImage]:
+        """Return a function that multiplies the focal lengths in K by a factor."""
 
-        def taken(index: int) -> Taken:
+        def render(index: int) -> FaultyImage:
             image, K = self.good(index)
             K = K.copy()
             K[[0, 1], [0, 1]] *= factor
-            return Taken(image, K)
+            return FaultyImage(image, K)
 
-        return taken
+        return render
 
-    def spoilt(self, how: Callable[[RGBImage], RGBImage]) -> Callable[[int], Taken]:
-        """Return good images after something was done to them."""
+    def changed(self, change: Callable[[RGBImage], RGBImage]) -> Callable[[int], FaultyImage]:
+        """Return a function that applies a change to an image without a fault."""
 
-        def taken(index: int) -> Taken:
+        def render(index: int) -> FaultyImage:
             image, K = self.good(index)
-            return Taken(how(image), K)
+            return FaultyImage(change(image), K)
 
-        return taken
+        return render
 
-    def faults(self) -> dict[str, Callable[[int], Taken]]:
-        """Return how an image with each fault is taken."""
+    def faults(self) -> dict[str, Callable[[int], FaultyImage]]:
+        """Return, by fault, the function that renders the image with a given index."""
         return {
             "none": self.good,
-            "blur of 2 px": self.spoilt(lambda image: defocus(image, 2.0)),
-            "blur of 5 px": self.spoilt(lambda image: defocus(image, 5.0)),
-            "a 16th of the light": self.spoilt(lambda image: capture(image, Sensor(-4.0))),
-            "8 times the light": self.spoilt(lambda image: capture(image, Sensor(3.0))),
+            "blur of 2 px": self.changed(lambda image: defocus(image, 2.0)),
+            "blur of 5 px": self.changed(lambda image: defocus(image, 5.0)),
+            "a 16th of the light": self.changed(lambda image: capture(image, Sensor(-4.0))),
+            "8 times the light": self.changed(lambda image: capture(image, Sensor(3.0))),
             "K twice as long": self.lens(2.0),
             "K half as long": self.lens(0.5),
             "part 0.4 times as large": self.sized(0.4),
@@ -109,44 +117,40 @@ class Studio:
 
 
 def main() -> None:
-    """Print a row for every fault."""
+    """Print a row per fault."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--images", type=int, default=40, help="a fault")
+    parser.add_argument("--images", type=int, default=40, help="images per fault")
     parser.add_argument("--seed", type=int, default=81)
     parser.add_argument("--model", default="pretrained/pivconnector")
     parser.add_argument("--part", default="pivconnector")
     parser.add_argument("--preset", default="quickstart")
-    parser.add_argument("--size", type=int, nargs=2, help="width height; else the network's")
-    parser.add_argument("--faults", nargs="+", default=[""], help="those with one of these words")
+    parser.add_argument("--size", type=int, nargs=2, help="width height; default: the network's")
+    parser.add_argument("--faults", nargs="+", default=[""], help="words in the faults' names")
     parser.add_argument("--show", action="store_true", help="print every finding")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     estimator, preset = PoseEstimator.load(arguments.model), PRESETS[arguments.preset]
     size = arguments.size or estimator.checkpoint.input_size
-    studio = Studio(arguments.part, preset.reframed(*size), arguments.seed)
-    print("| fault | nothing wrong | first finding |")
-    print("| --- | ---: | --- |")
-    for name, take in studio.faults().items():
+    renderer = FaultRenderer(arguments.part, preset.reframed(*size), arguments.seed)
+    print_head("fault", "no finding", "first finding")
+    for name, take in renderer.faults().items():
         if not any(word in name for word in arguments.faults):
             continue
         firsts: Counter[str] = Counter()
         for index in range(arguments.images):
             image, K = take(index)
-            wrong = [
-                finding
-                for finding in diagnose(Case(estimator, image, K, estimator.parts))
-                if finding.fix
-            ]
-            firsts[wrong[0].subject if wrong else ""] += 1
+            results = diagnose(Case(estimator, image, K, estimator.parts))
+            findings = [result for result in results if result.fix]
+            firsts[findings[0].subject if findings else ""] += 1
             if arguments.show:
-                print(index, *wrong, sep="\n    ")
+                print(index, *findings, sep="\n    ")
         fine = firsts.pop("", 0)
         listed = ", ".join(f"{subject} {count}" for subject, count in firsts.most_common())
-        print(f"| {name} | {fine} of {arguments.images} | {listed} |", flush=True)
+        print_row(name, f"{fine} of {arguments.images}", listed)
 
 
-def _taken(rendered: Rendered) -> Taken:
-    return Taken(rendered.image, rendered.scene.K)
+def _image_and_camera(rendered: Rendered) -> FaultyImage:
+    return FaultyImage(rendered.image, rendered.scene.K)
 
 
 if __name__ == "__main__":

@@ -1,14 +1,16 @@
-"""What networks do on a GPU, and whether renders keep up: a table of at most forty minutes.
+"""Speed of the networks on a GPU, and of rendering on the machine's cores, within forty minutes.
 
     python benchmarks/gpu.py [--out outputs/gpu] [--minutes 40] [--device cuda]
 
-Of ``dope``, ``dopepp`` and ``dopepp_fast``, untrained, at 416×416: milliseconds of one image's
-maps (median, 95th percentile), images a second in batches of 64, training images a second
-(targets, forward, loss, backward, optimiser), images a second that the loader renders on its cores,
-and training images a second while it does. Rows are written one by one to ``rows.json`` and
-``rows.md`` in ``--out``. After an interruption, or where the time was short, the same command
-measures the rows that are missing and those that failed. ``--device cpu --quick`` tries all of it
-in miniature.
+For the untrained ``dope``, ``dopepp`` and ``dopepp_fast`` at 416×416, the tables have
+
+- milliseconds of one image's maps (median, 95th percentile), images per second in batches of 64;
+- training images per second (targets, forward, loss, backward, optimiser);
+- images per second that the data loader renders, and training images per second on these renders.
+
+Each row is written to ``rows.json`` and ``rows.md`` in ``--out`` when it is measured. After an
+interruption or the end of the time, the same command measures missing and failed rows.
+``--device cpu --quick`` runs everything in miniature.
 """
 
 from __future__ import annotations
@@ -52,7 +54,7 @@ Values = dict[str, float | str]
 
 
 class Size(NamedTuple):
-    """How large all is: pixels, images, images of a training batch, seconds a measurement."""
+    """Sizes of the measurements: pixels, batch sizes, seconds per measurement, network width."""
 
     pixels: int
     batch: int
@@ -65,7 +67,7 @@ FULL, QUICK = Size(416, 64, 32, 5.0, 1.0), Size(64, 4, 4, 0.3, 0.25)
 
 
 class Row(NamedTuple):
-    """A line of a table: what is measured, and how."""
+    """A row of a table: table, settings, and the function that measures it."""
 
     table: str
     setting: dict[str, str]
@@ -73,18 +75,18 @@ class Row(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What tells it from all others."""
+        """The unique name of the row."""
         return " ".join([self.table, *self.setting.values()])
 
 
-class Workshop:
+class Measurements:
     """Measures networks of one size on one device."""
 
     def __init__(self, device: str, size: Size) -> None:
         self.device, self.size = torch.device(device), size
 
     def rows(self) -> Iterator[Row]:
-        """Yield all lines; what is asked most comes first."""
+        """Yield all rows, the most important first."""
         on_gpu = self.device.type == "cuda"
         eager, compiled = ([*DTYPES], ["tf32", "bf16"]) if on_gpu else (["fp32", "bf16"], ["fp32"])
         ways = [*product(eager, ["eager"]), *product(compiled, ["compiled"])]
@@ -92,7 +94,7 @@ class Workshop:
         for table, measure in (("inference", self.inference), ("training", self.training)):
             for precision, how in ways:
                 if table == "training" and precision == "fp16":
-                    continue  # training takes bf16 where there is any
+                    continue  # training uses bf16
                 fast = how == "eager" or self.size != QUICK  # compiling takes minutes on a CPU
                 for model in MODELS if fast else MODELS[-1:]:
                     setting = {"network": model, "precision": precision, "how": how}
@@ -101,10 +103,11 @@ class Workshop:
             yield Row("rendering", {"workers": str(workers)}, partial(self.rendering, workers))
         for model in MODELS:
             setting = {"network": model, "precision": "bf16", "workers": str(cores)}
-            yield Row("training on renders", setting, partial(self.fed, model, cores))
+            measure = partial(self.training_on_renders, model, cores)
+            yield Row("training on renders", setting, measure)
 
     def inference(self, model: str, precision: str, compiled: bool) -> Values:
-        """Time one image, and batches, from pixels on the device to maps on the device."""
+        """Measure single images and batches, from pixels on the device to maps on the device."""
         network = runtimes.placed(self._system(model)[0].network, self.device)
         network = network.to(DTYPES[precision])
         if compiled:
@@ -124,7 +127,7 @@ class Workshop:
         return values
 
     def training(self, model: str, precision: str, compiled: bool) -> Values:
-        """Time training steps on one batch of renders that lies on the device."""
+        """Measure training steps on one batch of renders on the device."""
         system, data = self._system(model, compiled)
         items = [data.train_item(0, index) for index in range(self.size.training_batch)]
         batch = collate(items, {name: number for number, name in enumerate(data.object_names)})
@@ -134,12 +137,12 @@ class Workshop:
         return {"images/s": len(batch) / float(np.median(seconds))}
 
     def rendering(self, workers: int) -> Values:
-        """Count the images that the loader renders, masks and augments."""
+        """Measure the images per second that the loader renders, masks and augments."""
         _, data = self._system("dopepp_fast", workers=workers)
         return {"images/s": self._rate(data, lambda _: None)}
 
-    def fed(self, model: str, workers: int) -> Values:
-        """Count training images while the loader renders them."""
+    def training_on_renders(self, model: str, workers: int) -> Values:
+        """Measure training images per second while the loader renders them."""
         system, data = self._system(model, workers=workers)
         step = self._step(system, "bf16")
         return {"images/s": self._rate(data, lambda batch: step(batch.to(self.device)))}
@@ -162,7 +165,7 @@ class Workshop:
         return system, build_datamodule(config.data, parts, config.seed)
 
     def _step(self, system: PoseSystem, precision: str) -> Callable[[Batch], None]:
-        """Return a step of training, as Lightning makes it."""
+        """Return a function that makes a training step on a batch."""
         parameters = [*system.network.parameters()]
         optimizer = system.make_optimizer(parameters)
         half = precision == "bf16"
@@ -179,12 +182,12 @@ class Workshop:
         return step
 
     def _precision(self, precision: str) -> AbstractContextManager[Any]:
-        """Allow or forbid TensorFloat-32 in convolutions and products."""
+        """Allow or forbid TensorFloat-32 in convolutions and matrix products."""
         torch.set_float32_matmul_precision("high" if precision == "tf32" else "highest")
         return torch.backends.cudnn.flags(benchmark=True, allow_tf32=precision == "tf32")
 
     def _times(self, call: Callable[[], object]) -> list[float]:
-        """Time calls for some seconds, each until the device is done."""
+        """Return the seconds of calls, each until the device has finished."""
         seconds: list[float] = []
         begun = time.perf_counter()
         while len(seconds) < 2 * WARM_UP or time.perf_counter() - begun < self.size.seconds:
@@ -197,7 +200,7 @@ class Workshop:
         return seconds[WARM_UP:]
 
     def _rate(self, data: PoseDataModule, use: Callable[[Batch], None]) -> float:
-        """Count images a second behind what the workers prepare in advance."""
+        """Return images per second, without the batches that workers prepare in advance."""
         loader, images, begun, ready = data.train_dataloader(), 0, 0.0, 2 * data.num_workers
         for number, batch in enumerate(loader):
             use(batch)
@@ -217,14 +220,16 @@ class Workshop:
 
 
 def measure(rows: list[Row], folder: Path, machine: str, minutes: float) -> int:
-    """Measure the rows that ``folder`` does not hold; return how many are missing at the end.
+    """Measure the rows missing in a folder; return the number of rows that are still missing.
 
-    A row that a device has no room for, or that torch cannot compile, is written with the reason.
+    A row that needs too much memory or that torch cannot compile is written with the reason.
     """
     file, begun = folder / "rows.json", time.monotonic()
     kept = json.loads(file.read_text()) if file.is_file() else {"machine": machine, "rows": {}}
     if kept["machine"] != machine:
-        raise SystemExit(f"{file} is of {kept['machine']}, this is {machine}: take another --out")
+        raise SystemExit(
+            f"{file} was measured on {kept['machine']}, not on {machine}: pass another --out"
+        )
     done: dict[str, Values] = kept["rows"]
     for row in rows:
         if row.name in done and "failed" not in done[row.name]:
@@ -246,7 +251,7 @@ def measure(rows: list[Row], folder: Path, machine: str, minutes: float) -> int:
 
 
 def markdown(rows: list[Row], done: Mapping[str, Values], machine: str) -> Iterator[str]:
-    """Yield the lines of a table for each kind of row."""
+    """Yield the lines of all tables."""
     yield machine
     for table in dict.fromkeys(row.table for row in rows):
         listed = [row for row in rows if row.table == table and row.name in done]
@@ -261,31 +266,32 @@ def markdown(rows: list[Row], done: Mapping[str, Values], machine: str) -> Itera
 
 
 def shown(value: float | str) -> str:
-    """Write a number in three digits."""
+    """Return a number with three digits."""
     return value if isinstance(value, str) else f"{value:.3g}" if value < 100 else f"{value:.0f}"
 
 
 def main() -> None:
-    """Measure what is missing, and say whether the same command has to be called again."""
+    """Measure missing rows, and print whether rows are still missing."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("outputs/gpu"))
-    parser.add_argument("--minutes", type=float, default=35, help="no row begins after these")
+    parser.add_argument("--minutes", type=float, default=35, help="start no row after this time")
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--quick", action="store_true", help="small networks and images")
     asked = parser.parse_args()
     if asked.device.startswith("cuda") and not torch.cuda.is_available():
-        raise SystemExit("PyTorch sees no GPU here: --device cpu --quick tries the command")
+        raise SystemExit("PyTorch finds no GPU; --device cpu --quick tests the command")
     on_gpu = asked.device.startswith("cuda")
     name = torch.cuda.get_device_name(asked.device) if on_gpu else platform.machine()
     size, cores = QUICK if asked.quick else FULL, available_cores()
     side = f"{size.pixels}×{size.pixels} pixels"
     machine = f"{name}, {cores} cores, PyTorch {torch.__version__}, {side}"
-    rows = [*Workshop(asked.device, size).rows()]
+    rows = [*Measurements(asked.device, size).rows()]
     try:
         missing = measure(rows, asked.out, machine, asked.minutes)
     except KeyboardInterrupt:
-        raise SystemExit(f"interrupted; {asked.out} has the rows so far") from None
-    print(asked.out / "rows.md", f"lacks {missing} rows: again" if missing else "is complete")
+        raise SystemExit(f"interrupted; {asked.out} holds the measured rows") from None
+    state = f"lacks {missing} rows: run the command again" if missing else "is complete"
+    print(asked.out / "rows.md", state)
 
 
 if __name__ == "__main__":

@@ -1,74 +1,49 @@
-"""Training speed of DOPE++ with other heads, interleaved in one process.
+"""Training speed of DOPE++ with different heads, in turn in one process.
 
-``python benchmarks/heads.py`` prints images a second of a training step at the laptop's scale
-(width 0.25, 128×128 pixels), one thread, and each head's ratio to the first one's.
+``python benchmarks/heads.py`` prints images per second of a training step at ``scale=laptop``
+(width 0.25, 128×128 pixels) on one thread, and each head's speed relative to the first head.
 """
 
 from __future__ import annotations
 
 import statistics
-import time
-from typing import Any
 
 import torch
+from runtimes import untrained
+from train_step import BATCH, SIZE, make_step, seconds
 
 from dopepp.experiment.assembly.build_system import choose_precision, keep_freed_memory
-from dopepp.models.losses import SpatialCrossEntropy
-from dopepp.models.network import PoseNetwork, build_network, network_cost
+from dopepp.models.network import network_cost
 
-BATCH, SIZE, WIDTH = 32, 128, 0.25
 STEPS, ROUNDS = 4, 7
-HEADS: dict[str, dict[str, Any]] = {
-    "features handed on, 1 stage": {"maps": None},
-    "2 stages": {"maps": None, "stages": 2},
-    "3 stages": {"maps": None, "stages": 3},
-    "6 stages": {"maps": None, "stages": 6},
-    "maps handed on": {"maps": "plain"},
-    "maps handed on and learned": {"maps": "learned"},
+FEATURES = "model.head.maps=null"
+HEADS = {
+    "features, 1 stage": [FEATURES],
+    "features, 2 stages": [FEATURES, "model.head.stages=2"],
+    "features, 3 stages": [FEATURES, "model.head.stages=3"],
+    "features, 6 stages": [FEATURES, "model.head.stages=6"],
+    "maps, plain": ["model.head.maps=plain"],
+    "maps, learned": ["model.head.maps=learned"],
 }
-
-
-def network_with(head: dict[str, Any]) -> PoseNetwork:
-    """Return DOPE++ with a head."""
-    name = "dopepp.models.heads.MultiScale"
-    return build_network(
-        {
-            "backbone": {"_target_": "dopepp.models.backbones.DSC", "width": WIDTH},
-            "attention": {"_target_": "dopepp.models.attention.CBAM"},
-            "head": {"_target_": name, "width": WIDTH, "batch_norm": True, **head},
-            "activation": "exp",
-            "num_objects": 1,
-        }
-    ).to(memory_format=torch.channels_last)
-
-
-def seconds(network: PoseNetwork) -> float:
-    """Time a few training steps: forward, loss and backward."""
-    loss = SpatialCrossEntropy(sigma=1.0)
-    images = torch.randint(0, 256, (BATCH, 3, SIZE, SIZE), dtype=torch.uint8)
-    images = images.contiguous(memory_format=torch.channels_last)
-    belief = torch.rand(BATCH, 9, SIZE // 8, SIZE // 8)
-    field = torch.rand(BATCH, 16, SIZE // 8, SIZE // 8)
-    half = choose_precision("auto", "cpu")[0].startswith("bf16")
-    start = time.perf_counter()
-    for _ in range(STEPS):
-        with torch.autocast("cpu", torch.bfloat16, enabled=half):
-            stages = network(images)
-        loss(stages, belief, field)[0].backward()
-    return (time.perf_counter() - start) / STEPS
+"""Options of each head: what the scales pass to the fusion, and the number of stages."""
 
 
 def main() -> None:
     """Print a line per head."""
     torch.set_num_threads(1)
     keep_freed_memory()
-    networks = {name: network_with(head) for name, head in HEADS.items()}
+    half = choose_precision("auto", "cpu")[0].startswith("bf16")
+    networks = {
+        name: untrained("dopepp", "model.width=0.25", *head)[0].to(
+            memory_format=torch.channels_last
+        )
+        for name, head in HEADS.items()
+    }
+    steps = {name: make_step(network, half) for name, network in networks.items()}
     times: dict[str, list[float]] = {name: [] for name in networks}
-    for network in networks.values():
-        seconds(network)
     for _ in range(ROUNDS):
-        for name, network in networks.items():
-            times[name].append(seconds(network))
+        for name, step in steps.items():
+            times[name].append(seconds(step, STEPS))
     first = next(iter(times))
     for name, network in networks.items():
         ratio = statistics.median(a / b for a, b in zip(times[first], times[name], strict=True))

@@ -1,4 +1,4 @@
-"""CPU time of a heap, heaps per minute on two cores, and the largest overlap of meshes.
+"""CPU time per simulated heap, heaps per minute on two cores, and the largest overlap of meshes.
 
 python benchmarks/heaps.py --heaps 60
 """
@@ -22,11 +22,11 @@ from dopepp.parts.convex import convex_pieces
 from dopepp.parts.mesh import SurfaceTree
 from dopepp.virtual import PRESETS, Factory, SceneObject, Surface
 
-SAMPLES = 300  # tested surface points of an object
+SAMPLES = 300  # tested surface points per object
 
 
 def heap(text: str, unit: str | None, index: int) -> tuple[float, ...]:
-    """Simulate a heap; return its number of objects, CPU seconds and largest overlap, diameters."""
+    """Simulate a heap; return the number of objects, CPU seconds, and overlap in diameters."""
     part = named_part(text, unit)
     Factory([part], PRESETS["table"], 0).scene(0, index)  # compiles
     factory = Factory([part], PRESETS["heap"], 0)
@@ -51,7 +51,7 @@ def overlap(first: SceneObject, second: SceneObject) -> float:
 
 @cache
 def tree(surface: Surface) -> SurfaceTree:
-    """Return a search tree of a surface's points."""
+    """Return the search tree of a surface."""
     return SurfaceTree(surface.vertices, surface.faces)
 
 
@@ -66,7 +66,7 @@ def is_inside(point: np.ndarray, corners: np.ndarray) -> bool:
 
 
 def main() -> None:
-    """Print a row for each part."""
+    """Print a row per part."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("parts", nargs="*", default=["pivconnector", "servoholder"])
     parser.add_argument("--unit")

@@ -1,7 +1,7 @@
-"""What a network costs in PyTorch on a CPU: as it was trained, and as the estimator runs it.
+"""CPU time of networks in PyTorch: as trained, and with batch norm folded into the convolutions.
 
-``python benchmarks/inference.py`` prints the 10th percentile of a frame's milliseconds, batch 1,
-all sides in turn in one process, on one thread and on two.
+``python benchmarks/inference.py`` prints the 10th percentile of the milliseconds per frame (batch
+1) on one thread and on two. Both variants run in turn in one process.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from functools import partial
 
 import numpy as np
 import torch
+from runtimes import untrained
 
-from dopepp.models.network import PoseNetwork, build_network, network_cost
+from dopepp.models.network import network_cost
 
 FRAMES = {128: 30, 416: 4}
 CASES = (
@@ -22,35 +23,17 @@ CASES = (
     ("dopepp_fast", 416, 1.0),
     ("dopepp", 416, 1.0),
 )
-"""Model, input size, pixels, and width: the quickstart's, and the full networks."""
+"""Model, input size in pixels, and width: the quickstart's network, and the full networks."""
 
 
-def network(model: str, width: float) -> PoseNetwork:
-    """Return an untrained network."""
-    fast = model == "dopepp_fast"
-    module = "dopepp.models"
-    head = "SharedTrunk" if fast else "MultiScale"
-    options = {} if fast else {"batch_norm": True, "maps": "learned"}
-    backbone, attention = ("Pyramid", "Identity") if fast else ("DSC", "CBAM")
-    return build_network(
-        {
-            "backbone": {"_target_": f"{module}.backbones.{backbone}", "width": width},
-            "attention": {"_target_": f"{module}.attention.{attention}"},
-            "head": {"_target_": f"{module}.heads.{head}", "width": width, **options},
-            "activation": "exp",
-            "num_objects": 1,
-        }
-    ).eval()
-
-
-def milliseconds(sides: list[Callable[[], object]], frames: int) -> list[float]:
-    """Time the sides in turn."""
+def milliseconds(calls: list[Callable[[], object]], frames: int) -> list[float]:
+    """Return the 10th percentile of each call's time; the calls run in turn."""
     rows = []
     for _ in range(frames + 2):
         row = []
-        for side in sides:
+        for call in calls:
             start = time.perf_counter_ns()
-            side()
+            call()
             row.append((time.perf_counter_ns() - start) / 1e6)
         rows.append(row)
     return list(np.quantile(rows[2:], 0.1, axis=0))
@@ -62,7 +45,8 @@ def main() -> None:
     words = ("model", "size", "GMACs", "threads", "trained ms", "folded ms", "ratio", "worst maps")
     print("".join(f"{word:>12}" for word in words))
     for model, size, width in CASES:
-        trained = network(model, width).to(memory_format=torch.channels_last)
+        trained = untrained(model, f"model.width={width}")[0].eval()
+        trained = trained.to(memory_format=torch.channels_last)
         folded = trained.for_inference()
         pixels = torch.randint(0, 256, (1, size, size, 3), dtype=torch.uint8).permute(0, 3, 1, 2)
         worst = max(
@@ -72,8 +56,8 @@ def main() -> None:
         cost = network_cost(trained, (size, size))[1]
         for threads in (1, 2):
             torch.set_num_threads(threads)
-            sides = [partial(side.maps, pixels) for side in (trained, folded)]
-            before, after = milliseconds(sides, FRAMES[size])
+            calls = [partial(network.maps, pixels) for network in (trained, folded)]
+            before, after = milliseconds(calls, FRAMES[size])
             times = f"{before:.1f}", f"{after:.1f}", f"{before / after:.2f}"
             row = (model, size, f"{cost:.2f}", threads, *times, f"{worst:.1e}")
             print("".join(f"{value:>12}" for value in row), flush=True)

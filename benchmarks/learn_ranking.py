@@ -3,10 +3,10 @@
     python benchmarks/learn_ranking.py samples.pickle --parts 40 --scenes 8 [--seed 0]
     python benchmarks/learn_ranking.py samples.pickle --fit
 
-The first command renders random parts in any rotation among clutter and look-alikes, and stores the
-features of the ranked matches, and start score, verification and error of refined poses. Run it
-with other ``--seed`` values in parallel and pass all files to ``--fit``, which learns both models,
-prints their quality on parts that they have not seen, and writes ``ranking.json``.
+The first command renders random parts in any rotation among clutter and look-alikes. It stores the
+features of the ranked matches, and the start score, verification and error of refined poses. Run it
+with several ``--seed`` values in parallel and pass all files to ``--fit``. This command fits both
+models, prints their quality on held-out parts, and writes ``ranking.json``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from learn_verification import errors, look_alike, random_part
+from learn_verification import errors, look_alike, random_part, scene_preset
 from scipy.optimize import minimize
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import brier_score_loss
@@ -30,15 +30,14 @@ from dopepp.parts.symmetry_finder import find_symmetries
 from dopepp.recovery.detection import refined_features
 from dopepp.virtual.backgrounds import find_backgrounds
 from dopepp.virtual.factory import Factory
-from dopepp.virtual.presets import preset_of
 
 SIZE, FOCAL = (480, 360), 450.0
 SMALLEST_PX, LARGEST_PX = 70.0, 260.0
-RATIO = 1.5  # of the working distances
+RATIO = 1.5  # farthest working distance / nearest working distance
 RIGHT_TURN, RIGHT_PLACE, RIGHT_DEPTH = 12.0, 0.08, 0.06  # degrees, diameters, relative
-HELD_OUT = 4  # every fourth part judges the models
+HELD_OUT = 4  # every fourth part is held out
 RIDGE = 1e-2
-KEPT = 6  # refined poses of each image
+KEPT = 6  # refined poses per image
 
 
 def samples(number: int, num_scenes: int, seed: int) -> list[dict[str, np.ndarray]]:
@@ -48,21 +47,14 @@ def samples(number: int, num_scenes: int, seed: int) -> list[dict[str, np.ndarra
     assert part.mesh is not None
     discrete, continuous = find_symmetries(part.mesh)
     if (discrete is not None and len(discrete)) or continuous:
-        return []  # several rotations would be right
+        return []  # several rotations would be correct
     near = part.diameter * FOCAL / rng.uniform(SMALLEST_PX * RATIO, LARGEST_PX)
     distances = (near, RATIO * near)
-    preset = preset_of(
-        "wide",
-        {
-            "width": SIZE[0], "height": SIZE[1],
-            "intrinsics_px": [FOCAL, FOCAL, SIZE[0] / 2 - 0.5, SIZE[1] / 2 - 0.5],
-            "turning": {"kind": "free"},
-            "placement": {"kind": "distance", "nearest": distances[0], "farthest": distances[1]},
-            "min_visible_fraction": 0.6, "clutter": [0, 60], "background_contrast": [0.5, 1.8],
-            "distractors": {"number": [0, 6], "lookalike_share": 0.3},
-            "materials": {"metal_share": 0.1, "coloured_share": 0.5},
-        },
-        "scene",
+    preset = scene_preset(
+        SIZE, FOCAL, distances,
+        min_visible_fraction=0.6,
+        distractors={"number": [0, 6], "lookalike_share": 0.3},
+        materials={"metal_share": 0.1, "coloured_share": 0.5},
     )  # fmt: skip
     backgrounds, other = find_backgrounds(None, "train"), look_alike(rng, part)
     true = Factory([part], preset, seed, backgrounds, negatives=[other])
@@ -97,7 +89,7 @@ def samples(number: int, num_scenes: int, seed: int) -> list[dict[str, np.ndarra
 
 
 def _near(transforms: np.ndarray, T: Transform, diameter: float) -> np.ndarray:
-    """Return which poses refinement would move to the true one."""
+    """Return whether each pose is close enough to the true pose for refinement to converge."""
     trace = np.einsum("nij,ij->n", transforms[:, :3, :3], T[:3, :3])
     turns = np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
     apart = np.linalg.norm(transforms[:, :2, 3] - T[:2, 3], axis=1)
@@ -128,7 +120,7 @@ def fit_ranking(rows: list[dict[str, np.ndarray]]) -> np.ndarray:
 
 
 def fit_bias(rows: list[dict[str, np.ndarray]], weights: np.ndarray) -> float:
-    """Return the bias that makes the best score of an image the log odds that it is right."""
+    """Return the bias with which an image's best score is the log odds of a correct match."""
     best = [(row["features"] @ weights).argmax() for row in rows]
     scores = [float(row["features"][i] @ weights) for row, i in zip(rows, best, strict=True)]
     labels = [bool(row["is_right"][i]) for row, i in zip(rows, best, strict=True)]
@@ -137,7 +129,7 @@ def fit_bias(rows: list[dict[str, np.ndarray]], weights: np.ndarray) -> float:
 
 
 def main() -> None:
-    """Make samples, or learn from them."""
+    """Write samples, or fit the models."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("samples", type=Path, nargs="+")
     parser.add_argument("--parts", type=int, default=40)
@@ -172,7 +164,7 @@ def main() -> None:
 
 
 def fit_slope(rows: list[dict[str, np.ndarray]]) -> tuple[float, float]:
-    """Return the level and slope that turn log odds of verification into those of a best pose."""
+    """Return offset and slope from the verification's log odds to those of a correct best pose."""
     odds = np.concatenate([row["odds"] for row in rows])
     labels = np.concatenate([row["is_end_right"] for row in rows])
     model = LogisticRegression().fit(odds[:, None], labels)
@@ -182,7 +174,7 @@ def fit_slope(rows: list[dict[str, np.ndarray]]) -> tuple[float, float]:
 def report(
     weights: np.ndarray, line: tuple[float, float], rows: list[dict[str, np.ndarray]]
 ) -> None:
-    """Print the quality on parts that were not learned."""
+    """Print the quality on held-out parts."""
     shown = [row for row in rows if row["is_right"].any()]
     ranks = np.array(
         [row["is_right"][np.argsort(-row["features"] @ weights)].argmax() for row in shown]

@@ -1,11 +1,11 @@
-"""Learn the initial weights of ``init_from=auto`` from random parts, within a time.
+"""Learn the initial weights of ``init_from=auto`` from random parts in a given time, on a GPU.
 
     python benchmarks/learn_start.py data/start --minutes 6 [--parts 160] [--from auto]
 
-Random parts are bodies with bosses, ribs, holes and slots, as machined or printed parts have. One
-network learns the poses of all, at any turn in the image and tilts of up to 60°. The weights of
-all layers except the output layers, which belong to the parts, are written as
-``dopepp_fast.safetensors`` to the folder, beside the parts' meshes. Needs a GPU.
+Random parts are bodies with bosses, ribs, holes and slots, similar to machined or printed parts. A
+single network learns the poses of all parts, with any in-plane rotation and tilts of up to 60°. The
+weights of all layers except the output layers, which are specific to the parts, are written to
+``dopepp_fast.safetensors`` in the folder, which also holds the parts' meshes.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from dopepp.training.system import PoseSystem
 DIAMETERS_MM = (35.0, 60.0)
 _SEGMENTS = 48  # sides of a round feature
 _WARM_UP = 0.05  # share of the time in which the learning rate grows
-_WINDOWS = 250_000  # rendered once, augmented anew every time
+_WINDOWS = 250_000  # rendered once, with new augmentation in each epoch
 
 
 def random_part(rng: np.random.Generator) -> trimesh.Trimesh:
-    """Return a random part, a closed mesh in millimetres with its box's centre at the origin."""
+    """Return a random closed mesh in millimetres, with the centre of its box at the origin."""
     while True:
         solid = _body(rng)
         for _ in range(rng.integers(1, 5)):
@@ -61,7 +61,7 @@ def random_part(rng: np.random.Generator) -> trimesh.Trimesh:
 
 
 def _body(rng: np.random.Generator) -> Manifold:
-    """Return a block, a disc or cone, a plate with a polygonal outline, or an angle."""
+    """Return a block, a disc or cone, a plate with a polygonal outline, or an L-shape."""
     kind = rng.integers(4)
     size = rng.uniform([15, 15, 4], [45, 35, 25])
     if kind == 0:
@@ -82,7 +82,7 @@ def _body(rng: np.random.Generator) -> Manifold:
 
 
 def _feature(rng: np.random.Generator, solid: Manifold, cut: bool) -> Manifold:
-    """Return a cylinder, a cone or a block in the box of a solid, mostly along an axis."""
+    """Return a cylinder, cone or block inside a solid's bounding box, mostly along an axis."""
     bounds = np.reshape(solid.bounding_box(), (2, 3))
     extent = bounds[1] - bounds[0]
     centre = bounds[0] + extent * rng.uniform(0.1, 0.9, 3)
@@ -109,7 +109,7 @@ def write_parts(folder: Path, number: int, seed: int) -> list[Path]:
 
 
 def learn(system: PoseSystem, data: PoseDataModule, minutes: float, device: str) -> int:
-    """Train for a time with one cycle of the learning rate; return the number of images."""
+    """Train for a given time with a one-cycle schedule; return the number of images."""
     optimizer = system.make_optimizer(system.parameters())
     rates = [group["lr"] for group in optimizer.param_groups]
     system.to(device).train()
@@ -161,8 +161,8 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--minutes", type=float, default=6.0)
     parser.add_argument("--parts", type=int, default=160)
-    parser.add_argument("--seed", type=int, default=0, help="of the parts")
-    parser.add_argument("--from", dest="start", default="null", help="weights to begin with")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the parts")
+    parser.add_argument("--from", dest="start", default="null", help="initial weights")
     parser.add_argument("--device", default="cuda")
     parser.add_argument("overrides", nargs="*", help="e.g. data.batch_size=32")
     args = parser.parse_intermixed_args()
@@ -172,13 +172,13 @@ def main() -> None:
     config = config_of(
         "dopepp_fast", "experiment=my_part", f"data.parts=[{files}]", "data.input_size=[128,128]",
         f"data.samples_per_epoch={_WINDOWS}", "data.batch_size=160", "optimizer.lr=0.012",
-        # Most maps are of absent parts, which the other terms of the loss are divided by.
+        # Most maps belong to absent parts; the belief terms of the loss are averages over all maps.
         f"model.loss.field_weight={2 / args.parts}", f"init_from={args.start}", *args.overrides,
     )  # fmt: skip
     torch.manual_seed(config.seed)
     parts = build_parts(config.data)
     data = build_datamodule(config.data, parts, config.seed)
-    data.train_item(0, 0)  # compiles the kernels before the workers fork
+    data.train_item(0, 0)  # compiles the rendering code before the workers fork
     system = build_system(config, parts, "")
     print(f"{learn(system, data, args.minutes, args.device)} images")
     save_start(system.network, args.folder / "dopepp_fast.safetensors")

@@ -3,10 +3,10 @@
     python benchmarks/learn_verification.py samples.npz --parts 60 --scenes 40 [--photos DIR]
     python benchmarks/learn_verification.py samples.npz --fit
 
-The first command renders random parts among clutter, occluders and look-alikes, refines poses that
-start near and far from the true one, and stores their evidence and whether they are right. Run it
-with other ``--seed`` values in parallel and pass all files to ``--fit``, which learns the model,
-prints its quality on parts that it has not seen, and writes ``verification.json``.
+The first command renders random parts among clutter, occluders and look-alikes. It refines poses
+that start near and far from the true pose, and stores their evidence and whether they are correct.
+Run it with several ``--seed`` values in parallel and pass all files to ``--fit``. This command fits
+the model, prints its quality on held-out parts, and writes ``verification.json``.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from dopepp.metrics.functional import add, add_s
 from dopepp.parts.part import Mesh, Part, make_part
 from dopepp.virtual.backgrounds import find_backgrounds
 from dopepp.virtual.factory import Factory
-from dopepp.virtual.presets import preset_of
+from dopepp.virtual.presets import Preset, preset_of
 
 SIZE, FOCAL = (320, 240), 300.0
 SMALLEST_PX, LARGEST_PX = 40.0, 190.0
@@ -48,11 +48,11 @@ FOR_OR_AGAINST = {
     **dict.fromkeys(("outside", "residual", "moved", "spread"), -1.0),
 }
 MACHINED = 0.5  # share of parts with holes and pockets
-HELD_OUT = 5  # every fifth part judges the model
+HELD_OUT = 5  # every fifth part is held out
 
 
 def random_part(rng: np.random.Generator, name: str) -> Part:
-    """Return a machined part, a lump with primitives on it, or primitives that touch."""
+    """Return a machined part, a bumpy body with primitives on it, or touching primitives."""
     if rng.random() < MACHINED:
         solid = _machined(rng).to_mesh()
         return _scaled(rng, name, np.asarray(solid.vert_properties, np.float64), solid.tri_verts)
@@ -108,7 +108,7 @@ def _machined(rng: np.random.Generator) -> Manifold:
 
 
 def _bore(rng: np.random.Generator, radius: float, length: float, solid: Manifold) -> Manifold:
-    """Return a cylinder along an axis, at a random place of a solid's faces."""
+    """Return a cylinder along an axis, at a random point of the solid's bounding box."""
     turns = [[0, 0, 0], [90, 0, 0], [0, 90, 0]][int(rng.integers(3))]
     sections = int(rng.choice([6, 32, 32, 32]))
     bore = Manifold.cylinder(length, radius, -1.0, sections, True).rotate(turns)
@@ -116,7 +116,7 @@ def _bore(rng: np.random.Generator, radius: float, length: float, solid: Manifol
 
 
 def _spot(rng: np.random.Generator, solid: Manifold) -> np.ndarray:
-    """Return a random point of the faces of a solid's bounding box."""
+    """Return a random point on the faces of a solid's bounding box."""
     low, high = np.array(solid.bounding_box()).reshape(2, 3)
     point = low + rng.uniform(0.05, 0.95, 3) * (high - low)
     axis = int(rng.integers(3))
@@ -125,7 +125,7 @@ def _spot(rng: np.random.Generator, solid: Manifold) -> np.ndarray:
 
 
 def _lump(rng: np.random.Generator) -> trimesh.Trimesh:
-    """Return a bumpy body like a scanned or sculpted object."""
+    """Return a bumpy body, similar to a scanned object."""
     lump = trimesh.creation.icosphere(4, 0.5)
     points = lump.vertices * rng.uniform(0.35, 1.0, 3)
     for _ in range(int(rng.integers(3, 12))):
@@ -161,7 +161,7 @@ def _primitive(rng: np.random.Generator, size: float) -> trimesh.Trimesh:
 
 
 def look_alike(rng: np.random.Generator, part: Part) -> Part:
-    """Return a part of other shape: mirrored, stretched, or without a share of its triangles."""
+    """Return a part that is mirrored, stretched, or cut off at one end."""
     assert part.mesh is not None
     vertices, faces = part.mesh.vertices.copy(), part.mesh.faces
     kind, axis = rng.integers(3), int(rng.integers(3))
@@ -182,7 +182,7 @@ def look_alike(rng: np.random.Generator, part: Part) -> Part:
 def starts(
     rng: np.random.Generator, T: Transform, part: Part, K: np.ndarray
 ) -> Iterator[tuple[Transform, np.ndarray]]:
-    """Yield start poses and their stated covariances, as a network would give them."""
+    """Yield start poses with covariances similar to those of a network."""
     depth = T[2, 3]
     for turn_deg, across, along in (
         (3.0, 0.01, 0.01), (6.0, 0.03, 0.03), (9.0, 0.04, 0.05), (15.0, 0.05, 0.08),
@@ -190,16 +190,42 @@ def starts(
     ):  # fmt: skip
         turn = rng.normal(size=3)
         turn *= math.radians(turn_deg) * rng.uniform(0.2, 1.0) / np.linalg.norm(turn)
-        # The ray of sight is near z in these images.
+        # The line of sight is almost parallel to z in these images.
         shift = np.array([*(across * part.diameter * rng.normal(size=2)), along * depth])
         shift[2] *= rng.normal() if along < 0.3 else rng.uniform(-1.0, 1.0)
         start = moved(T, np.concatenate([turn, shift]))
-        if across >= 1.0:  # anywhere on the image
+        if across >= 1.0:  # anywhere in the image
             pixel = rng.uniform(0.15, 0.85, 2) * SIZE
             start[:2, 3] = (pixel - K[:2, 2]) / FOCAL * start[2, 3]
         stated = rng.uniform(0.5, 2.0) * np.array([math.radians(7.0), 0.03, 0.04])
         deviations = np.repeat([stated[0], stated[1] * part.diameter, stated[2] * depth], [3, 2, 1])
         yield start, np.diag(deviations**2)
+
+
+def scene_preset(
+    size: tuple[int, int], focal: float, distances: tuple[float, float], **fields: object
+) -> Preset:
+    """Return a preset with any rotation among clutter.
+
+    Args:
+        size: Width and height in pixels.
+        focal: Focal length in pixels.
+        distances: Nearest and farthest distance of the part, metres.
+        fields: Other fields of the preset.
+    """
+    width, height = size
+    return preset_of(
+        "wide",
+        {
+            "width": width, "height": height,
+            "intrinsics_px": [focal, focal, width / 2 - 0.5, height / 2 - 0.5],
+            "turning": {"kind": "free"},
+            "placement": {"kind": "distance", "nearest": distances[0], "farthest": distances[1]},
+            "clutter": [0, 60], "background_contrast": [0.5, 1.8],
+            **fields,
+        },
+        "scene",
+    )  # fmt: skip
 
 
 def samples(number: int, num_scenes: int, seed: int, photos: str | None) -> Iterator[np.ndarray]:
@@ -208,28 +234,20 @@ def samples(number: int, num_scenes: int, seed: int, photos: str | None) -> Iter
     part = random_part(rng, f"part{number}")
     assert part.mesh is not None
     diameter = part.diameter
-    nearest, farthest = (diameter * FOCAL / px for px in (LARGEST_PX, SMALLEST_PX))
-    preset = preset_of(
-        "wide",
-        {
-            "width": SIZE[0], "height": SIZE[1],
-            "intrinsics_px": [FOCAL, FOCAL, SIZE[0] / 2 - 0.5, SIZE[1] / 2 - 0.5],
-            "turning": {"kind": "free"},
-            "placement": {"kind": "distance", "nearest": nearest, "farthest": farthest},
-            "min_visible_fraction": 0.35, "clutter": [0, 60], "background_contrast": [0.5, 1.8],
-            "distractors": {"number": [0, 6], "lookalike_share": 0.4},
-            "materials": {"metal_share": 0.15, "coloured_share": 0.6},
-            "sensors": {
-                "blur_probability": 0.6, "blur_px": [0.2, 2.2],
-                "motion_probability": 0.3, "motion_px": [1.0, 6.0],
-                "read_noise": [0.3, 4.0], "shot_noise": [0.5, 5.0],
-                "jpeg_probability": 0.4, "jpeg_quality": [50, 95],
-            },
+    preset = scene_preset(
+        SIZE, FOCAL, (diameter * FOCAL / LARGEST_PX, diameter * FOCAL / SMALLEST_PX),
+        min_visible_fraction=0.35,
+        distractors={"number": [0, 6], "lookalike_share": 0.4},
+        materials={"metal_share": 0.15, "coloured_share": 0.6},
+        sensors={
+            "blur_probability": 0.6, "blur_px": [0.2, 2.2],
+            "motion_probability": 0.3, "motion_px": [1.0, 6.0],
+            "read_noise": [0.3, 4.0], "shot_noise": [0.5, 5.0],
+            "jpeg_probability": 0.4, "jpeg_quality": [50, 95],
         },
-        "scene",
     )  # fmt: skip
     other = look_alike(rng, part)
-    # The print and the camera matrix differ from their files.
+    # A print has another size than its CAD file.
     printed = replace(part.mesh, vertices=part.mesh.vertices * rng.normal(1.0, 0.008))
     shown_part = make_part(part.name, printed)
     backgrounds = find_backgrounds(photos, "train")
@@ -252,17 +270,17 @@ def samples(number: int, num_scenes: int, seed: int, photos: str | None) -> Iter
             stated = covariance if refined.covariance is None else refined.covariance
             sure = rng.uniform(0.05, 1.0) * covariance
             moved_by = given.squared_distance(refined.T_cam_obj) ** 0.5
-            # Poses that refinement keeps are verified too, and some are nowhere near a part.
+            # Unrefined poses are verified too, also on an image without the part.
             for pixels, end, deviation, distance in (
                 (image, refined.T_cam_obj, stated, moved_by),
                 (image, start, sure, 0.0),
                 (empty + rng.integers(0, int(rng.integers(1, 40)), image.shape), start, sure, 0.0),
             ):
-                picture = np.clip(pixels, 0, 255).astype(np.uint8)
-                evidence = verifier.evidence(picture, scene.K, end, deviation, distance)
+                clipped = np.clip(pixels, 0, 255).astype(np.uint8)
+                evidence = verifier.evidence(clipped, scene.K, end, deviation, distance)
                 if evidence is not None:
                     far, near = errors(end, T, points, diameter)
-                    # ADD-S tells what ADD of a near-symmetry does not.
+                    # ADD-S is small for a correct pose of a nearly symmetric part.
                     looks_right = far < 0.1 or near < 0.015
                     is_right = shows_part and pixels is image and looks_right
                     yield np.array([*evidence, is_right, number, far, near])
@@ -278,10 +296,10 @@ def errors(
 
 
 def fit(inputs: np.ndarray, labels: np.ndarray, seed: int = 0) -> VerificationModel:
-    """Learn the model by maximum likelihood; it is monotone in what is evidence for or against.
+    """Fit the model by maximum likelihood, monotone in the evidence of ``FOR_OR_AGAINST``.
 
-    Real images have weaker creases and less regular shading than renders, so both are weakened
-    at random, and all evidence is blurred.
+    Real images have weaker creases and less regular shading than renders. Therefore both are
+    weakened at random, and noise is added to all evidence.
     """
     torch.manual_seed(seed)
     mean, scale = inputs.mean(axis=0), inputs.std(axis=0) + 1e-6
@@ -322,7 +340,7 @@ def fit(inputs: np.ndarray, labels: np.ndarray, seed: int = 0) -> VerificationMo
 
 
 def main() -> None:
-    """Make samples, or learn from them."""
+    """Write samples, or fit the model."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("samples", type=Path, nargs="+")
     parser.add_argument("--parts", type=int, default=60)
@@ -336,12 +354,8 @@ def main() -> None:
         rows: list[np.ndarray] = []
         for number in range(options.first, options.first + options.parts):
             rows += samples(number, options.scenes, options.seed, options.photos)
-            print(
-                number,
-                len(rows),
-                f"{np.mean([row[len(EVIDENCE)] for row in rows]):.2f} right",
-                flush=True,
-            )
+            right = np.mean([row[len(EVIDENCE)] for row in rows])
+            print(number, len(rows), f"{right:.2f} correct", flush=True)
             np.savez(options.samples[0], rows=np.array(rows))
         return
     table = np.concatenate([np.load(path)["rows"] for path in options.samples])
@@ -351,14 +365,9 @@ def main() -> None:
     model = fit(inputs[~held], labels[~held])
     report(model, inputs[held], labels[held])
     final = fit(inputs, labels)
+    names = " ".join(path.name for path in options.samples)
     values = {
-        "command": " ".join(
-            [
-                "python benchmarks/learn_verification.py",
-                *(path.name for path in options.samples),
-                "--fit",
-            ]
-        ),
+        "command": f"python benchmarks/learn_verification.py {names} --fit",
         "evidence": EVIDENCE,
         **{name: np.round(value, 5).tolist() for name, value in final._asdict().items()},
     }
@@ -368,7 +377,7 @@ def main() -> None:
 
 
 def report(model: VerificationModel, inputs: np.ndarray, labels: np.ndarray) -> None:
-    """Print the quality on parts that were not learned, and what each feature is worth alone."""
+    """Print the quality on held-out parts, and the average precision of each single number."""
     probability = 1 / (1 + np.exp(-model.log_odds(inputs)))
     print(f"{len(labels)} poses, {labels.mean():.1%} right")
     print(

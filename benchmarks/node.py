@@ -1,10 +1,11 @@
-"""A camera and `dopepp node --ros2` in two processes on one machine: what is lost, and how late.
+"""Lost images and latency of `dopepp node --ros2`, with a simulated camera in another process.
 
     python benchmarks/node.py --pictures 300 --rate 30
 
-Then the node is killed and started again while the camera goes on. Received are the images that
-reached the node; of these it leaves out those that a newer one replaced while it was busy. Late is
-from publishing an image to having its poses back here.
+The node is measured, killed, started again and measured again, while the camera publishes.
+"Received" is the number of images that reached the node. An image is "replaced by newer" if a newer
+image arrived while the node was busy. "Latency" is the time from publishing an image to receiving
+its poses.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+from common import print_head, print_row
 
 from dopepp.parts.catalogue import load_part
 from dopepp.robot.nodes.messages import image_fields
@@ -33,7 +35,7 @@ NODE_NAME = "dope"
 
 
 class Camera:
-    """Publishes images in turn, and hears the node's answers."""
+    """Publishes images in turn, and receives the node's poses."""
 
     def __init__(self, size: tuple[int, int]) -> None:
         import rclpy
@@ -65,7 +67,7 @@ class Camera:
         self.publisher = self.node.create_publisher(
             type(self.images[0]), TOPIC, QoSProfile(depth=10)
         )
-        self.beside = self.node.create_publisher(
+        self.info_publisher = self.node.create_publisher(
             type(self.info), "/camera/camera_info", QoSProfile(depth=10)
         )
         poses, diagnostics = (
@@ -73,30 +75,30 @@ class Camera:
             for kind in ("geometry_msgs/PoseArray", "diagnostic_msgs/DiagnosticArray")
         )
         self.sent: dict[int, float] = {}
-        self.late: dict[int, float] = {}
-        self.told: dict[str, str] = {}
-        self.node.create_subscription(poses, f"/{NODE_NAME}/poses_{PART}", self.hear, 100)
-        self.node.create_subscription(diagnostics, "/diagnostics", self.note, 10)
+        self.latency_ms: dict[int, float] = {}
+        self.diagnostics: dict[str, str] = {}
+        self.node.create_subscription(poses, f"/{NODE_NAME}/poses_{PART}", self.on_poses, 100)
+        self.node.create_subscription(diagnostics, "/diagnostics", self.on_diagnostics, 10)
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
         self.thread = threading.Thread(target=self.executor.spin, daemon=True)
         self.thread.start()
 
-    def hear(self, message) -> None:
-        """Note when an answer came."""
+    def on_poses(self, message) -> None:
+        """Record the latency of an image's poses."""
         key = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         if key in self.sent:
-            self.late[key] = 1000 * (time.perf_counter() - self.sent[key])
+            self.latency_ms[key] = 1000 * (time.perf_counter() - self.sent[key])
 
-    def note(self, message) -> None:
-        """Keep what the node says of itself."""
-        self.told = {entry.key: entry.value for entry in message.status[0].values}
+    def on_diagnostics(self, message) -> None:
+        """Store the node's diagnostics."""
+        self.diagnostics = {entry.key: entry.value for entry in message.status[0].values}
 
-    def counted(self) -> dict[str, int]:
-        """Return the node's counts of now."""
-        self.told = {}
-        wait_for("a diagnosis", lambda: "received" in self.told, 10.0)
-        return {key: int(self.told[key]) for key in ("received", "replaced by newer")}
+    def counts(self) -> dict[str, int]:
+        """Return the node's current counts of images."""
+        self.diagnostics = {}
+        wait_for("a diagnosis", lambda: "received" in self.diagnostics, 10.0)
+        return {key: int(self.diagnostics[key]) for key in ("received", "replaced by newer")}
 
     def send(self, number: int) -> None:
         """Publish an image with its camera_info."""
@@ -104,61 +106,60 @@ class Camera:
         now = self.node.get_clock().now()
         message.header.stamp = self.info.header.stamp = now.to_msg()
         self.sent[now.nanoseconds] = time.perf_counter()
-        self.beside.publish(self.info)
+        self.info_publisher.publish(self.info)
         self.publisher.publish(message)
 
     def run(self, count: int, rate: float) -> None:
-        """Publish at a rate."""
+        """Publish images at a rate (images per second)."""
         start = time.perf_counter()
         for number in range(count):
             time.sleep(max(0.0, start + number / rate - time.perf_counter()))
             self.send(number)
 
 
-def started(options: argparse.Namespace) -> subprocess.Popen[bytes]:
-    """Start the node as a user does."""
+def start_node(options: argparse.Namespace) -> subprocess.Popen[bytes]:
+    """Start the node with the command line."""
     command = [sys.executable, "-c", "from dopepp.cli import app; app()"]
     words = [*command, "node", options.model, "--ros2"]
     return subprocess.Popen([*words, "--topic", TOPIC, "--name", NODE_NAME])
 
 
-def wait_for(what: str, holds: Callable[[], bool], seconds: float = START_S) -> None:
-    """Wait until something holds, or end."""
+def wait_for(event: str, has_happened: Callable[[], bool], seconds: float = START_S) -> None:
+    """Wait for an event, and exit if it does not happen in time."""
     end = time.monotonic() + seconds
-    while not holds():
+    while not has_happened():
         if time.monotonic() > end:
-            sys.exit(f"{what}: not within {seconds:g} s")
+            sys.exit(f"{event}: not within {seconds:g} s")
         time.sleep(0.05)
 
 
-def measure(camera: Camera, count: int, rate: float) -> str:
-    """Return a row: images sent, received, replaced, answered, and how late answers were."""
-    camera.late.clear()
+def measure(camera: Camera, count: int, rate: float) -> list[str]:
+    """Return a row: images sent, received, lost, replaced and answered, and the latency."""
+    camera.latency_ms.clear()
     wait_for("the node", lambda: camera.publisher.get_subscription_count() > 0)
     number = 0
-    while not camera.late:  # until both sides know each other and numba has compiled
+    while not camera.latency_ms:  # until the node is connected and numba has compiled
         camera.send(number)
         number += 1
         time.sleep(2.0)
-    before = camera.counted()
+    before = camera.counts()
     camera.sent.clear()
-    camera.late.clear()
+    camera.latency_ms.clear()
     camera.run(count, rate)
     time.sleep(1.0)
-    after = camera.counted()
+    after = camera.counts()
     received, replaced = (after[key] - before[key] for key in ("received", "replaced by newer"))
-    late = np.array([*camera.late.values()])
-    return (
-        f"| {count} | {received} | {count - received} | {replaced} | "
-        f"{len(late)} | {np.median(late):.1f} | {np.percentile(late, 95):.1f} |"
-    )
+    latency = np.array([*camera.latency_ms.values()])
+    counts = count, received, count - received, replaced, len(latency)
+    times = np.median(latency), np.percentile(latency, 95)
+    return [*map(str, counts), *(f"{time_ms:.1f}" for time_ms in times)]
 
 
 def main() -> None:
-    """Print a row for a node, and one for the same node killed and started again."""
+    """Print a row for the node, and a row after it was killed and started again."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--model", default="pretrained/pivconnector")
-    parser.add_argument("--pictures", type=int, default=300)
+    parser.add_argument("--pictures", type=int, default=300, help="number of images per row")
     parser.add_argument("--rate", type=float, default=30.0)
     parser.add_argument("--size", type=int, nargs=2, default=(320, 240))
     options = parser.parse_args()
@@ -168,17 +169,18 @@ def main() -> None:
 
     rclpy.init()
     camera = Camera(tuple(options.size))
-    print("| sent | received | lost | replaced by newer | answered | late ms, median | p95 |")
-    print("| --: " * 7 + "|")
+    print_head(
+        "sent", "received", "lost", "replaced by newer", "answered", "latency ms, median", "p95"
+    )
     for number in range(2):
-        node = started(options)
+        node = start_node(options)
         try:
-            print(measure(camera, options.pictures, options.rate), flush=True)
+            print_row(*measure(camera, options.pictures, options.rate))
         finally:
             node.kill() if number == 0 else node.terminate()
             code = node.wait(30)
-        wait_for("its end", lambda: camera.publisher.get_subscription_count() == 0)
-    print(f"ended with {code}; 143 is that of SIGTERM")
+        wait_for("the node's end", lambda: camera.publisher.get_subscription_count() == 0)
+    print(f"exit code {code} (143 after SIGTERM)")
     camera.executor.shutdown()
     camera.thread.join(5.0)
     rclpy.try_shutdown()

@@ -1,4 +1,4 @@
-"""Where the preset ``paper`` puts its part: means of the place over many scenes, none rendered.
+"""Mean position of the part in scenes of the preset ``paper``, without rendering.
 
 python benchmarks/placement.py --scenes 10000
 """
@@ -16,17 +16,17 @@ from dopepp.virtual import PRESETS, Factory, OffsetPlacement
 
 
 class CountedPlacement(OffsetPlacement):
-    """The same places; counts how often one is drawn and how often one is moved."""
+    """Counts the drawn positions, and the positions moved along the optical axis."""
 
     drawn = moved = 0
 
     def draw(self, *arguments: object) -> np.ndarray:
-        """Count a place."""
+        """Draw a position, and count it."""
         CountedPlacement.drawn += 1
         return super().draw(*arguments)
 
     def redraw(self, *arguments: object) -> np.ndarray:
-        """Count a move along the optical axis."""
+        """Move a position along the optical axis, and count the move."""
         CountedPlacement.moved += 1
         return super().redraw(*arguments)
 

@@ -1,9 +1,10 @@
-"""What a network of renders loses on real frames: the part's looks, or what surrounds the part.
+"""Training loss of a network on real frames in which part or surroundings are replaced by renders.
 
-Windows of labelled real frames with an unhidden part, and the same windows with the part rendered
-at its true pose, before the real surroundings or before those of the training. The loss of the
-training on each (lower is better) says what is still to be learned. Where a true pose is off by a
-pixel or two, a seam of the real part shows around the rendered one, which counts as surroundings.
+The script cuts windows around unoccluded parts out of labelled real frames. In copies of a window,
+the part is rendered at its true pose, in front of the real surroundings or those of the training.
+The training loss of each variant (lower is better) shows whether the part's appearance or the
+surroundings cause the errors on real frames. If a true pose is off by a pixel or two, a seam of the
+real part remains around the rendered part and counts as surroundings.
 
 python benchmarks/real_gap.py outputs/dopepp_fast_bop_renders/RUN
 """
@@ -39,14 +40,14 @@ from dopepp.virtual.renderers import find_renderer
 from dopepp.virtual.scene import Scene, SceneObject
 
 UNHIDDEN = 0.98
-"""Visible share from which a part counts; nothing may stand before what is put in its place."""
+"""Smallest visible share; nothing may occlude the part that a render replaces."""
 
 RING_PX = 12.0
-"""What is nearer to the part than this are its immediate surroundings, pixels of the network's."""
+"""Width of the ring around the part that counts as immediate surroundings, network pixels."""
 
 
 def windows(config: RunConfig, parts: Parts, rng: np.random.Generator) -> list[tuple[Sample, int]]:
-    """Cut windows around unhidden parts out of the test's frames, with the number of each part."""
+    """Cut windows around unoccluded parts out of the test frames, with the part's number."""
     source = labelled_images(config.data, parts, config.seed, "test")
     scale, size = config.data.virtual.camera_scale or 1.0, np.array(config.data.network_input)
     names, cut = [part.name for part in parts], []
@@ -60,15 +61,15 @@ def windows(config: RunConfig, parts: Parts, rng: np.random.Generator) -> list[t
             corner = instance.keypoints[CENTROID] - size / 2 + rng.uniform(-0.15, 0.15, 2) * size
             left, top = np.clip(corner, 0, np.array(sample.size) - size).astype(int)
             window = crop_sample(sample, left, top, (int(size[0]), int(size[1])))
-            # Another part in the window would be one of its surroundings and to be found as well.
-            there = [near for near in window.instances if near.visible_fraction > 0]
-            if len(there) == 1 and there[0].visible_fraction > 0.9 * instance.visible_fraction:
-                cut.append((replace(window, instances=there), names.index(instance.label)))
+            # A second part in the window would be both surroundings and target.
+            visible = [near for near in window.instances if near.visible_fraction > 0]
+            if len(visible) == 1 and visible[0].visible_fraction > 0.9 * instance.visible_fraction:
+                cut.append((replace(window, instances=visible), names.index(instance.label)))
     return cut
 
 
 def variants(config: RunConfig, parts: Parts, rng: np.random.Generator) -> dict[str, list[Sample]]:
-    """Return every window as it is, rendered, and half and half."""
+    """Return the variants of every window, by name."""
     preset = seen_preset(config.data)
     photos = find_backgrounds(config.data.virtual.backgrounds)
     behind = ClutteredBackgrounds(photos, preset.clutter, preset.background_contrast)
@@ -91,24 +92,24 @@ def variants(config: RunConfig, parts: Parts, rng: np.random.Generator) -> dict[
         mixed = np.where(near[..., None], real, learned), np.where(near[..., None], learned, real)
         for name, image in {
             "all rendered": drawn.image,
-            "rendered part, real surroundings": laid(drawn.image, opaque, real),
-            f"… real to {RING_PX:g} pixels from it": laid(drawn.image, opaque, mixed[0]),
-            f"… real beyond {RING_PX:g} pixels": laid(drawn.image, opaque, mixed[1]),
-            "real part, learned surroundings": laid(real, opaque, learned),
+            "rendered part, real surroundings": composite(drawn.image, opaque, real),
+            f"… real within {RING_PX:g} pixels": composite(drawn.image, opaque, mixed[0]),
+            f"… real beyond {RING_PX:g} pixels": composite(drawn.image, opaque, mixed[1]),
+            "real part, rendered surroundings": composite(real, opaque, learned),
             "all real": real,
         }.items():
             made.setdefault(name, []).append(replace(window, image=image))
     return made
 
 
-def laid(part: RGBImage, opaque: np.ndarray, behind: RGBImage) -> RGBImage:
-    """Lay a part over what is to be behind it."""
+def composite(part: RGBImage, opaque: np.ndarray, behind: RGBImage) -> RGBImage:
+    """Return an image of a part in front of other surroundings, by an opacity mask."""
     return np.asarray(np.rint(opaque * part + (1 - opaque) * behind), np.uint8)
 
 
 @torch.inference_mode()
 def losses(system: PoseSystem, samples: Sequence[Sample]) -> np.ndarray:
-    """Return the training's loss on each window."""
+    """Return the training loss of each window."""
     numbers = {part.name: number for number, part in enumerate(system.parts)}
     values = []
     for first in range(0, len(samples), 32):
@@ -121,7 +122,7 @@ def losses(system: PoseSystem, samples: Sequence[Sample]) -> np.ndarray:
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("runs", type=Path, nargs="+", help="their folders; the first's windows")
+    parser.add_argument("runs", type=Path, nargs="+", help="run folders; windows are of the first")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     made: dict[str, list[Sample]] = {}
@@ -132,7 +133,7 @@ def main() -> None:
         made = made or variants(config, parts, np.random.default_rng(options.seed))
         trained = replace(config, init_from=str(run / "checkpoints" / "best.ckpt"))
         system = build_system(trained, parts, "").eval()
-        print(f"{run.name}: {len(made['all real'])} windows, loss of the training")
+        print(f"{run.name}: {len(made['all real'])} windows, training loss")
         for name, samples in made.items():
             values = losses(system, samples)
             error = values.std() / np.sqrt(len(values))

@@ -1,4 +1,4 @@
-"""How well poses come out of maps: simulated noise, clean maps, missing corners and crowds.
+"""Accuracy of poses recovered from maps: simulated noise, clean maps, missing corners, crowds.
 
 python benchmarks/recovery.py --seed 7
 """
@@ -12,6 +12,7 @@ from itertools import combinations
 import cv2
 import numpy as np
 import torch
+from common import pose_errors
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -32,7 +33,7 @@ SIZES = {
 
 
 class Solid:
-    """A cuboid's keypoints and, for ADD, points of its surface."""
+    """A cuboid with its keypoints and surface points."""
 
     def __init__(self, name: str) -> None:
         half = np.array(SIZES[name]) / 2
@@ -45,13 +46,12 @@ class Solid:
         self.points = points * half
 
     def right(self, T: np.ndarray, truth: np.ndarray) -> bool:
-        """ADD < 0.1 d."""
-        moved = self.points @ (T[:3, :3] - truth[:3, :3]).T + T[:3, 3] - truth[:3, 3]
-        return bool(np.linalg.norm(moved, axis=1).mean() < 0.1 * self.diameter)
+        """Return whether ADD is below a tenth of the diameter."""
+        return pose_errors(T, truth, self.points).add < 100 * self.diameter
 
 
 def random_pose(rng: np.random.Generator, u: float, v: float, z: float) -> np.ndarray:
-    """A random rotation, its centroid at pixel (u, v) in depth z."""
+    """Return a pose with a random rotation and the centroid at pixel (u, v) and depth z."""
     t = np.array([(u - K[0, 2]) * z / FOCAL, (v - K[1, 2]) * z / FOCAL, z])
     return make_transform(Rotation.random(random_state=rng).as_matrix(), t)
 
@@ -63,7 +63,7 @@ def crowd(
     sizes: tuple[float, float],
     count: int = 10,
 ) -> tuple[list[np.ndarray], torch.Tensor, torch.Tensor]:
-    """Instances at random, centroids at least 60 px apart, with noise on their maps."""
+    """Return random poses with centroids at least 60 px apart, and their noisy maps."""
     while True:
         centres: list[np.ndarray] = []
         for _ in range(2000):
@@ -116,7 +116,7 @@ def crowds(seed: int, frames: int) -> None:
 
 
 def noisy_maps(keypoints: np.ndarray, covariance: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-    """Draw peaks of covariance σ²I + Σ, σ one cell, at noisy keypoints, with their field."""
+    """Return maps with peaks of covariance σ²I + Σ (σ is one cell) at noisy keypoints."""
     belief, field = encode(
         torch.tensor(keypoints)[None, None],
         torch.zeros(1, 1, dtype=torch.long),
@@ -138,7 +138,7 @@ def noisy_maps(keypoints: np.ndarray, covariance: np.ndarray) -> tuple[torch.Ten
 def reference(
     cuboid: np.ndarray, pixels: np.ndarray, covariance: np.ndarray, truth: np.ndarray
 ) -> np.ndarray:
-    """Minimise a gated cost with the known covariances from the truth, with scipy."""
+    """Fit a pose with scipy: robust, with the known covariances, started at the true pose."""
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
 
     def residuals(p: np.ndarray) -> np.ndarray:
@@ -254,13 +254,13 @@ def missing(seed: int, poses: int) -> None:
 
 
 def main() -> None:
-    """Print the tables asked for."""
+    """Print the requested tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     functions: tuple[Callable[[int, int], None], ...] = (noise, clean, missing, crowds)
     tables = {function.__name__: function for function in functions}
     parser.add_argument("tables", nargs="*", default=list(tables), choices=list(tables))
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--frames", type=int, default=100, help="images of a row")
+    parser.add_argument("--frames", type=int, default=100, help="images per row")
     options = parser.parse_args()
     torch.set_num_threads(1)
     for table in options.tables:

@@ -1,11 +1,11 @@
-"""Refinement where something is wrong: camera, CAD, material, colour, blur, size of the image.
+"""Refinement under faults: camera matrix, CAD file, material, colour, blur, image size.
 
     python benchmarks/refine_conditions.py [--checkpoint pretrained/NAME] [--images 60]
 
-Poses are those that the network finds on rendered images that it was not trained on, the same
-scenes in every row, and those that it finds with refinement. Degrees, millimetres and "worse" are
-of parts that both find. Two parts of one kind, of one
-material, stand side by side in images twice as wide and high, the network's size of parts.
+Each row compares the network's poses without and with refinement, on the same scenes, which were
+not used in training. Degrees, millimetres and "worse" are those of parts that are detected without
+and with refinement. For the rows with two touching parts, images are twice as wide and high, so
+that a part has the same size in pixels.
 """
 
 from __future__ import annotations
@@ -16,10 +16,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
-import torch
 import trimesh
+from common import pose_errors, print_head, print_row, use_one_thread
 
 from dopepp.core.files import write_png
 from dopepp.data.sample import Instance
@@ -27,7 +26,7 @@ from dopepp.drawing.overlay import BLUE, GREEN, YELLOW, Wireframe, overlay
 from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.geometry.camera import Transform, crop_camera, transform
 from dopepp.geometry.cuboid import CENTROID
-from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
+from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.refinement.outline import filled_mask, make_outline_mesh, posed
 from dopepp.metrics.pose import assign
@@ -40,11 +39,11 @@ from dopepp.virtual.sensor import capture
 
 SEED = 991
 CAD_ERROR = 0.0003
-"""Metres by which the mesh is too thick everywhere."""
+"""Metres that are added to the mesh everywhere."""
 
 
 def on_target(change: Callable[[Material], Material]) -> Callable[[Scene], Scene]:
-    """Return a change of the targets' material."""
+    """Return a function that changes the targets' material in a scene."""
 
     def changed(scene: Scene) -> Scene:
         objects = tuple(
@@ -57,7 +56,7 @@ def on_target(change: Callable[[Material], Material]) -> Callable[[Scene], Scene
 
 
 def camouflaged(scene: Scene) -> Scene:
-    """Give the background the mean colour of the part as it is seen, with its own pattern faint."""
+    """Give the background the mean colour of the part in the image, with a faint pattern."""
     rendered = render(scene)
     colour = rendered.image[rendered.instances == scene.targets[0]].mean(axis=0)
     faint = colour + 0.1 * (scene.background - scene.background.mean(axis=(0, 1)))
@@ -65,7 +64,7 @@ def camouflaged(scene: Scene) -> Scene:
 
 
 def blurred(scene: Scene) -> Scene:
-    """Move the image by 5 pixels during the exposure."""
+    """Add motion blur of 5 pixels."""
     return replace(scene, sensor=replace(scene.sensor, motion_px=(5.0, 0.0)))
 
 
@@ -79,17 +78,17 @@ SCENES: dict[str, Callable[[Scene], Scene]] = {
     "background of the part's colour": camouflaged,
     "motion blur 5 px": blurred,
 }
-"""What is wrong with the image."""
+"""Faults of the image."""
 
 SIZES = ((640, 480), (1920, 1080))
 PAIRS = {"two touching parts of one kind": 0.0, "the same, one under the other by 15 %": 0.15}
-"""Of the second part, the share that the first one hides."""
+"""Share of the second part that the first part hides."""
 
 
 def paired(scene: Scene, hidden: float, rng: np.random.Generator) -> Scene:
-    """Put a second part of the same kind and material beside a scene's part, in the same plane.
+    """Add an equal part beside the scene's part, in the same plane, and remove distractors.
 
-    One that is partly hidden lies under the first. Distractors are left out.
+    With ``hidden`` above 0, the second part lies under the first.
     """
     target = scene.objects[scene.targets[0]]
     part, (width, height) = target.part, scene.size
@@ -97,7 +96,7 @@ def paired(scene: Scene, hidden: float, rng: np.random.Generator) -> Scene:
     assert part.mesh is not None
     outline = make_outline_mesh(part.mesh.vertices, part.mesh.faces)
     K, size = crop_camera(scene.K, -width // 2, -height // 2), (2 * width, 2 * height)
-    # In its plane the second one is turned to the other side as far as the first one is.
+    # In its plane, the second part has the opposite rotation of the first.
     first, turned, (a, b) = target.T_cam_obj, np.eye(4), target.T_cam_obj[:2, 0]
     turned[:3, :3] = rotation_vector_to_matrix(np.array([0.0, 0.0, 2.0 * math.atan2(b, a)]))
     way, middle = rng.uniform(0.0, 2.0 * math.pi), part.cuboid[CENTROID]
@@ -142,8 +141,8 @@ def measure(
     part: Part,
     scenes: list[Scene],
     focal: float = 1.0,
-) -> tuple[str, list[Tile]]:
-    """Return one row of the table, and images: truth green, network blue, refined yellow."""
+) -> tuple[list[str], list[Tile]]:
+    """Return a row, and drawn images: truth green, network blue, refined yellow."""
     rows, tiles, kept = [], [], 0
     for scene in scenes:
         image = capture(render(scene).image, scene.sensor)
@@ -155,7 +154,7 @@ def measure(
         ]
         frames = [Wireframe(instance.keypoints, GREEN, "true") for instance in shown]
         errors = np.full((2, len(shown), 2), np.inf)
-        for method, colour, pose_errors in zip(
+        for method, colour, of_method in zip(
             (network, estimator), (BLUE, YELLOW), errors, strict=True
         ):
             detections = method.predict(image, K)
@@ -167,9 +166,9 @@ def measure(
                     )
                 )
                 if number >= 0:
-                    pose_errors[number] = _errors(
-                        detection.T_cam_obj, shown[number].T_cam_obj, part
-                    )
+                    true = shown[number].T_cam_obj
+                    error = pose_errors(detection.T_cam_obj, true, part.points)
+                    of_method[number] = error.rotation, error.add
         rows.append(errors)
         title = ", ".join(
             f"{before[1]:.1f} to {after[1]:.1f}" for before, after in zip(*errors, strict=True)
@@ -192,26 +191,18 @@ def measure(
         f"{worse:.0%}",
         f"{kept / both.shape[1]:.0%}",
     ]
-    return "| " + " | ".join(cells) + " |", tiles[:3]
-
-
-def _errors(T: Transform, true: Transform, part: Part) -> tuple[float, float]:
-    """Return degrees, and millimetres of ADD."""
-    away = transform(T, part.points) - transform(true, part.points)
-    turn = math.degrees(float(rotation_angle(T[:3, :3] @ true[:3, :3].T)))
-    return turn, 1e3 * float(np.linalg.norm(away, axis=1).mean())
+    return cells, tiles[:3]
 
 
 def main() -> None:
-    """Print a row for everything that may be wrong."""
+    """Print a row per fault."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--checkpoint", default="pretrained/pivconnector")
     parser.add_argument("--images", type=int, default=60)
     parser.add_argument("--preset", default="quickstart")
-    parser.add_argument("--pictures", type=Path, help="write a sheet with three images of each row")
+    parser.add_argument("--pictures", type=Path, help="file for a sheet with three images per row")
     arguments = parser.parse_args()
-    cv2.setNumThreads(1)
-    torch.set_num_threads(1)
+    use_one_thread()
     estimator = PoseEstimator.load(arguments.checkpoint)
     part = load_part(estimator.parts[0].name)
     preset = PRESETS[arguments.preset]
@@ -222,13 +213,12 @@ def main() -> None:
         factory = Factory([part], sized, SEED)
         return [factory.scene(0, index) for index in range(arguments.images)]
 
-    titles = "what is wrong | missed | ADD-0.1d | ADD-0.05d | ° | ADD mm | worse by 1 mm | kept"
-    print(f"| {titles} |\n" + "| --- " * 8 + "|")
+    print_head("fault", "missed", "ADD-0.1d", "ADD-0.05d", "°", "ADD mm", "worse by 1 mm", "kept")
     sheet: list[Tile] = []
 
-    def show(name: str, *what: object, **options: float) -> None:
-        row, tiles = measure(name, estimator, *what, **options)  # type: ignore[arg-type]
-        print(row, flush=True)
+    def show(name: str, *given: object, **options: float) -> None:
+        row, tiles = measure(name, estimator, *given, **options)  # type: ignore[arg-type]
+        print_row(*row)
         sheet.extend(tiles)
 
     plain = scenes()

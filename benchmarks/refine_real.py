@@ -2,22 +2,22 @@
 
     python benchmarks/refine_real.py FOLDER [--checkpoint CKPT] [--half even] [--pictures SHEET.png]
 
-Starts are the detections of a network (``--checkpoint``), or else drawn around the published poses:
-10 mm off in a random direction and turned by 5° about a random axis. With ``--from-truth`` they are
-the published poses: with ``--scale-errors 1e-6``, how far images and annotation agree. RGB alone,
-objects that are at least half visible; errors are to the nearest of equivalent published poses.
+Start poses are the detections of a network (``--checkpoint``). Without a network, they are drawn
+around the published poses: shifted by 10 mm and rotated by 5°, both in random directions. With
+``--from-truth``, they are the published poses; adding ``--scale-errors 1e-6`` measures how well
+images and annotation agree. The refinement uses RGB only, and objects that are at least half
+visible. Errors are relative to the nearest equivalent of the published pose.
 
-"Distance" is the error along the viewing ray. If refined poses have it in common, the annotation
-has another scale than camera and CAD. What is chosen on a sequence is chosen on ``--half even`` and
-reported on ``--half odd``. Published rotations that are orthogonal to some thousandths only are
-replaced by the nearest ones.
+"Distance" is the error along the viewing ray. If it is equal in all frames, the annotation has
+another scale than camera and CAD file. Parameters are chosen on ``--half even`` and reported on
+``--half odd``. Published rotations that are not exactly orthogonal are replaced by the nearest
+rotation.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-import time
 from collections.abc import Iterator, Sequence
 from itertools import chain, product
 from pathlib import Path
@@ -26,6 +26,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
+from common import pose_errors, print_head, print_row, random_step, timed
 
 from dopepp.core.files import write_png
 from dopepp.core.json import read_json
@@ -43,6 +44,7 @@ from dopepp.geometry.camera import (
     project_keypoints,
     transform,
 )
+from dopepp.geometry.rotation import nearest_rotation
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.refinement.refiner import Refiner
@@ -59,14 +61,10 @@ WORSE_MM = 1.0
 SEED = 5
 COVARIANCE = np.diag(np.repeat([TURN**2 / 3, SHIFT**2 / 3], 3))
 HALVES = {"both": slice(None), "even": slice(0, None, 2), "odd": slice(1, None, 2)}
-TITLES = (
-    "object | poses | ADD mm | ADD-0.1d | rotation ° | translation mm | distance % | MSPD px | "
-    "worse by 1 mm | kept | normalised error | ms"
-)
 
 
 class Frame(NamedTuple):
-    """One frame with its sufficiently visible objects, by the number of the model."""
+    """One frame with the model numbers and poses of its sufficiently visible objects."""
 
     image: RGBImage
     K: CameraMatrix
@@ -85,20 +83,20 @@ def read_frames(scene: Path, half: slice) -> Iterator[Frame]:
     """Yield the frames of a scene."""
     truth, cameras = (read_json(scene / f"scene_{name}.json") for name in ("gt", "camera"))
     info = scene / "scene_gt_info.json"
-    seen = read_json(info) if info.exists() else {}
+    visible = read_json(info) if info.exists() else {}
     for image in list(truth)[half]:
         objects = []
         for number, annotation in enumerate(truth[image]):
-            if not seen or seen[image][number]["visib_fract"] >= LEAST_VISIBLE:
-                U, _, Vt = np.linalg.svd(np.reshape(annotation["cam_R_m2c"], (3, 3)))
-                T = make_transform(U @ Vt, np.array(annotation["cam_t_m2c"]) / 1000)
+            if not visible or visible[image][number]["visib_fract"] >= LEAST_VISIBLE:
+                R = nearest_rotation(np.reshape(annotation["cam_R_m2c"], (3, 3)))
+                T = make_transform(R, np.array(annotation["cam_t_m2c"]) / 1000)
                 objects.append((annotation["obj_id"], T))
-        picture = read_rgb(next((scene / "rgb").glob(f"{int(image):06d}.*")))
-        yield Frame(picture, np.reshape(cameras[image]["cam_K"], (3, 3)).astype(float), objects)
+        pixels = read_rgb(next((scene / "rgb").glob(f"{int(image):06d}.*")))
+        yield Frame(pixels, np.reshape(cameras[image]["cam_K"], (3, 3)).astype(float), objects)
 
 
 class DrawnStarts:
-    """Starts around the published poses, or at them."""
+    """Start poses around the published poses, or equal to them."""
 
     def __init__(
         self, parts: dict[int, Part], limits: Sequence[float], spread: float, from_truth: bool
@@ -112,11 +110,9 @@ class DrawnStarts:
         self.rng = np.random.default_rng(SEED)
 
     def starts(self, frame: Frame) -> Iterator[tuple[int, Transform, Transform]]:
-        """Yield model number, true pose and start of every object."""
+        """Yield model number, true pose and start pose of each object."""
         for number, true in frame.objects:
-            step = self.rng.normal(size=6)
-            step[:3] *= self.spread * TURN / np.linalg.norm(step[:3])
-            step[3:] *= self.spread * SHIFT / np.linalg.norm(step[3:])
+            step = random_step(self.rng, self.spread * TURN, self.spread * SHIFT)
             yield number, true, true if self.from_truth else moved(true, step)
 
     def refine(self, frame: Frame, number: int, start: Transform, limit: float) -> Refined:
@@ -127,7 +123,7 @@ class DrawnStarts:
 
 
 class NetworkStarts:
-    """Detections of a network as starts, with the corrections of its checkpoint."""
+    """Detections of a network as start poses, with the corrections of its checkpoint."""
 
     def __init__(self, parts: dict[int, Part], limits: Sequence[float], checkpoint: str) -> None:
         self.estimator = PoseEstimator.load(checkpoint)
@@ -138,7 +134,7 @@ class NetworkStarts:
         }
 
     def starts(self, frame: Frame) -> Iterator[tuple[int, Transform, Detection]]:
-        """Yield model number, true pose and detection of every object that is detected."""
+        """Yield model number, true pose and detection of each detected object."""
         detections = self.estimator.candidates(frame.image, frame.K)
         for number, part in self.parts.items():
             poses = [T for model, T in frame.objects if model == number]
@@ -157,24 +153,23 @@ class NetworkStarts:
         return Refined(start.T_cam_obj, end.T_cam_obj, None if end.kept else end.covariance)
 
 
-def pose_errors(part: Part, T: Transform, equivalents: np.ndarray, K: CameraMatrix) -> np.ndarray:
+def nearest_errors(
+    part: Part, T: Transform, equivalents: np.ndarray, K: CameraMatrix
+) -> np.ndarray:
     """Return ADD in mm, degrees, mm, distance in % and MSPD to the nearest true pose."""
-    points = transform(T, part.points)
-    distances = [
-        np.linalg.norm(points - transform(true, part.points), axis=1).mean() for true in equivalents
-    ]
-    true = equivalents[int(np.argmin(distances))]
-    cosine = (np.trace(T[:3, :3] @ true[:3, :3].T) - 1) / 2
-    turn = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
+    error, true = min(
+        ((pose_errors(T, true, part.points), true) for true in equivalents),
+        key=lambda pair: pair[0].add,
+    )
     shift, ray = T[:3, 3] - true[:3, 3], true[:3, 3]
-    pixels = project(points, K) - project(transform(true, part.points), K)
-    add, shift_mm = 1e3 * min(distances), 1e3 * np.linalg.norm(shift)
+    ours, theirs = (project(transform(pose, part.points), K) for pose in (T, true))
     along = 100 * shift @ ray / (ray @ ray)
-    return np.array([add, turn, shift_mm, along, np.linalg.norm(pixels, axis=1).max()])
+    mspd = np.linalg.norm(ours - theirs, axis=1).max()
+    return np.array([error.add, error.rotation, error.translation, along, mspd])
 
 
-def describe(name: str, rows: list[np.ndarray]) -> str:
-    """Return the table's row of an object: medians, network → refined."""
+def medians(name: str, rows: list[np.ndarray]) -> list[str]:
+    """Return the table's row of an object: medians at the start → refined."""
     errors = np.array(rows)
     before, after, rest = errors[:, :5], errors[:, 5:10], errors[:, 10:]
     is_kept, surprise, took, limit = rest.T
@@ -184,12 +179,12 @@ def describe(name: str, rows: list[np.ndarray]) -> str:
     right = " → ".join(f"{np.mean(poses[:, 0] < limit):.0%}" for poses in (before, after))
     worse = f"{np.mean(after[:, 0] > before[:, 0] + WORSE_MM):.0%}"
     normalised = f"{math.sqrt(np.nanmean(surprise)):.2f}"
-    cells = (name, str(len(rows)), add, right, turn, shift, along, mspd, worse)
-    return f"| {' | '.join(cells)} | {is_kept.mean():.0%} | {normalised} | {np.median(took):.1f} |"
+    rest = f"{is_kept.mean():.0%}", normalised, f"{np.median(took):.1f}"
+    return [name, str(len(rows)), add, right, turn, shift, along, mspd, worse, *rest]
 
 
 def main() -> None:
-    """Print a row for every object."""
+    """Print a row per object."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--checkpoint", help="start at the detections of this network")
@@ -209,7 +204,7 @@ def main() -> None:
     parser.add_argument(
         "--pictures",
         type=Path,
-        help="a sheet of every 20th: truth green, start blue, refined yellow",
+        help="file for a sheet of every 20th pose: truth green, start blue, refined yellow",
     )
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
@@ -228,12 +223,11 @@ def main() -> None:
     for limit, (count, (frame, number, true, start)) in product(
         arguments.scale_errors, enumerate(starts)
     ):
-        part, began = parts[number], time.process_time()
-        pose = method.refine(frame, number, start, limit)  # type: ignore[arg-type]
-        took = 1e3 * (time.process_time() - began)
+        part, given = parts[number], (frame, number, start, limit)
+        pose, took = timed(lambda given=given: method.refine(*given))  # type: ignore[misc]
         group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
         before, after = (
-            pose_errors(part, T, true @ group, frame.K) for T in (pose.start, pose.end)
+            nearest_errors(part, T, true @ group, frame.K) for T in (pose.start, pose.end)
         )
         surprise = math.nan
         if pose.covariance is not None:
@@ -255,9 +249,12 @@ def main() -> None:
             ]
             caption = f"{part.name}: {before[0]:.1f} to {after[0]:.1f} mm"
             tiles.append(Tile(overlay(frame.image, wireframes), caption))
-    print(f"| {TITLES} |\n" + "| --- " * 12 + "|")
+    print_head(
+        "object", "poses", "ADD mm", "ADD-0.1d", "rotation °", "translation mm", "distance %",
+        "MSPD px", "worse by 1 mm", "kept", "normalised error", "ms",
+    )  # fmt: skip
     for name, poses in rows.items():
-        print(describe(name, poses))
+        print_row(*medians(name, poses))
     if arguments.pictures is not None:
         write_png(arguments.pictures, contact_sheet(tiles, 4))
 

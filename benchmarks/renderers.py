@@ -1,11 +1,11 @@
-"""Mitsuba's variants beside the rasteriser: CPU time an image, and how far their labels agree.
+"""CPU time per image of Mitsuba's variants and the rasteriser, and agreement of their labels.
 
     python benchmarks/renderers.py [--images 6] [--size 640 480]
 
-All draw the same random scenes, in one run. Times are process time (all threads of the process,
-waiting left out) and wall time; the first image, which compiles kernels, is left out of both.
-Depth is compared at all pixels (within 1 mm), masks as instance numbers. The variant is fixed for
-the life of a process, so each runs in one of its own, with the rasteriser beside it.
+All renderers draw the same random scenes. Times are CPU time (all threads of the process) and wall
+time, without the first image, which compiles kernels. Depth agrees within 1 mm; masks agree if they
+have the same instance number. A process can use only one variant, so each variant runs in a
+separate process, together with the rasteriser.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
+from common import print_head, print_row
 
 from dopepp.core.errors import UserError
 from dopepp.parts.catalogue import BUILTIN
@@ -34,7 +35,7 @@ SEED = 11
 def timed(
     renderer: Callable[[Scene], Rendered], scenes: Sequence[Scene]
 ) -> tuple[list[Rendered], float, float]:
-    """Return images, and CPU and wall seconds an image; the first scene only warms up."""
+    """Return images, and CPU and wall seconds per image; the first scene is a warm-up."""
     renderer(scenes[0])
     cpu, wall = time.process_time(), time.perf_counter()
     images = [renderer(scene) for scene in scenes[1:]]
@@ -42,7 +43,7 @@ def timed(
     return images, (time.process_time() - cpu) / count, (time.perf_counter() - wall) / count
 
 
-def compare(name: str, preset: str, size: tuple[int, int], num_images: int) -> str:
+def compare(name: str, preset: str, size: tuple[int, int], num_images: int) -> list[str]:
     """Return one row of the table."""
     renderer = find_renderer("photoreal")
     parts = [make() for make in BUILTIN.values()]
@@ -53,13 +54,13 @@ def compare(name: str, preset: str, size: tuple[int, int], num_images: int) -> s
     pairs = list(zip(images, expected, strict=True))
     depth = [(np.abs(image.depth - reference.depth) < LIMIT_M).mean() for image, reference in pairs]
     masks = [(image.instances == reference.instances).mean() for image, reference in pairs]
-    times = f"{cpu:.3f} | {wall:.3f} | {1e3 * base:.1f} | {cpu / base:.0f}×"
-    agreement = f"{100 * min(depth):.3f} % | {100 * min(masks):.3f} %"
-    return f"| {name} | {preset} | {size[0]}×{size[1]} | {times} | {agreement} |"
+    times = f"{cpu:.3f}", f"{wall:.3f}", f"{1e3 * base:.1f}", f"{cpu / base:.0f}×"
+    agreement = f"{100 * min(depth):.3f} %", f"{100 * min(masks):.3f} %"
+    return [name, preset, f"{size[0]}×{size[1]}", *times, *agreement]
 
 
 def main() -> None:
-    """Print the table, or, called by itself, one renderer's rows of it."""
+    """Print the table, or with ``--only`` the rows of one variant."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--images", type=int, default=6, help="images per row")
     parser.add_argument("--size", type=int, nargs=2, default=(640, 480), help="width and height")
@@ -69,14 +70,14 @@ def main() -> None:
         cv2.setNumThreads(1)
         try:
             for preset in SCENES:
-                row = compare(arguments.only, preset, tuple(arguments.size), arguments.images)
-                print(row, flush=True)
+                print_row(*compare(arguments.only, preset, arguments.size, arguments.images))
         except UserError as error:
             print(f"{arguments.only}: not measured: {error}")
         return
-    headings = "variant | preset | size | CPU-s | wall-s | rasteriser CPU-ms | ratio"
-    print(f"| {headings} | depth within 1 mm (worst image) | same mask (worst image) |")
-    print("| --- " * 9 + "|", flush=True)
+    print_head(
+        "variant", "preset", "size", "CPU-s", "wall-s", "rasteriser CPU-ms", "ratio",
+        "depth within 1 mm (worst image)", "same mask (worst image)",
+    )  # fmt: skip
     for name in VARIANTS:
         settings = {"OMP_NUM_THREADS": "1", VARIANT_SETTING: name}
         command = [sys.executable, __file__, "--only", name, "--images", str(arguments.images)]

@@ -1,10 +1,10 @@
-"""What a network takes in each runtime and precision: PyTorch, onnxruntime, OpenVINO; DOPE beside.
+"""Time per frame of a network in each runtime and precision: PyTorch, onnxruntime, OpenVINO.
 
 ``python benchmarks/runtimes.py`` exports ``pretrained/pivconnector`` at 128×128 and the untrained
-``dopepp_fast`` at 416×416 in every format and precision (int8 on random pixels: speed does not
-depend on them) and times one image after the other, in one process: the first frame after
-loading, median and 95th percentile, and the ratio to PyTorch's float32. ``--isa AVX2`` limits
-PyTorch and OpenVINO to an instruction set and proves it by the kernels they choose; onnxruntime has
+``dopepp_fast`` at 416×416 in every format and precision. (int8 is calibrated on random pixels,
+which do not affect speed.) It times single images in one process: the first frame after loading,
+median and 95th percentile, and the speed relative to PyTorch in float32. ``--isa AVX2`` limits
+PyTorch and OpenVINO to an instruction set, and prints the kernels that they choose. onnxruntime has
 no such limit. ``--dope`` times DOPE at 416×416 as well. ``OMP_NUM_THREADS`` sets the threads.
 """
 
@@ -23,7 +23,7 @@ ROUNDS = 3
 
 
 def limit(isa: str | None) -> None:
-    """Set the libraries' own limits, which are read when they load."""
+    """Limit PyTorch and OpenVINO to an instruction set; call this before they are imported."""
     if isa is not None:
         os.environ["ONEDNN_MAX_CPU_ISA"] = isa
         os.environ["ATEN_CPU_CAPABILITY"] = isa.lower()
@@ -41,6 +41,7 @@ def main() -> None:
     import torch
 
     from dopepp.core.pool import num_threads
+    from dopepp.models.checkpoint import load_network
 
     torch.set_num_threads(num_threads())
     print(f"{num_threads()} threads, ATen {torch.backends.cpu.get_cpu_capability()}")
@@ -48,23 +49,19 @@ def main() -> None:
         show_kernels()
     print(f"{'network':>14}{'size':>6}{'runtime':>16}{'first':>9}{'p50':>9}{'p95':>9}{'ratio':>8}")
     for size in asked.sizes:
-        name, network, checkpoint = pivconnector() if size == 128 else untrained("dopepp_fast")
+        if size == 128:
+            name, (network, checkpoint) = "pivconnector", load_network("pretrained/pivconnector")
+        else:
+            name, (network, checkpoint) = "dopepp_fast", untrained("dopepp_fast")
         with tempfile.TemporaryDirectory() as folder:
             runs = dict(candidates(network, checkpoint, size, Path(folder)))
             if asked.dope and size == 416:
-                runs["dope pytorch"] = torch_run(untrained("dope")[1], size)
+                runs["dope pytorch"] = torch_run(untrained("dope")[0], size)
             show(name, size, times(runs, asked.frames))
 
 
-def pivconnector():
-    """Return the released network of the quickstart."""
-    from dopepp.models.checkpoint import load_network
-
-    return "pivconnector", *load_network(Path("pretrained/pivconnector"))
-
-
 def config_of(model: str, *overrides: str):
-    """Return a training's config with a model in its full width, on renders of one part."""
+    """Return the config of a training of a model on renders of one part."""
     from hydra import compose, initialize_config_dir
     from omegaconf import OmegaConf
 
@@ -76,42 +73,55 @@ def config_of(model: str, *overrides: str):
         return RunConfig.of(OmegaConf.to_container(compose("train", chosen), resolve=True))
 
 
-def untrained(model: str):
-    """Return an untrained network in its full width."""
+def untrained(model: str, *overrides: str):
+    """Return an untrained network and its checkpoint."""
     import torch
 
     from dopepp.experiment.assembly.build_parts import build_parts
     from dopepp.experiment.assembly.build_system import build_untrained
 
-    config = config_of(model)
+    config = config_of(model, *overrides)
     torch.manual_seed(0)
-    return model, *build_untrained(config, build_parts(config.data))
+    return build_untrained(config, build_parts(config.data))
 
 
 def candidates(network, checkpoint, size: int, folder: Path) -> Iterator[tuple[str, Callable]]:
-    """Yield what is timed, PyTorch first, each loaded from its own file."""
-    import numpy as np
+    """Yield name and prediction of each runtime, PyTorch first, each loaded from its own file."""
     import torch
 
     from dopepp.inference import runtimes
+
+    yield "pytorch fp32", torch_run(network, size)
+    pixels = torch.randint(0, 256, (1, 3, size, size), dtype=torch.uint8)
+    for layout, precision in FORMATS:
+        path = write_export(
+            network, checkpoint, layout, precision, folder / precision, (size, size)
+        )
+        exported, _ = runtimes.load(path, torch.device("cpu"))
+        yield f"{layout} {precision}", lambda run=exported: run.maps(pixels)
+
+
+def write_export(
+    network, checkpoint, layout: str, precision: str, stem: Path, size: tuple[int, int]
+) -> Path:
+    """Export a network of an input size (width, height) unless its file exists; return the path."""
+    import numpy as np
+
     from dopepp.inference.export import EXPORTERS
     from dopepp.inference.runtimes import Export
 
-    yield "pytorch fp32", torch_run(network, size)
-    rng = np.random.default_rng(0)
-    images = [rng.integers(0, 256, (1, 3, size, size), np.uint8) for _ in range(4)]
-    for layout, precision in FORMATS:
-        exporter, ending = EXPORTERS[layout]
-        path = folder / f"{precision}{ending}"
-        described = Export(layout, precision, network.size_multiple, 0, 0.0)
-        exporter(network, precision, images)(path, checkpoint, described)
-        exported, _ = runtimes.load(path, torch.device("cpu"))
-        pixels = torch.from_numpy(images[0])
-        yield f"{layout} {precision}", lambda run=exported, pixels=pixels: run.maps(pixels)
+    exporter, ending = EXPORTERS[layout]
+    path = stem.with_name(stem.name + ending)
+    if not path.exists():
+        rng, (width, height) = np.random.default_rng(0), size
+        images = [rng.integers(0, 256, (1, 3, height, width), np.uint8) for _ in range(4)]
+        description = Export(layout, precision, network.size_multiple, 0, 0.0)
+        exporter(network.eval(), precision, images)(path, checkpoint, description)
+    return path
 
 
 def torch_run(network, size: int) -> Callable[[], None]:
-    """Return one image's way through a network of PyTorch's."""
+    """Return a function that computes the maps of one image in PyTorch."""
     import torch
 
     from dopepp.inference import runtimes
@@ -127,7 +137,7 @@ def torch_run(network, size: int) -> Callable[[], None]:
 
 
 def times(runs: dict[str, Callable], frames: int) -> dict[str, tuple[float, list[float]]]:
-    """Time the first call of each, and then blocks of calls in turn, milliseconds."""
+    """Return the milliseconds of each runtime's first call and of later calls, in turn."""
     first = {name: timed(run) for name, run in runs.items()}
     later: dict[str, list[float]] = {name: [] for name in runs}
     for _ in range(ROUNDS):
@@ -138,14 +148,14 @@ def times(runs: dict[str, Callable], frames: int) -> dict[str, tuple[float, list
 
 
 def timed(run: Callable) -> float:
-    """Time one call, milliseconds."""
+    """Return the wall time of a call in milliseconds."""
     start = time.perf_counter()
     run()
     return 1000 * (time.perf_counter() - start)
 
 
 def show(name: str, size: int, measured: dict[str, tuple[float, list[float]]]) -> None:
-    """Print a network's lines."""
+    """Print a line for each runtime of a network."""
     base = statistics.median(measured["pytorch fp32"][1])
     for runtime, (first, later) in measured.items():
         p50, p95 = statistics.median(later), statistics.quantiles(later, n=20)[-1]
@@ -156,7 +166,7 @@ def show(name: str, size: int, measured: dict[str, tuple[float, list[float]]]) -
 
 
 def show_kernels() -> None:
-    """Print the kernels of a convolution, float32, that PyTorch and OpenVINO choose."""
+    """Print the kernels that PyTorch and OpenVINO choose for a float32 convolution."""
     import torch
 
     layer, image = torch.nn.Conv2d(64, 64, 3), torch.zeros(1, 64, 40, 40)

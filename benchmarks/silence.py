@@ -1,4 +1,4 @@
-"""What a network reports on camera frames without its part, by kind of frame.
+"""False detections of a network on camera frames without its part, by kind of frame.
 
 python benchmarks/silence.py outputs/dopepp_fast_virtual/RUN/checkpoints/best.ckpt --num-frames 90
 """
@@ -9,6 +9,7 @@ import argparse
 from collections import defaultdict
 
 import numpy as np
+from common import print_head, print_row
 
 from dopepp.data.negatives import PhotoFrames
 from dopepp.data.sample import SampleSource
@@ -20,7 +21,7 @@ from dopepp.virtual.backgrounds import PhotoBackgrounds, find_backgrounds
 
 
 def main() -> None:
-    """Print a row per kind of frame for the network, and for refined poses."""
+    """Print a row per kind of frame, for the network and for refined poses."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("checkpoint")
     parser.add_argument("--num-frames", type=int, default=90)
@@ -35,21 +36,19 @@ def main() -> None:
         count = min(len(photos.paths), options.num_frames)
         sources.append(PhotoFrames(photos, view.K, view.size, count, "photos of the training"))
     for estimator in (network, network.refining("region", parts)):
-        loudest, reported = defaultdict(list), defaultdict(list)
+        highest, reported = defaultdict(list), defaultdict(list)
         for source in sources:
             for index in range(len(source)):
                 sample = source.sample(index)
                 candidates = estimator.candidates(sample.image, sample.K, cropped=True)
                 passed = estimator.split(candidates)[0]
-                loudest[sample.source].append(max((each.score for each in candidates), default=0.0))
+                highest[sample.source].append(max((each.score for each in candidates), default=0.0))
                 reported[sample.source].append(len(passed))
         print(f"refine={estimator.refine}, threshold {estimator.min_score:.3g}")
-        print("| kind | frames | reported a frame | loudest: median | 90 % | max |")
-        for kind, scores in loudest.items():
-            middle, high = np.quantile(scores, (0.5, 0.9))
-            mean = np.mean(reported[kind])
-            row = f"{len(scores)} | {mean:.3f} | {middle:.3f} | {high:.3f} | {max(scores):.3f}"
-            print(f"| {kind} | {row} |")
+        print_head("kind", "frames", "detections/frame", "highest score: median", "90 %", "max")
+        for kind, scores in highest.items():
+            values = np.mean(reported[kind]), *np.quantile(scores, (0.5, 0.9)), max(scores)
+            print_row(kind, len(scores), *(f"{value:.3f}" for value in values))
 
 
 if __name__ == "__main__":

@@ -1,19 +1,19 @@
-"""Whole frames on this machine: network × runtime × precision × instruction set, DOPE beside.
+"""Time from a 640×480 frame to refined poses, by network, runtime, precision and instruction set.
 
     OMP_NUM_THREADS=2 python benchmarks/speed.py [--isa AVX2 native] [--seconds 6] [--only fast]
 
-A frame of 640×480 goes in, refined poses come out. Each instruction set has a process of its own,
-which proves the limit by the kernels that PyTorch and OpenVINO choose; onnxruntime knows no limit
-and is left out under one. In a process all take turns, frame by frame of the same scenes.
+Each instruction set is measured in a separate process, which prints the kernels that PyTorch and
+OpenVINO choose. onnxruntime cannot be limited to an instruction set and is measured natively only.
+In a process, all networks and runtimes take turns on the same scenes.
 
-``pivconnector`` is the released network of 128×128. The others are untrained, at 416×416, where a
-frame of 640×480 is 416×320: their maps are made, timed and put aside, and poses are recovered from
-the true maps with a trained network's noise (:mod:`dopepp.experiment.results.cost`); int8 is
-calibrated on random pixels. ``tracker`` follows a part through a rendered sequence
-(``benchmarks/track.py``) with the released ``pivconnector_wide``. Milliseconds; *CPU*, the
-process's time on all its threads, and
-the parts are 10th percentiles, which neighbours disturb least: with one thread they are about what
-an idle core takes.
+``pivconnector`` is the released network of 128×128. The other networks are untrained, at 416×416,
+where a frame of 640×480 becomes 416×320. Their maps are computed and timed, but poses are recovered
+from the true maps with a trained network's noise (:mod:`dopepp.experiment.results.cost`). int8 is
+calibrated on random pixels. ``tracker`` tracks a part through a rendered sequence
+(``benchmarks/track.py``) with the released ``pivconnector_wide``.
+
+All times are milliseconds. *CPU* is the process's time on all its threads. CPU and the times of the
+steps are 10th percentiles, which other load affects least.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from functools import cache
 from itertools import count, islice
 from pathlib import Path
 
-from runtimes import config_of, limit, show_kernels
+from runtimes import limit, show_kernels, untrained, write_export
 
 SIZE = (640, 480)
 SCENES, ROUNDS, TRACKED = 8, 3, range(30, 130)
@@ -47,45 +47,29 @@ NETWORKS = {
     "dope": EVERY[:2],
     "tracker": (EVERY[0], EVERY[2]),
 }
-"""What is timed, and in which formats; safetensors is PyTorch."""
+"""The measured networks and their formats; safetensors is PyTorch."""
 
 RELEASED = {"pivconnector": "pivconnector", "tracker": "pivconnector_wide"}
 
 
 def export(name: str, layout: str, precision: str, folder: Path) -> Path:
-    """Return a network's file, which is written where it is not there yet."""
-    import numpy as np
-    import torch
-
-    from dopepp.experiment.assembly.build_parts import build_parts
-    from dopepp.experiment.assembly.build_system import build_untrained
-    from dopepp.inference.export import EXPORTERS
-    from dopepp.inference.runtimes import Export
+    """Export a network unless its file exists, and return the file."""
     from dopepp.models.checkpoint import load_network
 
-    exporter, ending = EXPORTERS[layout]
-    path = folder / f"{name.replace(' ', '_')}_{precision}{ending}"
-    if path.exists():
-        return path
     if name in RELEASED:
         network, checkpoint = load_network(f"pretrained/{RELEASED[name]}")
     else:
         model, *width = name.split()
-        config = config_of(model, *(f"model.{option}" for option in width))
-        torch.manual_seed(0)
-        network, checkpoint = build_untrained(config, build_parts(config.data))
+        network, checkpoint = untrained(model, *(f"model.{option}" for option in width))
         checkpoint.state_dict.update(network.state_dict())
-    rng, (width, height) = np.random.default_rng(0), checkpoint.input_size
-    images = [rng.integers(0, 256, (1, 3, height, width), np.uint8) for _ in range(4)]
-    described = Export(layout, precision, network.size_multiple, 0, 0.0)
-    exporter(network.eval(), precision, images)(path, checkpoint, described)
-    return path
+    stem = folder / f"{name.replace(' ', '_')}_{precision}"
+    return write_export(network, checkpoint, layout, precision, stem, checkpoint.input_size)
 
 
-class Side:
-    """One network in one runtime: a call a frame, and what the frames took.
+class RuntimeTimes:
+    """One network in one runtime, with the times of its frames in milliseconds.
 
-    ``steps`` are what of a frame preparing, network, decoding and refining took.
+    ``steps`` holds the times of preparing the image, network, decoding and refining per frame.
     """
 
     def __init__(self, path: Path, tracked: bool) -> None:
@@ -108,7 +92,7 @@ class Side:
         self.num_found = 0
 
     def next(self) -> None:
-        """Time a frame."""
+        """Process the next frame, and record its times."""
         call, before = next(self.calls), self.estimator.spent_ms.copy()
         start, cpu_start = time.perf_counter(), time.process_time()
         detections = call()
@@ -118,8 +102,8 @@ class Side:
         self.num_found += len(detections)
 
     def row(self) -> list[str]:
-        """Return first frame, median, 95th percentile, CPU, parts, frames a second, found."""
-        later = self.frame[2:]  # the first allocates, compiles and chooses kernels
+        """Return first frame, median, 95th percentile, CPU, steps, frames/s and detections."""
+        later = self.frame[2:]  # the first frames allocate, compile and choose kernels
         p50, p95 = (
             statistics.median(later),
             statistics.quantiles(later, n=20, method="inclusive")[-1],
@@ -131,7 +115,7 @@ class Side:
         return [*(f"{value:.1f}" for value in values), f"{1000 / p50:.1f}", detected]
 
     def _frames(self, trained: bool) -> Iterator[Callable[[], list]]:
-        """Yield a prediction on one rendered scene after the other."""
+        """Yield predictions on the rendered scenes in turn."""
         import torch
 
         from dopepp.experiment.results.cost import likely_maps
@@ -152,7 +136,7 @@ class Side:
             yield lambda number=number: predict(number % SCENES)
 
     def _tracked(self) -> Iterator[Callable[[], list]]:
-        """Yield the following of a part from frame to frame, again and again."""
+        """Yield calls that track a part from frame to frame; the sequence repeats."""
         from dopepp.inference.tracker import PoseTracker
 
         while True:
@@ -163,7 +147,7 @@ class Side:
 
 @cache
 def scenes() -> list:
-    """Render the scenes that all networks see."""
+    """Render the scenes on which all networks predict."""
     from dopepp.data.rendered import RenderedSource
     from dopepp.parts.catalogue import pivconnector
     from dopepp.virtual import PRESETS, Factory
@@ -175,7 +159,7 @@ def scenes() -> list:
 
 @cache
 def motion() -> list:
-    """Render the frames that the tracker follows."""
+    """Render the frames of the tracker."""
     from track import sequence
 
     from dopepp.parts.catalogue import pivconnector
@@ -184,9 +168,10 @@ def motion() -> list:
 
 
 def measure(isa: str, folder: Path, seconds: float, only: str) -> None:
-    """Print the table of one instruction set, in this process."""
+    """Measure one instruction set in this process, and print its table."""
     limit(None if isa == "native" else isa)
     import torch
+    from common import print_head, print_row
 
     from dopepp.core.pool import num_threads
 
@@ -196,44 +181,31 @@ def measure(isa: str, folder: Path, seconds: float, only: str) -> None:
         f"load {os.getloadavg()[0]:.1f}"
     )
     show_kernels()
-    sides = {}
+    runs = {}
     for name, formats in NETWORKS.items():
         for layout, precision in formats if only in name else ():
             if layout != "onnx" or isa == "native":
                 runtime = {"safetensors": "PyTorch", "onnx": "onnxruntime"}.get(layout, "OpenVINO")
-                side = Side(export(name, layout, precision, folder), name == "tracker")
-                sides[name, runtime, precision] = side
-                side.next()
-                side.next()
+                run = RuntimeTimes(export(name, layout, precision, folder), name == "tracker")
+                runs[name, runtime, precision] = run
+                run.next()
+                run.next()
     for _ in range(ROUNDS):
-        for side in sides.values():
+        for run in runs.values():
             until = time.perf_counter() + seconds / ROUNDS
-            side.next()
+            run.next()
             while time.perf_counter() < until:
-                side.next()
-    heads = (
-        "network",
-        "runtime",
-        "precision",
-        "first",
-        "p50",
-        "p95",
-        "CPU",
-        "pre",
-        "maps",
-        "decode",
-        "refine",
-        "frames/s",
-        "found",
-    )
-    print(f"\n| {' | '.join(heads)} |\n|{' --- |' * 3}{' ---: |' * 10}")
-    for names, side in sides.items():
-        print(f"| {' | '.join([*names, *side.row()])} |")
+                run.next()
+    titles = "network runtime precision first p50 p95 CPU pre maps decode refine frames/s detected"
+    print()
+    print_head(*titles.split())
+    for names, run in runs.items():
+        print_row(*names, *run.row())
     print(f"\nload {os.getloadavg()[0]:.1f}", flush=True)
 
 
 def main() -> None:
-    """Write the files, then measure each instruction set in a fresh process."""
+    """Export the networks, then measure each instruction set in a fresh process."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--isa", nargs="+", default=["AVX2", "native"], help="oneDNN's names")
     parser.add_argument("--seconds", type=float, default=6, help="of each row")

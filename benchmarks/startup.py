@@ -1,4 +1,4 @@
-"""What a command takes until its first line and in all, as a multiple of importing PyTorch alone.
+"""Time of a command until its first output and until its end, relative to importing PyTorch.
 
 python benchmarks/startup.py --repeat 3
 """
@@ -25,7 +25,7 @@ K = ["--K", "128", "128", "63.5", "63.5"]
 
 
 class Start(NamedTuple):
-    """Seconds until the first line, until the end, and of processor time."""
+    """Wall time until the first line and until the end, and CPU time, seconds."""
 
     first: float
     end: float
@@ -33,7 +33,7 @@ class Start(NamedTuple):
 
 
 def start(command: list[str], folder: Path, until_first: bool) -> Start:
-    """Run a command; one that would go on for long is ended after its first line."""
+    """Run a command, and with ``until_first`` kill it after its first line."""
     begun = time.perf_counter()
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     process = subprocess.Popen(command, cwd=folder, **streams)
@@ -48,7 +48,7 @@ def start(command: list[str], folder: Path, until_first: bool) -> Start:
 
 
 def imports(code: str, folder: Path) -> dict[str, float]:
-    """Return the seconds that the largest packages take of an import, by name."""
+    """Return the seconds of the six packages with the longest imports, by name."""
     command = [sys.executable, "-X", "importtime", "-c", code]
     lines = subprocess.run(command, cwd=folder, capture_output=True, text=True).stderr.splitlines()
     seconds: dict[str, float] = {}
@@ -61,24 +61,14 @@ def imports(code: str, folder: Path) -> dict[str, float]:
 
 
 def main() -> None:
-    """Print a row per command, then where the imports of prediction go."""
+    """Print a row per command, then the packages with the longest imports of a prediction."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeat", type=int, default=3)
     repeat = parser.parse_args().repeat
     folder = Path(tempfile.mkdtemp())
     os.environ["PYTHONPATH"] = str(ROOT)
-    render = [
-        *DOPEPP,
-        "render",
-        "pivconnector",
-        "--preset",
-        "quickstart",
-        "-n",
-        "1",
-        "--out",
-        "data",
-    ]
-    subprocess.run(render, cwd=folder, check=True, capture_output=True)
+    render = ["render", "pivconnector", "--preset", "quickstart", "-n", "1", "--out", "data"]
+    subprocess.run([*DOPEPP, *render], cwd=folder, check=True, capture_output=True)
     (image,) = map(str, (folder / "data").glob("**/rgb/*.*"))
     commands = {
         "import torch": ([sys.executable, "-c", "import torch; print(1)"], False),
@@ -95,7 +85,7 @@ def main() -> None:
         first, end, cpu = (min(values) for values in zip(*runs, strict=True))
         torch_s = torch_s or cpu
         print(f"{name:34}{first:12.2f}{end:9.2f}{cpu:9.2f}{cpu / torch_s:12.2f}")
-    print("imports of dopepp.inference.estimator, seconds of their own:")
+    print("imports of dopepp.inference.estimator, seconds without nested imports:")
     for package, seconds in imports("import dopepp.inference.estimator", folder).items():
         print(f"  {package:20}{seconds:.2f}")
 

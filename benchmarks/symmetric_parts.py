@@ -1,7 +1,7 @@
-"""Write the two symmetric parts of ``docs/how-to/symmetry.md`` as STL files in millimetres.
+"""Write the two symmetric parts of ``docs/lab/symmetry.md`` as STL files in millimetres.
 
 ``python benchmarks/symmetric_parts.py FOLDER`` writes ``plate.stl``, 100 × 60 × 6 mm with two equal
-holes (three half turns), and ``can.stl``, a cylinder of 66 × 100 mm (round, and a flip).
+holes (three 180° rotations), and ``can.stl``, a cylinder of 66 × 100 mm.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ SEGMENTS = 64
 
 
 def plate() -> Manifold:
-    """Return the plate, about its middle."""
+    """Return the plate, centred at the origin."""
     hole = Manifold.cylinder(10.0, 9.0, circular_segments=SEGMENTS, center=True)
     holes = hole.translate((28.0, 0.0, 0.0)) + hole.translate((-28.0, 0.0, 0.0))
     return Manifold.cube((100.0, 60.0, 6.0), center=True) - holes
 
 
 def can() -> Manifold:
-    """Return the can, about its middle, with its axis along z."""
+    """Return the can, centred at the origin, with its axis along z."""
     return CrossSection.circle(33.0, SEGMENTS).extrude(100.0).translate((0.0, 0.0, -50.0))
 
 

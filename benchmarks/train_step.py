@@ -1,11 +1,14 @@
-"""Speed of the quickstart with each network: a training step, and one image's maps.
+"""Speed of a training step and of one prediction, for the quickstart with each network.
 
-``python benchmarks/train_step.py`` runs ``experiment=quickstart`` with every model below in turn in
-one process: images a second of forward, loss and backward in the precision that a training here
-takes, with and without glibc keeping freed memory, with memory kept in float32 and in bf16, and
-milliseconds of one image's maps in float32, memory not kept, as in a user's program.
-The first model is what the others are compared with. Other models:
-``python benchmarks/train_step.py dopepp dopepp_fast …``.
+``python benchmarks/train_step.py [dopepp dopepp_fast …]`` runs ``experiment=quickstart`` with the
+models in turn in one process. It prints
+
+- images per second of forward, loss and backward, in the precision that training selects on this
+  machine, without and with glibc keeping freed memory;
+- the same in float32 and in bf16, with freed memory kept;
+- milliseconds of one image's maps in float32, with freed memory returned, as in a user's program.
+
+Ratios are relative to the first model.
 """
 
 from __future__ import annotations
@@ -15,39 +18,21 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
+from runtimes import untrained
 
-from dopepp.experiment.assembly.build_parts import build_parts
-from dopepp.experiment.assembly.build_system import (
-    build_untrained,
-    choose_precision,
-    keep_freed_memory,
-)
-from dopepp.experiment.config.run_config import RunConfig
+from dopepp.experiment.assembly.build_system import choose_precision, keep_freed_memory
 from dopepp.models.losses import SpatialCrossEntropy
 from dopepp.models.network import PoseNetwork, network_cost
 
-CONF = Path(__file__).parents[1] / "conf"
 MODELS = ("dopepp", "dopepp_fast")
 BATCH, SIZE = 32, 128
 STEPS, IMAGES, ROUNDS = 5, 10, 4
 
 
-def make_network(model: str) -> PoseNetwork:
-    """Return the quickstart's network of a model, untrained."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        node = compose("train", ["experiment=quickstart", f"model={model}"])
-    config = RunConfig.of(OmegaConf.to_container(node, resolve=True))
-    network, _ = build_untrained(config, build_parts(config.data))
-    return network.to(memory_format=torch.channels_last)
-
-
 def make_step(network: PoseNetwork, half: bool) -> Callable[[], None]:
-    """Return one forward and backward pass of a network, in bf16 or in float32."""
+    """Return a function that runs one forward and backward pass, in bf16 or in float32."""
     loss = SpatialCrossEntropy(sigma=1.0)
     images = torch.randint(0, 256, (BATCH, 3, SIZE, SIZE), dtype=torch.uint8)
     images = images.contiguous(memory_format=torch.channels_last)
@@ -63,7 +48,7 @@ def make_step(network: PoseNetwork, half: bool) -> Callable[[], None]:
 
 
 def make_prediction(network: PoseNetwork) -> Callable[[], None]:
-    """Return one image's way through a network, in float32."""
+    """Return a function that computes one image's maps in float32."""
     image = torch.randint(0, 256, (1, 3, SIZE, SIZE), dtype=torch.uint8)
 
     def predict() -> None:
@@ -74,7 +59,7 @@ def make_prediction(network: PoseNetwork) -> Callable[[], None]:
 
 
 def seconds(call: Callable[[], None], repeats: int) -> float:
-    """Time a few calls after one that is not timed."""
+    """Return the mean time of a call, after one call that is not timed."""
     call()
     start = time.perf_counter()
     for _ in range(repeats):
@@ -83,7 +68,7 @@ def seconds(call: Callable[[], None], repeats: int) -> float:
 
 
 def return_freed_memory() -> None:
-    """Set glibc's defaults: blocks from 128 KiB on are mapped and unmapped each time."""
+    """Set glibc's defaults: blocks of 128 KiB and more are mapped and unmapped each time."""
     libc = ctypes.CDLL(None)
     libc.mallopt(-4, 65536)
     libc.mallopt(-1, 128 * 1024)
@@ -92,7 +77,10 @@ def return_freed_memory() -> None:
 
 def main(models: tuple[str, ...]) -> None:
     """Print a line per model: its size, and each rate with its ratio to the first model's."""
-    networks = {model: make_network(model) for model in models}
+    networks = {
+        model: untrained(model, "experiment=quickstart")[0].to(memory_format=torch.channels_last)
+        for model in models
+    }
     calls = {
         model: (
             make_step(network, half=False),
@@ -102,34 +90,34 @@ def main(models: tuple[str, ...]) -> None:
         for model, network in networks.items()
     }
     half = choose_precision("auto", "cpu")[0].startswith("bf16")
-    # Of each model: a step and an image with glibc's default, steps with memory kept.
+    # Per model: a step and an image with glibc's default, then both steps with memory kept.
     times: dict[str, list[tuple[float, float, float, float]]] = {model: [] for model in models}
     for _ in range(ROUNDS):
         for model, (single_step, half_step, predict) in calls.items():
             return_freed_memory()
             default = seconds(half_step if half else single_step, STEPS)
-            picture = seconds(predict, IMAGES)
+            image = seconds(predict, IMAGES)
             keep_freed_memory()
             kept = seconds(single_step, STEPS), seconds(half_step, STEPS)
-            times[model].append((default, picture, *kept))
+            times[model].append((default, image, *kept))
     chosen = "bf16" if half else "float32"
     print(
         f"{torch.get_num_threads()} threads, {BATCH} images of {SIZE}×{SIZE}, trained in {chosen}"
     )
     first = None
     for model, rounds in times.items():
-        default, picture, single_s, half_s = (
+        default, image, single_s, half_s = (
             statistics.median(samples) for samples in zip(*rounds, strict=True)
         )
         kept = half_s if half else single_s
         num_parameters, gmacs = network_cost(networks[model], (SIZE, SIZE))
-        first = first or (kept, picture)
+        first = first or (kept, image)
         print(
             f"{model:12} {num_parameters / 1e6:.2f} M weights, {gmacs:.3f} GMACs; training: "
             f"{BATCH / default:.1f} images/s, memory kept {BATCH / kept:.1f} "
             f"({first[0] / kept:.2f}×), float32 {BATCH / single_s:.1f}, bf16 {BATCH / half_s:.1f} "
-            f"({single_s / half_s:.2f}×); one image: {1000 * picture:.1f} ms "
-            f"({first[1] / picture:.2f}×)"
+            f"({single_s / half_s:.2f}×); one image: {1000 * image:.1f} ms "
+            f"({first[1] / image:.2f}×)"
         )
 
 

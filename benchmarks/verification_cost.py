@@ -1,11 +1,11 @@
-"""Cost of the verification of a pose, beside that of its refinement, on one core.
+"""CPU time of verifying a pose, compared with refining the pose, on one core.
 
     python benchmarks/verification_cost.py [FOLDER] [--poses 60] [--other verification.py]
 
-Poses are those of a BOP data set's frames in FOLDER, and those of the released parts in renders.
-Each is moved as far as a refined pose is off: 2 mm and 1° (standard deviations). ``--other``
-times another version of ``dopepp/inference/refinement/verification.py`` in turn and compares its
-evidence.
+Poses are the published poses in a BOP data set's frames in FOLDER, and the true poses in renders of
+the released parts. Each pose is moved by 2 mm and 1° (standard deviations), like a refined pose.
+``--other`` measures another version of ``dopepp/inference/refinement/verification.py`` in turn and
+compares the evidence.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import argparse
 import importlib.util
 import math
 import sys
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import islice
@@ -22,6 +21,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from common import print_head, print_row, timed
 from refine_real import read_frames
 
 from dopepp.data.formats.bop.bop_models import bop_parts, parts_by_id
@@ -54,26 +54,21 @@ def rendered_cases(name: str) -> Iterator[Case]:
     part = load_part(name)
     factory, index = Factory([part], PRESETS["table"], 61), 0
     while True:
-        picture = factory.render(0, index)
-        for number in picture.scene.targets:
-            if picture.visible_fractions[number] > 0.3:
-                T = picture.scene.objects[number].T_cam_obj
-                yield f"renders: {name}", part, picture.image, picture.scene.K, T
+        rendered = factory.render(0, index)
+        for number in rendered.scene.targets:
+            if rendered.visible_fractions[number] > 0.3:
+                T = rendered.scene.objects[number].T_cam_obj
+                yield f"renders: {name}", part, rendered.image, rendered.scene.K, T
         index += 1
 
 
 def fastest_ms(run: Callable[[], object]) -> float:
-    """Return the processor time of the fastest run, milliseconds."""
-    spent = []
-    for _ in range(REPEATS):
-        start = time.process_time()
-        run()
-        spent.append(1000 * (time.process_time() - start))
-    return min(spent)
+    """Return the CPU time of the fastest run in milliseconds."""
+    return min(timed(run)[1] for _ in range(REPEATS))
 
 
 def main() -> None:
-    """Print a row for every part."""
+    """Print a row per part."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", nargs="?", type=Path, help="BOP data set")
     parser.add_argument("--poses", type=int, default=60, help="per part")
@@ -92,8 +87,9 @@ def main() -> None:
     sources = [rendered_cases(name) for name in RENDERED]
     if arguments.folder is not None:
         sources.insert(0, real_cases(arguments.folder))
-    print("| part | poses | verify ms | refine ms | verify/refine | this/other | difference |")
-    print("| --- | ---: | ---: | ---: | ---: | ---: | ---: |")
+    print_head(
+        "part", "poses", "verify ms", "refine ms", "verify/refine", "this/other", "difference"
+    )
     for source in sources:
         rng, rows, refiner, title = np.random.default_rng(5), [], None, ""
         for name, part, image, K, T in islice(source, arguments.poses):
@@ -115,8 +111,7 @@ def main() -> None:
             rows.append((spent[0], refined, spent[0] / refined, spent[0] / spent[-1], difference))
         *figures, _ = np.median(rows, axis=0)
         difference = np.max(rows, axis=0)[-1]
-        text = " | ".join(f"{figure:.2f}" for figure in figures)
-        print(f"| {title} | {len(rows)} | {text} | {difference:.0e} |", flush=True)
+        print_row(title, len(rows), *(f"{figure:.2f}" for figure in figures), f"{difference:.0e}")
 
 
 if __name__ == "__main__":

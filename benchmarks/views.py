@@ -3,14 +3,13 @@
     python benchmarks/views.py [--scenes 100] [--angle 25] [--views 1 2 3] [--hidden 0.4]
                                [--perturbed] [--checkpoint CKPT] [--preset wide] [--first 0]
 
-The first camera is the preset's, at 640×480. The second looks at the part from ``--angle`` degrees
-beside it in a random direction, the third from as far in a direction at right angles. The scene is
-static: objects and lamps stay, the background is infinitely far away. ``--hidden`` covers a share
-of the part in every image (``dopepp.data.transforms.shading_protocol``). ``--perturbed`` moves
-every camera by 0.3 mm and 0.05° along and about each axis (standard deviations, which the estimator
-gets). Errors are those of right poses in the world, which is the first camera's frame without
-perturbation; "along" is along the first camera's line of sight. A pose is right if ADD is below a
-tenth of the diameter.
+The first camera is the preset's, at 640×480. The second camera views the part from a direction that
+differs by ``--angle`` degrees, the third from a direction at right angles to the second. Objects
+and lamps do not move, and the background is infinitely far away. ``--hidden`` covers a share of
+the part in every image (``dopepp.data.transforms.shading_protocol``). ``--perturbed`` moves each
+camera by 0.3 mm and 0.05° along and about each axis (standard deviations, which the estimator
+knows). Errors are those of correct poses (ADD below a tenth of the diameter) in the frame of the
+first camera without perturbation. "along" is along the first camera's line of sight.
 """
 
 from __future__ import annotations
@@ -21,9 +20,8 @@ import time
 from dataclasses import replace
 from typing import NamedTuple
 
-import cv2
 import numpy as np
-import torch
+from common import pose_errors, print_head, print_row, use_one_thread
 
 from dopepp.data.sample import Instance, Sample
 from dopepp.data.transforms.shading_protocol import shade
@@ -35,9 +33,7 @@ from dopepp.geometry.camera import (
     moved,
     orbited_camera,
     step_between,
-    transform,
 )
-from dopepp.geometry.rotation import rotation_angle
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Part
@@ -46,10 +42,6 @@ from dopepp.virtual.sensor import capture
 
 SEED, SIZE, PASSING = 4177, (640, 480), 0.1
 CAMERA_ERROR = 3e-4, math.radians(0.05)
-TITLES = (
-    "views | scenes | along mm, 50 % (90 %) | across mm | rotation ° | missed | wrong | "
-    "normalised error | ms"
-)
 
 
 class StaticScene(NamedTuple):
@@ -64,7 +56,7 @@ class StaticScene(NamedTuple):
 def static_scene(
     factory: Factory, index: int, angle: float, num_views: int, hidden: float
 ) -> StaticScene:
-    """Render a scene of the factory from several cameras."""
+    """Render a scene from several cameras; ``angle`` in radians."""
     rng, scene = np.random.default_rng([SEED, index]), factory.scene(0, index)
     target = scene.objects[scene.targets[0]]
     true, direction = target.T_cam_obj, rng.uniform(0.0, 2 * math.pi)
@@ -91,23 +83,22 @@ def static_scene(
 
 
 def perturbed(T_world_cam: Transform, rng: np.random.Generator) -> Transform:
-    """Return the pose of a camera with errors."""
+    """Return a camera pose with random errors."""
     shift, turn = CAMERA_ERROR
     return moved(T_world_cam, rng.normal(size=6) * np.repeat([turn, shift], 3))
 
 
-def pose_errors(T: Transform, true: Transform, part: Part) -> tuple[float, float, float, float]:
-    """Return ADD over the diameter, mm along and across the line of sight, and degrees."""
-    away = transform(T, part.points) - transform(true, part.points)
+def errors_by_ray(T: Transform, true: Transform, part: Part) -> tuple[float, float, float, float]:
+    """Return ADD in diameters, mm along and across the line of sight, and degrees."""
+    errors = pose_errors(T, true, part.points)
     ray, shift = true[:3, 3] / np.linalg.norm(true[:3, 3]), 1e3 * (T[:3, 3] - true[:3, 3])
     along = float(shift @ ray)
-    turn = math.degrees(float(rotation_angle(T[:3, :3] @ true[:3, :3].T)))
-    add = float(np.linalg.norm(away, axis=1).mean()) / part.diameter
-    return add, abs(along), float(np.linalg.norm(shift - along * ray)), turn
+    across = float(np.linalg.norm(shift - along * ray))
+    return errors.add / (1e3 * part.diameter), abs(along), across, errors.rotation
 
 
 def main() -> None:
-    """Print a row for every number of views."""
+    """Print a row per number of views."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scenes", type=int, default=100)
     parser.add_argument("--first", type=int, default=0, help="index of the first scene")
@@ -119,8 +110,7 @@ def main() -> None:
     parser.add_argument("--preset", default="wide")
     parser.add_argument("--verbose", action="store_true", help="print the scenes that fail")
     options = parser.parse_args()
-    cv2.setNumThreads(1)
-    torch.set_num_threads(1)
+    use_one_thread()
     estimator = PoseEstimator.load(options.checkpoint, refine="region")
     part = load_part(estimator.parts[0].name)
     factory = Factory([part], PRESETS[options.preset].reframed(*SIZE), SEED)
@@ -145,7 +135,7 @@ def main() -> None:
             row = (math.inf,) * 5
             for detection in result.detections:
                 T = detection.T_world_obj
-                errors = pose_errors(T, scene.T_world_obj, part)
+                errors = errors_by_ray(T, scene.T_world_obj, part)
                 step = step_between(T, scene.T_world_obj)
                 surprise = float(step @ np.linalg.solve(detection.covariance, step)) / 6
                 wrong[count] += errors[0] >= PASSING
@@ -154,7 +144,10 @@ def main() -> None:
             if options.verbose and (not math.isfinite(row[0]) or result.findings):
                 seen = [(it.score, it.views) for it in (*result.detections, *result.weaker)]
                 print(index, count, row, seen, result.findings)
-    print(f"| {TITLES} |\n" + "| --- " * 9 + "|")
+    print_head(
+        "views", "scenes", "along mm, 50 % (90 %)", "across mm", "rotation °", "missed", "wrong",
+        "normalised error", "ms",
+    )  # fmt: skip
     for count, values in rows.items():
         errors = np.array(values)
         right = errors[np.isfinite(errors[:, 0])]
@@ -163,7 +156,7 @@ def main() -> None:
         ]
         missed, normalised = 1 - len(right) / len(errors), math.sqrt(right[:, 4].mean())
         cells += [f"{missed:.1%}", f"{wrong[count] / len(errors):.1%}", f"{normalised:.2f}"]
-        print(f"| {count} | {len(errors)} | {' | '.join(cells)} | {np.median(times[count]):.0f} |")
+        print_row(count, len(errors), *cells, f"{np.median(times[count]):.0f}")
 
 
 if __name__ == "__main__":

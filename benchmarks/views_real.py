@@ -1,13 +1,13 @@
-"""Several views of a static scene of real frames (BOP), against one view.
+"""Several views of a static scene compared with one view, on real frames of a BOP data set.
 
     python benchmarks/views_real.py FOLDER [--checkpoint CKPT] [--frames 4] [--angles 20 40]
 
-The relative poses of the cameras come from the published poses of all objects but the evaluated
-one: their cuboids in two frames are aligned. LM-O's objects were moved several times, so frames
-belong together if all other objects agree within 8 mm; whether the evaluated object was moved is
-not looked up. Without a network, detections are drawn around the published poses, 5° and 10 mm off
-(times ``--spread``), in every frame independently. The table gives ADD(-S)-0.1d of objects that are
-at least a tenth visible in the first frame, refined on this frame and on all.
+The relative poses of the cameras come from aligning the cuboids of all other objects at their
+published poses. LM-O's objects were moved several times, so only frames are combined in which all
+other objects agree within 8 mm. The evaluated object may still have been moved. Without a network,
+detections are drawn around the published poses, 5° and 10 mm off (times ``--spread``), in each
+frame independently. The table has ADD(-S)-0.1d of objects that are at least a tenth visible in the
+first frame, refined on this frame and on all frames.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
+from common import print_head, print_row, random_step, use_one_thread
 from refine_real import COVARIANCE, SEED, SHIFT, TURN
 
 from dopepp.core.json import read_json
@@ -46,7 +46,7 @@ CAMERA_ERROR = (2e-3, math.radians(0.2))
 
 
 class Frames:
-    """The frames of a scene, with the published poses of the visible objects."""
+    """The frames of a scene, with the published poses and the visible objects."""
 
     def __init__(self, scene: Path) -> None:
         self.scene = scene
@@ -75,7 +75,7 @@ class Frames:
         return read_rgb(next((self.scene / "rgb").glob(f"{int(frame):06d}.*")))
 
     def relative(self, first: str, other: str, left_out: int, parts: dict[int, Part]) -> Transform:
-        """Return T_first_other by the poses of all objects but one (Kabsch 1976)."""
+        """Return T_first_other from the poses of all objects except one (Kabsch 1976)."""
         both = [
             [transform(self.poses[frame][n], parts[n].cuboid) for n in parts if n != left_out
              and n in self.poses[first] and n in self.poses[other]]
@@ -89,8 +89,8 @@ class Frames:
     def partners(
         self, first: str, left_out: int, parts: dict[int, Part], angles: tuple[float, float]
     ) -> list[str]:
-        """Return the frames of the same static scene from a viewing angle beside it, degrees."""
-        found = []
+        """Return the frames of the same scene whose viewing direction differs by given angles."""
+        frames = []
         for other in self.poses:
             T = self.relative(first, other, left_out, parts)
             turn = math.degrees(math.acos(np.clip(T[2, 2], -1.0, 1.0)))
@@ -105,12 +105,12 @@ class Frames:
                 if n != left_out and n in self.poses[first] and n in self.poses[other]
             ]
             if len(apart) >= FEWEST_OTHERS and max(apart) < STATIC:
-                found.append(other)
-        return found
+                frames.append(other)
+        return frames
 
 
 class DrawnEstimator:
-    """Stands for a network: its detections are drawn around the published poses."""
+    """Replaces a network: the detections are drawn around the published poses."""
 
     def __init__(self, part: Part, spread: float) -> None:
         self.covariance = spread**2 * COVARIANCE
@@ -123,7 +123,7 @@ class DrawnEstimator:
         self.starts: dict[bytes, Transform] = {}
 
     def candidates(self, image: np.ndarray, K: np.ndarray, *_: object) -> list[Detection]:
-        """Return the refined start of an image."""
+        """Return the refined detection of an image."""
         if (T := self.starts.get(image.tobytes())) is None:
             return []
         part, nothing = self.solid_parts[0], np.full((9, 2), np.nan)
@@ -133,7 +133,7 @@ class DrawnEstimator:
 
 
 def with_half_turn(part: Part) -> Part:
-    """State the symmetry that the data set leaves out."""
+    """Return a part with a 180° symmetry about z, which the data set does not state."""
     turn = make_transform(rotation_vector_to_matrix(np.array([0.0, 0.0, math.pi])), np.zeros(3))
     return replace(part, symmetries_discrete=turn[None])
 
@@ -146,7 +146,7 @@ def passes(T: Transform, true: Transform, part: Part, is_symmetric: bool) -> boo
 
 
 def main() -> None:
-    """Print a row for every object."""
+    """Print a row per object."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--scene", default="test/000002")
@@ -156,8 +156,7 @@ def main() -> None:
     parser.add_argument("--stride", type=int, default=1, help="use every n-th frame as the first")
     parser.add_argument("--spread", type=float, default=1.0, help="factor on the drawn errors")
     options = parser.parse_args()
-    cv2.setNumThreads(1)
-    torch.set_num_threads(1)
+    use_one_thread()
     parts = parts_by_id(options.folder, bop_parts(options.folder))
     parts = {n: with_half_turn(part) if n in SYMMETRIC else part for n, part in parts.items()}
     frames, rng = Frames(options.folder / options.scene), np.random.default_rng(SEED)
@@ -168,7 +167,7 @@ def main() -> None:
         known = {part.name for part in PoseEstimator.load(options.checkpoint).parts}
         solid = [part for part in solid if part.name in known]
         network = PoseEstimator.load(options.checkpoint, refine="region", parts=solid)
-    print("| object | frames | one frame | several | views that show it |\n" + "| --- " * 5 + "|")
+    print_head("object", "frames", "one frame", "several", "supporting views")
     total = np.zeros(2)
     count = 0
     for number, part in parts.items():
@@ -188,9 +187,7 @@ def main() -> None:
                 estimator.starts.clear()
                 for name, image in zip(chosen, images, strict=True):
                     if number in frames.visible[name]:
-                        step = rng.normal(size=6)
-                        step[:3] *= options.spread * TURN / np.linalg.norm(step[:3])
-                        step[3:] *= options.spread * SHIFT / np.linalg.norm(step[3:])
+                        step = random_step(rng, options.spread * TURN, options.spread * SHIFT)
                         pose = moved(frames.poses[name][number], step)
                         estimator.starts[image.tobytes()] = pose
             cameras = [frames.K[name] for name in chosen]
@@ -201,8 +198,8 @@ def main() -> None:
                     estimator, images[:views], cameras[:views], poses[:views],
                     camera_error=CAMERA_ERROR,
                 )  # fmt: skip
-                found = [it for it in result.detections if it.object == part.name]
-                best = max(found, key=lambda it: it.score, default=None)
+                of_part = [it for it in result.detections if it.object == part.name]
+                best = max(of_part, key=lambda it: it.score, default=None)
                 results.append(
                     best is not None and passes(best.T_world_obj, true, part, number in SYMMETRIC)
                 )
@@ -212,11 +209,8 @@ def main() -> None:
         shares = np.mean(rows, axis=0)
         total, count = total + np.sum(rows, axis=0), count + len(rows)
         mean = np.mean(shown) if shown else 0.0
-        print(
-            f"| {part.name} | {len(rows)} | {shares[0]:.1%} | {shares[1]:.1%} | {mean:.1f} |",
-            flush=True,
-        )
-    print(f"| all | {count} | {total[0] / count:.1%} | {total[1] / count:.1%} | |")
+        print_row(part.name, len(rows), *(f"{share:.1%}" for share in shares), f"{mean:.1f}")
+    print_row("all", count, *(f"{share:.1%}" for share in total / count), "")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""``benchmarks/gpu.py``: rows are kept one by one, and only missing ones are measured again."""
+"""``benchmarks/gpu.py`` keeps measured rows, and measures missing and failed rows again."""
 
 import json
 from pathlib import Path
@@ -27,10 +27,12 @@ def rows_of(gpu, calls, broken=()):
         return {"ms": 1.2345, "images/s": 1234.5}
 
     names = ("dope", "dopepp", "dopepp_fast")
-    return [gpu.Row("inference", {"network": one}, lambda one=one: measure(one)) for one in names]
+    return [
+        gpu.Row("inference", {"network": name}, lambda name=name: measure(name)) for name in names
+    ]
 
 
-def test_an_interrupted_command_goes_on_where_it_was(gpu, tmp_path):
+def test_an_interrupted_command_resumes(gpu, tmp_path):
     calls = []
     with pytest.raises(KeyboardInterrupt):
         gpu.measure(rows_of(gpu, calls, {"dopepp": KeyboardInterrupt()}), tmp_path, MACHINE, 1)
@@ -44,7 +46,7 @@ def test_an_interrupted_command_goes_on_where_it_was(gpu, tmp_path):
     assert lines[-3:] == [f"| {item} | 1.23 | 1234 |" for item in ("dope", "dopepp", "dopepp_fast")]
 
 
-def test_a_row_that_failed_says_why_and_is_tried_again(gpu, tmp_path):
+def test_a_failed_row_has_a_reason_and_is_measured_again(gpu, tmp_path):
     calls = []
     no_room = RuntimeError("CUDA out of memory.\nTried to allocate")
     rows = rows_of(gpu, calls, {"dopepp": no_room})
@@ -71,7 +73,7 @@ def test_rows_of_two_machines_are_not_mixed(gpu, tmp_path):
 
 
 def test_every_network_has_all_its_rows(gpu):
-    rows = [*gpu.Workshop("cpu", gpu.QUICK).rows()]
+    rows = [*gpu.Measurements("cpu", gpu.QUICK).rows()]
     assert len({row.name for row in rows}) == len(rows)
     for model in gpu.MODELS:
         tables = {row.table for row in rows if row.setting.get("network") == model}

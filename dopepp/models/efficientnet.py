@@ -177,7 +177,7 @@ class DepthwiseConv(nn.Conv2d):
     """A depthwise convolution that trains in float32 on CPUs, also under bf16 autocast.
 
     In bf16, the backward pass takes up to fifteen times as long on CPUs, except for 3×3 kernels of
-    stride 1 (``benchmarks/depthwise.py``).
+    stride 1.
     """
 
     def forward(self, features: Features) -> Features:

@@ -224,4 +224,4 @@ def test_a_run_killed_three_times_ends_as_one_left_in_peace(command):
     done = command("benchmarks/crash.py", "--kills=3", "--epochs=4", timeout=580, code=0)
     assert "3 kills: " in done.out
     assert ", 0 lost []" in done.out
-    assert "differences from the undisturbed run: none" in done.out
+    assert "differences from the uninterrupted run: none" in done.out

@@ -93,7 +93,7 @@ def test_no_picture_is_lost_between_two_processes_and_a_killed_node_starts_again
         sent, received, lost, _, answered, *_ = (float(item) for item in row)
         assert (sent, received, lost) == (50, 50, 0)
         assert answered > 0
-    assert "ended with 143" in done.stdout
+    assert "exit code 143" in done.stdout
 
 
 def test_whoever_is_slow_gets_the_newest():
