@@ -88,11 +88,6 @@ def system_failure(error: OSError, path: Path) -> str:
     return f"{error.filename or path}: {error.strerror or error}"
 
 
-def stopped(error: OSError, root: Path) -> StoppedError:
-    """Return the resumable error for a failed operation of the operating system."""
-    return StoppedError(system_failure(error, root))
-
-
 @contextmanager
 def interruptible(advice: str = RESUME) -> Iterator[None]:
     """Raise :class:`Interruption` on SIGINT and SIGTERM inside the block (main thread only).

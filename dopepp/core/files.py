@@ -85,10 +85,10 @@ def check_target(path: Path, suffixes: Sequence[str] = ()) -> None:
 def write_csv(
     path: Path | str, rows: Sequence[Mapping[str, object]], header: Sequence[str] = ()
 ) -> None:
-    """Write a CSV file with empty missing values; the default header is the longest row's."""
+    """Write a CSV file; missing values are empty, and the default header is the longest row's."""
     text = io.StringIO(newline="")
-    longest: Mapping[str, object] = max(rows, key=len)
-    writer = csv.DictWriter(text, header or list(longest), restval="", lineterminator="\n")
+    columns = header or list(max(rows, key=len))
+    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     write_whole(path, text.getvalue().encode())

@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from dopepp.core.errors import UserError
+from dopepp.core.files import read_limited
 
 MAX_BYTES: Final = 64_000_000
 """Size of 10,000 images of a BOP scene with ten objects each. Parsed JSON takes up to 20 times this
@@ -46,15 +47,10 @@ def read_json(path: str | Path, max_bytes: int = MAX_BYTES) -> object:
         fix = "pass the path of an existing file, or restore the file"
         raise UserError(f"{path}, no such file", allowed, fix)
     try:
-        with path.open("rb") as file:
-            content = file.read(max_bytes + 1)
-    except OSError as error:
-        fix = "make the file readable, or copy it again"
-        raise UserError(f"{path}: {error.strerror}", allowed, fix) from error
-    if len(content) > max_bytes:
-        size = path.stat().st_size / 1e6
-        fix = "pass a smaller file"
-        raise UserError(f"{path} of {size:,.3g} MB", allowed, fix)
+        content = read_limited(path, max_bytes)
+    except (OSError, ValueError) as error:
+        problem = f"{path}: {getattr(error, 'strerror', None) or error}"
+        raise UserError(problem, allowed, "pass a readable file of this size") from error
     return parse_json(content, str(path))
 
 

@@ -22,7 +22,7 @@ from typing import Any, Final
 import numpy as np
 import yaml
 
-from dopepp.core.errors import NO_SPACE, UserError, stopped
+from dopepp.core.errors import NO_SPACE, StoppedError, UserError, system_failure
 from dopepp.core.files import PARTIAL_SUFFIX, is_abandoned, partial_path, write_whole
 from dopepp.core.json import read_json
 from dopepp.core.validation import Range, check
@@ -278,7 +278,7 @@ def begin(root: Path, record: Mapping[str, Any]) -> None:
         _remove_abandoned(root)
     except OSError as error:
         if error.errno in NO_SPACE:
-            raise stopped(error, root) from error
+            raise StoppedError(system_failure(error, root)) from error
         raise UserError(
             f"folder {root}: {error.strerror}",
             "a folder that can be written",

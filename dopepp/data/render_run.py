@@ -22,7 +22,7 @@ from rich import progress as shown
 from rich.console import Console
 from rich.text import Text
 
-from dopepp.core.errors import StoppedError, UserError, stopped
+from dopepp.core.errors import StoppedError, UserError, system_failure
 from dopepp.core.pool import ClusterPool, LostWorkerError, Pool, ProcessPool, available_cores
 from dopepp.data.formats import RECORD_FILE, Writer
 from dopepp.data.render_job import Job, begin, has_started
@@ -260,7 +260,7 @@ def render_dataset(
     except LostWorkerError as error:
         raise StoppedError(str(error)) from error
     except OSError as error:
-        raise stopped(error, root) from error
+        raise StoppedError(system_failure(error, root)) from error
     run.report.wall_s = time.monotonic() - start
     return run.report
 

@@ -254,7 +254,5 @@ def check_camera(
     fix = "pass the K of this image's size (K scales with the image)"
     if off_centre == WHOLE < offset and min(x, y) > 0:
         likely = f"{2 * K[0, 2] + 1:.0f}×{2 * K[1, 2] + 1:.0f}"
-        fix += (
-            f": this K is likely of {likely} (--K-size); state the crop of a cropped image (--crop)"
-        )
+        fix += f": this K is likely of {likely} (--K-size); state a crop of the image (--crop)"
     raise UserError(problem, allowed, fix)

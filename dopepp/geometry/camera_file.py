@@ -141,11 +141,7 @@ def camera_of_fields(fields: Mapping[str, object], source: str) -> Camera:
 
 
 def _camera(calibration: Calibration, source: str) -> Camera:
-    """Check a calibration and return its camera.
-
-    Raises:
-        UserError: K or the number of distortion coefficients is invalid.
-    """
+    """Check K and the number of distortion coefficients, and return the camera."""
     K = pinhole_matrix(calibration.K, source)
     if min(K[0, 0], K[1, 1]) <= 0:
         problem = f"{source}: fx={K[0, 0]:g}, fy={K[1, 1]:g}"
@@ -160,11 +156,7 @@ def _camera(calibration: Calibration, source: str) -> Camera:
 
 
 def _text(path: Path) -> str:
-    """Return the text of a file of at most ``MAX_BYTES``.
-
-    Raises:
-        UserError: The file cannot be read, is too large or is not UTF-8.
-    """
+    """Return the text of a UTF-8 file of at most ``MAX_BYTES``."""
     try:
         return read_limited(path, MAX_BYTES).decode("utf-8-sig").strip()
     except (OSError, ValueError) as error:  # ValueError also for a null character in its name

@@ -29,6 +29,7 @@ FORMATS: Final = (
     "ROS camera_info, OpenCV FileStorage, BOP camera.json, COLMAP cameras.txt, "
     "3×3 numbers, or the four numbers fx fy cx cy"
 )
+_FORMAT_FIX: Final = "pass a file in one of these formats"
 _UNDISTORT: Final = "undistort the images and pass their new K"
 
 _SIDE: Final = Range(1, 65_536, "pixels")  # Side of a calibrated image
@@ -79,9 +80,7 @@ def parse_calibration(text: str, source: str) -> Calibration:
         text = re.sub(r"\A%YAML.*\n", "", text).removesuffix("---")
         content = parse_yaml(re.sub(r"!!opencv-(nd-)?matrix\b", "", text), source)
     if not isinstance(content, Mapping):
-        raise UserError(
-            f"{source} without any fields", FORMATS, "pass a file in one of these formats"
-        )
+        raise UserError(f"{source} without any fields", FORMATS, _FORMAT_FIX)
     return calibration_of_fields(content, source)
 
 
@@ -113,16 +112,15 @@ def _colmap(lines: Sequence[Sequence[str]], source: str) -> Calibration:
 def _xml(text: str, source: str) -> dict[object, object]:
     """Return the fields of OpenCV's XML; DOCTYPE is refused, because entities could expand."""
     allowed = "OpenCV's XML (opencv_storage), without DOCTYPE"
+    fix = "write the file with cv2.FileStorage"
     if "<!DOCTYPE" in text:
-        fix = "write the file with cv2.FileStorage"
         raise UserError(f"{source} with DOCTYPE", allowed, fix)
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
         problem = f"{source}, which cannot be parsed: {error!s:.200}"
-        raise UserError(problem, allowed, "write the file with cv2.FileStorage") from error
+        raise UserError(problem, allowed, fix) from error
     if root.tag != "opencv_storage":
-        fix = "write the file with cv2.FileStorage"
         raise UserError(f"{source}: <{root.tag:.50}>", allowed, fix)
     return {node.tag: {part.tag: _words(part) for part in node} or _words(node) for node in root}
 
@@ -152,7 +150,7 @@ def calibration_of_fields(content: Mapping[Any, object], source: str) -> Calibra
     elif all(four):
         K = camera_matrix(*(_number(*field) for field in four if field))
     else:
-        fix = "pass a file in one of these formats, with one camera"
+        fix = f"{_FORMAT_FIX}, with one camera"
         raise UserError(f"{source} without camera_matrix (it has {fields})", FORMATS, fix)
     lens = fields.find(
         "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distortion", "D"
@@ -203,11 +201,7 @@ def _key(name: str) -> str:
 
 
 def _size(fields: _Fields) -> Size | None:
-    """Return the image's size in the fields of a file; None if the file has no size.
-
-    Raises:
-        UserError: The size is incomplete or invalid.
-    """
+    """Return the image's size in the fields of a file; None if the file has no size."""
     both = fields.find("image_size", "resolution")
     if both is not None:
         name, sides = both[0], _numbers(*both)
@@ -220,11 +214,8 @@ def _size(fields: _Fields) -> Size | None:
         return None
     if width is None or height is None:
         missing = "image_height" if width else "image_width"
-        raise UserError(
-            f"{fields.source} without {missing}",
-            "image_width and image_height, or neither",
-            f"add {missing}",
-        )
+        allowed = "image_width and image_height, or neither"
+        raise UserError(f"{fields.source} without {missing}", allowed, f"add {missing}")
     return _side(*width), _side(*height)
 
 
@@ -244,11 +235,7 @@ def _numbers(name: str, value: object) -> list[float]:
 
 
 def _number(name: str, value: Any) -> float:
-    """Return a number, or the number in a text.
-
-    Raises:
-        UserError: The value is not a finite number.
-    """
+    """Return a finite number, or the finite number in a text."""
     numbers = None if isinstance(value, bool) else _floats([value])
     if numbers is None:
         problem = f"{name}={shown(value, 80)}"
@@ -272,11 +259,7 @@ def _side(name: str, value: object) -> int:
 
 
 def _matrix(values: Sequence[float], name: str) -> CameraMatrix:
-    """Return the camera matrix of nine numbers, row by row, or of fx, fy, cx, cy.
-
-    Raises:
-        UserError: There are neither nine nor four numbers.
-    """
+    """Return the camera matrix of nine numbers, row by row, or of fx, fy, cx, cy."""
     if len(values) == 9:
         return pinhole_matrix([values[:3], values[3:6], values[6:]], name)  # type: ignore[arg-type]
     if len(values) != 4:

@@ -64,10 +64,12 @@ def focal_factor(
         lens[[0, 1], [0, 1]] *= factor
         start[2, 3] *= factor  # keeps the size in the image
         step[3:] *= start[2, 3]
-        seen = project_keypoints(cuboid, moved(start, step), lens)[is_known]
-        return np.asarray(np.nan_to_num((seen - keypoints[is_known]) / extent, nan=10.0).ravel())
+        projected = project_keypoints(cuboid, moved(start, step), lens)[is_known]
+        return np.asarray(
+            np.nan_to_num((projected - keypoints[is_known]) / extent, nan=10.0).ravel()
+        )
 
-    def fitted(unknowns: int, first: float) -> OptimizeResult:
+    def fit(unknowns: int, first: float) -> OptimizeResult:
         """Fit the pose and, with a seventh unknown, the logarithm of the factor over ``first``."""
         most = np.array([*6 * [math.inf], math.log(2)])[:unknowns]
         start, bounds = np.zeros(unknowns), (-most, most)
@@ -75,10 +77,10 @@ def focal_factor(
             errors, start, loss="soft_l1", f_scale=MILD, bounds=bounds, max_nfev=50, args=(first,)
         )
 
-    free = {first: fitted(7, first) for first in LENGTHS}
+    free = {first: fit(7, first) for first in LENGTHS}
     first = min(free, key=lambda factor: float(free[factor].cost))
     best = free[first]
     spare = 2 * int(is_known.sum()) - 7
     covariance = np.linalg.pinv(best.jac.T @ best.jac) * 2 * best.cost / spare
-    gain = (2 * fitted(6, 1.0).cost / (spare + 1)) / max(2 * best.cost / spare, 1e-12)
+    gain = (2 * fit(6, 1.0).cost / (spare + 1)) / max(2 * best.cost / spare, 1e-12)
     return Focal(first * math.exp(best.x[6]), math.sqrt(covariance[6, 6]), float(gain))

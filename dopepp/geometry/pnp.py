@@ -26,6 +26,9 @@ from dopepp.geometry.refine import (
     GATE,
     MIN_POINTS,
     NO_GATE,
+    ObjectPoints,
+    Rays,
+    Whitenings,
     apply_rotation,
     column_mean,
     copy_pose,
@@ -48,6 +51,9 @@ MAX_TANGENT: Final = 1000.0
 
 ROTATION_TOLERANCE: Final = 1e-6  # Largest error of a refined rotation matrix's entries
 PLATE: Final = 0.3  # Largest thickness over length of a part whose mirrored tilt is refined as well
+
+
+_ONE_PIXEL: Final = np.eye(2)
 
 
 @dataclass(frozen=True)
@@ -75,8 +81,7 @@ def solve_pnp(
     object_points: Float[np.ndarray, "n 3"],
     image_points: Float[np.ndarray, "n 2"],
     K: CameraMatrix,
-    sigma_px: Float[np.ndarray, "n"] | float = 1.0,
-    covariance_px: Float[np.ndarray, "n 2 2"] | None = None,
+    covariance_px: Float[np.ndarray, "*#n 2 2"] = _ONE_PIXEL,
     widenings: Sequence[float] = (1.0,),
 ) -> PnPResult:
     """Estimate a pose from point correspondences with missing points and outliers.
@@ -85,9 +90,9 @@ def solve_pnp(
         object_points: Points in the object frame, metres.
         image_points: Positions of the points on the image, pixels; NaN marks a missing point.
         K: Camera matrix, pixels; it may have skew.
-        sigma_px: Standard deviation of each pixel position (isotropic), pixels.
-        covariance_px: Covariance of each pixel position, pixels², instead of ``sigma_px``. A point
-            whose deviation or covariance is not finite and positive (definite) is missing.
+        covariance_px: Covariance of each or every pixel position, pixels² (default: one pixel of
+            standard deviation). A point is missing if its covariance is not finite and positive
+            definite.
         widenings: Ascending factors on the standard deviations, tried in turn until two thirds of
             the points agree on a pose. The pose with the most agreeing points is returned.
 
@@ -107,13 +112,9 @@ def solve_pnp(
     K, n = np.ascontiguousarray(K, np.float64), len(object_points)
     if not (K.shape == (3, 3) and _is_pinhole(K)):
         raise ValueError(f"K must be a finite, invertible pinhole matrix, got {K.tolist()}")
-    if covariance_px is None:
-        sigma = np.broadcast_to(np.asarray(sigma_px, np.float64), n)
-        # Invalid deviations become NaN; infinite ones have no finite square.
-        with np.errstate(all="ignore"):
-            covariance_px = np.where(sigma > 0, sigma, np.nan)[:, None, None] ** 2 * np.eye(2)
-    covariance_px = np.asarray(covariance_px, np.float64).reshape(n, 2, 2)
-    rays, whitening, usable = _prepared(object_points, image_points, K, covariance_px)
+    covariances = np.broadcast_to(np.asarray(covariance_px, np.float64), (n, 2, 2))
+    covariances = np.ascontiguousarray(covariances)
+    rays, whitening, usable = _prepared(object_points, image_points, K, covariances)
     result = _solve(object_points[usable], rays, K[:2, :2].copy(), whitening, widenings)
     inliers = np.zeros(n, bool)
     inliers[usable] = result.inliers
@@ -122,18 +123,14 @@ def solve_pnp(
 
 @compiled()
 def _prepared(
-    object_points: Array, image_points: Array, K: Array, covariance: Array
-) -> tuple[Array, Array, Array]:
-    """Convert image points to rays, and their covariances to whitenings W with WᵀW = Σ⁻¹.
+    object_points: ObjectPoints,
+    image_points: Float[np.ndarray, "n 2"],
+    K: CameraMatrix,
+    covariance: Float[np.ndarray, "n 2 2"],
+) -> tuple[Rays, Whitenings, Bool[np.ndarray, "n"]]:
+    """Return the rays of the usable points, their whitenings of pixels, and which are usable.
 
-    Args:
-        object_points: Points in the object frame, (n, 3).
-        image_points: Measured pixels, (n, 2).
-        K: Camera matrix, pixels.
-        covariance: Covariance of each pixel, (n, 2, 2).
-
-    Returns:
-        Rays (x/z, y/z) and whitenings of the usable points, and which points are usable.
+    A whitening W of the covariance Σ has WᵀW = Σ⁻¹.
     """
     # Inputs may be any number and squares may overflow, so the results are checked. W is the
     # inverse of Cholesky's L with Σ = LLᵀ.
@@ -166,7 +163,7 @@ def _prepared(
 
 
 @compiled()
-def _is_pinhole(K: Array) -> bool:
+def _is_pinhole(K: CameraMatrix) -> bool:
     """Return whether K is a finite, invertible pinhole matrix."""
     determinant = K[0, 0] * K[1, 1] - K[0, 1] * K[1, 0]
     last = K[2, 0] == 0.0 and K[2, 1] == 0.0 and K[2, 2] == 1.0
@@ -175,13 +172,13 @@ def _is_pinhole(K: Array) -> bool:
 
 
 def _solve(
-    object_points: Float[np.ndarray, "n 3"],
-    rays: Float[np.ndarray, "n 2"],
+    object_points: ObjectPoints,
+    rays: Rays,
     to_px: Float[np.ndarray, "2 2"],
-    whitening: Float[np.ndarray, "n 2 2"],
+    whitening: Whitenings,
     widenings: Sequence[float],
 ) -> PnPResult:
-    """Solve for complete points; ``rays`` are (x/z, y/z), ``to_px`` maps rays to pixels."""
+    """Solve for complete points; ``to_px`` maps rays to pixels, ``whitening`` is of pixels."""
     no_inliers = np.zeros(len(rays), bool)
     if reason := degenerate(object_points, rays, to_px, whitening):
         return PnPResult(None, math.inf, no_inliers, reason)
@@ -211,29 +208,21 @@ def _solve(
 
 @compiled()
 def _concluded(
-    object_points: Array,
-    rays: Array,
-    whitening: Array,
-    to_px: Array,
-    R: Array,
-    t: Array,
+    object_points: ObjectPoints,
+    rays: Rays,
+    whitening: Whitenings,
+    to_px: Float[np.ndarray, "2 2"],
+    R: RotationMatrix,
+    t: Vector,
     size: float,
-    centre: Array,
-) -> tuple[Array, float, Array]:
-    """Fit the pose to the points that agree by least squares, and convert it to the object's frame.
+    centre: Vector,
+) -> tuple[Transform, float, Float[np.ndarray, "6 6"]]:
+    """Fit the pose (R, t) to the points that agree by least squares, in place.
 
-    Args:
-        object_points: Points that agree, centred and divided by ``size``.
-        rays: Measured ray (x/z, y/z) of each point.
-        whitening: Whitening of each ray.
-        to_px: Matrix from rays to pixels.
-        R: Initial rotation, updated in place.
-        t: Initial translation over ``size``, updated in place.
-        size: Size by which the points were divided, metres.
-        centre: Centre of the points in the object frame, metres.
+    The points are those of the object minus ``centre``, divided by ``size`` (metres).
 
     Returns:
-        Pose (metres), RMS reprojection error (pixels) and 6×6 covariance.
+        Pose of the object's frame (metres), RMS reprojection error (pixels) and covariance.
     """
     # Least squares is the best estimate for points that agree. A rotation ω about the points'
     # centre is the same rotation about the object's origin and a shift by centre × ω.
@@ -277,9 +266,7 @@ def _concluded(
 class _Starts:
     """Closed-form poses from all points and from subsets without one or two points."""
 
-    def __init__(
-        self, object_points: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 2"]
-    ) -> None:
+    def __init__(self, object_points: ObjectPoints, rays: Rays) -> None:
         self.object_points, self.rays = object_points, rays
         extents, axes = _principal_axes(object_points)
         self.normal, self.is_plate = axes[2], bool(extents[2] < PLATE * extents[0])
@@ -312,7 +299,7 @@ def _kept(count: int, left_out: int) -> list[NDArray[np.intp]]:
 
 
 def _best_pose(
-    whitening: Float[np.ndarray, "n 2 2"], starts: _Starts
+    whitening: Whitenings, starts: _Starts
 ) -> tuple[tuple[RotationMatrix, Vector] | None, Bool[np.ndarray, "n"]]:
     """Return the refined pose with the smallest truncated cost, and which points agree with it."""
     R, t, cost = np.empty((3, 3)), np.empty(3), math.inf
@@ -329,32 +316,21 @@ def _best_pose(
 
 @compiled()
 def _improved(
-    object_points: Array,
-    rays: Array,
-    whitening: Array,
-    starts: Array,
-    normal: Array,
+    object_points: ObjectPoints,
+    rays: Rays,
+    whitening: Whitenings,
+    starts: Float[np.ndarray, "s 6"],
+    normal: Vector,
     is_plate: bool,
-    best_R: Array,
-    best_t: Array,
+    best_R: RotationMatrix,
+    best_t: Vector,
     best: float,
-    agree: Array,
+    agree: Bool[np.ndarray, "n"],
 ) -> float:
-    """Refine the most likely start poses, and update the best pose in place.
+    """Refine the most likely start poses, and update the best pose and its agreeing points.
 
-    For a plate, the mirrored tilt of each start pose is refined as well.
-
-    Args:
-        object_points: Normalised points in the object frame.
-        rays: Measured ray (x/z, y/z) of each point.
-        whitening: Whitening of each ray.
-        starts: Start poses: rotation vector and translation, (n, 6).
-        normal: Normal of the plate in the object frame.
-        is_plate: Whether the points are nearly in a plane.
-        best_R: Rotation of the best pose.
-        best_t: Translation of the best pose.
-        best: Cost of the best pose.
-        agree: Which points agree with the best pose.
+    Start poses are a rotation vector and a translation. For a plate with a ``normal``, the mirrored
+    tilt of each start pose is refined as well.
 
     Returns:
         The cost of the best pose.
@@ -387,7 +363,7 @@ def _improved(
 
 @compiled()
 def _truncated_cost(residuals: Array) -> float:
-    """Return the MSAC cost of a pose: the squared gate for an outlier."""
+    """Return the MSAC cost of a pose: squared errors, at most the squared gate."""
     cost = 0.0
     for i in range(len(residuals)):
         squared = residuals[i, 0] ** 2 + residuals[i, 1] ** 2
@@ -396,7 +372,7 @@ def _truncated_cost(residuals: Array) -> float:
 
 
 @compiled()
-def _is_plausible(object_points: Array, R: Array, t: Array) -> bool:
+def _is_plausible(object_points: ObjectPoints, R: RotationMatrix, t: Vector) -> bool:
     """Return whether R is a rotation, t is not too long, and all points are before the camera."""
     for i in range(len(object_points)):
         x, y, z = object_points[i, 0], object_points[i, 1], object_points[i, 2]
@@ -429,7 +405,7 @@ def _principal_axes(points: Array) -> tuple[Array, Array]:
 
 
 @compiled()
-def _mirror(R: Array, t: Array, normal: Array) -> None:
+def _mirror(R: RotationMatrix, t: Vector, normal: Vector) -> None:
     """Replace a plate's pose by the mirrored tilt, which has almost the same image.
 
     From afar, plates tilted by +θ and by −θ about an axis have the same image. The mirrored pose

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.compiled import Array, compiled
+from dopepp.geometry.rotation import RotationMatrix, Vector
 
 GATE: Final = 3.0
 """Points beyond this many standard deviations are outliers (99.7 % of a Gaussian lies within)."""
@@ -38,6 +39,15 @@ _TINY_ANGLE: Final = 1e-8
 
 MIN_POINTS: Final = 4
 
+ObjectPoints = Float[np.ndarray, "n 3"]
+"""Points of an object; during refinement centred and of unit size."""
+
+Rays = Float[np.ndarray, "n 2"]
+"""Measured ray (x/z, y/z) of each point."""
+
+Whitenings = Float[np.ndarray, "n 2 2"]
+"""Matrix of each point from ray differences to standard deviations of the pixel's position."""
+
 SMALLEST: Final = 1e-9  # Smallest valid extent of the object points, metres
 LARGEST: Final = 1e9  # Largest valid extent of the object points, metres
 SAME_PIXEL: Final = 1e-3  # Largest difference of two positions that count as equal, pixels
@@ -45,20 +55,17 @@ SAME_PIXEL: Final = 1e-3  # Largest difference of two positions that count as eq
 
 @compiled()
 def refine_pose(
-    object_points: Array, rays: Array, whitening: Array, R: Array, t: Array, gate: float
+    object_points: ObjectPoints,
+    rays: Rays,
+    whitening: Whitenings,
+    R: RotationMatrix,
+    t: Vector,
+    gate: float,
 ) -> None:
-    """Minimise the Geman–McClure cost Σ r²/(r² + g²) from a pose, in place.
+    """Minimise the Geman–McClure cost Σ r²/(r² + g²) with the gate g from a pose, in place.
 
     Steps are damped, and a step that does not reduce the cost is repeated with more damping
     (Levenberg–Marquardt). A pose with points behind the camera remains unchanged.
-
-    Args:
-        object_points: Points, centred and of unit size.
-        rays: The rays (x/z, y/z) that show the points.
-        whitening: Maps of ray differences to standard deviations of the pixel's position.
-        R: Rotation of the pose.
-        t: Translation of the pose.
-        gate: Scale g of the cost, standard deviations.
     """
     n = len(rays)
     residuals, moved_residuals = np.empty((n, 2)), np.empty((n, 2))
@@ -96,20 +103,16 @@ def refine_pose(
 
 @compiled()
 def reproject(
-    object_points: Array, rays: Array, whitening: Array, R: Array, t: Array, out: Array
+    object_points: ObjectPoints,
+    rays: Rays,
+    whitening: Whitenings,
+    R: RotationMatrix,
+    t: Vector,
+    out: Float[np.ndarray, "n 2"],
 ) -> bool:
-    """Compute the whitened reprojection error of every point.
+    """Write the whitened reprojection errors; return whether all points are before the camera.
 
-    Args:
-        object_points: Points in the object frame, (n, 3).
-        rays: Measured ray (x/z, y/z) of each point.
-        whitening: Whitening of each ray, (n, 2, 2).
-        R: Rotation of the pose.
-        t: Translation of the pose.
-        out: Filled with the errors, (n, 2); NaN for points behind the camera.
-
-    Returns:
-        Whether all points are in front of the camera.
+    The errors of points behind the camera are NaN.
     """
     in_front = True
     for i in range(len(rays)):
@@ -147,32 +150,24 @@ def _robust_cost(residuals: Array, gate: float) -> float:
 
 @compiled()
 def normal_equations(
-    object_points: Array,
-    rays: Array,
-    whitening: Array,
-    R: Array,
-    t: Array,
-    residuals: Array,
+    object_points: ObjectPoints,
+    rays: Rays,
+    whitening: Whitenings,
+    R: RotationMatrix,
+    t: Vector,
+    residuals: Float[np.ndarray, "n 2"],
     gate: float,
-    hessian: Array,
-    gradient: Array,
+    hessian: Float[np.ndarray, "6 6"],
+    gradient: Float[np.ndarray, "6"],
 ) -> None:
     """Write JᵀJ and Jᵀr of a left increment (rotation vector, translation), robustly weighted.
 
+    The residuals are the whitened reprojection errors of :func:`reproject`.
+
     The derivatives of a ray (u, v) = (X, Y)/Z by x_cam are [1, 0, −u]/Z and [0, 1, −v]/Z. Since
     d(Exp(ω) p)/dω = −[p]×, a row a becomes −a [p]× = p × a with p = R x_obj. The weights are the
-    derivative of r²/(r² + g²) by r², times g². Points behind the camera are ignored.
-
-    Args:
-        object_points: Points in the object frame, (n, 3).
-        rays: Measured ray (x/z, y/z) of each point.
-        whitening: Whitening of each ray, (n, 2, 2).
-        R: Rotation of the pose.
-        t: Translation of the pose.
-        residuals: Whitened reprojection error of each point.
-        gate: Scale g of the cost, standard deviations.
-        hessian: Filled with JᵀJ, (6, 6).
-        gradient: Filled with Jᵀr.
+    derivative of r²/(r² + g²) by r², times g², with the gate g. Points behind the camera are
+    ignored.
     """
     for c in range(6):
         gradient[c] = 0.0
@@ -245,13 +240,7 @@ def solve_inside(
 
 @compiled()
 def apply_rotation(step: Array, R: Array, out: Array) -> None:
-    """Write Exp(ω) R for the rotation vector ω in the first three numbers of a step.
-
-    Args:
-        step: The step: ω, and possibly further numbers, which are ignored.
-        R: Rotation matrix.
-        out: Filled with the resulting rotation matrix.
-    """
+    """Write Exp(ω) R for the rotation vector ω in the first three numbers of a step."""
     x, y, z = step[0], step[1], step[2]
     angle = math.sqrt(x * x + y * y + z * z)
     a, b = 1.0, 0.5
@@ -268,18 +257,15 @@ def apply_rotation(step: Array, R: Array, out: Array) -> None:
 
 
 def degenerate(
-    object_points: Float[np.ndarray, "n 3"],
-    rays: Float[np.ndarray, "n 2"],
+    object_points: ObjectPoints,
+    rays: Rays,
     to_px: Float[np.ndarray, "2 2"],
-    whitening: Float[np.ndarray, "n 2 2"],
+    whitening: Whitenings,
 ) -> str:
-    """Return why these points do not determine a pose, or an empty string.
+    """Return why the points do not determine a pose, or an empty string.
 
-    Args:
-        object_points: Points in the object frame, metres.
-        rays: The rays (x/z, y/z) that show the points.
-        to_px: Matrix from rays to pixels.
-        whitening: Matrices from pixels to standard deviations.
+    Here, points are in metres, and the whitenings map pixels instead of rays. ``to_px`` maps rays
+    to pixels.
     """
     if len(object_points) < MIN_POINTS:
         return too_few(len(object_points))

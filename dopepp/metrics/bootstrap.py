@@ -179,11 +179,7 @@ STATISTICS: Final[dict[StatisticName, _Statistic]] = {
 
 
 def _check(mine: Numbers, baseline: Numbers, statistic: str, same_seeds: bool) -> None:
-    """Check the shapes of the compared values.
-
-    Raises:
-        UserError: The shapes do not match, or a mean has values that are not finite.
-    """
+    """Check that the shapes match, and that the values of a mean are finite."""
     shapes = [[values.shape for values in method] for method in (mine, baseline)]
     plain = all(len(shape) == 2 and min(shape) > 0 for shape in [*shapes[0], *shapes[1]])
     seeds = [{shape[0] for shape in method} for method in shapes]
@@ -211,12 +207,7 @@ def _resampled_difference(
 ) -> Float[np.ndarray, "resamples"]:
     """Return the difference of the statistic in each resample, averaged over objects.
 
-    Args:
-        mine: Numbers of the method, by object: (seeds, instances).
-        baseline: Numbers of the baseline.
-        compute: Returns the statistic of resampled instances.
-        draws: Weight of each seed in each resample, for both methods.
-        rng: Random numbers, which draw the instances.
+    ``draws`` are the weights of the seeds of both methods; ``rng`` draws the instances.
     """
     total = np.zeros(len(draws[0]))
     for ours, theirs in zip(mine, baseline, strict=True):
@@ -239,12 +230,7 @@ def _stretching(
     """Return a term that widens the bootstrap distribution, because few seeds vary too little.
 
     The term moves each resample away from the mean, so that the interval gets the width that
-    Student's t gives for this number of seeds.
-
-    Args:
-        effects: Difference between the methods for each seed.
-        draws: Weight of each seed in each resample.
-        confidence: Level of the interval.
+    Student's t gives for this number of seeds. ``effects`` are the differences between the methods.
     """
     num = len(effects)
     if num == 1:

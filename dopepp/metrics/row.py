@@ -1,4 +1,4 @@
-"""Errors of one object's poses, and the measures of a result table.
+"""Errors of an object's poses, and the measures of a result table.
 
 To add an error, give :class:`PoseErrors` a field and :meth:`PoseErrors.of` its function. To add a
 measure, give :class:`PoseRow` a field and :data:`COLUMNS` its heading and formula; tables, CSV and

@@ -104,8 +104,8 @@ class VGG19(_Chain):
         )
         if weights_path is None:
             return
-        if width != 1 or batch_norm or not isinstance(weights_path, str):
-            values = f"weights_path={weights_path!r:.200}, width={width:g}, batch_norm={batch_norm}"
+        if width != 1 or batch_norm:
+            values = f"weights_path={weights_path:.200}, width={width:g}, batch_norm={batch_norm}"
             allowed = "the path of a file, with width=1 and batch_norm=false"
             fix = "leave out weights_path, or set width=1 and batch_norm=false"
             raise UserError(values, allowed, fix)

@@ -52,7 +52,7 @@ _MAX_BITS: Final = 128
 _FOLDER_KEYS: Final = ("root", "cache_dir", "backgrounds")
 """Keys of a data configuration that name folders of the training machine."""
 
-_WHAT: Final = "a checkpoint (.ckpt) written by train.py"
+_KIND: Final = "a checkpoint (.ckpt) written by train.py"
 _FIX: Final = "use a checkpoint written by train.py"
 
 
@@ -135,12 +135,10 @@ def read(path: Path) -> Checkpoint:
     if path.suffix == SUFFIX:
         content, size = _read_released(path)
     else:
-        size = check_container(path, _WHAT)
-        content = read_mapping(path, _WHAT)
+        size = check_container(path, _KIND)
+        content = read_mapping(path, _KIND)
     if KEY not in content:
-        raise UserError(
-            f"{path} without {KEY!r} entry", _WHAT, "pass a checkpoint written by train.py"
-        )
+        raise UserError(f"{path} without {KEY!r} entry", _KIND, _FIX)
     try:
         checkpoint = parse_description(content[KEY])
         weights = content.get("state_dict")
@@ -172,11 +170,8 @@ def parse_description(payload: object) -> Checkpoint:
         UserError: A field is missing, of the wrong type or out of range.
     """
     if not isinstance(payload, dict):
-        raise UserError(
-            f"a description of type {type(payload).__name__}",
-            "a mapping",
-            "train the network again",
-        )
+        problem = f"a description of type {type(payload).__name__}"
+        raise UserError(problem, "a mapping", "train the network again")
     _check_plain(payload)
     version = payload.get("format_version")
     if type(version) is not int or version != FORMAT_VERSION:
@@ -283,11 +278,11 @@ def find(path: Path) -> Path:
     released = released_paths()
     if path.name not in released:
         names = ", ".join(f"{FOLDER}/{name}" for name in released) or "none"
-        raise UserError(
+        problem, allowed = (
             f"checkpoint {path}, no such file",
             f"an existing file, or one of {names}",
-            "use one of these names",
         )
+        raise UserError(problem, allowed, "use one of these names")
     return released[path.name]
 
 
@@ -295,10 +290,9 @@ def _read_released(path: Path) -> tuple[dict[str, Any], int]:
     """Return the content of a released file, with float32 weights, and the weights' size, bytes."""
     tensors, metadata = read_safetensors(path)
     if KEY not in metadata:
+        problem = f"{path} without a description under {KEY!r}"
         allowed = "a file written by `dopepp release` or `dopepp export`"
-        raise UserError(
-            f"{path} without a description under {KEY!r}", allowed, "download the file again"
-        )
+        raise UserError(problem, allowed, "download the file again")
     payload = parse_json(metadata[KEY], f"{path}, description under {KEY!r}")
     for name, value in tensors.items():
         tensors[name] = value.float() if value.is_floating_point() else value

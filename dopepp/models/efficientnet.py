@@ -81,7 +81,7 @@ class EfficientNetLite(Backbone):
         super().__init__()
         inside = scaled_channels(check("channels", channels, int, CHANNELS), width)
         top_down = check("top_down", top_down, tuple[int, int], BLOCKS_OR_NONE)
-        if isinstance(frozen, bool) or frozen not in (0, *self.strides):
+        if frozen not in (0, *self.strides):
             raise UserError(f"frozen={frozen!r:.100}", "0, 8, 16 or 32", "set e.g. frozen=8")
         before, self.down = 32, nn.ModuleList()
         for number, stages in enumerate(self.plan):
@@ -125,7 +125,7 @@ class EfficientNetLite(Backbone):
         return self
 
     def _load(self, path: str) -> None:
-        """Load the weights of a file, and adapt them to this network's normalisation."""
+        """Load the weights of a file."""
         weights = read_mapping(Path(path), "a state_dict of EfficientNet-Lite0 (.pth)")
         kinds = (nn.Conv2d, nn.BatchNorm2d)
         layers = [layer for layer in self.down.modules() if isinstance(layer, kinds)]
@@ -216,11 +216,8 @@ def same_conv(
     return nn.Sequential(*padding, conv, norm, *([nn.ReLU6(inplace=True)] if relu else []))
 
 
-def _weights_file(path: object) -> str:
+def _weights_file(path: str) -> str:
     """Return the path of the weights: a given file, or the ImageNet weights of a package."""
-    if not isinstance(path, str):
-        allowed = f"a file path, or the word {IMAGENET}"
-        raise UserError(f"weights_path={path!r:.200}", allowed, "set weights_path to one of these")
     if path != IMAGENET:
         return path
     # The package is not imported, because only its file is needed.

@@ -101,7 +101,7 @@ class Head(nn.Module):
 
     @property
     def outputs(self) -> list[nn.Conv2d]:
-        """The convolutions that produce maps; all other layers know nothing of the objects."""
+        """The convolutions that produce maps; no other layer depends on the objects."""
         return [*_outputs(self.belief_branches), *_outputs(self.field_branches)]
 
     def forward(self, features: Features) -> list[Stage]:

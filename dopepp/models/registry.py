@@ -51,11 +51,11 @@ class Registry(Generic[T]):
     @classmethod
     def of_module(cls, kind: str, base: type[T], module: ModuleType) -> Registry[T]:
         """Return a registry of the public subclasses of ``base`` that ``module`` defines."""
-        classes = [value for value in vars(module).values() if inspect.isclass(value)]
         allowed = [
             f"{module.__name__}.{value.__name__}"
-            for value in classes
-            if issubclass(value, base)
+            for value in vars(module).values()
+            if inspect.isclass(value)
+            and issubclass(value, base)
             and value is not base
             and value.__module__ == module.__name__
             and not value.__name__.startswith("_")
@@ -129,11 +129,7 @@ class Registry(Generic[T]):
             ) from error
 
     def _load(self, dotted: str) -> type[T]:
-        """Import a class and check it.
-
-        Raises:
-            UserError: It cannot be imported, or is not a subclass of the base class.
-        """
+        """Import a class, and check that its module defines it as a subclass of the base class."""
         module_name, _, name = dotted.rpartition(".")
         try:
             value = getattr(import_module(module_name), name)
@@ -143,14 +139,13 @@ class Registry(Generic[T]):
                 f"the dotted name of an importable {self.base.__name__}",
                 "install or import the module that defines it, or correct the name",
             ) from error
-        # A package may re-export a class of its submodules. A class of another module or name is
-        # rejected.
-        genuine = (
+        # A package may re-export a class of its submodules.
+        is_own = (
             inspect.isclass(value)
             and value.__qualname__ == name
             and f"{value.__module__}.".startswith(f"{module_name}.")
         )
-        if not genuine or not issubclass(value, self.base):
+        if not is_own or not issubclass(value, self.base):
             raise UserError(
                 f"{self.kind} {dotted}, which is {value!r:.200}",
                 f"a subclass of {self.base.__name__} defined in {module_name}",
@@ -165,11 +160,7 @@ class Registry(Generic[T]):
         arguments: Mapping[Any, object],
         provided: Mapping[str, object],
     ) -> None:
-        """Check the arguments of a class before it is instantiated.
-
-        Raises:
-            UserError: An argument is unknown, missing or set by the program.
-        """
+        """Refuse arguments that are unknown, missing, provided by the program or not plain."""
         parameters = inspect.signature(target).parameters
         named = {
             name: parameter
@@ -197,9 +188,8 @@ def _check_plain(value: object, where: str) -> None:
     if isinstance(value, Mapping):
         for key, item in value.items():
             if not isinstance(key, str) or key.startswith("_"):
-                problem = f"key {key!r:.100} in {where}"
                 fix = "write only plain values, without nested targets"
-                raise UserError(problem, "plain values", fix)
+                raise UserError(f"key {key!r:.100} in {where}", "plain values", fix)
             _check_plain(item, where)
     elif isinstance(value, (list, tuple)):
         for item in value:

@@ -59,15 +59,15 @@ def start_from_checkpoint(network: PoseNetwork, path: Path) -> None:
 
 
 def _copy(network: PoseNetwork, weights: Mapping[str, Tensor], others: set[str]) -> bool:
-    """Copy weights if exactly they and ``others`` are the network's; return whether they are."""
-    own = network.state_dict()
-    if own.keys() - others != weights.keys() or any(
-        own[name].shape != value.shape for name, value in weights.items()
+    """Copy weights if they fill the network except ``others``; return whether they do."""
+    present = network.state_dict()
+    if present.keys() - others != weights.keys() or any(
+        present[name].shape != value.shape for name, value in weights.items()
     ):
         return False
     with torch.no_grad():
         for name, value in weights.items():
-            own[name].copy_(value)
+            present[name].copy_(value)
     return True
 
 

@@ -109,28 +109,28 @@ def write_atomic(payload: Mapping[str, Any], path: Path, previous: Path | None =
             os.close(folder)
 
 
-def read_mapping(path: Path, what: str) -> dict[Any, Any]:
+def read_mapping(path: Path, kind: str) -> dict[Any, Any]:
     """Load a torch file with a mapping to the CPU, without running code in it.
 
     Loading takes no more memory than the file has bytes.
 
     Args:
         path: File to load.
-        what: Kind of file, for messages.
+        kind: Kind of file, for messages.
 
     Raises:
         UserError: The file is missing, damaged or too large, or its content is not a mapping of
             tensors and plain values.
     """
     path = Path(path)
-    _check_file(path, what)
+    _check_file(path, kind)
     try:
         with path.open("rb") as file:
             begin = file.read(len(_LEGACY))
         if begin == _LEGACY:
             _check_legacy(path)
         elif _ZIP.startswith(begin):
-            check_container(path, what)
+            check_container(path, kind)
             _check_archive(path)
         else:
             raise ValueError("neither a zip archive nor a pickle")
@@ -141,21 +141,21 @@ def read_mapping(path: Path, what: str) -> dict[Any, Any]:
         reason = " ".join(str(error).split("\n")[0].split()) or type(error).__name__
         problem = f"{path}, which torch cannot load ({reason[:200]})"
         fix = "download the file again; load only files that you trust"
-        raise UserError(problem, what, fix) from error
+        raise UserError(problem, kind, fix) from error
     if not isinstance(content, dict):
         fix = "pass a file of this kind"
-        raise UserError(f"{path}, which contains a {type(content).__name__}", what, fix)
+        raise UserError(f"{path}, which contains a {type(content).__name__}", kind, fix)
     return content
 
 
-def check_container(path: Path, what: str) -> int:
+def check_container(path: Path, kind: str) -> int:
     """Return the unpacked size of a torch file, at most the size of the file, bytes.
 
     Raises:
         UserError: The file is missing, truncated, not a torch file or compressed.
     """
     path = Path(path)
-    _check_file(path, what)
+    _check_file(path, kind)
     try:
         with path.open("rb") as file:
             # torch would read content before a zip archive.
@@ -165,19 +165,19 @@ def check_container(path: Path, what: str) -> int:
             size = sum(member.file_size for member in archive.infolist())
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
         problem = f"{path}, which is truncated or not a torch file"
-        raise UserError(problem, what, "copy the file again, or write it again") from error
+        raise UserError(problem, kind, "copy the file again, or write it again") from error
     limit = min(MAX_BYTES, path.stat().st_size)
     if size > limit:
-        allowed = f"{what} of at most {limit} bytes"
+        allowed = f"{kind} of at most {limit} bytes"
         fix = "get the file again from a source that you trust"
         raise UserError(f"{path}, which unpacks to {size} bytes", allowed, fix)
     return size
 
 
-def _check_file(path: Path, what: str) -> None:
+def _check_file(path: Path, kind: str) -> None:
     """Check that a path is a file."""
     if not path.is_file():
-        raise UserError(f"{path}, which is not a file", what, "pass the path of an existing file")
+        raise UserError(f"{path}, which is not a file", kind, "pass the path of an existing file")
 
 
 def _check_archive(path: Path) -> None:
@@ -214,20 +214,15 @@ def _check_legacy(path: Path) -> None:
 
 
 def _claimed_storages(content: bytes, num_pickles: int = 1) -> dict[str, int]:
-    """Return the claimed size of each storage by its key, bytes.
+    """Return the claimed bytes of each storage by its key in the first pickles of a file.
 
-    Args:
-        content: Concatenated pickles, possibly followed by other bytes.
-        num_pickles: Number of pickles.
-
-    Raises:
-        ValueError: A pickle is damaged, too long, or has operations that weights do not need.
+    Raise ``ValueError`` if a pickle is damaged, too long, or has operations that weights need not.
     """
     stream, storages = io.BytesIO(content[:_MAX_PICKLE_BYTES]), dict[str, int]()
     try:
         for _ in range(num_pickles):
-            for kind, key, count in _storage_references(stream):
-                claimed = count * _STORAGE_BYTES[kind]
+            for name, key, count in _storage_references(stream):
+                claimed = count * _STORAGE_BYTES[name]
                 if count < 0 or storages.setdefault(key, claimed) != claimed:
                     raise ValueError(f"storage {key!r:.20} of {count} numbers, or of two sizes")
     except (ValueError, KeyError) as error:

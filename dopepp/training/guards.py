@@ -150,9 +150,9 @@ class FiniteSteps(Callback):
         pl_module.log("train/skipped_steps", float(self.skipped), rank_zero_only=False)
 
     def _dump(self, trainer: Trainer, passes: list[_Pass], names: list[str]) -> Path:
-        """Write the first batch with non-finite values, on every process that has computed one.
+        """Write the first batch with non-finite values, if this process has one; return the folder.
 
-        Gradients are summed over processes, so all processes have the same non-finite gradients.
+        Gradients are summed over processes: only the loss shows which process has the batch.
         """
         folder = Path(trainer.default_root_dir) / FOLDER
         for item in passes:
@@ -167,13 +167,7 @@ class FiniteSteps(Callback):
 
 
 def _dump_batch(path: Path, batch: Batch, facts: Mapping[str, Any]) -> None:
-    """Write a batch for inspection; if the disk does not accept it, only warn.
-
-    Args:
-        path: Path without suffix: ``.pt`` holds the tensors and facts, ``.png`` the images.
-        batch: The batch.
-        facts: Further values for the ``.pt`` file, by name.
-    """
+    """Write a batch and facts to ``path.pt`` and ``path.png``, or warn that this is impossible."""
     shown = batch.rows(torch.arange(min(len(batch), _MAX_TILES))).to("cpu")
     images, truths = shown.images.permute(0, 2, 3, 1).numpy(), shown.keypoints.numpy()
     tiles = [
@@ -274,8 +268,8 @@ class EmptyMaps(Callback):
             "labels or units that contradict the images": labels,
         }
         likely_first = sorted(causes.items(), key=lambda item: not item[1][0])
-        for number, (name, (likely, text)) in enumerate(likely_first, start=1):
-            lines.append(f"  {number}. {name}{' (likely here)' if likely else ''}: {text}")
+        for number, (name, (is_likely, text)) in enumerate(likely_first, start=1):
+            lines.append(f"  {number}. {name}{' (likely here)' if is_likely else ''}: {text}")
         _log.warning("\n".join(lines))
 
     def _early(self, trainer: Trainer, system: PoseSystem) -> str:
@@ -303,10 +297,7 @@ class EmptyMaps(Callback):
         )
 
     def _labels(self) -> tuple[bool, str]:
-        """Return whether the labels are a likely cause of empty maps, and advice on them.
-
-        Labels are a likely cause if few keypoints are inside the images or the objects are small.
-        """
+        """Return whether labels are a likely cause (outside the images, or small), with advice."""
         inside, sizes = torch.cat(self._inside), torch.cat(self._sizes)
         advice = "check the green labels in val_overlay.png, and run dopepp check on the data"
         if not len(inside):

@@ -4,10 +4,10 @@ A run that was interrupted anywhere and resumed ends with the weights, best chec
 of an uninterrupted run, if its arithmetic is deterministic (as on CPUs). See
 ``docs/explanation/reliability.md``. Ctrl-C and SIGTERM take effect between two steps.
 
-Lightning's ``ModelCheckpoint`` keeps the best checkpoint, but is not suitable for the last
-checkpoint. ``ModelCheckpoint`` saves inside a batch or a validation, or at the end of an epoch,
-where Lightning's counters cause replayed or skipped batches. This module sets the counters of every
-checkpoint to a moment between two batches, before a validation or between two epochs.
+Lightning's ``ModelCheckpoint`` keeps the best checkpoint only. It saves inside a batch or a
+validation, or at the end of an epoch, where Lightning's counters cause replayed or skipped batches.
+This module sets the counters of every checkpoint to a moment between two batches, before a
+validation or between two epochs.
 """
 
 from __future__ import annotations
@@ -144,10 +144,10 @@ class LastCheckpoint(Checkpoint):
         wait_s = max(self.every_s, self._duration_s / self.max_share)
         progress = _progress(trainer)
         is_late = time.monotonic() - self._saved_at >= wait_s
-        due = trainer.is_global_zero and (is_late or progress[1] != self._saved[1])
+        is_due = trainer.is_global_zero and (is_late or progress[1] != self._saved[1])
         # Rank 0 decides when to save, but any process may receive a signal.
         agree = trainer.strategy.reduce_boolean_decision
-        if not agree(due or stop is not None, all=False):
+        if not agree(is_due or stop is not None, all=False):
             return
         if progress != self._saved:
             self._save(trainer, cut)
@@ -181,7 +181,7 @@ class StopRequest:
     def __init__(self) -> None:
         self.number: int | None = None
         self._process = os.getpid()
-        self._kept: dict[int, Any] = {}
+        self._previous: dict[int, Any] = {}
 
     def listen(self) -> None:
         """Install the signal handlers, in the main thread only."""
@@ -189,23 +189,23 @@ class StopRequest:
             return
         requeued = [signal.SIGUSR1] if "SLURM_JOB_ID" in os.environ else []
         for number in (signal.SIGINT, signal.SIGTERM, *requeued):
-            self._kept[number] = signal.signal(number, self._remember)
+            self._previous[number] = signal.signal(number, self._handle)
 
     def end(self) -> None:
         """Restore the signal handlers."""
-        for number, handler in self._kept.items():
+        for number, handler in self._previous.items():
             signal.signal(number, handler)
-        self._kept = {}
+        self._previous = {}
 
-    def _remember(self, number: int, _: FrameType | None) -> None:
+    def _handle(self, number: int, _: FrameType | None) -> None:
         """Handle a signal: request a stop; on a second Ctrl-C, stop at once."""
         if os.getpid() != self._process:  # a forked worker of the data loader
             return
         if number == signal.SIGINT and self.number is not None:
             raise Interruption(number)
-        first = self.number is None
+        is_first = self.number is None
         self.number = signal.SIGINT if number == signal.SIGINT else signal.SIGTERM
-        if first:
+        if is_first:
             # Not through a stream or logger, which the signal may have interrupted.
             os.write(2, _ANSWERS[self.number])
 

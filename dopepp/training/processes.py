@@ -20,6 +20,7 @@ from lightning.fabric.utilities.distributed import _set_num_threads_if_needed
 from lightning.pytorch import Trainer
 from lightning.pytorch.strategies import DDPStrategy
 from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
+from lightning.pytorch.utilities import rank_zero_only
 
 from dopepp.core.errors import RunError
 
@@ -27,6 +28,11 @@ _STARTED_BY: Final = "DOPEPP_STARTED_BY"  # Environment variable with the parent
 _POLL_S: Final = 1.0
 _NOTICE_S: Final = 5.0  # Time from a broken connection until the death of a process is noticed
 _GRACE_S: Final = 20.0  # Time after a death in which other processes may end by themselves
+
+
+def is_first_process() -> bool:
+    """Return whether this process has rank 0, also before there is a trainer."""
+    return not getattr(rank_zero_only, "rank", 0)
 
 
 class ProcessDiedError(RunError):
@@ -52,7 +58,7 @@ class Watch(threading.Thread):
                 os._exit(1)  # exceptions do not reach the main thread in a collective
 
     def stop(self) -> None:
-        """Stop watching; processes may end from now on."""
+        """Stop watching, before the other processes end normally."""
         self._stopped.set()
 
     def death(self, wait_s: float = 0.0) -> str | None:

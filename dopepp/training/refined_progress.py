@@ -22,7 +22,7 @@ from dopepp.training.system import PoseSystem
 
 IMAGE: Final = "refined.png"  # curve in the run folder
 
-NUM_PICTURES: Final = 40
+NUM_IMAGES: Final = 40
 NUM_CONFIRMING: Final = 100  # images on which a reached goal is confirmed
 MIN_SCORE: Final = 0.5  # reported poses are more likely correct than incorrect
 MAX_SHARE: Final = 0.1  # largest share of the time that measurements take
@@ -31,16 +31,16 @@ MAX_SHARE: Final = 0.1  # largest share of the time that measurements take
 class RefinedProgress(Callback):
     """Measures reported refined poses on whole images of the camera after validations.
 
-    A measurement is logged as ``val/refined`` (share of the instances with a reported pose whose
-    ADD(-S) is below a tenth of the diameter) and ``val/refined_precision``, printed with its 95 %
-    interval, and drawn in ``refined.png`` over the minutes of training.
+    A measurement is logged as ``val/refined`` and ``val/refined_precision``, printed with its 95 %
+    interval, and drawn in ``refined.png`` over the minutes of training. ``val/refined`` is the
+    share of instances with a reported pose whose ADD(-S) is below a tenth of the diameter.
 
     Args:
         images: Held-out images, at the camera's resolution.
         refine: Evidence that refines the poses.
-        stop_at: Share that ends the training, once it is confirmed on more images; None: never.
-        every_s: Shortest time between two measurements, seconds. It is longer if measurements would
-            take more than a tenth of the time.
+        stop_at: Share that ends the training, once more images confirm the share; None: never.
+        every_s: Shortest time between two measurements, seconds. The time is longer if measurements
+            would take more than a tenth of the training.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class RefinedProgress(Callback):
         stop_at: float | None = None,
         every_s: float = 120.0,
     ) -> None:
-        self.pictures, self.refine, self.stop_at, self.every_s = images, refine, stop_at, every_s
+        self.images, self.refine, self.stop_at, self.every_s = images, refine, stop_at, every_s
         self.curve: list[tuple[float, float, float, float]] = []
         """Minutes of training, share, and the ends of its interval."""
         self._minutes_before, self._begin, self._due = 0.0, 0.0, 0.0
@@ -83,11 +83,9 @@ class RefinedProgress(Callback):
         estimator = self._estimator(system)
         # Only the first process measures, so nothing is gathered.
         metrics = PoseMetrics(system.parts, sync_on_compute=False)
-        share, count, precision = self._measure(estimator, metrics, 0, NUM_PICTURES)
+        share, count, precision = self._measure(estimator, metrics, 0, NUM_IMAGES)
         if self.stop_at is not None and share >= self.stop_at:
-            share, count, precision = self._measure(
-                estimator, metrics, NUM_PICTURES, NUM_CONFIRMING
-            )
+            share, count, precision = self._measure(estimator, metrics, NUM_IMAGES, NUM_CONFIRMING)
         low, high = wilson_interval(round(share * count), count)
         minutes = self._minutes()
         self.curve.append((minutes, share, low, high))
@@ -106,7 +104,7 @@ class RefinedProgress(Callback):
         return reached
 
     def _estimator(self, system: PoseSystem) -> PoseEstimator:
-        """Return an estimator of the network as it is."""
+        """Return an estimator of the network with its present weights."""
         checkpoint = parse_description(system.payload)
         network = system.network.for_inference()
         estimator = PoseEstimator(network, checkpoint, system.device, self.refine, system.parts)
@@ -115,23 +113,16 @@ class RefinedProgress(Callback):
     def _measure(
         self, estimator: PoseEstimator, metrics: PoseMetrics, first: int, end: int
     ) -> tuple[float, int, float]:
-        """Add images to the metrics; return recall, number of instances and precision.
-
-        Args:
-            estimator: Estimator of the network.
-            metrics: Metrics of the images before the first.
-            first: First image to add.
-            end: Image after the last.
-        """
-        for index in range(first, min(end, len(self.pictures))):
-            sample = self.pictures.sample(index)
+        """Add the images first, …, end − 1; return recall, number of instances and precision."""
+        for index in range(first, min(end, len(self.images))):
+            sample = self.images.sample(index)
             poses = estimator.predict(sample.image, sample.K)
             metrics.update(poses, sample.instances, sample.K, sample.image.shape[1])
         row = metrics.compute()[MEAN]
         return row.add_or_s_01d or 0.0, row.num_instances, row.precision or 0.0
 
     def _minutes(self) -> float:
-        """Return the minutes of training, those of interrupted runs included."""
+        """Return the minutes of training, including interrupted runs."""
         return self._minutes_before + (time.monotonic() - self._begin) / 60
 
     def _draw(self, folder: Path) -> None:

@@ -23,6 +23,7 @@ from dopepp.data.batch import PADDING, Batch
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.maps.codec import Beliefs, Fields, MapGeometry, encode
+from dopepp.metrics.functional.distances import project_points
 from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
 from dopepp.models.heads import Stage
 from dopepp.models.losses import MapLoss
@@ -62,7 +63,7 @@ class SymmetryOptions(Checked):
 def draw_maps(
     batch: Batch, keypoints: Keypoints, num_objects: int, geometry: MapGeometry
 ) -> Targets:
-    """Draw the target maps of a batch; instances that are hidden too far for metrics are left out.
+    """Draw the target maps of a batch, without instances that are too occluded for metrics.
 
     Args:
         batch: Images with labels.
@@ -72,8 +73,8 @@ def draw_maps(
     """
     height, width = batch.images.shape[-2:]
     map_size = height // geometry.stride, width // geometry.stride
-    seen = batch.visible_fraction >= MIN_VISIBLE_FRACTION
-    index = torch.where(seen, batch.object_index, PADDING)
+    is_visible = batch.visible_fraction >= MIN_VISIBLE_FRACTION
+    index = torch.where(is_visible, batch.object_index, PADDING)
     return encode(keypoints, index, num_objects, map_size, geometry)
 
 
@@ -104,11 +105,11 @@ def choose_keypoints(
         # Draw maps only for images on which this choice is allowed for the instance.
         rows = allowed[:, slot, 1 + choice].nonzero()[:, 0]
         images = batch.rows(rows)
-        answer = [(logits[rows].detach(), field[rows].detach()) for logits, field in stages]
+        outputs = [(logits[rows].detach(), field[rows].detach()) for logits, field in stages]
         other = keypoints[rows]
         other[:, slot] = choices[rows, slot, 1 + choice]
         present_loss, other_loss = (
-            loss.per_image(answer, *draw_maps(images, points, symmetry.num_objects, geometry))
+            loss.per_image(outputs, *draw_maps(images, points, symmetry.num_objects, geometry))
             for points in (keypoints[rows], other)
         )
         is_better = other_loss < present_loss
@@ -135,7 +136,7 @@ class SymmetryHandling:
         longest = max(len(row["transforms"]) for row in rows)
         for row in rows:
             count = len(row["transforms"])
-            row["there"] = np.arange(longest) < count
+            row["is_pose"] = np.arange(longest) < count
             padding = [np.eye(4)[None]] * (longest - count)
             row["transforms"] = np.concatenate([row["transforms"], *padding])
         self.active = options.canonical and any(row["symmetric"] for row in rows)
@@ -155,7 +156,9 @@ class SymmetryHandling:
         index = batch.object_index.clamp(min=0)
         tables = self._on(batch.T_cam_obj.device)
         symmetric = tables["symmetric"][index] & (batch.object_index != PADDING)
-        keypoints = _project(poses, tables["cuboids"][index], batch.K).to(batch.keypoints.dtype)
+        cuboids, K = tables["cuboids"][index][:, :, None], batch.K.double()[:, None, None]
+        keypoints = project_points(poses[..., :3, :3], poses[..., :3, 3], cuboids, K)
+        keypoints = keypoints.to(batch.keypoints.dtype)
         labelled = batch.keypoints[:, :, None].expand_as(keypoints)
         border = np.radians(self.options.border_deg)
         allowed = symmetric[..., None] & (nearest - nearest[..., :1] < border)
@@ -185,7 +188,7 @@ class SymmetryHandling:
         poses[..., :3, :3], poses[..., :3, 3] = rotations, moved
         trace = (towards @ rotations).diagonal(dim1=-2, dim2=-1).sum(-1)
         angle = ((trace - 1) / 2).clamp(-1, 1).arccos()
-        return poses, torch.where(tables["there"][index], angle, torch.inf)
+        return poses, torch.where(tables["is_pose"][index], angle, torch.inf)
 
     def _on(self, device: torch.device) -> dict[str, Tensor]:
         """Return the tables of symmetries on a device."""
@@ -269,15 +272,3 @@ def _best_axis_rotation(
     angle = torch.atan2(sine, cosine)[..., None, None]
     identity: Tensor = torch.eye(3, dtype=offset.dtype, device=offset.device)
     return identity + angle.sin() * skew + (1 - angle.cos()) * skew @ skew
-
-
-def _project(
-    poses: Float[Tensor, "batch instances choices 4 4"],
-    cuboids: Float[Tensor, "batch instances 9 3"],
-    K: Float[Tensor, "batch 3 3"],
-) -> Float[Tensor, "batch instances choices 9 2"]:
-    """Project the cuboids' points; NaN at or behind the camera."""
-    points = cuboids[:, :, None] @ poses[..., :3, :3].mT + poses[..., None, :3, 3]
-    depth = points[..., 2:]
-    rays = torch.where(depth > 0, points / depth, torch.nan)
-    return (rays @ K.double()[:, None, None].mT)[..., :2]

@@ -1,7 +1,7 @@
-"""Compiled functions: the first compilation is announced, once, and none that is on disk."""
+"""Compiled functions: the first compilation is logged once; cached code is not compiled."""
 
 
-def test_compiling_is_announced_once_and_never_again(command, tmp_path):
+def test_compiling_is_logged_once(command, tmp_path):
     module = tmp_path / "loops.py"
     module.write_text(
         "import logging\n"
@@ -18,7 +18,7 @@ def test_compiling_is_announced_once_and_never_again(command, tmp_path):
     assert second.err == ""
 
 
-def test_a_first_compilation_calls_functions_beside(command, tmp_path):
+def test_a_first_compilation_calls_functions_in_a_second_process(command, tmp_path):
     (tmp_path / "later.py").write_text(
         f"from pathlib import Path\ndef call(): Path({str(tmp_path / 'called')!r}).touch()\n"
     )

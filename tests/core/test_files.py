@@ -1,4 +1,4 @@
-"""Files that are whole or absent."""
+"""Files that are complete or absent."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_a_png_keeps_its_pixels_in_rgb(tmp_path):
 @pytest.mark.parametrize(
     "image", [np.zeros((2, 2, 3)), np.zeros((2, 2), np.uint8), np.zeros((0, 2, 3), np.uint8)]
 )
-def test_what_is_no_image_is_refused(image, tmp_path):
+def test_arrays_that_are_no_rgb_image_are_refused(image, tmp_path):
     with pytest.raises(ValueError, match=r"an image must be uint8 \(H, W, 3\), got"):
         write_png(tmp_path / "image.png", image)
     assert list(tmp_path.iterdir()) == []
@@ -59,7 +59,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monke
 
 
 @pytest.mark.parametrize(("name", "head"), [("a.png", b"\x89PNG"), ("b.JPG", b"\xff\xd8")])
-def test_a_pictures_suffix_decides_its_format(name, head, tmp_path):
+def test_the_suffix_determines_the_format_of_an_image(name, head, tmp_path):
     check_target(tmp_path / "new" / name, IMAGES)
     assert list((tmp_path / "new").iterdir()) == []
     write_image(tmp_path / "new" / name, np.full((4, 6, 3), (200, 100, 50), np.uint8))
@@ -79,7 +79,7 @@ def test_a_pictures_suffix_decides_its_format(name, head, tmp_path):
         ("/proc/none/a.png", "No such file"),
     ],
 )
-def test_where_nothing_can_be_written(name, message, tmp_path):
+def test_an_unwritable_target_is_refused(name, message, tmp_path):
     (tmp_path / "folder.png").mkdir()
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match=message):

@@ -54,7 +54,7 @@ def test_reads_what_json_writes(value, ascii_only, indent):
     ],
     ids=lambda value: repr(value)[:20],
 )
-def test_refuses_in_one_line_with_the_place(text, message):
+def test_invalid_json_is_refused_with_the_position(text, message):
     with pytest.raises(UserError) as caught:
         parse_json(text, "some/file.json")
     assert "some/file.json" in str(caught.value)
@@ -63,7 +63,7 @@ def test_refuses_in_one_line_with_the_place(text, message):
     assert len(str(caught.value)) < 300
 
 
-def test_brackets_in_strings_are_no_nesting():
+def test_brackets_in_strings_do_not_count_as_nesting():
     value = {"a": "[" * 500 + '\\"{{' * 50, "b": ["}"] * 3}
     assert parse_json(json.dumps(value), "here") == value
     deepest = "[" * MAX_DEPTH + "]" * MAX_DEPTH
@@ -89,5 +89,5 @@ def test_read_names_the_file_and_bounds_its_size(tmp_path):
     path.write_text('{"0": [1, 2.5]}')
     assert read_json(path) == {"0": [1, 2.5]}
     assert read_json(path, max_bytes=15) == {"0": [1, 2.5]}
-    with pytest.raises(UserError, match=r"scene_gt\.json of .* MB; allowed: .* at most 1.4e-05 MB"):
+    with pytest.raises(UserError, match=r"scene_gt\.json: more than .* MB; .* at most 1.4e-05 MB"):
         read_json(path, max_bytes=14)

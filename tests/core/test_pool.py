@@ -1,4 +1,4 @@
-"""Pools: order, errors, lost processes, interruptions; clusters that are not there."""
+"""Pools: order, errors, lost processes, interruptions, and missing clusters."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from dopepp.core.errors import UserError
 from dopepp.core.pool import ClusterPool, LostWorkerError, Pool, ProcessPool
 
 EVALUATE = pickle.dumps(eval)
-posix = pytest.mark.skipif(os.name != "posix", reason="signals are asked of POSIX")
+posix = pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
 
 
 class InlinePool(Pool):
-    """Applies the function here, to as many items at a time as there is room."""
+    """Completes items in this process, in reverse order, once ``room`` items are submitted."""
 
     def __init__(self, room: int) -> None:
-        self._room, self.flying = room, list[tuple[Future[object], object]]()
+        self._room, self.submitted = room, list[tuple[Future[object], object]]()
 
     def __exit__(self, *_: object) -> None: ...
 
@@ -33,16 +33,16 @@ class InlinePool(Pool):
         return self._room
 
     def submit(self, item: object) -> Future[object]:
-        self.flying.append((Future(), item))
-        assert len(self.flying) <= self._room
-        if len(self.flying) == self._room or item == 9:
-            while self.flying:
-                future, item = self.flying.pop()
+        self.submitted.append((Future(), item))
+        assert len(self.submitted) <= self._room
+        if len(self.submitted) == self._room or item == 9:
+            while self.submitted:
+                future, item = self.submitted.pop()
                 future.set_result(item)
-        return self.flying[-1][0] if self.flying else future
+        return self.submitted[-1][0] if self.submitted else future
 
 
-def test_what_is_done_may_decide_what_comes_next():
+def test_results_may_determine_further_items():
     handed_out, values = [], [1]
 
     def items() -> Iterator[int]:
@@ -55,7 +55,7 @@ def test_what_is_done_may_decide_what_comes_next():
     assert handed_out == [2**power for power in range(10)]
 
 
-def test_no_more_is_handed_out_than_there_is_room():
+def test_no_more_items_are_read_than_the_capacity():
     read = []
 
     def items() -> Iterator[str]:
@@ -72,7 +72,7 @@ def test_no_more_is_handed_out_than_there_is_room():
     assert sorted(done) == list(range(1, 51))
 
 
-def test_an_error_and_a_lost_process_cost_one_item_each():
+def test_an_error_and_a_lost_process_affect_one_item_each():
     died = "a worker process died ({}); if memory was short, use fewer --workers"
     errors = {
         "1 / 0": "ZeroDivisionError",
@@ -107,7 +107,7 @@ def test_a_stopped_pool_completes_its_items(tmp_path):
         with ProcessPool(EVALUATE, 1) as pool:
             assert next(pool.run(["1", item]))[1].result() == 1
             started.extend(pool._processes)
-            for number in (signal.SIGINT, signal.SIGTERM):  # Ctrl-C reaches it, and it goes on
+            for number in (signal.SIGINT, signal.SIGTERM):  # the process continues
                 os.kill(started[0].pid, number)
             raise KeyboardInterrupt
 
@@ -152,13 +152,13 @@ if __name__ == "__main__":
     for _ in range(200):
         try:
             os.killpg(parent.pid, 0)
-        except ProcessLookupError:  # nobody of its group is left
+        except ProcessLookupError:  # no process of the group exists
             return
         time.sleep(0.05)
     pytest.fail("processes outlive their parent")
 
 
-def test_without_ray_it_says_what_to_install(monkeypatch):
+def test_without_ray_the_error_names_the_extra(monkeypatch):
     monkeypatch.setattr("dopepp.core.errors.find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"--engine ray without .* pip install 'dopepp\[ray\]'"):
         ClusterPool(EVALUATE, None, 1)

@@ -1,4 +1,4 @@
-"""Plain values become typed objects; every mistake is one line with its name."""
+"""Plain values are converted to typed objects; a mistake gives one line with its name."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_a_mistake_names_field_value_and_choices(given, got, allowed):
 
 
 @pytest.mark.parametrize("value", [{1, 2}, 10**5000, float], ids=["set", "endless", "class"])
-def test_what_no_file_holds_is_refused(value):
+def test_values_that_json_cannot_represent_are_refused(value):
     with pytest.raises(UserError):
         parse(Outer, {"number": value}, "root")
 

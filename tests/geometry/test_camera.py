@@ -42,7 +42,7 @@ def test_projection_is_opencvs():
 
 
 @pytest.mark.filterwarnings("error")
-def test_what_is_not_in_front_of_the_camera_has_no_pixel():
+def test_points_behind_the_camera_have_no_pixel():
     points = np.array([[0, 0, 1], [0.1, 0.2, 0], [0.1, 0.2, -1], [np.nan, 0, 1], [1, 1, 1e-320]])
     pixels = project(points, K)
     assert_allclose(pixels[0], K[:2, 2])
@@ -56,7 +56,7 @@ def test_transforms_invert():
     assert_allclose(transform(invert_transform(T), transform(T, points)), points, atol=1e-12)
 
 
-def test_resized_camera_sees_the_resized_points():
+def test_a_resized_camera_projects_to_resized_points():
     rng = np.random.default_rng(3)
     points = rng.uniform([-0.2, -0.2, 0.5], [0.2, 0.2, 1], (20, 3))
     expected = resize_points(project(points, K), 0.65, 1.7)
@@ -69,7 +69,7 @@ SIZES = st.tuples(st.integers(1, 3000), st.integers(1, 3000))
 
 @settings(max_examples=200)
 @given(SIZES, SIZES)
-def test_letterbox_fits_and_comes_back(size, input_size):
+def test_a_letterbox_fits_and_can_be_inverted(size, input_size):
     box = Letterbox.fit(size, input_size)
     assert 1 <= box.width <= input_size[0]
     assert 1 <= box.height <= input_size[1]
@@ -86,7 +86,7 @@ def test_letterbox_fits_and_comes_back(size, input_size):
 
 
 @pytest.mark.parametrize("input_size", [(128, 128), (416, 416), (64, 300)])
-def test_letterbox_image_goes_where_its_points_go(input_size):
+def test_a_letterbox_moves_image_and_points_alike(input_size):
     grid_y, grid_x = np.mgrid[:150, :200]
     blob = 255 * np.exp(-((grid_x - 120.4) ** 2 + (grid_y - 60.8) ** 2) / (2 * 8.0**2))
     image = np.repeat(np.round(blob).astype(np.uint8)[..., None], 3, axis=2)
@@ -99,7 +99,7 @@ def test_letterbox_image_goes_where_its_points_go(input_size):
     assert_allclose(centre, box.points(np.array([120.4, 60.8])), atol=0.1)
 
 
-def test_letterbox_averages_when_it_shrinks():
+def test_a_letterbox_averages_when_shrinking():
     checkers = np.indices((64, 64)).sum(0) % 2 * np.uint8(255)
     image = np.repeat(checkers[..., None].astype(np.uint8), 3, axis=2)
     assert np.abs(Letterbox.fit((64, 64), (16, 16)).image(image).astype(int) - 128).max() <= 1
@@ -151,7 +151,7 @@ def test_bad_camera(bad, message):
         (ANYWHERE, (-7.0, 30.0), True),
     ],
 )
-def test_how_far_off_the_middle_the_principal_point_may_be(off_centre, principal, good):
+def test_the_principal_point_has_a_largest_offset(off_centre, principal, good):
     x, y = np.array([640, 480]) * principal - 0.5
     there = camera_matrix(600, 600, x, y)
     if good:
@@ -162,8 +162,8 @@ def test_how_far_off_the_middle_the_principal_point_may_be(off_centre, principal
 
 
 @pytest.mark.parametrize("scale", [0.25, 0.5, 1.5, 2.0])
-def test_the_k_of_another_resolution_is_told_with_its_likely_size(scale):
-    """A lens like real ones', its image a quarter to twice as large as that of its K."""
+def test_the_k_of_another_resolution_is_refused_with_its_likely_size(scale):
+    """The image is a quarter to twice as large as the image for which K holds."""
     own = camera_matrix(600, 610, 310.5, 245.25)
     size = (round(640 / scale), round(480 / scale))
     with pytest.raises(UserError) as caught:
@@ -174,7 +174,7 @@ def test_the_k_of_another_resolution_is_told_with_its_likely_size(scale):
 
 
 @pytest.mark.parametrize(("degrees", "good"), [(4.8, False), (5, True), (150, True), (151, False)])
-def test_a_picture_sees_5_to_150_degrees(degrees, good):
+def test_the_field_of_view_is_5_to_150_degrees(degrees, good):
     focal = 320 / np.tan(np.radians(degrees) / 2)
     K = camera_matrix(focal, focal, 319.5, 239.5)
     if good:
@@ -182,11 +182,11 @@ def test_a_picture_sees_5_to_150_degrees(degrees, good):
         return
     with pytest.raises(UserError, match=f"field of view {degrees:g}°"):
         check_camera(K, (640, 480), "test", WHOLE)
-    if degrees < 5:  # what was cut out of an image may see as little as that
+    if degrees < 5:  # allowed for a crop
         check_camera(K, (640, 480), "test", ANYWHERE)
 
 
-def test_a_step_between_two_poses_makes_one_of_the_other():
+def test_the_step_between_two_poses_moves_the_first_to_the_second():
     rng = np.random.default_rng(4)
     for _ in range(20):
         before, after = (

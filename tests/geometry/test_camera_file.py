@@ -109,7 +109,7 @@ NDDS = """{"camera_settings": [{
   "intrinsic_settings": {"fx": 601.25, "fy": 602.5, "cx": 318.75, "cy": 242.5, "s": 0},
   "captured_image_size": {"width": 640, "height": 480}
 }]}"""
-# Of COLMAP, (0.5, 0.5) is the centre of the top-left pixel.
+# COLMAP's (0.5, 0.5) is the centre of the top-left pixel.
 COLMAP = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n# Number of cameras: 1\n1 {}\n"
 ROWS = "601.25 0 318.75\n0 602.5 242.5\n0 0 1\n"
 ANY = (640, 480)
@@ -139,7 +139,7 @@ FOUR = {"fx": 601.25, "fy": 602.5, "cx": 318.75, "cy": 242.5}
         ("K: [[601.25, 0, 318.75], [0, 602.5, 242.5], [0, 0, 1]]\nD: [0, 0, 0, 0]", None, ()),
     ],
 )  # fmt: skip
-def test_every_format_says_the_same(text, size, lens, tmp_path):
+def test_every_format_has_the_same_content(text, size, lens, tmp_path):
     path = tmp_path / "camera.dat"
     path.write_text(text, encoding="utf-8")
     camera = read_camera(path)
@@ -164,7 +164,7 @@ def test_colmap_models_of_one_focal_length(line, focal, lens, tmp_path):
     assert camera.distortion == lens
 
 
-NUMBERS = st.floats(-1e6, 1e6).map(lambda one: 0.0 if abs(one) < 1e-300 else one)
+NUMBERS = st.floats(-1e6, 1e6).map(lambda number: 0.0 if abs(number) < 1e-300 else number)
 
 
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -194,8 +194,8 @@ def test_reads_what_opencv_writes_to_the_last_bit(tmp_path, suffix, four, lens, 
     assert camera.distortion == (tuple(lens) if any(lens) else ())
 
 
-def test_its_lens_projects_as_opencvs(tmp_path):
-    """COLMAP's and OpenCV's lens models are one: a point through either is the same pixel."""
+def test_its_lens_projects_like_opencvs(tmp_path):
+    """COLMAP's and OpenCV's lens models project a point to the same pixel."""
     path = tmp_path / "cameras.txt"
     path.write_text(COLMAP.format("OPENCV 640 480 600 610 320 240 -0.1 0.05 0.001 -0.002"))
     camera, (x, y) = read_camera(path), (0.2, -0.15)
@@ -268,7 +268,7 @@ def test_a_bad_file_is_one_line(name, tmp_path):
     [("missing", "No such file"), ("", "Is a directory"), ("large", "more than 0.25 MB"),
      ("nul\0", "null")],
 )  # fmt: skip
-def test_a_file_that_is_none(name, message, tmp_path):
+def test_a_path_without_a_readable_file_is_refused(name, message, tmp_path):
     (tmp_path / "large").write_bytes(b"1 " * 600_000)
     with pytest.raises(UserError, match=message):
         read_camera(tmp_path / name)
@@ -281,7 +281,7 @@ MARKS = [b"[", b"{", b"-", b": ", b"&a ", b"!!", b"<", b"1e999", b"\n"]
 @settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_a_changed_file_is_a_camera_or_refused(tmp_path, data):
-    """Bytes replaced, inserted and cut out: nothing but a camera or one line comes of it."""
+    """With bytes replaced, inserted and removed, a file gives a camera or a UserError."""
     content = bytearray(data.draw(st.sampled_from(SAMPLES)).encode())
     for _ in range(data.draw(st.integers(1, 4))):
         start = data.draw(st.integers(0, len(content)))
@@ -298,28 +298,28 @@ def test_a_changed_file_is_a_camera_or_refused(tmp_path, data):
     assert np.isfinite(camera.distortion).all()
 
 
-def seen(points: np.ndarray, camera: Camera) -> np.ndarray:
+def pixels(points: np.ndarray, camera: Camera) -> np.ndarray:
     lens = np.array(camera.distortion) if camera.distortion else None
     return cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.K, lens)[0][:, 0]
 
 
 POINTS = np.random.default_rng(0).uniform([-0.2, -0.15, 0.8], [0.2, 0.15, 1.2], (20, 3))
 CAMERA = Camera((640, 480), K, LENS, "lens.yaml")
-UNSAID = Camera(None, K, (), "--K")
+PLAIN = Camera(None, K, (), "--K")
 
 
-@pytest.mark.parametrize("camera", [CAMERA, UNSAID])
-def test_the_camera_of_a_picture(camera):
-    """As an image is resized or cut, so is where its camera sees a point, lens and all."""
-    whole = seen(POINTS, camera)
+@pytest.mark.parametrize("camera", [CAMERA, PLAIN])
+def test_the_camera_of_an_image(camera):
+    """Resizing or cropping an image moves projected points like the image's pixels."""
+    whole = pixels(POINTS, camera)
     assert_array_equal(camera.for_picture((640, 480)).K, K)
     half = camera.for_picture((320, 240), K_size=(640, 480))
     assert (half.size, half.distortion) == ((320, 240), camera.distortion)
-    assert_allclose(seen(POINTS, half), (whole + 0.5) / 2 - 0.5, atol=1e-9)
+    assert_allclose(pixels(POINTS, half), (whole + 0.5) / 2 - 0.5, atol=1e-9)
     odd = camera.for_picture((213, 160), K_size=(640, 480))  # 213⅓: rounded to whole pixels
-    assert_allclose(seen(POINTS, odd), (whole + 0.5) * [213 / 640, 1 / 3] - 0.5, atol=1e-9)
+    assert_allclose(pixels(POINTS, odd), (whole + 0.5) * [213 / 640, 1 / 3] - 0.5, atol=1e-9)
     corner = camera.for_picture((100, 60), crop=(500, 400, 100, 60))
-    assert_allclose(seen(POINTS, corner), whole - [500, 400], atol=1e-9)
+    assert_allclose(pixels(POINTS, corner), whole - [500, 400], atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -333,31 +333,31 @@ def test_the_camera_of_a_picture(camera):
         (CAMERA, (1280, 720), {}, "fix: calibrate the camera at 1280×720"),
         (CAMERA, (1280, 720), {"K_size": (640, 480)}, "fix: calibrate the camera at 1280×720"),
         (CAMERA, (320, 240), {"K_size": (1280, 960)}, "--K-size 1280 960 with lens.yaml"),
-        (UNSAID, (320, 240), {"K_size": (1280, 960)}, "1280×960 image of --K.*likely of 638×486"),
-        (UNSAID, (320, 240), {"K_size": (0, 5)}, "--K-size 0 5; allowed: width and height above"),
-        (UNSAID, (1280, 960), {}, "1280×960 image of --K: principal point at 25% of its width"),
+        (PLAIN, (320, 240), {"K_size": (1280, 960)}, "1280×960 image of --K.*likely of 638×486"),
+        (PLAIN, (320, 240), {"K_size": (0, 5)}, "--K-size 0 5; allowed: width and height above"),
+        (PLAIN, (1280, 960), {}, "1280×960 image of --K: principal point at 25% of its width"),
         (CAMERA, (9, 9), {"K_size": (640, 480), "crop": (0, 0, 9, 9)}, "--K-size with --crop"),
         (CAMERA, (9, 9), {"crop": (0, 0, 10, 9)}, "--crop 0 0 10 9 with an image of 9×9"),
         (CAMERA, (9, 9), {"crop": (632, 0, 9, 9)}, "inside the calibrated image of 640×480"),
-        (UNSAID, (9, 9), {"crop": (-1, 0, 9, 9)}, "--crop -1 0 9 9; allowed"),
+        (PLAIN, (9, 9), {"crop": (-1, 0, 9, 9)}, "--crop -1 0 9 9; allowed"),
         (Camera((64, 48), K, (), "x"), (64, 48), {}, "64×48 image of x: principal point at 499%"),
     ],
 )
-def test_a_k_of_another_picture_is_refused(camera, size, options, message):
+def test_the_k_of_another_image_is_refused(camera, size, options, message):
     with pytest.raises(UserError, match=message):
         camera.for_picture(size, **options)
 
 
-def test_the_lens_is_taken_out_of_a_picture():
-    """A dot where the lens puts a point comes to lie where the pinhole puts it."""
+def test_an_image_is_undistorted():
+    """A dot at a point's distorted position moves to its pinhole position."""
     point = np.array([[0.45, -0.3, 1.0]])
     image = np.zeros((480, 640, 3), np.uint8)
-    x, y = seen(point, CAMERA)[0]
+    x, y = pixels(point, CAMERA)[0]
     cv2.circle(image, (round(x * 16), round(y * 16)), 4 * 16, (255, 255, 255), -1, shift=4)
     straight = CAMERA.undistorted(image)[..., 0].astype(float)
     rows, columns = np.mgrid[:480, :640]
     result = np.array([(straight * columns).sum(), (straight * rows).sum()]) / straight.sum()
-    expected = seen(point, UNSAID)[0]
+    expected = pixels(point, PLAIN)[0]
     assert_allclose(result, expected, atol=0.3)
     assert np.linalg.norm(expected - (x, y)) > 5
-    assert UNSAID.undistorted(image) is image
+    assert PLAIN.undistorted(image) is image

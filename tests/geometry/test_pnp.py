@@ -51,8 +51,14 @@ def add(T: np.ndarray | None, truth: np.ndarray, cuboid: np.ndarray) -> float:
     return float(error / np.linalg.norm(cuboid[0] - cuboid[6]))
 
 
+def isotropic(sigma: np.ndarray | float) -> np.ndarray:
+    """Covariances of standard deviations in pixels."""
+    with np.errstate(all="ignore"):
+        return np.asarray(sigma)[..., None, None] ** 2 * np.eye(2)
+
+
 def check(result: PnPResult, object_points: np.ndarray) -> None:
-    """What holds for every result, whatever went in."""
+    """Check what holds for the result of any input."""
     assert (result.inliers.shape, result.inliers.dtype) == ((len(object_points),), bool)
     assert (result.T_cam_obj is None) == bool(result.reason)
     if result.T_cam_obj is None:
@@ -66,11 +72,11 @@ def check(result: PnPResult, object_points: np.ndarray) -> None:
     assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6)
     assert np.linalg.det(T[:3, :3]) > 0
     assert_array_equal(T[3], [0, 0, 0, 1])
-    seen = object_points[result.inliers]
+    inliers = object_points[result.inliers]
     size = np.linalg.norm(np.ptp(object_points[np.isfinite(object_points).all(1)], axis=0))
-    assert transform(T, seen)[:, 2].min() > 0
-    # The centre of the points in use is that far at most; any of them at most one size more.
-    assert np.linalg.norm(transform(T, seen), axis=1).max() <= (MAX_DISTANCE + 1) * size * 1.001
+    assert transform(T, inliers)[:, 2].min() > 0
+    # MAX_DISTANCE limits the centre of the inliers; a point is at most one size farther.
+    assert np.linalg.norm(transform(T, inliers), axis=1).max() <= (MAX_DISTANCE + 1) * size * 1.001
 
 
 @pytest.mark.parametrize("name", CUBOIDS)
@@ -121,7 +127,7 @@ def test_wild_corners_are_rejected(name, count):
         pixels = project_keypoints(cuboid, truth, K) + rng.normal(size=(9, 2)) * 0.2
         wild = rng.integers(8, size=count)
         pixels[wild] += 60 * np.stack([np.cos(wild), np.sin(wild)], axis=1)
-        result = solve_pnp(cuboid, pixels, K, 0.2)
+        result = solve_pnp(cuboid, pixels, K, isotropic(0.2))
         check(result, cuboid)
         near = add(result.T_cam_obj, truth, cuboid) < 0.1
         is_clean = not result.inliers[wild].any() and result.inliers.sum() >= 8 - count
@@ -132,24 +138,19 @@ def test_wild_corners_are_rejected(name, count):
 @pytest.mark.parametrize(
     "bad",
     [
-        *(np.nan, np.inf, 0.0, -1.0),
         *(np.zeros((2, 2)), -np.eye(2), np.full((2, 2), np.nan), np.diag([np.inf, 1])),
-        [[1.0, 2.0], [2.0, 1.0]],
+        np.array([[1.0, 2.0], [2.0, 1.0]]),
     ],
     ids=str,
 )
-def test_a_point_without_a_proper_sigma_or_covariance_is_missing(bad):
+def test_a_point_without_a_proper_covariance_is_missing(bad):
     cuboid = CUBOIDS["box"]
     pixels = project_keypoints(cuboid, look_at(cuboid, np.random.default_rng(3)), K)
     pixels[2] += 100
-    if np.ndim(bad) == 0:
-        given = np.ones(9)
-        assert "0 usable points" in solve_pnp(cuboid, pixels, K, bad).reason
-    else:
-        given = np.tile(np.eye(2), (9, 1, 1))
-    given[2] = bad
-    name = "sigma_px" if np.ndim(bad) == 0 else "covariance_px"
-    result = solve_pnp(cuboid, pixels, K, **{name: given})
+    assert "0 usable points" in solve_pnp(cuboid, pixels, K, bad).reason
+    covariance = np.tile(np.eye(2), (9, 1, 1))
+    covariance[2] = bad
+    result = solve_pnp(cuboid, pixels, K, covariance)
     assert_array_equal(result.inliers, np.arange(9) != 2)
 
 
@@ -161,7 +162,7 @@ def opencv(cuboid: np.ndarray, pixels: np.ndarray, flag: int) -> np.ndarray | No
 
 @pytest.mark.parametrize("name", ["box", "can", "plate"])
 def test_beats_opencv_on_anisotropic_noise_and_wild_corners(name):
-    """Noise like a network's: 0.5–4 px, elongated any way; a wild corner in 40 % of images."""
+    """Noise like a network's: 0.5–4 px, elongated; 40 % of the images have a wild corner."""
     cuboid, rng = CUBOIDS[name], np.random.default_rng(4)
     passed = []
     for _ in range(120):
@@ -174,7 +175,7 @@ def test_beats_opencv_on_anisotropic_noise_and_wild_corners(name):
         pixels = project_keypoints(cuboid, truth, K) + np.stack(noise, axis=1)
         if rng.random() < 0.4:
             pixels[rng.integers(8)] = rng.uniform(0, 416, 2)
-        ours = solve_pnp(cuboid, pixels, K, sigma)
+        ours = solve_pnp(cuboid, pixels, K, isotropic(sigma))
         check(ours, cuboid)
         flags = (cv2.SOLVEPNP_SQPNP, cv2.SOLVEPNP_EPNP)
         poses = (ours.T_cam_obj, *(opencv(cuboid, pixels, flag) for flag in flags))
@@ -195,7 +196,7 @@ def test_widenings_are_solved_in_turn_until_two_thirds_agree(name):
         least = 2 * np.isfinite(pixels[:, 0]).sum() / 3
         best = None
         for factor in (1.0, 2.0, 4.0):
-            item = solve_pnp(cuboid, pixels, K, factor)
+            item = solve_pnp(cuboid, pixels, K, isotropic(factor))
             if best is None or item.inliers.sum() > best.inliers.sum():
                 best, chosen = item, factor
             if best.inliers.sum() >= least:
@@ -245,7 +246,7 @@ NUMBERS = st.one_of(st.floats(), st.floats(-2, 2), st.sampled_from(SPECIAL))
 @given(st.lists(st.lists(NUMBERS, min_size=6, max_size=6), max_size=9))
 def test_garbage_never_breaks_it(rows):
     table = np.array(rows, float).reshape(-1, 6)
-    check(solve_pnp(table[:, :3], table[:, 3:5], K, table[:, 5]), table[:, :3])
+    check(solve_pnp(table[:, :3], table[:, 3:5], K, isotropic(table[:, 5])), table[:, :3])
 
 
 @pytest.mark.parametrize("spread", [0.01, 1.0, 30.0, 400.0, 1e5])
@@ -255,7 +256,7 @@ def test_random_pixels_never_give_a_wild_pose(spread):
         for _ in range(60):
             pixels = 200 + spread * rng.normal(size=(9, 2))
             pixels[rng.random(9) < 0.2] = np.nan
-            check(solve_pnp(CUBOIDS[name], pixels, K, sigma), CUBOIDS[name])
+            check(solve_pnp(CUBOIDS[name], pixels, K, isotropic(sigma)), CUBOIDS[name])
 
 
 def test_equal_points_and_pixels_never_give_a_wild_pose():
@@ -267,29 +268,29 @@ def test_equal_points_and_pixels_never_give_a_wild_pose():
     check(solve_pnp(coincident, rng.uniform(0, 400, (9, 2)), K), coincident)
 
 
-def test_lengths_must_match_and_the_camera_be_one():
+def test_lengths_must_match_and_the_camera_be_a_pinhole():
     cuboid = CUBOIDS["box"]
     with pytest.raises(ValueError, match="9 object points, 8 image points"):
         solve_pnp(cuboid, np.zeros((8, 2)), K)
     with pytest.raises(ValueError, match="broadcast"):
-        solve_pnp(cuboid, np.zeros((9, 2)), K, np.ones(8))
+        solve_pnp(cuboid, np.zeros((9, 2)), K, isotropic(np.ones(8)))
     for bad in (np.full((3, 3), np.nan), np.zeros((3, 3)), np.eye(4), 2 * np.eye(3), K * 0 + 1):
         with pytest.raises(ValueError, match="invertible pinhole matrix"):
             solve_pnp(cuboid, cuboid[:, :2], bad)
 
 
 def test_the_mirrored_start_saves_plates_from_the_wrong_tilt():
-    """Of two tilts with almost one image, the cost must decide, not the start."""
+    """Two tilts have almost the same image: the cost must decide, not the start."""
     cuboid, rng = CUBOIDS["plate"], np.random.default_rng(9)
     for _ in range(40):
         truth = make_transform(random_rotation(rng), np.array([0.02, -0.01, 0.9]))
         pixels = project_keypoints(cuboid, truth, K) + rng.normal(size=(9, 2)) * 0.3
-        result = solve_pnp(cuboid, pixels, K, 0.3).T_cam_obj
-        at_truth, at_found = (
+        result = solve_pnp(cuboid, pixels, K, isotropic(0.3)).T_cam_obj
+        at_truth, at_estimate = (
             np.fmin(((project(transform(T, cuboid), K) - pixels) ** 2).sum(1) / 0.3**2, 9).sum()
             for T in (truth, result)
         )
-        assert at_found <= at_truth
+        assert at_estimate <= at_truth
 
 
 def covariances(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -301,13 +302,13 @@ def covariances(rng: np.random.Generator, n: int) -> np.ndarray:
 
 @pytest.mark.parametrize("name", ["box", "box off its origin", "plate"])
 def test_the_covariance_is_that_of_the_poses(name):
-    """Poses of many noisy observations scatter as each of them says."""
+    """The poses of many noisy observations scatter like their estimated covariances."""
     rng = np.random.default_rng(5)
     cuboid = CUBOIDS[name]
     truth = look_at(cuboid, rng)
     pixels, sigma = project(transform(truth, cuboid), K), 0.02 * covariances(rng, 9)
     root = np.linalg.cholesky(sigma)
-    steps, said = [], []
+    steps, estimated = [], []
     for _ in range(400):
         noise = (root @ rng.normal(size=(9, 2, 1)))[..., 0]
         result = solve_pnp(cuboid, pixels + noise, K, covariance_px=sigma)
@@ -315,23 +316,12 @@ def test_the_covariance_is_that_of_the_poses(name):
             continue
         turn = cv2.Rodrigues(result.T_cam_obj[:3, :3] @ truth[:3, :3].T)[0][:, 0]
         steps.append(np.concatenate([turn, (result.T_cam_obj - truth)[:3, 3]]))
-        said.append(result.covariance)
+        estimated.append(result.covariance)
     assert len(steps) > 350
-    expected = np.mean(said, axis=0)
+    expected = np.mean(estimated, axis=0)
     scale = 1 / np.sqrt(np.diag(expected))
     assert_allclose(
         scale[:, None] * np.cov(np.transpose(steps)) * scale,
         scale[:, None] * expected * scale,
         atol=0.25,
     )
-
-
-def test_a_covariance_that_is_a_circle_is_a_sigma():
-    rng = np.random.default_rng(9)
-    cuboid, sigma = CUBOIDS["can"], rng.uniform(0.5, 4, 9)
-    pixels = project(transform(look_at(cuboid, rng), cuboid), K) + rng.normal(0, 1, (9, 2))
-    by_sigma = solve_pnp(cuboid, pixels, K, sigma)
-    by_covariance = solve_pnp(
-        cuboid, pixels, K, covariance_px=sigma[:, None, None] ** 2 * np.eye(2)
-    )
-    assert_allclose(by_sigma.T_cam_obj, by_covariance.T_cam_obj, atol=1e-9)

@@ -48,7 +48,7 @@ def test_matrix_to_quaternion_is_scipys_up_to_sign(quaternion):
 
 @wide
 @given(AXES, st.sampled_from([0.0, 1e-12, 1e-6, 0.1, 2.0, 3.14]))
-def test_rotation_vectors_are_found_again(axis: list[float], angle: float) -> None:
+def test_rotation_vectors_survive_a_round_trip(axis: list[float], angle: float) -> None:
     vector = angle * np.array(axis) / np.linalg.norm(axis)
     result = matrix_to_rotation_vector(rotation_vector_to_matrix(vector))
     assert_allclose(result, vector, rtol=1e-9, atol=1e-14)
@@ -67,7 +67,7 @@ def test_quaternions_of_any_norm(scale):
 
 
 @pytest.mark.parametrize("bad", [[0, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 0]])
-def test_no_quaternion(bad):
+def test_zero_and_infinite_quaternions_are_refused(bad):
     with pytest.raises(ValueError, match="finite and non-zero"):
         quaternion_to_matrix(np.array(bad))
 
@@ -130,12 +130,12 @@ def test_the_nearest_rotation_is_the_polar_factor(seed):
     bent = random_rotation(rng) + rng.normal(scale=0.05, size=(4, 3, 3))
     result = nearest_rotation(bent)
     assert_allclose(result, [polar(item)[0] for item in bent], atol=1e-12)
-    # Of a mirror image, too, it is a rotation, and none beside it is nearer.
+    # A mirrored matrix also gives a rotation, and no neighbouring rotation is nearer.
     mirrored = -bent[0]
     (nearest,) = nearest_rotation(mirrored[None])
     assert is_rotation(nearest, 1e-9)
-    beside = Rotation.from_rotvec(rng.normal(scale=0.05, size=(50, 3))).as_matrix() @ nearest
-    distances = np.linalg.norm(beside - mirrored, axis=(1, 2))
+    neighbours = Rotation.from_rotvec(rng.normal(scale=0.05, size=(50, 3))).as_matrix() @ nearest
+    distances = np.linalg.norm(neighbours - mirrored, axis=(1, 2))
     assert (distances >= np.linalg.norm(nearest - mirrored)).all()
 
 

@@ -87,7 +87,7 @@ def test_group_of_a_can():
     np.testing.assert_allclose(on_axis, np.tile(axis_point, (630, 1)), atol=1e-12)
     angles = Rotation.from_matrix(group[:315, :3, :3]).magnitude()
     assert np.diff(np.sort(angles)).max() < 2 * 0.01
-    # It is a group: the product of two of its members is one of them.
+    # The product of two members is a member.
     product = group[7] @ group[400]
     assert np.abs(group - product).max(axis=(1, 2)).min() < 1e-12
 

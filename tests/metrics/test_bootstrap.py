@@ -1,4 +1,4 @@
-"""The paired bootstrap against scipy's, against closed forms, and against what it is for."""
+"""The paired bootstrap against scipy's, closed forms and simulated comparisons."""
 
 from typing import Any
 
@@ -102,7 +102,7 @@ def test_the_methods_change_places_and_the_interval_its_sign(seed, num, seeds, n
 
 @settings(max_examples=60)
 @given(values=st.lists(st.floats(0, 180) | st.just(np.inf) | st.just(np.nan), min_size=1))
-def test_the_median_is_of_what_is_finite(values):
+def test_the_median_is_of_the_finite_numbers(values):
     finite = [value for value in values if np.isfinite(value)]
     result = STATISTICS["median"](np.array([values, values]))
     expected = np.median(finite) if finite else np.nan
@@ -137,7 +137,7 @@ def test_fewer_than_six_differing_instances_prove_nothing(num):
     assert item.within_noise
 
 
-def test_the_sign_test_says_how_many():
+def test_the_fewest_differing_instances_follow_from_the_sign_test():
     for confidence in (0.5, 0.8, 0.95, 0.99, 0.999):
         fewest = fewest_differing(confidence)
         assert 2 * 0.5**fewest <= 1 - confidence + 1e-12 < 2 * 0.5 ** (fewest - 1) + 1e-12
@@ -153,7 +153,7 @@ def test_several_objects_count_alike():
     assert result.high - result.low < alone.high - alone.low
 
 
-def test_pairs_of_seeds_cancel_what_they_share():
+def test_pairs_of_seeds_cancel_shared_effects():
     rng = np.random.default_rng(4)
     shared = rng.normal(0, 1, (4, 1))
     mine, other = shared + 0.2 + rng.normal(0, 0.01, (2, 4, 100))
@@ -180,7 +180,7 @@ PASSES = np.array([[0.0, 1.0, 1.0]])
         ([PASSES], [PASSES + np.inf], "not finite"),
     ],
 )
-def test_what_cannot_be_paired_is_a_users_mistake(mine, baseline, message):
+def test_values_that_cannot_be_paired_are_a_user_error(mine, baseline, message):
     with pytest.raises(UserError, match=message):
         paired_difference(mine, baseline)
 
@@ -192,7 +192,7 @@ def test_what_cannot_be_paired_is_a_users_mistake(mine, baseline, message):
     noise=st.floats(0, 0.02),
     seeds=st.integers(2, 6),
 )
-def test_as_many_seeds_as_it_says_tell_a_difference(gain, spread, noise, seeds):
+def test_the_estimated_number_of_seeds_makes_a_difference_significant(gain, spread, noise, seeds):
     """Of a known spread over seeds and images, the interval with so many just leaves out 0."""
     rng = np.random.default_rng(4)
     over_seeds, over_images = rng.normal(size=seeds), rng.normal(size=50)

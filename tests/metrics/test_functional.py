@@ -76,7 +76,7 @@ def test_add_equals_the_loop(near):
     scale=st.floats(0.5, 2.0),
 )
 def test_add_s_is_exact_for_any_matrix(seed, count, scale):
-    """From true points to the nearest estimated one; rotations, scaled, skewed and flat ones."""
+    """Distances to the nearest estimated point, also for scaled, skewed and flat matrices."""
     R_est, t_est, R_gt, t_gt = poses(5, seed)
     R_est[1] *= scale
     R_est[2] += 0.3 * torch.from_numpy(np.random.default_rng(seed).normal(size=(3, 3)))
@@ -155,7 +155,7 @@ def test_mssd_and_mspd_are_their_formulas(seed, count, turning, is_near):
     """Also where most symmetries are left out early, because others are surely nearer."""
     axes = [(turning, (0.01, 0.0, 0.0))] if turning else []
     group = symmetry_group(HALF_TURN[None], axes, 0.2)
-    R_est, t_est, R_gt, t_gt = (one.numpy() for one in poses(4, seed))
+    R_est, t_est, R_gt, t_gt = (tensor.numpy() for tensor in poses(4, seed))
     if is_near:  # true up to a symmetry and a little: many symmetries come close to the best
         some = group[np.random.default_rng(seed).integers(len(group), size=4)]
         R_est, t_est = R_gt @ some[:, :3, :3], t_gt + (R_gt @ some[:, :3, 3:])[..., 0] + 1e-4
@@ -164,8 +164,8 @@ def test_mssd_and_mspd_are_their_formulas(seed, count, turning, is_near):
     symmetric = points @ group[:, :3, :3].transpose(0, 2, 1) + group[:, None, :3, 3]
 
     def pixels(points: np.ndarray) -> np.ndarray:
-        seen = points @ K.numpy().T
-        return seen[..., :2] / seen[..., 2:]
+        projected = points @ K.numpy().T
+        return projected[..., :2] / projected[..., 2:]
 
     surface, image = [], []
     for n in range(4):
@@ -216,7 +216,7 @@ def test_mahalanobis_distance_equals_scipy():
     assert_allclose(mahalanobis(R_est, t_est, R_gt, t_gt, covariance), expected, rtol=1e-6)
 
 
-def test_mahalanobis_distance_takes_the_nearest_symmetry():
+def test_the_mahalanobis_distance_is_the_smallest_over_symmetries():
     R, t, _, _ = poses(5, 5)
     group = torch.from_numpy(np.stack([np.eye(4), HALF_TURN]))
     turned = R @ group[1, :3, :3], t + R @ group[1, :3, 3]

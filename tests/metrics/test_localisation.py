@@ -1,4 +1,4 @@
-"""BOP's scores, against plain loops over what BOP's definitions say."""
+"""BOP's scores, against plain loops over BOP's definitions."""
 
 from dataclasses import dataclass, replace
 
@@ -47,11 +47,11 @@ def matched_loop(errors, threshold):
     """bop_toolkit's greedy matching, estimate by estimate."""
     taken = []
     for row in errors:
-        best, result = threshold, None
+        best, nearest = threshold, None
         for number, error in enumerate(row):
             if number not in taken and error < best:
-                best, result = error, number
-        taken += [] if result is None else [result]
+                best, nearest = error, number
+        taken += [] if nearest is None else [nearest]
     return len(taken)
 
 
@@ -79,10 +79,12 @@ def vsd_loop(estimated, true, measured, diameter, tolerances):
         for v, u in np.ndindex(measured.shape):
             ray = np.linalg.norm(np.linalg.inv(K) @ [u, v, 1])
             e, t, m = (ray * image[v, u] for image in (estimated, true, measured))
-            seen_t = t > 0 and (m == 0 or t - m <= VSD_DELTA)
-            seen_e = e > 0 and (m == 0 or e - m <= VSD_DELTA or seen_t)
-            count += seen_t or seen_e
-            wrong += (seen_t != seen_e) or (seen_t and abs(t - e) / diameter >= tolerance)
+            visible_true = t > 0 and (m == 0 or t - m <= VSD_DELTA)
+            visible_estimated = e > 0 and (m == 0 or e - m <= VSD_DELTA or visible_true)
+            count += visible_true or visible_estimated
+            wrong += (visible_true != visible_estimated) or (
+                visible_true and abs(t - e) / diameter >= tolerance
+            )
         errors.append(wrong / count if count else 1.0)
     return errors
 
@@ -91,14 +93,14 @@ def vsd_loop(estimated, true, measured, diameter, tolerances):
 def test_vsd_is_its_definition(x, z):
     rng = np.random.default_rng(3)
     measured = np.where(rng.random(SIZE[::-1]) < 0.2, 0.0, 0.5 + 0.03 * rng.normal(size=SIZE[::-1]))
-    measured[20:24] = 0.4  # something before both
+    measured[20:24] = 0.4  # an object in front of both
     estimated, true = drawn(pose(x, z=z)), drawn(pose())
     tolerances = (0.05, 0.2, 0.5)
-    got = vsd(estimated, true, measured, K, 0.1, tolerances=tolerances)
-    np.testing.assert_allclose(got, vsd_loop(estimated, true, measured, 0.1, tolerances))
+    result = vsd(estimated, true, measured, K, 0.1, tolerances=tolerances)
+    np.testing.assert_allclose(result, vsd_loop(estimated, true, measured, 0.1, tolerances))
 
 
-def test_vsd_of_what_nobody_sees_is_one():
+def test_vsd_of_an_invisible_object_is_one():
     nothing = np.zeros(SIZE[::-1])
     np.testing.assert_array_equal(vsd(nothing, nothing, nothing, K, 0.1), np.ones(10))
 
@@ -113,27 +115,27 @@ def scores(images, of=None, depth=None, draw=None):
 def test_recalls_by_hand():
     diameter = part().diameter
     shift = 0.22 * diameter  # passes 0.25 … 0.5 of ten thresholds: six
-    got = scores(
+    result = scores(
         [
             ([Pose("box", 0.9, pose(shift))], [truth(pose())]),
             ([], [truth(pose())]),
             ([Pose("box", 0.1, pose())], [truth(pose())]),
         ]
     )
-    assert (got.num_targets, got.ar_vsd, got.ar) == (3, None, None)
-    assert got.ar_mssd == pytest.approx((0.6 + 0 + 1) / 3)
+    assert (result.num_targets, result.ar_vsd, result.ar) == (3, None, None)
+    assert result.ar_mssd == pytest.approx((0.6 + 0 + 1) / 3)
     pixels = K[0, 0] * shift / (0.5 - HALF[2]) * 640 / SIZE[0]  # of the nearest corner
     share = np.mean([pixels < limit for limit in range(5, 55, 5)])
-    assert got.ar_mspd == pytest.approx((share + 0 + 1) / 3)
-    assert got.add_or_s_01d == pytest.approx(1 / 3)
-    assert "3 targets: AR n/a (VSD n/a, MSSD 53.3%" in got.in_words()
+    assert result.ar_mspd == pytest.approx((share + 0 + 1) / 3)
+    assert result.add_or_s_01d == pytest.approx(1 / 3)
+    assert "3 targets: AR n/a (VSD n/a, MSSD 53.3%" in result.in_words()
 
 
-def test_targets_are_those_of_the_list_else_the_visible_and_as_many_estimates_count():
+def test_targets_are_listed_or_visible_and_limit_the_number_of_estimates():
     away = Pose("box", 0.9, pose(0.3))
     right = Pose("box", 0.5, pose())
     item = [truth(pose())]
-    # One target: the best scored estimate alone counts, whichever is the nearest.
+    # One target: only the estimate with the best score counts, not the nearest.
     assert scores([([right, away], item)]).add_or_s_01d == 0
     assert scores([([right, replace(away, score=0.1)], item)]).add_or_s_01d == 1
     hidden = truth(pose(0.3), visible=0.05)
@@ -156,8 +158,8 @@ def test_add_or_s_is_over_the_vertices(seed, symmetric):
     estimated, true = (vertices @ T[:3, :3].T + T[:3, 3] for T in (T_est, T_gt))
     nearest = [np.linalg.norm(estimated - item, axis=1).min() for item in true]
     error = np.mean(nearest if symmetric else np.linalg.norm(estimated - true, axis=1))
-    got = scores([([Pose("box", 1.0, T_est)], [truth(T_gt)])], given_part)
-    assert got.add_or_s_01d == (error < 0.1 * given_part.diameter)
+    result = scores([([Pose("box", 1.0, T_est)], [truth(T_gt)])], given_part)
+    assert result.add_or_s_01d == (error < 0.1 * given_part.diameter)
 
 
 def test_symmetric_parts_are_scored_with_add_s():
@@ -167,14 +169,14 @@ def test_symmetric_parts_are_scored_with_add_s():
     assert (symmetric.ar_mssd, symmetric.ar_mspd, symmetric.add_or_s_01d) == (1, 1, 1)
 
 
-def test_ar_is_the_mean_of_three_where_there_is_depth():
+def test_ar_is_the_mean_of_three_recalls_if_depth_is_available():
     mesh = Mesh(part().cuboid[:8], np.array([(0, 1, 2)], np.int32))
     images = [([Pose("box", 1.0, pose(0.01))], [truth(pose())])]
     measured = drawn(pose())
-    got = scores(images, part(mesh=mesh), measured, lambda _, T, *__: drawn(T))
+    result = scores(images, part(mesh=mesh), measured, lambda _, T, *__: drawn(T))
     errors = vsd_loop(drawn(pose(0.01)), measured, measured, part().diameter, np.arange(1, 11) / 20)
     recalls = [np.mean([error < limit / 20 for limit in range(1, 11)]) for error in errors]
-    assert got.ar_vsd == pytest.approx(np.mean(recalls))
-    assert 0 < got.ar_vsd < 1
-    assert got.ar == pytest.approx((got.ar_vsd + got.ar_mssd + got.ar_mspd) / 3)
+    assert result.ar_vsd == pytest.approx(np.mean(recalls))
+    assert 0 < result.ar_vsd < 1
+    assert result.ar == pytest.approx((result.ar_vsd + result.ar_mssd + result.ar_mspd) / 3)
     assert scores([*images, ([], [truth(pose())])], part(mesh=mesh), measured).ar is None  # no draw

@@ -1,4 +1,4 @@
-"""Two gloo processes give the numbers of one; also where a rank has seen nothing."""
+"""Two gloo processes compute the same numbers as one process, also if a rank has no images."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def metric() -> PoseMetrics:
 
 
 def feed(target: PoseMetrics, images: range) -> None:
-    """Every third image is missed, every other one has a duplicate."""
+    """Add images: every third is missed, and every second has a duplicate."""
     for i in images:
         rng = np.random.default_rng(i)
         T = np.eye(4)
@@ -73,7 +73,7 @@ def run_rank(rank: int, folder: Path) -> None:
 
 
 @pytest.mark.ddp
-def test_two_processes_give_the_numbers_of_one(tmp_path):
+def test_two_processes_compute_the_numbers_of_one_process(tmp_path):
     fork = multiprocessing.get_context("fork")
     ranks = [fork.Process(target=run_rank, args=(rank, tmp_path)) for rank in range(2)]
     for process in ranks:

@@ -1,4 +1,4 @@
-"""The accumulator: matching, counting, rates and the cases in which there is nothing to count."""
+"""The accumulator: matching, counting, rates, and cases without instances or detections."""
 
 from __future__ import annotations
 
@@ -46,21 +46,21 @@ def truth(name: str, T: Array, visible: float = 1.0) -> Instance:
 K = np.array([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]])
 
 
-def test_errors_are_compared_with_what_estimates_state_of_themselves():
+def test_errors_are_compared_with_estimated_covariances():
     rng = np.random.default_rng(1)
     deviation = np.array([0.02, 0.01, 0.01, 0.002, 0.002, 0.005])
     flip = np.diag([-1.0, -1.0, 1.0, 1.0])
     metric = PoseMetrics([replace(part("box"), symmetries_discrete=flip[None])])
     for number in range(1500):
         T = pose(0, tuple(rng.normal(size=3)))
-        result = moved(T, 3 * deviation * rng.normal(size=6))
-        result = result @ flip if number % 2 else result
-        metric.update([Detection("box", 1, result, np.diag(deviation**2))], [truth("box", T)])
+        estimate = moved(T, 3 * deviation * rng.normal(size=6))
+        estimate = estimate @ flip if number % 2 else estimate
+        metric.update([Detection("box", 1, estimate, np.diag(deviation**2))], [truth("box", T)])
     assert metric.compute()["box"].median_deviations == pytest.approx(3, rel=0.05)
     inside = chi2.cdf(chi2.ppf(0.9, 6) / 9, 6)
     assert metric.compute()["box"].coverage == pytest.approx(inside, abs=0.02)
     assert metric.compute()[MEAN].median_deviations == pytest.approx(3, rel=0.05)
-    metric.update([], [truth("box", pose())])  # a miss states nothing
+    metric.update([], [truth("box", pose())])  # a miss has no covariance
     assert metric.compute()["box"].median_deviations == pytest.approx(3, rel=0.05)
     file = PoseMetrics([part("box")])
     file.update([Detection("box", 1, pose(0.01))], [truth("box", pose())])
@@ -69,7 +69,7 @@ def test_errors_are_compared_with_what_estimates_state_of_themselves():
 
 
 def test_rows_agree_with_the_functions():
-    """Of a part with a symmetry, on images of two sizes; most poses are turned by it."""
+    """For a symmetric part on images of two sizes; most estimates are rotated by the symmetry."""
     rng = np.random.default_rng(3)
     turned = np.diag([-1.0, -1.0, 1.0, 1.0])
     turned[:3, 3] = [0.002, 0.0, 0.0]
@@ -136,10 +136,10 @@ def test_rows_agree_with_the_functions():
 
 
 @pytest.mark.parametrize(
-    ("found", "truths", "counts", "errors"),
+    ("detections", "truths", "counts", "errors"),
     [
-        # Of two the better score counts; the other is a false positive. Precision counts poses
-        # within 12 mm.
+        # The detection with the better score counts, and the other is a false positive. Precision
+        # counts poses within 12 mm.
         ([(0.2, pose(0)), (0.9, pose(0.03))], [(0, 1)], (1, 1, 0, 0), [0.03]),
         ([(0.9, pose(0)), (0.2, pose(0.03))], [(0, 1)], (1, 1, 0.5, 0), [0]),
         # Farther than half the diameter, or no pose at all: a miss and a false positive.
@@ -148,18 +148,18 @@ def test_rows_agree_with_the_functions():
             ([(0.9, np.full((4, 4), bad))], [(0, 1)], (1, 1, 0, 1), [math.inf])
             for bad in (math.nan, math.inf)
         ),
-        # An instance hardly visible neither counts nor makes a false positive …
+        # A hardly visible instance neither counts nor makes a false positive …
         ([(0.9, pose(0.3))], [(0, 0.1), (0.3, 0.0999)], (1, 0, None, 1), [math.inf]),
-        # … and a second detection there has no instance left to explain it.
+        # … but a second detection at its position is a false positive.
         ([(s, pose(0.3)) for s in (0.9, 0.8)], [(0, 0.1), (0.3, 0.0999)], (1, 1, 0, 1), [math.inf]),
-        # An instance that counts is matched before a hidden one.
+        # An evaluated instance is matched before a hidden instance.
         ([(0.9, pose(0.01))], [(0.01, 0.05), (0, 0.9)], (1, 0, 1, 0), [0.01]),
     ],
 )
-def test_what_stands_for_an_instance(found, truths, counts, errors):
+def test_detections_are_matched_with_instances(detections, truths, counts, errors):
     metric = PoseMetrics([part("box")])
     instances = [truth("box", pose(x), visible) for x, visible in truths]
-    metric.update([Detection("box", score, T) for score, T in found], instances)
+    metric.update([Detection("box", score, T) for score, T in detections], instances)
     row = metric.compute()["box"]
     assert (row.num_instances, row.false_per_frame, row.precision, row.miss_rate) == counts
     assert metric.errors("box") == pytest.approx(errors)
@@ -175,8 +175,8 @@ def test_a_detection_matches_within_half_a_diameter_and_ten_centimetres(diameter
     assert (row.matching_radius, row.miss_rate) == (radius, 0.5)
 
 
-def test_the_distance_is_taken_between_centres_not_origins():
-    # The origin lies half a metre beside the part: a small turn moves the centre out of reach.
+def test_the_distance_of_a_match_is_between_centres():
+    # The origin is half a metre from the part, so a small rotation moves the centre far away.
     points = np.random.default_rng(0).uniform([0.45, -0.05, -0.05], [0.55, 0.05, 0.05], (50, 3))
     far = Part("far", cuboid_keypoints(points.min(0), points.max(0)), 0.1, points)
     metric = PoseMetrics([far])
@@ -197,13 +197,13 @@ def test_objects_do_not_match_each_other():
 
 
 @pytest.mark.parametrize("names", [[], ["a", "a"], ["a", "mean"]])
-def test_parts_must_have_names_of_their_own(names):
+def test_names_of_parts_must_be_distinct(names):
     with pytest.raises(UserError, match="one or more parts with distinct names"):
         PoseMetrics([part(name) for name in names])
 
 
 @pytest.mark.filterwarnings("ignore:The ``compute`` method of metric PoseMetrics was called")
-def test_all_missed_gives_zero_and_nothing_at_all_is_not_available():
+def test_misses_give_zero_and_an_empty_metric_gives_none():
     metric = PoseMetrics([part("box")])
     for row in metric.compute().values():
         assert row == PoseRow(row.object, "estimate", num_instances=0, false_per_frame=0)
@@ -217,7 +217,7 @@ def test_all_missed_gives_zero_and_nothing_at_all_is_not_available():
     assert row == replace(expected, **dict.fromkeys(zeros, 0.0))
 
 
-def test_an_object_without_ground_truth_stays_out_of_the_mean():
+def test_the_mean_excludes_objects_without_ground_truth():
     metric = PoseMetrics([part("a"), part("b"), part("c")])
     metric.update(
         [Detection("a", 1, pose()), Detection("c", 1, pose())],
@@ -256,7 +256,7 @@ def test_references_use_the_instances_that_count():
         assert rows[MEAN].add_01d == rows["a"].add_01d
 
 
-def test_the_corners_of_the_mesh_count_where_there_is_one():
+def test_mssd_uses_the_vertices_of_a_mesh():
     vertices = np.array([[0.1, 0, 0], [-0.1, 0, 0], [0, 0.1, 0]])
     box = replace(part("box"), mesh=Mesh(vertices, np.array([[0, 1, 2]], np.int32)))
     metric = PoseMetrics([box])
@@ -284,18 +284,18 @@ STRAY, MISSED = "stray", "missed"
         # Half of the recall at precision 1; 51 of the 101 recalls are at most 0.5.
         ([(0.9, 0.0), (0.0, MISSED)], 51 / 101),
         ([(0.0, MISSED), (0.0, MISSED)], 0),
-        # A pose off by more than 12 mm is wrong though matched, and so is a stray one before it.
+        # A matched pose with an error above 12 mm is wrong, and so is a stray detection.
         ([(0.9, 0.013), (0.8, 0.0119)], 51 / 101 * 0.5),
         ([(0.9, STRAY), (0.8, 0.0)], 0.5),
         ([(0.8, 0.0), (0.7, STRAY)], 1),
-        # Of equal scores the wrong one comes first, whatever the order of the images.
+        # Of equal scores, the wrong detection comes first in any order of the images.
         ([(0.5, 0.0), (0.5, STRAY)], 0.5),
         ([(0.5, STRAY), (0.5, 0.0)], 0.5),
         ([(math.nan, 0.0), (0.1, STRAY)], 0.5),
     ],
 )
 def test_average_precision_by_hand(images, expected):
-    """Of a score and an error in metres for each image."""
+    """Each image has a score and an error in metres."""
     metric = PoseMetrics([part("box")])
     for score, error in images:
         shift = error if isinstance(error, float) else 0.0
@@ -305,7 +305,7 @@ def test_average_precision_by_hand(images, expected):
 
 
 def test_precision_and_false_detections_count_in_frames():
-    """Of ten images: six right, one wrong, a duplicate and two of an image without the part."""
+    """Ten images with six correct poses and one wrong pose, and two detections without the part."""
     turned = np.diag([-1.0, -1.0, 1.0, 1.0])
     box = replace(part("box"), symmetries_discrete=turned[None])
     metric = PoseMetrics([box])

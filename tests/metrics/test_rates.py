@@ -174,7 +174,7 @@ def test_calibration_error_is_its_definition(seed, count, bins):
     assert result == pytest.approx(expected, abs=1e-12)
 
 
-def test_calibration_error_at_the_ends_and_of_mistakes():
+def test_calibration_error_of_extreme_and_invalid_scores():
     none = torch.zeros(0)
     assert expected_calibration_error(none, none.bool()) == 0.0
     assert expected_calibration_error(torch.ones(3), torch.ones(3, dtype=torch.bool)) == 0.0

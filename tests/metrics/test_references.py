@@ -82,7 +82,7 @@ def test_rows_depend_on_the_seed_only():
     rows = reference_rows(plate(), T, seed=3)
     assert rows == reference_rows(plate(), T[::-1], seed=3)
     assert rows != reference_rows(plate(), T, seed=4)
-    for row in rows.values():  # what a guess without score and place does not have
+    for row in rows.values():  # a guess has no score and no position
         assert row.median_translation is None
         assert (row.miss_rate, row.precision, row.false_per_frame) == (None, None, None)
 

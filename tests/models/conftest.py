@@ -7,7 +7,7 @@ import pytest
 
 @pytest.fixture(scope="session")
 def make_spec():
-    """A spec of named parts; ``backbone_``, ``attention_`` and ``head_`` prefixes set arguments."""
+    """Return a spec; ``backbone_``, ``attention_`` and ``head_`` prefixes set arguments."""
 
     def make(
         backbone: str = "DSC",
@@ -33,13 +33,13 @@ def make_spec():
 
 @pytest.fixture
 def small_spec(make_spec):
-    """DOPE++ at an eighth of its width: a network that is built and run in milliseconds."""
+    """Spec of DOPE++ at an eighth of its width, which runs in milliseconds."""
     return make_spec(backbone_width=0.125, backbone_batch_norm=True, head_width=0.125)
 
 
 @pytest.fixture
 def small_fast_spec(make_spec):
-    """The fast DOPE++ at a sixteenth of its channels, with lists as YAML and JSON give them."""
+    """Spec of the fast DOPE++ at a sixteenth of its width, with lists as in YAML and JSON."""
     shape = {"backbone_channels": [64, 192, 256, 256], "backbone_blocks": [1, 2, 1, 2]}
     sizes = {"backbone_width": 0.0625, "attention_reduction": 2, "head_width": 0.0625}
     return make_spec("Pyramid", "SE", "SharedTrunk", **shape, **sizes)

@@ -39,8 +39,8 @@ def test_publishes_its_channels_and_stride(backbone, width, channels, batch_norm
         assert backbone(torch.zeros(1, 3, 64, 48)).shape == (1, channels, 8, 6)
 
 
-def test_a_pyramid_counts_as_its_blocks_do():
-    """Weights of convolutions by hand: of a block, of its shortcut where the shape changes."""
+def test_a_pyramid_has_the_weights_of_its_blocks():
+    """Count the weights of blocks, and of shortcuts where the shape changes."""
 
     def block(before: int, after: int) -> int:
         return 9 * before * after + 9 * after * after + (before * after if before != after else 0)
@@ -91,7 +91,7 @@ def torchvision():
             channels = wide
     reference = nn.Sequential(*layers[:23])
     weights = {f"features.{key}": value for key, value in reference.state_dict().items()}
-    # What the file holds beyond these layers is left alone.
+    # Further weights in the file are ignored.
     return reference, weights | {"classifier.6.bias": torch.zeros(1000)}
 
 

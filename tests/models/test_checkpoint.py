@@ -79,7 +79,7 @@ def test_round_trip(checkpoint, saved, part):
         assert torch.equal(value, checkpoint.state_dict[name])
 
 
-def test_a_spec_with_lists_comes_back(checkpoint, small_fast_spec, tmp_path):
+def test_a_spec_with_lists_survives_a_round_trip(checkpoint, small_fast_spec, tmp_path):
     network = build_network(small_fast_spec).eval()
     stored = replace(checkpoint, spec=small_fast_spec, state_dict=network.state_dict())
     write_atomic(stored.to_file(), tmp_path / "best.ckpt")
@@ -109,7 +109,7 @@ def test_numpy_scalars_become_plain_values(checkpoint, tmp_path):
     assert loaded.data == {"K": np.eye(3).tolist(), "sizes": [1, 2], "none": None, "flag": True}
 
 
-def test_what_is_not_plain_is_refused_before_writing(checkpoint):
+def test_values_that_are_not_plain_are_refused_before_writing(checkpoint):
     checkpoint.data = {"path": Path("here")}
     with pytest.raises(TypeError, match="holds plain values"):
         checkpoint.to_payload()
@@ -122,7 +122,7 @@ def test_pretrained_weights_path_is_neither_written_nor_read(make_spec, part, tm
     checkpoint = Checkpoint(spec, network.state_dict(), [part], (64, 64), 8, 1.0)
     content = checkpoint.to_file()
     assert "weights_path" not in content["dopepp"]["spec"]["backbone"]
-    # A file that names one all the same must not make its reader open it.
+    # A reader must not open weights that a file names nevertheless.
     content["dopepp"]["spec"]["backbone"]["weights_path"] = "/etc/passwd"
     write_atomic(content, tmp_path / "a.ckpt")
     loaded, _ = load_network(tmp_path / "a.ckpt")
@@ -253,14 +253,14 @@ def test_weights_beyond_half_precision_are_refused(checkpoint, tmp_path):
     assert not any(tmp_path.iterdir())
 
 
-def test_a_name_stands_for_a_file_of_the_package(released, tmp_path, monkeypatch):
+def test_a_name_refers_to_a_file_of_the_package(released, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "released_paths", lambda: {"bracket": released})
     assert read(Path("pretrained/bracket")).input_size == (128, 96)
     with pytest.raises(
         UserError, match="pretrained/other, no such file; allowed: an existing file, or one of"
     ):
         read(Path("pretrained/other"))
-    monkeypatch.chdir(tmp_path)  # a file of the user's own goes first
+    monkeypatch.chdir(tmp_path)  # a file of the user has priority
     (tmp_path / "pretrained").mkdir()
     (tmp_path / "pretrained" / "bracket").write_bytes(b"mine")
     with pytest.raises(UserError, match="pretrained/bracket"):
@@ -276,12 +276,12 @@ def test_a_released_file_without_a_description(text, tmp_path):
 
 
 @pytest.mark.parametrize("name", sorted(released_paths()))
-def test_what_is_released_loads_and_is_small_and_portable(name):
+def test_a_released_checkpoint_loads_and_is_small_and_portable(name):
     path = released_paths()[name]
     assert path.stat().st_size <= 8_000_000
     assert f"pretrained/{name}" in path.with_suffix(".md").read_text()
     network, checkpoint = load_network(Path("pretrained", name))
     assert all(value.isfinite().all() for value in network.state_dict().values())
-    # No text of it is a path: absolute, of a home, or of Windows.
+    # No text is a path: absolute, in a home folder, or of Windows.
     assert not re.search(r'"(/|~|\\\\|\w:\\\\)', json.dumps(checkpoint.to_payload()))
     assert any(name.startswith(part.name) for part in checkpoint.parts)

@@ -27,7 +27,7 @@ def pretrained():
 
 
 @torch.no_grad()
-def test_the_way_down_is_the_published_networks(published, pretrained):
+def test_the_encoder_is_the_published_networks(published, pretrained):
     torch.manual_seed(0)
     pixels = torch.randint(0, 256, (1, 3, 256, 320)).float()
     mean, std = (torch.tensor(item).view(1, 3, 1, 1) for item in (IMAGENET_MEAN, IMAGENET_STD))
@@ -37,7 +37,7 @@ def test_the_way_down_is_the_published_networks(published, pretrained):
         result = blocks(features)
         for block in published._blocks[first : last + 1]:
             expected = block(expected)
-        # Beyond an image's edge the first convolution sees another grey: 127, not the mean colour.
+        # The first convolution pads with another colour: grey 127, not the mean colour.
         inside = slice(14, -14) if first == 0 else slice(None)
         difference = (result - expected)[..., inside, inside].abs().max()
         assert difference < 1e-4 * expected.abs().max()
@@ -45,8 +45,8 @@ def test_the_way_down_is_the_published_networks(published, pretrained):
 
 
 @torch.no_grad()
-def test_it_tells_a_cat_from_a_cup(published, pretrained):
-    """What it learned is there: the published classifier on top of these features."""
+def test_pretrained_features_distinguish_a_cat_from_a_cup(published, pretrained):
+    """The published classifier classifies images by these features."""
     data = pytest.importorskip("skimage.data")
     mean, std = torch.tensor(IMAGENET_MEAN), torch.tensor(IMAGENET_STD)
     for image, classes in ((data.chelsea(), range(281, 286)), (data.coffee(), (504, 967, 968))):
@@ -61,7 +61,7 @@ def test_it_tells_a_cat_from_a_cup(published, pretrained):
 
 
 @pytest.mark.parametrize(("frozen", "count"), [(0, 0), (8, 1), (16, 2), (32, 3)])
-def test_frozen_layers_stay_and_the_others_learn(frozen, count):
+def test_only_layers_that_are_not_frozen_learn(frozen, count):
     torch.manual_seed(0)
     backbone = EfficientNetLite(width=0.125, frozen=frozen).train()
     before = {name: value.clone() for name, value in backbone.state_dict().items()}
@@ -98,7 +98,7 @@ def test_a_missing_extra_is_named(monkeypatch):
         EfficientNetLite(weights_path="imagenet")
 
 
-def test_what_a_checkpoint_stores_needs_no_extra(monkeypatch, make_spec):
+def test_a_checkpoint_needs_no_extra(monkeypatch, make_spec):
     spec = make_spec("EfficientNetLite", backbone_weights_path="imagenet", backbone_width=0.125)
     trained = build_network(spec)
     monkeypatch.setattr(errors, "find_spec", lambda name: None)

@@ -9,7 +9,7 @@ from dopepp.models.layers import find_activation
 from dopepp.models.losses import MapMSE, SpatialCrossEntropy
 
 SIGMA = 1.5
-# Deep under the float32 resolution of any sum, and still finite: "no belief here" as a logit.
+# Finite logit of an empty belief, far below the float32 resolution of any sum.
 NOTHING = -60.0
 
 
@@ -62,14 +62,14 @@ def test_terms_are_the_poisson_divergence(seed, x, y, level, second):
     mass = z.exp().sum() / (2 * math.pi * SIGMA**2)
     field = torch.zeros(1, 16, 16, 16)
     _, parts = SpatialCrossEntropy(SIGMA)([(logits[None, None], field)], target[None, None], field)
-    got = float(parts["where"] + parts["count"])
+    result = float(parts["where"] + parts["count"])
     if mass < math.e**2:
-        assert got == pytest.approx(float(expected), rel=1e-3, abs=1e-4)
-    else:  # the exponential goes on as its tangent
-        assert got <= float(expected) + 1e-3
+        assert result == pytest.approx(float(expected), rel=1e-3, abs=1e-4)
+    else:  # the exponential continues as its tangent
+        assert result <= float(expected) + 1e-3
 
 
-def test_an_absent_keypoint_costs_the_mass_that_is_there():
+def test_an_absent_keypoint_costs_the_predicted_mass():
     nothing, field = torch.zeros(1, 9, 16, 16), torch.zeros(1, 16, 16, 16)
     logits = torch.full((1, 9, 16, 16), math.log(0.01))
     loss = SpatialCrossEntropy(SIGMA, count_weight=2.0)
@@ -119,7 +119,7 @@ def test_field_error_counts_only_inside_the_discs():
     _, parts = SpatialCrossEntropy(SIGMA)([(logits, target + 10 * (1 - inside))], belief, target)
     assert float(parts["field"]) == 0
     _, parts = SpatialCrossEntropy(SIGMA)([(belief, target)], belief, torch.zeros_like(target))
-    assert float(parts["field"]) == 0  # where no disc is
+    assert float(parts["field"]) == 0  # without discs
 
 
 @pytest.mark.parametrize("loss", [MapMSE(), SpatialCrossEntropy(SIGMA)])
@@ -148,7 +148,7 @@ def test_losses_of_the_images_have_the_loss_as_their_mean(loss):
     assert images.mean().item() == pytest.approx(loss(stages, belief, field)[0].item(), rel=1e-5)
 
 
-def test_an_image_is_charged_for_itself_alone():
+def test_the_loss_of_an_image_depends_on_this_image_only():
     belief, field = torch.rand(3, 9, 8, 8), torch.ones(3, 16, 8, 8)
     wrong = belief.clone()
     wrong[1] += 0.5

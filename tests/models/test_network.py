@@ -48,7 +48,7 @@ def test_every_combination_gives_stages_of_the_right_shape(
         ("VGG19", "Cascade"),
     ],
 )
-def test_the_copy_for_inference_answers_the_same_without_batch_norm(make_spec, backbone, head):
+def test_the_copy_for_inference_gives_the_same_maps_without_batch_norm(make_spec, backbone, head):
     options = {"backbone_width": 0.125, "head_width": 0.125}
     options |= {} if head == "SharedTrunk" else {"head_batch_norm": True}
     network = build_network(make_spec(backbone, "CBAM", head, **options)).double()
@@ -61,22 +61,22 @@ def test_the_copy_for_inference_answers_the_same_without_batch_norm(make_spec, b
     folded = network.for_inference()
     assert network.training
     assert all(torch.equal(before[name], value) for name, value in network.state_dict().items())
-    assert not any(isinstance(one, nn.BatchNorm2d) for one in folded.modules())
+    assert not any(isinstance(layer, nn.BatchNorm2d) for layer in folded.modules())
     with torch.inference_mode():
         for same, expected in zip(folded(images)[-1], network.eval()(images)[-1], strict=True):
             torch.testing.assert_close(same, expected)
 
 
 @pytest.mark.parametrize("stages", [1, 2])
-def test_every_scale_of_a_multi_scale_stage_answers_maps_of_its_own(make_spec, stages):
+def test_every_scale_of_a_multi_scale_stage_has_its_own_maps(make_spec, stages):
     head = {"head_width": 0.125, "head_stages": stages, "head_batch_norm": True}
     network = build_network(make_spec(backbone_width=0.125, **head, head_maps="learned"))
-    answers = network(torch.randint(0, 256, (2, 3, 64, 96), dtype=torch.uint8))
-    assert len(answers) == 4 * stages  # a quarter, a half, full scale, fused
-    for number, (belief, field) in enumerate(answers):
+    outputs = network(torch.randint(0, 256, (2, 3, 64, 96), dtype=torch.uint8))
+    assert len(outputs) == 4 * stages  # a quarter, a half, full scale, fused
+    for number, (belief, field) in enumerate(outputs):
         assert belief.shape == (2, 9, 8, 12)
         assert field.shape == (2, 16, 8, 12)
-        # Untrained, each answers the bias, give or take little: an empty map.
+        # An untrained output is nearly the bias: an empty map.
         assert (network.activate(belief) - network.activate(belief.new_tensor(
             network.activate.initial_logit))).abs().max() < 0.1  # fmt: skip
         factor = (4, 2, 1, 1)[number % 4]
@@ -84,11 +84,11 @@ def test_every_scale_of_a_multi_scale_stage_answers_maps_of_its_own(make_spec, s
         repeated = coarse.repeat_interleave(factor, 2).repeat_interleave(factor, 3)
         torch.testing.assert_close(belief, repeated)
     # The loss of the coarsest maps alone reaches no convolution of the fusion.
-    answers[0][0].sum().backward()
+    outputs[0][0].sum().backward()
     branch = network.head.belief_branches[0]
     assert all(parameter.grad is None for parameter in network.head.field_branches.parameters())
     assert branch.down_quarter[-1].weight.grad is not None
-    assert all(one.grad is None for one in branch.up_quarter.parameters())
+    assert all(parameter.grad is None for parameter in branch.up_quarter.parameters())
 
 
 def test_maps_of_nine_channels_cost_less_than_features(make_spec):
@@ -102,13 +102,13 @@ def test_maps_of_nine_channels_cost_less_than_features(make_spec):
 
 def test_normalisation_is_imagenets_and_not_in_the_checkpoint(small_spec):
     network = build_network(small_spec)
-    seen = []
-    network.backbone.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    inputs_of_layer = []
+    network.backbone.register_forward_pre_hook(lambda _, inputs: inputs_of_layer.append(inputs[0]))
     images = torch.randint(0, 256, (1, 3, 32, 32), dtype=torch.uint8)
     network.eval()(images)
     mean = torch.tensor([0.485, 0.456, 0.406])[:, None, None]
     std = torch.tensor([0.229, 0.224, 0.225])[:, None, None]
-    torch.testing.assert_close(seen[0], (images / 255 - mean) / std)
+    torch.testing.assert_close(inputs_of_layer[0], (images / 255 - mean) / std)
     assert not {"mean", "std"} & network.state_dict().keys()
 
 
@@ -137,7 +137,7 @@ def test_images_of_another_shape_are_refused(small_spec, shape):
 
 
 @pytest.mark.parametrize("head", ["Cascade", "SharedTrunk"])
-def test_sizes_are_multiples_of_what_backbone_and_head_ask_for(make_spec, head):
+def test_sizes_are_multiples_of_the_backbones_and_the_heads(make_spec, head):
     widths = {"backbone_width": 0.125, "head_width": 0.125}
     network = build_network(make_spec(head=head, **widths)).eval()
     assert network.size_multiple == 8
@@ -160,7 +160,7 @@ def test_activations():
 @pytest.mark.parametrize(
     "head", [partial(Cascade, stages=2), partial(MultiScale, stages=2), SharedTrunk]
 )
-def test_an_untrained_head_answers_nearly_nothing(head, activation, expected):
+def test_an_untrained_head_gives_nearly_empty_maps(head, activation, expected):
     torch.manual_seed(0)
     head = head(128, 1, activation)
     with torch.no_grad():
@@ -174,12 +174,14 @@ def test_an_untrained_head_answers_nearly_nothing(head, activation, expected):
 
 def test_later_stages_read_activated_beliefs_and_the_field():
     head = Cascade(8, 1, "exp", stages=2, width=0.0625)
-    seen = []
-    head.belief_branches[1].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    inputs_of_layer = []
+    head.belief_branches[1].register_forward_pre_hook(
+        lambda _, inputs: inputs_of_layer.append(inputs[0])
+    )
     features = torch.randn(1, 8, 4, 4)
     belief, field = head(features)[0]
     expected = torch.cat([features, belief.clamp(max=0).exp(), field], dim=1)
-    torch.testing.assert_close(seen[0], expected)
+    torch.testing.assert_close(inputs_of_layer[0], expected)
 
 
 def test_multiscale_has_the_paper_convolutions():
@@ -193,7 +195,7 @@ def test_multiscale_has_the_paper_convolutions():
     assert num_parameters(MultiScale(128, 1)) == expected
 
 
-def test_belief_and_field_share_the_trunk_alone():
+def test_belief_and_field_share_only_the_trunk():
     head = SharedTrunk(8, 2, channels=24, blocks=2)
     belief, field = head(torch.randn(1, 8, 8, 8))[0]
     assert (belief.shape, field.shape) == ((1, 18, 8, 8), (1, 32, 8, 8))
@@ -248,7 +250,7 @@ def test_he_initialisation_keeps_the_scale_without_batch_norm(make_spec):
 
 
 def macs_by_hooks(network: nn.Module, images: torch.Tensor) -> int:
-    """Count by running: every output value of a layer takes one filter's worth of products."""
+    """Count while running: an output value takes one product per weight of its filter."""
     total = 0
 
     def count(layer: nn.Module, _: object, output: torch.Tensor) -> None:
@@ -267,7 +269,7 @@ def macs_by_hooks(network: nn.Module, images: torch.Tensor) -> int:
 @pytest.mark.parametrize(
     ("backbone", "head"), [("DSC", "Cascade"), ("DSC", "MultiScale"), ("Pyramid", "SharedTrunk")]
 )
-def test_agrees_with_counting_by_hooks(make_spec, backbone, attention, head):
+def test_the_cost_equals_a_count_by_hooks(make_spec, backbone, attention, head):
     spec = make_spec(backbone, attention, head, backbone_width=0.125, head_width=0.125)
     network = build_network(spec).eval()
     _, gmacs = network_cost(network, (96, 64))
@@ -286,7 +288,7 @@ def test_most_of_dopes_compute_is_in_its_stages(make_spec):
     assert backbone_swapped < gmacs
 
 
-def test_leaves_the_network_as_it_was(small_spec):
+def test_measuring_the_cost_does_not_change_the_network(small_spec):
     network = build_network(small_spec).train()
     network.attention.eval()
     before = {name: value.clone() for name, value in network.state_dict().items()}

@@ -34,7 +34,7 @@ HOSTILE = [
     *(f"dopepp.models.backbones.{name}" for name in OTHERS),
     *(None, 7, nn.Identity, b"os.system"),
 ]
-"""More of them, in checkpoints: ``tests/security/test_hostile_checkpoints.py``."""
+"""Hostile checkpoints have further targets: ``tests/security/test_hostile_checkpoints.py``."""
 
 
 @pytest.mark.parametrize(
@@ -57,7 +57,7 @@ def test_a_refused_target_is_not_even_imported(tmp_path, monkeypatch):
 
 
 def test_a_rebound_name_is_refused(monkeypatch):
-    """The allow-list names a class, not whatever somebody put in its place."""
+    """The allow-list names a class, not an object that replaced the class."""
     monkeypatch.setattr(backbones, "DSC", nn.Identity)
     with pytest.raises(UserError, match=r"which is <class .*Identity.*defined in"):
         BACKBONES.build({"_target_": DSC})
@@ -126,7 +126,7 @@ def test_arguments_are_named_and_plain(arguments, message):
         BACKBONES.build({"_target_": DSC, **arguments})
 
 
-def test_what_the_composer_provides_cannot_be_set(make_spec):
+def test_arguments_provided_by_the_program_cannot_be_set(make_spec):
     spec = make_spec()
     spec["attention"]["channels"] = 7
     with pytest.raises(
@@ -183,7 +183,7 @@ def test_a_registry_takes_classes_that_a_package_re_exports():
         OPTIMIZERS.build({"_target_": "torch.optim.Adam"}, params=parameters)
 
 
-def test_what_a_class_refuses_or_misses_is_a_user_error():
+def test_invalid_and_missing_arguments_are_user_errors():
     parameters = [nn.Parameter(torch.zeros(1))]
     with pytest.raises(UserError, match=r"which failed: Invalid learning rate: -1"):
         OPTIMIZERS.build({"_target_": "torch.optim.SGD", "lr": -1}, params=parameters)
@@ -192,13 +192,13 @@ def test_what_a_class_refuses_or_misses_is_a_user_error():
 
 
 class Logger:
-    """Takes more than it lists, as Lightning's loggers do."""
+    """Accepts unlisted keywords, like Lightning's loggers."""
 
     def __init__(self, path: str, **more: object) -> None:
         self.path, self.more = path, more
 
 
-def test_keywords_that_a_class_hands_on(monkeypatch, tiny_module):
+def test_a_class_may_accept_any_keywords(monkeypatch, tiny_module):
     monkeypatch.setattr(Logger, "__module__", tiny_module)
     sys.modules[tiny_module].Logger = Logger
     registry = Registry("logger", Logger, [f"{tiny_module}.Logger"])

@@ -33,7 +33,7 @@ NOISE_SIZE = 32
 
 
 class OneLayer(Backbone):
-    """One convolution: these tests are about steps and files, not about layers."""
+    """One convolution, because these tests do not depend on the network."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -62,7 +62,7 @@ def part():
 
 @pytest.fixture(scope="session")
 def make_system(part):
-    """A system of a network of three convolutions for one part, or two of the same shape."""
+    """Return a system with a network of three convolutions, for one part or two equal parts."""
     backbone, head = (f"{__name__}.{layers.__name__}" for layers in (OneLayer, Pointwise))
     BACKBONES.register(backbone)
     HEADS.register(head)
@@ -112,13 +112,13 @@ def make_datamodule(part):
 
 @pytest.fixture(scope="session")
 def batch(make_datamodule):
-    """Two rendered images; not to be changed."""
+    """Two rendered images, which tests must not change."""
     first: Batch = next(iter(make_datamodule().val_dataloader()))
     return first
 
 
 class Noise:
-    """A source of images that are others in every epoch and cost nothing."""
+    """A cheap source of images that differ in every epoch."""
 
     name = "noise"
 
@@ -154,16 +154,16 @@ def make_noise(part):
 
 @pytest.fixture(scope="session")
 def make_trainer():
-    """A trainer of one epoch that logs every step into its folder's table and prints nothing."""
+    """Return a trainer of one epoch that logs every step to its folder's table."""
 
     def make(folder: Path, callbacks: Sequence[Callback], **options: Any) -> Trainer:
         table = MetricsTable(folder / "metrics.csv")
-        usual = {
+        defaults = {
             "accelerator": "cpu", "max_epochs": 1, "num_sanity_val_steps": 0, "logger": table,
             "log_every_n_steps": 1, "use_distributed_sampler": False,
             "plugins": [AtomicCheckpointIO(prepare=table.write)],
             "enable_progress_bar": False, "enable_model_summary": False,
         }  # fmt: skip
-        return Trainer(default_root_dir=folder, callbacks=[*callbacks], **usual | options)
+        return Trainer(default_root_dir=folder, callbacks=[*callbacks], **defaults | options)
 
     return make

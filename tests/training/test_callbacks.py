@@ -1,5 +1,4 @@
-"""The callbacks on one fit whose validation maps are the true ones, most of them displaced; then
-what they draw and what they say of time."""
+"""Validation callbacks on true maps, some of them displaced; throughput, progress and profiles."""
 
 import logging
 from dataclasses import replace
@@ -31,7 +30,7 @@ from dopepp.training.throughput import Operators, Throughput, make_profiler, pro
 
 
 class Displaced(PoseSystem):
-    """Its maps are the targets; the first of every batch is two cells to the side."""
+    """Returns the target maps; the first image's maps of every batch are shifted by two cells."""
 
     def validation_step(self, batch: Batch, batch_idx: int) -> ValidationOutput:
         belief, field = self.targets(batch)
@@ -55,7 +54,7 @@ class Recorder(Callback):
 
 @pytest.fixture
 def validate(make_trainer, tmp_path):
-    """Train one epoch and return what was recovered and logged in its validation."""
+    """Train one epoch; return the detections and logged values of its validation."""
 
     def fit(system: PoseSystem, data: PoseDataModule) -> Recorder:
         recorder = Recorder()
@@ -67,7 +66,7 @@ def validate(make_trainer, tmp_path):
     return fit
 
 
-def test_figures_pictures_and_throughput(validate, make_system, make_datamodule, tmp_path, caplog):
+def test_metrics_images_and_throughput(validate, make_system, make_datamodule, tmp_path, caplog):
     caplog.set_level(logging.INFO)
     system, data = make_system(system_class=Displaced), make_datamodule()
     recorder = validate(system, data)
@@ -81,15 +80,15 @@ def test_figures_pictures_and_throughput(validate, make_system, make_datamodule,
     assert mean.num_instances == 3
     for name in LOGGED:
         assert recorder.logged[f"val/{name}"] == pytest.approx(getattr(mean, name), rel=1e-4)
-    # Neither all nor nothing, or the comparison would say little.
+    # An intermediate value makes the comparison meaningful.
     assert 0 < recorder.logged["val/auc_10cm"] < 1
 
-    # Curves and sheet are whole images, the curve's table agrees with the figures.
+    # The curves and their table agree with the metrics.
     assert read_rgb(tmp_path / "val_auc.png").std() > 0
     curve = read_csv(tmp_path / "val_auc.csv")
     assert curve[0]["threshold_m"] == "0"
     assert float(curve[-1]["pivconnector"]) == pytest.approx(mean.pass_10cm)
-    # Green for the truth and yellow for the prediction are on the sheet.
+    # The sheet has green true and yellow predicted wireframes.
     sheet = read_rgb(tmp_path / "val_overlay.png").astype(int)
     red, green, blue = np.moveaxis(sheet, -1, 0)
     assert ((green > 150) & (red < 100) & (blue < 100)).any()
@@ -103,13 +102,13 @@ def test_figures_pictures_and_throughput(validate, make_system, make_datamodule,
     assert float(last["val/selection"]) == pytest.approx(mean.auc_10cm, rel=1e-4)
     assert 0 < float(last["val/ar_mspd"]) < 1
 
-    # … and said in a line per epoch.
-    said = [r.getMessage() for r in caplog.records if "images/s" in r.getMessage()]
-    assert len(said) == len({line.partition(":")[0] for line in said}) > 0
-    assert "% of the time waiting for the loader" in said[0]
+    # … and logged once per epoch.
+    lines = [r.getMessage() for r in caplog.records if "images/s" in r.getMessage()]
+    assert len(lines) == len({line.partition(":")[0] for line in lines}) > 0
+    assert "% of the time waiting for the loader" in lines[0]
 
 
-def test_batches_give_back_the_samples_instances(part, batch, make_datamodule):
+def test_a_batch_contains_the_instances_of_its_samples(part, batch, make_datamodule):
     batch = replace(batch, object_index=torch.tensor([[0], [-1]]))
     first, second = batch_instances(batch, (part,))
     assert second == []
@@ -120,7 +119,7 @@ def test_batches_give_back_the_samples_instances(part, batch, make_datamodule):
     assert first[0].visible_fraction == pytest.approx(truth.visible_fraction)
 
 
-def test_no_counted_instance_still_gives_a_number(validate, make_system, make_noise):
+def test_a_validation_without_instances_logs_nan(validate, make_system, make_noise):
     class Blind(Displaced):
         def validation_step(self, batch: Batch, batch_idx: int) -> ValidationOutput:
             batch.object_index[:] = -1
@@ -132,7 +131,7 @@ def test_no_counted_instance_still_gives_a_number(validate, make_system, make_no
     assert "val/median_rotation_deg" not in recorder.logged
 
 
-def test_time_is_left_for_the_whole_run(monkeypatch):
+def test_the_remaining_time_is_of_the_whole_run(monkeypatch):
     monkeypatch.setattr(TQDMProgressBar, "on_train_start", lambda *_: None)
     monkeypatch.setattr(TQDMProgressBar, "get_metrics", lambda *_: {"train/loss": 1.0})
     now = [100.0]
@@ -141,14 +140,14 @@ def test_time_is_left_for_the_whole_run(monkeypatch):
     bar: Any = throughput.RunProgress()
     bar.on_train_start(trainer, None)
     assert "left" not in bar.get_metrics(trainer, None)
-    # Twenty steps in a minute, of a run resumed at the 50th: 180 are left.
+    # A run resumed at step 50 took a minute for 20 steps, so 180 steps take 9 minutes.
     trainer.global_step, now[0] = 70, 160.0
     assert bar.get_metrics(trainer, None) == {"left": "0:09:00", "train/loss": 1.0}
-    trainer.global_step = 251  # resumed for less
+    trainer.global_step = 251  # resumed with fewer steps
     assert bar.get_metrics(trainer, None)["left"] == "0:00:00"
 
 
-def test_the_simple_profiler_lists_what_took_longest(tmp_path):
+def test_the_simple_profiler_lists_the_slowest_hooks(tmp_path):
     profiler: Any = make_profiler("simple", tmp_path)
     profiler.recorded_durations = {"step": [0.25, 0.75], "save": [0.125], "rest": [0.0]}
     assert profile_rows(profiler, limit=2) == [

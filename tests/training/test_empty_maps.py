@@ -1,4 +1,4 @@
-"""The diagnosis, on validations whose maps, labels and losses are made up."""
+"""The diagnosis of empty maps, on synthetic validations."""
 
 import logging
 from dataclasses import replace
@@ -17,7 +17,7 @@ CAUSES = ("too few training steps", "a learning rate", "labels or units")
 
 
 class Validations:
-    """Feeds a callback with validations of one batch."""
+    """Calls a callback with validations of one batch."""
 
     def __init__(self, system: PoseSystem, batch: Batch, patience: int = 2) -> None:
         self.system, self.batch, self.callback = system, batch, EmptyMaps(patience)
@@ -72,14 +72,14 @@ def test_a_falling_loss_needs_more_steps(validations, caplog):
     assert "step 20 of 1,000" in cause
     validations(0.001, 0.9)
     validations.callback.on_train_end(validations.trainer, validations.system)
-    assert not caplog.messages  # once is enough
+    assert not caplog.messages  # it warns once
 
 
 LABELS = "labels or units"
 
 
 @pytest.mark.parametrize(
-    ("scale", "shift", "index", "loss", "cause", "said"),
+    ("scale", "shift", "index", "loss", "cause", "text"),
     [
         (1.0, 0.0, 0, 2.0, "a learning rate", "from 2 to 2, the rate is 0.5"),
         (1.0, 1e4, 0, 1.0, LABELS, "0 % of the keypoints are inside"),
@@ -89,7 +89,7 @@ LABELS = "labels or units"
     ],
 )
 def test_a_flat_loss_or_labels_off_the_image_are_the_cause(
-    scale, shift, index, loss, cause, said, validations, caplog
+    scale, shift, index, loss, cause, text, validations, caplog
 ):
     validations.batch = replace(
         validations.batch,
@@ -100,10 +100,12 @@ def test_a_flat_loss_or_labels_off_the_image_are_the_cause(
     validations(0.001, loss)
     first = first_cause(caplog)
     assert cause in first
-    assert said in first
+    assert text in first
 
 
-def test_a_short_training_says_it_at_its_end_and_a_resumed_one_counts_on(validations, caplog):
+def test_a_short_training_warns_at_its_end_and_a_resumed_training_continues_the_count(
+    validations, caplog
+):
     validations(0.001, 2.0)
     state = validations.callback.state_dict()
     validations.callback.on_train_end(validations.trainer, validations.system)
@@ -114,7 +116,7 @@ def test_a_short_training_says_it_at_its_end_and_a_resumed_one_counts_on(validat
     assert "from 2 to 1" in caplog.messages[0]
 
 
-def test_corners_or_centroids_alone_give_no_pose_both_do(validations, caplog):
+def test_a_pose_needs_both_corners_and_centroids(validations, caplog):
     for channel in (0, 8):
         validations.callback = EmptyMaps(patience=1)
         validations(0.9, 2.0, channel)

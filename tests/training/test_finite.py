@@ -1,4 +1,4 @@
-"""Steps that are not finite: what they leave as it was, how they count, how they end a run."""
+"""Skipped steps: unchanged states, counts, and the end of a run."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -28,7 +28,7 @@ NUM_BATCHES = 4
 
 
 class Faulty(PoseSystem):
-    """Has one pass after the other; those listed are bad in the way that is named."""
+    """Makes listed passes non-finite in the named way."""
 
     faults: Mapping[int, str] = {}
     passes = 0
@@ -47,12 +47,12 @@ class Faulty(PoseSystem):
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
         super().optimizer_step(*args, **kwargs)
-        if self.faults.get(self.passes - 1) == "weights":  # as too high a rate makes them
+        if self.faults.get(self.passes - 1) == "weights":  # as after a too high learning rate
             next(self.parameters()).data[0] = torch.nan
 
 
 class States(Callback):
-    """Keeps what there is to change, before the first and after every batch."""
+    """Keeps weights, buffers and optimiser states before the first and after every batch."""
 
     def __init__(self) -> None:
         self.states: list[list[Tensor]] = []
@@ -121,7 +121,7 @@ def one_cycle(optimizer: torch.optim.Optimizer, num_steps: int) -> OneCycleLR:
 
 
 @pytest.mark.parametrize("fault", ["loss", "gradient", "statistics"])
-def test_a_bad_step_changes_nothing_and_the_schedule_goes_on(fault, run, tmp_path, caplog):
+def test_a_bad_step_changes_nothing_but_the_schedule(fault, run, tmp_path, caplog):
     done = run({1: fault}, {"make_scheduler": one_cycle})
     assert done.states.changed() == [True, False, True, True]
     counts = [row["train/skipped_steps"] for row in read_csv(tmp_path / "metrics.csv")]
@@ -129,10 +129,10 @@ def test_a_bad_step_changes_nothing_and_the_schedule_goes_on(fault, run, tmp_pat
     assert (done.guard.skipped, done.guard.in_a_row) == (1, 0)
     assert done.trainer.global_step == NUM_BATCHES
     assert done.trainer.lr_scheduler_configs[0].scheduler.last_epoch == NUM_BATCHES
-    said = [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING]
-    assert [fault in line and "not finite in step 1:" in line for line in said] == [True]
+    lines = [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING]
+    assert [fault in line and "not finite in step 1:" in line for line in lines] == [True]
     assert not (tmp_path / FOLDER).exists()
-    # The count goes on in a resumed run.
+    # A resumed run continues the count.
     stored = torch.load(tmp_path / "last.ckpt", weights_only=True)["callbacks"]
     assert stored["FiniteSteps"] == {"skipped": 1}
 
@@ -146,15 +146,15 @@ def test_a_bad_step_changes_nothing_and_the_schedule_goes_on(fault, run, tmp_pat
     ],
 )
 def test_no_optimizer_moves_by_its_momentum_or_decay(make_optimizer, run):
-    faults = {0: "gradient", 2: "loss"}  # of which no two are in a row
+    faults = {0: "gradient", 2: "loss"}  # never two in a row
     done = run(faults, {"make_optimizer": make_optimizer}, max_in_a_row=2, gradient_clip_val=None)
     assert (done.states.changed(), done.guard.skipped) == ([False, True, False, True], 2)
 
 
-def test_with_accumulation_the_whole_step_is_left_out(run):
+def test_with_accumulation_the_whole_step_is_skipped(run):
     done = run({0: "loss"}, accumulate_grad_batches=2)
     first, *_, last = done.states.states
-    untouched = done.states.states[2]  # after the second pass the step would have been taken
+    untouched = done.states.states[2]  # after the second pass, which completes the step
     assert all(torch.equal(a, b) for a, b in zip(first, untouched, strict=True))
     assert not all(torch.equal(a, b) for a, b in zip(first, last[: len(first)], strict=True))
     assert (done.guard.skipped, done.trainer.global_step) == (1, 2)
@@ -169,7 +169,7 @@ def test_a_scalers_own_overflow_is_not_counted(fault, scale, counted, run):
     precision = MixedPrecision("16-mixed", "cpu", scaler)
     done = run({1: fault}, max_in_a_row=2, plugins=[precision])
     assert done.guard.skipped == counted
-    assert scaler.get_scale() == scale / 2  # its own answer, once
+    assert scaler.get_scale() == scale / 2  # halved once, by the scaler
     weights = [
         [state[i] for i, name in enumerate(done.system.state_dict()) if "running" not in name]
         for state in done.states.states
@@ -196,13 +196,13 @@ def test_after_n_in_a_row_the_run_ends_with_the_batch_on_disk(run, batches, tmp_
     sheet = read_rgb(folder / "step_2_rank_0.png").astype(int)
     red, green, blue = np.moveaxis(sheet, -1, 0)
     assert ((green > 150) & (red < 100) & (blue < 100)).any()  # the true wireframe
-    # What was saved after the good step is what there is.
+    # The checkpoint is from the good step.
     saved = torch.load(tmp_path / "last.ckpt", weights_only=True)
     assert all(value.isfinite().all() for value in saved["state_dict"].values())
 
 
 def test_weights_that_are_not_finite_are_never_saved(run, tmp_path):
-    """They break in the second step; at once that ends the run, or a checkpoint that is due."""
+    """Weights that break in the second step end the run, at once or at the next checkpoint."""
     with pytest.raises(RunError, match=r"not finite in step 2 \(the weights are not finite\)"):
         run({1: "weights"}, save_every=100)
     with pytest.raises(
@@ -216,10 +216,10 @@ def test_weights_that_are_not_finite_are_never_saved(run, tmp_path):
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
-def test_what_may_be_saved(value):
+def test_only_finite_weights_and_optimiser_states_are_saved(value):
     good = {"w": torch.ones(3), "n": torch.tensor(4)}
     bad = {**good, "w": torch.tensor([1.0, value])}
-    # A checkpoint's other entries may hold what they like: a best score of −∞, for one.
+    # Other entries may be infinite, e.g. a best score of −∞.
     check_state({"state_dict": good, "callbacks": {"best": torch.tensor(value)}})
     check_state({"state_dict": {}})
     with pytest.raises(RunError, match="the weights"):
@@ -230,7 +230,7 @@ def test_what_may_be_saved(value):
 
 
 @pytest.mark.parametrize("count", [0, -1, 1.5, True, "ten"])
-def test_a_count_that_means_nothing_is_refused(count):
+def test_an_invalid_count_is_refused(count):
     with pytest.raises(UserError, match="max_in_a_row"):
         FiniteSteps(count)
     with pytest.raises(UserError, match="patience"):
@@ -252,14 +252,14 @@ class Line(LightningModule):
         self.layer = torch.nn.Linear(1, 1)
     def training_step(self, batch, batch_idx):
         loss = (self.layer(batch[0]) ** 2).mean()
-        # Only the second process, and a gradient that is finite: the others learn it from the flag.
+        # Only the second process has the loss, and its gradient is finite.
         if batch_idx == 1 and self.trainer.global_rank == 1:
             loss = loss.detach() * torch.inf + sum(p.sum() * 0 for p in self.parameters())
         return loss
     def configure_optimizers(self):
         return torch.optim.SGD(self.parameters(), lr=0.1)
     def on_train_batch_end(self, outputs, batch, batch_idx):
-        self.seen = getattr(self, "seen", []) + [float(self.layer.weight)]
+        self.weights = getattr(self, "weights", []) + [float(self.layer.weight)]
 
 torch.manual_seed(0)
 torch.set_num_threads(1)
@@ -269,13 +269,13 @@ trainer = Trainer(accelerator="cpu", devices=2, strategy=WatchedDDP(60), max_epo
     enable_model_summary=False, default_root_dir=sys.argv[1])
 line = Line()
 trainer.fit(line, DataLoader(TensorDataset(torch.ones(6, 1)), batch_size=1))
-torch.save([guard.skipped, line.seen], Path(sys.argv[1]) / f"{trainer.global_rank}.pt")
+torch.save([guard.skipped, line.weights], Path(sys.argv[1]) / f"{trainer.global_rank}.pt")
 """
 
 
 @pytest.mark.slow
 @pytest.mark.ddp
-def test_all_processes_leave_a_step_out_together(command, tmp_path):
+def test_all_processes_skip_a_step_together(command, tmp_path):
     (tmp_path / "line.py").write_text(SCRIPT)
     command(tmp_path / "line.py", str(tmp_path), timeout=120, code=0)
     ranks = [torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in (0, 1)]

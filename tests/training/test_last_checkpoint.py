@@ -1,4 +1,4 @@
-"""A run cut at any hook and resumed ends as if it had not been; "cut" is here an exception."""
+"""A run that is interrupted in any hook and resumed ends like an uninterrupted run."""
 
 import random
 import shutil
@@ -27,13 +27,13 @@ TIMES = ("throughput/images_per_s", "throughput/loader_wait")
 
 
 class CutError(Exception):
-    """The run ends here, as after kill -9."""
+    """An interruption of the run, like kill -9."""
 
 
 class Noisy(PoseSystem):
-    """Draws from every global generator in each step, so that one in another state shows.
+    """Draws from every global generator in each step, so that a wrong state changes the weights.
 
-    Of two normal numbers that Python and NumPy make at a time they keep one for the next call.
+    Python and NumPy draw two normal numbers at a time and keep the second for the next call.
     """
 
     def training_step(self, batch: Batch, batch_idx: int) -> torch.Tensor:
@@ -43,7 +43,7 @@ class Noisy(PoseSystem):
 
 
 class Cut(Callback):
-    """Raises at the n-th call of any of the hooks, whichever it is."""
+    """Raises :class:`CutError` at the n-th call of all hooks together."""
 
     def __init__(self, at: int | None) -> None:
         self.at, self.calls = at, 0
@@ -62,7 +62,7 @@ class Cut(Callback):
 
 @pytest.fixture(scope="module")
 def runs(make_system, make_noise, make_trainer):
-    """Train in a folder, from its newest checkpoint if there is one."""
+    """Train in a folder, starting from its newest checkpoint if it exists."""
 
     def train(
         folder: Path, cut: Cut, last: LastCheckpoint | None = None,
@@ -93,9 +93,9 @@ def best(folder: Path) -> tuple[int, dict[str, torch.Tensor]]:
     return content["global_step"], content["state_dict"]
 
 
-def assert_same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> None:
-    assert one.keys() == other.keys()
-    assert [name for name in one if not torch.equal(one[name], other[name])] == []
+def assert_same(state: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> None:
+    assert state.keys() == other.keys()
+    assert [name for name in state if not torch.equal(state[name], other[name])] == []
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +113,7 @@ def assert_ends_as(folder: Path, system: PoseSystem, cut: Path, again: PoseSyste
 
 
 @pytest.mark.parametrize("every", [17, pytest.param(1, marks=pytest.mark.slow)])
-def test_a_run_cut_at_any_hook_ends_as_if_it_had_not_been(every, runs, whole, tmp_path):
+def test_a_run_cut_at_any_hook_ends_like_an_uncut_run(every, runs, whole, tmp_path):
     folder, system, num_calls = whole
     for at in range(1, num_calls + 1, every):
         cut = tmp_path / str(at)
@@ -122,17 +122,17 @@ def test_a_run_cut_at_any_hook_ends_as_if_it_had_not_been(every, runs, whole, tm
         assert_ends_as(folder, system, cut, runs(cut, Cut(None)))
 
 
-def test_the_clock_and_the_share_of_time_decide(runs, tmp_path):
+def test_the_interval_and_the_share_of_time_limit_saving(runs, tmp_path):
     patient, thrifty = LastCheckpoint(every_s=3600), LastCheckpoint(every_s=0, max_share=1e-6)
     for name, last in (("patient", patient), ("thrifty", thrifty)):
         with pytest.raises(CutError):
             runs(tmp_path / name, Cut(12), last)
     assert not (tmp_path / "patient" / "checkpoints" / "last.ckpt").exists()
     saved = torch.load(tmp_path / "thrifty" / "checkpoints" / "last.ckpt", weights_only=True)
-    assert saved["global_step"] == 1  # its duration is known from then on
+    assert saved["global_step"] == 1  # the duration of saving is known from now on
 
 
-def test_accumulated_gradients_are_not_cut_in_two(runs, tmp_path):
+def test_accumulated_gradients_are_never_split(runs, tmp_path):
     whole = runs(tmp_path / "whole", Cut(None), accumulate_grad_batches=2)
     for at in (6, 9):
         with pytest.raises(CutError):
@@ -145,7 +145,7 @@ def validations(folder: Path) -> list[str]:
     return [row["epoch"] for row in rows(folder) if row["val/loss"]]
 
 
-def test_patience_outlives_a_cut(runs, tmp_path):
+def test_patience_survives_a_cut(runs, tmp_path):
     def run(name: str, cut: int | None, patience: int = 1) -> PoseSystem:
         # Nothing counts as an improvement: with a patience of 1 the second validation is the last.
         stop = EarlyStop("val/loss", min_delta=1e9, patience=patience)
@@ -155,10 +155,10 @@ def test_patience_outlives_a_cut(runs, tmp_path):
     assert validations(tmp_path / "whole") == ["0", "1"]
     with pytest.raises(CutError):
         run("cut", 36)
-    for _ in range(2):  # what has stopped early stays so …
+    for _ in range(2):  # a run that stopped early remains stopped …
         again = run("cut", None)
         assert_ends_as(tmp_path / "whole", whole, tmp_path / "cut", again)
-    run("cut", None, patience=2)  # … until there is more patience
+    run("cut", None, patience=2)  # … until the patience is larger
     assert validations(tmp_path / "cut") == ["0", "1", "2"]
 
 
@@ -180,7 +180,7 @@ def last_state(folder: Path, name: str) -> dict[str, torch.Tensor]:
 
 
 def assert_average(folder: Path, states: Sequence[dict[str, torch.Tensor]]) -> None:
-    """Compare the saved average with its formula in plain arithmetic."""
+    """Compare the saved average with its formula."""
     expected = dict(states[0])
     for n, state in enumerate(states[1:], start=1):
         decay = min(0.3, n / (n + 9))
@@ -201,15 +201,15 @@ def averaged(runs, tmp_path_factory):
     return folder, system
 
 
-def test_the_trained_weights_stand_beside_the_average(averaged, whole):
+def test_a_checkpoint_has_both_trained_weights_and_average(averaged, whole):
     average, trained = (last_state(averaged[0], name) for name in ("state_dict", TRAINED))
-    assert_same(trained, averaged[1].state_dict())  # training has gone on with them, to its end
-    assert_same(trained, whole[1].state_dict())  # as it does without an average
+    assert_same(trained, averaged[1].state_dict())  # training continued with these weights
+    assert_same(trained, whole[1].state_dict())  # as without an average
     assert any(not torch.equal(average[name], trained[name]) for name in trained)
 
 
 @pytest.mark.parametrize("at", [9, 16, 36])  # between two steps, in both validations
-def test_an_average_outlives_a_cut_and_may_end_with_it(at, averaged, runs, whole, tmp_path):
+def test_an_average_survives_a_cut_and_may_be_dropped(at, averaged, runs, whole, tmp_path):
     with pytest.raises(CutError):
         runs(tmp_path / "cut", Cut(at), more=[AveragedWeights(0.3)])
     shutil.copytree(tmp_path / "cut", tmp_path / "copy")
@@ -220,7 +220,7 @@ def test_an_average_outlives_a_cut_and_may_end_with_it(at, averaged, runs, whole
     assert_same(without.state_dict(), whole[1].state_dict())
 
 
-def test_an_average_may_begin_with_a_resume(runs, whole, tmp_path):
+def test_an_average_may_start_in_a_resumed_run(runs, whole, tmp_path):
     with pytest.raises(CutError):
         runs(tmp_path, Cut(9))
     begun, recorder = last_state(tmp_path, "state_dict"), Recorder()

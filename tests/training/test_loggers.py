@@ -8,7 +8,7 @@ from dopepp.core.files import read_csv
 from dopepp.training.loggers import GuardedLogger, MetricsTable
 
 
-def test_columns_grow_and_a_steps_figures_share_a_row(tmp_path):
+def test_columns_are_added_and_a_step_has_one_row(tmp_path):
     table = MetricsTable(tmp_path / "run" / "metrics.csv")
     table.save()
     assert not table.path.exists()
@@ -65,32 +65,32 @@ def test_an_existing_file_is_continued(tmp_path):
 CALLS = ("construction", "name", "log_hyperparams", "log_metrics", "save", "finalize")
 
 
-def noting(call: str) -> Callable[..., None]:
-    return lambda logger, *_, **__: logger._note(call)
+def recording(call: str) -> Callable[..., None]:
+    return lambda logger, *_, **__: logger._record(call)
 
 
 class Broken(Logger):
-    """Notes what is asked of it, and fails in the named call."""
+    """Records calls, and fails in the named call."""
 
     version = ""
 
     def __init__(self, failing: str = "") -> None:
         super().__init__()
         self.failing = failing
-        self.seen: list[str] = []
-        self._note("construction")
+        self.calls: list[str] = []
+        self._record("construction")
 
-    def _note(self, call: str) -> None:
-        self.seen.append(call)
+    def _record(self, call: str) -> None:
+        self.calls.append(call)
         if call == self.failing:
             raise ConnectionError(f"{call} failed")
 
     @property
     def name(self) -> str:
-        self._note("name")
+        self._record("name")
         return "broken"
 
-    log_hyperparams, log_metrics, save, finalize = (noting(item) for item in CALLS[2:])
+    log_hyperparams, log_metrics, save, finalize = (recording(item) for item in CALLS[2:])
 
 
 def use(logger: GuardedLogger) -> None:
@@ -104,7 +104,7 @@ def use(logger: GuardedLogger) -> None:
 
 
 @pytest.mark.parametrize("call", ["", *CALLS])
-def test_a_failing_logger_warns_once_and_is_off(call, caplog):
+def test_a_failing_logger_warns_once_and_is_disabled(call, caplog):
     made: list[Broken] = []
 
     def make() -> Broken:
@@ -114,10 +114,10 @@ def test_a_failing_logger_warns_once_and_is_off(call, caplog):
     with caplog.at_level(logging.WARNING):
         logger = GuardedLogger(make)
         use(logger)
-    if not call:  # it works, and gets everything
-        assert set(made[0].seen) == set(CALLS)
+    if not call:  # the logger works and receives all calls
+        assert set(made[0].calls) == set(CALLS)
         assert not caplog.records
     else:
         assert len(caplog.records) == 1
         assert f"{call} failed" in caplog.text
-        assert not made or (made[0].seen.count(call), made[0].seen[-1]) == (1, call)
+        assert not made or (made[0].calls.count(call), made[0].calls[-1]) == (1, call)

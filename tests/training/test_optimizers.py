@@ -18,7 +18,7 @@ def step(optimizer, parameters, gradients):
 
 
 @given(rows=st.integers(1, 60), columns=st.integers(1, 60), seed=st.integers(0, 2**31))
-def test_singular_values_come_near_one_and_directions_stay(rows, columns, seed):
+def test_singular_values_become_nearly_one_and_directions_remain(rows, columns, seed):
     matrix = np.random.default_rng(seed).normal(size=(rows, columns))
     U, S, Vt = np.linalg.svd(matrix, full_matrices=False)
     result = orthogonalised(torch.tensor(matrix)).numpy()
@@ -57,13 +57,13 @@ def test_biases_and_norms_take_the_step_of_adamw():
     assert torch.equal(ours, theirs)
 
 
-def test_weights_shrink_by_the_decay_where_no_gradient_is():
+def test_weights_without_a_gradient_shrink_by_the_decay():
     weight = nn.Parameter(torch.full((4, 4), 2.0))
     step(Muon([weight], lr=0.1, weight_decay=0.5), [weight], [torch.zeros(4, 4)])
     assert torch.allclose(weight, torch.full((4, 4), 1.9))
 
 
-def test_a_run_goes_on_from_its_state_to_the_last_bit():
+def test_a_resumed_run_is_exact():
     def run(parameters, optimizer, steps):
         schedule = OneCycleLR(optimizer, 0.02, total_steps=20)
         for number in range(10):
@@ -72,7 +72,7 @@ def test_a_run_goes_on_from_its_state_to_the_last_bit():
                 step(
                     optimizer, parameters, [torch.randn_like(parameter) for parameter in parameters]
                 )
-            optimizer._opt_called = True  # so that torch does not warn of steps left out
+            optimizer._opt_called = True  # prevents torch's warning of skipped steps
             schedule.step()
             if number + 1 == steps.stop:
                 return

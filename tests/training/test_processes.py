@@ -1,4 +1,4 @@
-"""What a process does when another one of its run is gone."""
+"""The behaviour of a process after the death of another process of its run."""
 
 import multiprocessing
 import os
@@ -16,7 +16,7 @@ def sleeper(code: str = "import time; time.sleep(60)") -> subprocess.Popen[bytes
     return subprocess.Popen([sys.executable, "-c", code])
 
 
-def test_a_death_is_told_with_its_cause():
+def test_a_death_is_described_with_its_cause():
     quiet, killed = sleeper(), sleeper()
     failed, done = sleeper("raise SystemExit(3)"), sleeper("pass")
     try:
@@ -27,7 +27,7 @@ def test_a_death_is_told_with_its_cause():
         failed.wait()
         assert "ended with code 3" in str(Watch([failed], None).death())
         done.wait()
-        assert Watch([done], None).death() is None  # it was finished
+        assert Watch([done], None).death() is None  # it ended normally
         assert Watch([], os.getppid()).death() is None
         assert "rank 0 on this machine) has died" in str(Watch([], 2**22).death())
     finally:
@@ -43,19 +43,19 @@ def hang(errors: Path) -> None:
     time.sleep(120)
 
 
-def test_what_hangs_is_ended_from_outside(tmp_path):
+def test_a_hanging_process_is_ended(tmp_path):
     """As in a collective on GPUs, where no exception reaches the main thread."""
     process = multiprocessing.get_context("fork").Process(target=hang, args=[tmp_path / "errors"])
     process.start()
     process.join(100)
     assert process.exitcode == 1
-    said = (tmp_path / "errors").read_text()
-    assert said.endswith("was killed by signal 9: the run ends\n")
+    message = (tmp_path / "errors").read_text()
+    assert message.endswith("was killed by signal 9: the run ends\n")
 
 
 def test_a_stopped_watch_lets_processes_end():
     child = sleeper("raise SystemExit(3)")
     watch = Watch([child], None)
     watch.stop()
-    watch.run()  # returns at once, and this process is still here
+    watch.run()  # returns at once, without ending this process
     child.wait()

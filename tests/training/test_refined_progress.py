@@ -1,4 +1,4 @@
-"""The measurement of refined poses during a training, with an estimator whose poses are known."""
+"""The measurement of refined poses during a training, with an estimator of true poses."""
 
 import numpy as np
 import pytest
@@ -11,28 +11,28 @@ from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.functional import wilson_interval
 from dopepp.recovery.detection import Detection
 from dopepp.training import refined_progress
-from dopepp.training.refined_progress import NUM_CONFIRMING, NUM_PICTURES, RefinedProgress
+from dopepp.training.refined_progress import NUM_CONFIRMING, NUM_IMAGES, RefinedProgress
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import PRESETS
 
 
-class Known:
-    """Returns the true pose of every image, or one that is 5 cm off where ``wrong`` says so."""
+class TruePoses:
+    """Returns the true pose of every image, 5 cm off for the image numbers that are ``wrong``."""
 
     def __init__(self, images, wrong):
-        self.pictures, self.wrong, self.asked = images, wrong, 0
+        self.images, self.wrong, self.count = images, wrong, 0
 
     def predict(self, image, K):
-        (instance,) = self.pictures.sample(self.asked).instances
+        (instance,) = self.images.sample(self.count).instances
         T = instance.T_cam_obj.copy()
-        T[0, 3] += 0.05 * self.wrong(self.asked)
-        self.asked += 1
+        T[0, 3] += 0.05 * self.wrong(self.count)
+        self.count += 1
         peaks = np.full((9, 2), np.nan)
         return [Detection(instance.label, 0.9, 0.9, T, peaks, peaks, 0.0, None)]
 
 
 class Repeated:
-    """As many images as one likes from one render, moved by nothing."""
+    """A source that repeats one render."""
 
     name = "repeated"
 
@@ -57,7 +57,7 @@ def measure(monkeypatch, make_trainer, make_system, make_datamodule, images, tmp
     """Fit with a measurement after every validation; return the callback, trainer and estimator."""
 
     def measure(wrong, epochs=1, **options):
-        known = Known(images, wrong)
+        known = TruePoses(images, wrong)
         monkeypatch.setattr(RefinedProgress, "_estimator", lambda self, system: known)
         progress = RefinedProgress(images, "region", **options)
         trainer = make_trainer(tmp_path, [progress], max_epochs=epochs)
@@ -70,7 +70,7 @@ def measure(monkeypatch, make_trainer, make_system, make_datamodule, images, tmp
 def test_share_precision_and_interval_are_reported_and_drawn(measure, tmp_path, capsys):
     progress, trainer, known = measure(lambda number: number % 4 == 0)
     ((minutes, share, low, high),) = progress.curve
-    assert known.asked == NUM_PICTURES
+    assert known.count == NUM_IMAGES
     assert share == pytest.approx(0.75)
     assert (low, high) == pytest.approx(wilson_interval(30, 40))
     assert 0 < minutes < 5
@@ -85,9 +85,9 @@ def test_share_precision_and_interval_are_reported_and_drawn(measure, tmp_path, 
     assert not trainer.should_stop
 
 
-def test_a_reached_goal_is_confirmed_on_more_pictures(measure, capsys):
-    _, trainer, known = measure(lambda number: number >= NUM_PICTURES, epochs=3, stop_at=0.9)
-    assert known.asked == NUM_CONFIRMING  # the second validation came too soon to measure again
+def test_a_reached_goal_is_confirmed_on_more_images(measure, capsys):
+    _, trainer, known = measure(lambda number: number >= NUM_IMAGES, epochs=3, stop_at=0.9)
+    assert known.count == NUM_CONFIRMING  # the other validations were too early for a measurement
     assert trainer.current_epoch == 3
     assert "40 % of 100 parts" in capsys.readouterr().out
 
@@ -99,10 +99,10 @@ def test_the_goal_ends_the_training(measure, capsys):
     assert "stop_at=0.95 is reached" in shown
 
 
-def test_measurements_keep_their_distance_in_time(measure, monkeypatch):
+def test_the_time_between_measurements_has_a_minimum(measure, monkeypatch):
     monkeypatch.setattr(refined_progress, "MAX_SHARE", 1e9)
     progress, _, known = measure(lambda number: False, epochs=3, every_s=0.0)
-    assert (len(progress.curve), known.asked) == (3, 3 * NUM_PICTURES)
+    assert (len(progress.curve), known.count) == (3, 3 * NUM_IMAGES)
     minutes = [point[0] for point in progress.curve]
     assert minutes == sorted(minutes)
     progress, _, _ = measure(lambda number: False, epochs=3, every_s=1e6)

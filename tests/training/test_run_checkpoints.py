@@ -11,7 +11,7 @@ from dopepp.training.run_checkpoints import AtomicCheckpointIO, SavingFailedErro
 
 
 @pytest.mark.parametrize("weights_only", [None, False, True])
-def test_loading_runs_no_code_whoever_asks(weights_only, tmp_path):
+def test_loading_runs_no_code(weights_only, tmp_path):
     path, trace = tmp_path / "hostile.ckpt", tmp_path / "trace"
 
     class Hostile:
@@ -28,14 +28,14 @@ def full_disk(*_: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-def test_what_cannot_be_written_is_written_later_in_order(tmp_path, caplog):
+def test_files_that_cannot_be_written_are_written_later_in_order(tmp_path, caplog):
     refuse = [True]
     io = AtomicCheckpointIO(prepare=lambda: full_disk() if refuse[0] else None)
-    with pytest.raises(Exception, match="pickle"):  # which nothing would change
+    with pytest.raises(Exception, match="pickle"):  # a retry would not help
         AtomicCheckpointIO().save_checkpoint({"step": lambda: 0}, tmp_path / "best.ckpt")
     weights = torch.zeros(2)
     io.save_checkpoint({"step": 1, "weights": weights}, tmp_path / "best.ckpt")
-    weights += 1  # training goes on
+    weights += 1  # training continues
     io.save_checkpoint({"step": 1}, tmp_path / "last.ckpt")
     io.save_checkpoint({"step": 2}, tmp_path / "last.ckpt")
     assert io.waiting == [tmp_path / "best.ckpt", tmp_path / "last.ckpt"]
@@ -51,7 +51,7 @@ def test_what_cannot_be_written_is_written_later_in_order(tmp_path, caplog):
     assert io.load_checkpoint(tmp_path / "last.ckpt") == {"step": 2}
 
 
-def test_nothing_outside_of_the_run_is_removed(tmp_path, caplog):
+def test_files_outside_the_run_are_not_removed(tmp_path, caplog):
     run, other = tmp_path / "run", tmp_path / "other.ckpt"
     io = AtomicCheckpointIO(folder=run)
     io.save_checkpoint({"step": 1}, run / "checkpoints" / "old.ckpt")
@@ -66,7 +66,7 @@ def test_nothing_outside_of_the_run_is_removed(tmp_path, caplog):
     assert list((run / "checkpoints").iterdir()) == []
 
 
-def test_a_moved_run_finds_its_own_files(tmp_path):
+def test_a_moved_run_refers_to_its_moved_files(tmp_path):
     old, new = tmp_path / "old" / "checkpoints", tmp_path / "new" / "checkpoints"
     best = {
         "dirpath": str(old), "monitor": "val/x", "best_model_path": str(old / "best.ckpt"),
@@ -94,7 +94,7 @@ def test_the_previous_file_is_kept(tmp_path):
         assert io.load_checkpoint(tmp_path / f"{name}.ckpt") == {"step": step}
 
 
-def test_half_written_files_of_processes_that_are_gone_are_swept_away(tmp_path):
+def test_partial_files_of_dead_processes_are_removed(tmp_path):
     with subprocess.Popen(["true"]) as process:
         process.wait()
     (tmp_path / "checkpoints").mkdir()

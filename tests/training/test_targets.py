@@ -1,4 +1,4 @@
-"""Equal images get equal maps, and at a sector's border the network may choose."""
+"""Equal images have equal target maps; at the border of a sector, the network chooses."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -40,7 +40,7 @@ CONE = make_part("cone", (0.01, 0.02, 0), symmetries_continuous=(AXIS,))
 
 
 def make_batch(poses: np.ndarray, part: Part, index: int = 0) -> Batch:
-    """One instance an image."""
+    """Return a batch with one instance per image."""
     keypoints = np.stack([project_keypoints(part.cuboid, T, K) for T in poses])
     count = len(poses)
     return Batch(
@@ -70,20 +70,20 @@ def face_on(angles_deg: Sequence[float]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("part", [PLATE, CAN, CONE], ids=lambda part: part.name)
-def test_poses_that_look_alike_get_the_same_keypoints(part):
+def test_equivalent_poses_have_the_same_keypoints(part):
     handling = SymmetryHandling([part], SymmetryOptions())
     poses = random_poses(40, seed=5)
     group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous, 0.3)
     expected = handling.equivalents(make_batch(poses, part)).keypoints[:, 0, 0]
     for S in group:
         result = handling.equivalents(make_batch(poses @ S, part)).keypoints[:, 0, 0]
-        # Poses exactly on a border may go either way: none of 40 random ones lies within 1e-4.
+        # Poses exactly on a border have two targets; no random pose is within 1e-4 of a border.
         assert (result - expected).abs().max() < 0.02
 
 
 @pytest.mark.parametrize("part", [PLATE, CAN, CONE], ids=lambda part: part.name)
 def test_the_first_choice_is_the_best_of_the_whole_group(part):
-    """Brute force over the group in steps of a degree, straight ahead, where no sight turns."""
+    """Brute force over the group in steps of a degree, for parts on the optical axis."""
     handling = SymmetryHandling([part], SymmetryOptions())
     poses = random_poses(20, seed=6)
     fixed = part.cuboid[8]
@@ -116,7 +116,7 @@ def test_choices_of_a_box_are_permutations_of_its_corners():
         assert all(sorted(order) == list(range(9)) and order[8] == 8 for order in orders)
 
 
-def test_parts_without_symmetries_and_padding_are_left_bit_by_bit():
+def test_parts_without_symmetries_and_padding_keep_their_labels_exactly():
     handling = SymmetryHandling([PLAIN, PLATE], SymmetryOptions(border_deg=360))
     batch = make_batch(random_poses(3, seed=8), PLAIN)
     result = handling.equivalents(batch)
@@ -129,7 +129,7 @@ def test_parts_without_symmetries_and_padding_are_left_bit_by_bit():
     assert not SymmetryHandling([PLATE], SymmetryOptions(False, 0.0)).active
 
 
-def test_the_border_is_as_wide_as_asked():
+def test_the_border_has_the_configured_width():
     """Face on, a plate at θ in the image plane is |θ| and 180° − |θ| from the reference."""
     poses = face_on((0.0, 70.0, 80.0, 95.0, 120.0))
     handling = SymmetryHandling([PLATE], SymmetryOptions(border_deg=30.0))
@@ -146,23 +146,23 @@ def plate_system(make_system):
     return system
 
 
-def test_targets_are_the_choice_that_the_maps_are_nearest_to(plate_system):
+def test_targets_are_the_choice_nearest_to_the_maps(plate_system):
     batch = make_batch(face_on((0.0, 85.0)), PLATE)
     result = plate_system.symmetry.equivalents(batch)
     geometry = plate_system.geometry
     first, second = (draw_maps(batch, result.keypoints[:, :, n], 1, geometry) for n in (0, 1))
     assert not torch.allclose(first[0], second[0])
-    for says in (first, second):
-        stages = [(says[0].clamp(min=1e-9).log(), says[1])]
+    for maps in (first, second):
+        stages = [(maps[0].clamp(min=1e-9).log(), maps[1])]
         belief, field = plate_system.targets(batch, stages)
-        # Far from the border there is no choice, whatever the network says.
+        # Far from the border, the network has no influence.
         assert torch.equal(belief[0], first[0][0])
-        assert torch.equal(belief[1], says[0][1])
-        assert torch.equal(field[1], says[1][1])
+        assert torch.equal(belief[1], maps[0][1])
+        assert torch.equal(field[1], maps[1][1])
     assert torch.equal(plate_system.targets(batch)[0], first[0])
 
 
-def test_instances_on_one_image_choose_each_for_itself(plate_system):
+def test_instances_of_an_image_are_chosen_independently(plate_system):
     poses = face_on((85.0, -88.0))
     poses[:, :3, 3] = (-0.08, 0, 0.4), (0.08, 0, 0.4)
     alone = make_batch(poses, PLATE)
@@ -222,7 +222,7 @@ def test_hardly_visible_instances_and_padding_leave_empty_channels(visible, inde
         assert maps.flatten(1).any(dim=1).tolist() == drawn
 
 
-def test_an_instance_fills_its_own_objects_channels_only(batch):
+def test_an_instance_is_drawn_only_in_the_channels_of_its_object(batch):
     belief, field = draw(replace(batch, object_index=torch.tensor([[0], [1]])), num_objects=2)
     filled = [maps.unflatten(1, (2, -1)).flatten(2).any(dim=2).tolist() for maps in (belief, field)]
     assert filled == [[[True, False], [False, True]]] * 2

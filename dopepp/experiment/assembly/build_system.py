@@ -19,7 +19,6 @@ import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import Logger
-from lightning.pytorch.utilities import rank_zero_only
 from torch import nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
@@ -39,7 +38,7 @@ from dopepp.parts.size import Seen
 from dopepp.recovery.detection import RecoveryOptions
 from dopepp.training.loggers import MetricsTable
 from dopepp.training.optimizers import AveragedWeights
-from dopepp.training.processes import WatchedDDP
+from dopepp.training.processes import WatchedDDP, is_first_process
 from dopepp.training.run_checkpoints import AtomicCheckpointIO
 from dopepp.training.system import OptimizerFactory, PoseSystem, SchedulerFactory
 from dopepp.training.throughput import RunProgress, make_profiler
@@ -147,7 +146,7 @@ def _initialise(network: PoseNetwork, config: RunConfig) -> None:
         start_from_checkpoint(network, Path(config.init_from))
         return
     fits = start_from_parts(network)
-    if config.resume is None and not getattr(rank_zero_only, "rank", 0):
+    if config.resume is None and is_first_process():
         program.say(
             "initial weights: learned on random parts (init_from=auto)"
             if fits
@@ -199,7 +198,7 @@ def build_trainer(
     elif accelerator == "auto":
         accelerator = "cpu"
     precision, reason = choose_precision(options.precision, accelerator)
-    if not getattr(rank_zero_only, "rank", 0):
+    if is_first_process():
         program.say(f"precision {precision}: {reason}")
     callbacks = [*(CALLBACKS.build(node) for node in config.callbacks.values()), *further]
     if config.ema is not None:

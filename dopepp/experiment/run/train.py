@@ -18,7 +18,6 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning.pytorch import Callback, Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint
-from lightning.pytorch.utilities import rank_zero_only
 
 from dopepp.core import extensions
 from dopepp.core.errors import Interruption, RunError, UserError
@@ -62,7 +61,7 @@ from dopepp.inference.refinement.refiner import refine_terms
 from dopepp.parts.part import Parts
 from dopepp.training.loggers import GuardedLogger
 from dopepp.training.pose_validation import EarlyStop
-from dopepp.training.processes import ProcessDiedError
+from dopepp.training.processes import ProcessDiedError, is_first_process
 from dopepp.training.pruning import PrunedError, raise_if_pruned
 from dopepp.training.refined_progress import RefinedProgress
 from dopepp.training.run_checkpoints import FOLDER, check_free_space, newest_checkpoint, saved_step
@@ -147,7 +146,7 @@ def _train(
     seed_everything(config.seed, verbose=False)
     keep_freed_memory()
     # Only the first process reports.
-    display.console.quiet = bool(getattr(rank_zero_only, "rank", 0))
+    display.console.quiet = not is_first_process()
     parts = build_parts(config.data)
     config = fitted_to_camera(config, parts)
     if config.tune:
@@ -169,7 +168,7 @@ def _train(
     display.show_config(config.plain)
     for change in changes:
         display.console.print(f"changed since the run began: {change}")
-    if not getattr(rank_zero_only, "rank", 0):
+    if is_first_process():
         write_config(run_dir, config.plain)
         write_environment(run_dir, config.seed, fingerprint, [str(change) for change in changes])
         if config.resume is not None:

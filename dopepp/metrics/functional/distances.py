@@ -117,8 +117,8 @@ def reprojection_error(
     K = _check_cameras(K, len(R_est))
     errors = t_est.new_empty(len(t_est))
     for chunk in _chunks(len(t_est), len(points)):
-        estimated = _project(R_est[chunk], t_est[chunk], points, K[chunk])
-        true = _project(R_gt[chunk], t_gt[chunk], points, K[chunk])
+        estimated = project_points(R_est[chunk], t_est[chunk], points, K[chunk])
+        true = project_points(R_gt[chunk], t_gt[chunk], points, K[chunk])
         errors[chunk] = (estimated - true).norm(dim=2).mean(dim=1)
     return nan_is_miss(errors)
 
@@ -150,9 +150,14 @@ def mspd(
     return least_farthest(estimated, true, points, group, perspective=True)
 
 
-def _project(R: Rotations, t: Positions, points: Tensor, K: Rotations) -> Float[Tensor, "n v 2"]:
-    """Project points at poses to pixels; NaN at or behind the camera."""
-    cam = points @ R.mT + t[:, None]
+def project_points(
+    R: Float[Tensor, "*n 3 3"],
+    t: Float[Tensor, "*n 3"],
+    points: Float[Tensor, "*#n v 3"],
+    K: Float[Tensor, "*#n 3 3"],
+) -> Float[Tensor, "*n v 2"]:
+    """Project object points at poses (R, t) to pixels; NaN at or behind the camera."""
+    cam = points @ R.mT + t[..., None, :]
     depth = cam[..., 2:]
     rays = torch.where(depth > 0, cam / depth, torch.nan)
     return (rays @ K.mT)[..., :2]
@@ -322,9 +327,9 @@ def vsd(
     """
     rays = _ray_lengths(K, depth.shape)
     measured, estimated, true = rays * depth, rays * depth_est, rays * depth_gt
-    seen_gt = _seen(true, measured, delta)
-    seen_est = _seen(estimated, measured, delta) | (seen_gt & (estimated > 0))
-    either, both = seen_gt | seen_est, seen_gt & seen_est
+    visible_gt = _is_visible(true, measured, delta)
+    visible_est = _is_visible(estimated, measured, delta) | (visible_gt & (estimated > 0))
+    either, both = visible_gt | visible_est, visible_gt & visible_est
     num_either = int(either.sum())
     if not num_either:
         return np.ones(len(tolerances))
@@ -340,6 +345,8 @@ def _ray_lengths(K: CameraMatrix, shape: tuple[int, ...]) -> Depths:
     return np.asarray(np.linalg.norm(rays / rays[2], axis=0).reshape(shape))
 
 
-def _seen(distance: Depths, measured: Depths, delta: float) -> Bool[np.ndarray, "height width"]:
+def _is_visible(
+    distance: Depths, measured: Depths, delta: float
+) -> Bool[np.ndarray, "height width"]:
     """Return where a surface is visible: not behind the measured depth, or depth is missing."""
     return np.asarray((distance > 0) & ((distance - measured <= delta) | (measured == 0)))

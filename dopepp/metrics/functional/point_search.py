@@ -111,26 +111,18 @@ def _squared_box_distance(box: Array, x: float, y: float, z: float) -> float:
 
 @compiled()
 def _mean_distance(
-    points: Array,
-    boxes: Array,
-    firsts: Array,
-    R: Array,
-    targets: Array,
-    queries: Array,
+    points: Float[np.ndarray, "v 3"],
+    boxes: Float[np.ndarray, "nodes 6"],
+    firsts: Int[np.ndarray, "leaves+1"],
+    R: Float[np.ndarray, "3 3"],
+    targets: Float[np.ndarray, "v 3"],
+    queries: Float[np.ndarray, "v 3"],
     bound: float,
 ) -> float:
-    """Average the distances from targets to the nearest ``R·point``.
+    """Average the distances from targets to the nearest ``R·point`` of a tree (:func:`_tree`).
 
-    Node k of the tree has the children 2k + 1 and 2k + 2.
-
-    Args:
-        points: Object points in the tree's order.
-        boxes: Box of every node (:func:`_squared_box_distance`).
-        firsts: Index of the first point of every leaf, then the number of points.
-        R: Matrix of the estimated pose.
-        targets: True points.
-        queries: R⁻¹·targets.
-        bound: Lower bound of ‖R v‖² / ‖v‖².
+    Node k has the children 2k + 1 and 2k + 2. ``queries`` are R⁻¹·targets, and ``bound`` is a lower
+    bound of ‖R v‖² / ‖v‖².
     """
     num_inner = len(boxes) // 2
     nodes, floors = np.empty(64, np.int64), np.empty(64)
@@ -244,30 +236,20 @@ def _set_targets(B: Array, b: Array, points: Array, perspective: bool, targets: 
 
 @compiled()
 def _search(
-    B: Array,
-    b: Array,
-    A: Array,
-    a: Array,
-    points: Array,
-    rotations: Array,
-    shifts: Array,
+    B: Float[np.ndarray, "n 3 3"],
+    b: Float[np.ndarray, "n 3"],
+    A: Float[np.ndarray, "n 3 3"],
+    a: Float[np.ndarray, "n 3"],
+    points: Float[np.ndarray, "v 3"],
+    rotations: Float[np.ndarray, "s 3 3"],
+    shifts: Float[np.ndarray, "s 3"],
     num_probes: int,
     perspective: bool,
-    errors: Array,
+    errors: Float[np.ndarray, "n"],
 ) -> None:
-    """Compute the maximum point distance of every pose under its best symmetry.
+    """Write the maximum point distance of every pose under its best symmetry.
 
-    Args:
-        B: Matrix of each estimated pose: R, or K·R for distances in the image.
-        b: Offset of each estimated pose.
-        A: Matrix of each true pose.
-        a: Offset of each true pose.
-        points: Points of the object, the probes first.
-        rotations: Rotation of each symmetry.
-        shifts: Translation of each symmetry.
-        num_probes: Number of points that give a lower bound quickly.
-        perspective: Whether points are divided by their depth.
-        errors: Filled with the error of each pose; infinite for a point behind the camera.
+    The arguments are as in :func:`least_farthest`; the probes are the first points.
     """
     targets = np.empty((len(points), 3))
     P, p = np.empty((len(rotations), 3, 3)), np.empty((len(rotations), 3))
