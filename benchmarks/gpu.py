@@ -31,7 +31,7 @@ import numpy as np
 import torch
 from runtimes import config_of
 
-from dopepp.core.files import write_whole
+from dopepp.core.files import write_file
 from dopepp.core.pool import available_cores
 from dopepp.data.batch import Batch, collate
 from dopepp.data.datamodule import PoseDataModule
@@ -241,8 +241,8 @@ def measure(rows: list[Row], folder: Path, machine: str, minutes: float) -> int:
         except (RuntimeError, NotImplementedError) as error:
             values = {"failed": f"{type(error).__name__}: {str(error).strip():.120}".split("\n")[0]}
         done[row.name] = values
-        write_whole(file, json.dumps(kept, indent=1).encode())
-        write_whole(folder / "rows.md", "\n".join(markdown(rows, done, machine)).encode())
+        write_file(file, json.dumps(kept, indent=1).encode())
+        write_file(folder / "rows.md", "\n".join(markdown(rows, done, machine)).encode())
         print(row.name, *(f"{key}: {shown(value)}" for key, value in values.items()), flush=True)
         gc.collect()
         torch._dynamo.reset()

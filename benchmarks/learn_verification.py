@@ -24,7 +24,7 @@ import trimesh
 from manifold3d import Manifold
 from sklearn.metrics import average_precision_score, brier_score_loss, log_loss
 
-from dopepp.geometry.camera import Transform, make_transform, moved
+from dopepp.geometry.camera import Transform, make_transform, move_pose
 from dopepp.geometry.rotation import random_rotation
 from dopepp.inference.refinement import verification
 from dopepp.inference.refinement.outline import make_outline_mesh
@@ -193,7 +193,7 @@ def starts(
         # The line of sight is almost parallel to z in these images.
         shift = np.array([*(across * part.diameter * rng.normal(size=2)), along * depth])
         shift[2] *= rng.normal() if along < 0.3 else rng.uniform(-1.0, 1.0)
-        start = moved(T, np.concatenate([turn, shift]))
+        start = move_pose(T, np.concatenate([turn, shift]))
         if across >= 1.0:  # anywhere in the image
             pixel = rng.uniform(0.15, 0.85, 2) * SIZE
             start[:2, 3] = (pixel - K[:2, 2]) / FOCAL * start[2, 3]

@@ -20,7 +20,7 @@ from common import PoseErrors, pose_errors, print_head, print_row, timed
 from depth import structured_light
 
 from dopepp.data.part_symmetries import with_symmetries
-from dopepp.geometry.camera import moved, transform
+from dopepp.geometry.camera import move_pose, transform
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.refinement.refiner import PartRefiner
 from dopepp.parts.catalogue import load_part
@@ -62,7 +62,7 @@ def measure(
             if rendered.visible_fractions[number] < LEAST_VISIBLE:
                 continue
             true = rendered.scene.objects[number].T_cam_obj
-            start = moved(true, rng.normal(size=6) * DEVIATIONS)
+            start = move_pose(true, rng.normal(size=6) * DEVIATIONS)
             given = rendered.image, rendered.scene.K, start, np.diag(DEVIATIONS**2), depth
             if not took:  # compiles, or loads compiled code
                 refiner.refine(*given)

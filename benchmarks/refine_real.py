@@ -39,7 +39,7 @@ from dopepp.geometry.camera import (
     CameraMatrix,
     Transform,
     make_transform,
-    moved,
+    move_pose,
     project,
     project_keypoints,
     transform,
@@ -113,7 +113,7 @@ class DrawnStarts:
         """Yield model number, true pose and start pose of each object."""
         for number, true in frame.objects:
             step = random_step(self.rng, self.spread * TURN, self.spread * SHIFT)
-            yield number, true, true if self.from_truth else moved(true, step)
+            yield number, true, true if self.from_truth else move_pose(true, step)
 
     def refine(self, frame: Frame, number: int, start: Transform, limit: float) -> Refined:
         """Refine a start; ``limit`` is the largest relative error of the scale."""

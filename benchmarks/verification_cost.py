@@ -26,7 +26,7 @@ from refine_real import read_frames
 
 from dopepp.data.formats.bop.bop_models import bop_parts, parts_by_id
 from dopepp.drawing.pictures import RGBImage
-from dopepp.geometry.camera import CameraMatrix, Transform, moved
+from dopepp.geometry.camera import CameraMatrix, Transform, move_pose
 from dopepp.inference.refinement import verification
 from dopepp.inference.refinement.refiner import PartRefiner
 from dopepp.parts.catalogue import load_part
@@ -99,7 +99,7 @@ def main() -> None:
                 assert refiner.verifier is not None
                 mesh = refiner.verifier.mesh
                 verifiers = [version(mesh, part.diameter) for version in versions]
-            pose = moved(T, rng.multivariate_normal(np.zeros(6), COVARIANCE))
+            pose = move_pose(T, rng.multivariate_normal(np.zeros(6), COVARIANCE))
             case = (image, K, pose, COVARIANCE)
             evidence = [verifier.evidence(*case, 1.0) for verifier in verifiers]
             if any(values is None for values in evidence):

@@ -30,7 +30,7 @@ from dopepp.geometry.camera import (
     CameraMatrix,
     Transform,
     invert_transform,
-    moved,
+    move_pose,
     orbited_camera,
     step_between,
 )
@@ -85,7 +85,7 @@ def static_scene(
 def perturbed(T_world_cam: Transform, rng: np.random.Generator) -> Transform:
     """Return a camera pose with random errors."""
     shift, turn = CAMERA_ERROR
-    return moved(T_world_cam, rng.normal(size=6) * np.repeat([turn, shift], 3))
+    return move_pose(T_world_cam, rng.normal(size=6) * np.repeat([turn, shift], 3))
 
 
 def errors_by_ray(T: Transform, true: Transform, part: Part) -> tuple[float, float, float, float]:

@@ -28,7 +28,7 @@ from dopepp.drawing.pictures import read_rgb
 from dopepp.geometry.camera import (
     Transform,
     make_transform,
-    moved,
+    move_pose,
     project_keypoints,
     transform,
 )
@@ -188,7 +188,7 @@ def main() -> None:
                 for name, image in zip(chosen, images, strict=True):
                     if number in frames.visible[name]:
                         step = random_step(rng, options.spread * TURN, options.spread * SHIFT)
-                        pose = moved(frames.poses[name][number], step)
+                        pose = move_pose(frames.poses[name][number], step)
                         estimator.starts[image.tobytes()] = pose
             cameras = [frames.K[name] for name in chosen]
             poses = [frames.relative(first, name, number, parts) for name in chosen]

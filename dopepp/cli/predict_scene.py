@@ -56,7 +56,7 @@ def predict_scene(
         UserError: There are fewer than two images, a source is not a still image, or an image
             has no pose or no camera.
     """
-    from dopepp.core.files import write_whole
+    from dopepp.core.files import write_file
     from dopepp.inference.several_views.view_files import read_camera_poses
 
     poses = read_camera_poses(views)
@@ -94,4 +94,4 @@ def predict_scene(
     if save is not None:
         result.save(save)
     if json_file is not None:
-        write_whole(json_file, f"{result.to_json()}\n".encode())
+        write_file(json_file, f"{result.to_json()}\n".encode())

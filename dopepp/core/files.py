@@ -42,15 +42,15 @@ def write_png(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> N
     """
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
         raise ValueError(f"an image must be uint8 (H, W, 3), got {image.dtype} {image.shape}")
-    write_whole(path, _encoded(image, ".png"))
+    write_file(path, _encode(image, ".png"))
 
 
 def write_image(path: Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
     """Write an RGB image in the format of the path's suffix, one of :data:`IMAGES`."""
-    write_whole(path, _encoded(image, path.suffix.lower()))
+    write_file(path, _encode(image, path.suffix.lower()))
 
 
-def _encoded(image: UInt8[np.ndarray, "height width 3"], suffix: str) -> bytes:
+def _encode(image: UInt8[np.ndarray, "height width 3"], suffix: str) -> bytes:
     """Return an image encoded in the format of a suffix."""
     import cv2  # takes a tenth of a second, and not every command writes images
 
@@ -91,7 +91,7 @@ def write_csv(
     writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    write_whole(path, text.getvalue().encode())
+    write_file(path, text.getvalue().encode())
 
 
 def read_csv(path: Path) -> list[dict[str, str]]:
@@ -102,7 +102,7 @@ def read_csv(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
-def write_whole(path: Path | str, content: bytes) -> None:
+def write_file(path: Path | str, content: bytes) -> None:
     """Write a file atomically."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -109,7 +109,7 @@ class PickledFunction:
             return pickle.dumps((None, RuntimeError(traceback.format_exc())))
 
 
-def opened(answer: bytes) -> Any:
+def unpickle_answer(answer: bytes) -> Any:
     """Return the value of a pickled (value, error) pair from :class:`PickledFunction`.
 
     Raises:
@@ -227,7 +227,7 @@ class ProcessPool(Pool):
             how = f"signal {-code}" if code is not None and code < 0 else f"code {code}"
             reason = f"a worker process died ({how}); if memory was short, use fewer --workers"
             raise LostWorkerError(reason) from error
-        return opened(answer)
+        return unpickle_answer(answer)
 
     def _start(self) -> SpawnProcess:
         """Start this thread's worker process and connect to it."""
@@ -342,7 +342,7 @@ class ClusterPool(Pool):
             try:
                 answer, node = answered.result()
                 self.num_tasks[node] += 1
-                result.set_result(opened(answer))
+                result.set_result(unpickle_answer(answer))
             except self._ray.exceptions.RayError as error:
                 reason = " ".join(str(error).split())
                 lost = LostWorkerError(f"Ray: {type(error).__name__}: {reason[:300]}")

@@ -145,7 +145,7 @@ def parse(kind: type[T], value: object, name: str = "", fix: str = "") -> T:
         UserError: A field is missing, unknown, of the wrong type or out of its range.
     """
     try:
-        typed: T = _validated(kind, value, name)
+        typed: T = _validate(kind, value, name)
     except ValidationError as error:
         if cause := _cause(error.errors()[0]):  # error of a __post_init__
             raise cause from None
@@ -181,11 +181,12 @@ def check(
     """
     limited: Any = kind if limits is None else Annotated[kind, limits]
     try:
-        typed: T = _validated(limited, value, name)
+        typed: T = _validate(limited, value, name)
     except ValidationError as error:
         mistake = next(_mistakes(limited, value, error))
         owner = "" if of is None else f" of {getattr(of, 'name', None) or type(of).__name__}"
-        problem = f"{mistake.name(name)}={mistake.got if mistake.location else shown(value)}{owner}"
+        got = mistake.got if mistake.location else short_repr(value)
+        problem = f"{mistake.name(name)}={got}{owner}"
         raise UserError(problem, mistake.allowed, f"set {name} to an allowed value") from None
     return typed
 
@@ -215,7 +216,7 @@ def _ranged_fields(kind: Any) -> dict[str, Any]:
     }
 
 
-def shown(value: object, max_length: int = 100) -> str:
+def short_repr(value: object, max_length: int = 100) -> str:
     """Return a value as text for a message, cut to ``max_length`` characters.
 
     An integer with too many digits for a conversion to text is represented by its type.
@@ -234,7 +235,7 @@ def _adapter(kind: type[T]) -> TypeAdapter[T]:
     return TypeAdapter(kind, config=config)
 
 
-def _validated(kind: Any, value: object, name: str) -> Any:
+def _validate(kind: Any, value: object, name: str) -> Any:
     """Validate a plain value against a type, without converting between types."""
     return _adapter(kind).validate_json(_json(value, name), strict=True)
 
@@ -271,12 +272,12 @@ def _mistakes(kind: type[Any], value: object, error: ValidationError) -> Iterato
         first = details[0]
         if first["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
             fields = ", ".join(_fields(kind, location[:-1], value)) or "no field"
-            yield _Mistake(location, shown(first["input"]), fields, is_unknown=True)
+            yield _Mistake(location, short_repr(first["input"]), fields, is_unknown=True)
         elif first["type"] in ("missing", "missing_argument"):
             yield _Mistake(location, "", "a value")
         else:
             allowed = " or ".join(dict.fromkeys(map(_allowed, details)))
-            yield _Mistake(location, shown(first["input"]), allowed)
+            yield _Mistake(location, short_repr(first["input"]), allowed)
 
 
 def _location(value: object, detail: ErrorDetails) -> tuple[str | int, ...]:

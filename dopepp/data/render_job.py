@@ -23,7 +23,7 @@ import numpy as np
 import yaml
 
 from dopepp.core.errors import NO_SPACE, StoppedError, UserError, system_failure
-from dopepp.core.files import PARTIAL_SUFFIX, is_abandoned, partial_path, write_whole
+from dopepp.core.files import PARTIAL_SUFFIX, is_abandoned, partial_path, write_file
 from dopepp.core.json import read_json
 from dopepp.core.validation import Range, check
 from dopepp.data.formats import RECORD_FILE, Writer
@@ -301,7 +301,7 @@ def _claim(root: Path, record: Mapping[str, Any]) -> None:
             problem = f"folder {root}, which holds {foreign[0]!r} and no {RECORD_FILE}"
             allowed = "an empty folder, or the folder of a render job"
             raise UserError(problem, allowed, "pass a new folder with --out")
-        write_whole(path, (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())
+        write_file(path, (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())
     # This also follows writing, as two jobs may begin simultaneously.
     differences = list(_differences(read_json(path, _MAX_RECORD_BYTES), record, ""))
     if differences:

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import draft, write_whole
+from dopepp.core.files import draft, write_file
 from dopepp.data.sample import DescribedSource, Instance, Sample, SourceInfo, resize_sample
 from dopepp.drawing.pictures import Shape, Size
 from dopepp.virtual.factory import Factory
@@ -193,7 +193,7 @@ class CachedSource:
             self.folder = folder / hashlib.sha256(text.encode()).hexdigest()[:24]
             self._slots = _in_file(self.folder / "slots.bin", slot, len(source))
             self._checksums = _in_file(self.folder / "checksums.bin", np.dtype("u8"), len(source))
-            write_whole(self.folder / "identity.json", text.encode())
+            write_file(self.folder / "identity.json", text.encode())
         self._store(0, first)
 
     def __len__(self) -> int:

@@ -50,7 +50,7 @@ def invert_transform(T_a_b: Transform) -> Transform:
     return make_transform(rotation, -rotation @ T_a_b[:3, 3])
 
 
-def moved(T_cam_obj: Transform, step: Step) -> Transform:
+def move_pose(T_cam_obj: Transform, step: Step) -> Transform:
     """Apply a step to a pose."""
     R = rotation_vector_to_matrix(step[:3])
     return make_transform(R @ T_cam_obj[:3, :3], T_cam_obj[:3, 3] + step[3:])
@@ -70,7 +70,7 @@ def orbited_camera(point: Vector, angle: float, direction: float) -> Transform:
 
 
 def step_between(before: Transform, after: Transform) -> Step:
-    """Return the step from one pose to another, the inverse of :func:`moved`."""
+    """Return the step from one pose to another, the inverse of :func:`move_pose`."""
     rotvec = matrix_to_rotation_vector(after[:3, :3] @ before[:3, :3].T)
     return np.concatenate([rotvec, after[:3, 3] - before[:3, 3]])
 

@@ -96,20 +96,20 @@ class Camera:
                 fix = "pass the size of the calibrated image, e.g. --K-size 1920 1080"
                 raise UserError(stated, "width and height above 0", fix)
             if self.size is not None and K_size != self.size:
-                allowed = f"the file's own size, {_by(self.size)}"
+                allowed = f"the file's own size, {_size_text(self.size)}"
                 fix = f"leave out --K-size, or pass --K-size {self.size[0]} {self.size[1]}"
                 raise UserError(f"{stated} with {self.source}", allowed, fix)
         calibrated = K_size or self.size
         if calibrated is not None:
             check_camera(self.K, calibrated, self.source, WHOLE)
         if crop is not None:
-            K = check_camera(_cut(self.K, calibrated, size, crop), size, self.source, ANYWHERE)
+            K = _check_and_crop(self.K, calibrated, size, crop)
+            K = check_camera(K, size, self.source, ANYWHERE)
         elif calibrated is None or calibrated == size:
             K = check_camera(self.K, size, self.source, WHOLE)
         elif K_size is None or not _equal_aspect(size, calibrated):
-            problem = (
-                f"{self.source}, whose K is for {_by(calibrated)}, with an image of {_by(size)}"
-            )
+            problem = f"{self.source}, whose K is for {_size_text(calibrated)}"
+            problem += f", with an image of {_size_text(size)}"
             allowed = "K for the image's size, or an option that explains the difference"
             raise UserError(problem, allowed, _fix(size, calibrated))
         else:
@@ -127,7 +127,7 @@ def read_camera(path: Path | str) -> Camera:
         UserError: The file is missing, over 250 kB or in an unknown format, describes several
             cameras or a fisheye lens, lacks the camera matrix, or has an invalid field.
     """
-    return camera_of_text(_text(Path(path)), str(path))
+    return camera_of_text(_read_text(Path(path)), str(path))
 
 
 def camera_of_text(text: str, source: str) -> Camera:
@@ -155,7 +155,7 @@ def _camera(calibration: Calibration, source: str) -> Camera:
     return Camera(calibration.size, K, lens, source)
 
 
-def _text(path: Path) -> str:
+def _read_text(path: Path) -> str:
     """Return the text of a UTF-8 file of at most ``MAX_BYTES``."""
     try:
         return read_limited(path, MAX_BYTES).decode("utf-8-sig").strip()
@@ -165,17 +165,20 @@ def _text(path: Path) -> str:
         raise UserError(problem, allowed, "pass a file in one of these formats") from error
 
 
-def _cut(K: CameraMatrix, calibrated: Size | None, size: Size, crop: Crop) -> CameraMatrix:
-    """Return K of a crop of the calibrated image."""
+def _check_and_crop(
+    K: CameraMatrix, calibrated: Size | None, size: Size, crop: Crop
+) -> CameraMatrix:
+    """Return K of a crop, after checking its size and position in the calibrated image."""
     x, y, width, height = crop
     stated = "--crop " + " ".join(map(str, crop))
     if (width, height) != size:
-        problem = f"{stated} with an image of {_by(size)}"
+        problem = f"{stated} with an image of {_size_text(size)}"
         fix = f"pass --crop {x} {y} {size[0]} {size[1]}"
         raise UserError(problem, "x y followed by the image's width and height", fix)
     exceeds = calibrated is not None and (x + width > calibrated[0] or y + height > calibrated[1])
     if min(x, y) < 0 or exceeds:
-        inside = f"inside the calibrated image{f' of {_by(calibrated)}' if calibrated else ''}"
+        inside = "inside the calibrated image"
+        inside += f" of {_size_text(calibrated)}" if calibrated else ""
         fix = "pass the position of the crop in the calibrated image"
         raise UserError(stated, f"x y width height {inside}", fix)
     return crop_camera(K, x, y)
@@ -195,9 +198,9 @@ def _fix(size: Size, calibrated: Size) -> str:
         return f"{resized}, {cut}" if cut else resized
     if size == calibrated[::-1]:
         return "rotate the image back, or calibrate rotated images (EXIF orientation is applied)"
-    return cut or f"calibrate the camera at {_by(size)}"
+    return cut or f"calibrate the camera at {_size_text(size)}"
 
 
-def _by(size: Size) -> str:
+def _size_text(size: Size) -> str:
     """Format a size as ``width×height``."""
     return f"{size[0]}×{size[1]}"

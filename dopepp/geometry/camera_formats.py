@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 
 from dopepp.core.errors import UserError
 from dopepp.core.json import parse_json
-from dopepp.core.validation import Range, check, shown
+from dopepp.core.validation import Range, check, short_repr
 from dopepp.core.yaml import parse_yaml
 from dopepp.geometry.camera import CameraMatrix, camera_matrix, pinhole_matrix
 
@@ -163,7 +163,7 @@ def calibration_of_fields(content: Mapping[Any, object], source: str) -> Calibra
     models += () if any(distortion) else ("", None)
     if model is not None and model[1] not in models:
         allowed = "plumb_bob, rational_polynomial"
-        raise UserError(f"{model[0]}={shown(model[1], 80)}", allowed, _UNDISTORT)
+        raise UserError(f"{model[0]}={short_repr(model[1], 80)}", allowed, _UNDISTORT)
     return Calibration(_size(fields), K, distortion)
 
 
@@ -238,7 +238,7 @@ def _number(name: str, value: Any) -> float:
     """Return a finite number, or the finite number in a text."""
     numbers = None if isinstance(value, bool) else _floats([value])
     if numbers is None:
-        problem = f"{name}={shown(value, 80)}"
+        problem = f"{name}={short_repr(value, 80)}"
         raise UserError(problem, "finite numbers", "write it as plain numbers, without base64")
     return numbers[0]
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import OptimizeResult, least_squares
 
-from dopepp.geometry.camera import CameraMatrix, Transform, moved, project_keypoints
+from dopepp.geometry.camera import CameraMatrix, Transform, move_pose, project_keypoints
 from dopepp.geometry.cuboid import Cuboid
 
 MIN_POINTS: Final = 8  # With fewer keypoints, an outlier resembles perspective
@@ -64,7 +64,7 @@ def focal_factor(
         lens[[0, 1], [0, 1]] *= factor
         start[2, 3] *= factor  # keeps the size in the image
         step[3:] *= start[2, 3]
-        projected = project_keypoints(cuboid, moved(start, step), lens)[is_known]
+        projected = project_keypoints(cuboid, move_pose(start, step), lens)[is_known]
         return np.asarray(
             np.nan_to_num((projected - keypoints[is_known]) / extent, nan=10.0).ravel()
         )

@@ -114,7 +114,7 @@ def solve_pnp(
         raise ValueError(f"K must be a finite, invertible pinhole matrix, got {K.tolist()}")
     covariances = np.broadcast_to(np.asarray(covariance_px, np.float64), (n, 2, 2))
     covariances = np.ascontiguousarray(covariances)
-    rays, whitening, usable = _prepared(object_points, image_points, K, covariances)
+    rays, whitening, usable = _prepare(object_points, image_points, K, covariances)
     result = _solve(object_points[usable], rays, K[:2, :2].copy(), whitening, widenings)
     inliers = np.zeros(n, bool)
     inliers[usable] = result.inliers
@@ -122,7 +122,7 @@ def solve_pnp(
 
 
 @compiled()
-def _prepared(
+def _prepare(
     object_points: ObjectPoints,
     image_points: Float[np.ndarray, "n 2"],
     K: CameraMatrix,
@@ -196,7 +196,7 @@ def _solve(
             reason = f"only {int(agree.sum())} points agree on a pose, {MIN_POINTS} are needed"
             result = PnPResult(None, math.inf, no_inliers, reason)
         else:
-            T, error, covariance = _concluded(
+            T, error, covariance = _fit_inliers(
                 centred[agree], rays[agree], ray_whitening[agree], to_px, *pose, size, centre
             )
             result = PnPResult(T, error, agree, "", covariance)
@@ -207,7 +207,7 @@ def _solve(
 
 
 @compiled()
-def _concluded(
+def _fit_inliers(
     object_points: ObjectPoints,
     rays: Rays,
     whitening: Whitenings,
@@ -275,7 +275,7 @@ class _Starts:
     def without(self, left_out: int) -> Float[np.ndarray, "s 6"]:
         """Return SQPnP's poses (rotation vector, translation) for all omissions, or NaN."""
         while len(self._steps) <= left_out:
-            kept = _kept(len(self.rays), len(self._steps))
+            kept = _selections(len(self.rays), len(self._steps))
             steps = np.full((len(kept), 6), np.nan)
             for step, rows in zip(steps, kept, strict=True):
                 with suppress(cv2.error):  # OpenCV 5 raises on coincident points
@@ -293,7 +293,7 @@ class _Starts:
 
 
 @cache
-def _kept(count: int, left_out: int) -> list[NDArray[np.intp]]:
+def _selections(count: int, left_out: int) -> list[NDArray[np.intp]]:
     """Return all selections of rows that omit ``left_out`` rows."""
     return [np.array(rows) for rows in combinations(range(count), count - left_out)][::-1]
 
@@ -308,14 +308,14 @@ def _best_pose(
     agree = np.zeros(count, bool)
     for left_out in range(min(MAX_LEFT_OUT, count - MIN_POINTS) + 1):
         poses = starts.without(left_out)
-        cost = _improved(points, rays, whitening, poses, normal, is_plate, R, t, cost, agree)
+        cost = _improve(points, rays, whitening, poses, normal, is_plate, R, t, cost, agree)
         if cost < math.inf and agree.sum() >= count - left_out:
             break
     return (None if cost == math.inf else (R, t)), agree
 
 
 @compiled()
-def _improved(
+def _improve(
     object_points: ObjectPoints,
     rays: Rays,
     whitening: Whitenings,

@@ -53,7 +53,7 @@ def symmetry_group(
         group = np.concatenate([group, np.asarray(discrete, np.float64)])
     if not continuous:
         return group
-    axes = np.array([_unit(axis) for axis, _ in continuous])
+    axes = np.array([_normalise(axis) for axis, _ in continuous])
     offset = np.array(continuous[0][1], np.float64)
     if np.linalg.norm(np.cross(axes[0], axes), axis=1).max() > _PARALLEL:
         return rotations_about(offset, _ball_rotations(max(2 * max_step, BALL_STEP)))
@@ -63,7 +63,7 @@ def symmetry_group(
     return np.asarray((about_axis[None] @ group[:, None]).reshape(-1, 4, 4))
 
 
-def _unit(axis: Sequence[float]) -> Vector:
+def _normalise(axis: Sequence[float]) -> Vector:
     """Return an axis normalised to length 1."""
     length = float(np.linalg.norm(axis))
     if not 0 < length < math.inf:

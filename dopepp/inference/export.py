@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
 from dopepp.core.errors import UserError, require
-from dopepp.core.files import write_whole
+from dopepp.core.files import write_file
 from dopepp.inference.runtimes import INPUT, OUTPUTS, Export, Pixels, described, pack
 from dopepp.inference.runtimes.openvino import NAME, load_openvino
 from dopepp.models.checkpoint import KEY, SUFFIX, Checkpoint, write_content
@@ -103,7 +103,7 @@ def to_onnx(network: PoseNetwork, precision: str, images: Sequence[Pixels]) -> S
     def save(path: Path, checkpoint: Checkpoint, export: Export) -> None:
         del model.metadata_props[:]
         model.metadata_props.add(key=KEY, value=pack(checkpoint, export))
-        write_whole(path, model.SerializeToString())
+        write_file(path, model.SerializeToString())
 
     return save
 

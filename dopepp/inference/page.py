@@ -24,7 +24,7 @@ from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_whole
+from dopepp.core.files import write_file
 from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import RGBImage, read_photo
 from dopepp.drawing.sheet import belief_tiles, contact_sheet
@@ -197,7 +197,7 @@ def _outputs(
         min_score=estimator.min_score,
     )
     file = Path(mkdtemp(dir=folder), f"{path.stem}.json")
-    write_whole(file, json.dumps(result.records(), ensure_ascii=False, indent=1).encode())
+    write_file(file, json.dumps(result.records(), ensure_ascii=False, indent=1).encode())
     rows: list[list[object]] = []
     for detection in detections:
         position = [f"{mm:.1f}" for mm in 1000 * detection.T_cam_obj[:3, 3]]

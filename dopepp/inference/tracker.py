@@ -29,7 +29,7 @@ from dopepp.geometry.camera import (
     CameraMatrix,
     Step,
     Transform,
-    moved,
+    move_pose,
     project_keypoints,
     step_between,
     transform,
@@ -103,7 +103,7 @@ class Motion:
         step[:6, 6:] = step[6:, 6:] = PERSISTENCE * np.eye(6)
         added = np.kron([[1.0, 1.0], [1.0, 1.0]], np.diag(self._velocity_change(sudden) ** 2))
         return Motion(
-            moved(self.T_cam_obj, PERSISTENCE * self.velocity),
+            move_pose(self.T_cam_obj, PERSISTENCE * self.velocity),
             PERSISTENCE * self.velocity,
             step @ self.covariance @ step.T + added,
             self.correction,

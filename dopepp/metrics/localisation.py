@@ -29,7 +29,7 @@ from dopepp.metrics.functional import (
     mssd,
     vsd,
 )
-from dopepp.metrics.pose import PredictedPose, TruePose, counted
+from dopepp.metrics.pose import PredictedPose, TruePose, is_evaluated
 from dopepp.metrics.row import bop_points, symmetry_transforms
 from dopepp.parts.part import Part
 
@@ -97,7 +97,7 @@ class Localisation:
     ) -> None:
         """Add the detections and ground truth of one image, with its measured depth in metres."""
         for part in self._parts.values():
-            true = [i.T_cam_obj for i in instances if i.label == part.name and counted(i)]
+            true = [i.T_cam_obj for i in instances if i.label == part.name and is_evaluated(i)]
             candidates = (d for d in detections if d.object == part.name)
             ranked = sorted(candidates, key=lambda detection: -detection.score)
             estimated = [detection.T_cam_obj for detection in ranked[: len(true)]]

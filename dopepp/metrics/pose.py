@@ -120,7 +120,7 @@ def assign(
     offsets = np.reshape(predicted, (-1, 1, 3)) - np.reshape(true, (1, -1, 3))
     distances = torch.from_numpy(np.linalg.norm(offsets, axis=2))
     scores = torch.tensor([float(d.score) for d in detections], dtype=torch.float64)
-    counts = np.array([counted(i) for i in instances], bool)
+    counts = np.array([is_evaluated(i) for i in instances], bool)
     assigned = np.full(len(detections), -1)
     for group in (counts, ~counts):
         left, numbers = np.flatnonzero(assigned < 0), np.flatnonzero(group)
@@ -130,7 +130,7 @@ def assign(
     return assigned
 
 
-def counted(instance: TruePose) -> bool:
+def is_evaluated(instance: TruePose) -> bool:
     """Return whether an instance is a target or, without a list of targets, visible enough."""
     if instance.wanted is not None:
         return instance.wanted
@@ -215,7 +215,7 @@ class PoseMetrics(Metric):
                     table[number, _SCORE] = detection.score
                     if detection.covariance is not None:
                         table[number, _COVARIANCE] = np.ravel(detection.covariance)
-            self._keep(self.poses, table[[counted(instance) for instance in true]])
+            self._keep(self.poses, table[[is_evaluated(instance) for instance in true]])
             strays = [(index, candidates[k].score) for k in np.flatnonzero(assigned < 0)]
             self._keep(self.false_positives, np.array(strays, np.float64))
 

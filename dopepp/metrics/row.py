@@ -219,9 +219,9 @@ class Column:
 
     def text(self, row: PoseRow) -> str:
         """Return the cell of a row."""
-        return self.shown(getattr(row, self.field))
+        return self.format(getattr(row, self.field))
 
-    def shown(self, value: float | None, *, signed: bool = False) -> str:
+    def format(self, value: float | None, *, signed: bool = False) -> str:
         """Return a value in the displayed unit, or ``n/a`` for None."""
         if value is None:
             return NOT_AVAILABLE

@@ -314,12 +314,12 @@ def write_content(content: Mapping[str, Any], path: Path, half: bool = True) -> 
     weights = content["state_dict"]
     if half:
         weights = {name: _half(name, value) for name, value in weights.items()}
-    write_safetensors(path, weights, {KEY: packed(content[KEY])})
+    write_safetensors(path, weights, {KEY: payload_json(content[KEY])})
 
 
-def packed(payload: Mapping[str, Any]) -> str:
+def payload_json(payload: Mapping[str, Any]) -> str:
     """Return a payload as one line of JSON, without folders of this machine."""
-    return json.dumps(_portable(payload), allow_nan=False)
+    return json.dumps(_without_folders(payload), allow_nan=False)
 
 
 def _half(name: str, value: Tensor) -> Tensor:
@@ -334,12 +334,12 @@ def _half(name: str, value: Tensor) -> Tensor:
     return half
 
 
-def _portable(value: Any, key: str = "") -> Any:
+def _without_folders(value: Any, key: str = "") -> Any:
     """Return a payload without folders, and with the names of files instead of their paths."""
     if isinstance(value, Mapping):
-        return {name: _portable(item, name) for name, item in value.items()}
+        return {name: _without_folders(item, name) for name, item in value.items()}
     if isinstance(value, list):
-        return [_portable(item, key) for item in value]
+        return [_without_folders(item, key) for item in value]
     if not isinstance(value, str):
         return value
     if key in _FOLDER_KEYS and ("/" in value or "\\" in value):

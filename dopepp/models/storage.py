@@ -23,7 +23,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import partial_path, read_limited, write_whole
+from dopepp.core.files import partial_path, read_limited, write_file
 from dopepp.core.json import parse_json
 
 MAX_BYTES: Final = 4 * 2**30  # Six times the checkpoint of the full DOPE with Adam's moments
@@ -320,7 +320,7 @@ def write_safetensors(
     plain = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     content = save(plain, dict(metadata))
     _header(content)
-    write_whole(path, content)
+    write_file(path, content)
 
 
 def _header(content: bytes) -> bytes:

@@ -71,20 +71,20 @@ class Muon(AdamW):
         state["step"] += 1
         beta = group["betas"][0]
         momentum = state["exp_avg"].lerp_(gradient, 1 - beta)
-        direction = orthogonalised(gradient.lerp(momentum, beta).flatten(1))
+        direction = orthogonalise(gradient.lerp(momentum, beta).flatten(1))
         size = _RMS * max(direction.shape) ** 0.5
         weight.mul_(1 - group["lr"] * group["weight_decay"])
         weight.sub_(direction.view_as(weight), alpha=group["lr"] * size)
 
 
-def orthogonalised(matrix: Float[Tensor, "m n"]) -> Float[Tensor, "m n"]:
+def orthogonalise(matrix: Float[Tensor, "m n"]) -> Float[Tensor, "m n"]:
     """Return approximately U·Vᵀ of a matrix U·S·Vᵀ, with singular values of 0.7–1.2.
 
     All rounds are polynomials of the small Gram matrix; only the first and the last product use the
     matrix itself.
     """
     if matrix.shape[0] > matrix.shape[1]:
-        return orthogonalised(matrix.T).T
+        return orthogonalise(matrix.T).T
     matrix = matrix / (matrix.norm() + 1e-12)
     gram = matrix @ matrix.T
     factor = whole = _polynomial(gram)

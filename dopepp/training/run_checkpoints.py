@@ -135,8 +135,8 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         loaded: Mapping[str, Any] = super().load_checkpoint(path, map_location, weights_only=True)
         if self._folder is None:
             return dict(loaded)
-        states = loaded.get("callbacks", {})
-        callbacks = {name: _moved(state, self._folder / FOLDER) for name, state in states.items()}
+        states, folder = loaded.get("callbacks", {}), self._folder / FOLDER
+        callbacks = {name: _move_paths(state, folder) for name, state in states.items()}
         return {**loaded, "callbacks": callbacks}
 
 
@@ -152,7 +152,7 @@ def newest_checkpoint(run_dir: Path) -> tuple[Path, Checkpoint] | None:
     paths = [run_dir / FOLDER / name for name in (LAST, PREVIOUS, BEST)]
     for path in filter(Path.exists, paths):
         try:
-            checkpoint, step = _read_whole(path)
+            checkpoint, step = _read_intact(path)
         except UserError as error:
             damaged.append(path.name)
             _log.warning("ignoring %s", error.got)
@@ -214,7 +214,7 @@ def sweep(run_dir: Path) -> None:
                 path.unlink(missing_ok=True)
 
 
-def _read_whole(path: Path) -> tuple[Checkpoint, int]:
+def _read_intact(path: Path) -> tuple[Checkpoint, int]:
     """Read a checkpoint and verify its checksums, which torch ignores."""
     checkpoint = read(path)
     with zipfile.ZipFile(path) as archive:
@@ -239,7 +239,7 @@ def _copy(value: Any) -> Any:
     return [_copy(item) for item in value] if isinstance(value, list) else value
 
 
-def _moved(state: Any, folder: Path) -> Any:
+def _move_paths(state: Any, folder: Path) -> Any:
     """Return a callback's state, with the files of a ``ModelCheckpoint`` moved to a folder."""
     if not isinstance(state, dict) or "dirpath" not in state:
         return state

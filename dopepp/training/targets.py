@@ -218,7 +218,7 @@ def _symmetry_row(part: Part) -> dict[str, np.ndarray]:
         # A ball has further axes, but its maps are round for any choice.
         axis, offset = map(np.array, part.symmetries_continuous[0])
         axis = axis / np.linalg.norm(axis)
-        reference = _between(FACING @ axis, UP) @ FACING
+        reference = _rotation_between(FACING @ axis, UP) @ FACING
         fixed = offset + axis * (axis @ (fixed - offset))
     return {
         "transforms": transforms,
@@ -231,7 +231,7 @@ def _symmetry_row(part: Part) -> dict[str, np.ndarray]:
     }
 
 
-def _between(start: np.ndarray, end: np.ndarray) -> Float[np.ndarray, "3 3"]:
+def _rotation_between(start: np.ndarray, end: np.ndarray) -> Float[np.ndarray, "3 3"]:
     """Return the smallest rotation of one unit vector to another."""
     across = np.cross(start, end)
     sine, cosine = np.linalg.norm(across), start @ end

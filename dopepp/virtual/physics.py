@@ -21,7 +21,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import cache_folder, write_whole
+from dopepp.core.files import cache_folder, write_file
 from dopepp.geometry.camera import make_transform, transform
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.parts.convex import Piece, hull_faces
@@ -98,7 +98,7 @@ def settle(
         poses = np.empty((0, 4, 4)) if settled is None else settled
         content = io.BytesIO()
         np.save(content, poses, allow_pickle=False)
-        write_whole(path, content.getvalue())
+        write_file(path, content.getvalue())
     return poses if len(poses) == len(starts) else None
 
 

@@ -13,9 +13,9 @@ from dopepp.core.files import (
     IMAGES,
     check_target,
     read_limited,
+    write_file,
     write_image,
     write_png,
-    write_whole,
 )
 
 
@@ -46,14 +46,14 @@ def test_a_file_is_read_up_to_a_limit(tmp_path):
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
     path = tmp_path / "a.csv"
-    write_whole(path, b"old")
+    write_file(path, b"old")
 
     def full(*_: object) -> None:
         raise OSError("No space left on device")
 
     monkeypatch.setattr(Path, "replace", full)
     with pytest.raises(OSError, match="No space left"):
-        write_whole(path, b"new")
+        write_file(path, b"new")
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 

@@ -16,7 +16,7 @@ from dopepp.geometry.camera import (
     check_camera,
     invert_transform,
     make_transform,
-    moved,
+    move_pose,
     project,
     resize_camera,
     resize_points,
@@ -197,4 +197,4 @@ def test_the_step_between_two_poses_moves_the_first_to_the_second():
         turn = Rotation.from_matrix(after[:3, :3]) * Rotation.from_matrix(before[:3, :3]).inv()
         assert_allclose(step[:3], turn.as_rotvec(), atol=1e-9)
         assert_allclose(step[3:], after[:3, 3] - before[:3, 3])
-        assert_allclose(moved(before, step), after, atol=1e-12)
+        assert_allclose(move_pose(before, step), after, atol=1e-12)

@@ -12,7 +12,7 @@ from dopepp.geometry.camera import (
     camera_matrix,
     invert_transform,
     make_transform,
-    moved,
+    move_pose,
     transform,
 )
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
@@ -78,7 +78,7 @@ def test_the_error_of_points_is_that_of_drawn_poses(mesh):
     rng = np.random.default_rng(0)
     spread = rng.normal(size=(6, 6)) * np.repeat([0.01, 0.001], 3)[:, None]
     covariance, pose = spread @ spread.T, make_transform(random_rotation(rng), rng.normal(size=3))
-    draws = [moved(pose, spread @ rng.normal(size=6)) for _ in range(4000)]
+    draws = [move_pose(pose, spread @ rng.normal(size=6)) for _ in range(4000)]
     at = transform(pose, mesh.vertices)
     squares = [((transform(draw, mesh.vertices) - at) ** 2).sum(axis=1).mean() for draw in draws]
     assert point_error(mesh, pose, covariance) == pytest.approx(

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 
 from dopepp import PoseEstimator
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import invert_transform, make_transform, moved, resize_camera
+from dopepp.geometry.camera import invert_transform, make_transform, move_pose, resize_camera
 from dopepp.geometry.camera_file import Camera
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
 from dopepp.parts.catalogue import pivconnector
@@ -198,7 +198,7 @@ def test_a_detection_that_the_image_did_not_refine_does_not_veto_the_others(
         if len(calls) < 2:
             return detections
         covariance = np.diag(np.repeat([math.radians(5.0), 0.005], 3) ** 2)
-        wrong = moved(detections[0].T_cam_obj, np.array([0.0, 0.0, 0.0, 0.04, 0.0, 0.0]))  # 8 σ
+        wrong = move_pose(detections[0].T_cam_obj, np.array([0.0, 0.0, 0.0, 0.04, 0.0, 0.0]))  # 8 σ
         unrefined = {"covariance": covariance, "start": (wrong, covariance), "probability": 0.05}
         return [
             replace(

@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import make_transform, moved, project_keypoints, step_between
+from dopepp.geometry.camera import make_transform, move_pose, project_keypoints, step_between
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.tracker import (
@@ -268,7 +268,7 @@ def filtered(motion: Motion, T: np.ndarray) -> Motion:
     prior, own = np.linalg.inv(motion.pose_covariance), np.diag(1 / NOISE**2)
     covariance = np.linalg.inv(prior + own)
     step = covariance @ own @ step_between(motion.T_cam_obj, T)
-    return motion.update(moved(motion.T_cam_obj, step), covariance)
+    return motion.update(move_pose(motion.T_cam_obj, step), covariance)
 
 
 def test_what_a_frame_says_is_kalmans_update() -> None:
@@ -276,7 +276,7 @@ def test_what_a_frame_says_is_kalmans_update() -> None:
     root = rng.normal(size=(12, 12)) * np.tile(NOISE, 2)[:, None]
     forecast = Motion(START, rng.normal(size=6) * 0.01, root @ root.T, np.zeros(6))
     measured = rng.normal(size=6) * 1e-4  # small, so that turns add up
-    result = filtered(forecast, moved(START, measured))
+    result = filtered(forecast, move_pose(START, measured))
     H = np.eye(6, 12)
     P, R = forecast.covariance, np.diag(NOISE**2)
     gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
@@ -290,9 +290,9 @@ def test_a_filter_foresees_a_steady_motion() -> None:
     step = np.array([0, math.radians(6), 0, 0.01, 0, 0])
     motion, T = at_rest(START, np.diag(NOISE**2)), START
     for _ in range(15):
-        T = moved(T, step)
+        T = move_pose(T, step)
         motion = filtered(motion.predict(), T)
-    miss = step_between(motion.predict().T_cam_obj, moved(T, step))
+    miss = step_between(motion.predict().T_cam_obj, move_pose(T, step))
     assert np.abs(miss[:3]).max() < math.radians(0.5)
     assert np.abs(miss[3:]).max() < 0.001
 
@@ -301,7 +301,7 @@ def test_a_part_at_rest_trembles_less_than_what_is_seen_of_it() -> None:
     rng = np.random.default_rng(1)
     motion, steps = at_rest(START, np.diag(NOISE**2)), []
     for _ in range(80):
-        after = filtered(motion.predict(), moved(START, rng.normal(size=6) * NOISE))
+        after = filtered(motion.predict(), move_pose(START, rng.normal(size=6) * NOISE))
         steps.append(step_between(motion.T_cam_obj, after.T_cam_obj))
         motion = after
     trembling = np.sqrt(np.mean(np.square(steps[20:]), axis=0) / 2)

@@ -18,7 +18,7 @@ from scipy.stats import chi2
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance
-from dopepp.geometry.camera import make_transform, moved
+from dopepp.geometry.camera import make_transform, move_pose
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.metrics.functional import add, add_s, auc, mspd, mssd, pass_rate, rotation_error_deg
 from dopepp.metrics.pose import MEAN, PoseMetrics
@@ -53,7 +53,7 @@ def test_errors_are_compared_with_estimated_covariances():
     metric = PoseMetrics([replace(part("box"), symmetries_discrete=flip[None])])
     for number in range(1500):
         T = pose(0, tuple(rng.normal(size=3)))
-        estimate = moved(T, 3 * deviation * rng.normal(size=6))
+        estimate = move_pose(T, 3 * deviation * rng.normal(size=6))
         estimate = estimate @ flip if number % 2 else estimate
         metric.update([Detection("box", 1, estimate, np.diag(deviation**2))], [truth("box", T)])
     assert metric.compute()["box"].median_deviations == pytest.approx(3, rel=0.05)

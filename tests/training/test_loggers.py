@@ -35,7 +35,7 @@ def test_a_failing_write_keeps_the_old_file_and_the_rows(tmp_path, monkeypatch, 
         raise OSError("no space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("dopepp.core.files.write_whole", full)
+        patch.setattr("dopepp.core.files.write_file", full)
         with pytest.raises(OSError, match="no space"):
             table.write()
         table.save()

@@ -8,7 +8,7 @@ from hypothesis import given
 from torch import nn
 from torch.optim.lr_scheduler import OneCycleLR
 
-from dopepp.training.optimizers import Muon, orthogonalised
+from dopepp.training.optimizers import Muon, orthogonalise
 
 
 def step(optimizer, parameters, gradients):
@@ -21,7 +21,7 @@ def step(optimizer, parameters, gradients):
 def test_singular_values_become_nearly_one_and_directions_remain(rows, columns, seed):
     matrix = np.random.default_rng(seed).normal(size=(rows, columns))
     U, S, Vt = np.linalg.svd(matrix, full_matrices=False)
-    result = orthogonalised(torch.tensor(matrix)).numpy()
+    result = orthogonalise(torch.tensor(matrix)).numpy()
     inside = U.T @ result @ Vt.T
     kept = np.diag(inside)[S / np.linalg.norm(S) > 0.002]
     assert ((kept > 0.65) & (kept < 1.25)).all()
@@ -30,7 +30,7 @@ def test_singular_values_become_nearly_one_and_directions_remain(rows, columns, 
 
 
 def test_a_matrix_of_zeros_takes_no_step():
-    assert not orthogonalised(torch.zeros(3, 5)).any()
+    assert not orthogonalise(torch.zeros(3, 5)).any()
 
 
 def test_a_step_is_as_large_as_that_of_adamw():

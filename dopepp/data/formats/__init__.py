@@ -21,7 +21,7 @@ from typing import Any, Final, Protocol, TypeVar
 import numpy as np
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_whole
+from dopepp.core.files import write_file
 from dopepp.core.json import MAX_BYTES, read_json
 from dopepp.data.sample import Instance, Sample, hull_areas
 from dopepp.drawing.pictures import Mask, Shape
@@ -138,7 +138,7 @@ def encode_by_key(content: Mapping[str, object]) -> bytes:
 
 def stage(path: Path, content: bytes) -> None:
     """Write an item to the staging folder; retry if another process removes the folder."""
-    _retry(lambda: write_whole(path, content))
+    _retry(lambda: write_file(path, content))
 
 
 def staged_items(staging: Path, suffix: str) -> list[Path]:

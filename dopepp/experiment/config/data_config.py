@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 from dopepp.core.errors import UserError
-from dopepp.core.validation import STRICT, Range, parse, shown
+from dopepp.core.validation import STRICT, Range, parse, short_repr
 from dopepp.data.rendered import MAX_ITEMS, Split
 from dopepp.geometry.camera import camera_matrix
 from dopepp.virtual.presets import Preset, preset_of, written_out
@@ -213,7 +213,7 @@ class DataConfig:
             UserError: An option is unknown, missing, of a wrong type or out of range.
         """
         if isinstance(data, Mapping) and "virtual" in data:
-            problem = f"data.virtual={shown(data['virtual'])}"
+            problem = f"data.virtual={short_repr(data['virtual'])}"
             raise UserError(problem, "virtual.…", "write virtual.… instead of data.virtual.…")
         parsed = replace(parse(cls, data, "data"), virtual=VirtualConfig.of(virtual))
         _ = parsed.preset  # raises for a wrong field before anything is rendered

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar, get_args
 import torch
 
 from dopepp.core.errors import UserError
-from dopepp.core.validation import STRICT, Range, check, parse, shown
+from dopepp.core.validation import STRICT, Range, check, parse, short_repr
 from dopepp.experiment.config.data_config import Count, DataConfig, Node, Seed, Share, with_files
 from dopepp.models.layers import MAX_WIDTH, MIN_WIDTH
 from dopepp.training.targets import SymmetryOptions
@@ -431,7 +431,7 @@ def _parsed(kind: type[C], options: Mapping[str, Any]) -> C:
     """Parse a whole config."""
     if "plain" in options:
         raise UserError(
-            f"plain={shown(options['plain'])}", "the options of `--cfg job`", "leave out plain"
+            f"plain={short_repr(options['plain'])}", "the options of `--cfg job`", "leave out plain"
         )
     return replace(parse(kind, options), plain=options)
 

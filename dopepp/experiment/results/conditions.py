@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_csv, write_png, write_whole
+from dopepp.core.files import write_csv, write_file, write_png
 from dopepp.data.sample import Sample, SampleSource
 from dopepp.data.transforms.shading_protocol import TOLERANCE, Shaded, shade
 from dopepp.drawing.curves import figure_image, rates_figure
@@ -211,7 +211,7 @@ def record_condition(
     write_csv(path.with_suffix(".csv"), pivot(values, (*_LABELS, "condition"), recorded))
     sections = [f"## {title}\n\n{markdown(table)}" for title, table in tables.items()]
     text = "\n".join([f"{condition.introduction}\n", *(f"{line}\n" for line in notes), *sections])
-    write_whole(path, text.encode())
+    write_file(path, text.encode())
     panels = {}  # one panel per object and rate, with one curve per method
     for name in dict.fromkeys(value.object for value in values if value.object != MEAN):
         for rate in rates:

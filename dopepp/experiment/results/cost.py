@@ -24,7 +24,7 @@ import torch
 from jaxtyping import UInt8
 from torch import nn
 
-from dopepp.core.files import write_png, write_whole
+from dopepp.core.files import write_file, write_png
 from dopepp.data.batch import collate
 from dopepp.data.sample import Sample, pad_sample, resize_sample
 from dopepp.drawing.curves import PlotLine, figure_image, lines_figure
@@ -166,7 +166,7 @@ def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
     write_config(run_dir, config.plain)
     write_json(run_dir / COST_FILE, asdict(cost))
     write_json(run_dir / VERSIONS_FILE, environment(config.seed, ""))
-    write_whole(run_dir / FRAMES_FILE, frames.to_csv(float_format="%.6f").encode())
+    write_file(run_dir / FRAMES_FILE, frames.to_csv(float_format="%.6f").encode())
     save_frame_rates(run_dir / "frame_rate.png", {cost.name: frames})
     write_run_readme(run_dir, f"Cost of {cost.name}")
     display.show_table(

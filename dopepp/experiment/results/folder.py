@@ -19,7 +19,7 @@ import yaml
 
 import dopepp
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_whole
+from dopepp.core.files import write_file
 from dopepp.core.json import read_json as read_strict_json
 from dopepp.core.pool import cpu_fact
 from dopepp.experiment import program
@@ -49,12 +49,12 @@ _MAX_UNTRACKED: Final = 100
 def write_config(run_dir: Path, config: Mapping[str, Any]) -> None:
     """Write the resolved config."""
     text = yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True)
-    write_whole(run_dir / CONFIG_FILE, text.encode())
+    write_file(run_dir / CONFIG_FILE, text.encode())
 
 
 def write_json(path: Path, record: Mapping[str, Any]) -> None:
     """Write a record as JSON atomically; non-finite numbers are an error."""
-    write_whole(path, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())
+    write_file(path, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -99,7 +99,7 @@ def write_environment(
         present["git"]["diff_sha256"] = digest
         if len(diff) <= _MAX_DIFF_BYTES:
             present["git"]["diff"] = f"{DIFFERENCE}{digest[:8]}.diff"
-            write_whole(run_dir / present["git"]["diff"], diff)
+            write_file(run_dir / present["git"]["diff"], diff)
     write_json(path, {**present, "changes": list(changes), "earlier": earlier})
 
 

@@ -155,7 +155,7 @@ class Value(NamedTuple):
 
     def _shown(self, value: float) -> str:
         """Return a number in the unit and format of its column."""
-        return self.column.shown(None if math.isnan(value) else value, signed=self.is_change)
+        return self.column.format(None if math.isnan(value) else value, signed=self.is_change)
 
 
 def make_frame(values: Iterable[Value]) -> pd.DataFrame:

@@ -20,7 +20,7 @@ from typing import Any, Final
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_whole
+from dopepp.core.files import write_file
 from dopepp.experiment import program
 from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.results.false_alarms import alarm_rows
@@ -109,7 +109,7 @@ def _templates() -> Environment:
 def write_page(path: Path, template: str, **content: object) -> None:
     """Render ``templates/TEMPLATE.md.j2`` with the content and write the page."""
     text = _templates().get_template(f"{template}.md.j2").render(content)
-    write_whole(path, text.encode())
+    write_file(path, text.encode())
 
 
 class RunReadme:

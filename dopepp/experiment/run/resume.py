@@ -24,7 +24,7 @@ import yaml
 from hydra.core.hydra_config import HydraConfig
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_whole
+from dopepp.core.files import write_file
 from dopepp.core.yaml import read_yaml
 from dopepp.data.sample import DescribedSource, Sample
 from dopepp.experiment.assembly.build_sources import held_out_source
@@ -195,7 +195,7 @@ def remember_overrides(run: Path) -> None:
         return
     overrides = [str(text) for text in HydraConfig.get().overrides.task]
     write_json(run / OVERRIDES_FILE, {"overrides": overrides})
-    write_whole(run / OVERRIDES, yaml.safe_dump(overrides).encode())
+    write_file(run / OVERRIDES, yaml.safe_dump(overrides).encode())
 
 
 def _task(hydra: object) -> object:

@@ -44,7 +44,7 @@ from dopepp.metrics.functional import (
     expected_calibration_error,
     mahalanobis,
 )
-from dopepp.metrics.pose import assign, counted
+from dopepp.metrics.pose import assign, is_evaluated
 from dopepp.metrics.row import symmetry_transforms
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.heads import Stage
@@ -412,7 +412,7 @@ def score_images(estimator: PoseEstimator, parts: Parts, *sources: SampleSource)
     num_instances, kinds = 0, {}
     for number, sample, part, detections, true in _by_object(estimator, parts, *sources):
         kinds[number] = sample.source
-        num_instances += sum(map(counted, true))
+        num_instances += sum(map(is_evaluated, true))
         right, judged = _judge(part, detections, true)
         for detection, is_right in zip(compress(detections, judged), right[judged], strict=True):
             if refined:
@@ -453,7 +453,7 @@ def matched_poses(
         if only_right:
             chosen, _ = _judge(part, detections, instances)
         for detection, number, is_chosen in zip(detections, numbers, chosen, strict=True):
-            if number >= 0 and counted(instances[number]) and is_chosen:
+            if number >= 0 and is_evaluated(instances[number]) and is_chosen:
                 matches.append((detection, instances[number].T_cam_obj @ group))
     return matches
 
@@ -489,7 +489,7 @@ def _judge(
     As in every evaluation, detections of heavily occluded instances do not count.
     """
     numbers = assign(part, detections, true)
-    counts = np.array([number < 0 or counted(true[number]) for number in numbers], bool)
+    counts = np.array([number < 0 or is_evaluated(true[number]) for number in numbers], bool)
     matched = np.flatnonzero(counts & (numbers >= 0)).tolist()
     right = np.zeros(len(detections), bool)
     if matched:

@@ -23,7 +23,7 @@ from typing import Any, Final
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from dopepp.core.files import write_whole
+from dopepp.core.files import write_file
 from dopepp.core.yaml import read_yaml
 from dopepp.experiment import program
 
@@ -183,7 +183,7 @@ def record_run(command: Sequence[str], run_dir: Path) -> None:
     """Store the run folder of this SLURM job and command; do nothing outside SLURM."""
     note = _note(command)
     if note is not None:
-        write_whole(note, f"{run_dir.absolute()}\n".encode())
+        write_file(note, f"{run_dir.absolute()}\n".encode())
 
 
 def requeued_run(command: Sequence[str]) -> Path | None:

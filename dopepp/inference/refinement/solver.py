@@ -13,7 +13,7 @@ from typing import Final, Protocol
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.geometry.camera import Transform, moved, step_between
+from dopepp.geometry.camera import Transform, move_pose, step_between
 from dopepp.geometry.refine import solve_damped
 
 PoseMatrix = Float[np.ndarray, "6 6"]
@@ -88,7 +88,7 @@ class Prior:
         """
         deviations = spread * np.linalg.cholesky(np.linalg.inv(self.information))
         draws = np.random.default_rng(0).normal(size=(count, 6))
-        return [moved(self.T_cam_obj, deviations @ draw) for draw in draws]
+        return [move_pose(self.T_cam_obj, deviations @ draw) for draw in draws]
 
 
 def make_prior(
@@ -156,7 +156,7 @@ def descend(
             last.append(equations)
             information, gradient = information + equations[0], gradient + equations[1]
         solve_damped(information, -gradient, DAMPING, step)
-        pose = moved(pose, step)
+        pose = move_pose(pose, step)
         if step @ information @ step < ARRIVED**2:
             break
     return Solution(pose, information, [(H, g - H @ step) for H, g in last])

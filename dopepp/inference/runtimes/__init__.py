@@ -23,7 +23,7 @@ from dopepp.core.files import read_limited
 from dopepp.core.json import parse_json
 from dopepp.core.validation import STRICT, Range, check, parse
 from dopepp.geometry.cuboid import NUM_CORNERS, NUM_KEYPOINTS
-from dopepp.models.checkpoint import KEY, Checkpoint, load_network, packed, parse_description
+from dopepp.models.checkpoint import KEY, Checkpoint, load_network, parse_description, payload_json
 from dopepp.models.heads import Stage
 from dopepp.models.network import Images, PoseNetwork, check_spec
 from dopepp.models.storage import MAX_HEADER_BYTES
@@ -200,7 +200,7 @@ def invalid_export(path: Path, problem: object, allowed: str = "") -> UserError:
 
 def pack(checkpoint: Checkpoint, export: Export) -> str:
     """Return the description for a file's metadata."""
-    return packed(described(checkpoint, export)[KEY])
+    return payload_json(described(checkpoint, export)[KEY])
 
 
 def described(checkpoint: Checkpoint, export: Export) -> dict[str, Any]:

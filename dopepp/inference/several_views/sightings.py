@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.geometry.camera import Transform, moved, transform
+from dopepp.geometry.camera import Transform, move_pose, transform
 from dopepp.geometry.cuboid import Cuboid
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.refinement.joint_refinement import PosedImage
@@ -62,7 +62,7 @@ class PartGeometry:
         for pose in poses:
             information = information + pose.information
             gradient += pose.information @ self.nearest(pose, first).offset(first)
-        return Prior(moved(first, np.linalg.solve(information, gradient)), information)
+        return Prior(move_pose(first, np.linalg.solve(information, gradient)), information)
 
 
 @dataclass(frozen=True, eq=False)

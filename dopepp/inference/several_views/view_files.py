@@ -24,7 +24,7 @@ import numpy as np
 from dopepp.core.errors import UserError
 from dopepp.core.files import read_limited
 from dopepp.core.json import read_json
-from dopepp.core.validation import Range, check, shown
+from dopepp.core.validation import Range, check, short_repr
 from dopepp.core.yaml import read_yaml
 from dopepp.geometry.camera import Transform, invert_transform, make_transform
 from dopepp.geometry.camera_file import Camera, camera_of_fields, camera_of_text, read_camera
@@ -127,7 +127,7 @@ def transform_of(value: object, where: str) -> Transform:
         UserError: The value has none of these forms, or is not a rigid transform.
     """
     fields = value if isinstance(value, Mapping) else {}
-    problem = f"{where}={shown(value)}"
+    problem = f"{where}={short_repr(value)}"
     try:
         if "matrix" in fields:
             T = np.array(fields["matrix"], np.float64).reshape(4, 4)

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import cache_folder, write_whole
+from dopepp.core.files import cache_folder, write_file
 from dopepp.core.json import read_json
 from dopepp.drawing.pictures import RGBImage, read_rgb
 from dopepp.geometry.camera import CameraMatrix, camera_matrix
@@ -65,7 +65,7 @@ def background_log_odds(
     level = max(LOWEST, float(np.mean(levels) + MARGIN * np.std(levels)))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, json.dumps(level).encode())
+        write_file(path, json.dumps(level).encode())
     except OSError as error:
         logger.warning("%s: cannot cache the measured level: %s", part.name, error)
     return level

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull
 
 from dopepp.core.errors import UserError, require
-from dopepp.core.files import cache_folder, write_whole
+from dopepp.core.files import cache_folder, write_file
 from dopepp.parts.part import Mesh, Part
 
 Piece = Float[np.ndarray, "vertices 3"]
@@ -48,7 +48,7 @@ def convex_pieces(part: Part) -> tuple[Piece, ...]:
     vertices, counts = np.concatenate(pieces).astype(np.float32), [len(piece) for piece in pieces]
     content = io.BytesIO()
     np.savez_compressed(content, vertices=vertices, counts=counts)
-    write_whole(cache_folder() / "solids" / name, content.getvalue())
+    write_file(cache_folder() / "solids" / name, content.getvalue())
     return _read_pieces(cache_folder() / "solids" / name)
 
 

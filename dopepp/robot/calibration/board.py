@@ -20,7 +20,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import check_target, write_whole
+from dopepp.core.files import check_target, write_file
 from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import Transform, make_transform
 from dopepp.geometry.camera_file import Camera
@@ -137,7 +137,7 @@ class Board:
             Image.fromarray(page).save(content, "PDF", resolution=dpi)
         else:
             Image.fromarray(page).save(content, "PNG", dpi=(dpi, dpi))
-        write_whole(path, content.getvalue())
+        write_file(path, content.getvalue())
         height, width = (side / PX_PER_MM for side in page.shape)
         return f"{width:g} × {height:g} mm; print at 100 %, not fitted to the page, and measure it"
 

@@ -13,7 +13,7 @@ import yaml
 from jaxtyping import Bool, Float
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import check_target, write_whole
+from dopepp.core.files import check_target, write_file
 from dopepp.drawing.pictures import Size
 from dopepp.geometry.camera_file import Camera
 from dopepp.robot.calibration.board import MIN_POINTS, Sighting
@@ -159,7 +159,7 @@ def write_camera(path: Path, camera: Camera, trusted: bool = True) -> None:
     }
     remark = "" if trusted else "# NOT TRUSTED: written with --force; see the report\n"
     text = remark + yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
-    write_whole(path, text.encode())
+    write_file(path, text.encode())
 
 
 def _matrix(values: Float[np.ndarray, "rows columns"]) -> dict[str, object]:

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import check_target, write_whole
+from dopepp.core.files import check_target, write_file
 from dopepp.core.json import read_json
 from dopepp.core.yaml import read_yaml
 from dopepp.geometry.camera import Transform
@@ -260,7 +260,7 @@ def write_calibration(
     if findings:
         content["doubts"] = list(findings)
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True)
-    write_whole(path, text.encode())
+    write_file(path, text.encode())
 
 
 def check_trust(findings: Sequence[str], force: bool) -> None:

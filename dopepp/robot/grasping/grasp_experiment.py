@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 
 from dopepp.core.errors import RunError, UserError
-from dopepp.core.files import check_target, write_csv, write_image, write_whole
+from dopepp.core.files import check_target, write_csv, write_file, write_image
 from dopepp.core.pool import LostWorkerError, ProcessPool, available_cores
 from dopepp.core.validation import Range, check
 from dopepp.parts.catalogue import load_part
@@ -309,8 +309,8 @@ def write_report(folder: Path, records: Sequence[Record], facts: Mapping[str, An
     ]
     summaries = {name: _summary(group) for name, group in groups.items()}
     content = {**facts, "sources": summaries, "trials": trials}
-    write_whole(folder / "grasps.json", (json.dumps(content, indent=1) + "\n").encode())
-    write_whole(folder / "grasps.md", markdown(records, facts).encode())
+    write_file(folder / "grasps.json", (json.dumps(content, indent=1) + "\n").encode())
+    write_file(folder / "grasps.md", markdown(records, facts).encode())
     if any(record.off for record in records):
         from dopepp.drawing.curves import figure_image
 

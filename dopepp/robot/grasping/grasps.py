@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import check_target, write_whole
+from dopepp.core.files import check_target, write_file
 from dopepp.core.validation import STRICT, Range, parse
 from dopepp.core.yaml import read_yaml
 from dopepp.geometry.camera import Transform, make_transform
@@ -176,7 +176,7 @@ def write_grasps(path: Path, part: Part, grasps: Sequence[Grasp]) -> None:
             for name in ("point", "closing", "approach")
         )
         lines.append(f"- {{{vectors}, width: {_written(grasp.width)}}}")
-    write_whole(path, ("\n".join(lines) + "\n").encode())
+    write_file(path, ("\n".join(lines) + "\n").encode())
 
 
 def _written(value: float) -> str:

@@ -18,7 +18,7 @@ from numpy.random import Generator
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import CONF
-from dopepp.core.validation import Checked, Pair, Range, Span, parse, shown
+from dopepp.core.validation import Checked, Pair, Range, Span, parse, short_repr
 from dopepp.core.yaml import read_yaml
 from dopepp.drawing.pictures import Size
 from dopepp.geometry.camera import (
@@ -206,7 +206,7 @@ def written_out(name: str, changes: object = None) -> tuple[str, object]:
     fields: Any = read_yaml(path)
     base = fields.pop("base", None) if isinstance(fields, dict) else None
     if base not in _NAMES:
-        problem, allowed = f"{path} with base={shown(base)}", ", ".join(_NAMES)
+        problem, allowed = f"{path} with base={short_repr(base)}", ", ".join(_NAMES)
         raise UserError(
             problem, allowed, "set base to the name of the preset that the file changes"
         )

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from dopepp.core.errors import StoppedError, UserError
 from dopepp.core.files import partial_path
-from dopepp.core.pool import PickledFunction, Pool, opened
+from dopepp.core.pool import PickledFunction, Pool, unpickle_answer
 from dopepp.data.formats import RECORD_FILE
 from dopepp.data.formats.ndds.ndds_writer import NddsWriter
 from dopepp.data.render_job import WRITERS, make_job, named_part
@@ -52,7 +52,7 @@ class InlinePool(Pool):
         self._left = None if self._left is None else self._left - 1
         future: Future[object] = Future()
         try:
-            future.set_result(opened(self._function(item)))
+            future.set_result(unpickle_answer(self._function(item)))
         except Exception as error:
             future.set_exception(error)
         return future

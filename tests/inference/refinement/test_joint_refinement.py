@@ -13,7 +13,7 @@ from dopepp.geometry.camera import (
     camera_matrix,
     invert_transform,
     make_transform,
-    moved,
+    move_pose,
     project,
     step_between,
     transform,
@@ -39,7 +39,7 @@ class Keypoints:
     def __call__(self, pose, prior):
         def residuals(step):
             return (
-                (self.pixels - project(transform(moved(pose, step), POINTS), K)) / NOISE_PX
+                (self.pixels - project(transform(move_pose(pose, step), POINTS), K)) / NOISE_PX
             ).ravel()
 
         rest = residuals(np.zeros(6))
@@ -68,7 +68,7 @@ def scene(seed: int, error: np.ndarray, num_views: int = 2):
 
 
 def joint(true, views, pixels):
-    start = moved(true, np.array([0.02, -0.03, 0.01, 0.002, 0.001, -0.003]))
+    start = move_pose(true, np.array([0.02, -0.03, 0.01, 0.002, 0.001, -0.003]))
     terms = [ViewTerm(Keypoints(px), view) for px, view in zip(pixels, views, strict=True)]
     return descend(start, Prior(start, WEAK), terms, 12)
 
@@ -78,7 +78,7 @@ def by_scipy(true, views, pixels, error):
     whiten = np.linalg.inv(np.linalg.cholesky(error))
 
     def residuals(unknowns):
-        pose, rest = moved(true, unknowns[:6]), []
+        pose, rest = move_pose(true, unknowns[:6]), []
         for number, (view, px) in enumerate(zip(views, pixels, strict=True)):
             step = unknowns[6 + 6 * number : 12 + 6 * number]
             off = make_transform(rotation_vector_to_matrix(step[:3]), step[3:])
@@ -95,7 +95,7 @@ def by_scipy(true, views, pixels, error):
         residuals, np.zeros(6 + 6 * len(views)), x_scale=scale, xtol=1e-14, ftol=1e-14
     )
     covariance = np.linalg.inv(solved.jac.T @ solved.jac)[:6, :6]
-    return moved(true, solved.x[:6]), covariance
+    return move_pose(true, solved.x[:6]), covariance
 
 
 @pytest.mark.parametrize("seed", range(4))

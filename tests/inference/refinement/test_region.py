@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 from scipy import ndimage
 from scipy.stats import truncnorm
 
-from dopepp.geometry.camera import camera_matrix, make_transform, moved, project, transform
+from dopepp.geometry.camera import camera_matrix, make_transform, move_pose, project, transform
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
 from dopepp.inference.refinement.colour import colour_bins, crop_around, log_odds
 from dopepp.inference.refinement.outline import (
@@ -78,7 +78,7 @@ def picture(
 
 
 def started(seed: int, T: np.ndarray = TRUE) -> np.ndarray:
-    return moved(T, np.random.default_rng(seed).normal(size=6) * DEVIATIONS)
+    return move_pose(T, np.random.default_rng(seed).normal(size=6) * DEVIATIONS)
 
 
 def off(T: np.ndarray, true: np.ndarray = TRUE) -> tuple[float, float]:
@@ -92,7 +92,7 @@ def off(T: np.ndarray, true: np.ndarray = TRUE) -> tuple[float, float]:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_contour_is_the_border_of_the_brute_force_silhouette(part: Part, seed: int) -> None:
-    T = moved(TRUE, np.random.default_rng(seed).normal(size=6) * [1, 1, 1, 0.01, 0.01, 0.01])
+    T = move_pose(TRUE, np.random.default_rng(seed).normal(size=6) * [1, 1, 1, 0.01, 0.01, 0.01])
     mesh = make_outline_mesh(part.mesh.vertices, part.mesh.faces)
     at = posed(mesh, T, K)
     mask = filled_mask(mesh, at, SIZE)
@@ -164,7 +164,7 @@ def test_derivative_against_finite_differences(part: Part) -> None:
     points = contour.arms @ TRUE[:3, :3]
     for axis, step in enumerate(1e-6 * np.eye(6)):
         ahead, behind = (
-            project(transform(moved(TRUE, sign * step), points), K) for sign in (1, -1)
+            project(transform(move_pose(TRUE, sign * step), points), K) for sign in (1, -1)
         )
         slope = ((ahead - behind) * contour.normals).sum(axis=1) / 2e-6
         assert_allclose(rows[:, axis], slope, rtol=1e-5, atol=1e-4)
@@ -354,7 +354,7 @@ def test_distance_is_kept_where_the_scale_may_be_wrong(part: Part) -> None:
     refiner = RegionRefiner(part.mesh.vertices, part.mesh.faces)
     for log_distance, deviations, kept in ((0.0, PRECISE, 0.002), (0.06, DEVIATIONS, 0.02)):
         turned = np.array([0.05, -0.06, 0.05, *log_distance * TRUE[:3, 3]])
-        given = moved(TRUE, turned)
+        given = move_pose(TRUE, turned)
         refined = refiner.refine(picture(part), wrong_camera, given, np.diag(deviations**2))
         degrees, _ = off(refined.T_cam_obj)
         assert degrees < 0.5
@@ -384,7 +384,7 @@ def test_a_known_size_or_an_unknown_distance_gives_the_distance_of_the_outline(
     part: Part, scale_error: float, deviations: np.ndarray, ratio: float
 ) -> None:
     refiner = RegionRefiner(part.mesh.vertices, part.mesh.faces, scale_error)
-    given = moved(TRUE, np.array([0.03, -0.03, 0.03, *0.008 * TRUE[:3, 3]]))
+    given = move_pose(TRUE, np.array([0.03, -0.03, 0.03, *0.008 * TRUE[:3, 3]]))
     refined = refiner.refine(picture(part), K, given, np.diag(deviations**2))
     distances = [np.linalg.norm(T[:3, 3]) for T in (refined.T_cam_obj, TRUE)]
     assert distances[0] / distances[1] == pytest.approx(ratio, abs=0.003)
@@ -433,7 +433,7 @@ def test_without_a_covariance_a_broad_one_is_taken(refiner: RegionRefiner) -> No
 def test_tight_prior_needs_the_last_round_only(refiner: RegionRefiner) -> None:
     # As a tracker's: the outline is two pixels off.
     deviations = np.repeat([math.radians(0.4), 0.0004], 3)
-    start = moved(TRUE, np.array([1, -1, 1, -1, 1, 1]) * deviations)
+    start = move_pose(TRUE, np.array([1, -1, 1, -1, 1, 1]) * deviations)
     learned: list[int] = []
     with pytest.MonkeyPatch.context() as patch:
         learn = Round.learn
@@ -451,7 +451,7 @@ def test_tight_prior_needs_the_last_round_only(refiner: RegionRefiner) -> None:
 def test_a_pose_that_was_known_well_is_not_given_up(refiner: RegionRefiner, seed: int) -> None:
     # An image adds little to it, and moves it by a fraction of a pixel either way.
     deviations = np.repeat([math.radians(0.05), 0.00005], 3)
-    start = moved(TRUE, np.random.default_rng(seed).normal(size=6) * deviations)
+    start = move_pose(TRUE, np.random.default_rng(seed).normal(size=6) * deviations)
     refined = refiner.refine(
         picture(pivconnector()), K, start, np.diag(deviations**2), followed=True
     )
@@ -504,7 +504,7 @@ def test_support_falls_with_what_is_hidden_agreement_hardly(refiner: RegionRefin
 
 def test_far_from_a_covariance_that_is_too_sure_the_part_is_found_where_it_is_asked_for(refiner):
     sure = np.diag(np.repeat([math.radians(1.5), 0.0015], 3) ** 2)
-    start = moved(TRUE, np.array([0.15, 0.2, -0.2, 0.012, -0.008, 0.02]))
+    start = move_pose(TRUE, np.array([0.15, 0.2, -0.2, 0.012, -0.008, 0.02]))
     image = tiled(pivconnector(), 0.3)
     near = refiner.refine(image, K, start, sure)
     assert max(off(near.T_cam_obj)) > 5

@@ -11,7 +11,7 @@ from dopepp.geometry.camera import (
     Transform,
     camera_matrix,
     make_transform,
-    moved,
+    move_pose,
     project,
     transform,
 )
@@ -101,9 +101,8 @@ def test_the_stated_deviation_is_that_of_sampled_poses():
     vertices = make_outline_mesh(part.mesh.vertices, part.mesh.faces).vertices
     steps = rng.multivariate_normal(np.zeros(6), COVARIANCE, 4000)
     here = transform(POSE, vertices)
-    squares = [
-        ((transform(moved(POSE, step), vertices) - here) ** 2).sum(axis=1).mean() for step in steps
-    ]
+    moved = [transform(move_pose(POSE, step), vertices) for step in steps]
+    squares = [((points - here) ** 2).sum(axis=1).mean() for points in moved]
     expected = math.log(math.sqrt(np.mean(squares)) / (0.1 * part.diameter))
     assert values["spread"] == pytest.approx(expected, abs=0.03)
 
@@ -114,7 +113,7 @@ def test_the_stated_deviation_is_that_of_sampled_poses():
 )
 def test_the_right_pose_has_more_evidence_than_a_wrong_pose(rendered, step):
     image, K, T = rendered
-    right, wrong = evidence(image, K, T), evidence(image, K, moved(T, np.array(step, float)))
+    right, wrong = evidence(image, K, T), evidence(image, K, move_pose(T, np.array(step, float)))
     for name in ("outline", "outline_gain", "outline_weakest"):
         assert right[name] > wrong[name] + 0.1
     odds = [learned_model().log_odds(np.array(list(each.values()))) for each in (right, wrong)]

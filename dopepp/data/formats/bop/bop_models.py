@@ -20,7 +20,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_whole
+from dopepp.core.files import write_file
 from dopepp.data.formats.bop import EXACT, INEXACT, MM, is_number
 from dopepp.data.formats.images import encode_png
 from dopepp.data.formats.invariants import rotation_problem
@@ -289,10 +289,10 @@ def write_models(root: Path, parts: Sequence[Part]) -> None:
         model = folder / f"obj_{numbers[part.name]:06d}.ply"
         texture = model.with_suffix(".png")
         assert part.mesh is not None
-        write_whole(model, ply_bytes(part.mesh, texture.name))
+        write_file(model, ply_bytes(part.mesh, texture.name))
         if part.mesh.texture is not None:
-            write_whole(texture, encode_png(part.mesh.texture))
-    write_whole(path, content)
+            write_file(texture, encode_png(part.mesh.texture))
+    write_file(path, content)
 
 
 def model_info(part: Part) -> dict[str, object]:

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_whole
+from dopepp.core.files import write_file
 from dopepp.data.formats.bop import MM
 from dopepp.geometry.camera import Transform
 from dopepp.geometry.rotation import is_rotation
@@ -73,7 +73,7 @@ def write_results(path: Path, results: Sequence[BopResult]) -> None:
         t = " ".join(repr(float(value)) for value in result.T_cam_obj[:3, 3] * MM)
         ids = f"{result.scene_id},{result.im_id},{result.obj_id}"
         lines.append(f"{ids},{float(result.score)!r},{R},{t},{float(result.seconds)!r}")
-    write_whole(path, ("\n".join(lines) + "\n").encode())
+    write_file(path, ("\n".join(lines) + "\n").encode())
 
 
 def read_results(path: Path, objects: Collection[int]) -> list[BopResult]:

@@ -21,7 +21,7 @@ from jaxtyping import UInt16
 from PIL import Image
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_whole
+from dopepp.core.files import write_file
 from dopepp.core.json import read_json
 from dopepp.data.formats import STAGING, encode_by_key, finalizing, read_object, stage, staged_items
 from dopepp.data.formats.bop import MAX_SCENE_BYTES, MM
@@ -88,12 +88,12 @@ class BopWriter(BopFolder):
         labels = self.labels(sample)
         chunk, image = divmod(index, self.chunk_size)
         scene = self._scene(chunk)
-        write_whole(scene / "rgb" / f"{image:06d}.png", encode_png(sample.image))
-        write_whole(scene / "depth" / f"{image:06d}.png", encode_png(labels.depth))
+        write_file(scene / "rgb" / f"{image:06d}.png", encode_png(sample.image))
+        write_file(scene / "depth" / f"{image:06d}.png", encode_png(labels.depth))
         for folder, masks in (("mask", labels.masks), ("mask_visib", labels.visible_masks)):
             for number, mask in enumerate(masks):
                 path = scene / folder / f"{image:06d}_{number:06d}.png"
-                write_whole(path, encode_png(mask.astype("uint8") * 255))
+                write_file(path, encode_png(mask.astype("uint8") * 255))
         item = {"camera": labels.camera, "gt": labels.truths, "gt_info": labels.infos}
         stage(scene / STAGING / f"{image:06d}.json", json.dumps(item).encode())
 
@@ -119,7 +119,7 @@ class BopWriter(BopFolder):
                 # Sorted, so that the bytes do not depend on the order of writing.
                 merged = dict(sorted(merged.items(), key=lambda entry: int(entry[0])))
                 if items:
-                    write_whole(path, encode_by_key(merged))
+                    write_file(path, encode_by_key(merged))
             if items:
                 image, camera = next(iter(merged.items()))
                 self._write_camera(chunk, int(image), camera)
@@ -140,7 +140,7 @@ class BopWriter(BopFolder):
         K = camera["cam_K"]
         record = {"cx": K[2], "cy": K[5], "depth_scale": camera["depth_scale"]}
         record |= {"fx": K[0], "fy": K[4], "height": height, "width": width}
-        write_whole(self.root / "camera.json", (json.dumps(record, indent=2) + "\n").encode())
+        write_file(self.root / "camera.json", (json.dumps(record, indent=2) + "\n").encode())
 
 
 def _staged(scene: Path) -> list[Path]:

@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Float, Integer
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_whole
+from dopepp.core.files import write_file
 from dopepp.core.json import read_json
 from dopepp.data.formats.images import encode_png
 from dopepp.data.formats.invariants import Box
@@ -93,7 +93,7 @@ class NddsWriter:
         elif foreign:
             problem = f"{foreign[0].name} in {self._root}, which is not from an NDDS writer"
         else:
-            write_whole(path, settings)
+            write_file(path, settings)
             return
         allowed = "an empty folder, or one begun with the same parts"
         raise UserError(problem, allowed, "pass another folder")
@@ -115,8 +115,8 @@ class NddsWriter:
             steps[(steps < 0) | (steps > np.iinfo(np.uint16).max)] = 0
             images[".depth.png"] = steps.astype(np.uint16)
         for suffix, image in images.items():
-            write_whole(self._path(index, suffix), encode_png(image))
-        write_whole(self._path(index, ".json"), _encode(record))
+            write_file(self._path(index, suffix), encode_png(image))
+        write_file(self._path(index, ".json"), _encode(record))
 
     def _path(self, index: int, suffix: str) -> Path:
         """Return the path of an item's file with a suffix."""
@@ -136,7 +136,7 @@ class NddsWriter:
         records: list[Any] = [read_json(self._path(index, ".json")) for index in sorted(indices)]
         cameras = [record["camera_data"] for record in records]
         if cameras and all(cameras[0][n] == camera[n] for camera in cameras for n in CAMERA_FIELDS):
-            write_whole(self._root / CAMERA_SETTINGS, _encode(camera_settings(cameras[0])))
+            write_file(self._root / CAMERA_SETTINGS, _encode(camera_settings(cameras[0])))
 
 
 def object_settings(parts: Sequence[Part]) -> dict[str, Any]:

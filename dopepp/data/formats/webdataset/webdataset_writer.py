@@ -16,7 +16,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final
 
-from dopepp.core.files import partial_path, write_whole
+from dopepp.core.files import partial_path, write_file
 from dopepp.data.formats import STAGING, encode_by_key, finalizing, read_object, stage, staged_items
 from dopepp.data.formats.bop.bop_writer import BopFolder
 from dopepp.data.formats.images import encode_png, encode_runs
@@ -96,7 +96,7 @@ class WebdatasetWriter(BopFolder):
         shards = read_object(path)
         merged = shards | {member.key: chunk for member in members(self._shard(chunk))}
         if merged != shards:
-            write_whole(path, encode_by_key(dict(sorted(merged.items()))))
+            write_file(path, encode_by_key(dict(sorted(merged.items()))))
 
     def _shard(self, chunk: int) -> Path:
         """Return the path of a chunk's shard."""
