@@ -23,7 +23,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled(**options: Any) -> Callable[[Function], Function]:
-    """Return a decorator that compiles a function with numba.
+    """Return a decorator that compiles a function with numba and further ``options`` of njit.
 
     Compiled functions release the GIL and are single-threaded, because data loaders fork. Division
     by zero follows IEEE 754, as in numpy; a check would prevent vectorised loops.
@@ -31,9 +31,6 @@ def compiled(**options: Any) -> Callable[[Function], Function]:
     The machine code is cached next to the package, or in the user's cache folder if the package is
     read-only; ``NUMBA_CACHE_DIR`` overrides both. Plain loops compile many times faster than slice
     assignments, array expressions and calls with constants.
-
-    Args:
-        options: Further options of ``numba.njit``.
     """
     compiler = numba.njit(cache=True, nogil=True, error_model="numpy", **options)
     return cast("Callable[[Function], Function]", compiler)
@@ -44,13 +41,10 @@ _warm_ups: Final[list[str]] = []
 
 
 def compile_in_background(function: str) -> None:
-    """Register a function that a second process calls to compile the inner loops of a later job.
+    """Register ``module:function``, which a second process calls to compile loops of a later job.
 
     The second process starts when this process has to compile, as on a new machine. Both processes
     use the same cache, so that two cores share the compilation.
-
-    Args:
-        function: ``module:function``.
     """
     if function not in _warm_ups:
         _warm_ups.append(function)

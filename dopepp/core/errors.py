@@ -90,11 +90,7 @@ def system_failure(error: OSError, path: Path) -> str:
 
 @contextmanager
 def interruptible(advice: str = RESUME) -> Iterator[None]:
-    """Raise :class:`Interruption` on SIGINT and SIGTERM inside the block (main thread only).
-
-    Args:
-        advice: Recommendation in the message of the interruption.
-    """
+    """Raise :class:`Interruption` with advice on SIGINT and SIGTERM in the block (main thread)."""
 
     def interrupt(number: int, _: FrameType | None) -> NoReturn:
         raise Interruption(number, advice)

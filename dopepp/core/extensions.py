@@ -7,11 +7,11 @@ A package ``mine`` declares its components in its ``pyproject.toml``::
     [project.entry-points."dopepp.conf"]
     mine = "mine.conf"  # a folder of Hydra config files
 
-The groups are ``dopepp.`` with ``backbones``, ``attentions``, ``heads``, ``losses`` (classes),
-``renderers`` (modules), ``formats`` (functions that open images) and ``conf``. The config files of
-every installed package are available, because a file runs no code. Code is imported only from
-enabled packages: by ``extensions=[mine]``, ``PoseEstimator.load(…, extensions=["mine"])`` or the
-environment variable ``DOPEPP_EXTENSIONS=mine``, which worker processes inherit.
+The groups are ``backbones``, ``attentions``, ``heads``, ``losses`` (classes), ``renderers``
+(modules), ``formats`` (functions that open images) and ``conf``. Config files of every installed
+package are available, because they run no code. Code is imported only from enabled packages: by
+``extensions=[mine]``, ``PoseEstimator.load(…, extensions=["mine"])`` or the environment variable
+``DOPEPP_EXTENSIONS=mine``, which worker processes inherit.
 """
 
 from __future__ import annotations

@@ -58,11 +58,7 @@ def _encode(image: UInt8[np.ndarray, "height width 3"], suffix: str) -> bytes:
 
 
 def check_target(path: Path, suffixes: Sequence[str] = ()) -> None:
-    """Check that a file can be written, and create its folder.
-
-    Args:
-        path: The file to write.
-        suffixes: Allowed suffixes (default: any).
+    """Check that a file can be written and has an allowed suffix (default: any); make its folder.
 
     Raises:
         UserError: The suffix is not allowed, or the file cannot be written.
@@ -87,8 +83,8 @@ def write_csv(
 ) -> None:
     """Write a CSV file; missing values are empty, and the default header is the longest row's."""
     text = io.StringIO(newline="")
-    columns = header or list(max(rows, key=len))
-    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
+    longest: Mapping[str, object] = max(rows, key=len)
+    writer = csv.DictWriter(text, header or list(longest), restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     write_file(path, text.getvalue().encode())
@@ -157,12 +153,7 @@ def partial_path(path: Path) -> Path:
 
 
 def is_abandoned(path: Path, now: float) -> bool:
-    """Return whether a partial file's process has ended.
-
-    Args:
-        path: The partial file.
-        now: Time of the file system's clock, seconds.
-    """
+    """Return whether a partial file's process has ended; ``now`` is the file system's time, s."""
     match = _PARTIAL.fullmatch(path.name)
     if match and match[1] == _machine() and not _is_running(int(match[2])):
         return True

@@ -57,9 +57,7 @@ def read_json(path: str | Path, max_bytes: int = MAX_BYTES) -> object:
 def parse_json(text: str | bytes, where: str) -> object:
     """Parse JSON text in UTF-8, with or without a byte order mark. The caller limits its size.
 
-    Args:
-        text: The text.
-        where: Name of the source, for messages.
+    ``where`` is the source of the text, for messages.
 
     Raises:
         UserError: The text is not UTF-8 or JSON, has a duplicate key, nesting deeper than 64, or a

@@ -181,11 +181,7 @@ class Letterbox:
 
 
 def pinhole_matrix(K: CameraMatrix, source: str) -> CameraMatrix:
-    """Return K as float64, with exact zeros and ones.
-
-    Args:
-        K: Camera matrix, pixels.
-        source: Origin of K, for messages.
+    """Return K as float64, with exact zeros and ones; ``source`` is its origin, for messages.
 
     Raises:
         UserError: K is not a finite pinhole matrix.

@@ -55,11 +55,8 @@ class Calibration(NamedTuple):
 def parse_calibration(text: str, source: str) -> Calibration:
     """Parse the text of a camera file.
 
-    Among plain numbers, ``#`` starts a comment, and brackets and commas are ignored.
-
-    Args:
-        text: Content of the file.
-        source: Path of the file, for messages.
+    Among plain numbers, ``#`` starts a comment, and brackets and commas are ignored. ``source`` is
+    the path of the file, for messages.
 
     Raises:
         UserError: The format is unknown, or the text does not describe exactly one camera.

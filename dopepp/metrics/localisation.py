@@ -75,11 +75,9 @@ class BopScores:
 
 
 class Localisation:
-    """Accumulates the errors of a method's poses, image by image.
+    """Accumulates the errors of a method's poses of parts, image by image.
 
-    Args:
-        parts: The evaluated objects.
-        draw: Renderer of a part's depth, for VSD; without a renderer, VSD is not computed.
+    VSD is computed only with ``draw``, the renderer of a part's depth.
     """
 
     def __init__(self, parts: Sequence[Part], draw: Draw | None = None) -> None:

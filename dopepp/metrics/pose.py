@@ -99,15 +99,10 @@ def matching_radius(part: Part) -> float:
 def assign(
     part: Part, detections: Sequence[PredictedPose], instances: Sequence[TruePose]
 ) -> Int[np.ndarray, "detections"]:
-    """Match the detections of an object in an image with its instances.
+    """Match the detections of an object in an image with the instances of the object.
 
     Cuboid centres within :func:`matching_radius` match, by
     :func:`~dopepp.metrics.functional.match`: first evaluated instances, then hidden instances.
-
-    Args:
-        part: The object.
-        detections: Detections of the object.
-        instances: Instances of the object.
 
     Returns:
         Index of each detection's instance; −1 if it matches none.

@@ -42,12 +42,7 @@ _NUM_SURFACE_DRAWS: Final = 300
 def reference_rows(
     part: Part, T_cam_obj: Float[np.ndarray, "n 4 4"], seed: int = 0
 ) -> dict[str, PoseRow]:
-    """Compute the three reference rows of one part on one test set.
-
-    Args:
-        part: The object.
-        T_cam_obj: True poses of the evaluated instances, metres.
-        seed: Seed of the guesses.
+    """Compute the three reference rows of a part for the true poses of its instances, metres.
 
     Returns:
         Rows by name, in the order of :data:`REFERENCES`. Measures are None without instances, and

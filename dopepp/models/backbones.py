@@ -216,14 +216,9 @@ class Pyramid(Backbone):
 def copy_layer(
     weights: Mapping[str, object], name: str, layer: nn.Module, path: str, network: str
 ) -> None:
-    """Copy the tensors of a layer from a file's weights.
+    """Copy the weights of a file to a layer, which is called ``name`` in the file.
 
-    Args:
-        weights: Content of the file.
-        name: Name of the layer in the file.
-        layer: Layer to fill.
-        path: Path of the file, for messages.
-        network: Network of the file, for messages.
+    ``path`` and ``network`` of the file are for messages.
 
     Raises:
         UserError: A tensor is missing or has another shape.

@@ -122,10 +122,7 @@ class _Header:
 
 
 def read(path: Path) -> Checkpoint:
-    """Read a checkpoint and compare its weights with its spec.
-
-    Args:
-        path: A file or ``pretrained/NAME``.
+    """Read a checkpoint (a file or ``pretrained/NAME``) and compare its weights with its spec.
 
     Raises:
         UserError: The file is missing, damaged, too large, inconsistent, of another version or
@@ -301,12 +298,9 @@ def _read_released(path: Path) -> tuple[dict[str, Any], int]:
 
 
 def write_content(content: Mapping[str, Any], path: Path, half: bool = True) -> None:
-    """Write a safetensors file without local paths.
+    """Write the result of :meth:`Checkpoint.to_file` as safetensors, without local paths.
 
-    Args:
-        content: Result of :meth:`Checkpoint.to_file`.
-        path: File to write.
-        half: Whether to write float16 weights.
+    Weights are float16 if ``half``.
 
     Raises:
         UserError: A weight does not fit into half precision.

@@ -67,10 +67,7 @@ class PoseNetwork(nn.Module):
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
 
     def forward(self, images: Images) -> list[heads.Stage]:
-        """Return the belief logits and vector field of every stage.
-
-        Args:
-            images: RGB, 0–255, uint8 or floating point.
+        """Return the belief logits and vector field of every stage for RGB images, 0–255.
 
         Raises:
             UserError: The shape does not match the network.
@@ -107,15 +104,11 @@ class PoseNetwork(nn.Module):
 
 
 def network_cost(network: nn.Module, input_size: tuple[int, int]) -> tuple[int, float]:
-    """Return the number of parameters, and the multiply–accumulates per image in units of 10⁹.
+    """Return the number of parameters, and 10⁹ multiply–accumulates for an image (width, height).
 
     The forward pass runs on the ``meta`` device, so it takes milliseconds and leaves the batch
     norm statistics unchanged. Convolutions and matrix products are counted; elementwise operations
     are not.
-
-    Args:
-        network: Network to measure.
-        input_size: (width, height) of the image, pixels.
     """
     tensors = {**dict(network.named_parameters()), **dict(network.named_buffers())}
     shapes = {name: tensor.to("meta") for name, tensor in tensors.items()}

@@ -71,12 +71,7 @@ _FIELDS: Final = {"dtype", "shape", "data_offsets"}
 
 
 def write_atomic(payload: Mapping[str, Any], path: Path, previous: Path | None = None) -> None:
-    """Write a torch file atomically.
-
-    Args:
-        payload: Content of the file.
-        path: File to write.
-        previous: Path to which the old file is moved (default: it is replaced).
+    """Write a torch file atomically, after moving the old file to ``previous`` if given.
 
     Raises:
         OSError: The file cannot be written; the old file is intact.
@@ -110,13 +105,9 @@ def write_atomic(payload: Mapping[str, Any], path: Path, previous: Path | None =
 
 
 def read_mapping(path: Path, kind: str) -> dict[Any, Any]:
-    """Load a torch file with a mapping to the CPU, without running code in it.
+    """Load a torch file with a mapping to the CPU, without running code in the file.
 
-    Loading takes no more memory than the file has bytes.
-
-    Args:
-        path: File to load.
-        kind: Kind of file, for messages.
+    Loading takes no more memory than the file has bytes. ``kind`` describes the file in messages.
 
     Raises:
         UserError: The file is missing, damaged or too large, or its content is not a mapping of

@@ -225,11 +225,7 @@ def _log_picture(trainer: Trainer, name: str, image: RGBImage) -> None:
 
 @contextmanager
 def best_effort(name: str) -> Iterator[None]:
-    """Log a warning instead of an ``OSError``.
-
-    Args:
-        name: Name of the file, for the warning.
-    """
+    """Log a warning with the file's name instead of raising an ``OSError``."""
     try:
         yield
     except OSError as error:

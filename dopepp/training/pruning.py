@@ -72,8 +72,9 @@ class TrialReport(Callback):
         self._storage = open_storage(self._location)
         self._study = optuna.load_study(study_name=self._name, storage=self._storage, pruner=pruner)
         study_id = self._storage.get_study_id_from_name(self._name)
-        trial_id = self._storage.get_trial_id_from_study_id_trial_number(study_id, self.number)
-        self._trial_id = trial_id
+        self._trial_id = self._storage.get_trial_id_from_study_id_trial_number(
+            study_id, self.number
+        )
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Report the value of the epoch; a resumed trial repeats reports."""
@@ -104,10 +105,7 @@ def raise_if_pruned(trainer: Trainer) -> None:
 
 
 def open_storage(location: str) -> BaseStorage:
-    """Open or create the database of a study.
-
-    Args:
-        location: SQLite file or database URL.
+    """Open or create the database of a study: an SQLite file or a database URL.
 
     Raises:
         UserError: The database cannot be opened.

@@ -69,7 +69,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
     @property
     def waiting(self) -> list[Path]:
-        """The files that could not be written yet, oldest first."""
+        """Files that could not be written yet, oldest first."""
         return list(self._waiting)
 
     def save_checkpoint(
@@ -77,10 +77,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     ) -> None:
         """Write the file atomically; if that fails, keep the checkpoint in memory and warn.
 
-        Args:
-            checkpoint: Content of the file.
-            path: File to write.
-            storage_options: ``{"previous": PATH}`` moves the old file to this path.
+        The options ``{"previous": PATH}`` move the old file to this path.
         """
         target = Path(os.fspath(path))
         self._waiting.pop(target, None)
@@ -178,11 +175,7 @@ def saved_step(path: Path) -> int | None:
 
 
 def check_free_space(run_dir: Path, weight_bytes: int) -> None:
-    """Check in advance that a run can write its checkpoints.
-
-    Args:
-        run_dir: Folder of the run.
-        weight_bytes: Size of the network's weights.
+    """Check in advance that a run can write its checkpoints of a network's size.
 
     Raises:
         UserError: The folder is not writable, or has too little free space.

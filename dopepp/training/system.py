@@ -109,12 +109,8 @@ class PoseSystem(LightningModule):
     def targets(self, batch: Batch, stages: Sequence[Stage] | None = None) -> Targets:
         """Return the target maps of a batch, on its device.
 
-        Instances whose visibility is too low for metrics are omitted.
-
-        Args:
-            batch: Images with labels.
-            stages: The network's output, which may choose among the equivalent poses of a
-                symmetric part (:mod:`~dopepp.training.targets`).
+        The network's output may choose among the equivalent poses of a symmetric part
+        (:mod:`~dopepp.training.targets`).
         """
         keypoints = batch.keypoints
         if self.symmetry.active:

@@ -63,14 +63,7 @@ class SymmetryOptions(Checked):
 def draw_maps(
     batch: Batch, keypoints: Keypoints, num_objects: int, geometry: MapGeometry
 ) -> Targets:
-    """Draw the target maps of a batch, without instances that are too occluded for metrics.
-
-    Args:
-        batch: Images with labels.
-        keypoints: Keypoints of every instance, input pixels.
-        num_objects: Number of the network's objects.
-        geometry: Stride and spread of the maps.
-    """
+    """Draw keypoints (input pixels) as target maps, without instances too occluded for metrics."""
     height, width = batch.images.shape[-2:]
     map_size = height // geometry.stride, width // geometry.stride
     is_visible = batch.visible_fraction >= MIN_VISIBLE_FRACTION
@@ -88,14 +81,7 @@ def choose_keypoints(
     """Return the keypoints of each instance in the equivalent pose to train on.
 
     The default is the pose nearest to the reference orientation. An allowed alternative is used if
-    its maps have a lower loss; instances are decided in sequence.
-
-    Args:
-        batch: Images with labels.
-        stages: The network's output; None uses the default.
-        symmetry: Equivalent poses of the parts.
-        loss: Loss that compares alternatives.
-        geometry: Geometry of the maps.
+    its maps have a lower loss against the network's ``stages``; instances are decided in sequence.
     """
     choices, allowed = symmetry.equivalents(batch)
     keypoints = choices[:, :, 0].clone()

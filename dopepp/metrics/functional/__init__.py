@@ -117,10 +117,7 @@ def region_levels(distances: Errors) -> Errors:
 
     The squared Mahalanobis distance x of a true pose from its estimate follows χ² with six degrees
     of freedom if the covariance is correct. The level is that distribution's value at x,
-    1 − exp(−x/2)·(1 + x/2 + x²/8).
-
-    Args:
-        distances: Mahalanobis distances (:func:`mahalanobis`); infinite or NaN for a miss.
+    1 − exp(−x/2)·(1 + x/2 + x²/8). The distances of :func:`mahalanobis` are infinite for a miss.
     """
     half = nan_is_miss(to_float64(distances)).square() / 2
     return torch.where(half.isfinite(), 1 - (-half).exp() * (1 + half + half.square() / 2), 1.0)
@@ -168,12 +165,8 @@ def match(
 ) -> Int[Tensor, "p"]:
     """Match predictions with instances one-to-one, greedily by descending score.
 
-    Predictions with equal scores keep the input order; NaN scores come last.
-
-    Args:
-        scores: Score of each prediction.
-        distances: Distance from each prediction to each instance, metres; NaN never matches.
-        max_distance: Largest distance of a match (inclusive), metres.
+    Predictions with equal scores keep the input order; NaN scores come last. A match is at most
+    ``max_distance`` wide; a NaN distance never matches.
 
     Returns:
         Index of each prediction's instance; −1 if it matches none.
@@ -202,12 +195,8 @@ def average_precision(
 ) -> float:
     """Return COCO's average precision: the mean interpolated precision at 101 recall levels.
 
-    Predictions with equal scores keep the input order; NaN scores come last.
-
-    Args:
-        scores: Score of each prediction.
-        correct: Whether each prediction is correct; False for duplicates.
-        num_instances: Number of ground-truth instances.
+    Predictions with equal scores keep the input order; NaN scores come last. Duplicates are not
+    correct.
 
     Returns:
         The average precision in [0, 1]; 0.0 without predictions or instances.

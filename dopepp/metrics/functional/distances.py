@@ -84,16 +84,10 @@ def mssd(
 ) -> Errors:
     """Return the maximum symmetry-aware surface distance, metres (MSSD; Drost 2017, BOP 2019).
 
-    The formula is min over S of max over x of ‖(R̂x + t̂) − (R(Sx) + t)‖.
-
-    Args:
-        R_est: Estimated rotations.
-        t_est: Estimated translations, metres.
-        R_gt: True rotations.
-        t_gt: True translations, metres.
-        points: Object points, metres.
-        symmetries: Transforms S, (S, 4, 4) or (S, 3, 3), which must contain the identity (see
-            :func:`dopepp.geometry.symmetry.symmetry_group`); None for the identity alone.
+    The formula is min over S of max over x of ‖(R̂x + t̂) − (R(Sx) + t)‖. ``symmetries`` are the
+    transforms S, (S, 4, 4) or (S, 3, 3), which must contain the identity (see
+    :func:`dopepp.geometry.symmetry.symmetry_group`); None for the identity alone. The other
+    arguments are as in :func:`add`.
     """
     R_est, t_est, R_gt, t_gt, points = _checked(R_est, t_est, R_gt, t_gt, points)
     group = _check_symmetries(symmetries, t_est)
@@ -207,17 +201,10 @@ def mahalanobis(
 ) -> Errors:
     """Return the Mahalanobis distance √(δᵀ Σ⁻¹ δ) of the true pose from the estimate.
 
-    Args:
-        R_est: Estimated rotations.
-        t_est: Estimated translations, metres.
-        R_gt: True rotations.
-        t_gt: True translations, metres.
-        covariance: Σ of the step δ from the estimated to the true pose: a rotation vector about
-            the object's origin (radians) and a shift (metres), in camera axes.
-        symmetries: As in :func:`mssd`; the distance is the smallest to any equivalent pose.
-
-    Returns:
-        Distances; infinite for a singular or non-finite covariance.
+    ``covariance`` is Σ of the step δ from the estimated to the true pose: a rotation vector about
+    the object's origin (radians) and a shift (metres), in camera axes. A singular or non-finite
+    covariance gives an infinite distance. With ``symmetries`` (as in :func:`mssd`), the distance is
+    the smallest to any equivalent pose. The other arguments are as in :func:`add`.
 
     Raises:
         ValueError: An array has an unexpected shape.

@@ -39,11 +39,7 @@ def mean_nearest(
 ) -> Float[np.ndarray, "n"]:
     """Return the mean distance from the true points to the nearest estimated points, metres.
 
-    Args:
-        points: Object points, metres.
-        R_est: Estimated rotations, or any matrices.
-        R_gt: True rotations, or any matrices.
-        offset: True minus estimated translations, metres.
+    Rotations may be any matrices; ``offset`` is the true minus the estimated translation.
     """
     points, boxes, firsts = _tree(points)
     distances = np.empty(len(offset))
@@ -167,17 +163,10 @@ def least_farthest(
 ) -> Float[Tensor, "n"]:
     """Return the maximum point distance under the best symmetry (MSSD, MSPD).
 
-    The distance of a pair of poses is the minimum over symmetries S of the maximum over points x of
-    ‖π(Bx + b) − π(A(Sx) + a)‖. It is infinite if a third coordinate is not positive under
-    ``perspective``.
-
-    Args:
-        estimated: Estimated maps (B, b).
-        true: True maps (A, a).
-        points: Object points x.
-        symmetries: Rotations and translations of the symmetries S.
-        perspective: Whether π divides by the third coordinate, which must be positive; otherwise
-            it is the identity.
+    The distance of the estimated map (B, b) from the true map (A, a) is the minimum over symmetries
+    S of the maximum over points x of ‖π(Bx + b) − π(A(Sx) + a)‖. With ``perspective``, π divides by
+    the third coordinate, and the distance is infinite if a third coordinate is not positive;
+    otherwise π is the identity.
     """
     ordered = _probes_first(points.detach().cpu().numpy())
     B, b, A, a, rotations, shifts = (
