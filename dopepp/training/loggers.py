@@ -6,7 +6,6 @@ To add a logger, add a line to ``dopepp/experiment/assembly/build_system.py`` an
 
 from __future__ import annotations
 
-import csv
 import logging
 from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +16,7 @@ from typing import Any, TypeVar
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from lightning.pytorch.utilities import rank_zero_only
 
-from dopepp.core.files import write_csv
+from dopepp.core.files import read_csv, write_csv
 from dopepp.drawing.pictures import RGBImage
 
 _log = logging.getLogger(__name__)
@@ -36,11 +35,9 @@ class MetricsTable(Logger):
         self.path = path
         self._rows: dict[int, dict[str, Any]] = {}
         self._failing = False
-        if path.is_file():
-            with path.open(newline="") as stream:
-                for row in csv.DictReader(stream):
-                    cells = {name: cell for name, cell in row.items() if cell != ""}
-                    self._rows[int(cells.pop("step"))] = cells
+        for row in read_csv(path):
+            cells = {name: cell for name, cell in row.items() if cell != ""}
+            self._rows[int(cells.pop("step"))] = cells
 
     @property
     def name(self) -> str:
