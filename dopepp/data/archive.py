@@ -1,7 +1,8 @@
 """Unpack an untrusted tar file, completely or not at all.
 
-All names, kinds and sizes of members are checked before the first byte is written. The folder is
-renamed to its final name last. Only plain files and folders are unpacked, with default permissions.
+The names, types and sizes of all members are checked before the first byte is written. The folder
+is renamed to its final name last. Only plain files and folders are unpacked, with default
+permissions.
 ``tarfile``'s ``filter="data"`` is not enough: it accepts links within the folder, makes absolute
 paths relative, and ignores backslashes, drives, repeated names, files below files and sizes
 (``tests/security/test_hostile_files.py`` has a case for each).
@@ -32,7 +33,7 @@ _RESERVED: Final = frozenset('<>:"|?*\\')
 """Characters that are special or forbidden in paths of some systems."""
 
 
-class Bounded(io.RawIOBase):
+class BoundedStream(io.RawIOBase):
     """A seekable stream that rejects reads of more than ``CHUNK_BYTES``.
 
     A tar header can claim a name of any length, and :mod:`tarfile` would read it at once.
@@ -50,7 +51,7 @@ class Bounded(io.RawIOBase):
         return self._stream.tell()
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Move to a position, and return it."""
+        """Set and return the stream's position."""
         return self._stream.seek(offset, whence)
 
     def read(self, size: int = -1) -> bytes:
@@ -64,14 +65,13 @@ class Bounded(io.RawIOBase):
         return self._stream.read(size)
 
 
-def safe_extract(archive: Path | str, folder: Path | str, most_members: int = MAX_MEMBERS) -> Path:
-    """Unpack a tar file into ``folder``, which must be new or empty.
+def safe_extract(archive: Path | str, folder: Path | str) -> Path:
+    """Unpack a tar file into ``folder``, which must be new or empty, completely or not at all.
 
     Raises:
         UserError: The archive is missing, damaged, or of another format; a member's path leads out
             of the folder or repeats another path; a member is neither a plain file nor a folder;
-            there are too many members; or the folder is not empty or not writable. Nothing remains
-            of an archive that is not unpacked completely.
+            the archive has more than ``MAX_MEMBERS``; or the folder is not empty or not writable.
     """
     archive, folder = Path(archive), Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -84,8 +84,11 @@ def safe_extract(archive: Path | str, folder: Path | str, most_members: int = MA
         raise UserError(f"archive {archive}, no such file", "a tar file", fix)
     draft = partial_path(folder.absolute())
     try:
-        with archive.open("rb") as file, tarfile.open(fileobj=Bounded(file), mode="r:") as tar:
-            members = _checked(archive, tar, most_members)
+        with (
+            archive.open("rb") as file,
+            tarfile.open(fileobj=BoundedStream(file), mode="r:") as tar,
+        ):
+            members = _check_members(archive, tar)
             shutil.rmtree(draft, ignore_errors=True)
             draft.mkdir(parents=True)
             needed, free = sum(m.size for m in members.values()), shutil.disk_usage(draft).free
@@ -104,32 +107,30 @@ def safe_extract(archive: Path | str, folder: Path | str, most_members: int = MA
         fix = "check the permissions of archive and folder, and free space on the disk"
         raise UserError(problem, allowed, fix) from error
     except Exception as error:  # a damaged header makes tarfile raise any type
-        raise _refused(archive, f"damaged: {error or type(error).__name__}") from error
+        raise _rejection(archive, f"damaged: {error or type(error).__name__}") from error
     finally:
         shutil.rmtree(draft, ignore_errors=True)
     return folder
 
 
-def _checked(
-    archive: Path, tar: tarfile.TarFile, most_members: int
-) -> dict[PurePosixPath, tarfile.TarInfo]:
+def _check_members(archive: Path, tar: tarfile.TarFile) -> dict[PurePosixPath, tarfile.TarInfo]:
     """Return the members by their paths in the folder, or reject the archive."""
     members: dict[PurePosixPath, tarfile.TarInfo] = {}
     is_folder: dict[str, bool] = {}
     for number, member in enumerate(tar):
-        path, shown = PurePosixPath(member.name), f"member {member.name[:100]!r}"
-        if number == most_members:
-            raise _refused(archive, f"more than {most_members} members")
+        path, quoted = PurePosixPath(member.name), f"member {member.name[:100]!r}"
+        if number == MAX_MEMBERS:
+            raise _rejection(archive, f"more than {MAX_MEMBERS} members")
         if problem := _problem(member, path):
-            raise _refused(archive, f"{shown}{problem}")
-        # Folders may be repeated; a file may not, nor contain another. Case is ignored, as some
-        # file systems do.
+            raise _rejection(archive, f"{quoted}{problem}")
+        # A folder may be repeated. A file may neither be repeated nor contain a file. The case of
+        # letters is ignored, because some file systems ignore it.
         for parent in (*path.parents, path) if member.isdir() else path.parents:
             if is_folder.setdefault(str(parent).casefold(), True) is False:
-                raise _refused(archive, f"{shown}, whose path or parent is also a file")
+                raise _rejection(archive, f"{quoted}, whose path or parent is also a file")
         if not member.isdir():
             if str(path).casefold() in is_folder:
-                raise _refused(archive, f"more than one {shown}")
+                raise _rejection(archive, f"more than one {quoted}")
             is_folder[str(path).casefold()] = False
         members[path] = member
     return members
@@ -157,7 +158,7 @@ def _unpack(tar: tarfile.TarFile, member: tarfile.TarInfo, path: Path) -> None:
         return
     path.parent.mkdir(parents=True, exist_ok=True)
     source = tar.extractfile(member)
-    assert source is not None  # only plain files are left
+    assert source is not None  # _problem rejects members other than files and folders
     # Mode "x" overwrites nothing, even if a repeated name passes the checks.
     with source, path.open("xb") as target:
         shutil.copyfileobj(source, target, CHUNK_BYTES)
@@ -165,7 +166,7 @@ def _unpack(tar: tarfile.TarFile, member: tarfile.TarInfo, path: Path) -> None:
         raise tarfile.ReadError(f"member {member.name!r} is shorter than stated in its header")
 
 
-def _refused(archive: Path, reason: str) -> UserError:
+def _rejection(archive: Path, reason: str) -> UserError:
     """Return the error for an archive that is not unpacked."""
     allowed = "a complete tar file of plain files and folders that stay inside its own folder"
     fix = "do not trust the file; download it again from its source"

@@ -6,7 +6,7 @@ Belief targets are computed from the keypoints on the training device.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -48,11 +48,10 @@ class Batch:
         return self._map(lambda tensor: tensor.to(*args, **kwargs))
 
     def rows(self, index: Int[Tensor, " rows"]) -> Batch:
-        """Return some of the images."""
+        """Return the images with these indices, with their instances."""
         part = self._map(lambda tensor: tensor[index.to(tensor.device)])
-        numbers = index.tolist()
-        part.keys = [self.keys[number] for number in numbers]
-        part.sources = [self.sources[number] for number in numbers]
+        part.keys = [self.keys[number] for number in index.tolist()]
+        part.sources = [self.sources[number] for number in index.tolist()]
         return part
 
     def pin_memory(self) -> Batch:
@@ -61,17 +60,17 @@ class Batch:
 
     def _map(self, function: Callable[[Tensor], Tensor]) -> Batch:
         """Apply a function to every tensor."""
-        values: dict[str, Any] = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        tensors = {name: value for name, value in values.items() if isinstance(value, Tensor)}
-        values |= {name: function(value) for name, value in tensors.items()}
-        return Batch(**values)
+        tensors: dict[str, Any] = {
+            name: function(value) for name, value in vars(self).items() if isinstance(value, Tensor)
+        }
+        return replace(self, **tensors)
 
 
 def collate(samples: Sequence[Sample], object_index: Mapping[str, int]) -> Batch:
     """Stack samples of one size; ``object_index`` gives the index of each object by name."""
     # At least one slot, because code that uses batches does not handle an empty axis.
     shape = (len(samples), max(1, *(len(sample.instances) for sample in samples)))
-    stated = {
+    fields = {
         "T_cam_obj": np.tile(np.eye(4, dtype=np.float32), (*shape, 1, 1)),
         "keypoints": np.full((*shape, 9, 2), np.nan, np.float32),
         "visible_fraction": np.zeros(shape, np.float32),
@@ -81,14 +80,14 @@ def collate(samples: Sequence[Sample], object_index: Mapping[str, int]) -> Batch
     for row, sample in enumerate(samples):
         for column, instance in enumerate(sample.instances):
             index[row, column] = object_index[instance.label]
-            for name, array in stated.items():
+            for name, array in fields.items():
                 array[row, column] = getattr(instance, name)
     images = torch.from_numpy(np.stack([sample.image for sample in samples]))
-    arrays = {"object_index": index, **stated}
     return Batch(
         images=images.permute(0, 3, 1, 2),
         K=torch.from_numpy(np.stack([sample.K for sample in samples]).astype(np.float32)),
+        object_index=torch.from_numpy(index),
         keys=[sample.key for sample in samples],
         sources=[sample.source for sample in samples],
-        **{name: torch.from_numpy(array) for name, array in arrays.items()},
+        **{name: torch.from_numpy(array) for name, array in fields.items()},
     )

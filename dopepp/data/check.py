@@ -19,8 +19,7 @@ from dopepp.data.formats.problems import CheckReport
 from dopepp.data.formats.webdataset.webdataset_invariants import check_webdataset, shard_paths
 from dopepp.data.formats.ycb_video.ycb_invariants import check_ycb
 
-_LISTED: Final = 8
-"""Limit of listed data sets in a parent folder."""
+_MAX_LISTED: Final = 8  # data sets of a parent folder in a message
 
 LAYOUTS: Final[dict[str, tuple[Callable[[Path], bool], Callable[[CheckReport], None]]]] = {
     "YCB-Video": (lambda root: all((root / n).is_dir() for n in ("image_sets", "data")), check_ycb),
@@ -50,7 +49,7 @@ def check_dataset(root: Path) -> CheckReport:
         raise UserError(f"{root}, which is not a folder", allowed, fix)
     layout = _layout_of(root)
     if layout in (None, "NDDS"):  # NDDS includes annotations of all subfolders
-        _refuse_parent(root, layout)
+        _reject_parent(root, layout)
     if layout is None:
         problem = f"{root}, a folder with an unknown layout"
         raise UserError(problem, allowed, "pass the folder of the data set")
@@ -64,24 +63,22 @@ def _layout_of(root: Path) -> str | None:
     return next((name for name, (is_layout, _) in LAYOUTS.items() if is_layout(root)), None)
 
 
-def _refuse_parent(root: Path, layout: str | None) -> None:
-    """Reject a folder that holds data sets and is not a data set itself.
-
-    FAT's scene folders form one data set, but each folder of a render job is its own data set.
-    """
+def _reject_parent(root: Path, layout: str | None) -> None:
+    """Reject a folder that holds data sets and is not a data set itself."""
     if (root / RECORD_FILE).is_file() or any(root.glob("*.json")):
         return
     folders = [path for path in root.iterdir() if path.is_dir() and not path.name.startswith(".")]
-    layouts = {path.name: name for path in sorted(folders) if (name := _layout_of(path))}
-    is_set = {
-        name: layouts[name] != "NDDS" or (root / name / RECORD_FILE).is_file() for name in layouts
-    }
-    if not any(is_set.values()) and (layout is not None or not layouts):
-        return
-    listed = [f"{name} ({kind})" for name, kind in layouts.items()]
-    remainder = f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
-    problem = (
-        f"{root}, a folder of {len(listed)} data sets: {', '.join(listed[:_LISTED])}{remainder}"
+    layouts = {path: name for path in sorted(folders) if (name := _layout_of(path))}
+    # FAT's scene folders form one data set, but each folder of a render job is its own data set.
+    is_parent = any(
+        name != "NDDS" or (path / RECORD_FILE).is_file() for path, name in layouts.items()
     )
-    fix = f"check each on its own, e.g. dopepp check {root / next(iter(layouts))}"
+    if not is_parent and (layout is not None or not layouts):
+        return
+    listed = [f"{path.name} ({name})" for path, name in layouts.items()]
+    names = ", ".join(listed[:_MAX_LISTED])
+    if len(listed) > _MAX_LISTED:
+        names += f" and {len(listed) - _MAX_LISTED} more"
+    problem = f"{root}, a folder of {len(listed)} data sets: {names}"
+    fix = f"check each data set, e.g. dopepp check {next(iter(layouts))}"
     raise UserError(problem, "one data set", fix)

@@ -44,7 +44,7 @@ from dopepp.parts.part import Part
 from dopepp.parts.size import Seen, widest
 from dopepp.virtual.backgrounds import Backgrounds
 
-_SEEN_ITEMS: Final = 200  # Number of images for measuring the range of sizes
+_MAX_MEASURED: Final = 200  # images of a source for measuring the parts' sizes
 
 
 class PoseDataModule(LightningDataModule):
@@ -146,16 +146,18 @@ class PoseDataModule(LightningDataModule):
             fix = "leave the object out, or add a source that shows it (e.g. renders)"
             raise UserError(problem, "objects with at least one instance in a training source", fix)
 
-    def seen(self, parts: Sequence[Part]) -> dict[str, Seen]:
-        """Measure size and distance of the parts on validation images, else training images."""
+    def size_ranges(self, parts: Sequence[Part]) -> dict[str, Seen]:
+        """Measure the ranges of size and distance of each part.
+
+        Validation images are measured first; training images only for parts that they lack.
+        """
         views: dict[str, list[Seen]] = {part.name: [] for part in parts}
         for source in (self.val_source, self.train_source):
             missing = [part for part in parts if not views[part.name]]
-            for index in range(min(len(source), _SEEN_ITEMS) if missing else 0):
+            for index in range(min(len(source), _MAX_MEASURED) if missing else 0):
                 sample = source.sample(index)
                 scale = Letterbox.fit(sample.size, self.input_size).scale_x
-                pairs = itertools.product(missing, sample.instances)
-                for part, instance in pairs:
+                for part, instance in itertools.product(missing, sample.instances):
                     if instance.label == part.name:
                         depth = float(transform(instance.T_cam_obj, part.cuboid[CENTROID])[2])
                         pixels = scale * focal_length(sample.K) * part.diameter / depth
@@ -164,21 +166,16 @@ class PoseDataModule(LightningDataModule):
 
     def summary(self) -> list[tuple[str, SourceInfo]]:
         """Return the splits and descriptions of all sources, for the log at the start."""
-        splits = self._splits().items()
-        return [(split, info) for split, source in splits for info in source.describe()]
+        splits = {"train": self.train_source, "val": self.val_source, "test": self.test_source}
+        return [(split, info) for split, source in splits.items() for info in source.describe()]
 
     def fingerprint(self) -> str:
         """Return a SHA-256 over everything that determines the images."""
-        record = {
-            split: [[info.name, info.num_images, dict(info.identity)] for info in source.describe()]
-            for split, source in self._splits().items()
-        }
+        record: dict[str, list[object]] = {"train": [], "val": [], "test": []}
+        for split, info in self.summary():
+            record[split].append([info.name, info.num_images, dict(info.identity)])
         text = json.dumps({"seed": self.seed, **record}, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
-
-    def _splits(self) -> dict[str, DescribedSource]:
-        """Return the sources by the name of their split."""
-        return {"train": self.train_source, "val": self.val_source, "test": self.test_source}
 
 
 Item = Callable[[int, int], Sample]
@@ -186,13 +183,9 @@ Item = Callable[[int, int], Sample]
 
 
 class SampleDataset(Dataset[Sample | UserError]):
-    """Dataset indexed by (epoch, index).
+    """The ``num_items`` samples of an epoch, indexed by (epoch, index).
 
-    A ``UserError`` is returned instead of raised; :class:`PoseLoader` raises it.
-
-    Args:
-        item: Makes the samples.
-        num_items: Samples in an epoch.
+    A ``UserError`` is returned instead of raised; :class:`PoseLoader` raises the error.
     """
 
     def __init__(self, item: Item, num_items: int) -> None:
@@ -238,20 +231,17 @@ class EpochSampler(DistributedSampler[tuple[int, int]]):
         order = np.arange(self._num_items)
         if self.shuffle:
             order = item_rng(self.seed, Purpose.SHUFFLE, epoch).permutation(order)
-        mine = order[self._rank :: self._world_size][: len(self)]
+        items_of_rank = order[self._rank :: self._world_size][: len(self)]
         skip, self.skip = self.skip, 0
-        return iter([(epoch, int(index)) for index in mine[skip:]])
+        return iter([(epoch, int(index)) for index in items_of_rank[skip:]])
 
 
 class PoseLoader(DataLoader[Any]):
     """A ``DataLoader`` that resumes inside an epoch and raises a worker's ``UserError``.
 
-    An exception of a worker would arrive with its stack as text. Therefore workers return the error
-    as a value.
+    Workers return the error as a value, because ``DataLoader`` turns exceptions into text.
 
     Args:
-        dataset: Samples.
-        sampler: Order of the samples.
         object_names: Names of the objects, in the network's order.
         **options: Options of ``DataLoader``.
     """
@@ -298,7 +288,7 @@ class PoseLoader(DataLoader[Any]):
         else:
             return
         # This ends the workers cleanly. Otherwise the exception's traceback keeps them in a
-        # reference cycle, and the collector closes their queues before waiting for them.
+        # reference cycle, and the collector closes their queues before they have ended.
         self._iterator = None
         raise batch
 

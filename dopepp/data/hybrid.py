@@ -30,22 +30,10 @@ from dopepp.geometry.cuboid import CENTROID
 
 _log = logging.getLogger(__name__)
 
-REAL: Final = 0
-VIRTUAL: Final = 1
-SYNTHETIC: Final = 2
+REAL, VIRTUAL, SYNTHETIC = range(3)
 _ROLES: Final = ("real", "virtual", "synthetic")
 
 Order = Int[np.ndarray, " items"]
-
-
-def _shares(
-    present: tuple[bool, ...], real_fraction: float, synthetic_fraction: float
-) -> list[float]:
-    """Return the shares of (real, virtual, synthetic) images; absent sources have share 0."""
-    real, virtual, synthetic = present
-    real_share = (real_fraction if virtual or synthetic else 1.0) if real else 0.0
-    synthetic_part = (synthetic_fraction if virtual else 1.0) if synthetic else 0.0
-    return [real_share, (1 - real_share) * (1 - synthetic_part), (1 - real_share) * synthetic_part]
 
 
 class HybridSource:
@@ -76,17 +64,22 @@ class HybridSource:
         name: str = "hybrid",
     ) -> None:
         self._sources = (real, virtual, synthetic)
-        present = tuple(source is not None for source in self._sources)
-        if not any(present):
+        if real is None and virtual is None and synthetic is None:
             problem, fix = "a hybrid mix without any source", "set data.root=FOLDER"
             raise UserError(problem, "at least one source", fix)
-        shares = _shares(present, real_fraction, synthetic_fraction)
-        if real is not None and shares[REAL] != real_fraction:
+        # A missing source gives its share to the other sources.
+        if real is None:
+            real_fraction = 0.0
+        elif virtual is None and synthetic is None and real_fraction != 1:
             _log.warning("there are no virtual images: the real share is 1, not %g", real_fraction)
-        num_real = round(shares[REAL] * samples_per_epoch)
-        num_synthetic = round(shares[SYNTHETIC] * samples_per_epoch)
-        if virtual is None and synthetic is not None:
+            real_fraction = 1.0
+        num_real = round(real_fraction * samples_per_epoch)
+        if synthetic is None:
+            num_synthetic = 0
+        elif virtual is None:
             num_synthetic = samples_per_epoch - num_real
+        else:
+            num_synthetic = round((1 - real_fraction) * synthetic_fraction * samples_per_epoch)
         self.counts = (num_real, samples_per_epoch - num_real - num_synthetic, num_synthetic)
         self.name, self._seed, self._length = name, seed, samples_per_epoch
         self._plan = lru_cache(1)(self._make_plan)
@@ -104,7 +97,7 @@ class HybridSource:
         """Return item ``index`` of ``epoch`` from the source that the mix has drawn."""
         role, cycle, item = self.locate(index, epoch)
         source = self._sources[role]
-        assert source is not None  # an absent source has no items in the plan
+        assert source is not None  # the plan has no items of a missing source
         return source.sample(item, cycle)
 
     def locate(self, index: int, epoch: int) -> tuple[int, int, int]:
@@ -160,25 +153,23 @@ class WindowedSource:
 
     def __init__(self, source: DescribedSource, image: Size, window: Size, seed: int) -> None:
         self._source, self.name = source, source.name
-        self._picture, self._window, self._seed = image, window, seed
+        self._image, self._window, self._seed = image, window, seed
 
     def __len__(self) -> int:
         return len(self._source)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Return a window of item ``index``."""
-        sample = resize_sample(self._source.sample(index, epoch), self._picture)
+        sample = resize_sample(self._source.sample(index, epoch), self._image)
         rng = item_rng(self._seed, Purpose.WINDOW, epoch, index)
         size = np.minimum(self._window, sample.size)
-        centres = np.array([instance.keypoints[CENTROID] for instance in sample.instances]).reshape(
-            -1, 2
-        )
-        shown = centres[((centres >= 0) & (centres < sample.size)).all(axis=1)]
-        middle = rng.uniform(0, 1, 2) * sample.size - 0.5
-        if len(shown):
-            middle = shown[rng.integers(len(shown))]
-        first = np.maximum(np.ceil(middle - size + 0.5), 0)
-        last = np.minimum(np.floor(middle + 0.5), np.array(sample.size) - size)
+        points = [instance.keypoints[CENTROID] for instance in sample.instances]
+        centres = [point for point in points if ((point >= 0) & (point < sample.size)).all()]
+        centre = rng.uniform(0, 1, 2) * sample.size - 0.5
+        if centres:
+            centre = centres[rng.integers(len(centres))]
+        first = np.maximum(np.ceil(centre - size + 0.5), 0)
+        last = np.minimum(np.floor(centre + 0.5), np.array(sample.size) - size)
         left, top = np.floor(first + rng.uniform(0, 1, 2) * (last - first + 1)).astype(int).tolist()
         window = crop_sample(sample, left, top, (int(size[0]), int(size[1])))
         return pad_sample(window, self._window)
@@ -188,8 +179,8 @@ class WindowedSource:
         return self._source.contains(label)
 
     def describe(self) -> list[SourceInfo]:
-        """Describe the source with the sizes."""
-        sizes = {"picture": list(self._picture), "window": list(self._window)}
+        """Describe the source with the sizes of image and window."""
+        sizes = {"picture": list(self._image), "window": list(self._window)}
         return [
             replace(info, identity={**info.identity, **sizes}) for info in self._source.describe()
         ]

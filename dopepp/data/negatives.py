@@ -39,7 +39,7 @@ class PhotoFrames:
         name: str = "pictures",
         seed: int = 0,
     ) -> None:
-        self.pictures, self.K, self.size, self.name = images, K, size, name
+        self.images, self.K, self.size, self.name = images, K, size, name
         self._length = len(images.paths) if num_frames is None else num_frames
         self._seed = seed
         self._order = item_rng(seed, Purpose.SHUFFLE, 0).permutation(len(images.paths))
@@ -55,13 +55,14 @@ class PhotoFrames:
         """
         if not 0 <= index < self._length:
             raise IndexError(f"index {index} is out of range for {self._length} frames")
-        lap, number = divmod(index, len(self._order))
-        rng = item_rng(self._seed, Purpose.WINDOW, lap, number)
-        share = 1.0 if lap < 2 else rng.uniform(0.5, 1.0)
-        image, path = self.pictures.frame(
-            rng, int(self._order[number]), self.size, share, lap % 2 == 1
+        round_number, number = divmod(index, len(self._order))
+        rng = item_rng(self._seed, Purpose.WINDOW, round_number, number)
+        share = 1.0 if round_number < 2 else rng.uniform(0.5, 1.0)
+        is_mirrored = round_number % 2 == 1
+        image, path = self.images.frame(
+            rng, int(self._order[number]), self.size, share, is_mirrored
         )
-        key = f"{path.relative_to(self.pictures.folder).as_posix()}/{lap}"
+        key = f"{path.relative_to(self.images.folder).as_posix()}/{round_number}"
         return Sample(image, self.K.copy(), [], None, self.name, key)
 
     def contains(self, label: str) -> bool:
@@ -71,7 +72,7 @@ class PhotoFrames:
     def describe(self) -> list[SourceInfo]:
         """Return the identity of the images and the camera."""
         identity = {
-            "pictures": self.pictures.identity(),
+            "pictures": self.images.identity(),
             "K": self.K.tolist(),
             "size": list(self.size),
             "seed": self._seed,
@@ -102,12 +103,10 @@ class UnlabelledRenders:
 
 
 class FrameMix:
-    """Frames of several sources in turn, selected by the index.
+    """A mix whose consecutive frames come from the sources in turn.
 
     Args:
-        sources: One or more sources, each with at least ``num_frames / len(sources)`` frames,
-            rounded up.
-        num_frames: Number of frames.
+        sources: Each has at least ``num_frames / len(sources)`` frames, rounded up.
     """
 
     def __init__(
@@ -119,15 +118,15 @@ class FrameMix:
         return self._length
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Return frame ``index``, from the sources in turn.
+        """Return frame ``index``.
 
         Raises:
             IndexError: The index is negative, or not below the number of frames.
         """
         if not 0 <= index < self._length:
             raise IndexError(f"index {index} is out of range for {self._length} frames")
-        item, kind = divmod(index, len(self.sources))
-        return self.sources[kind].sample(item, epoch)
+        item, source = divmod(index, len(self.sources))
+        return self.sources[source].sample(item, epoch)
 
     def contains(self, label: str) -> bool:
         """Return whether any source holds this object."""

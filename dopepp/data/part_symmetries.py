@@ -47,24 +47,15 @@ def choose_symmetries(
     if choice == AUTO:
         return [with_symmetries(part) for part in parts]
     if isinstance(choice, Mapping):
-        given = {name: bop_models.parse_symmetries(name, entry) for name, entry in choice.items()}
-        return [_with(part, *given[part.name]) if part.name in given else part for part in parts]
-    infos = _read_infos(choice)
-    for part in parts:
-        if part.name not in infos:
-            problem = f"data.symmetries={choice}, which has no entry for {part.name}"
-            raise UserError(problem, ", ".join(infos), f'add an entry with "name": "{part.name}"')
-    return [
-        _with(part, infos[part.name].symmetries_discrete, infos[part.name].symmetries_continuous)
-        for part in parts
-    ]
-
-
-def _with(
-    part: Part, discrete: bop_models.Discrete | None, continuous: bop_models.Continuous
-) -> Part:
-    """Return a part with these symmetries."""
-    return replace(part, symmetries_discrete=discrete, symmetries_continuous=continuous)
+        entries = {name: bop_models.parse_symmetries(name, entry) for name, entry in choice.items()}
+    else:
+        entries = _read_symmetries(choice)
+        for part in parts:
+            if part.name not in entries:
+                problem = f"data.symmetries={choice}, which has no entry for {part.name}"
+                fix = f'add an entry with "name": "{part.name}"'
+                raise UserError(problem, ", ".join(entries), fix)
+    return [replace(part, **entries.get(part.name, {})) for part in parts]
 
 
 def with_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
@@ -87,7 +78,8 @@ def with_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
     if is_coloured and (len(discrete) or continuous):
         reason = "if they distinguish the sides, set data.symmetries=none"
         _log.warning("%s has colours, which the search ignores: %s", part.name, reason)
-    return _with(part, discrete if len(discrete) else None, continuous)
+    found = discrete if len(discrete) else None
+    return replace(part, symmetries_discrete=found, symmetries_continuous=continuous)
 
 
 def describe_symmetries(path: Path | str, unit: str | None, tolerance: float) -> str:
@@ -97,12 +89,8 @@ def describe_symmetries(path: Path | str, unit: str | None, tolerance: float) ->
     return json.dumps(entry, indent=2, ensure_ascii=False)
 
 
-def _read_infos(choice: str) -> dict[str, bop_models.ModelInfo]:
-    """Return a file's entries by the part's name.
-
-    Raises:
-        UserError: The file does not exist.
-    """
+def _read_symmetries(choice: str) -> dict[str, bop_models.Symmetries]:
+    """Return the symmetries in a file by the part's name."""
     path = Path(choice)
     if not path.is_file():
         allowed = f"null, {NONE}, {AUTO} or a models_info.json"
@@ -111,4 +99,5 @@ def _read_infos(choice: str) -> dict[str, bop_models.ModelInfo]:
     records = read_json(path)
     if isinstance(records, dict) and "diameter" in records:
         records = {"1": records}  # a file with a single entry
-    return {info.name: info for info in bop_models.parse_models(path, records).values()}
+    infos = bop_models.parse_models(path, records).values()
+    return {info.name: info.symmetries for info in infos}

@@ -54,7 +54,7 @@ _NAMED: Final = re.compile(r"([^=/\\]+)=(.+)")  # ``NAME=FILE``; a name is not a
 
 
 @dataclass(frozen=True)
-class Job:
+class RenderJob:
     """Images to render, independent of processes and shards."""
 
     factory: Factory  # renders image (0, index)
@@ -93,7 +93,7 @@ def make_job(
     camera: str | Path | None = None,
     working_distance: str | None = None,
     views: int = 1,
-) -> Job:
+) -> RenderJob:
     """Make a job from user input.
 
     Args:
@@ -124,9 +124,14 @@ def make_job(
     targets = [named_part(text, unit) for text in parts]
     if camera is not None or working_distance is not None:
         scenes = _in_camera(scenes, targets, camera, working_distance)
+    if size is not None:
+        sides = re.fullmatch(r"([0-9]{1,6})[x,]([0-9]{1,6})", size)
+        if sides is None:
+            raise UserError(f"--size {size}", "WIDTHxHEIGHT in pixels", "pass e.g. --size 640x480")
+        scenes = scenes.reframed(int(sides[1]), int(sides[2]))
     factory = Factory(
         targets,
-        scenes if size is None else scenes.reframed(*_sides(size)),
+        scenes,
         seed,
         find_backgrounds(backgrounds),
         renderer=renderer,
@@ -148,15 +153,11 @@ def make_job(
     # One view adds no key, so that older folders can be continued.
     if views > 1:
         record["views"] = views
-    return Job(factory, layout, views, record)
+    return RenderJob(factory, layout, views, record)
 
 
 def _find_writer(layout: str) -> Callable[[Path, Sequence[Part]], Writer]:
-    """Import and return the class of a layout's writer.
-
-    Raises:
-        UserError: The layout is unknown.
-    """
+    """Import and return the class of a layout's writer."""
     if layout not in WRITERS:
         fix = "pass --format with one of these names"
         raise UserError(f"format {layout!r}", ", ".join(WRITERS), fix)
@@ -176,11 +177,7 @@ def named_part(text: str, unit: str | None) -> Part:
 def _in_camera(
     scenes: Preset, parts: Sequence[Part], path: str | Path | None, distance: str | None
 ) -> Preset:
-    """Return the preset with the camera of a file, and log the parts' sizes in its images.
-
-    Raises:
-        UserError: Only the camera or only the distance is given, or the distance is not a pair.
-    """
+    """Return the preset with the camera of a file, and log the parts' sizes in its images."""
     if path is None or distance is None:
         missing = "--camera FILE" if path is None else "--working-distance 0.3,0.8"
         given = "--working-distance" if path is None else "--camera"
@@ -198,20 +195,8 @@ def _in_camera(
     return view.whole(scenes, view.scale_for(parts))
 
 
-def _sides(size: str) -> tuple[int, int]:
-    """Parse an image size ``WIDTHxHEIGHT``."""
-    match = re.fullmatch(r"([0-9]{1,6})[x,]([0-9]{1,6})", size)
-    if match is None:
-        raise UserError(f"--size {size}", "WIDTHxHEIGHT in pixels", "pass e.g. --size 640x480")
-    return int(match[1]), int(match[2])
-
-
 def _nested(changes: Sequence[str]) -> dict[str, Any]:
-    """Convert ``a.b=1`` to ``{"a": {"b": 1}}``.
-
-    Raises:
-        UserError: A change has another form, or two changes set the same field.
-    """
+    """Convert ``a.b=1`` to ``{"a": {"b": 1}}``."""
     tree: dict[str, Any] = {}
     for change in changes:
         path, sign, text = change.partition("=")
@@ -254,12 +239,12 @@ _MAX_RECORD_BYTES: Final = 4_000_000  # about 10,000 parts
 _MAX_DIFFERENCES: Final = 3  # differences shown in an error message
 
 
-def has_started(root: Path) -> bool:
-    """Return whether a job has claimed the folder."""
+def is_claimed(root: Path) -> bool:
+    """Return whether the folder has the record of a job."""
     return (root / RECORD_FILE).is_file()
 
 
-def begin(root: Path, record: Mapping[str, Any]) -> None:
+def claim(root: Path, record: Mapping[str, Any]) -> None:
     """Claim a folder for a job, and remove the files of interrupted writes.
 
     A folder that this job has claimed before is accepted.
@@ -274,24 +259,17 @@ def begin(root: Path, record: Mapping[str, Any]) -> None:
     """
     try:
         root.mkdir(parents=True, exist_ok=True)
-        _claim(root, json.loads(json.dumps(record)))
+        _write_record(root, json.loads(json.dumps(record)))
         _remove_abandoned(root)
     except OSError as error:
         if error.errno in NO_SPACE:
             raise StoppedError(system_failure(error, root)) from error
-        raise UserError(
-            f"folder {root}: {error.strerror}",
-            "a folder that can be written",
-            "pass another folder with --out",
-        ) from error
+        problem, fix = f"folder {root}: {error.strerror}", "pass another folder with --out"
+        raise UserError(problem, "a folder that can be written", fix) from error
 
 
-def _claim(root: Path, record: Mapping[str, Any]) -> None:
-    """Write the record of a job to a new folder, or compare it with the record in the folder.
-
-    Raises:
-        UserError: The folder contains other files, or belongs to a job with other settings.
-    """
+def _write_record(root: Path, record: Mapping[str, Any]) -> None:
+    """Write the record of a job to a new folder, or compare it with the record in the folder."""
     path = root / RECORD_FILE
     # Listed before the check for a record, because other shards write after their record.
     names = sorted(entry.name for entry in root.iterdir())

@@ -11,7 +11,7 @@ import numpy as np
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_png
-from dopepp.data.render_job import Job
+from dopepp.data.render_job import RenderJob
 from dopepp.data.rendered import rendered_sample
 from dopepp.data.sample import Sample
 from dopepp.drawing.overlay import Wireframe, overlay
@@ -32,11 +32,11 @@ from dopepp.virtual.scene import Rendered
 
 NUM_SCENES: Final = 8
 _PANELS: Final = 4
-_LISTED: Final = 4  # visible fractions in a caption, at most
+_MAX_LISTED: Final = 4  # visible fractions in a caption
 _AXIS_LENGTH: Final = 0.5  # length of a drawn axis, diameters
 
 
-def write_preview(job: Job, out: Path) -> Path:
+def write_preview(job: RenderJob, out: Path) -> Path:
     """Write a contact sheet of the job's first images, and return its path.
 
     Args:
@@ -52,11 +52,8 @@ def write_preview(job: Job, out: Path) -> Path:
     try:
         write_png(path, sheet)
     except OSError as error:
-        raise UserError(
-            f"sheet {path}: {error.strerror}",
-            "a folder that can be written",
-            "pass another folder with --out",
-        ) from error
+        problem, fix = f"sheet {path}: {error.strerror}", "pass another folder with --out"
+        raise UserError(problem, "a folder that can be written", fix) from error
     return path
 
 
@@ -81,19 +78,19 @@ def scene_tiles(rendered: Rendered, name: str) -> Iterator[Tile]:
     yield Tile(rendered.image, f"{name}: {width}×{height}, {lights}{plane}")
     counts = Counter(instance.label for instance in sample.instances)
     names = [label if count == 1 else f"{count} {label}" for label, count in counts.items()]
-    yield Tile(_posed(rendered, sample), ", ".join(names) or "no target")
+    yield Tile(_draw_poses(rendered, sample), ", ".join(names) or "no target")
     masks = [instance.mask for instance in sample.instances]
     percents = [round(100 * instance.visible_fraction) for instance in sample.instances]
-    seen = f"visible: {', '.join(f'{percent} %' for percent in percents)}"
-    if len(percents) > _LISTED:
-        seen = f"visible: {min(percents)} to {max(percents)} % of {len(percents)} targets"
+    visible = f"visible: {', '.join(f'{percent} %' for percent in percents)}"
+    if len(percents) > _MAX_LISTED:
+        visible = f"visible: {min(percents)} to {max(percents)} % of {len(percents)} targets"
     elif not percents:
-        seen = "no instance"
-    yield Tile(mask_panel(rendered.image, masks), f"{seen}; distractors: {others}")
+        visible = "no instance"
+    yield Tile(mask_panel(rendered.image, masks), f"{visible}; distractors: {others}")
     yield Tile(*depth_panel(rendered.depth, rendered.instances >= 0))
 
 
-def _posed(rendered: Rendered, sample: Sample) -> RGBImage:
+def _draw_poses(rendered: Rendered, sample: Sample) -> RGBImage:
     """Draw cuboids in the masks' colours, and the axes of the object frames."""
     frames = [
         Wireframe(instance.keypoints, COLOURS[number % len(COLOURS)])

@@ -14,18 +14,19 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
 import cv2
-from rich import progress as shown
+from rich import progress as rich_progress
 from rich.console import Console
 from rich.text import Text
 
 from dopepp.core.errors import StoppedError, UserError, system_failure
 from dopepp.core.pool import ClusterPool, LostWorkerError, Pool, ProcessPool, available_cores
 from dopepp.data.formats import RECORD_FILE, Writer
-from dopepp.data.render_job import Job, begin, has_started
+from dopepp.data.render_job import RenderJob, claim, is_claimed
 from dopepp.data.rendered import MAX_ITEMS
 from dopepp.virtual.renderers.photoreal import THREADS_SETTING
 
@@ -66,7 +67,7 @@ class RenderReport:
 
 
 def run(
-    job: Job,
+    job: RenderJob,
     out: Path,
     num: int | None,
     shard: str = "0/1",
@@ -97,11 +98,7 @@ def run(
 
 
 def _engine(engine: str, workers: int | None, ray_address: str | None) -> OpenPool:
-    """Return the function that opens the pool, after checking the options.
-
-    Raises:
-        UserError: An option is invalid, or an address is given without the engine ``ray``.
-    """
+    """Check the options, and return the function that opens the pool."""
     workers = available_cores() if workers is None else workers
     if not 1 <= workers <= MAX_WORKERS:
         fix = "pass an allowed number, or leave out --workers"
@@ -150,11 +147,11 @@ class Chunk:
     """A shard's share of a chunk."""
 
     number: int
-    required: range  # the job's images in the chunk, from all shards, needed to finalize it
+    required: range  # the job's images in the chunk, from all shards, needed to finalize the chunk
     missing: Sequence[int]  # the shard's images in the chunk that are not rendered
 
 
-def plan(writer: Writer, shard: Shard, num_items: int) -> Iterator[Chunk]:
+def plan_chunks(writer: Writer, shard: Shard, num_items: int) -> Iterator[Chunk]:
     """Yield the chunks that a shard overlaps, in order, including complete chunks."""
     span, size = shard.span(num_items), writer.chunk_size
     for number in range(span.start // size, -(-span.stop // size) if span else 0):
@@ -177,13 +174,12 @@ class RenderTask:
 class RenderTasks:
     """Performs tasks of a job in a process of a pool, on one thread."""
 
-    def __init__(self, job: Job, root: Path) -> None:
+    def __init__(self, job: RenderJob, root: Path) -> None:
         self._job, self._root = job, root
-        self._writer: Writer | None = None
 
     def __call__(self, task: RenderTask) -> tuple[float, float]:
         """Perform a task; return the CPU seconds of rendering and of encoding and writing."""
-        writer = self._open()
+        writer = self._writer
         if task.finalizes:
             written = writer.written(task.chunk)
             # Otherwise other shards still render images of the chunk.
@@ -200,21 +196,20 @@ class RenderTasks:
             write_s += time.process_time() - middle
         return render_s, write_s
 
-    def _open(self) -> Writer:
-        """Return this process's writer into the data set; open it at the first task."""
-        if self._writer is None:
-            cv2.setNumThreads(1)
-            os.environ.setdefault(THREADS_SETTING, "1")
-            if not has_started(self._root):
-                problem = f"{self._root}, in which a worker finds no {RECORD_FILE}"
-                allowed = "a folder with the same path on every machine of the cluster"
-                raise UserError(problem, allowed, "pass an --out on a shared file system")
-            self._writer = self._job.writer(self._root)
-        return self._writer
+    @cached_property
+    def _writer(self) -> Writer:
+        """This process's writer into the data set."""
+        cv2.setNumThreads(1)
+        os.environ.setdefault(THREADS_SETTING, "1")
+        if not is_claimed(self._root):
+            problem = f"{self._root}, in which a worker finds no {RECORD_FILE}"
+            allowed = "a folder with the same path on every machine of the cluster"
+            raise UserError(problem, allowed, "pass an --out on a shared file system")
+        return self._job.writer(self._root)
 
 
 def render_dataset(
-    job: Job,
+    job: RenderJob,
     root: Path,
     num_items: int,
     open_pool: OpenPool,
@@ -241,22 +236,23 @@ def render_dataset(
     if not 1 <= num_items <= MAX_ITEMS:
         raise UserError(f"-n {num_items}", f"1 to {MAX_ITEMS:,} images", "pass e.g. -n 1000")
     root, shard = root.resolve(), shard or Shard()
-    if not has_started(root):
+    if not is_claimed(root):
         # This fails before anything is written if the preset cannot show the part.
         job.factory.scene(0, 0)
-    begin(root, job.record)
+    claim(root, job.record)
     start = time.monotonic()
     try:
         writer = job.writer(root)
         writer.prepare()
-        run = _Run(list(plan(writer, shard, num_items)), RenderReport(len(shard.span(num_items))))
-        on_progress(run.num_there, run.report.num_images)
+        chunks = list(plan_chunks(writer, shard, num_items))
+        run = _Run(chunks, RenderReport(len(shard.span(num_items))))
+        on_progress(run.num_done, run.report.num_images)
         with open_pool(pickle.dumps(RenderTasks(job, root))) as pool:
             # Render tasks with finalizing tasks in between, then the remaining finalizing tasks.
-            for tasks in (run.tasks(pool.batch_size), run.finalizes()):
+            for tasks in (run.render_tasks(pool.batch_size), run.finalizing_tasks()):
                 for task, future in pool.run(tasks):
-                    run.note(task, *future.result())
-                    on_progress(run.num_there, run.report.num_images)
+                    run.count(task, *future.result())
+                    on_progress(run.num_done, run.report.num_images)
     except LostWorkerError as error:
         raise StoppedError(str(error)) from error
     except OSError as error:
@@ -271,34 +267,34 @@ class _Run:
     def __init__(self, chunks: list[Chunk], report: RenderReport) -> None:
         self.report = report
         self._chunks = {chunk.number: chunk for chunk in chunks}
-        self._left = {chunk.number: len(chunk.missing) for chunk in chunks}
+        self._num_missing = {chunk.number: len(chunk.missing) for chunk in chunks}
         # Complete chunks may lack finalizing, which is idempotent.
-        self._complete = deque(number for number, left in self._left.items() if not left)
-        self.num_there = report.num_images - sum(self._left.values())
+        self._complete = deque(number for number, num in self._num_missing.items() if not num)
+        self.num_done = report.num_images - sum(self._num_missing.values())
 
-    def tasks(self, images_per_task: int) -> Iterator[RenderTask]:
+    def render_tasks(self, images_per_task: int) -> Iterator[RenderTask]:
         """Yield the tasks that render images, and tasks that finalize each completed chunk."""
         for chunk in self._chunks.values():
             for first in range(0, len(chunk.missing), images_per_task):
-                yield from self.finalizes()
+                yield from self.finalizing_tasks()
                 yield RenderTask(chunk.number, chunk.missing[first : first + images_per_task])
 
-    def finalizes(self) -> Iterator[RenderTask]:
-        """Yield finalizing tasks of the chunks that are complete by now."""
+    def finalizing_tasks(self) -> Iterator[RenderTask]:
+        """Yield a task for each chunk that has been completed and not been finalized."""
         while self._complete:
             number = self._complete.popleft()
             yield RenderTask(number, self._chunks[number].required, finalizes=True)
 
-    def note(self, task: RenderTask, render_s: float, write_s: float) -> None:
-        """Count a finished task."""
+    def count(self, task: RenderTask, render_s: float, write_s: float) -> None:
+        """Count the images and times of a finished task."""
         if task.finalizes:
             return
         self.report.render_s += render_s
         self.report.write_s += write_s
         self.report.num_rendered += len(task.indices)
-        self.num_there += len(task.indices)
-        self._left[task.chunk] -= len(task.indices)
-        if not self._left[task.chunk]:
+        self.num_done += len(task.indices)
+        self._num_missing[task.chunk] -= len(task.indices)
+        if not self._num_missing[task.chunk]:
             self._complete.append(task.chunk)
 
 
@@ -306,10 +302,17 @@ class ProgressDisplay:
     """Context that shows progress as a bar or, without a terminal, as lines in the log."""
 
     def __init__(self, console: Console) -> None:
-        counts = "rendering", shown.BarColumn(), shown.MofNCompleteColumn(), _RateColumn()
-        times = shown.TimeElapsedColumn(), "left", shown.TimeRemainingColumn()
-        is_hidden = not console.is_terminal
-        self._bar = shown.Progress(*counts, *times, console=console, disable=is_hidden)
+        self._bar = rich_progress.Progress(
+            "rendering",
+            rich_progress.BarColumn(),
+            rich_progress.MofNCompleteColumn(),
+            _RateColumn(),
+            rich_progress.TimeElapsedColumn(),
+            "left",
+            rich_progress.TimeRemainingColumn(),
+            console=console,
+            disable=not console.is_terminal,
+        )
         self._first: int | None = None
         self._start = self._last = 0.0
 
@@ -335,10 +338,10 @@ class ProgressDisplay:
             _log.info("%s images, %.1f/s, %.0f min left", f"{done:,} of {total:,}", rate, left)
 
 
-class _RateColumn(shown.ProgressColumn):
+class _RateColumn(rich_progress.ProgressColumn):
     """Images per second over the last half minute; empty while unknown."""
 
-    def render(self, task: shown.Task) -> Text:
+    def render(self, task: rich_progress.Task) -> Text:
         """Return the rate as text."""
         speed = task.finished_speed or task.speed
         return Text(f"{speed:.1f}/s" if speed else "", style="progress.data.speed")

@@ -118,31 +118,6 @@ _FILLED: Final = 1 << 32
 """Added to a slot's CRC-32, so that only an empty slot has the checksum 0."""
 
 
-def _in_memory(dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndarray, " items"]:
-    """Return zeros in memory shared with forked processes; only written pages take memory."""
-    return np.frombuffer(mmap.mmap(-1, dtype.itemsize * num_items), dtype)
-
-
-def _in_file(path: Path, dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndarray, " items"]:
-    """Map an existing file, or a new file of zeros, into memory.
-
-    Raises:
-        UserError: The file cannot be created, e.g. because the disk is full.
-    """
-    # Disk space is allocated now, because a full disk under a map with holes kills the process.
-    size = dtype.itemsize * num_items
-    try:
-        if not path.is_file() or path.stat().st_size != size:
-            with draft(path) as partial, partial.open("wb") as file:
-                os.posix_fallocate(file.fileno(), 0, size)
-        with path.open("r+b") as file:
-            return np.frombuffer(mmap.mmap(file.fileno(), size), dtype)
-    except OSError as error:
-        problem = f"data.cache=disk, {size / 1e9:.2f} GB in {path.parent}: {error.strerror}"
-        fix = "set data.cache_dir to another disk, or data.cache=none"
-        raise UserError(problem, "a folder with at least this much free space", fix) from error
-
-
 class CachedSource:
     """Caches another source's items of epoch 0, resized to the network's input size.
 
@@ -172,7 +147,7 @@ class CachedSource:
         first = self._resized(0)
         self._source_name = first.source
         self._shape, self._has_depth = first.image.shape[:2], first.depth is not None
-        slot = _slot(self._shape, self._has_depth)
+        slot = _slot_layout(self._shape, self._has_depth)
         self.num_bytes = slot.itemsize * len(source)
         self.folder = None
         if folder is None:
@@ -181,18 +156,18 @@ class CachedSource:
                 size = f"{self.num_bytes / 1e9:.1f} GB"
                 problem = f"data.cache=memory for {len(source)} images of {source.name} ({size})"
                 allowed = f"at most half of this machine's {available / 1e9:.1f} GB"
-                fix = "set data.cache=none or disk, or lower data.input_size or "
-                fix += "data.samples_per_epoch"
-                raise UserError(problem, allowed, fix)
-            self._slots = _in_memory(slot, len(source))
-            self._checksums = _in_memory(np.dtype("u8"), len(source))
+                settings = "data.input_size or data.samples_per_epoch"
+                raise UserError(
+                    problem, allowed, f"set data.cache=none or disk, or lower {settings}"
+                )
         else:
             described = [[info.name, info.num_images, info.identity] for info in source.describe()]
             record = {"items": described, "identity": identity, "slot": str(slot.descr)}
             text = json.dumps(record, sort_keys=True, indent=1)
             self.folder = folder / hashlib.sha256(text.encode()).hexdigest()[:24]
-            self._slots = _in_file(self.folder / "slots.bin", slot, len(source))
-            self._checksums = _in_file(self.folder / "checksums.bin", np.dtype("u8"), len(source))
+        self._slots = self._shared_array("slots.bin", slot)
+        self._checksums = self._shared_array("checksums.bin", np.dtype("u8"))
+        if self.folder is not None:
             write_file(self.folder / "identity.json", text.encode())
         self._store(0, first)
 
@@ -216,6 +191,24 @@ class CachedSource:
             replace(info, identity={**info.identity, "cached": True})
             for info in self._source.describe()
         ]
+
+    def _shared_array(self, name: str, dtype: np.dtype[Any]) -> Shaped[np.ndarray, " items"]:
+        """Map memory that forked processes share or, with a folder, a file, at first zeros."""
+        size = dtype.itemsize * len(self._source)
+        if self.folder is None:
+            return np.frombuffer(mmap.mmap(-1, size), dtype)  # only written pages take memory
+        path = self.folder / name
+        try:
+            if not path.is_file() or path.stat().st_size != size:
+                with draft(path) as partial, partial.open("wb") as file:
+                    # Allocated now, because a full disk under a file with holes kills the process.
+                    os.posix_fallocate(file.fileno(), 0, size)
+            with path.open("r+b") as file:
+                return np.frombuffer(mmap.mmap(file.fileno(), size), dtype)
+        except OSError as error:
+            problem = f"data.cache=disk, {size / 1e9:.2f} GB in {path.parent}: {error.strerror}"
+            fix = "set data.cache_dir to another disk, or data.cache=none"
+            raise UserError(problem, "a folder with at least this much free space", fix) from error
 
     def _resized(self, index: int) -> Sample:
         """Return an item of the source at the cached size."""
@@ -250,8 +243,8 @@ class CachedSource:
         """Reject samples that a slot cannot represent."""
         if len(sample.instances) > _MAX_INSTANCES:
             raise ValueError(f"{len(sample.instances)} instances; at most {_MAX_INSTANCES}")
-        kept = (self._shape, self._source_name, self._has_depth)
-        if (sample.image.shape[:2], sample.source, sample.depth is not None) != kept:
+        layout = (self._shape, self._source_name, self._has_depth)
+        if (sample.image.shape[:2], sample.source, sample.depth is not None) != layout:
             rule = "a cache holds images of one size and source, all with depth or all without"
             raise ValueError(f"a {sample.size} image of {sample.source}; {rule}")
         texts = [sample.key, *(instance.label for instance in sample.instances)]
@@ -281,7 +274,7 @@ class CachedSource:
         )
 
 
-def _slot(shape: Shape, has_depth: bool) -> np.dtype[Any]:
+def _slot_layout(shape: Shape, has_depth: bool) -> np.dtype[Any]:
     """Return the layout of a cached sample."""
     instance = np.dtype(
         [

@@ -79,7 +79,7 @@ class SampleSource(Protocol):
     name: str
 
     def __len__(self) -> int:
-        """Return how many items an epoch has."""
+        """Return the number of items of an epoch."""
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Return item ``index`` of ``epoch``."""
@@ -145,24 +145,24 @@ def hull_areas(
     return float(inside), float(cv2.contourArea(hull))
 
 
-def less_visible(
+def reduce_visibility(
     before: Instance, after: Instance, shapes: tuple[Shape, Shape], scale: float = 1.0
 ) -> Instance:
-    """Reduce the visible fraction of an object by its loss in another view of the image.
+    """Reduce the visible fraction of an object by its loss in a crop or warp of the image.
 
     The loss is a share of the mask's pixels or, without a mask, of the cuboid's outline.
 
     Args:
         before: The object on the image.
-        after: The object with keypoints and mask of the view.
-        shapes: (height, width) of the image and of the view.
-        scale: Pixels of the view per pixel of the image.
+        after: The object with keypoints and mask of the new image.
+        shapes: (height, width) of the image and of the new image.
+        scale: Pixels of the new image per pixel of the image.
     """
-    whole, left = (
+    area_before, area_after = (
         hull_areas(view.keypoints, shape)[0] if view.mask is None else float(view.mask.sum())
         for view, shape in zip((before, after), shapes, strict=True)
     )
-    share = min(left / (scale**2 * whole), 1.0) if whole else 0.0
+    share = min(area_after / (scale**2 * area_before), 1.0) if area_before else 0.0
     return replace(after, visible_fraction=before.visible_fraction * share)
 
 
@@ -185,7 +185,7 @@ def item_rng(seed: int, purpose: Purpose, epoch: int, index: int = 0) -> Generat
     return np.random.default_rng([seed, epoch, index, int(purpose)])
 
 
-def nearest(image: NDArray[Any], width: int, height: int) -> NDArray[Any]:
+def resize_nearest(image: NDArray[Any], width: int, height: int) -> NDArray[Any]:
     """Resize by nearest neighbour: target pixel j takes source pixel ⌊(j + ½) / s⌋.
 
     Integer arithmetic is exact; ``cv2.INTER_NEAREST`` takes ⌊j / s⌋, half a pixel off.
@@ -211,7 +211,7 @@ def resize_sample(sample: Sample, input_size: Size) -> Sample:
     if (box.width, box.height) == sample.size:
         return sample
     image, K = box.image(sample.image), box.camera(sample.K)
-    sample = _map_pixels(sample, lambda pixels: nearest(pixels, box.width, box.height))
+    sample = _map_pixels(sample, lambda pixels: resize_nearest(pixels, box.width, box.height))
     instances = [
         replace(instance, keypoints=box.points(instance.keypoints)) for instance in sample.instances
     ]
@@ -232,7 +232,7 @@ def pad_sample(sample: Sample, input_size: Size) -> Sample:
 
 
 def crop_sample(sample: Sample, left: int, top: int, size: Size) -> Sample:
-    """Crop (width, height) pixels; visible fractions shrink as in :func:`less_visible`."""
+    """Crop (width, height) pixels, with reduced visible fractions (:func:`reduce_visibility`)."""
     width, height = size
 
     def cut(pixels: NDArray[Any]) -> NDArray[Any]:
@@ -240,7 +240,7 @@ def crop_sample(sample: Sample, left: int, top: int, size: Size) -> Sample:
 
     cropped, shapes = _map_pixels(sample, cut), (sample.image.shape[:2], (height, width))
     instances = [
-        less_visible(before, replace(after, keypoints=before.keypoints - (left, top)), shapes)
+        reduce_visibility(before, replace(after, keypoints=before.keypoints - (left, top)), shapes)
         for before, after in zip(sample.instances, cropped.instances, strict=True)
     ]
     K = crop_camera(sample.K, left, top)

@@ -157,13 +157,19 @@ def find_peaks(
     if field is not None:
         vectors = _on_host(field).reshape(-1, height, width)
     half = min(max(math.ceil(REACH * geometry.sigma), HALF_WIDTHS[0]), HALF_WIDTHS[1])
-    least = float(np.float32(threshold))  # rounded like the beliefs
-    inputs = maps.reshape(-1, height, width), vectors, least, half, geometry.sigma
     # The views by channel share the memory of the arrays, so filling the views fills the arrays.
     outputs = (
         array.reshape(-1, *array.shape[2:]) for array in (score, position, covariance, toward)
     )
-    _find(*inputs, geometry.field_radius, *outputs)
+    _find(
+        maps.reshape(-1, height, width),
+        vectors,
+        float(np.float32(threshold)),  # rounded like the beliefs
+        half,
+        geometry.sigma,
+        geometry.field_radius,
+        *outputs,
+    )
     pixels = position * geometry.stride + (geometry.stride - 1) / 2
     return Peaks(pixels, score, covariance * geometry.stride**2, toward)
 
@@ -186,20 +192,7 @@ def _find(
     covariance: Array,
     toward: Array,
 ) -> None:
-    """Find and fit the peaks of all channels.
-
-    Args:
-        belief: Belief maps.
-        field: Vector field, which may be empty.
-        threshold: Belief below which a maximum is not a peak.
-        half: Half-width of the fitted window, cells.
-        sigma: Standard deviation of a perfect peak, cells.
-        radius: Radius of the field's discs, cells.
-        score: Filled with the belief of each peak, by channel.
-        position: Filled with (x, y) of each peak, cells.
-        covariance: Filled with the covariance of each position, cells².
-        toward: Filled with the mean vector of the field at each peak.
-    """
+    """Fill the last four arrays with the peaks of all channels, in cells; see :class:`Peaks`."""
     cells = np.empty((score.shape[1], 2), np.int64)
     for channel in range(len(belief)):
         count = _strongest(belief[channel], threshold, score[channel], cells)

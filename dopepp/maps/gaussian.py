@@ -24,24 +24,24 @@ FIRST_MARGIN: Final = 3.0
 cells², while positions within cells are unknown."""
 
 MARGIN: Final = 1.0  # FIRST_MARGIN after both positions are fitted
-SURELY: Final = 1e-6  # Margin above the rounding errors of squared distances, cells²
+ROUNDING: Final = 1e-6  # above the rounding errors of squared distances, cells²
 
 PLATEAU: Final = 3  # Number of cells as high as the peak that indicates a clamped top
 
 STEPS: Final = 3  # Gauss–Newton steps; without noise, the start is exact.
 
-STEEPEST: Final = 10.0
+MAX_EXPONENT: Final = 10.0
 """Largest logarithm of a fitted top, relative to the peak's belief."""
 
-ARRIVED: Final = 1e-4  # Largest parameter change at convergence: 1e-3 px at stride 8
+CONVERGED: Final = 1e-4  # Largest parameter change at convergence: 1e-3 px at stride 8
 
 SHAPE_PRIOR: Final = 0.5
 """Prior standard deviation of a peak's curvature, relative to the target's."""
 
 RIDGE: Final = 1e-14  # Determines directions in which no cell exceeds the floor.
-FLATTEST: Final = 1e-3  # Smallest curvature of a peak, 1/cells²: a standard deviation of 22 cells
+MIN_CURVATURE: Final = 1e-3  # 1/cells²: a standard deviation of 22 cells
 
-UNCERTAIN: Final = 4.0
+CENTRE_VARIANCE: Final = 4.0
 """Variance of a position that is only the centre of its highest cells, cells²."""
 
 
@@ -64,7 +64,7 @@ def fit_peaks(
         covariance: Filled with the covariance of each position, cells²: the covariance of the fit,
             plus the excess of the fitted Gaussian over the target if larger than the map's noise.
     """
-    count, side = len(cells), 2 * half + 1
+    (height, width), count, side = belief.shape, len(cells), 2 * half + 1
     theta, hessian = np.zeros((count, 6)), np.zeros((count, 6, 6))
     noise, freedom = 0.0, 0.0
     scores, work, workspace = np.empty(count), np.empty((5, 10)), np.empty((11, 6))
@@ -72,9 +72,11 @@ def fit_peaks(
     logarithms = np.empty((count, side, side))
     for i in range(count):
         scores[i] = belief[cells[i, 1], cells[i, 0]]
-        _read_window(belief, cells[i, 0] - half, cells[i, 1] - half, scores[i], windows[i])
         for y in range(side):
             for x in range(side):
+                row, column = cells[i, 1] - half + y, cells[i, 0] - half + x
+                inside = 0 <= row < height and 0 <= column < width
+                windows[i, y, x] = belief[row, column] / scores[i] if inside else math.nan
                 logarithms[i, y, x] = math.log(max(windows[i, y, x], FLOOR))
         position[i, 0], position[i, 1] = cells[i, 0], cells[i, 1]
     for i in range(count):
@@ -100,26 +102,15 @@ def fit_peaks(
             _linearised(
                 windows[i], usable[i], theta[i], relative, sigma, work, workspace[0], hessian[i]
             )
-            if _step(theta[i], hessian[i], workspace) < ARRIVED:
+            if _step(theta[i], hessian[i], workspace) < CONVERGED:
                 break
-        u, v, sound = _mode(windows[i], theta[i])
+        u, v, is_fitted = _mode(windows[i], theta[i])
         position[i, 0], position[i, 1] = cells[i, 0] + u, cells[i, 1] + v
-        if sound:
+        if is_fitted:
             _covariance(theta[i], u, v, hessian[i], relative, sigma, workspace, covariance[i])
         else:
             covariance[i] = 0.0
-            covariance[i, 0, 0] = covariance[i, 1, 1] = UNCERTAIN
-
-
-@compiled()
-def _read_window(belief: Array, left: int, top: int, score: float, window: Array) -> None:
-    """Write the cells around a peak relative to its belief; NaN outside of the map."""
-    height, width = belief.shape
-    for y in range(len(window)):
-        for x in range(len(window)):
-            row, column = top + y, left + x
-            inside = 0 <= row < height and 0 <= column < width
-            window[y, x] = belief[row, column] / score if inside else math.nan
+            covariance[i, 0, 0] = covariance[i, 1, 1] = CENTRE_VARIANCE
 
 
 @compiled()
@@ -183,19 +174,9 @@ def _own_cells(
 ) -> None:
     """Mark the cells of a peak's window that belong to this peak.
 
-    A cell belongs to the peak if it is finite, no other peak is higher in the cell, and the cell is
-    not part of a clamped plateau. Of Gaussians s·exp(−d²/2σ²), the highest in a cell has the
-    smallest d² − 2σ² log s.
-
-    Args:
-        i: Index of the peak.
-        windows: Window of cells around each peak, relative to its belief.
-        cells: (column, row) of each peak.
-        position: Estimated (x, y) of each peak, cells.
-        scores: Belief of each peak.
-        sigma: Standard deviation of a perfect peak, cells.
-        margin: Advantage that this peak needs over another peak, cells².
-        usable: Filled with whether each cell belongs to the peak.
+    A cell belongs to peak ``i`` if the cell is finite, no other peak is higher there by ``margin``
+    (cells²), and the cell is not part of a clamped plateau. Of Gaussians s·exp(−d²/2σ²), the
+    highest in a cell has the smallest d² − 2σ² log s.
     """
     side, highest = windows.shape[1], 0
     half = side // 2
@@ -213,7 +194,7 @@ def _own_cells(
         row = cells[i, 1] + (half if position[j, 1] > position[i, 1] else -half)
         mine = (column - position[i, 0]) ** 2 + (row - position[i, 1]) ** 2
         other = (column - position[j, 0]) ** 2 + (row - position[j, 1]) ** 2
-        if mine - handicap < other - SURELY:
+        if mine - handicap < other - ROUNDING:
             continue
         for y in range(side):
             for x in range(side):
@@ -239,17 +220,10 @@ def _fit_logarithm(
     workspace: Array,
     theta: Array,
 ) -> None:
-    """Fit the logarithm of a Gaussian to the cells of a window by weighted linear least squares.
+    """Fit the logarithm of a Gaussian to the usable cells by weighted linear least squares.
 
-    Args:
-        window: Cells around a peak, relative to its belief.
-        logarithm: Logarithm of these cells.
-        usable: Which cells belong to the peak.
-        sigma: Standard deviation of a perfect peak, cells.
-        noise: Variance of a cell over the peak's squared belief, which weights the shape's prior.
-        work: Workspace for sums, (5, 10).
-        workspace: Workspace, (11, 6).
-        theta: Filled with the coefficients of (1, x, y, −x², −xy, −y²).
+    ``theta`` receives the coefficients of (1, x, y, −x², −xy, −y²). ``noise``, a cell's variance
+    over the peak's squared belief, weights the prior of the shape.
     """
     side, half, curvature = len(window), len(window) // 2, 0.5 / sigma**2
     theta[:] = 0.0
@@ -282,20 +256,10 @@ def _linearised(
     gradient: Array,
     hessian: Array,
 ) -> tuple[float, float]:
-    """Write the normal equations of a Gaussian fit at the present coefficients.
+    """Write the normal equations of a Gaussian fit at ``theta`` into gradient and Hessian.
 
-    Args:
-        window: Cells around a peak, relative to its belief.
-        usable: Which cells belong to the peak.
-        theta: Coefficients of (1, x, y, −x², −xy, −y²) in the exponent.
-        noise: Variance of a cell over the peak's squared belief, which weights the shape's prior.
-        sigma: Standard deviation of a perfect peak, cells.
-        work: Workspace for sums, (5, 10).
-        gradient: Filled with the gradient.
-        hessian: Filled with the 6×6 matrix.
-
-    Returns:
-        The sum of squared residuals and the number of cells.
+    Returns the sum of squared residuals and the number of usable cells; arguments are as in
+    :func:`_fit_logarithm`.
     """
     side, half = len(window), len(window) // 2
     squared, used = 0.0, 0.0
@@ -308,7 +272,7 @@ def _linearised(
             if usable[y, x]:
                 u = float(x - half)
                 # Clipped, because a steeper fit is wrong and its square could overflow.
-                model = math.exp(min(level + u * (slope - theta[3] * u), STEEPEST))
+                model = math.exp(min(level + u * (slope - theta[3] * u), MAX_EXPONENT))
                 residual = model - window[y, x]
                 squared += residual * residual
                 used += 1.0
@@ -375,15 +339,9 @@ def _system(
 
 @compiled()
 def _mode(window: Array, theta: Array) -> tuple[float, float, bool]:
-    """Find the maximum of a peak.
+    """Return x and y of the maximum from the window's middle, cells, and whether the fit is sound.
 
-    Args:
-        window: Cells around the peak, odd side length.
-        theta: Coefficients of (1, x, y, −x², −xy, −y²) of the fitted logarithm.
-
-    Returns:
-        x and y from the middle of the window, cells, and whether the fit determines them. Otherwise
-        they are the centre of the highest cells.
+    Without a sound fit, the maximum is the centre of the highest cells.
     """
     half = len(window) // 2
     across, down, count = 0.0, 0.0, 0
@@ -401,7 +359,7 @@ def _mode(window: Array, theta: Array) -> tuple[float, float, bool]:
     smallest = 0.5 * (a + c - math.sqrt((a - c) ** 2 + 4 * b * b))
     # The cell of a clamped top may be any of its cells.
     reach = 1.0 if count < PLATEAU else 2.0
-    if smallest > FLATTEST and abs(x - across) <= reach and abs(y - down) <= reach:
+    if smallest > MIN_CURVATURE and abs(x - across) <= reach and abs(y - down) <= reach:
         return x, y, True
     return across, down, False
 
@@ -417,7 +375,7 @@ def _covariance(
     workspace: Array,
     out: Array,
 ) -> None:
-    """Write the covariance of a sound peak's position; see :func:`fit_peaks`.
+    """Write the covariance of the position of a sound fit; see :func:`fit_peaks`.
 
     The offset is P⁻¹(p, q) with the precision P = [[2r, t], [t, 2s]] of the Gaussian, so it moves
     by P⁻¹(dp − 2x·dr − y·dt, dq − x·dt − 2y·ds).

@@ -269,7 +269,7 @@ def test_neither_render_nor_check_imports_torch(layout, command, tmp_path):
 import sys
 from typer.testing import CliRunner
 from dopepp.cli import app
-from dopepp.data.render_job import begin, make_job
+from dopepp.data.render_job import claim, make_job
 from dopepp.data.render_run import RenderTasks, RenderTask
 from pathlib import Path
 out = {str(tmp_path / "out")!r}
@@ -278,7 +278,7 @@ arguments = ["render", "servoholder", "--preset", "quickstart", "--size", "32x24
 done = CliRunner().invoke(app, arguments)
 assert done.exit_code == 0, done.output
 job = make_job(["servoholder"], preset="quickstart", size="32x24", layout={layout!r})
-begin(Path(out), job.record)
+claim(Path(out), job.record)
 job.writer(Path(out)).prepare()
 perform = RenderTasks(job, Path(out))
 for task in (RenderTask(0, range(2)), RenderTask(0, range(2), finalizes=True)):

@@ -22,16 +22,16 @@ def pack(members) -> bytes:
     return file.getvalue()
 
 
-def unpack(folder: Path, content: bytes, **limits: int) -> Path:
+def unpack(folder: Path, content: bytes) -> Path:
     archive = folder / "archive"
     archive.write_bytes(content)
-    return safe_extract(archive, folder / "out", **limits)
+    return safe_extract(archive, folder / "out")
 
 
-def refused(folder: Path, content: bytes, message: str, **limits: int) -> None:
-    """Nothing but one line: neither the folder nor a part of it is left."""
+def assert_rejected(folder: Path, content: bytes, message: str) -> None:
+    """Check for an error of one line, and that no unpacked file remains."""
     with pytest.raises(UserError, match=message) as caught:
-        unpack(folder, content, **limits)
+        unpack(folder, content)
     assert "\n" not in str(caught.value)
     assert [path.name for path in folder.iterdir()] == ["archive"]
 
@@ -44,7 +44,7 @@ def test_a_tar_file_is_unpacked_completely(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["archive", "out"]
 
 
-def test_folders_may_come_twice_and_permissions_are_not_taken_over(tmp_path):
+def test_folders_may_be_repeated_and_permissions_are_ignored(tmp_path):
     again, script = tarfile.TarInfo("set"), tarfile.TarInfo("run")
     again.type, script.mode, script.uid = tarfile.DIRTYPE, 0o6777, 0
     members = [("./set/a", b"1"), (again, b""), (again, b""), (script, b"#!")]
@@ -53,7 +53,7 @@ def test_folders_may_come_twice_and_permissions_are_not_taken_over(tmp_path):
     assert (folder / "run").stat().st_mode & 0o6111 == 0
 
 
-def test_an_empty_folder_is_used_and_another_one_left_alone(tmp_path):
+def test_an_empty_folder_is_used_and_a_filled_folder_rejected(tmp_path):
     (tmp_path / "out").mkdir()
     unpack(tmp_path, pack(GOOD))
     with pytest.raises(UserError, match=r"out, which is not empty or not a folder; allowed: a new"):
@@ -64,30 +64,27 @@ def test_an_empty_folder_is_used_and_another_one_left_alone(tmp_path):
 @pytest.mark.parametrize(
     "name", ["../x", "set/../../x", "/etc/x", "set\\..\\x", "C:x", "a\nb", "x" * 300, "d/" * 900]
 )
-def test_a_path_out_of_the_folder_is_refused(tmp_path, name):
+def test_a_path_out_of_the_folder_is_rejected(tmp_path, name):
     folder = tmp_path / "inner"
     folder.mkdir()
     message = "leads out of the folder|a name that some systems cannot write"
-    refused(folder, pack([("good", b"1"), (name, b"2")]), message)
+    assert_rejected(folder, pack([("good", b"1"), (name, b"2")]), message)
     assert [path.name for path in tmp_path.iterdir()] == ["inner"]
 
 
-def test_the_number_of_members_is_limited(tmp_path):
+def test_the_number_of_members_is_limited(tmp_path, monkeypatch):
     content = pack([(f"file{number}", bytes(10)) for number in range(10)])
-    refused(tmp_path, content, "more than 9 members", most_members=9)
-    assert unpack(tmp_path, content, most_members=10).is_dir()
+    monkeypatch.setattr("dopepp.data.archive.MAX_MEMBERS", 9)
+    assert_rejected(tmp_path, content, "more than 9 members")
+    monkeypatch.setattr("dopepp.data.archive.MAX_MEMBERS", 10)
+    assert unpack(tmp_path, content).is_dir()
 
 
-def test_a_damaged_archive_and_what_is_no_file_are_refused(tmp_path):
+def test_damaged_and_missing_archives_are_rejected(tmp_path):
     content = pack([("a", os.urandom(5000)), ("b", os.urandom(5000))])
-    for damaged in (
-        content[:0],
-        content[:300],
-        content[:7000],
-        b"junk" * 500,
-        gzip.compress(content),
-    ):
-        refused(tmp_path, damaged, "damaged")
+    junk, compressed = b"junk" * 500, gzip.compress(content)
+    for damaged in (content[:0], content[:300], content[:7000], junk, compressed):
+        assert_rejected(tmp_path, damaged, "damaged")
     for archive in (tmp_path, tmp_path / "gone.tar"):
         with pytest.raises(UserError, match="no such file"):
             safe_extract(archive, tmp_path / "out")

@@ -1,4 +1,4 @@
-"""Which folder is a data set, and which one only holds some."""
+"""Distinguish a data set from a folder of data sets."""
 
 import pytest
 
@@ -29,7 +29,7 @@ NDDS = ("000000.json", "000000.png", "_object_settings.json")
         ([f"set{n}/{BOP}" for n in range(10)], r"10 data sets: set0 .*set7 \(BOP\) and 2 more"),
     ],
 )  # fmt: skip
-def test_a_folder_of_data_sets_is_none(names, found, tmp_path):
+def test_a_folder_of_data_sets_is_rejected(names, found, tmp_path):
     make(tmp_path, *names)
     first = min(name.split("/")[0] for name in names)
     with pytest.raises(UserError, match=found) as error:
@@ -43,7 +43,7 @@ def test_folders_of_scenes_are_one_data_set(tmp_path):
 
 
 @pytest.mark.parametrize("names", [[], ["notes/readme.txt"]])
-def test_a_folder_of_nothing_known(names, tmp_path):
+def test_a_folder_of_unknown_layout_is_rejected(names, tmp_path):
     make(tmp_path, *names)
     with pytest.raises(UserError, match="a folder with an unknown layout"):
         check_dataset(tmp_path)

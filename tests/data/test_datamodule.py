@@ -92,7 +92,7 @@ def test_padding_is_neither_augmented_nor_masked(build):
         assert not build().train_item(0, index).image[48:].any()
 
 
-def test_validation_is_untouched_and_test_is_native(build, fake_source):
+def test_validation_images_are_unchanged_and_test_images_have_native_size(build, fake_source):
     datamodule = build()
     keys = []
     for batch in datamodule.val_dataloader():
@@ -123,7 +123,7 @@ def test_ranks_share_the_items(fake_source, shuffle, num_items):
 
 
 @pytest.mark.parametrize("num_workers", [0, 2])
-def test_a_users_mistake_arrives_as_one_line(build, fake_source, num_workers):
+def test_a_user_error_of_a_worker_is_raised_as_one_line(build, fake_source, num_workers):
     error = UserError("frame 7", "complete frames", "download it again")
     source = fake_source(12, bad=lambda index: error if index == 7 else None)
     with pytest.raises(UserError, match=r"^got frame 7; allowed: complete frames") as caught:
@@ -143,7 +143,7 @@ def test_summary_and_fingerprint(build, fake_source):
     assert build(val=fake_source(6)).fingerprint() != fingerprint
 
 
-def test_sizes_and_distances_of_a_part_are_those_of_the_validation_images(build, fake_source):
+def test_size_ranges_are_measured_on_validation_images(build, fake_source):
     part = make_part("box", None, np.array([[0.0, 0, 0], [0.1, 0.1, 0.2]]))
     can = replace(part, name="can")
     source = fake_source(5)
@@ -154,7 +154,7 @@ def test_sizes_and_distances_of_a_part_are_those_of_the_validation_images(build,
     ]
     sample = source.sample(0)
     focal = math.sqrt(sample.K[0, 0] * sample.K[1, 1]) * 64 / max(sample.size)
-    (name, seen), *rest = build().seen([part, can]).items()
+    (name, seen), *rest = build().size_ranges([part, can]).items()
     assert (name, rest) == ("box", [])
     lengths = [focal * part.diameter / depth for depth in (max(depths), min(depths))]
     assert seen == pytest.approx((*lengths, min(depths), max(depths)))

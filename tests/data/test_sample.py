@@ -9,8 +9,8 @@ from dopepp.data.sample import (
     Instance,
     Sample,
     letterbox_sample,
-    nearest,
     pad_sample,
+    resize_nearest,
     resize_sample,
 )
 from dopepp.geometry.camera import project_keypoints
@@ -24,7 +24,7 @@ from dopepp.geometry.cuboid import cuboid_keypoints
 )
 def test_nearest_is_the_source_pixel_under_the_target_centre(shape, target):
     image = np.arange(shape[0] * shape[1]).reshape(shape)
-    result = nearest(image, *target)
+    result = resize_nearest(image, *target)
     assert result.shape == target[::-1]
     for row in range(0, target[1], 7):
         for column in range(0, target[0], 7):

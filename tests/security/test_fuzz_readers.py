@@ -248,7 +248,7 @@ def _pack(path: Path) -> None:
 def _extract(path: Path) -> None:
     target = path.parent / "unpacked"
     shutil.rmtree(target, ignore_errors=True)
-    safe_extract(path, target, most_members=100)
+    safe_extract(path, target)
 
 
 def _datasets(root: Path) -> dict[str, Target]:

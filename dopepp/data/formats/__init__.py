@@ -1,4 +1,4 @@
-"""Share code between layouts: instances, shares of a data set, writers that survive a kill.
+"""Code that several layouts use: instances, shares of a data set, and resumable writers.
 
 Writers write items one by one and finalize them chunk by chunk. An item's last file marks the item
 as complete. Files that a chunk's items share (``scene_gt.json``, a tar shard) are assembled from
@@ -73,7 +73,7 @@ class Writer(Protocol):
         """
 
 
-def share(num_items: int, part_of: tuple[float, float], name: str) -> slice:
+def share_slice(num_items: int, part_of: tuple[float, float], name: str) -> slice:
     """Return the slice of ``num_items`` items for a share (first, last) in fractions.
 
     Equal bounds are rounded equally, so adjacent shares neither overlap nor leave a gap.
@@ -85,12 +85,12 @@ def share(num_items: int, part_of: tuple[float, float], name: str) -> slice:
     first, last = part_of
     if not 0 <= first < last <= 1:
         raise ValueError(f"part_of must be ascending in [0, 1], got {part_of}")
-    chosen = slice(round(first * num_items), round(last * num_items))
-    if chosen.start == chosen.stop:
+    part = slice(round(first * num_items), round(last * num_items))
+    if part.start == part.stop:
         problem = f"{name}: no image in the fraction {first:.3g} – {last:.3g} of {num_items} images"
         fix = "set data.image_sets to a separate folder for each split"
         raise UserError(problem, "a folder with more images", fix)
-    return chosen
+    return part
 
 
 def make_instance(
@@ -123,10 +123,11 @@ def read_object(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
     """
     content = read_json(path, max_bytes) if path.exists() else {}
     if not isinstance(content, dict):
-        fix = "restore the file from a copy, or choose another folder"
-        raise UserError(
-            f"{path}, which is not a JSON object", "a file written by `dopepp render`", fix
+        problem, allowed = (
+            f"{path}, which is not a JSON object",
+            "a file written by `dopepp render`",
         )
+        raise UserError(problem, allowed, "restore the file from a copy, or choose another folder")
     return content
 
 
@@ -136,7 +137,7 @@ def encode_by_key(content: Mapping[str, object]) -> bytes:
     return ("{\n" + ",\n".join(lines) + "\n}\n").encode()
 
 
-def stage(path: Path, content: bytes) -> None:
+def stage_item(path: Path, content: bytes) -> None:
     """Write an item to the staging folder; retry if another process removes the folder."""
     _retry(lambda: write_file(path, content))
 
@@ -150,11 +151,11 @@ def staged_items(staging: Path, suffix: str) -> list[Path]:
 
 
 @contextmanager
-def finalizing(staging: Path) -> Iterator[None]:
+def lock_staging(staging: Path) -> Iterator[None]:
     """Lock a folder of staged items, and finally remove the folder if it is empty.
 
-    The lock keeps a process from removing items that it has not merged. The system releases the
-    lock of a killed process.
+    Without the lock, a process could remove items that another process has just staged. The system
+    releases the lock of a killed process.
     """
     path = staging / _LOCK
     while True:
@@ -162,7 +163,7 @@ def finalizing(staging: Path) -> Iterator[None]:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX)
             # The previous holder may have removed the file; a new file is locked then.
-            if not _is_same(descriptor, path):
+            if not _is_open_file(descriptor, path):
                 continue
             yield
             if not any(entry.name != _LOCK for entry in staging.iterdir()):
@@ -181,7 +182,7 @@ def _open(path: Path) -> int:
 
 
 def _retry(act: Callable[[], T]) -> T:
-    """Repeat ``act``, which needs a folder that a finalizer may remove at any moment."""
+    """Repeat ``act``, which needs a folder that another process may remove at any moment."""
     # A folder removed before its use is not found; a folder removed within ``mkdir`` "exists".
     for _ in range(_ATTEMPTS - 1):
         with suppress(FileNotFoundError, FileExistsError):
@@ -189,7 +190,7 @@ def _retry(act: Callable[[], T]) -> T:
     return act()
 
 
-def _is_same(descriptor: int, path: Path) -> bool:
+def _is_open_file(descriptor: int, path: Path) -> bool:
     """Return whether an open file is still the file at a path."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())

@@ -36,14 +36,14 @@ DEPTH_SCALES_MM: Final = (0.1, 1.0)
 _MAX_UNITS: Final = 65_535
 
 
-def picture(
+def decode_image(
     node: Node, content: bytes | None = None, modes: Sequence[str] = ()
 ) -> Image.Image | None:
     """Decode a BOP image; report a missing, damaged or too large image and return None.
 
     Args:
         node: The file or tar member.
-        content: Bytes of an image in a tar file.
+        content: Bytes of the image; None to read the file of the node.
         modes: Pillow's names of the allowed pixel types; empty to allow all.
     """
     if content is None:
@@ -67,14 +67,14 @@ def picture(
 def image_shape(
     node: Node, content: bytes | None = None, modes: Sequence[str] = ()
 ) -> Shape | None:
-    """Return the (height, width) of an image after decoding it like :func:`picture`."""
-    image = picture(node, content, modes)
+    """Decode an image like :func:`decode_image`, and return its (height, width)."""
+    image = decode_image(node, content, modes)
     if image is not None:
         return image.height, image.width
-    return stated_shape(Path(node.path) if content is None else io.BytesIO(content))
+    return header_shape(Path(node.path) if content is None else io.BytesIO(content))
 
 
-def stated_shape(file: Path | io.BytesIO) -> Shape | None:
+def header_shape(file: Path | io.BytesIO) -> Shape | None:
     """Return the (height, width) in the header of a truncated image, or None."""
     try:
         with Image.open(file, formats=FORMATS) as image:
@@ -90,7 +90,7 @@ def decode_rgb(content: bytes, where: str) -> RGBImage:
     Raises:
         UserError: The image is not a PNG, JPEG or TIFF of 8 bits, is damaged, or too large.
     """
-    image = picture(Node(STRICT, where), content, COLOUR_MODES)
+    image = decode_image(Node(STRICT, where), content, COLOUR_MODES)
     assert image is not None
     return np.array(image.convert("RGB"))
 
@@ -111,9 +111,8 @@ def decode_depth(content: bytes, where: str, depth_scale: float, shape: Shape) -
     units = decode_one_channel(node, shape, content, DEPTH_MODES)
     assert units is not None
     if np.isnan(depth_scale):
-        node["image"].report(
-            "no depth_scale", "depth_scale (mm per unit) next to the image's cam_K"
-        )
+        allowed = "depth_scale (mm per unit) next to the image's cam_K"
+        node["image"].report("no depth_scale", allowed)
     return (units.astype(np.float64) * (depth_scale / 1000)).astype(np.float32)
 
 
@@ -131,18 +130,15 @@ def decode_mask(content: bytes, where: str, shape: Shape) -> Mask:
 def decode_one_channel(
     node: Node, shape: Shape | None, content: bytes | None = None, modes: tuple[str, ...] = ()
 ) -> NDArray[Any] | None:
-    """Decode an image of one channel: a BOP depth image or mask.
+    """Decode a BOP depth image or mask; report an invalid image and return None.
 
     Args:
-        node: The file, which receives a report of an invalid image.
+        node: The file or tar member.
         shape: Expected (height, width); None to allow any shape.
         content: Bytes of the image; None to read the file of the node.
         modes: Allowed Pillow modes; empty for all modes of one channel.
-
-    Returns:
-        The pixels, or None for an invalid image.
     """
-    image = picture(node, content)
+    image = decode_image(node, content)
     if image is None:
         return None
     if len(image.getbands()) > 1 or (modes and image.mode not in modes):
@@ -157,8 +153,8 @@ def read_map(node: Node, shape: Shape | None, colour: bool = False) -> NDArray[A
 
     Args:
         node: The file.
-        shape: (height, width) of the colour image; None to allow any shape.
-        colour: Whether to return None for several channels, without a report.
+        shape: Expected (height, width); None to allow any shape.
+        colour: Whether to return None for several channels without a report.
     """
     image = node["image"].attempt(lambda: pictures.read_image(Path(node.path)))
     if image is not None and image.ndim > 2 and colour:
@@ -170,13 +166,7 @@ def read_map(node: Node, shape: Shape | None, colour: bool = False) -> NDArray[A
 def check_one_channel(
     node: Node, image: NDArray[Any] | None, shape: tuple[int, ...] | None
 ) -> NDArray[Any] | None:
-    """Check that an image has one channel and the expected size; if not, report it and return None.
-
-    Args:
-        node: Where to report several channels or a wrong size.
-        image: The image; None if it could not be read.
-        shape: Shape of the colour image; None for any size.
-    """
+    """Return an image of one channel and of ``shape``; report any other and return None."""
     if image is None:
         return None
     if image.ndim != 2:
@@ -190,7 +180,7 @@ def check_one_channel(
 
 
 def encode_png(pixels: NDArray[Any]) -> bytes:
-    """Return an RGB (uint8) or one-channel (uint8, uint16) image as PNG."""
+    """Encode an RGB (uint8) or one-channel (uint8, uint16) image as PNG."""
     if pixels.ndim == 3:
         pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
     return bytes(cv2.imencode(".png", pixels)[1])
@@ -221,18 +211,18 @@ def encode_runs(mask: Mask) -> dict[str, list[int]]:
 
 
 def decode_runs(record: object, shape: Shape, node: Node) -> Mask | None:
-    """Decode the run lengths of a mask; report wrong runs and return None.
+    """Decode the run lengths of a mask; report invalid run lengths and return None.
 
     The record's size must be the image's ``shape`` (height, width), which bounds memory, and the
-    runs must fill it.
+    run lengths must add up to its pixels.
     """
     fields = mapping(record)
     counts, size = fields.get("counts"), fields.get("size")
-    whole = isinstance(counts, list) and all(type(n) is int and n >= 0 for n in counts)
+    are_lengths = isinstance(counts, list) and all(type(n) is int and n >= 0 for n in counts)
     if size != list(shape):
         problem = "missing" if record is None else f"size {size!r:.40}"
         node.report(problem, f"runs of the image's size [{shape[0]}, {shape[1]}]")
-    elif not whole or counts is None or sum(counts) != shape[0] * shape[1]:
+    elif not are_lengths or counts is None or sum(counts) != shape[0] * shape[1]:
         allowed = f"a list of run lengths that add up to {shape[0] * shape[1]} pixels"
         node.report(f"counts {counts!r:.40}", allowed)
     else:

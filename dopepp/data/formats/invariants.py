@@ -53,7 +53,7 @@ class Box(NamedTuple):
             return None
         return cls(float(columns[0]), float(rows[0]), float(columns[-1]), float(rows[-1]))
 
-    def beyond(self, other: Box) -> float:
+    def excess_px(self, other: Box) -> float:
         """Return by how many pixels another box exceeds this box; negative inside."""
         left, top = self.left - other.left, self.top - other.top
         return max(left, top, other.right - self.right, other.bottom - self.bottom)
@@ -77,10 +77,7 @@ def rotation_problem(rotation: RotationMatrix, tolerance: float = 1e-3) -> str |
 
 
 def check_translation(node: Node, translation: Vector, diameter: float | None) -> bool:
-    """Check an object's position relative to the camera.
-
-    A position behind the camera is reported in the field ``z``, an implausible distance, which
-    suggests a wrong unit, in the field ``unit``.
+    """Report a position behind the camera (field ``z``) or an implausible distance (``unit``).
 
     Args:
         node: Parent of the two fields.
@@ -88,7 +85,7 @@ def check_translation(node: Node, translation: Vector, diameter: float | None) -
         diameter: The object's diameter; None if unknown.
 
     Returns:
-        Whether nothing is reported. A NaN is not reported here.
+        Whether the position is plausible; True for a NaN.
     """
     depth = float(translation[2])
     if depth <= 0:
@@ -110,13 +107,7 @@ def check_translation(node: Node, translation: Vector, diameter: float | None) -
 def plausible_camera(
     node: Node, K: CameraMatrix | None, shape: Shape | None
 ) -> CameraMatrix | None:
-    """Return K; None if K is missing or damaged, or after reporting an implausible K.
-
-    Args:
-        node: The camera matrix's field.
-        K: Camera matrix in pixels.
-        shape: (height, width) of the image; None if unknown.
-    """
+    """Return K (pixels), or None if K is missing, damaged or implausible, which is reported."""
     if K is None or not np.isfinite(K).all():
         return None
     if shape is None:
@@ -137,7 +128,7 @@ def check_box(
     node: Node,
     points_cam: Points,
     K: CameraMatrix,
-    seen: Box | None,
+    visible: Box | None,
     visible_fraction: float | None = None,
     shape: Shape | None = None,
 ) -> None:
@@ -147,26 +138,26 @@ def check_box(
         node: The box's field.
         points_cam: Points in the camera frame whose hull contains the object.
         K: Camera matrix in pixels.
-        seen: Box of the visible pixels; None if no pixel is visible.
+        visible: Box of the visible pixels; None if no pixel is visible.
         visible_fraction: Visible share of the object, if known.
         shape: (height, width) of the image, if ``visible_fraction`` ignores truncation.
     """
     predicted = Box.of_points(project(points_cam, K))
-    if predicted is None or seen is None:
+    if predicted is None or visible is None:
         return
     width, height = predicted.right - predicted.left, predicted.bottom - predicted.top
     tolerance = max(BOX_TOLERANCE_PX, BOX_TOLERANCE_SHARE * max(width, height))
-    excess_px = predicted.beyond(seen)
+    excess_px = predicted.excess_px(visible)
     if excess_px > tolerance:
         distance = f"{excess_px:.0f} px outside the reprojected box {predicted}"
-        node.report(f"visible at {seen}, {distance} (allowed {tolerance:.0f} px)")
+        node.report(f"visible at {visible}, {distance} (allowed {tolerance:.0f} px)")
         return
     is_whole = visible_fraction is not None and visible_fraction >= FULLY_VISIBLE
     if not is_whole or (shape is not None and not predicted.is_inside(shape)):
         return
-    across, down = seen.right - seen.left + 1, seen.bottom - seen.top + 1
-    cover = max(across / (width + 1), down / (height + 1))
+    columns, rows = visible.right - visible.left + 1, visible.bottom - visible.top + 1
+    cover = max(columns / (width + 1), rows / (height + 1))
     if cover < SMALLEST_COVER:
         allowed = f"(allowed: at least {SMALLEST_COVER:.0%} of its width or height)"
         share = f"{cover:.0%} of the reprojected box {predicted}"
-        node.report(f"fully visible at {seen}, {share} {allowed}")
+        node.report(f"fully visible at {visible}, {share} {allowed}")

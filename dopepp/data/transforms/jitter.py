@@ -16,7 +16,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from dopepp.core.validation import Checked, Pair, Range, Span
-from dopepp.data.sample import Instance, Sample, less_visible
+from dopepp.data.sample import Instance, Sample, reduce_visibility
 from dopepp.geometry.camera import crop_camera, make_transform
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 
@@ -42,35 +42,35 @@ class CameraJitter(Checked):
         roll = np.radians(rng.uniform(-self.roll_deg, self.roll_deg))
         R_roll = rotation_vector_to_matrix(np.array([0, 0, roll]))
         zoom = float(np.exp(rng.uniform(*np.log(self.zoom))))
-        goal = middle + rng.uniform(-self.shift, self.shift, 2) * size
+        target = middle + rng.uniform(-self.shift, self.shift, 2) * size
         K = np.diag([zoom, zoom, 1.0]) @ sample.K
         # The homography is affine, because the camera rolls about its axis.
         warp = (K @ R_roll @ np.linalg.inv(sample.K))[:2]
-        offset = goal - warp @ [*middle, 1.0]
+        offset = target - warp @ [*middle, 1.0]
         warp[:, 2] += offset
 
-        def warped(pixels: NDArray[np.uint8], border: int, how: int) -> NDArray[np.uint8]:
-            image = cv2.warpAffine(pixels, warp, sample.size, flags=how, borderMode=border)
+        def warp_pixels(pixels: NDArray[np.uint8], border: int, flags: int) -> NDArray[np.uint8]:
+            image = cv2.warpAffine(pixels, warp, sample.size, flags=flags, borderMode=border)
             return np.asarray(image, np.uint8)
 
-        def moved(instance: Instance) -> Instance:
+        def warp_instance(instance: Instance) -> Instance:
             mask = instance.mask
             if mask is not None:
-                codes = warped(mask.astype(np.uint8), cv2.BORDER_CONSTANT, cv2.INTER_NEAREST)
+                codes = warp_pixels(mask.astype(np.uint8), cv2.BORDER_CONSTANT, cv2.INTER_NEAREST)
                 mask = codes.astype(bool)
-            shown = replace(
+            jittered = replace(
                 instance,
                 T_cam_obj=make_transform(R_roll, np.zeros(3)) @ instance.T_cam_obj,
                 keypoints=instance.keypoints @ warp[:, :2].T + warp[:, 2],
                 mask=mask,
             )
             shape = sample.image.shape[:2]
-            return less_visible(instance, shown, (shape, shape), zoom)
+            return reduce_visibility(instance, jittered, (shape, shape), zoom)
 
         return replace(
             sample,
-            image=warped(sample.image, cv2.BORDER_REPLICATE, cv2.INTER_LINEAR),
+            image=warp_pixels(sample.image, cv2.BORDER_REPLICATE, cv2.INTER_LINEAR),
             K=crop_camera(K, *-offset),
-            instances=[moved(instance) for instance in sample.instances],
+            instances=[warp_instance(instance) for instance in sample.instances],
             depth=None,  # unused in training
         )

@@ -159,7 +159,7 @@ def _train(
     sources = {"train": datamodule.train_source, "val": datamodule.val_source}
     sources["test"] = datamodule.test_source
     images = {split: describe_images(source) for split, source in sources.items()}
-    system = build_system(config, parts, fingerprint, images, datamodule.seen(parts))
+    system = build_system(config, parts, fingerprint, images, datamodule.size_ranges(parts))
     resume_from, changes = _resume_path(config, system)
     # Lightning may reject the options, so the trainer is built before anything is written.
     trainer = build_trainer(config, run_dir, trackers, _progress(config, datamodule))

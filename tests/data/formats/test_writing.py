@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dopepp.data.check import check_dataset
-from dopepp.data.formats import STAGING, finalizing, stage, staged_items
+from dopepp.data.formats import STAGING, lock_staging, stage_item, staged_items
 from dopepp.data.formats.bop.bop_reader import BopReader
 from dopepp.data.formats.bop.bop_writer import BopWriter
 from dopepp.data.formats.ndds.ndds_reader import NddsReader
@@ -55,9 +55,7 @@ def die(*_):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_bytes_depend_neither_on_the_order_nor_on_kills(
-    tmp_path, boxes, layout, write_set, contents
-):
+def test_bytes_depend_neither_on_order_nor_on_kills(tmp_path, boxes, layout, write_set, contents):
     writer_class, (parts, samples) = LAYOUTS[layout][0], boxes
     whole = write_set(writer_class, tmp_path / "whole", parts, samples, 998)
     root = tmp_path / "killed"
@@ -70,7 +68,7 @@ def test_bytes_depend_neither_on_the_order_nor_on_kills(
     writer.write(999, samples[1])
     with pytest.MonkeyPatch.context() as patch:  # after some files of an item, before its marker
         module = writer_class.__module__
-        for name in ("stage", "_encode"):
+        for name in ("stage_item", "_encode"):
             patch.setattr(f"{module}.{name}", die, raising=False)
         with pytest.raises(KeyboardInterrupt):
             writer.write(998, samples[0])
@@ -93,21 +91,21 @@ def test_bytes_depend_neither_on_the_order_nor_on_kills(
 ITEMS = 300
 
 
-def _stage_and_seal(staging: Path, finalized: Path, first: int) -> None:
+def _stage_and_finalize(staging: Path, finalized: Path, first: int) -> None:
     for index in range(first, first + ITEMS):
-        stage(staging / f"{index:06d}.json", b"{}")
-        with finalizing(staging):
+        stage_item(staging / f"{index:06d}.json", b"{}")
+        with lock_staging(staging):
             for path in staged_items(staging, ".json"):
                 path.rename(finalized / path.name)
 
 
 @pytest.mark.ddp
-def test_nobody_stumbles_over_a_folder_that_vanishes(tmp_path):
+def test_processes_stage_while_others_remove_the_folder(tmp_path):
     staging, finalized = tmp_path / STAGING, tmp_path / "finalized"
     finalized.mkdir()
     context = multiprocessing.get_context("fork")
     processes = [
-        context.Process(target=_stage_and_seal, args=(staging, finalized, first))
+        context.Process(target=_stage_and_finalize, args=(staging, finalized, first))
         for first in (0, ITEMS, 2 * ITEMS)
     ]
     for process in processes:
@@ -123,5 +121,5 @@ def test_nobody_stumbles_over_a_folder_that_vanishes(tmp_path):
 
 def test_a_file_in_the_way_is_an_error(tmp_path):
     (tmp_path / STAGING).write_text("not a folder")
-    with pytest.raises(FileExistsError), finalizing(tmp_path / STAGING):
+    with pytest.raises(FileExistsError), lock_staging(tmp_path / STAGING):
         pass

@@ -8,7 +8,7 @@ import pytest
 
 from dopepp.core.errors import StoppedError, UserError
 from dopepp.core.pool import ClusterPool, ProcessPool
-from dopepp.data.render_job import WRITERS, begin
+from dopepp.data.render_job import WRITERS, claim
 from dopepp.data.render_run import RenderTask, RenderTasks, Shard, render_dataset
 
 NUM = 60
@@ -66,7 +66,7 @@ def test_one_worker_two_workers_and_two_nodes_write_the_same_bytes(
 @pytest.mark.slow
 def test_both_nodes_work_and_a_lost_node_costs_nothing(two_nodes, small_job, tmp_path):
     job = small_job("ndds")
-    begin(tmp_path, job.record)
+    claim(tmp_path, job.record)
     job.writer(tmp_path).prepare()
     second = two_nodes.add_node(num_cpus=1, object_store_memory=80_000_000)
     done = []

@@ -26,7 +26,7 @@ from dopepp.data.render_run import (
     ProgressDisplay,
     RenderReport,
     Shard,
-    plan,
+    plan_chunks,
     render_dataset,
 )
 
@@ -236,7 +236,7 @@ def test_a_plan_has_what_is_missing(num_items, total, written):
     writer.written = lambda chunk: {i for i in written if i // size == chunk}
     planned = []
     for number in range(total):
-        chunks = list(plan(writer, Shard(number, total), num_items))
+        chunks = list(plan_chunks(writer, Shard(number, total), num_items))
         planned += [index for chunk in chunks for index in chunk.missing]
         for chunk in chunks:
             assert set(chunk.required) == {i for i in range(num_items) if i // size == chunk.number}

@@ -66,15 +66,14 @@ class BopPoses:
     visible_fractions: Float[np.ndarray, " objects"]
     inexact: Bool[np.ndarray, " objects"]
 
-    def of(self, chosen: Bool[np.ndarray, " objects"]) -> BopPoses:
-        """Return the chosen objects."""
-        fields = (self.obj_ids, self.T_cam_obj, self.visible_fractions, self.inexact)
-        return BopPoses(*(values[chosen] for values in fields))
+    def select(self, is_selected: Bool[np.ndarray, " objects"]) -> BopPoses:
+        """Return the selected objects."""
+        return BopPoses(*(values[is_selected] for values in vars(self).values()))
 
-    def without_model(self, modelled: Collection[int]) -> Counter[int]:
-        """Count by number the objects outside ``modelled``; none if ``modelled`` is empty."""
+    def without_model(self, models: Collection[int]) -> Counter[int]:
+        """Count the objects outside ``models`` by number; none if ``models`` is empty."""
         ids = self.obj_ids[self.obj_ids >= 0].tolist()
-        return Counter(number for number in ids if modelled and number not in modelled)
+        return Counter(number for number in ids if models and number not in models)
 
 
 def read_cameras(
@@ -83,25 +82,25 @@ def read_cameras(
     """Return each image's K in pixels and ``depth_scale`` in mm per unit (NaN if not stated)."""
     node = partial(nodes, "camera")
     K = _column(records, "cam_K", 9, node).reshape(-1, 3, 3)
-    scales = _stated_column(records, "depth_scale", node)
+    scales = _optional_column(records, "depth_scale", node)
     for number in np.flatnonzero(scales <= 0).tolist():
         node(number)["depth_scale"].report(f"{scales[number]:g}", "millimetres above 0")
     return K, scales
 
 
-def pair_infos(truths: Sequence[Record], stated: object, node: Node) -> list[Record | None]:
+def pair_infos(truths: Sequence[Record], entry: object, node: Node) -> list[Record | None]:
     """Return the ``gt_info`` record of each object of an image; None if missing.
 
     Args:
         truths: The image's ``gt`` records.
-        stated: The image's ``gt_info`` entry; null and an empty list count as missing.
+        entry: The image's ``gt_info`` entry; null and an empty list count as missing.
         node: The entry's node.
     """
-    if stated is None or stated == []:
+    if entry is None or entry == []:
         return [None] * len(truths)
-    if isinstance(stated, list):
-        stated = [{} if info is None else info for info in stated]
-    infos = node.entries(stated)
+    if isinstance(entry, list):
+        entry = [{} if info is None else info for info in entry]
+    infos = node.entries(entry)
     if len(infos) != len(truths):
         node.report(f"{len(infos)} objects", f"{len(truths)}, the number of poses")
     return [*infos[: len(truths)], *[None] * (len(truths) - len(infos))]
@@ -132,37 +131,28 @@ def read_poses(truths: Sequence[Record], infos: Sequence[Record | None], nodes: 
         if math.isfinite(ids[number]):
             node(number)["obj_id"].report(f"{ids[number]:g}", "an object's number")
         ids[number] = -1
-    fractions = _stated_column(infos, "visib_fract", info_node)
+    fractions = _optional_column(infos, "visib_fract", info_node)
     for number in np.flatnonzero((fractions < -_ROUNDING) | (fractions > 1 + _ROUNDING)).tolist():
         info_node(number)["visib_fract"].report(f"{fractions[number]:.6g}", "0 – 1")
         fractions[number] = math.nan
     return BopPoses(ids.astype(np.int64), poses, np.clip(fractions, 0.0, 1.0), inexact)
 
 
-def _stated_column(
+def _optional_column(
     records: Sequence[object], field: str, node: Callable[[int], Node]
 ) -> Float[np.ndarray, " records"]:
-    """Return the number in a field of each record, or NaN for records without the field.
-
-    Args:
-        records: Records of the objects of an image.
-        field: Name of the field.
-        node: Returns the node of the record with this index, for reports.
-    """
-    stated = [n for n, record in enumerate(records) if field in mapping(record)]
+    """Return the number in a field of each record, or NaN for records without the field."""
+    indices = [n for n, record in enumerate(records) if field in mapping(record)]
     values = np.full(len(records), math.nan)
-    rows = [records[n] for n in stated]
-    values[stated] = _column(rows, field, 1, lambda n: node(stated[n]))[:, 0]
+    rows = [records[n] for n in indices]
+    values[indices] = _column(rows, field, 1, lambda n: node(indices[n]))[:, 0]
     return values
 
 
 def _column(
     records: Sequence[object], field: str, count: int, node: Callable[[int], Node]
 ) -> Float[np.ndarray, "records count"]:
-    """Convert a field of all records at once, or record by record to report wrong records.
-
-    Nested lists of the right size, e.g. ``[[…], […], […]]`` for a matrix, are accepted.
-    """
+    """Convert a field of all records at once, or record by record to report wrong records."""
     if not records:
         return np.empty((0, count))
     try:
@@ -295,13 +285,12 @@ def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int
     """
     cameras, truths, infos = read_records(folder)
     images = sorted(cameras)
-    if without := truths.keys() - cameras.keys():
-        problem = f"ignoring {len(without)} images with ground truth but without a camera"
-        _log.warning("%s: %s; first: %d", folder, problem, min(without))
+    if without_camera := truths.keys() - cameras.keys():
+        problem = f"ignoring {len(without_camera)} images with ground truth but without a camera"
+        _log.warning("%s: %s; first: %d", folder, problem, min(without_camera))
     owners = [(row, n) for row, i in enumerate(images) for n in range(len(truths.get(i, ())))]
 
     def nodes(record_kind: str, number: int) -> Node:
-        """Return the node of an image's camera or of an object's record, for error messages."""
         node = Node(STRICT, folder / f"scene_{record_kind}.json")
         if record_kind == "camera":
             return node[f"{images[number]}"]
@@ -318,7 +307,7 @@ def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int
     is_wanted = np.isin(poses.obj_ids, sorted(wanted))
     is_behind = poses.T_cam_obj[:, 2, 3] <= 0
     keep = is_wanted & ~is_behind
-    without_model = poses.of(~is_wanted).without_model(with_model)
+    without_model = poses.select(~is_wanted).without_model(with_model)
     return BopScene(
         folder,
         np.array(images, np.int64),
@@ -326,12 +315,12 @@ def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int
         _relative_files(folder, DEPTHS, images),
         K,
         scales,
-        np.searchsorted(table[keep, 0], np.arange(len(images) + 1)),
-        table[keep, 1],
-        poses.of(keep),
-        int((~is_wanted).sum()) - without_model.total(),
-        without_model,
-        int((is_wanted & is_behind).sum()),
+        first=np.searchsorted(table[keep, 0], np.arange(len(images) + 1)),
+        gt_ids=table[keep, 1],
+        poses=poses.select(keep),
+        num_other=int((~is_wanted).sum()) - without_model.total(),
+        without_model=without_model,
+        num_behind=int((is_wanted & is_behind).sum()),
     )
 
 

@@ -20,7 +20,13 @@ from jaxtyping import Float
 
 from dopepp.data.formats import STAGING, bop, staged_items
 from dopepp.data.formats.bop import MM, BopPoses, Nodes, Record
-from dopepp.data.formats.bop.bop_models import INFO_FILE, info_path, modelled, parse_models, part_of
+from dopepp.data.formats.bop.bop_models import (
+    INFO_FILE,
+    info_path,
+    objects_with_model,
+    parse_models,
+    read_part,
+)
 from dopepp.data.formats.images import COLOUR_MODES, DEPTH_MODES, decode_one_channel, image_shape
 from dopepp.data.formats.invariants import Box, check_box, check_translation, plausible_camera
 from dopepp.data.formats.problems import CheckReport, Node, mapping
@@ -82,7 +88,7 @@ class _SceneCheck:
 
     def __init__(self, report: CheckReport, folder: Path, models: Models | None) -> None:
         self._report, self._folder, self._models = report, folder, models
-        self._pictures, self._depths = map(self._image_files, (bop.IMAGES, bop.DEPTHS))
+        self._images, self._depths = map(self._image_files, (bop.IMAGES, bop.DEPTHS))
         self._masks = {name: _mask_files(folder / name) for name in _MASKS}
         self._records = bop.read_records(folder, report)
         self._has_truth = (folder / _TRUTH).is_file()
@@ -105,7 +111,7 @@ class _SceneCheck:
             else:
                 report.note(f"{folder} has no {_TRUTH}: its poses are not published")
         oddities = Oddities()
-        images = sorted(cameras.keys() | self._pictures.keys() | truths.keys())
+        images = sorted(cameras.keys() | self._images.keys() | truths.keys())
         for image in images:
             # An unreadable file is a single defect, not a defect of every image.
             for by_image, name in ((cameras, _CAMERA), (truths, _TRUTH)):
@@ -123,7 +129,7 @@ class _SceneCheck:
     def _check_image(self, image: int) -> BopPoses:
         """Check the files and annotations of an image; return its poses."""
         report, folder, (cameras, truths, infos) = self._report, self._folder, self._records
-        path = self._pictures.get(image, folder / "rgb" / f"{image:06d}.png")
+        path = self._images.get(image, folder / "rgb" / f"{image:06d}.png")
         shape = image_shape(Node(report, path), modes=COLOUR_MODES)
         if self._depths:
             path = self._depths.get(image, folder / "depth" / f"{image:06d}.png")
@@ -145,10 +151,15 @@ class _SceneCheck:
             mask = decode_one_channel(Node(report, path), shape)
             return None if mask is None else mask != 0
 
-        objects_infos = infos.get(image, [None] * len(objects))
-        camera, has_depth = cameras.get(image), bool(self._depths)
         return check_image(
-            nodes, camera, objects, objects_infos, shape, has_depth, self._models, read_mask
+            nodes,
+            cameras.get(image),
+            objects,
+            infos.get(image, [None] * len(objects)),
+            shape,
+            bool(self._depths),
+            self._models,
+            read_mask,
         )
 
 
@@ -216,12 +227,12 @@ def load_models(report: CheckReport, roots: Sequence[Path]) -> Models | None:
     if records is None:
         return None
     infos = parse_models(path, records, report)
-    present = modelled(infos)
+    present = objects_with_model(infos)
     if absent := infos.keys() - present:
         numbers = ", ".join(map(str, sorted(absent)))
         report.note(f"{path.parent}: no file of object {numbers}, whose annotations are ignored")
     for number in sorted(present):
-        Node(report, infos[number].path)["mesh"].attempt(partial(part_of, infos[number]))
+        Node(report, infos[number].path)["mesh"].attempt(partial(read_part, infos[number]))
     sizes = {
         int(key): _model(node[key], record, infos[int(key)].diameter)
         for key, record in records.items()
@@ -240,7 +251,7 @@ def _model(node: Node, record: object, stated: float) -> Model:
         allowed = f"{least:g} … {most:g} mm: is it in another unit?"
         node["unit"].report(f"{diameter * MM:.4g} mm", allowed)
         diameter = None
-    bounds = [fields.get(f"{what}_{axis}") for what in ("min", "size") for axis in "xyz"]
+    bounds = [fields.get(f"{bound}_{axis}") for bound in ("min", "size") for axis in "xyz"]
     if all(value is None for value in bounds):
         return Model(diameter)
     low, size = node["min_x … size_z"].numbers(bounds, 2, 3) / MM
@@ -289,13 +300,13 @@ def check_image(
             outside = int(np.count_nonzero(visible & ~whole))
             if outside > PIXEL_TOLERANCE * visible.sum():
                 node["mask_visib"].report(f"{outside} visible pixels outside the whole mask")
-        seen = None if visible is None else Box.of_mask(visible)
+        visible_box = None if visible is None else Box.of_mask(visible)
         if info is not None:
             _check_counts(nodes("gt_info", n), info, visible, fraction)
-            seen = _check_boxes(nodes("gt_info", n), info, seen)
+            visible_box = _check_boxes(nodes("gt_info", n), info, visible_box)
         is_posed &= bool(np.isfinite(T_cam_obj).all())
         if is_posed and K is not None and model.corners is not None:
-            check_box(node["box"], transform(T_cam_obj, model.corners), K, seen, fraction)
+            check_box(node["box"], transform(T_cam_obj, model.corners), K, visible_box, fraction)
     return poses
 
 
@@ -331,17 +342,17 @@ def _check_counts(
             node["px_count_visib"].report(f"{count:g}, but mask_visib has {pixels} pixels")
 
 
-def _check_boxes(node: Node, info: Mapping[str, Any], seen: Box | None) -> Box | None:
+def _check_boxes(node: Node, info: Mapping[str, Any], mask_box: Box | None) -> Box | None:
     """Compare ``bbox_visib`` with the mask's box; return the mask's box, or else the stated box."""
     boxes: dict[str, Box] = {}
     for field_name in ("bbox_visib", "bbox_obj"):
         if field_name in info:
             x, y, width, height = node[field_name].numbers(info[field_name], 4).tolist()
-            if width >= 0 and height >= 0:  # −1 where nothing is visible
+            if width >= 0 and height >= 0:  # −1 without a visible pixel
                 boxes[field_name] = Box(x, y, x + width, y + height)
     box = boxes.get("bbox_visib")
-    if seen is not None and box is not None:
-        distance = max(abs(a - b) for a, b in zip(seen, box, strict=True))
+    if mask_box is not None and box is not None:
+        distance = max(abs(a - b) for a, b in zip(mask_box, box, strict=True))
         if distance > BOX_EDGE_PX:
-            node["bbox_visib"].report(f"{box}, but mask_visib has {seen}")
-    return seen or box
+            node["bbox_visib"].report(f"{box}, but mask_visib has {mask_box}")
+    return mask_box or box

@@ -40,11 +40,9 @@ INFO_FILE: Final = "models_info.json"
 
 SYMMETRY_FIELDS: Final = ("symmetries_discrete", "symmetries_continuous")
 
-Discrete = Float[np.ndarray, "symmetries 4 4"]
-"""Rigid transforms without the identity, metres."""
-
-Continuous = tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]
-"""(axis, offset) pairs, metres."""
+Symmetries = dict[str, Any]
+"""The two :data:`SYMMETRY_FIELDS` as arguments of :class:`~dopepp.parts.part.Part`: rigid
+transforms without the identity (None if there are none), and (axis, offset) pairs; metres."""
 
 _ALLOWED: Final = 'objects by number, each once: {"1": {"diameter": …}, …}'
 
@@ -59,8 +57,7 @@ class ModelInfo:
     name: str
     path: Path
     diameter: float
-    symmetries_discrete: Discrete | None
-    symmetries_continuous: Continuous
+    symmetries: Symmetries
 
 
 def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Part]:
@@ -79,16 +76,17 @@ def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Pa
         fix = "set data.root to the root folder, or unpack the data set's models into it"
         raise UserError(problem, "the root folder of a BOP data set", fix)
     by_name = {info.name: info for info in infos.values()}
-    wanted = list(objects or by_name)
-    absent = [name for name in wanted if objects is None and not by_name[name].path.is_file()]
-    if 0 < len(absent) < len(wanted):
-        _log.warning("%s: ignoring models without a file: %s", root, ", ".join(absent))
-        wanted = [name for name in wanted if name not in absent]
-    for name in wanted:
+    if objects is None:
+        present = objects_with_model(infos)
+        absent = [info.name for number, info in infos.items() if number not in present]
+        if absent:
+            _log.warning("%s: ignoring models without a file: %s", root, ", ".join(absent))
+        objects = [info.name for number, info in infos.items() if number in present]
+    for name in objects:
         if name not in by_name:
             problem, allowed = f"data.objects with {name!r}", ", ".join(by_name)
             raise UserError(problem, allowed, "set data.objects to one or more of these names")
-    return [part_of(by_name[name]) for name in wanted]
+    return [read_part(by_name[name]) for name in objects]
 
 
 def parts_by_id(root: Path, parts: Sequence[Part]) -> dict[int, Part]:
@@ -131,16 +129,15 @@ def model_numbers(names: Sequence[str]) -> dict[str, int]:
     return {name: number for number, name in enumerate(names, start=1)}
 
 
-def part_of(info: ModelInfo) -> Part:
+def read_part(info: ModelInfo) -> Part:
     """Make a part from an object's mesh.
 
     Raises:
         UserError: The mesh is missing, damaged or not in millimetres.
     """
-    symmetries: dict[str, Any] = {name: getattr(info, name) for name in SYMMETRY_FIELDS}
     mesh = read_mesh(info.path, unit="mm")
     try:
-        part = make_part(info.name, mesh, unit="mm", **symmetries)
+        part = make_part(info.name, mesh, unit="mm", **info.symmetries)
     except UserError as error:  # a wrong size may mean a wrong unit; BOP has only one
         allowed = f"{error.allowed}, from a file in millimetres as BOP requires"
         fix = "download the model again, or convert its file to millimetres"
@@ -158,7 +155,7 @@ def read_models(root: Path) -> dict[int, ModelInfo]:
     return {} if path is None else parse_models(path, Node(STRICT, path).load(_ALLOWED))
 
 
-def modelled(infos: Mapping[int, ModelInfo]) -> set[int]:
+def objects_with_model(infos: Mapping[int, ModelInfo]) -> set[int]:
     """Return the objects with a model file, or all objects if none has a file."""
     with_file = {number for number, info in infos.items() if info.path.is_file()}
     return with_file or set(infos)
@@ -200,19 +197,16 @@ def _info(node: Node, model: Path, record: object) -> ModelInfo:
             node["diameter"].report(f"{fields['diameter']!r:.40}", "millimetres above 0")
             diameter = math.nan
     name = node["name"].attempt(lambda: check_name(fields.get("name", model.stem)))
-    return ModelInfo(name or model.stem, model, diameter, *_symmetries(node, fields))
+    return ModelInfo(name or model.stem, model, diameter, _symmetries(node, fields))
 
 
-def _symmetries(node: Node, fields: Mapping[str, Any]) -> tuple[Discrete | None, Continuous]:
+def _symmetries(node: Node, fields: Mapping[str, Any]) -> Symmetries:
     """Read the discrete and continuous symmetries of a model's record."""
-    discrete, continuous = SYMMETRY_FIELDS
-    return (
-        _discrete(node[discrete], fields.get(discrete)),
-        _continuous(node[continuous], fields.get(continuous)),
-    )
+    readers = zip(SYMMETRY_FIELDS, (_discrete, _continuous), strict=True)
+    return {name: read(node[name], fields.get(name)) for name, read in readers}
 
 
-def parse_symmetries(name: str, fields: object) -> tuple[Discrete | None, Continuous]:
+def parse_symmetries(name: str, fields: object) -> Symmetries:
     """Return the symmetries in a config's entry, in the format of ``models_info.json``.
 
     Raises:
@@ -224,7 +218,7 @@ def parse_symmetries(name: str, fields: object) -> tuple[Discrete | None, Contin
     return _symmetries(node, mapping(fields))
 
 
-def _discrete(node: Node, value: object) -> Discrete | None:
+def _discrete(node: Node, value: object) -> Float[np.ndarray, "symmetries 4 4"] | None:
     """Read discrete symmetries without the identity; report invalid transforms."""
     transforms = []
     for number, row in enumerate(_rows(node, value)):
@@ -244,7 +238,9 @@ def _discrete(node: Node, value: object) -> Discrete | None:
     return np.array(transforms) if transforms else None
 
 
-def _continuous(node: Node, value: object) -> Continuous:
+def _continuous(
+    node: Node, value: object
+) -> tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]:
     """Read continuous symmetries as pairs of axis and offset, metres."""
     pairs = []
     for number, row in enumerate(node.entries(_rows(node, value))):
@@ -318,18 +314,18 @@ def ply_bytes(mesh: Mesh, texture_name: str) -> bytes:
     """Encode a mesh as binary PLY that names its texture's file, if it has a texture."""
     import trimesh  # slow to import, and only needed for writing
 
-    # Weighted by the angles of the faces around a vertex, as BOP's are (Thürmer, Wüthrich 1998).
+    # Weighted by the faces' angles at the vertex, like BOP's normals (Thürmer, Wüthrich 1998).
     normals = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).vertex_normals
     columns = [mesh.vertices * MM, np.asarray(normals)]
     names = ["x", "y", "z", "nx", "ny", "nz"]
-    textured = mesh.texture is not None and mesh.uv is not None
-    if textured:
+    has_texture = mesh.texture is not None and mesh.uv is not None
+    if has_texture:
         names += ["texture_u", "texture_v"]
         columns.append(np.asarray(mesh.uv))
-    shades = () if mesh.colours is None else ("red", "green", "blue")
+    channels = () if mesh.colours is None else ("red", "green", "blue")
     values = np.hstack(columns).astype("<f4")
     vertices = np.empty(
-        len(values), [("numbers", "<f4", values.shape[1]), ("colour", "u1", len(shades))]
+        len(values), [("numbers", "<f4", values.shape[1]), ("colour", "u1", len(channels))]
     )
     vertices["numbers"] = values
     if mesh.colours is not None:
@@ -339,10 +335,10 @@ def ply_bytes(mesh: Mesh, texture_name: str) -> bytes:
     header = [
         "ply",
         "format binary_little_endian 1.0",
-        *([f"comment TextureFile {texture_name}"] if textured else []),
+        *([f"comment TextureFile {texture_name}"] if has_texture else []),
         f"element vertex {len(vertices)}",
         *(f"property float {name}" for name in names),
-        *(f"property uchar {name}" for name in shades),
+        *(f"property uchar {name}" for name in channels),
         f"element face {len(faces)}",
         "property list uchar int vertex_indices",
         "end_header",

@@ -21,9 +21,9 @@ from jaxtyping import Int
 from dopepp.core.errors import UserError
 from dopepp.core.json import read_json
 from dopepp.core.validation import Range, parse
-from dopepp.data.formats import ESTIMATED, bop, make_instance, share
+from dopepp.data.formats import ESTIMATED, bop, make_instance, share_slice
 from dopepp.data.formats.bop import BopScene, read_scene
-from dopepp.data.formats.bop.bop_models import modelled, parts_by_id, read_models
+from dopepp.data.formats.bop.bop_models import objects_with_model, parts_by_id, read_models
 from dopepp.data.formats.images import decode_depth, decode_mask, decode_rgb
 from dopepp.data.sample import Instance, Sample, SourceInfo
 from dopepp.drawing.pictures import DepthMap, Shape, Size, read_content
@@ -104,23 +104,19 @@ class BopReader:
         self.root, self.split, self.name = Path(root), split, f"bop/{split}"
         self._parts = parts_by_id(self.root, parts)
         self._read_depth = read_depth
-        with_model = modelled(read_models(self.root))
+        with_model = objects_with_model(read_models(self.root))
         folders = _scene_folders(self.root, split)
         self._scenes = [read_scene(folder, self._parts, with_model) for folder in folders]
         if targets == AUTO:
-            is_there = split.startswith("test") and (self.root / TARGETS_FILE).is_file()
-            targets = TARGETS_FILE if is_there else None
+            is_present = split.startswith("test") and (self.root / TARGETS_FILE).is_file()
+            targets = TARGETS_FILE if is_present else None
         self._targets = None if targets is None else read_targets(self.root / targets)
-        items = self._present()
-        self._items = items[share(len(items), part_of, self.name)]
+        items = self._find_items()
+        self._items = items[share_slice(len(items), part_of, self.name)]
         self._log_oddities(with_model)
 
-    def _present(self) -> Int[np.ndarray, "items 2"]:
-        """Return (scene, row) of the selected images on disk, in order.
-
-        Raises:
-            UserError: None of the selected images is on disk.
-        """
+    def _find_items(self) -> Int[np.ndarray, "items 2"]:
+        """Return (scene, row) of the selected images on disk, in order."""
         listed = [
             (number, row)
             for number, scene in enumerate(self._scenes)
@@ -128,15 +124,14 @@ class BopReader:
             if self._targets is None or (int(scene.folder.name), image) in self._targets
         ]
         present = [(number, row) for number, row in listed if self._scenes[number].files[row]]
-        num_wanted = len(listed) if self._targets is None else len(self._targets)
+        num_listed = len(listed) if self._targets is None else len(self._targets)
         if not present:
-            problem = f"no image under {self.root / self.split} ({num_wanted:,} listed)"
+            problem = f"no image under {self.root / self.split} ({num_listed:,} listed)"
             allowed = "at least one of the listed images in rgb/ or gray/"
-            raise UserError(
-                problem, allowed, "unpack all archives of the data set into this folder"
-            )
-        if len(present) < num_wanted:
-            absent = f"{num_wanted - len(present):,} of {num_wanted:,}"
+            fix = "unpack all archives of the data set into this folder"
+            raise UserError(problem, allowed, fix)
+        if len(present) < num_listed:
+            absent = f"{num_listed - len(present):,} of {num_listed:,}"
             _log.warning("%s: %s listed images are absent", self.name, absent)
         return np.array(present, np.int64)
 
@@ -145,12 +140,10 @@ class BopReader:
         other = sum(scene.num_other for scene in self._scenes)
         behind = sum(scene.num_behind for scene in self._scenes)
         without: Counter[int] = sum((scene.without_model for scene in self._scenes), Counter())
-        left_out = other + without.total()
-        self._left_out = {"other_objects": left_out, "behind_the_camera": behind}
+        self._ignored = {"other_objects": other + without.total(), "behind_the_camera": behind}
         if other or behind:
-            problem = (
-                f"{other:,} objects that are not among the parts and {behind:,} behind the camera"
-            )
+            problem = f"{other:,} objects that are not among the parts"
+            problem += f" and {behind:,} behind the camera"
             _log.info("%s: ignoring %s", self.name, problem)
         if inexact := sum(int(scene.poses.inexact.sum()) for scene in self._scenes):
             problem = f"{inexact:,} rotations are orthogonal to {bop.INEXACT:g} only"
@@ -201,10 +194,10 @@ class BopReader:
         numbers = range(objects.start, objects.stop)
         instances = [self._instance(scene, k, path.stem, K, shape) for k in numbers]
         if self._targets is not None and (counts := self._target_counts(scene, row)) is not None:
-            left = Counter({self._parts[n].name: counts[n] for n in self._parts})
+            remaining = Counter({part.name: counts[n] for n, part in self._parts.items()})
             for instance in sorted(instances, key=lambda instance: -instance.visible_fraction):
-                instance.wanted = left[instance.label] > 0
-                left[instance.label] -= 1
+                instance.wanted = remaining[instance.label] > 0
+                remaining[instance.label] -= 1
         depth = self._depth(scene, row, shape) if self._read_depth else None
         key = f"{scene.folder.name}/{scene.image_ids[row]:06d}"
         return Sample(image, K, instances, depth, self.name, key)
@@ -223,8 +216,8 @@ class BopReader:
         """Read the depth image; None in a scene without depth images."""
         if not any(scene.depth_files):
             return None
-        missing = f"depth/{scene.image_ids[row]:06d}.png"
-        path = scene.folder / (scene.depth_files[row] or missing)
+        expected = f"depth/{scene.image_ids[row]:06d}.png"
+        path = scene.folder / (scene.depth_files[row] or expected)
         return decode_depth(read_content(path), str(path), float(scene.depth_scales[row]), shape)
 
     def view(self) -> tuple[Size, CameraMatrix, tuple[float, float] | None]:
@@ -252,15 +245,16 @@ class BopReader:
         digest = hashlib.sha256()
         unknown = 0
         for number, row in self._items.tolist():
-            scene, chosen = self._scenes[number], self._scenes[number].objects(row)
+            scene = self._scenes[number]
+            poses, objects = scene.poses, scene.objects(row)
             digest.update(f"{scene.folder.name}/{scene.image_ids[row]}".encode())
-            for array in (scene.K[row], scene.poses.T_cam_obj[chosen], scene.poses.obj_ids[chosen]):
+            for array in (scene.K[row], poses.T_cam_obj[objects], poses.obj_ids[objects]):
                 digest.update(np.ascontiguousarray(array).tobytes())
-            unknown += int(np.isnan(scene.poses.visible_fractions[chosen]).sum())
+            unknown += int(np.isnan(poses.visible_fractions[objects]).sum())
         identity: dict[str, object] = {
             "annotation": digest.hexdigest(),
             "objects": {part.name: part.mesh_hash for part in self._parts.values()},
-            "left_out": self._left_out,
+            "left_out": self._ignored,
             "visible_fractions": "scene_gt_info.json" if not unknown else ESTIMATED,
         }
         return [SourceInfo(self.name, len(self), identity, self._num_instances)]
@@ -276,11 +270,7 @@ class BopReader:
 
 
 def _scene_folders(root: Path, split: str) -> list[Path]:
-    """Return a split's scenes in order, i.e. the folders whose names are numbers.
-
-    Raises:
-        UserError: The split's folder is missing or has no scene.
-    """
+    """Return a split's scenes in order, i.e. the folders whose names are numbers."""
     if not (root / split).is_dir():
         splits = sorted({path.parent.parent.name for path in root.glob("*/*/scene_camera.json")})
         raise UserError(

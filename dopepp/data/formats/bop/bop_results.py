@@ -183,11 +183,7 @@ def _check_repeats(path: Path, table: Table) -> None:
 
 
 def _check_unit(path: Path, table: Table) -> None:
-    """Check that the translations are in millimetres.
-
-    Raises:
-        UserError: The median distance is implausible in millimetres.
-    """
+    """Check that the median distance is plausible in millimetres."""
     if not len(table):
         return
     distances = np.linalg.norm(table[:, 14:17], axis=1)

@@ -23,7 +23,14 @@ from PIL import Image
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_file
 from dopepp.core.json import read_json
-from dopepp.data.formats import STAGING, encode_by_key, finalizing, read_object, stage, staged_items
+from dopepp.data.formats import (
+    STAGING,
+    encode_by_key,
+    lock_staging,
+    read_object,
+    stage_item,
+    staged_items,
+)
 from dopepp.data.formats.bop import MAX_SCENE_BYTES, MM
 from dopepp.data.formats.bop.bop_models import INFO_FILE, MODEL_FOLDERS, model_numbers, write_models
 from dopepp.data.formats.images import depth_units, encode_png
@@ -69,7 +76,7 @@ class BopFolder:
 
     @cached_property
     def _surfaces(self) -> dict[str, tuple[Part, Surface]]:
-        """Return each part and its surface by name, for parts with a mesh."""
+        """Each part and its surface by name, for parts with a mesh."""
         return {part.name: (part, make_surface(part.mesh)) for part in self._parts if part.mesh}
 
     def labels(self, sample: Sample) -> Labels:
@@ -95,12 +102,12 @@ class BopWriter(BopFolder):
                 path = scene / folder / f"{image:06d}_{number:06d}.png"
                 write_file(path, encode_png(mask.astype("uint8") * 255))
         item = {"camera": labels.camera, "gt": labels.truths, "gt_info": labels.infos}
-        stage(scene / STAGING / f"{image:06d}.json", json.dumps(item).encode())
+        stage_item(scene / STAGING / f"{image:06d}.json", json.dumps(item).encode())
 
     def written(self, chunk: int) -> set[int]:
         """Return the indices of the scene's complete images."""
         scene = self._scene(chunk)
-        images = {int(path.stem) for path in _staged(scene)}
+        images = {int(path.stem) for path in _staged_files(scene)}
         cameras = read_object(scene / "scene_camera.json", MAX_SCENE_BYTES)
         images |= {int(image) for image in cameras}
         return {chunk * self.chunk_size + image for image in images}
@@ -109,8 +116,8 @@ class BopWriter(BopFolder):
         """Merge the staged records into the scene's files, and the first camera into the root's."""
         scene = self._scene(chunk)
         image_numbers = {index % self.chunk_size for index in indices}
-        with finalizing(scene / STAGING):
-            staged = [path for path in _staged(scene) if int(path.stem) in image_numbers]
+        with lock_staging(scene / STAGING):
+            staged = [path for path in _staged_files(scene) if int(path.stem) in image_numbers]
             items: dict[int, Any] = {int(path.stem): read_json(path) for path in staged}
             for field in SCENE_FIELDS:
                 path = scene / f"scene_{field}.json"
@@ -135,15 +142,15 @@ class BopWriter(BopFolder):
         folders = (self.root / self.split).iterdir()
         if chunk > min(int(path.name) for path in folders if path.name.isdecimal()):
             return
-        with Image.open(self._scene(chunk) / "rgb" / f"{image:06d}.png") as picture:
-            width, height = picture.size
+        with Image.open(self._scene(chunk) / "rgb" / f"{image:06d}.png") as file:
+            width, height = file.size
         K = camera["cam_K"]
         record = {"cx": K[2], "cy": K[5], "depth_scale": camera["depth_scale"]}
         record |= {"fx": K[0], "fy": K[4], "height": height, "width": width}
         write_file(self.root / "camera.json", (json.dumps(record, indent=2) + "\n").encode())
 
 
-def _staged(scene: Path) -> list[Path]:
+def _staged_files(scene: Path) -> list[Path]:
     """Return the files of the scene's images that are not merged yet."""
     return staged_items(scene / STAGING, ".json")
 
@@ -187,8 +194,8 @@ def make_labels(
     for instance, mask in zip(sample.instances, visible, strict=True):
         part, surface = parts[instance.label]
         T: Transform = np.asarray(instance.T_cam_obj, np.float64)
-        shown = SceneObject(surface, instance.T_cam_obj, part=part)
-        whole = silhouette(shown, sample.K, sample.size)
+        item = SceneObject(surface, instance.T_cam_obj, part=part)
+        whole = silhouette(item, sample.K, sample.size)
         masks.append(whole.mask)
         infos.append(_info(instance, mask, whole, depth))
         truth = {"cam_R_m2c": T[:3, :3].ravel().tolist(), "cam_t_m2c": (T[:3, 3] * MM).tolist()}
@@ -204,10 +211,10 @@ def _info(
     instance: Instance, visible: Mask, whole: Silhouette, depth: UInt16[np.ndarray, "height width"]
 ) -> Record:
     """Return an instance's record in ``scene_gt_info.json``."""
-    seen, inside = Box.of_mask(visible), Box.of_mask(whole.mask)
+    visible_box = Box.of_mask(visible)
     return {
-        "bbox_obj": _bop_box(None if seen is None else _beyond_the_border(inside, whole)),
-        "bbox_visib": _bop_box(seen),
+        "bbox_obj": _bop_box(None if visible_box is None else _silhouette_box(whole)),
+        "bbox_visib": _bop_box(visible_box),
         # A silhouette around the camera has no finite size, so its pixels in the image are counted.
         "px_count_all": int(whole.num_px if math.isfinite(whole.num_px) else whole.mask.sum()),
         "px_count_valid": int(np.count_nonzero(depth[whole.mask])),
@@ -223,9 +230,10 @@ def _bop_box(box: Box | None) -> list[int]:
     return [int(n) for n in (box.left, box.top, box.right - box.left, box.bottom - box.top)]
 
 
-def _beyond_the_border(inside: Box | None, whole: Silhouette) -> Box | None:
+def _silhouette_box(whole: Silhouette) -> Box | None:
     """Return the box of a silhouette, including its pixels beyond the image's border."""
     # The silhouette's box bounds the vertices; the box of pixels is exact inside the border.
+    inside = Box.of_mask(whole.mask)
     if inside is None or whole.box is None:
         return inside
     height, width = whole.mask.shape

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats import ndds, share
+from dopepp.data.formats import ndds, share_slice
 from dopepp.data.formats.ndds import conventions
 from dopepp.data.formats.ndds.conventions import NddsFinding, Observation
 from dopepp.data.sample import Instance, Sample, SourceInfo, hull_areas
@@ -77,7 +77,7 @@ class NddsReader:
             raise UserError(f"classes of the parts {unknown}", allowed, fix)
         self._settings = ndds.NddsSettings(self.folder)
         items = _find(self.folder)
-        self.items = items[share(len(items), part_of, self.name)]
+        self.items = items[share_slice(len(items), part_of, self.name)]
         # From all items, so that training and validation shares have the same convention.
         self.finding = self._find_convention(items)
         _log.info("%s: %s items; found: %s", self.name, f"{len(self.items):,}", self.finding)

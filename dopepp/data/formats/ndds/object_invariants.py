@@ -234,7 +234,7 @@ class ObjectCheck:
         elif seen is not None:
             (a, b), (c, d) = first.tolist(), last.tolist()
             boxes = {"row, column": Box(b, a, d, c), "column, row": Box(a, b, c, d)}
-            fits = {order: box.beyond(seen) <= PROJECTION_PX for order, box in boxes.items()}
+            fits = {order: box.excess_px(seen) <= PROJECTION_PX for order, box in boxes.items()}
             problem = f"{boxes['row, column']} does not contain the mask's box {seen}"
             self._judge("bounding_box", fits, problem)
 

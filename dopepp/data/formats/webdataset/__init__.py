@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from dopepp.core.errors import UserError
-from dopepp.data.archive import Bounded
+from dopepp.data.archive import BoundedStream
 from dopepp.data.formats.problems import STRICT, Node, Problems
 
 FIELDS: Final = ("image", "depth", "camera", "gt", "gt_info", "mask_visib")
@@ -140,7 +140,7 @@ def members(path: Path, problems: Problems = STRICT) -> Iterator[TarMember]:
 def _walk(node: Node, file: io.BufferedReader, size: int) -> Iterator[TarMember]:
     """Yield the members of a shard; report members that are repeated, unsafe or too large."""
     names: set[str] = set()
-    with tarfile.open(fileobj=Bounded(file), mode="r:") as archive:
+    with tarfile.open(fileobj=BoundedStream(file), mode="r:") as archive:
         while (info := archive.next()) is not None:
             archive.members = []  # type: ignore[attr-defined]  # which collects all headers
             name = PurePosixPath(info.name)

@@ -22,7 +22,7 @@ import numpy as np
 from dopepp.core.errors import UserError
 from dopepp.core.files import partial_path
 from dopepp.core.json import MAX_BYTES
-from dopepp.data.formats import ESTIMATED, bop, make_instance, share
+from dopepp.data.formats import ESTIMATED, bop, make_instance, share_slice
 from dopepp.data.formats.bop.bop_models import parts_by_id
 from dopepp.data.formats.images import decode_depth, decode_rgb, decode_runs
 from dopepp.data.formats.problems import STRICT, Node, Problems, mapping
@@ -81,7 +81,7 @@ class WebdatasetReader:
         _check_keys(self._shards)
         items = [(n, i) for n, shard in enumerate(self._shards) for i in range(len(shard.keys))]
         table = np.array(items, np.int64).reshape(-1, 2)
-        self._items = table[share(len(table), part_of, self.name)]
+        self._items = table[share_slice(len(table), part_of, self.name)]
 
     def __len__(self) -> int:
         return len(self._items)

@@ -17,7 +17,14 @@ from pathlib import Path
 from typing import Final
 
 from dopepp.core.files import partial_path, write_file
-from dopepp.data.formats import STAGING, encode_by_key, finalizing, read_object, stage, staged_items
+from dopepp.data.formats import (
+    STAGING,
+    encode_by_key,
+    lock_staging,
+    read_object,
+    stage_item,
+    staged_items,
+)
 from dopepp.data.formats.bop.bop_writer import BopFolder
 from dopepp.data.formats.images import encode_png, encode_runs
 from dopepp.data.formats.webdataset import KEY_FILE, TarMember, members, read_span
@@ -49,7 +56,7 @@ class WebdatasetWriter(BopFolder):
             runs = {str(number): encode_runs(mask) for number, mask in enumerate(masks)}
             content[f"{name}.json"] = json.dumps(runs).encode()
         chunk, image = divmod(index, self.chunk_size)
-        stage(
+        stage_item(
             self._staging(chunk) / f"{image:06d}.tar", _archive(f"{chunk:06d}_{image:06d}", content)
         )
 
@@ -63,7 +70,7 @@ class WebdatasetWriter(BopFolder):
     def finalize(self, chunk: int, indices: Sequence[int]) -> None:
         """Merge the staged images into the shard and into ``key_to_shard.json``."""
         image_numbers = {index % self.chunk_size for index in indices}
-        with finalizing(self.root / self.split / STAGING):
+        with lock_staging(self.root / self.split / STAGING):
             staged = {int(path.stem): path for path in self._staged(chunk)}
             staged = {image: path for image, path in staged.items() if image in image_numbers}
             if staged:

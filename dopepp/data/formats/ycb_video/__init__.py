@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.images import read_map, stated_shape
+from dopepp.data.formats.images import header_shape, read_map
 from dopepp.data.formats.invariants import rotation_problem
 from dopepp.data.formats.problems import STRICT, Node, Problems
 from dopepp.drawing.pictures import Shape, read_image
@@ -208,7 +208,7 @@ def read_frame(
     )
     path = Path(colour.path)
     image = colour["image"].attempt(lambda: _read_colour(path, alpha=subset == "synthetic"))
-    shape: Shape | None = stated_shape(path) if image is None else image.shape[:2]
+    shape: Shape | None = header_shape(path) if image is None else image.shape[:2]
     meta = read_meta(Path(f"{start}-meta.mat"), problems)
     units = read_map(depth, shape) if read_depth else None
     return YcbFrame(image, shape, meta, units, read_map(label, shape))

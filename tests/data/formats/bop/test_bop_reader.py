@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.data.check import check_dataset
-from dopepp.data.formats import share
+from dopepp.data.formats import share_slice
 from dopepp.data.formats.bop.bop_models import bop_parts
 from dopepp.data.formats.bop.bop_reader import BopReader
 from dopepp.data.formats.images import decode_mask, decode_rgb, encode_png
@@ -174,12 +174,12 @@ def test_shares_are_disjoint_and_complete(num_items, inner):
     taken = []
     for first, last in pairwise(bounds):
         try:
-            taken += range(num_items)[share(num_items, (first, last), "x")]
+            taken += range(num_items)[share_slice(num_items, (first, last), "x")]
         except UserError:
             continue
     assert taken == list(range(num_items))
     with pytest.raises(ValueError, match="ascending"):
-        share(num_items, (0.5, 0.5), "x")
+        share_slice(num_items, (0.5, 0.5), "x")
 
 
 def test_absent_images_and_objects_behind_the_camera_are_counted(scene, caplog, block):
