@@ -44,8 +44,8 @@ class Problems:
         Args:
             path: File with the problem.
             where: Field in the file, or an empty string.
-            message: What is wrong.
-            allowed: What would be right; empty if the message implies it.
+            message: Description of the problem.
+            allowed: Allowed values; empty if the message implies them.
 
         Raises:
             UserError: In this class, always.
@@ -56,11 +56,6 @@ class Problems:
 
     def report_error(self, path: Path | str, where: str, error: UserError) -> None:
         """Report an error that another package raised.
-
-        Args:
-            path: File with the problem.
-            where: Field in the file.
-            error: The error.
 
         Raises:
             UserError: In this class, always: the given error.
@@ -157,7 +152,7 @@ class Node:
         self.problems.report(self.path, self.where, message, allowed)
 
     def attempt(self, read: Callable[[], T]) -> T | None:
-        """Return the result of ``read``, or report its error and return None."""
+        """Return the result of ``read``; report its UserError and return None."""
         is_missing = isinstance(self.path, Path) and not self.path.is_file()
         try:
             return read()
@@ -168,7 +163,7 @@ class Node:
     def load(
         self, allowed: str = "a JSON object { }", max_bytes: int = MAX_BYTES
     ) -> dict[str, Any] | None:
-        """Read a JSON file whose top level is an object; return None if that is impossible.
+        """Read a JSON file whose top level is an object; report any other file and return None.
 
         Numbers that are not finite and repeated keys are reported, and the rest is read.
         """
@@ -177,7 +172,7 @@ class Node:
         if strict is not None:
             content = strict[0]
         elif path.is_file() and path.stat().st_size <= max_bytes:
-            content = _leniently(path.read_bytes())
+            content = _parse_leniently(path.read_bytes())
         else:
             return None
         if isinstance(content, dict):
@@ -189,7 +184,7 @@ class Node:
     def decode(self, content: bytes) -> Any:
         """Parse JSON like :meth:`load`, with any top level."""
         strict = self["JSON"].attempt(lambda: [parse_json(content, str(self.path))])
-        return _leniently(content) if strict is None else strict[0]
+        return _parse_leniently(content) if strict is None else strict[0]
 
     def numbers(self, value: object, *shape: int) -> Float[np.ndarray, "..."]:
         """Return a field's numbers as an array; report other values and return NaN.
@@ -227,8 +222,8 @@ class Node:
         return [mapping(entry) for entry in value]
 
 
-def _leniently(content: bytes) -> Any:
-    """Parse JSON; return None if it is invalid."""
+def _parse_leniently(content: bytes) -> Any:
+    """Parse JSON, also with repeated keys and NaN; return None for other invalid JSON."""
     try:
         return json.loads(content)
     except (ValueError, RecursionError):

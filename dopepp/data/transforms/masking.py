@@ -47,8 +47,8 @@ class BackgroundCrops:
     ) -> None:
         self.image, self.min_contrast, self.max_draws = image, min_contrast, max_draws
         occupied = np.zeros(image.shape[:2], bool)
-        for seen in silhouettes:
-            occupied |= seen
+        for mask in silhouettes:
+            occupied |= mask
         self._integral = cv2.integral(occupied.astype(np.uint8))
 
     def draw(self, size: Size, rng: Generator) -> RGBImage | None:
@@ -122,20 +122,28 @@ def has_contrast(crop: RGBImage, min_contrast: float) -> bool:
     return float(crop.reshape(-1, 3).std(axis=0).max()) >= min_contrast
 
 
-def covered_instances(
+def mask_slices(mask: Mask) -> tuple[slice, slice]:
+    """Return the slices of rows and columns that a mask's pixels span."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+
+def cover_instances(
     instances: Sequence[Instance], silhouettes: Sequence[Mask], covered: Mask
 ) -> list[Instance]:
     """Remove covered pixels from instances; keypoints and poses stay."""
-    changed = []
-    for instance, seen in zip(instances, silhouettes, strict=True):
-        num_seen = int(np.count_nonzero(seen))
-        if num_seen:
-            share = int(np.count_nonzero(seen & covered)) / num_seen
+    remaining = []
+    for instance, visible in zip(instances, silhouettes, strict=True):
+        num_visible = int(np.count_nonzero(visible))
+        if num_visible:
+            share = int(np.count_nonzero(visible & covered)) / num_visible
             mask = None if instance.mask is None else instance.mask & ~covered
-            visible = instance.visible_fraction * (1 - share)
-            instance = replace(instance, mask=mask, visible_fraction=visible, masked_fraction=share)
-        changed.append(instance)
-    return changed
+            fraction = instance.visible_fraction * (1 - share)
+            instance = replace(
+                instance, mask=mask, visible_fraction=fraction, masked_fraction=share
+            )
+        remaining.append(instance)
+    return remaining
 
 
 @dataclass(frozen=True)
@@ -171,22 +179,22 @@ class RandomMask(Checked):
             height, width = (side.stop - side.start for side in patch)
             crop = self._crop(crops, (height, width), rng, other)
             if crop is not None:
-                rows, columns = map(_middle, patch, crop.shape)
+                rows, columns = map(_middle_slice, patch, crop.shape)
                 image[rows, columns], covered[rows, columns] = crop, True
-        instances = covered_instances(sample.instances, silhouettes, covered)
+        instances = cover_instances(sample.instances, silhouettes, covered)
         return replace(sample, image=image, instances=instances)
 
-    def _patch(self, seen: Mask, rng: Generator) -> tuple[slice, slice] | None:
+    def _patch(self, object_mask: Mask, rng: Generator) -> tuple[slice, slice] | None:
         """Draw a patch inside the object's box; None if the box is too small."""
         slices = []
-        for axis, limit in ((1, self.max_height), (0, self.max_width)):
-            hit = np.flatnonzero(seen.any(axis=axis))
-            start, extent = int(hit[0]), int(hit[-1] - hit[0] + 1)
+        limits = self.max_height, self.max_width
+        for side, limit in zip(mask_slices(object_mask), limits, strict=True):
+            extent = side.stop - side.start
             longest = int(limit * extent)
             if longest < MIN_PATCH_PX:
                 return None
             length = int(rng.integers(MIN_PATCH_PX, longest + 1))
-            offset = start + int(rng.integers(0, extent - length + 1))
+            offset = side.start + int(rng.integers(0, extent - length + 1))
             slices.append(slice(offset, offset + length))
         return slices[0], slices[1]
 
@@ -199,16 +207,16 @@ class RandomMask(Checked):
             return crop
         height, width = crops.image.shape[:2]
         for _ in range(self.max_draws):
-            picture = other.draw(rng, width, height)
+            background = other.draw(rng, width, height)
             row = int(rng.integers(0, height - size[0] + 1))
             column = int(rng.integers(0, width - size[1] + 1))
-            crop = picture[row : row + size[0], column : column + size[1]]
+            crop = background[row : row + size[0], column : column + size[1]]
             if has_contrast(crop, self.min_contrast):
                 return crop
         return None
 
 
-def _middle(patch: slice, length: int) -> slice:
-    """Return the middle of a patch's rows or columns."""
+def _middle_slice(patch: slice, length: int) -> slice:
+    """Return the ``length`` middle rows or columns of a patch."""
     start = patch.start + (patch.stop - patch.start - length) // 2
     return slice(start, start + length)

@@ -20,7 +20,12 @@ from jaxtyping import Bool, Int
 from numpy.random import Generator
 
 from dopepp.data.sample import Instance, Purpose, Sample, item_rng, silhouette
-from dopepp.data.transforms.masking import MIN_PATCH_PX, BackgroundCrops, covered_instances
+from dopepp.data.transforms.masking import (
+    MIN_PATCH_PX,
+    BackgroundCrops,
+    cover_instances,
+    mask_slices,
+)
 from dopepp.drawing.pictures import Mask, RGBImage
 
 TOLERANCE: Final = 0.02  # Allowed difference of the covered share from the requested share.
@@ -34,7 +39,7 @@ _NEVER: Final = np.iinfo(np.int32).max
 
 
 @dataclass(frozen=True)
-class Shaded:
+class ShadedSample:
     """An image with shaded objects.
 
     Attributes:
@@ -48,7 +53,7 @@ class Shaded:
     reached: tuple[float | None, ...]
 
 
-def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> list[Shaded]:
+def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> list[ShadedSample]:
     """Shade an image's objects, once for each share.
 
     Args:
@@ -71,11 +76,11 @@ def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> lis
     covers = []
     for number, (instance, rng) in enumerate(zip(sample.instances, rngs, strict=True)):
         if _can_be_shaded(instance):
-            own, others = silhouettes[number], np.zeros(shape, bool)
+            visible, others = silhouettes[number], np.zeros(shape, bool)
             for other in silhouettes[:number] + silhouettes[number + 1 :]:
                 others |= other
-            covers.append(_Cover(own, others & ~own, crops, largest, rng))
-    return [_shaded(sample, silhouettes, covers, share) for share in shares]
+            covers.append(_Cover(visible, others & ~visible, crops, largest, rng))
+    return [_cover_share(sample, silhouettes, covers, share) for share in shares]
 
 
 def _can_be_shaded(instance: Instance) -> bool:
@@ -83,72 +88,61 @@ def _can_be_shaded(instance: Instance) -> bool:
     return instance.mask is not None and bool(instance.mask.any())
 
 
-def _shaded(
+def _cover_share(
     sample: Sample, silhouettes: Sequence[Mask], covers: Sequence[_Cover], share: float
-) -> Shaded:
-    """Cover a share of each object with its patches, and update the instances and the depth.
-
-    Args:
-        sample: The image without shading.
-        silhouettes: Silhouette of each instance.
-        covers: Patches of the instances that can be shaded.
-        share: Share of each object's visible pixels to cover.
-    """
+) -> ShadedSample:
+    """Cover a share of each object with its patches, and update the instances and the depth."""
     image, covered = sample.image.copy(), np.zeros(sample.image.shape[:2], bool)
     for cover in covers:
-        is_patch = cover.laid(share)
+        is_patch = cover.pixels_of_share(share)
         image[cover.box][is_patch] = cover.pixels[is_patch]
         covered[cover.box] |= is_patch
-    instances = covered_instances(sample.instances, silhouettes, covered)
+    instances = cover_instances(sample.instances, silhouettes, covered)
     depth = None if sample.depth is None else np.where(covered, np.float32(0), sample.depth)
-    return Shaded(
-        share,
-        replace(sample, image=image, instances=instances, depth=depth),
-        tuple(
-            after.masked_fraction if _can_be_shaded(before) else None
-            for before, after in zip(sample.instances, instances, strict=True)
-        ),
+    reached = (
+        after.masked_fraction if _can_be_shaded(before) else None
+        for before, after in zip(sample.instances, instances, strict=True)
     )
+    shaded = replace(sample, image=image, instances=instances, depth=depth)
+    return ShadedSample(share, shaded, tuple(reached))
 
 
 class _Cover:
     """Patches that cover ``share`` of an instance's visible pixels.
 
-    ``order`` numbers the pixels of the box in the order of covering; ``spared`` pixels stay.
+    ``order`` numbers the pixels of the box in the order of covering; no patch covers ``protected``
+    pixels.
     """
 
     def __init__(
-        self, seen: Mask, spared: Mask, crops: BackgroundCrops, share: float, rng: Generator
+        self, visible: Mask, protected: Mask, crops: BackgroundCrops, share: float, rng: Generator
     ) -> None:
-        self.box = _box(seen)
-        self._seen, self._spared = seen[self.box], spared[self.box]
-        self.pixels = np.zeros((*self._seen.shape, 3), np.uint8)
-        self.order: Int[np.ndarray, "rows columns"] = np.full(self._seen.shape, _NEVER, np.int32)
-        self._num_seen, self._num_laid = int(np.count_nonzero(self._seen)), 0
+        self.box = mask_slices(visible)
+        self._visible, self._protected = visible[self.box], protected[self.box]
+        shape = self._visible.shape
+        self.pixels = np.zeros((*shape, 3), np.uint8)
+        self.order: Int[np.ndarray, "rows columns"] = np.full(shape, _NEVER, np.int32)
+        self._num_visible, self._num_covered = int(np.count_nonzero(self._visible)), 0
         for _ in range(_MAX_PATCHES):
-            bare = np.argwhere(self._seen & (self.order == _NEVER))
-            if self._num_seen - len(bare) >= self._num_asked(share):
+            uncovered = np.argwhere(self._visible & (self.order == _NEVER))
+            if self._num_visible - len(uncovered) >= round(share * self._num_visible):
                 break
             crop = self._draw_crop(crops, rng)
             if crop is None:
                 break
-            self._lay(crop, bare[rng.integers(len(bare))], rng)
+            self._add_patch(crop, uncovered[rng.integers(len(uncovered))], rng)
 
-    def laid(self, share: float) -> Bool[np.ndarray, "rows columns"]:
+    def pixels_of_share(self, share: float) -> Bool[np.ndarray, "rows columns"]:
         """Return the covered pixels of the box for a share of the visible pixels."""
-        asked = self._num_asked(share)
-        if asked == 0:
+        num_pixels = round(share * self._num_visible)
+        if num_pixels == 0:
             return np.zeros(self.order.shape, bool)
-        last = np.sort(self.order[self._seen])[asked - 1]
+        last = np.sort(self.order[self._visible])[num_pixels - 1]
         return self.order <= min(int(last), _NEVER - 1)
-
-    def _num_asked(self, share: float) -> int:
-        """Return the number of pixels to cover for a share."""
-        return round(share * self._num_seen)
 
     def _draw_crop(self, crops: BackgroundCrops, rng: Generator) -> RGBImage | None:
         """Draw a crop of random size, reduced to fit the background, or None."""
-        extent = self._seen.shape
+        extent = self._visible.shape
         if min(extent) < MIN_PATCH_PX:
             return None
         height, width = (
@@ -156,7 +150,7 @@ class _Cover:
         )
         return crops.largest((height, width), rng)
 
-    def _lay(self, crop: RGBImage, pixel: Int[np.ndarray, "2"], rng: Generator) -> None:
+    def _add_patch(self, crop: RGBImage, pixel: Int[np.ndarray, "2"], rng: Generator) -> None:
         """Draw a crop below earlier crops, at a random position that covers ``pixel``."""
         slices = []
         for position, length, extent in zip(pixel, crop.shape, self.order.shape, strict=False):
@@ -164,14 +158,8 @@ class _Cover:
             start = int(rng.integers(first, last + 1))
             slices.append(slice(start, start + length))
         patch = slices[0], slices[1]
-        new = (self.order[patch] == _NEVER) & ~self._spared[patch]
+        new = (self.order[patch] == _NEVER) & ~self._protected[patch]
         num_new = int(np.count_nonzero(new))
-        self.order[patch][new] = np.arange(self._num_laid, self._num_laid + num_new)
+        self.order[patch][new] = np.arange(self._num_covered, self._num_covered + num_new)
         self.pixels[patch][new] = crop[new]
-        self._num_laid += num_new
-
-
-def _box(seen: Mask) -> tuple[slice, slice]:
-    """Return the slices of rows and columns that a mask's pixels span."""
-    rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
-    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+        self._num_covered += num_new

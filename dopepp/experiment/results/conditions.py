@@ -24,7 +24,7 @@ from jaxtyping import Float
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_csv, write_file, write_png
 from dopepp.data.sample import Sample, SampleSource
-from dopepp.data.transforms.shading_protocol import TOLERANCE, Shaded, shade
+from dopepp.data.transforms.shading_protocol import TOLERANCE, ShadedSample, shade
 from dopepp.drawing.curves import figure_image, rates_figure
 from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.experiment.results import display
@@ -318,7 +318,7 @@ def _shaded(share: float, metrics: Mapping[str, PoseMetrics], reached: Sequence[
     return Level(share, rows, facts, note if num_outside else "")
 
 
-def _examples(sample: Sample, shaded: Sequence[Shaded]) -> list[Tile]:
+def _examples(sample: Sample, shaded: Sequence[ShadedSample]) -> list[Tile]:
     """Return tiles of the objects without shading and at every share."""
     window = _around_masks(sample)
     tiles = [Tile(sample.image[window], f"{sample.key}: unmasked")]

@@ -85,34 +85,34 @@ def objects_of(record: Mapping[str, Any], path: Path, problems: Problems = STRIC
 def parse_object(item: Mapping[str, Any], node: Node) -> NddsObject:
     """Parse one object, and report a missing location or quaternion."""
 
-    def take(name: str, *shape: int) -> NDArray[np.float64]:
+    def numbers(name: str, *shape: int) -> NDArray[np.float64]:
         return node[name].numbers(item.get(name), *shape)
 
-    def take_corners(name: str, axes: int) -> NDArray[np.float64] | None:
+    def corners(name: str, axes: int) -> NDArray[np.float64] | None:
         value = item.get(name)
         # Some writers append the centroid as the ninth point.
         count = 9 if isinstance(value, list) and len(value) == 9 else 8
-        return None if value in (None, []) else take(name, count, axes)[:8]
+        return None if value in (None, []) else numbers(name, count, axes)[:8]
 
-    quaternion = take("quaternion_xyzw", 4)
+    quaternion = numbers("quaternion_xyzw", 4)
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > _NORM_TOLERANCE:
         node["quaternion_xyzw"].report(f"norm {norm:.4g}", "a quaternion of norm 1")
         quaternion = np.full(4, np.nan)
-    corners_px, cuboid = take_corners("projected_cuboid", 2), take_corners("cuboid", 3)
+    corners_px, cuboid = corners("projected_cuboid", 2), corners("cuboid", 3)
     centroid = None if cuboid is None else cuboid.mean(axis=0)
     if item.get("cuboid_centroid") is not None:
-        centroid = take("cuboid_centroid", 3)
-    visibility = None if item.get("visibility") is None else float(take("visibility", 1)[0])
+        centroid = numbers("cuboid_centroid", 3)
+    visibility = None if item.get("visibility") is None else float(numbers("visibility", 1)[0])
     if visibility is not None and (visibility > 1 or (visibility < 0 and visibility != -1)):
         node["visibility"].report(f"{visibility:g}", "0 … 1, or −1 for unknown")
         visibility = None
-    label, location = str(item.get("class", "")), take("location", 3)
+    label, location = str(item.get("class", "")), numbers("location", 3)
     return NddsObject(node, label, location, quaternion, corners_px, cuboid, centroid, visibility)
 
 
-def stated(record: Mapping[str, Any], name: str) -> object:
-    """Return an entry of the ``conventions`` added by our writer, or None."""
+def convention_entry(record: Mapping[str, Any], name: str) -> object:
+    """Return an entry of the ``conventions`` that our writer adds to annotations, or None."""
     return mapping(record.get("conventions")).get(name)
 
 
@@ -134,14 +134,14 @@ def find_items(folder: Path) -> tuple[list[Path], list[Path]]:
     return with_image, without
 
 
-def companion(annotation: Path, suffix: str) -> Path:
+def sibling_path(annotation: Path, suffix: str) -> Path:
     """Return the path of an annotation's stem with another suffix, e.g. ``.seg.png``."""
     return annotation.with_name(annotation.name.removesuffix(".json") + suffix)
 
 
-def image_of(annotation: Path) -> Path | None:
+def image_path(annotation: Path) -> Path | None:
     """Return the path of an annotation's image, or None without an image."""
-    paths = [companion(annotation, suffix) for suffix in IMAGE_SUFFIXES]
+    paths = [sibling_path(annotation, suffix) for suffix in IMAGE_SUFFIXES]
     return next((path for path in paths if path.is_file()), None)
 
 
@@ -155,8 +155,7 @@ class NddsSettings:
     def read(self, path: Path) -> Mapping[str, Any] | None:
         """Return the content of a settings file; None if it is missing or damaged."""
         if path not in self._files:
-            is_there = path.is_file()
-            self._files[path] = read_record(path, self._problems) if is_there else None
+            self._files[path] = read_record(path, self._problems) if path.is_file() else None
         return self._files[path]
 
     def _of(self, annotation: Path, name: str) -> tuple[Path, Mapping[str, Any]]:
@@ -176,9 +175,9 @@ class NddsSettings:
         and ``right``). If no camera or several cameras match, the problem is reported and K is NaN.
         """
         node = Node(problems, annotation, "camera_data.intrinsics")
-        stated_here = mapping(record.get("camera_data")).get("intrinsics")
-        if isinstance(stated_here, dict):
-            return _intrinsics(stated_here, node)
+        intrinsics = mapping(record.get("camera_data")).get("intrinsics")
+        if isinstance(intrinsics, dict):
+            return _intrinsics(intrinsics, node)
         path, settings = self._of(annotation, CAMERA_SETTINGS)
         side = annotation.name.removesuffix(".json").rpartition(".")[2]
         cameras = _entries(settings, "camera_settings")
@@ -264,10 +263,10 @@ def read_depth(record: Mapping[str, Any], annotation: Path, shape: Shape) -> Dep
         annotation: Path of the annotation; FAT's file names also imply a unit.
         shape: (height, width) of the image.
     """
-    unit = stated(record, "depth_unit_m")
+    unit = convention_entry(record, "depth_unit_m")
     if unit is None and annotation.name.endswith((".left.json", ".right.json")):
         unit = DEPTH_UNIT
-    path = companion(annotation, ".depth.png")
+    path = sibling_path(annotation, ".depth.png")
     if not isinstance(unit, (int, float)) or not 0 < unit <= 1 or not path.is_file():
         return None
     values = read_map(Node(STRICT, path), shape)
@@ -277,7 +276,7 @@ def read_depth(record: Mapping[str, Any], annotation: Path, shape: Shape) -> Dep
 
 def read_labels(annotation: Path, shape: Shape) -> NDArray[Any] | None:
     """Read ``STEM.seg.png``; None if it is missing or a colour image, whose meaning is unknown."""
-    path = companion(annotation, ".seg.png")
+    path = sibling_path(annotation, ".seg.png")
     image = read_image(path) if path.is_file() else None
     is_map = image is not None and image.ndim == 2
     return check_one_channel(Node(STRICT, path), image, shape) if is_map else None
@@ -297,13 +296,13 @@ def label_values(
     counts, class_counts = Counter(of_object), Counter(of_class)
     values: dict[str, int | None] = {}
     for (node, _, _), value, class_id in zip(objects, of_object, of_class, strict=True):
-        is_alone = counts[value] == 1
+        is_unique = counts[value] == 1
         if value is None and not has_object_ids(record):
-            value, is_alone = class_id, class_counts[class_id] == 1
-        values[node.where] = value if is_alone else None
+            value, is_unique = class_id, class_counts[class_id] == 1
+        values[node.where] = value if is_unique else None
     return values
 
 
 def has_object_ids(record: Mapping[str, Any]) -> bool:
     """Return whether an annotation states that ``.seg.png`` labels objects, not classes."""
-    return stated(record, "segmentation") == "segmentation_id"
+    return convention_entry(record, "segmentation") == "segmentation_id"

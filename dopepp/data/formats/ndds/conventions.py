@@ -92,17 +92,15 @@ class Observation:
 
     def T_cam_obj(self, convention: PoseConvention) -> Transform | None:  # noqa: N802
         """Return the mesh's pose in metres; None if the convention needs a missing ``fixed``."""
-        fixed = convention.frame.startswith("fixed")
-        if fixed and self.fixed is None:
-            return None
         order = 1 if convention.quaternion == "xyzw" else 0
         rotation = quaternion_to_matrix(np.roll(self.item.quaternion, order))
         scale = METRES[convention.unit]
         location = self.item.location * scale
-        if self.fixed is not None and fixed:
-            rotation_file, offset = rotation, self.fixed[:3, 3] * scale
-            rotation = rotation_file @ self.fixed[:3, :3]
-            location = location + rotation_file @ offset
+        if convention.frame.startswith("fixed"):
+            if self.fixed is None:
+                return None
+            location = location + rotation @ (self.fixed[:3, 3] * scale)
+            rotation = rotation @ self.fixed[:3, :3]
         if convention.frame.endswith("centred"):
             centroid = self.item.location if self.item.centroid is None else self.item.centroid
             location = centroid * scale - rotation @ self._corners[convention.frame].mean(axis=0)
@@ -150,10 +148,10 @@ MAX_ERROR_PX: Final = 5.0
 _MAX_SHARE: Final = 0.05
 """Allowed error of an instance as a share of its projected cuboid's longer side."""
 
-_MOST: Final = 0.75
+_MIN_FITTING: Final = 0.75
 """Share of the instances that must fit; the others may be damaged."""
 
-_RATIO: Final = 3.0
+_MIN_RATIO: Final = 3.0
 """Factor by which any convention with other poses must fit worse."""
 
 _ROUNDING_PX: Final = 0.05  # error difference of equally good fits, due to rounding in files
@@ -196,7 +194,7 @@ def find_convention(observations: Sequence[Observation], where: str) -> NddsFind
             conventions with different poses fit equally well.
     """
     errors = {
-        convention: _most([observation.error_px(convention) for observation in observations])
+        convention: _quantile([observation.error_px(convention) for observation in observations])
         for convention in POSE_CONVENTIONS
     }
     ranked = sorted(errors, key=lambda convention: errors[convention])
@@ -205,12 +203,12 @@ def find_convention(observations: Sequence[Observation], where: str) -> NddsFind
         raise _undecidable(where, "no known convention fits", ranked[:6], errors)
     best = next(c for c in POSE_CONVENTIONS if errors[c] <= least + _ROUNDING_PX)
     rivals = [convention for convention in ranked if convention != best]
-    alike = tuple(rival for rival in rivals if _same_poses(observations, best, rival))
-    others = [rival for rival in rivals if rival not in alike]
+    equal = tuple(rival for rival in rivals if _same_poses(observations, best, rival))
+    others = [rival for rival in rivals if rival not in equal]
     rival_px = min((errors[rival] for rival in others), default=np.inf)
-    if rival_px < _RATIO * errors[best] + _ROUNDING_PX:
+    if rival_px < _MIN_RATIO * errors[best] + _ROUNDING_PX:
         raise _undecidable(where, "two conventions fit equally well", [best, *others[:5]], errors)
-    undecided = tuple(rival for rival in alike if replace(rival, frame=best.frame) != best)
+    undecided = tuple(rival for rival in equal if replace(rival, frame=best.frame) != best)
     return NddsFinding(best, errors[best], rival_px, undecided, len(observations))
 
 
@@ -250,21 +248,21 @@ def _same_poses(observations: Sequence[Observation], a: PoseConvention, b: PoseC
             return False
         separation = np.abs(transform(T_a, part.cuboid) - transform(T_b, part.cuboid)).max()
         distances.append(float(separation) / part.diameter)
-    return _most(distances) <= _SAME_POSE
+    return _quantile(distances) <= _SAME_POSE
 
 
-def _most(values: Sequence[float]) -> float:
-    """Return the bound of three quarters of the values, which is robust to damaged items."""
-    return float(np.quantile(values, _MOST, method="higher"))
+def _quantile(values: Sequence[float]) -> float:
+    """Return the upper bound of three quarters of the values, which is robust to damaged items."""
+    return float(np.quantile(values, _MIN_FITTING, method="higher"))
 
 
 def _undecidable(
-    where: str, why: str, shown: Sequence[PoseConvention], errors: dict[PoseConvention, float]
+    where: str, reason: str, listed: Sequence[PoseConvention], errors: dict[PoseConvention, float]
 ) -> UserError:
     """Return the error for a data set whose annotations fit none or several conventions."""
-    figures = "; ".join(f"{errors[convention]:.3g} px: {convention}" for convention in shown)
+    figures = "; ".join(f"{errors[convention]:.3g} px: {convention}" for convention in listed)
     return UserError(
-        f"{where}: {why}; reprojection error: {figures}",
+        f"{where}: {reason}; reprojection error: {figures}",
         f"one convention with at most {MAX_ERROR_PX:g} px and a third of any other error",
         "pass the data set's own meshes in the right unit, and check its K",
     )

@@ -30,9 +30,9 @@ _DERIVED: Final = (".depth", ".seg", ".cs", ".is", ".16", ".8")
 
 def check_ndds(report: CheckReport) -> None:
     """Check every annotation, every image and the settings."""
-    items, lonely = ndds.find_items(report.root)
-    _check_unannotated(report, items + lonely)
-    for path in lonely:
+    items, without_image = ndds.find_items(report.root)
+    _check_unannotated(report, items + without_image)
+    for path in without_image:
         report.report(path, "image", f"missing: no {' or '.join(IMAGE_SUFFIXES)} of this name")
     folders = {path.parent for path in items}
     settings = NddsSettings(report.root, report)
@@ -43,7 +43,7 @@ def check_ndds(report: CheckReport) -> None:
         folder: [suffix for suffix in _MAPS if any(folder.glob(f"*{suffix}"))] for folder in folders
     }
     majority = Majority(report)
-    for path in sorted(items + lonely):
+    for path in sorted(items + without_image):
         _check_item(report, path, settings, majority, expected.get(path.parent, []))
         report.count_image()
     majority.conclude()
@@ -63,12 +63,12 @@ def _check_settings(report: CheckReport, settings: NddsSettings, folder: Path) -
     if cameras is not None:
         node = Node(report, folder / ndds.CAMERA_SETTINGS, "camera_settings")
         entries = node.entries(cameras.get("camera_settings"))
-        for camera_name in _twice(str(camera.get("name")) for camera in entries):
+        for camera_name in _repeated(str(camera.get("name")) for camera in entries):
             node["name"].report(f"{camera_name!r:.60} twice")
 
 
-def _twice(values: Iterable[Hashable]) -> list[Hashable]:
-    """Return the repeated values."""
+def _repeated(values: Iterable[Hashable]) -> list[Hashable]:
+    """Return the values that occur more than once."""
     return [value for value, number in Counter(values).items() if number > 1]
 
 
@@ -91,10 +91,10 @@ def _check_item(
     report: CheckReport, path: Path, settings: NddsSettings, majority: Majority, maps: list[str]
 ) -> None:
     """Check an annotation, its image and the required ``maps``, given by suffix."""
-    image = ndds.image_of(path)
+    image = ndds.image_path(path)
     shape = None if image is None else image_shape(Node(report, image))
     images = {
-        suffix: read_map(Node(report, ndds.companion(path, suffix)), shape, colour=True)
+        suffix: read_map(Node(report, ndds.sibling_path(path, suffix)), shape, colour=True)
         for suffix in maps
     }
     labels = images.get(".seg.png")
@@ -105,10 +105,10 @@ def _check_item(
     objects = ndds.objects_of(record, path, report)
     ids = _check_ids(Node(report, path, "objects"), objects)
     if labels is not None and ndds.has_object_ids(record):
-        strangers = sorted(set(np.unique(labels).tolist()) - ids - {0})
-        if strangers:
-            message = f"{strangers[:10]}: no object's segmentation_id"
-            report.report(ndds.companion(path, ".seg.png"), "values", message)
+        unknown = sorted(set(np.unique(labels).tolist()) - ids - {0})
+        if unknown:
+            message = f"{unknown[:10]}: no object's segmentation_id"
+            report.report(ndds.sibling_path(path, ".seg.png"), "values", message)
     values = ndds.label_values(objects, record, path, settings)
     classes = settings.classes(path)
     for node, item, label in objects:
@@ -138,6 +138,6 @@ def _check_ids(node: Node, objects: Objects) -> set[int]:
     for name in ("instance_id", "segmentation_id"):
         stated = [item.get(name) for _, item, _ in objects]
         ids = [value for value in stated if type(value) is int and value > 0]  # −1, 0: none
-        for value in _twice(ids):
+        for value in _repeated(ids):
             node[name].report(f"{value} twice")
     return set(ids)

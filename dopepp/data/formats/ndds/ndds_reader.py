@@ -76,19 +76,15 @@ class NddsReader:
             fix = "map each class to the name of a part"
             raise UserError(f"classes of the parts {unknown}", allowed, fix)
         self._settings = ndds.NddsSettings(self.folder)
-        items = _find(self.folder)
+        items = _find_items(self.folder)
         self.items = items[share_slice(len(items), part_of, self.name)]
         # From all items, so that training and validation shares have the same convention.
         self.finding = self._find_convention(items)
         _log.info("%s: %s items; found: %s", self.name, f"{len(self.items):,}", self.finding)
 
     def _find_convention(self, items: Sequence[Path]) -> NddsFinding:
-        """Determine the convention of the poses from evenly spread items.
-
-        Raises:
-            UserError: No item shows one of the parts, or the convention is ambiguous.
-        """
-        seen: list[Observation] = []
+        """Determine the convention of the poses from evenly spread items."""
+        visible: list[Observation] = []
         hidden: list[Observation] = []
         others: Counter[str] = Counter()
         step = max(1, len(items) // _MAX_OBSERVATIONS)
@@ -98,17 +94,17 @@ class NddsReader:
             others.update(labels)
             for observation in observations:
                 if observation.item.corners_px is not None:
-                    (hidden if observation.item.visibility == 0 else seen).append(observation)
-            if len(seen) >= _MAX_OBSERVATIONS:
+                    (hidden if observation.item.visibility == 0 else visible).append(observation)
+            if len(visible) >= _MAX_OBSERVATIONS:
                 break
-        if not seen and not hidden:
+        if not visible and not hidden:
             listed = ", ".join(f"{name} ({number})" for name, number in others.most_common(8))
             names = f"{', '.join(self._parts)}; other classes: {listed or 'none'}"
             problem = f"{self.folder}: no instance with projected_cuboid of the parts {names}"
             fix = "name the parts like the classes, or set classes={class: part}"
             raise UserError(problem, "at least one instance whose class is a part's name", fix)
         # Hidden objects may be behind the camera, where projections are meaningless.
-        return conventions.find_convention(seen or hidden, str(self.folder))
+        return conventions.find_convention(visible or hidden, str(self.folder))
 
     def _part(self, label: str) -> Part | None:
         """Return the part of a class name, after removing FAT's suffix if necessary."""
@@ -139,14 +135,14 @@ class NddsReader:
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Read an item; the epoch is ignored."""
         path = self.items[index]
-        image = read_rgb(ndds.image_of(path) or ndds.companion(path, ndds.IMAGE_SUFFIXES[0]))
+        image = read_rgb(ndds.image_path(path) or ndds.sibling_path(path, ndds.IMAGE_SUFFIXES[0]))
         shape: Shape = image.shape[:2]
         record = ndds.read_record(path) or {}
         K = check_camera(self._settings.camera(record, path), shape[::-1], str(path))
         objects = ndds.objects_of(record, path)
         values = ndds.label_values(objects, record, path, self._settings)
         labels = cache(lambda: ndds.read_labels(path, shape))
-        counts_truncation = ndds.stated(record, "visibility_counts_truncation") is True
+        counts_truncation = ndds.convention_entry(record, "visibility_counts_truncation") is True
         instances = []
         for observation in self._read(path)[0]:
             if not self._is_out_of_view(observation):
@@ -200,34 +196,29 @@ class NddsReader:
         }
         if len(self.items) > _MAX_COUNTED_ITEMS:
             return [SourceInfo(self.name, len(self.items), identity)]
-        kept: Counter[str] = Counter()
-        left_out: Counter[str] = Counter()
+        num_instances = dict.fromkeys(self._parts, 0)
+        ignored: Counter[str] = Counter()
         for path in self.items:
             observations, others = self._read(path)
-            left_out.update(others)
+            ignored.update(others)
             for observation in observations:
                 if self._is_out_of_view(observation):
-                    left_out[f"{observation.item.label}, behind the camera"] += 1
+                    ignored[f"{observation.item.label}, behind the camera"] += 1
                 else:
-                    kept[observation.part.name] += 1
-        identity["left out"] = dict(sorted(left_out.items()))
-        instances = {name: kept[name] for name in self._parts}
-        return [SourceInfo(self.name, len(self.items), identity, instances)]
+                    num_instances[observation.part.name] += 1
+        identity["left out"] = dict(sorted(ignored.items()))
+        return [SourceInfo(self.name, len(self.items), identity, num_instances)]
 
 
-def _find(folder: Path) -> list[Path]:
-    """Return the annotation files with an image.
-
-    Raises:
-        UserError: The folder has none.
-    """
-    items, lonely = ndds.find_items(folder) if folder.is_dir() else ([], [])
+def _find_items(folder: Path) -> list[Path]:
+    """Return the annotation files with an image."""
+    items, without_image = ndds.find_items(folder) if folder.is_dir() else ([], [])
     if not items:
-        counts = f"({len(lonely)} JSON files without an image)"
+        counts = f"({len(without_image)} JSON files without an image)"
         allowed = "an NDDS or FAT folder with pairs such as 000000.json and 000000.png or .jpg"
         problem = f"{folder} without an annotated image {counts}"
         raise UserError(problem, allowed, "pass the folder of the data set")
-    if lonely:
+    if without_image:
         message = "%s: ignoring %s annotations without an image; first: %s"
-        _log.warning(message, folder, f"{len(lonely):,}", lonely[0])
+        _log.warning(message, folder, f"{len(without_image):,}", without_image[0])
     return items

@@ -85,7 +85,7 @@ class NddsWriter:
         path = self._root / OBJECT_SETTINGS
         settings = _encode(object_settings(list(self._parts.values())))
         present = sorted(self._root.glob("[!._]*")) if self._root.is_dir() else []
-        foreign = [path for path in present if path.is_dir() or path.suffix in _DATA_SUFFIXES]
+        foreign = [entry for entry in present if entry.is_dir() or entry.suffix in _DATA_SUFFIXES]
         if path.is_file():
             if path.read_bytes() == settings:
                 return
@@ -95,7 +95,7 @@ class NddsWriter:
         else:
             write_file(path, settings)
             return
-        allowed = "an empty folder, or one begun with the same parts"
+        allowed = "an empty folder, or a folder begun with the same parts"
         raise UserError(problem, allowed, "pass another folder")
 
     def write(self, index: int, sample: Sample) -> None:
@@ -204,15 +204,14 @@ def object_record(
     depth = np.where(pixels[:, 2:] == 0, np.finfo(np.float64).tiny, pixels[:, 2:])
     with np.errstate(over="ignore"):
         projected = np.clip(pixels[:, :2] / depth, -_FARTHEST_PX, _FARTHEST_PX)
-    seen = None if instance.mask is None else Box.of_mask(instance.mask)
-    box = seen or Box.of_points(projected[:CENTROID])
+    visible_box = None if instance.mask is None else Box.of_mask(instance.mask)
+    box = visible_box or Box.of_points(projected[:CENTROID])
     assert box is not None  # all corners have finite projections
-    segmented = {} if instance.mask is None else {"segmentation_id": number}
     return {
         "class": instance.label,
         "name": f"{instance.label}_{number}",
         "instance_id": number,
-        **segmented,
+        **({} if instance.mask is None else {"segmentation_id": number}),
         "visibility": float(instance.visible_fraction),
         "location": location.tolist(),
         "quaternion_xyzw": [x, y, z, w],

@@ -121,13 +121,23 @@ class ObjectCheck:
         self._check_transforms(rotations)
         # The file may state that the object is hidden (0) or its visibility unknown (−1).
         is_hidden = self._visibility is not None and self._visibility <= 0
-        seen = None if mask is None else Box.of_mask(mask)
-        self._check_bounding_box(None if is_hidden else seen)
+        visible_box = None if mask is None else Box.of_mask(mask)
+        self._check_bounding_box(None if is_hidden else visible_box)
         if self._location is None or is_hidden:
             return
         axes = self._camera_axes(self._location, K)
-        if self._is_location_possible(self._location, axes) and K is not None:
-            self._check_image(axes, K, shape, seen, None if mask is None else self._visibility)
+        if not self._is_location_possible(self._location, axes) or K is None:
+            return
+        if self._cuboid is not None:
+            points = self._cuboid @ axes.T
+            self._check_projections(points, K)
+        elif self._projected is not None:
+            # Points at depth 1 that project onto ``projected_cuboid``.
+            points = np.column_stack([self._projected, np.ones(8)]) @ np.linalg.inv(K).T
+        else:
+            return
+        fraction = None if mask is None else self._visibility
+        check_box(self._node["box"], points, K, visible_box, fraction, shape)
 
     def _add(self, field: str, message: str) -> None:
         """Report a problem in a field of the object."""
@@ -151,7 +161,7 @@ class ObjectCheck:
         orders = {"x, y, z, w": np.roll(stored, 1), "w, x, y, z": stored}
         return {order: quaternion_to_matrix(values) for order, values in orders.items()}
 
-    def _judge(self, field: str, fits: dict[str, bool], problem: str) -> None:
+    def _compare_conventions(self, field: str, fits: dict[str, bool], problem: str) -> None:
         """Report a field that fits no convention, and vote if it fits only one convention."""
         if not any(fits.values()):
             self._add(field, problem)
@@ -189,7 +199,7 @@ class ObjectCheck:
                 for order, rotation in rotations.items()
             }
             message = "not the cuboid's orientation in either order"
-            self._judge("quaternion_xyzw", fits, message)
+            self._compare_conventions("quaternion_xyzw", fits, message)
 
     def _check_transforms(self, rotations: Mapping[str, RotationMatrix]) -> None:
         """Check NDDS's matrix: rows P·Rᵀ (P mirrors, as Unreal is left-handed) above location."""
@@ -217,26 +227,27 @@ class ObjectCheck:
                     )
                     self._add(name, message)
 
-    def _check_bounding_box(self, seen: Box | None) -> None:
-        """Compare the stated box, which may contain hidden pixels, with the visible pixels."""
-        stated = mapping(self._item.get("bounding_box"))
-        if not stated:
+    def _check_bounding_box(self, visible_box: Box | None) -> None:
+        """Compare ``bounding_box``, which may contain hidden pixels, with the visible pixels."""
+        entry = mapping(self._item.get("bounding_box"))
+        if not entry:
             return
         node = self._node["bounding_box"]
         first, last = (
-            _finite(node[name].numbers(stated.get(name), 2))
-            for name in ("top_left", "bottom_right")
+            _finite(node[name].numbers(entry.get(name), 2)) for name in ("top_left", "bottom_right")
         )
         if first is None or last is None:
             return
         if (first > last).any():
             node.report(f"top_left {first.tolist()}, bottom_right {last.tolist()}")
-        elif seen is not None:
+        elif visible_box is not None:
             (a, b), (c, d) = first.tolist(), last.tolist()
             boxes = {"row, column": Box(b, a, d, c), "column, row": Box(a, b, c, d)}
-            fits = {order: box.excess_px(seen) <= PROJECTION_PX for order, box in boxes.items()}
-            problem = f"{boxes['row, column']} does not contain the mask's box {seen}"
-            self._judge("bounding_box", fits, problem)
+            fits = {
+                order: box.excess_px(visible_box) <= PROJECTION_PX for order, box in boxes.items()
+            }
+            problem = f"{boxes['row, column']} does not contain the mask's box {visible_box}"
+            self._compare_conventions("bounding_box", fits, problem)
 
     def _camera_axes(self, location: Vector, K: CameraMatrix | None) -> RotationMatrix:
         """Return the rotation from the file's camera axes into OpenCV's."""
@@ -270,35 +281,6 @@ class ObjectCheck:
         self._add("location.unit", message)
         return False
 
-    def _check_image(
-        self,
-        axes: RotationMatrix,
-        K: CameraMatrix,
-        shape: Shape | None,
-        seen: Box | None,
-        fraction: float | None,
-    ) -> None:
-        """Compare the annotated projections and the visible pixels with the cuboid.
-
-        Without a cuboid, projections and visible pixels are compared with each other.
-
-        Args:
-            axes: Rotation from the file's camera axes into OpenCV's.
-            K: Camera matrix, pixels.
-            shape: (height, width) of the image.
-            seen: Box of the visible pixels.
-            fraction: Visible fraction.
-        """
-        if self._cuboid is not None:
-            points = self._cuboid @ axes.T
-            self._check_projections(points, K)
-        elif self._projected is not None:
-            # Points at depth 1 that project onto the stated points.
-            points = np.column_stack([self._projected, np.ones(8)]) @ np.linalg.inv(K).T
-        else:
-            return
-        check_box(self._node["box"], points, K, seen, fraction, shape)
-
     def _check_projections(self, cuboid: Corners, K: CameraMatrix) -> None:
         """Compare the annotated projections of the cuboid with its projections at the pose."""
         expected = project(np.vstack([cuboid, cuboid.mean(axis=0)]), K)
@@ -309,8 +291,8 @@ class ObjectCheck:
             ("projected_cuboid", self._projected, expected[:8]),
             ("projected_cuboid_centroid", self._projected_centroid, expected[8:]),
         )
-        for name, stated, true in pairs:
-            distance = 0.0 if stated is None else np.linalg.norm(stated - true, axis=-1).max()
+        for name, annotated, true in pairs:
+            distance = 0.0 if annotated is None else np.linalg.norm(annotated - true, axis=-1).max()
             if distance > allowed:
                 message = f"{distance:.3g} px from the cuboid's image (allowed {allowed:.2g} px)"
                 self._add(name, message)
@@ -322,10 +304,8 @@ def _finite(values: Float[np.ndarray, "..."] | None) -> Float[np.ndarray, "..."]
 
 
 def _quarter_turn_distance(rotation: RotationMatrix) -> float:
-    """Return the angle to the nearest matrix that permutes and flips axes, radians.
-
-    Object frames of different tools differ by these matrices.
-    """
+    """Return the angle to the nearest matrix that permutes and flips axes, radians."""
+    # The object frames of different tools differ by these matrices.
     nearest = np.where(np.abs(rotation) == np.abs(rotation).max(axis=0), np.sign(rotation), 0.0)
     if abs(np.linalg.det(nearest)) != 1:
         return np.inf

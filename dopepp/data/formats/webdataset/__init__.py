@@ -150,7 +150,7 @@ def _walk(node: Node, file: io.BufferedReader, size: int) -> Iterator[TarMember]
             if len(names) == MAX_MEMBERS:
                 node.report(f"over {MAX_MEMBERS:,} members", _ALLOWED)
                 return
-            if problem := "twice" if info.name in names else _refusal(info, size):
+            if problem := "twice" if info.name in names else _problem(info, size):
                 node.report(f"member {info.name!r:.80} {problem}", _ALLOWED)
                 continue
             names.add(info.name)
@@ -172,7 +172,7 @@ def _leads_out(info: tarfile.TarInfo) -> bool:
     return name.is_absolute() or ".." in name.parts or odd
 
 
-def _refusal(info: tarfile.TarInfo, archive_size: int) -> str:
+def _problem(info: tarfile.TarInfo, archive_size: int) -> str:
     """Return why a member is rejected, or an empty string."""
     key, dot, _ = PurePosixPath(info.name).name.partition(".")
     if _leads_out(info):
@@ -192,5 +192,5 @@ def field_of(extension: str) -> str | None:
         return "image"
     if _DEPTH.fullmatch(extension):
         return "depth"
-    field = extension.removesuffix(".json")
-    return field if field in FIELDS and field != extension else None
+    field, _, suffix = extension.partition(".")
+    return field if field in FIELDS and suffix == "json" else None

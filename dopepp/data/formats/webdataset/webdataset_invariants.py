@@ -37,13 +37,13 @@ def shard_paths(root: Path) -> Iterator[Path]:
 def check_webdataset(report: CheckReport) -> None:
     """Check the models and every shard."""
     models = load_models(report, (report.root, *report.root.resolve().parents[:1]))
-    seen: dict[Path, dict[str, str]] = {}
+    shard_names: dict[Path, dict[str, str]] = {}  # by folder and key
     for path in shard_paths(report.root):
-        keys, oddities = seen.setdefault(path.parent, {}), Oddities()
+        keys, oddities = shard_names.setdefault(path.parent, {}), Oddities()
         for key, group in groupby(shards.members(path, report), key=lambda member: member.key):
             if key in keys:
-                same = keys[key] == path.name
-                problem = "its members are not together" if same else f"also in {keys[key]}"
+                is_same = keys[key] == path.name
+                problem = "its members are not together" if is_same else f"also in {keys[key]}"
                 report.report(f"{path}/{key}", "key", problem)
             keys[key] = path.name
             content = _content(report, path, group)
@@ -52,13 +52,14 @@ def check_webdataset(report: CheckReport) -> None:
         oddities.note(report, path)
         if staged := len(list((path.parent / STAGING).glob("**/[0-9]*.tar"))):
             report.note(f"{path.parent}: {staged} images written and not yet finalized")
-    for folder, keys in seen.items():
+    for folder, keys in shard_names.items():
         node = Node(report, folder / shards.KEY_FILE)
         listed = node.load() if (folder / shards.KEY_FILE).is_file() else None
-        for key in sorted(keys.keys() - listed.keys()) if listed else ():
-            node[key].report(f"missing; it is in {keys[key]}")
-        for key in sorted(listed.keys() - keys.keys()) if listed else ():
-            node[key].report("in no shard")
+        if listed:
+            for key in sorted(keys.keys() - listed.keys()):
+                node[key].report(f"missing; it is in {keys[key]}")
+            for key in sorted(listed.keys() - keys.keys()):
+                node[key].report("in no shard")
 
 
 def _content(report: CheckReport, path: Path, group: Iterator[shards.TarMember]) -> Content:

@@ -26,7 +26,7 @@ from dopepp.data.formats import ESTIMATED, bop, make_instance, share_slice
 from dopepp.data.formats.bop.bop_models import parts_by_id
 from dopepp.data.formats.images import decode_depth, decode_rgb, decode_runs
 from dopepp.data.formats.problems import STRICT, Node, Problems, mapping
-from dopepp.data.formats.webdataset import ShardIndex, index_shard
+from dopepp.data.formats.webdataset import FIELDS, ShardIndex, index_shard
 from dopepp.data.sample import Sample, SourceInfo
 from dopepp.drawing.pictures import Mask, Shape
 from dopepp.geometry.camera import check_camera
@@ -76,24 +76,23 @@ class WebdatasetReader:
         self._parts = parts_by_id(self.root, parts)
         self._read_depth, self._logged_inexact = read_depth, False
         folder = None if download_dir is None else Path(download_dir)
-        paths = find_shards(self.root, shards, folder)
-        self._shards = [index_shard(path) for path in paths]
+        self._shards = [index_shard(path) for path in find_shards(self.root, shards, folder)]
         _check_keys(self._shards)
         items = [(n, i) for n, shard in enumerate(self._shards) for i in range(len(shard.keys))]
-        table = np.array(items, np.int64).reshape(-1, 2)
-        self._items = table[share_slice(len(table), part_of, self.name)]
+        self._items = items[share_slice(len(items), part_of, self.name)]
 
     def __len__(self) -> int:
         return len(self._items)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Read an image; the epoch is ignored."""
-        shard, image = self._shards[self._items[index, 0]], int(self._items[index, 1])
-        records = _records(shard, image)
-        content = shard.read(image, "image")
-        assert content is not None  # every indexed image has an image
-        picture = decode_rgb(content, records.start)
-        shape: Shape = picture.shape[:2]
+        number, row = self._items[index]
+        shard = self._shards[number]
+        records = _records(shard, row)
+        content = shard.read(row, "image")
+        assert content is not None  # index_shard requires an image for every key
+        image = decode_rgb(content, records.start)
+        shape: Shape = image.shape[:2]
         K, scales = bop.read_cameras([records.json("camera")], records.nodes)
         camera = check_camera(K[0], (shape[1], shape[0]), records.start)
         has_masks = records.json("mask_visib") is not None
@@ -103,17 +102,17 @@ class WebdatasetReader:
             problem = f"rotations orthogonal to {bop.INEXACT:g} only"
             _log.warning("%s: %s; using the nearest rotations", records.start, problem)
         instances = []
-        for number in self._chosen(poses):
-            mask = records.mask("mask_visib", number, shape) if has_masks else None
-            part = self._parts[int(poses.obj_ids[number])]
-            T, fraction = poses.T_cam_obj[number], float(poses.visible_fractions[number])
+        for k in self._select_objects(poses):
+            mask = records.mask("mask_visib", k, shape) if has_masks else None
+            part = self._parts[int(poses.obj_ids[k])]
+            T, fraction = poses.T_cam_obj[k], float(poses.visible_fractions[k])
             instances.append(make_instance(part, T, camera, fraction, mask, shape))
-        encoded, depth = shard.read(image, "depth") if self._read_depth else None, None
+        encoded, depth = shard.read(row, "depth") if self._read_depth else None, None
         if encoded is not None:
             depth = decode_depth(encoded, f"{records.start}.depth", float(scales[0]), shape)
-        return Sample(picture, camera, instances, depth, self.name, shard.keys[image])
+        return Sample(image, camera, instances, depth, self.name, shard.keys[row])
 
-    def _chosen(self, poses: bop.BopPoses) -> list[int]:
+    def _select_objects(self, poses: bop.BopPoses) -> list[int]:
         """Return the indices of the parts' objects in front of the camera."""
         is_selected = np.isin(poses.obj_ids, list(self._parts)) & (poses.T_cam_obj[:, 2, 3] > 0)
         return [int(number) for number in np.flatnonzero(is_selected)]
@@ -121,25 +120,25 @@ class WebdatasetReader:
     def contains(self, label: str) -> bool:
         """Return whether any image shows this object, reading ground truth until one does."""
         object_ids = {number for number, part in self._parts.items() if part.name == label}
-        for number, image in self._items.tolist() if object_ids else ():
-            poses = _records(self._shards[number], image).poses()
-            if any(int(poses.obj_ids[k]) in object_ids for k in self._chosen(poses)):
+        for number, row in self._items if object_ids else ():
+            poses = _records(self._shards[number], row).poses()
+            if any(int(poses.obj_ids[k]) in object_ids for k in self._select_objects(poses)):
                 return True
         return False
 
     def describe(self) -> list[SourceInfo]:
         """Describe the data by hashes of files and objects, and the origin of the fractions."""
-        digest, stated = hashlib.sha256(), True
-        for number, image in self._items.tolist():
+        digest, has_infos = hashlib.sha256(), True
+        for number, row in self._items:
             shard = self._shards[number]
-            digest.update(shard.keys[image].encode())
-            digest.update(shard.spans[image, :, 1].tobytes())
-            stated &= bool((shard.spans[image, 4:5, 0] >= 0).all())
+            digest.update(shard.keys[row].encode())
+            digest.update(shard.spans[row, :, 1].tobytes())
+            has_infos &= bool(shard.spans[row, FIELDS.index("gt_info"), 0] >= 0)
         identity: dict[str, object] = {
             "shards": [shard.path.name for shard in self._shards],
             "members": digest.hexdigest(),
             "objects": {part.name: part.mesh_hash for part in self._parts.values()},
-            "visible_fractions": "gt_info.json" if stated else ESTIMATED,
+            "visible_fractions": "gt_info.json" if has_infos else ESTIMATED,
         }
         return [SourceInfo(self.name, len(self), identity)]
 
@@ -208,15 +207,14 @@ def _records(shard: ShardIndex, image: int) -> ShardRecords:
 
 def _check_keys(shards: Sequence[ShardIndex]) -> None:
     """Check that no two shards contain the same key."""
-    owners: dict[str, Path] = {}
+    shard_of: dict[str, Path] = {}
     for shard in shards:
-        if twice := [key for key in shard.keys if key in owners]:
-            other = owners[twice[0]]
-            examples = ", ".join(twice[:3])
-            problem = f"{shard.path}, which repeats {len(twice)} keys of {other}, e.g. {examples}"
+        if repeated := [key for key in shard.keys if key in shard_of]:
+            problem = f"{shard.path}, which repeats {len(repeated)} keys of {shard_of[repeated[0]]}"
             fix = "delete the repeated shard, or write it again"
-            raise UserError(problem, "each key in only one shard", fix)
-        owners |= dict.fromkeys(shard.keys, shard.path)
+            allowed = "each key in only one shard"
+            raise UserError(f"{problem}, e.g. {', '.join(repeated[:3])}", allowed, fix)
+        shard_of |= dict.fromkeys(shard.keys, shard.path)
 
 
 def find_shards(root: Path, shards: str, download_dir: Path | None = None) -> list[Path]:
@@ -248,11 +246,7 @@ def find_shards(root: Path, shards: str, download_dir: Path | None = None) -> li
 
 
 def _expanded(text: str) -> list[str]:
-    """Expand the braces in a name of shards.
-
-    Raises:
-        UserError: The braces are wrong, or give more than MAX_SHARDS names.
-    """
+    """Expand the braces in a name of shards to at most MAX_SHARDS names."""
     from braceexpand import braceexpand  # comes with the webdataset library
 
     # The library builds a whole range at once and does not limit the product of braces.
@@ -285,21 +279,16 @@ def _local(path: Path) -> list[Path]:
 
 
 def _fetched(url: str, scheme: str, folder: Path | None) -> Path:
-    """Download a shard unless the folder contains it; return its path.
-
-    Raises:
-        UserError: The shard cannot be downloaded, or no folder was given.
-    """
+    """Download a shard unless the folder contains it; return its path."""
     problem = f"shards {url!r:.100}"
     if scheme == "pipe":  # an untrusted config must not run commands
         allowed = "files, folders and URLs of shards"
         fix = "download the shards and pass their folder"
         raise UserError(f"{problem}, a command to run", allowed, fix)
     if folder is None:
-        allowed = "local shards, or a folder to download them into"
-        raise UserError(
-            f"{problem}, which are not on this machine", allowed, "set data.download_dir=FOLDER"
-        )
+        problem, allowed = f"{problem}, which are not on this machine", "local shards, or a folder"
+        fix = "set data.download_dir=FOLDER"
+        raise UserError(problem, f"{allowed} to download them into", fix)
     name = PurePosixPath(urlsplit(url).path).name
     if not name.endswith(".tar"):
         name = hashlib.sha256(url.encode()).hexdigest()[:16] + ".tar"

@@ -89,8 +89,8 @@ class WebdatasetWriter(BopFolder):
         partial = partial_path(path)
         try:
             with tarfile.open(partial, "w", format=tarfile.USTAR_FORMAT) as archive:
-                for key, content in _merged([path, *staged.values()], chunk):
-                    _add(archive, key, content)
+                for key, content in _merge_images([path, *staged.values()], chunk):
+                    _add_image(archive, key, content)
             partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)
@@ -118,17 +118,10 @@ class WebdatasetWriter(BopFolder):
         return staged_items(self._staging(chunk), ".tar")
 
 
-def _merged(paths: Sequence[Path], chunk: int) -> Iterator[tuple[str, Content]]:
-    """Merge the images of tar archives, in order of the image number.
+def _merge_images(paths: Sequence[Path], chunk: int) -> Iterator[tuple[str, Content]]:
+    """Yield key and files of each image of the existing archives, by image number.
 
     If several archives hold an image, the last archive wins. One image is in memory at a time.
-
-    Args:
-        paths: Archives; missing archives are ignored.
-        chunk: Number of the chunk, which begins the keys.
-
-    Yields:
-        Key and files of an image.
     """
     images: dict[int, tuple[Path, list[TarMember]]] = {}
     for path in paths:
@@ -144,11 +137,11 @@ def _archive(key: str, content: Content) -> bytes:
     """Return the bytes of a tar file with the files of one image."""
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w") as archive:
-        _add(archive, key, content)
+        _add_image(archive, key, content)
     return buffer.getvalue()
 
 
-def _add(archive: tarfile.TarFile, key: str, content: Content) -> None:
+def _add_image(archive: tarfile.TarFile, key: str, content: Content) -> None:
     """Add the files of one image to a tar file, in a fixed order and with fixed metadata."""
     for extension, data in sorted(content.items()):
         info = tarfile.TarInfo(f"{key}.{extension}")

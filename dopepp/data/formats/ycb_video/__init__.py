@@ -31,15 +31,15 @@ def read_classes(root: Path) -> list[str]:
         UserError: The folder is not one of YCB-Video.
     """
     path = root / "image_sets" / "classes.txt"
-    for is_there, lack in (
+    for is_present, problem in (
         (root.is_dir(), "is not a folder"),
         ((root / "data").is_dir(), "has no data/"),
         (path.is_file(), "has no image_sets/classes.txt"),
     ):
-        if not is_there:
+        if not is_present:
             allowed = "a YCB-Video folder with data/, image_sets/classes.txt and models/"
             fix = "set data.root to the unpacked YCB-Video data set"
-            raise UserError(f"data.root={root}, which {lack}", allowed, fix)
+            raise UserError(f"data.root={root}, which {problem}", allowed, fix)
     return path.read_text().split()
 
 
@@ -155,16 +155,16 @@ def _columns(node: Node, fields: Mapping[str, NDArray[Any]]) -> list[tuple[int, 
     """Return each object's class index and 3×4 pose, or [] if the two fields do not match."""
     if "cls_indexes" not in fields or "poses" not in fields:
         return []
-    stored = np.asarray(fields["cls_indexes"])
-    indices = node["cls_indexes"].numbers(stored, stored.size)
-    odd = indices[indices % 1 != 0]
-    if np.isfinite(odd).any():
-        node["cls_indexes"].report(f"{odd.tolist()!r:.60}", "whole numbers")
+    values = np.asarray(fields["cls_indexes"])
+    indices = node["cls_indexes"].numbers(values, values.size)
+    fractional = indices[indices % 1 != 0]
+    if np.isfinite(fractional).any():
+        node["cls_indexes"].report(f"{fractional.tolist()!r:.60}", "whole numbers")
     stack = np.asarray(fields["poses"])
     stack = stack[..., None] if stack.shape == (3, 4) else stack  # MATLAB drops a last axis of 1
     if stack.shape != (3, 4, len(indices)):
         node["poses"].report(f"shape {stack.shape} for {len(indices)} classes", "(3, 4, N)")
-    elif not len(odd):
+    elif not len(fractional):
         return [(int(index), stack[..., n]) for n, index in enumerate(indices)]
     return []
 

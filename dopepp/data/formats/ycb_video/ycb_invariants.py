@@ -101,26 +101,23 @@ class _FrameCheck:
         self._check_box_file(Path(f"{start}-box.txt"), frame.shape)
         is_read = bool(meta.poses) or np.isfinite(meta.factor_depth)
         if label is not None and is_read:
-            strangers = sorted(set(np.unique(label).tolist()) - {0, *meta.poses})
-            if strangers:
-                message = f"classes {strangers} without a pose in meta.mat"
+            without_pose = sorted(set(np.unique(label).tolist()) - {0, *meta.poses})
+            if without_pose:
+                message = f"classes {without_pose} without a pose in meta.mat"
                 self._report.report(Path(f"{start}-label.png"), "values", message)
         for index in meta.poses:
-            seen = None if label is None else Box.of_mask(label == index)
-            self._check_pose(node, meta, index, K, seen)
+            visible_box = None if label is None else Box.of_mask(label == index)
+            self._check_pose(node, meta, index, K, visible_box)
 
     def _check_pose(
-        self, node: Node, meta: FrameMeta, index: int, K: CameraMatrix | None, seen: Box | None
+        self,
+        node: Node,
+        meta: FrameMeta,
+        index: int,
+        K: CameraMatrix | None,
+        visible_box: Box | None,
     ) -> None:
-        """Check the class and the pose of an object in a frame.
-
-        Args:
-            node: Node of the frame's ``meta.mat``.
-            meta: Content of this file.
-            index: Class index of the object.
-            K: Camera matrix, pixels.
-            seen: Box of the object's visible pixels.
-        """
+        """Check the pose of the object with a class index in ``meta``, whose file is ``node``."""
         column, T_cam_obj = meta.columns[index], meta.poses[index]
         if not 1 <= index <= len(self._classes):
             allowed = f"1 … {len(self._classes)}, the lines of classes.txt"
@@ -132,7 +129,7 @@ class _FrameCheck:
         is_posed = check_translation(node, T_cam_obj[:3, 3], diameter)
         is_posed &= bool(np.isfinite(T_cam_obj).all())
         if is_posed and points is not None and K is not None:
-            check_box(node["box"], transform(T_cam_obj, points), K, seen)
+            check_box(node["box"], transform(T_cam_obj, points), K, visible_box)
 
     def _check_box_file(self, path: Path, shape: Shape | None) -> None:
         """Check ``box.txt``, if present, with lines of name, left, top, right and bottom."""

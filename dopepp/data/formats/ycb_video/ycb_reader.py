@@ -83,28 +83,24 @@ class YcbVideoReader:
         self._parts = {classes.index(part.name) + 1: part for part in parts}
         if image_set is not None:
             frames = ycb_video.read_image_set(self.root, image_set, subset)
-        where = f"{image_set}.txt" if image_set else "frames"
-        self.frames = self._present(list(frames or ()), where)
+        list_name = f"{image_set}.txt" if image_set else "frames"
+        self.frames = self._present_frames(list(frames or ()), list_name)
         self._backgrounds, self._seed, self._read_depth = backgrounds, seed, read_depth
 
-    def _present(self, listed: list[str], where: str) -> list[str]:
-        """Return the listed frames that are on disk.
-
-        Raises:
-            UserError: None of them is.
-        """
+    def _present_frames(self, listed: list[str], list_name: str) -> list[str]:
+        """Return the listed frames that are on disk."""
         folder = self.root / ycb_video.FOLDERS[self.subset]
-        is_there = {frame: Path(f"{self._start(frame)}-color.png").is_file() for frame in listed}
-        absent = [frame for frame in listed if not is_there[frame]]
+        is_present = {frame: Path(f"{self._start(frame)}-color.png").is_file() for frame in listed}
+        absent = [frame for frame in listed if not is_present[frame]]
         if len(absent) == len(listed):
-            problem = f"no frame of {where} under {folder} ({len(absent):,} listed)"
+            problem = f"no frame of {list_name} under {folder} ({len(absent):,} listed)"
             fix = "unpack all archives of the data set into it, or set another image set"
             raise UserError(problem, "at least one listed frame on disk", fix)
         if absent:
             counts = f"{len(absent):,} of {len(listed):,}"
             message = "%s: %s frames listed in %s are absent; first: %s"
-            _log.warning(message, self.name, counts, where, absent[0])
-        return [frame for frame in listed if is_there[frame]]
+            _log.warning(message, self.name, counts, list_name, absent[0])
+        return [frame for frame in listed if is_present[frame]]
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -123,8 +119,8 @@ class YcbVideoReader:
         instances = []
         for class_index, part in self._parts.items():
             if class_index in meta.poses:
-                seen = np.asarray(frame.labels == class_index)
-                mask = None if is_real and not seen.any() else seen
+                labelled = np.asarray(frame.labels == class_index)
+                mask = None if is_real and not labelled.any() else labelled
                 pose = meta.poses[class_index]
                 instances.append(make_instance(part, pose, K, np.nan, mask, shape))
         return Sample(self._rgb(frame.image, name, epoch), K, instances, depth, self.name, name)
