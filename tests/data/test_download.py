@@ -91,7 +91,7 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_a_file_arrives_whole(server, tmp_path):
+def test_a_file_is_downloaded_completely(server, tmp_path):
     seen = []
     path = tmp_path / "new" / "file.bin"
     fetch(url(server, "good"), path, len(CONTENT), SHA256, lambda *at: seen.append(at))
@@ -122,13 +122,13 @@ def test_a_broken_connection_is_resumed(server, tmp_path):
 
 
 @pytest.mark.parametrize("there", [1000, len(CONTENT), len(CONTENT) + 5])
-def test_any_partial_file_ends_well(server, tmp_path, there):
+def test_any_partial_file_is_completed(server, tmp_path, there):
     (tmp_path / "f.partial").write_bytes((CONTENT + bytes(5))[:there])
     fetch(url(server, "no-range"), tmp_path / "f", len(CONTENT), SHA256)
     assert (tmp_path / "f").read_bytes() == CONTENT
 
 
-def test_a_server_that_goes_on_elsewhere_is_refused(server, tmp_path):
+def test_a_server_that_resumes_at_another_byte_is_rejected(server, tmp_path):
     (tmp_path / "f.partial").write_bytes(CONTENT[:1000])
     with pytest.raises(UserError, match=r"continues at 'bytes 0-.* instead of byte 1000"):
         fetch(url(server, "wrong-range"), tmp_path / "f", len(CONTENT), SHA256)
@@ -148,7 +148,7 @@ def test_a_server_that_goes_on_elsewhere_is_refused(server, tmp_path):
         ("redirect:ftp://127.0.0.1/x", "unknown url type: ftp"),
     ],
 )
-def test_what_is_not_the_file_leaves_nothing(server, tmp_path, kind, message):
+def test_a_wrong_file_is_rejected_and_deleted(server, tmp_path, kind, message):
     with pytest.raises(UserError, match=message) as caught:
         fetch(url(server, kind), tmp_path / "f", len(CONTENT), SHA256)
     assert "\n" not in str(caught.value)
@@ -156,7 +156,7 @@ def test_what_is_not_the_file_leaves_nothing(server, tmp_path, kind, message):
 
 
 @pytest.mark.parametrize("target", ["http://127.0.0.1/x", "HTTP://127.0.0.1/x", "ftp://a/x"])
-def test_https_is_never_left(target):
+def test_redirections_from_https_to_other_schemes_are_rejected(target):
     request = urllib.request.Request("https://host/file.tar")
     with pytest.raises(UserError, match=r"file\.tar: redirected to .*, which is not https"):
         _Redirects().redirect_request(request, io.BytesIO(), 302, "", HTTPMessage(), target)
@@ -165,7 +165,7 @@ def test_https_is_never_left(target):
     assert followed.full_url == safe
 
 
-def test_no_network_is_one_line(tmp_path):
+def test_no_network_gives_one_line(tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -176,7 +176,7 @@ def test_no_network_is_one_line(tmp_path):
         fetch("file:///etc/passwd", tmp_path / "f", 1, SHA256)
 
 
-def test_a_folder_that_cannot_be_written_is_one_line(server, tmp_path):
+def test_a_folder_that_cannot_be_written_gives_one_line(server, tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(UserError, match=r"file/f, which cannot be written"):
         fetch(url(server, "good"), tmp_path / "file" / "f", len(CONTENT), SHA256)

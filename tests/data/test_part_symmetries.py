@@ -39,7 +39,7 @@ def test_the_command_prints_an_entry_that_training_reads(stl, tmp_path):
         assert np.allclose(read.symmetries_discrete, actual.symmetries_discrete, atol=1e-12)
 
 
-def test_nothing_is_found_or_taken_away_unless_asked(stl):
+def test_symmetries_change_only_on_request(stl):
     part = load_part(stl, "mm")
     assert choose_symmetries([part], None) == [part]
     assert part.symmetries_discrete is None
@@ -50,7 +50,7 @@ def test_nothing_is_found_or_taken_away_unless_asked(stl):
     assert bare.symmetries_continuous == ()
 
 
-def test_mistakes_are_named(stl, tmp_path):
+def test_wrong_files_and_parts_are_rejected(stl, tmp_path):
     part = load_part(stl, "mm")
     with pytest.raises(UserError, match=r"data.symmetries=gone.json, no such file.*none, auto"):
         choose_symmetries([part], "gone.json")
@@ -78,7 +78,7 @@ def test_a_round_part_has_its_axis_in_millimetres(tmp_path):
 HALF_TURN = [-1, 0, 0, 10, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 
 
-def test_entries_by_name_are_of_the_parts_they_name(stl):
+def test_entries_by_name_apply_to_the_named_parts(stl):
     part = load_part(stl, "mm")
     entry = {"symmetries_discrete": [HALF_TURN]}
     (given,) = choose_symmetries([part], {"block": entry, "absent": entry})
@@ -99,6 +99,6 @@ def test_entries_by_name_are_of_the_parts_they_name(stl):
         ({"symmetries_discrete": [[1] * 16]}, r"block: symmetries_discrete\[0\]: not a rotation"),
     ],
 )
-def test_entries_that_are_none_are_named(stl, entry, message):
+def test_invalid_entries_are_rejected(stl, entry, message):
     with pytest.raises(UserError, match=message):
         choose_symmetries([load_part(stl, "mm")], {"block": entry})

@@ -40,7 +40,7 @@ def by_hand(
     return beliefs, fields
 
 
-def test_maps_are_what_their_definition_says():
+def test_maps_agree_with_their_definition():
     """Several images, objects and instances, padding, absent and off-map keypoints."""
     rng = np.random.default_rng(0)
     keypoints = rng.uniform(-30, 150, (3, 4, 9, 2))
@@ -59,7 +59,7 @@ def test_maps_are_what_their_definition_says():
         assert_close(ours, torch.tensor(theirs).float(), atol=2e-5, rtol=0)
 
 
-def test_no_instance_at_all_draws_nothing():
+def test_maps_without_an_instance_are_zero():
     none = torch.zeros(2, 0, 9, 2), torch.zeros(2, 0, dtype=torch.long)
     belief, field = encode(*none, 2, (12, 10), GEOMETRY)
     assert torch.equal(belief, torch.zeros(2, 18, 12, 10))

@@ -74,7 +74,7 @@ EQUAL_NEIGHBOURS = [(10.5, 10.0), (10.0, 10.5), (10.5, 10.5), (0.5, 0.0), (28.5,
 
 @pytest.mark.parametrize("height", [1.0, 1e3, 1e15])
 @pytest.mark.parametrize("centre", BORDER + EQUAL_NEIGHBOURS)
-def test_a_peak_anywhere_is_one_and_exact(centre, height):
+def test_a_peak_at_any_position_is_exact(centre, height):
     """An identity activation does not bound beliefs; the fit must not care."""
     found = positions(find_peaks(gaussians(centre, height=height), GEOMETRY))
     assert found == pytest.approx(np.array([centre]), abs=1e-3)
@@ -115,7 +115,7 @@ def test_a_plateau_of_any_shape_is_one_peak_near_its_middle(name):
     assert np.linalg.norm(found[0] - [12 + columns.mean(), 10 + rows.mean()]) < 1.0
 
 
-def test_the_steps_of_a_coarse_number_format_are_no_peaks():
+def test_steps_of_a_coarse_number_format_are_not_peaks():
     """A bf16 belief has terraces on its flanks: equal neighbours below the top."""
     for sigma in (2.0, 4.0):
         belief = gaussians((14.3, 15.6), sigma=sigma).bfloat16()
@@ -125,7 +125,7 @@ def test_the_steps_of_a_coarse_number_format_are_no_peaks():
 
 @pytest.mark.parametrize("sigma", [1.0, 2.0])
 @pytest.mark.parametrize("apart", [3.0, 3.5, 4.0, 6.0])
-def test_two_instances_do_not_pull_at_each_other(sigma, apart):
+def test_the_peaks_of_two_instances_are_independent(sigma, apart):
     rng = np.random.default_rng(2)
     geometry = MapGeometry(8, sigma)
     for first, turn in zip(
@@ -172,7 +172,7 @@ def test_the_strongest_above_the_threshold_fill_the_slots():
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_constant_map_of_nothing_has_no_peak(value):
+def test_a_constant_map_has_no_peak(value):
     peaks = find_peaks(torch.full((2, 9, 8, 8), value), GEOMETRY)
     assert not (peaks.score > 0).any()
 
@@ -188,7 +188,7 @@ def test_peaks_are_the_highest_cells_of_their_neighbourhoods(size):
         assert_array_equal(found[found > 0], highest[:6].astype(np.float64))
 
 
-def test_random_maps_never_give_a_position_that_is_none():
+def test_random_maps_give_finite_positions():
     rng = torch.Generator().manual_seed(3)
     belief = torch.rand(4, 9, 20, 20, generator=rng)
     belief[0] = (belief[0] > 0.5).float()
@@ -204,7 +204,7 @@ def test_random_maps_never_give_a_position_that_is_none():
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])
-def test_a_blurred_peak_tells_its_covariance(noise):
+def test_the_covariance_of_a_blurred_peak(noise):
     """Target variance off, the rest is Σ with its xy term; noise of the map alone adds little."""
     rng, generator = np.random.default_rng(5), torch.Generator().manual_seed(5)
     y, x = np.mgrid[:NUM_CELLS, :NUM_CELLS]

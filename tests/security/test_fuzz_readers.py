@@ -333,5 +333,5 @@ def test_many_damaged_files(name, targets, tmp_path):
     fuzz(targets[name], tmp_path, THOROUGH, repeat=False)
 
 
-def test_every_good_file_is_tried(targets):
+def test_every_undamaged_file_is_read(targets):
     assert set(targets) == set(NAMES)

@@ -44,7 +44,7 @@ def test_two_pickles_in_two_folders(good, tmp_path, rejected):
     rejected(path, "2 members FOLDER/data.pkl")
 
 
-def test_an_archive_behind_something_else(good, tmp_path, rejected):
+def test_an_archive_after_other_bytes(good, tmp_path, rejected):
     """torch would read what comes first, which nobody has looked at."""
     path = tmp_path / "bad.ckpt"
     for first in (b"\x80\x02}.", b"#!/bin/sh\n", bytes(512)):
@@ -67,7 +67,7 @@ def test_a_zip_bomb(method, tmp_path, rejected):
     rejected(path, "which unpacks to 50000000 bytes")
 
 
-def test_a_declared_size_that_lies(tmp_path, rejected):
+def test_a_wrong_declared_size(tmp_path, rejected):
     """The directory says 10 bytes, or 10 terabytes, of a member of a thousand."""
     path = pack(tmp_path / "bad.ckpt", [("a/data.pkl", bytes(1000))])
     content = bytearray(path.read_bytes())
@@ -136,7 +136,7 @@ FIELDS = {
     ("field", "value"),
     [(field, "a billion laughs") for field in FIELDS] + [("data", value) for value in VALUES],
 )
-def test_values_that_explode(field, value, saved, rejected):
+def test_values_of_huge_size(field, value, saved, rejected):
     bad = VALUES[value]()
     rejected(saved(lambda c: FIELDS[field](c, bad)), r"bad\.ckpt")
 
@@ -241,7 +241,7 @@ TOO_MUCH |= {name: (weight(make), "weights that do not fit") for name, make in W
 
 
 @pytest.mark.parametrize("name", TOO_MUCH)
-def test_a_spec_a_table_or_weights_that_ask_for_too_much(name, saved, canary, rejected):
+def test_a_spec_a_table_or_weights_of_huge_size(name, saved, canary, rejected):
     edit, message = TOO_MUCH[name]
     rejected(saved(edit), message)
 
@@ -250,7 +250,7 @@ def test_a_spec_a_table_or_weights_that_ask_for_too_much(name, saved, canary, re
     "value",
     [float("nan"), *(pytest.param(v, marks=pytest.mark.slow) for v in (-float("inf"), 3e38))],
 )
-def test_weights_that_are_no_numbers_find_nothing_and_crash_nothing(value, saved, bounded):
+def test_weights_of_nan_give_no_detection(value, saved, bounded):
     def spoil(content):
         for tensor in content["state_dict"].values():
             if tensor.is_floating_point():

@@ -173,12 +173,12 @@ GRAPHS = {
 
 
 @pytest.mark.parametrize("name", GRAPHS)
-def test_a_graph_that_asks_for_more_than_ours(name, spoilt, rejected):
+def test_a_graph_with_other_operations_than_an_export(name, spoilt, rejected):
     edit, message = GRAPHS[name]
     rejected(spoilt(edit), message)
 
 
-def test_the_unspoilt_file_loads_and_answers_in_its_own_shape_only(spoilt, refused):
+def test_the_unchanged_file_loads_with_its_own_shape_only(spoilt, refused):
     estimator = PoseEstimator.load(spoilt())
     belief, field = estimator.network.maps(torch.zeros(2, 3, 64, 40, dtype=torch.uint8))
     assert (belief.shape, field.shape) == ((2, 9, 8, 5), (2, 16, 8, 5))
@@ -235,7 +235,7 @@ DESCRIPTIONS = {
 
 
 @pytest.mark.parametrize("name", DESCRIPTIONS)
-def test_a_description_that_lies(name, payload, spoilt, rejected):
+def test_a_wrong_description(name, payload, spoilt, rejected):
     text, message = DESCRIPTIONS[name]
     changed = text(payload)
 
@@ -247,7 +247,7 @@ def test_a_description_that_lies(name, payload, spoilt, rejected):
     rejected(spoilt(edit), message)
 
 
-def test_what_is_no_onnx_file(spoilt, good, tmp_path, rejected):
+def test_other_files_than_onnx(spoilt, good, tmp_path, rejected):
     whole = spoilt().read_bytes()
     path = tmp_path / "b.onnx"
     for content in (b"", whole[:-700], whole[:40], good.read_bytes(), b"\xff" * 1000, b"[]"):
@@ -315,7 +315,7 @@ XMLS = {
 
 
 @pytest.mark.parametrize("name", XMLS)
-def test_an_openvino_file_that_asks_for_more_than_ours(name, folder, rejected):
+def test_an_openvino_file_with_other_operations_than_an_export(name, folder, rejected):
     edit, message = XMLS[name]
     path = folder / "model.xml"
     xml = path.read_text()
@@ -324,7 +324,7 @@ def test_an_openvino_file_that_asks_for_more_than_ours(name, folder, rejected):
     rejected(folder, message)
 
 
-def test_an_openvino_folder_that_is_not_whole(folder, tmp_path, rejected):
+def test_an_incomplete_openvino_folder(folder, tmp_path, rejected):
     moved = tmp_path / "moved"
     shutil.copytree(folder, moved)
     assert PoseEstimator.load(moved).parts[0].name == "bracket"

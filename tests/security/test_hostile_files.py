@@ -114,7 +114,7 @@ def made(content: Any) -> bytes:
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 @pytest.mark.parametrize("name", IMAGES)
-def test_pictures_that_explode_or_are_none(name, suffix, tmp_path, refused, bounded):
+def test_hostile_images(name, suffix, tmp_path, refused, bounded):
     path = tmp_path / f"image{suffix}"
     content = made(IMAGES[name])
     path.write_bytes(content)
@@ -133,7 +133,7 @@ def test_pictures_that_explode_or_are_none(name, suffix, tmp_path, refused, boun
 
 
 @pytest.mark.parametrize("kind", ["PNG", "WEBP", "TIFF"])
-def test_an_animation_is_its_first_picture(kind, tmp_path):
+def test_the_first_image_of_an_animation_is_read(kind, tmp_path):
     frames = [Image.new("RGB", (16, 12), (level, 0, 0)) for level in (200, 100, 50)]
     options = {"lossless": True} if kind == "WEBP" else {}
     content = encoded(kind, frames[0], save_all=True, append_images=frames[1:], **options)
@@ -143,7 +143,7 @@ def test_an_animation_is_its_first_picture(kind, tmp_path):
     assert read_picture(path).shape == (12, 16, 3)
 
 
-def test_a_picture_that_is_no_file(tmp_path, refused):
+def test_image_paths_without_a_file(tmp_path, refused):
     (tmp_path / "folder.png").mkdir()
     (tmp_path / "loop.png").symlink_to(tmp_path / "loop.png")
     for name in ("folder.png", "loop.png", "x" * 300 + ".png", "none.png"):
@@ -200,7 +200,7 @@ MESHES = {
 
 
 @pytest.mark.parametrize("name", MESHES)
-def test_meshes_that_lie_or_reach_out(name, tmp_path, refused):
+def test_hostile_meshes(name, tmp_path, refused):
     path = tmp_path / "deep" / name.split("|")[0]
     path.parent.mkdir()
     path.write_bytes(MESHES[name])
@@ -208,7 +208,7 @@ def test_meshes_that_lie_or_reach_out(name, tmp_path, refused):
         read_mesh(path, "mm")
 
 
-def test_a_material_that_reaches_out(tmp_path, refused):
+def test_a_material_with_a_texture_outside_its_folder(tmp_path, refused):
     Image.new("RGB", (4, 4)).save(tmp_path / "secret.png")
     folder = tmp_path / "part"
     folder.mkdir()
@@ -285,7 +285,7 @@ ARCHIVES: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("name", ARCHIVES)
-def test_archives_that_reach_out_or_explode(name, tmp_path, refused):
+def test_hostile_archives(name, tmp_path, refused):
     archive, folder = tmp_path / "in" / "a.tar", tmp_path / "in" / "out" / "folder"
     archive.parent.mkdir()
     archive.write_bytes(made(ARCHIVES[name]))
@@ -296,7 +296,7 @@ def test_archives_that_reach_out_or_explode(name, tmp_path, refused):
 
 
 @pytest.mark.parametrize("name", [name for name in ARCHIVES if "folder" not in name])
-def test_shards_that_reach_out_or_explode(name, tmp_path, bounded):
+def test_hostile_shards(name, tmp_path, bounded):
     """A shard is never unpacked; what is in it may be refused or passed over."""
     path = tmp_path / "shard-000000.tar"
     path.write_bytes(made(ARCHIVES[name]))
@@ -360,7 +360,7 @@ READERS = {
 @pytest.mark.parametrize(
     ("file", "name"), [(file, name) for file, (_, table) in READERS.items() for name in table]
 )
-def test_numbers_tables_and_records_of_anybody(file, name, tmp_path, refused):
+def test_hostile_tables_and_records(file, name, tmp_path, refused):
     read, table = READERS[file]
     path = tmp_path / file
     path.parent.mkdir(exist_ok=True)
@@ -390,7 +390,7 @@ ARGUMENTS = {
 
 
 @pytest.mark.parametrize("name", ARGUMENTS)
-def test_the_command_line_ends_in_a_line(name, good, tmp_path, bounded, monkeypatch):
+def test_hostile_input_ends_a_command_with_one_line(name, good, tmp_path, bounded, monkeypatch):
     arguments, files = ARGUMENTS[name]
     monkeypatch.chdir(good.parent)
     for file, content in files.items():

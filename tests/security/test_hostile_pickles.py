@@ -114,7 +114,7 @@ BOMBS = {
 
 @pytest.mark.parametrize("name", BOMBS)
 @pytest.mark.parametrize("place", ["data", "optimizer state"])
-def test_a_call_that_fills_the_memory(name, place, write, Call, rejected):
+def test_a_call_that_allocates_huge_memory(name, place, write, Call, rejected):
     """torch's own list of harmless calls has some that allocate what their argument says."""
     try:
         path = write(place, BOMBS[name](Call))

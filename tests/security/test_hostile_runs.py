@@ -66,7 +66,7 @@ TEXTS = {
 
 
 @pytest.mark.parametrize("name", TEXTS)
-def test_overrides_that_are_no_list_of_text(name, tmp_path, refused):
+def test_overrides_other_than_a_list_of_text(name, tmp_path, refused):
     path = tmp_path / ".hydra" / "overrides.yaml"
     path.parent.mkdir()
     path.write_text(TEXTS[name])
@@ -87,7 +87,7 @@ def test_the_files_that_hydra_writes_are_read(tmp_path):
     assert read_yaml(path) == {"a": {"b": [1, 2.5, None, True]}, "c": "x"}
 
 
-def test_a_run_folder_that_is_no_file_of_text(run_folder, told):
+def test_overrides_that_are_not_a_text_file(run_folder, told):
     run = run_folder("")
     (run / ".hydra" / "overrides.yaml").write_bytes(b"\xff\xfe\x00")
     assert "overrides.yaml" in told("train.py", f"resume={run}")
@@ -105,7 +105,7 @@ STORED = {
 
 
 @pytest.mark.parametrize("name", STORED)
-def test_a_checkpoint_whose_data_are_none(name, saved, told, tmp_path):
+def test_a_checkpoint_with_invalid_data_settings(name, saved, told, tmp_path):
     """``evaluate.py`` takes the data from the checkpoint: what is wrong there is one line, too."""
     data = {"name": "x", "seed": 0, "config": STORED[name]}
     path = saved(lambda content: content["dopepp"].update(data=data))

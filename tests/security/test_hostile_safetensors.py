@@ -69,7 +69,7 @@ FILES = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_header_that_lies(name, tmp_path, refused):
+def test_a_wrong_header(name, tmp_path, refused):
     path = tmp_path / "a.safetensors"
     path.write_bytes(FILES[name])
     with refused(r"a\.safetensors: .*allowed: a complete safetensors file"):
@@ -83,7 +83,7 @@ def test_a_header_of_megabytes_is_not_parsed(tmp_path, refused):
         read_safetensors(path)
 
 
-def test_a_huge_file_and_what_is_no_file(tmp_path, refused):
+def test_a_huge_file_and_paths_without_a_file(tmp_path, refused):
     path = tmp_path / "a.safetensors"
     for place in (path, tmp_path):
         with refused(r"No such file|Is a directory"):
@@ -102,7 +102,7 @@ def test_a_huge_file_and_what_is_no_file(tmp_path, refused):
     ),
     text=st.text(st.characters(exclude_categories=["Cs"])),
 )
-def test_what_is_written_is_read_by_us_and_by_the_library(array, text, tmp_path_factory):
+def test_written_files_are_read_by_dopepp_and_the_library(array, text, tmp_path_factory):
     path = tmp_path_factory.mktemp("any") / "a.safetensors"
     tensors = {"a": torch.from_numpy(array.copy()), "b.c": torch.ones(2, 3)}
     write_safetensors(path, tensors, {"text": text})
@@ -115,7 +115,7 @@ def test_what_is_written_is_read_by_us_and_by_the_library(array, text, tmp_path_
             assert other.numpy().tobytes() == tensor.numpy().tobytes()
 
 
-def test_views_and_shared_tensors_are_written_as_they_look(tmp_path):
+def test_views_and_shared_tensors_are_written_by_value(tmp_path):
     base = torch.arange(12.0).view(3, 4)
     tensors = {"t": base.T, "again": base, "row": base[1], "repeated": torch.ones(1).expand(5)}
     write_safetensors(tmp_path / "a.safetensors", tensors, {})
@@ -124,7 +124,7 @@ def test_views_and_shared_tensors_are_written_as_they_look(tmp_path):
     assert all(torch.equal(loaded[name], tensor) for name, tensor in tensors.items())
 
 
-def test_a_header_too_long_to_be_read_is_not_written(tmp_path):
+def test_a_header_above_the_readers_limit_is_not_written(tmp_path):
     path = tmp_path / "a.safetensors"
     write_safetensors(path, {"a": torch.ones(2)}, {"x": "y"})
     before = path.read_bytes()

@@ -258,7 +258,7 @@ SCENES: dict[str, Any] = {  # bytes, or what makes them, where that takes long
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_scenes_that_explode_lie_or_reach_out(name, tmp_path, refused):
+def test_hostile_scenes(name, tmp_path, refused):
     path = tmp_path / "deep" / name.split("|")[0]
     path.parent.mkdir()
     content = SCENES[name]
@@ -277,13 +277,13 @@ def test_scenes_that_explode_lie_or_reach_out(name, tmp_path, refused):
         ("a.off", TRIANGLE_OFF),
     ],
 )
-def test_what_the_attacks_are_made_of_is_read(name, content, tmp_path, bounded):
+def test_the_undamaged_scenes_are_read(name, content, tmp_path, bounded):
     (tmp_path / name).write_bytes(content)
     with bounded():
         assert len(read_mesh(tmp_path / name, "mm").faces) in (1, 30, 401)
 
 
-def test_a_texture_named_beside_a_glb_is_not_opened(tmp_path, refused):
+def test_an_external_texture_of_a_glb_is_not_opened(tmp_path, refused):
     (tmp_path / "secret.png").write_bytes(png(4))
     (tmp_path / "a.glb").write_bytes(glb(images=[{"uri": "secret.png"}]))
     with refused("needs the file 'secret.png'; .* inside"):

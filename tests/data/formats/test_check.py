@@ -359,7 +359,7 @@ def copy_of(good_sets, tmp_path):
     ("layout", "below"),
     [("BOP", ("", "train_pbr", SCENE)), ("BOP-WebDataset", ("", "train_pbr")), ("NDDS", ("",))],
 )
-def test_a_good_set_is_clean_from_any_level(good_sets, layout, below):
+def test_a_correct_data_set_has_no_defects_at_any_level(good_sets, layout, below):
     for folder in below:
         report = check_dataset(good_sets / layout / folder)
         expected = (layout, NUM_IMAGES, [], [])
@@ -396,7 +396,7 @@ def assert_refused(make_reader: Callable[[], Any], expected: str) -> None:
     ("layout", "name"),
     [(layout, name) for layout, (table, *_) in LAYOUTS.items() for name in table],
 )
-def test_every_damage_is_found_and_refused_with_file_and_field(copy_of, boxes, layout, name):
+def test_check_and_reader_report_every_damage_with_file_and_field(copy_of, boxes, layout, name):
     table, _, damage, make_reader = LAYOUTS[layout]
     case, root = table[name], copy_of(layout)
     damage(root, case.place, case.value)
@@ -417,7 +417,7 @@ INDEPENDENT = [
 
 
 @pytest.mark.parametrize(("layout", "names"), INDEPENDENT)
-def test_one_defect_hides_no_other(copy_of, layout, names):
+def test_every_defect_is_reported(copy_of, layout, names):
     table, root = LAYOUTS[layout][0], copy_of(layout)
     for name in names:
         spoil(root, table[name].place, table[name].value)
@@ -437,7 +437,7 @@ NOTED = {
 
 
 @pytest.mark.parametrize("name", NOTED)
-def test_what_every_reader_copes_with_is_a_note(copy_of, name):
+def test_deviations_that_readers_accept_are_notes(copy_of, name):
     root, (place, value, expected) = copy_of("BOP"), NOTED[name]
     spoil(root, place, value)
     report = check_dataset(root)
@@ -461,7 +461,7 @@ def test_private_ground_truth_and_missing_models_are_notes(copy_of):
     ("place", "value"),
     [(f"{INFO}:0.1.visib_fract", 1.0000001), (f"{MODELS}:1.symmetries_discrete.0.0", times(1.004))],
 )
-def test_what_is_rounded_is_taken_by_check_and_reader(copy_of, place, value):
+def test_check_and_reader_accept_rounded_values(copy_of, place, value):
     root = copy_of("BOP")
     spoil(root, place, value)
     assert check_dataset(root).lines()[:-1] == []
@@ -472,14 +472,14 @@ def test_what_is_rounded_is_taken_by_check_and_reader(copy_of, place, value):
     np.testing.assert_allclose(symmetry @ symmetry.T, np.eye(3), atol=1e-12)
 
 
-def test_pictures_and_depth_are_one_image_by_their_number(copy_of, boxes):
+def test_image_and_depth_are_matched_by_number(copy_of, boxes):
     root = copy_of("BOP")
     (root / SCENE / "rgb" / "000001.png").rename(root / SCENE / "rgb" / "1.png")
     assert check_dataset(root).ok
     np.testing.assert_allclose(BopReader(root, boxes[0], "train_pbr").sample(1).depth, 0.4)
 
 
-def test_an_empty_folder_of_depth_is_none(copy_of, boxes):
+def test_an_empty_depth_folder_means_no_depth(copy_of, boxes):
     root = copy_of("BOP")
     for path in (root / SCENE / "depth").iterdir():
         path.unlink()
@@ -487,14 +487,14 @@ def test_an_empty_folder_of_depth_is_none(copy_of, boxes):
     assert BopReader(root, boxes[0], "train_pbr").sample(0).depth is None
 
 
-def test_a_scene_that_no_reader_finds_is_a_defect(copy_of):
+def test_a_scene_folder_without_a_number_is_a_defect(copy_of):
     root = copy_of("BOP")
     (root / SCENE).rename(root / "train_pbr" / "kitchen")
     assert_found(root, "train_pbr/kitchen: name: not a scene number")
 
 
 @pytest.mark.parametrize("stated", [b"[]", b"[null, null]"])
-def test_shards_may_state_no_visible_fraction(copy_of, boxes, stated):
+def test_shards_may_lack_visible_fractions(copy_of, boxes, stated):
     root = copy_of("BOP-WebDataset")
     spoil_shard(root, "gt_info.json", stated)
     report = check_dataset(root)
@@ -515,13 +515,13 @@ LISTS = {
 
 
 @pytest.mark.parametrize("expected", LISTS)
-def test_members_out_of_order_are_found(copy_of, expected):
+def test_members_out_of_order_are_reported(copy_of, expected):
     root = copy_of("BOP-WebDataset")
     write_tar(root / SHARD, LISTS[expected](list(members_of(root / SHARD).items())))
     assert_found(root, expected)
 
 
-def test_a_bad_archive_does_not_hide_what_it_holds(copy_of):
+def test_defects_in_a_damaged_archive_are_reported(copy_of):
     root = copy_of("BOP-WebDataset")
     spoil_shard(root, "gt.json:0.cam_t_m2c", [0, 0, -1])
     members = list(members_of(root / SHARD).items())
@@ -536,7 +536,7 @@ def test_a_bad_archive_does_not_hide_what_it_holds(copy_of):
     ("field", "change", "note"),
     [("quaternion_xyzw", roll, "w, x, y, z"), ("bounding_box", flip_box, "column, row")],
 )
-def test_habits_of_a_whole_set_are_notes(copy_of, field, change, note):
+def test_conventions_of_a_whole_data_set_are_notes(copy_of, field, change, note):
     root = copy_of("NDDS")
     for path in root.glob("0*.json"):
         for number in (0, 1):
@@ -545,7 +545,7 @@ def test_habits_of_a_whole_set_are_notes(copy_of, field, change, note):
     assert (report.defects, report.notes) == ([], [f"{field}: {note} (6 objects)"])
 
 
-def test_opengl_files_without_cuboids_are_clean(copy_of):
+def test_opengl_files_without_cuboids_have_no_defects(copy_of):
     """As old nvisii writes them: y up, z backwards, projections and nothing in 3-D."""
     root = copy_of("NDDS")
     (root / SETTINGS).unlink()
@@ -565,7 +565,7 @@ def test_opengl_files_without_cuboids_are_clean(copy_of):
     assert (report.defects, report.notes) == ([], ["camera axes: OpenGL (6 objects)"])
 
 
-def test_what_nobody_sees_may_be_behind_the_camera(copy_of):
+def test_invisible_objects_may_be_behind_the_camera(copy_of):
     root = copy_of("NDDS")
     spoil(root, f"{OBJECT}.visibility", 0)
     spoil(root, f"{OBJECT}.location.2", lambda z: -z)
@@ -668,7 +668,7 @@ YCB_VIDEO_READ = {
 
 
 @pytest.mark.parametrize("name", [*YCB_VIDEO, *YCB_VIDEO_READ])
-def test_every_damage_of_ycb_video_is_found_and_refused(ycb, box, name):
+def test_check_and_reader_report_every_damage_of_ycb_video(ycb, box, name):
     damage, expected = (YCB_VIDEO | YCB_VIDEO_READ)[name]
     damage(ycb)
     assert_found(ycb.root, expected)
@@ -677,7 +677,7 @@ def test_every_damage_of_ycb_video_is_found_and_refused(ycb, box, name):
         assert_refused(lambda: YcbVideoReader(ycb.root, [box], "train"), expected)
 
 
-def test_one_defect_of_a_frame_hides_no_other(ycb):
+def test_every_defect_of_a_frame_is_reported(ycb):
     poses(R00=1.1, tz=-0.3)(ycb)
     for name in ("colour cut", "depth size", "box of nobody"):
         (YCB_VIDEO | YCB_VIDEO_READ)[name][0](ycb)
@@ -685,7 +685,7 @@ def test_one_defect_of_a_frame_hides_no_other(ycb):
     assert_found(ycb.root, *expected)
 
 
-def test_unlabelled_objects_and_absent_models_are_no_defects(ycb):
+def test_unlabelled_objects_and_missing_models_are_not_defects(ycb):
     assert check_dataset(ycb.root).lines()[:-1] == []
     ycb.write(FRAME, labelled=False)
     shutil.rmtree(ycb.root / "models" / "004_mug")
@@ -698,7 +698,7 @@ def test_unlabelled_objects_and_absent_models_are_no_defects(ycb):
     assert missing.startswith("models/004_mug/points.xyz is missing")
 
 
-def test_the_real_frames_are_clean(ycb_root):
+def test_the_real_frames_have_no_defects(ycb_root):
     report = check_dataset(ycb_root)
     assert (report.layout, report.num_images, report.defects) == ("YCB-Video", 9, [])
     (note,) = report.notes

@@ -28,7 +28,9 @@ LAYOUTS = {
 
 @pytest.mark.render
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_what_is_written_is_clean_and_read_back(tmp_path, parts, samples, layout, write_set):
+def test_written_data_sets_have_no_defects_and_are_read_back(
+    tmp_path, parts, samples, layout, write_set
+):
     writer, make_reader = LAYOUTS[layout]
     root = write_set(writer, tmp_path / "set", parts, samples)
     report = check_dataset(root)
@@ -119,7 +121,7 @@ def test_processes_stage_while_others_remove_the_folder(tmp_path):
     assert not staging.exists()
 
 
-def test_a_file_in_the_way_is_an_error(tmp_path):
+def test_a_file_in_place_of_the_staging_folder_is_an_error(tmp_path):
     (tmp_path / STAGING).write_text("not a folder")
     with pytest.raises(FileExistsError), lock_staging(tmp_path / STAGING):
         pass

@@ -14,7 +14,7 @@ from dopepp.data.render_run import RenderTask, RenderTasks, Shard, render_datase
 NUM = 60
 
 
-def test_an_error_in_a_worker_arrives_as_what_it_was(small_job, tmp_path):
+def test_an_error_of_a_worker_keeps_its_type(small_job, tmp_path):
     def open_pool(content):
         (tmp_path / "_dopepp_render.json").unlink()
         return ProcessPool(content, 1)
@@ -64,7 +64,7 @@ def test_one_worker_two_workers_and_two_nodes_write_the_same_bytes(
 
 
 @pytest.mark.slow
-def test_both_nodes_work_and_a_lost_node_costs_nothing(two_nodes, small_job, tmp_path):
+def test_both_nodes_work_and_tasks_of_a_lost_node_are_repeated(two_nodes, small_job, tmp_path):
     job = small_job("ndds")
     claim(tmp_path, job.record)
     job.writer(tmp_path).prepare()

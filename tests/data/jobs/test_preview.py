@@ -24,7 +24,7 @@ def test_a_sheet_has_four_panels_a_scene_and_shows_the_jobs_first_images():
     assert np.abs(small - image).mean() < 4
 
 
-def test_panels_say_what_they_show():
+def test_captions_describe_the_panels():
     job = make_job(
         ["servoholder"], preset="bin", changes=["targets_per_image=[5,5]"], size="160x120"
     )
@@ -41,7 +41,7 @@ def test_panels_say_what_they_show():
     assert changed[rendered.instances >= 0].mean() > 2 * changed[rendered.instances < 0].mean()
 
 
-def test_no_target_is_said_so():
+def test_captions_without_a_target():
     job = make_job(["servoholder"], changes=["targets_per_image=[0,0]", *SMALL])
     _, posed, masks, depth = scene_tiles(job.factory.render(0, 0), "image 0")
     assert posed.caption == "no target"
@@ -49,7 +49,9 @@ def test_no_target_is_said_so():
     assert depth.caption == "no depth"
 
 
-def test_the_sheet_lies_beside_the_folder_or_where_it_is_wanted(small_job, tmp_path, monkeypatch):
+def test_the_sheet_is_written_next_to_the_folder_or_to_a_given_path(
+    small_job, tmp_path, monkeypatch
+):
     sheet = np.zeros((5, 7, 3), np.uint8)
     monkeypatch.setattr(render_preview, "preview_sheet", lambda factory: sheet)
     assert write_preview(small_job(), tmp_path / "data") == tmp_path / "data.preview.png"

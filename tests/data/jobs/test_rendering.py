@@ -81,7 +81,7 @@ def whole(job, contents, tmp_path_factory):
     return contents(root)
 
 
-def test_whatever_stops_a_job_it_ends_with_the_same_files(job, tmp_path, contents, whole):
+def test_an_interrupted_job_writes_the_same_files(job, tmp_path, contents, whole):
     for dies_after in (0, 2, 3):
         with pytest.raises(KeyboardInterrupt):
             render_dataset(job, tmp_path, NUM, lambda work: InlinePool(work, dies_after))  # noqa: B023
@@ -94,13 +94,13 @@ def test_whatever_stops_a_job_it_ends_with_the_same_files(job, tmp_path, content
     assert contents(tmp_path) == whole
 
 
-def test_a_job_grows(job, tmp_path, contents, whole):
+def test_a_job_can_be_extended(job, tmp_path, contents, whole):
     for num in (2, 5, 3, NUM):
         render_dataset(job, tmp_path, num, InlinePool)
     assert contents(tmp_path) == whole
 
 
-def test_shards_share_a_folder_at_the_same_time(job, tmp_path, contents, whole):
+def test_simultaneous_shards_share_a_folder(job, tmp_path, contents, whole):
     # They begin and end within chunks: the last to finish finalizes what it shares with others.
     others = []
 
@@ -123,7 +123,7 @@ def test_shards_of_separate_folders_are_merged_by_copying(job, tmp_path, content
     assert contents(tmp_path / "merged") == whole
 
 
-def test_a_full_disk_is_one_line_and_leaves_no_half_file(
+def test_a_full_disk_gives_one_line_and_no_partial_file(
     job, tmp_path, monkeypatch, contents, whole
 ):
     # Room for the parts' meshes, and for half of all else.
@@ -148,7 +148,7 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(
     assert contents(tmp_path) == whole
 
 
-def test_another_job_in_the_folder_is_refused_by_its_field(tmp_path, small_job, contents):
+def test_another_job_in_the_folder_is_rejected_with_the_field(tmp_path, small_job, contents):
     render_dataset(small_job("ndds"), tmp_path, 2, InlinePool)
     before = contents(tmp_path)
     for change, field in (
@@ -200,7 +200,7 @@ def test_a_damaged_record_is_a_user_error(content, tmp_path, small_job):
         render_dataset(small_job(), tmp_path, 2, InlinePool)
 
 
-def test_a_folder_with_something_else_is_refused(tmp_path, small_job):
+def test_a_folder_of_other_files_is_rejected(tmp_path, small_job):
     (file := tmp_path / "thesis.pdf").touch()
     for folder, message in (tmp_path, r"holds 'thesis\.pdf' and no"), (file / "x", "Not a dir"):
         with pytest.raises(UserError, match=message):
@@ -230,7 +230,7 @@ def test_shards_cover_every_image_once(num_items, total):
 
 
 @given(st.integers(1, 60), st.integers(1, 5), st.sets(st.integers(0, 70)))
-def test_a_plan_has_what_is_missing(num_items, total, written):
+def test_a_plan_lists_the_missing_images(num_items, total, written):
     writer = NddsWriter(Path("unused"), [])
     size = writer.chunk_size
     writer.written = lambda chunk: {i for i in written if i // size == chunk}
@@ -244,7 +244,7 @@ def test_a_plan_has_what_is_missing(num_items, total, written):
 
 
 @pytest.mark.parametrize("text", ["3/2", "2/2", "1", "-1/2", "1/0", "0/0", "a/b", "", "1/2/3"])
-def test_a_shard_that_is_none(text):
+def test_an_invalid_shard_is_rejected(text):
     with pytest.raises(UserError, match="i/n with 0 <= i < n"):
         Shard.parse(text)
 
@@ -269,7 +269,7 @@ def test_a_part_can_be_given_a_name(tmp_path):
         (["lighting.tint=blue"], "lighting.tint='blue'"),
     ],
 )
-def test_changes_that_cannot_be_made(changes, message):
+def test_invalid_changes_are_rejected(changes, message):
     with pytest.raises(UserError, match=message):
         make_job(["servoholder"], changes=changes)
 
@@ -282,7 +282,7 @@ def test_changes_reach_the_preset(small_job):
     json.dumps(preset.record, allow_nan=False)
 
 
-def test_a_defect_comes_with_its_traceback(tmp_path, monkeypatch, small_job):
+def test_an_internal_error_keeps_its_traceback(tmp_path, monkeypatch, small_job):
     monkeypatch.setattr(NddsWriter, "write", lambda *_: dict[str, str]()["defect"])
     with pytest.raises(RuntimeError, match=r"(?s)test_rendering\.py.*KeyError: 'defect'"):
         render_dataset(small_job("ndds"), tmp_path, 2, InlinePool)

@@ -43,7 +43,7 @@ def wait_for_group(process: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", WRITERS)
-def test_killed_at_random_moments_it_ends_with_the_same_files(layout, tmp_path, contents):
+def test_a_job_killed_at_random_moments_writes_the_same_files(layout, tmp_path, contents):
     run(tmp_path / "whole", layout, 1)
     out, rng, codes = tmp_path / "out", random.Random(layout), []
     kinds = [signal.SIGKILL, signal.SIGINT, signal.SIGKILL, signal.SIGTERM, signal.SIGKILL]

@@ -83,7 +83,7 @@ def test_pure_function_of_seed_epoch_and_index():
     assert names != sorted(names)
 
 
-def test_an_absent_source_gives_its_share_away(caplog):
+def test_a_missing_source_gives_its_share_to_the_others(caplog):
     assert HybridSource(None, Named("virtual", 5), 0.5, 10, 0).counts == (0, 10, 0)
     synthetic = Named("synthetic", 5)
     only_synthetic = HybridSource(Named("real", 5), None, 0.3, 10, 0, synthetic, 0.2)
@@ -94,7 +94,7 @@ def test_an_absent_source_gives_its_share_away(caplog):
     assert "the real share is 1" in caplog.text
 
 
-def test_contains_and_describe_know_only_used_sources():
+def test_contains_and_describe_ignore_unused_sources():
     mix = HybridSource(Named("real", 5), Named("virtual", 5), 0.0, 10, 0)
     assert not mix.contains("real")
     assert mix.contains("virtual")
@@ -106,6 +106,6 @@ def test_contains_and_describe_know_only_used_sources():
     assert roles == {VIRTUAL}
 
 
-def test_a_mix_of_nothing_is_refused():
+def test_a_mix_without_a_source_is_rejected():
     with pytest.raises(UserError, match="without any source"):
         HybridSource(None, None, 0.5, 4, 0)

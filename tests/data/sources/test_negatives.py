@@ -23,7 +23,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_pictures_of_the_camera_stay_as_they_are(folder):
+def test_images_of_the_camera_are_unchanged(folder):
     source = PhotoFrames(PhotoBackgrounds(folder), K, SIZE, name="desk")
     assert len(source) == 4
     samples = [source.sample(index) for index in range(4)]
@@ -38,7 +38,7 @@ def test_pictures_of_the_camera_stay_as_they_are(folder):
         source.sample(4)
 
 
-def test_later_rounds_are_mirrored_and_then_regions(folder):
+def test_the_second_round_is_mirrored_and_further_rounds_show_regions(folder):
     source = PhotoFrames(PhotoBackgrounds(folder), K, SIZE, num_frames=12)
     for index in range(4):
         whole, mirrored, region = (source.sample(index + 4 * lap) for lap in range(3))
@@ -48,7 +48,7 @@ def test_later_rounds_are_mirrored_and_then_regions(folder):
         np.testing.assert_array_equal(source.sample(index + 8).image, region.image)
 
 
-def test_a_larger_picture_covers_the_frame_from_its_middle(tmp_path):
+def test_a_larger_image_is_cropped_at_its_centre(tmp_path):
     # Brightness grows along x and y, so that the corners state their place.
     y, x = np.mgrid[0:480, 0:800]
     picture = np.stack([x / 4, y / 4, 0 * x], axis=2).astype(np.uint8)
@@ -59,7 +59,7 @@ def test_a_larger_picture_covers_the_frame_from_its_middle(tmp_path):
     np.testing.assert_allclose(image[-1, -1, :2], (180, 120), atol=2)
 
 
-def test_a_damaged_picture_is_replaced_and_too_many_are_an_error(tmp_path):
+def test_damaged_images_are_replaced_up_to_a_limit(tmp_path):
     rng = np.random.default_rng(0)
     for number in range(120):
         noise = rng.integers(0, 256, (12, 16, 3), np.uint8)
@@ -75,7 +75,7 @@ def test_a_damaged_picture_is_replaced_and_too_many_are_an_error(tmp_path):
         [source.sample(index) for index in range(120)]
 
 
-def test_the_index_decides_the_kind(folder):
+def test_the_index_selects_the_source(folder):
     photos = PhotoBackgrounds(folder)
     sources = [PhotoFrames(photos, K, SIZE, name=name) for name in "abc"]
     mix = FrameMix(sources, 10)

@@ -68,7 +68,7 @@ def test_bounds_description_and_objects(factory):
     assert other.identity != info.identity
 
 
-def test_what_litters_the_background_belongs_to_the_identity():
+def test_clutter_settings_belong_to_the_identity():
     def identity(**changes):
         factory = Factory([pivconnector()], preset_of("quickstart", changes), 3)
         (info,) = RenderedSource(factory, 4, "val").describe()
@@ -78,7 +78,7 @@ def test_what_litters_the_background_belongs_to_the_identity():
     assert len({each["preset"] for each in identities}) == 3
 
 
-def test_another_scale_is_the_same_test_set_from_elsewhere(factory):
+def test_a_scale_moves_the_camera_of_the_same_test_set(factory):
     usual, near = (RenderedSource(factory, 2, "test", scale=scale) for scale in (1.0, 0.5))
     first, other = usual.sample(1), near.sample(1)
     assert first.key == other.key

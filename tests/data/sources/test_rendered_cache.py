@@ -24,7 +24,7 @@ def assert_same(first: Sample, second: Sample) -> None:
             np.testing.assert_array_equal(instance.mask, other.mask)
 
 
-def test_keeps_every_field_renders_once_and_ignores_the_epoch(fake_source):
+def test_samples_are_rendered_once_and_cached_completely(fake_source):
     source = fake_source(num_items=3)
     cached = CachedSource(source, (64, 64))
     for epoch in (0, 5, 2):
@@ -33,7 +33,7 @@ def test_keeps_every_field_renders_once_and_ignores_the_epoch(fake_source):
     assert source.calls == [(0, 0), (0, 1), (0, 2)]
 
 
-def test_without_mask_and_without_instance_and_what_is_returned_is_a_copy(fake_source):
+def test_samples_without_mask_or_instance_are_cached_and_copied(fake_source):
     source = fake_source(num_items=2)
     bare, empty = source.sample(1), source.sample(0)
     bare.instances[0].mask, empty.instances = None, []
@@ -47,7 +47,7 @@ def test_without_mask_and_without_instance_and_what_is_returned_is_a_copy(fake_s
                 array[:] = 0
 
 
-def test_images_are_kept_at_the_input_size(fake_source):
+def test_images_are_cached_at_the_input_size(fake_source):
     cached = CachedSource(fake_source(size=(640, 480)), (64, 64))
     expected = resize_sample(fake_source(size=(640, 480)).sample(1), (64, 64))
     assert_same(cached.sample(1), expected)
@@ -77,7 +77,7 @@ def test_forked_processes_fill_one_cache(fake_source):
     assert source.calls == [(0, 0)]  # this process rendered the first item only
 
 
-def test_what_does_not_fit_is_refused(fake_source, monkeypatch):
+def test_samples_that_do_not_fit_are_rejected(fake_source, monkeypatch):
     with pytest.raises(UserError, match=r"data\.cache=memory.*set data\.cache=none"):
         CachedSource(fake_source(num_items=10**9), (64, 64))
     with pytest.raises(ValueError, match="more than 64 characters"):
@@ -93,7 +93,7 @@ def test_what_does_not_fit_is_refused(fake_source, monkeypatch):
         CachedSource(fake_source(), (64, 64))
 
 
-def test_a_file_lasts_and_is_told_apart(fake_source, tmp_path):
+def test_a_cache_file_is_reused_for_equal_content_only(fake_source, tmp_path):
     first = fake_source(num_items=4)
     kept = CachedSource(first, (64, 64), tmp_path, identity="a")
     for index in range(3):
@@ -115,7 +115,7 @@ def test_a_file_lasts_and_is_told_apart(fake_source, tmp_path):
         assert other.folder != kept.folder
 
 
-def test_a_torn_slot_is_filled_again(fake_source, tmp_path):
+def test_a_damaged_slot_is_filled_again(fake_source, tmp_path):
     kept = CachedSource(fake_source(num_items=4), (64, 64), tmp_path)
     kept.sample(2)
     path = kept.folder / "slots.bin"
@@ -127,7 +127,7 @@ def test_a_torn_slot_is_filled_again(fake_source, tmp_path):
     assert (0, 2) in source.calls
 
 
-def test_native_size_keeps_depth(fake_source, tmp_path):
+def test_a_cache_of_native_size_keeps_depth(fake_source, tmp_path):
     source = fake_source()
     sample = source.sample(1)
     sample.depth = np.linspace(0, 1, 48 * 64, dtype=np.float32).reshape(48, 64)
@@ -137,7 +137,7 @@ def test_native_size_keeps_depth(fake_source, tmp_path):
     assert CachedSource(source, (64, 64)).sample(1).depth is None
 
 
-def test_no_room_is_one_line(fake_source, tmp_path, monkeypatch):
+def test_a_full_disk_gives_one_line(fake_source, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -147,7 +147,7 @@ def test_no_room_is_one_line(fake_source, tmp_path, monkeypatch):
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
-def test_describes_itself_as_cached(fake_source):
+def test_the_description_is_marked_as_cached(fake_source):
     source = fake_source()
     (info,), (plain,) = CachedSource(source, (64, 64)).describe(), source.describe()
     assert info.identity == {**plain.identity, "cached": True}

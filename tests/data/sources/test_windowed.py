@@ -28,7 +28,7 @@ def windows(frames):
     return make
 
 
-def test_poses_and_pixels_stay_together(windows):
+def test_keypoints_follow_the_window(windows):
     for sample in windows(8):
         assert sample.size == (96, 64)
         for detection in sample.instances:
@@ -37,7 +37,7 @@ def test_poses_and_pixels_stay_together(windows):
             assert detection.mask.shape == (64, 96)
 
 
-def test_a_window_is_a_piece_of_the_resized_picture(frames):
+def test_a_window_is_a_crop_of_the_resized_image(frames):
     whole = letterbox_sample(frames.sample(2), (160, 120))
     window = WindowedSource(frames, (160, 120), (96, 64), 5).sample(2)
     left, top = np.round(whole.K[:2, 2] - window.K[:2, 2]).astype(int)
@@ -47,7 +47,7 @@ def test_a_window_is_a_piece_of_the_resized_picture(frames):
     )
 
 
-def test_every_window_holds_a_centre_and_chance_moves_it(windows):
+def test_every_window_contains_a_centre_at_a_random_position(windows):
     shown = windows(40)
     centres = np.array([sample.instances[0].keypoints[CENTROID] for sample in shown])
     assert ((centres > -0.5) & (centres < (95.5, 63.5))).all()
@@ -58,7 +58,7 @@ def test_every_window_holds_a_centre_and_chance_moves_it(windows):
         np.testing.assert_array_equal(first.image, other.image)
 
 
-def test_a_picture_smaller_than_the_window_is_padded(windows):
+def test_an_image_smaller_than_the_window_is_padded(windows):
     (sample,) = windows(1, window=(200, 64))
     assert (sample.size, sample.instances[0].mask.shape) == ((200, 64), (64, 200))
     assert not sample.image[:, 160:].any()
@@ -80,7 +80,7 @@ def test_without_an_object_a_window_is_anywhere():
 
 
 @pytest.mark.parametrize("has_mask", [True, False])
-def test_what_a_window_cuts_off_is_not_visible(has_mask, frames):
+def test_pixels_outside_the_window_are_not_visible(has_mask, frames):
     sample = frames.sample(0)
     instance = sample.instances[0]
     if not has_mask:

@@ -34,7 +34,7 @@ def test_pure_function_of_the_generator(seed, epoch):
     assert (first.dtype, first.shape) == (image.dtype, image.shape)
 
 
-def test_everything_off_changes_nothing(image):
+def test_zero_ranges_change_nothing(image):
     np.testing.assert_array_equal(only()(image, np.random.default_rng(0)), image)
 
 
@@ -64,7 +64,7 @@ def test_hue_and_saturation_keep_the_luma(image):
     np.testing.assert_allclose(only(hue=1.0, saturation=0.5)(grey, np.random.default_rng(0)), 77)
 
 
-def test_noise_has_the_asked_spread():
+def test_noise_has_the_given_standard_deviation():
     grey = np.full((200, 200, 3), 128, np.uint8)
     augment = only(noise_probability=1, noise_sigma=(6.0, 6.0))
     noise = augment(grey, np.random.default_rng(0)).astype(float) - 128
@@ -88,6 +88,6 @@ def test_blur_and_jpeg_against_opencv(image):
     "options",
     [{"brightness": -0.1}, {"noise_sigma": (5, 1)}, {"blur_probability": 1.2}, {"hue": -1}],
 )
-def test_wrong_ranges_are_refused(options):
+def test_wrong_ranges_are_rejected(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         Photometric(**options)

@@ -69,7 +69,7 @@ def test_masks_are_those_of_the_scene_rendered_through_the_new_camera(factory):
     assert max(rolls) > 20
 
 
-def test_the_picture_moves_with_the_keypoints():
+def test_pixels_move_with_the_keypoints():
     rng = np.random.default_rng(0)
     for _ in range(20):
         sample, _ = posed(rng)
@@ -82,7 +82,7 @@ def test_the_picture_moves_with_the_keypoints():
         np.testing.assert_allclose([columns.mean(), rows.mean()], expected, atol=0.6)
 
 
-def test_what_leaves_the_picture_is_not_visible():
+def test_pixels_outside_the_image_are_not_visible():
     mask = np.zeros((100, 100), bool)
     mask[40:60, 90:100] = True
     item = Instance("box", np.eye(4), np.zeros((9, 2)), 0.5, mask)
@@ -95,7 +95,7 @@ def test_what_leaves_the_picture_is_not_visible():
     assert sample.instances[0].mask.sum() == mask.sum()
 
 
-def test_without_a_mask_the_cuboids_outline_tells_what_is_visible():
+def test_without_a_mask_the_cuboids_outline_determines_visibility():
     keypoints = np.array([[90.0, 40], [98, 40], [98, 60], [90, 60]] * 2 + [[94, 50]])
     point = Instance("box", np.eye(4), keypoints, 0.5)
     sample = Sample(np.zeros((100, 100, 3), np.uint8), np.eye(3), [point])

@@ -88,7 +88,7 @@ def test_bounds_share_and_origin_of_the_patch(mask, limit, seed):
         assert patch.reshape(-1, 3).std(axis=0).max() > 0
 
 
-def test_unless_told_otherwise_a_patch_has_at_most_the_papers_share_of_the_box():
+def test_the_default_limits_of_a_patch_are_the_papers():
     """Equation 4: 0.8 of the height and 0.8 of the width."""
     mask = np.zeros(SIZE, bool)
     mask[10:50, 20:70] = True
@@ -100,7 +100,7 @@ def test_unless_told_otherwise_a_patch_has_at_most_the_papers_share_of_the_box()
     assert np.max(sizes, axis=0).tolist() == [32, 40]
 
 
-def test_the_crop_is_a_piece_of_the_own_background():
+def test_the_crop_comes_from_the_images_background():
     mask = ellipse(30, 40, 12, 12)
     sample, other = sample_of(mask), Stripes()
     result = RandomMask(1.0)(sample, np.random.default_rng(3), other)
@@ -114,7 +114,7 @@ def test_the_crop_is_a_piece_of_the_own_background():
     assert not mask[row : row + last - first, column : column + stop - start].any()
 
 
-def test_where_no_window_fits_a_smaller_one_of_the_own_background_is_taken():
+def test_the_crop_shrinks_to_fit_the_background():
     # Three columns of background are left: no patch of this part is so narrow.
     mask = np.ones(SIZE, bool)
     mask[:, :3] = False
@@ -129,7 +129,7 @@ def test_where_no_window_fits_a_smaller_one_of_the_own_background_is_taken():
         assert not changed[~mask].any()
 
 
-def test_a_part_that_fills_the_frame_takes_another_picture():
+def test_a_part_that_fills_the_frame_is_covered_with_another_image():
     sample, other = sample_of(np.ones(SIZE, bool)), Stripes()
     result = RandomMask(1.0)(sample, np.random.default_rng(0), other)
     assert other.calls == 1
@@ -148,7 +148,7 @@ def test_a_solid_background_is_never_pasted():
     assert untouched.instances[0].masked_fraction == 0
 
 
-def test_a_patch_counts_for_every_instance_it_covers():
+def test_a_patch_reduces_every_instance_that_it_covers():
     left, right = ellipse(30, 30, 20, 15), ellipse(30, 45, 20, 15)
     right &= ~left
     sample = sample_of(left, right)
@@ -170,7 +170,7 @@ def test_probability_and_empty_masks():
     assert masked.instances[0] == hidden.instances[0]
 
 
-def test_without_a_mask_the_cuboids_hull_stands_in(fake_source):
+def test_without_a_mask_the_hull_of_the_cuboid_is_used(fake_source):
     sample = fake_source().sample(0)
     instance = sample.instances[0]
     instance.mask = None
@@ -184,7 +184,7 @@ def test_without_a_mask_the_cuboids_hull_stands_in(fake_source):
 
 
 @pytest.mark.parametrize("field", ["probability", "max_height", "max_width"])
-def test_shares_outside_0_to_1_are_refused(field):
+def test_shares_outside_0_to_1_are_rejected(field):
     with pytest.raises(ValueError, match=f"{field}=1.5"):
         RandomMask(**{field: 1.5})
 
@@ -246,7 +246,7 @@ def test_the_share_is_reached_inside_the_box(mask, share, seed):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_patches_are_several_crops_of_the_own_background(seed):
+def test_patches_are_several_crops_of_the_images_background(seed):
     mask = ellipse(36, 40, 20, 28)
     sample = addressed(mask)
     (shaded,) = shade(sample, [0.8], seed, 0)
@@ -267,7 +267,7 @@ def test_patches_are_several_crops_of_the_own_background(seed):
         assert np.ptp(columns[place]) + 1 <= 0.5 * (stop - start)
 
 
-def test_more_shading_contains_less_and_depends_on_nothing_else():
+def test_a_larger_share_contains_a_smaller_share():
     sample = addressed(ellipse(36, 40, 20, 28))
     together = shade(sample, SHARES, 5, 7)
     for share, first in zip(SHARES, together, strict=True):
@@ -307,7 +307,7 @@ def test_every_instance_is_covered_by_its_own_patches_alone(masks, seed):
                 assert abs(reached - shaded.share) <= TOLERANCE
 
 
-def test_what_cannot_be_shaded_is_left_alone():
+def test_instances_without_visible_pixels_are_not_shaded():
     mask = ellipse(36, 30, 15, 15)
     sample = addressed(mask, np.zeros(SIZE, bool))
     corners = np.array([[60, 20], [90, 20], [60, 60], [90, 60]] * 2 + [[75, 40]], np.float64)
@@ -323,7 +323,7 @@ def test_what_cannot_be_shaded_is_left_alone():
     assert not (inside & (taken_from[:, 1] >= 60) & (taken_from[:, 1] <= 90)).any()
 
 
-def test_a_solid_background_covers_nothing_and_says_so():
+def test_a_solid_background_covers_nothing():
     sample = addressed(ellipse(36, 40, 20, 28))
     sample.image[~is_object(sample.image)] = 9
     (shaded,) = shade(sample, [0.4], 0, 0)
@@ -331,7 +331,7 @@ def test_a_solid_background_covers_nothing_and_says_so():
     assert shaded.reached == (0.0,)
 
 
-def test_little_room_gives_smaller_crops_and_a_smooth_background_is_no_solid_one():
+def test_a_small_background_gives_smaller_crops_and_a_gradient_has_contrast():
     mask = np.ones(SIZE, bool)
     mask[:, :6] = mask[:6] = False
     smooth = addressed(seen := ellipse(36, 40, 8, 12))
@@ -352,7 +352,7 @@ def test_the_only_crops_with_contrast_are_found():
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
-def test_a_share_outside_0_to_1_is_refused(share):
+def test_a_share_outside_0_to_1_is_rejected(share):
     with pytest.raises(ValueError, match=r"shares must be in \[0, 1\]"):
         shade(addressed(), [0.2, share], 0, 0)
 

@@ -26,7 +26,7 @@ def cylinder() -> Mesh:
     return Mesh(np.asarray(solid.vertices), np.asarray(solid.faces, np.int32))
 
 
-def test_parts_come_back_with_symmetries_in_metres(tmp_path):
+def test_written_parts_are_read_with_symmetries_in_metres(tmp_path):
     flip = np.eye(4)
     flip[:3, :3] = Rotation.from_euler("x", 180, degrees=True).as_matrix()
     flip[:3, 3] = 0.001, -0.002, 0.003
@@ -83,7 +83,7 @@ def test_texture_round_trip(ycb_root, tmp_path):
     np.testing.assert_allclose(read.mesh.vertices, part.mesh.vertices, atol=1e-7)
 
 
-def test_parts_called_as_bops_files_keep_their_numbers(tmp_path):
+def test_parts_named_like_bops_files_keep_their_numbers(tmp_path):
     parts = [replace(servoholder(), name="obj_000012"), replace(pivconnector(), name="obj_000005")]
     write_models(tmp_path, parts)
     result = parts_by_id(tmp_path, bop_parts(tmp_path))
@@ -100,7 +100,7 @@ def test_other_parts_are_numbered_in_their_order(names):
     assert model_numbers(names) == dict(zip(names, (1, 2), strict=True))
 
 
-def test_objects_without_a_name_are_called_after_their_file(tmp_path):
+def test_objects_without_a_name_are_named_after_their_file(tmp_path):
     write_models(tmp_path, [servoholder(), pivconnector()])
     folder = tmp_path / "models"
     path = folder / "models_info.json"
@@ -153,7 +153,7 @@ def test_damaged_models_info(content, message, tmp_path):
         read_models(tmp_path)
 
 
-def test_an_identity_is_no_symmetry_and_a_wrong_diameter_is_told(tmp_path, caplog):
+def test_the_identity_is_dropped_and_a_wrong_diameter_logged(tmp_path, caplog):
     write_models(tmp_path, [servoholder()])
     path = tmp_path / "models" / "models_info.json"
     records = json.loads(path.read_text())
@@ -184,7 +184,7 @@ def test_vertex_colours_round_trip_and_survive_decimation(tmp_path, monkeypatch)
     np.testing.assert_allclose(light.colours, expected, atol=8)
 
 
-def test_models_without_a_file_are_left_out_unless_they_are_asked_for(tmp_path, caplog):
+def test_models_without_a_file_are_ignored_unless_requested(tmp_path, caplog):
     write_models(tmp_path, [servoholder(), pivconnector()])
     (tmp_path / "models" / "obj_000001.ply").unlink()
     assert [part.name for part in bop_parts(tmp_path)] == ["pivconnector"]
@@ -196,7 +196,7 @@ def test_models_without_a_file_are_left_out_unless_they_are_asked_for(tmp_path, 
         bop_parts(tmp_path)
 
 
-def test_a_model_in_another_unit_or_of_too_many_triangles_is_told_apart(tmp_path, monkeypatch):
+def test_models_in_another_unit_or_with_too_many_triangles_are_rejected(tmp_path, monkeypatch):
     write_models(tmp_path, [servoholder()])
     path = tmp_path / "models" / "obj_000001.ply"
     solid: Any = trimesh.creation.box((0.06, 0.04, 0.024))

@@ -126,7 +126,7 @@ def test_gray_tiff_jpeg_and_16_bit_tiff_depth(tmp_path, block):
         assert sample.instances[0].mask is None
 
 
-def test_fraction_is_estimated_where_it_is_not_stated(tmp_path, block):
+def test_a_missing_visible_fraction_is_estimated(tmp_path, block):
     scene = Scene(tmp_path)
     half_out = truth(1, (-78.75, 0.0, 250.0))  # its centre is on the left border, pixel −½ + ½
     scene.annotate({"0": [truth(1), half_out]}, None)
@@ -202,7 +202,7 @@ def bent(by: float) -> dict[str, Any]:
     return truth(2) | {"cam_R_m2c": (shear @ np.reshape(R, (3, 3))).ravel().tolist()}
 
 
-def test_inexact_rotations_are_the_nearest_ones_and_said_once(scene, block, caplog):
+def test_inexact_rotations_are_replaced_and_logged_once(scene, block, caplog):
     scene.json("scene_gt", {"3": [bent(5e-3), truth(2)], "11": [bent(9e-3), bent(9e-4)]})
     scene.json("scene_gt_info", {})
     source = BopReader(scene.root, [block(2)], "test")
@@ -222,7 +222,7 @@ def test_inexact_rotations_are_the_nearest_ones_and_said_once(scene, block, capl
         BopReader(scene.root, [block(2)], "test")
 
 
-def test_missing_infos_and_models_are_coped_with_and_counted(scene, block, caplog):
+def test_missing_infos_and_models_are_accepted_and_counted(scene, block, caplog):
     caplog.set_level("INFO")
     scene.json("scene_gt", {"3": [truth(9), truth(2)], "11": [truth(9), truth(2)]})
     scene.json("scene_gt_info", {"3": [{"visib_fract": 0.25}, {"visib_fract": 0.75}]})
@@ -262,7 +262,7 @@ def test_a_list_of_targets_marks_the_most_visible_instances(scene, block, caplog
     assert len(BopReader(scene.root, [block(2)], "test", targets="auto")) == 2
 
 
-def test_the_view_is_the_pictures_camera_and_the_annotated_distances(scene, block):
+def test_the_view_has_the_first_camera_and_the_range_of_depths(scene, block):
     scene.annotate({"3": [truth(2, (0, 0, 251.0)), truth(9)], "11": [truth(2, (0, 0, 309.0))]}, {})
     size, camera, distances = BopReader(scene.root, [block(2)], "test").view()
     assert (size, distances) == ((64, 48), (0.25, 0.31))
@@ -271,7 +271,7 @@ def test_the_view_is_the_pictures_camera_and_the_annotated_distances(scene, bloc
     assert BopReader(scene.root, [block(2)], "test").view()[2] is None
 
 
-def test_linemod_occlusion_as_it_is_published(shared_data, caplog):
+def test_the_published_linemod_occlusion(shared_data, caplog):
     root = shared_data / "lmo_bop"
     if not root.is_dir():
         pytest.skip(f"no {root}")
@@ -288,7 +288,7 @@ def test_linemod_occlusion_as_it_is_published(shared_data, caplog):
     assert all(part.mesh.colours is not None for part in parts)
 
 
-def test_matrices_may_be_nested_and_numbers_whole(tmp_path, block):
+def test_nested_matrices_and_integers_are_accepted(tmp_path, block):
     scene = Scene(tmp_path)
     nested = truth(1) | {"cam_R_m2c": np.reshape(R, (3, 3)).tolist(), "cam_t_m2c": [[0], [0], [9]]}
     scene.annotate({"0": [nested]}, {"0": [1]})
@@ -298,7 +298,7 @@ def test_matrices_may_be_nested_and_numbers_whole(tmp_path, block):
     np.testing.assert_array_equal(instance.T_cam_obj[:3, :3], np.reshape(R, (3, 3)))
 
 
-def test_what_contradicts_an_image_is_named(scene, block):
+def test_files_that_contradict_an_image_are_rejected(scene, block):
     def refused(match, **options):
         with pytest.raises(UserError, match=match):
             BopReader(scene.root, [block(2)], "test", **options).sample(0)
@@ -315,7 +315,7 @@ def test_what_contradicts_an_image_is_named(scene, block):
     refused(r"K with .*cx=500.*image 3", read_depth=False)
 
 
-def test_wrong_folders_are_named(scene, tmp_path, block):
+def test_wrong_folders_are_rejected(scene, tmp_path, block):
     with pytest.raises(
         UserError, match=r"train_pbr, which is not a folder; allowed: one of \['test"
     ):

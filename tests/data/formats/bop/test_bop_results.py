@@ -109,7 +109,7 @@ def test_what_is_written_is_read_back(seed, count, tmp_path_factory):
         (HEADER, r"line 2: scene_id 'scene_id'"),
     ],
 )
-def test_a_wrong_line_is_named(line, message, tmp_path):
+def test_a_wrong_line_is_rejected_with_its_number(line, message, tmp_path):
     path = write(tmp_path, f"{HEADER}\n{line}\n")
     with pytest.raises(UserError, match=message) as error:
         read_results(path, {2, 3})
@@ -118,12 +118,12 @@ def test_a_wrong_line_is_named(line, message, tmp_path):
     assert len(str(error.value)) < 600 + len(str(path))
 
 
-def test_the_same_pose_twice_with_another_score_is_none(tmp_path):
+def test_a_pose_may_be_repeated_with_another_score(tmp_path):
     again = GOOD.replace("0.75", "0.7")
     assert len(read_results(write(tmp_path, f"{GOOD}\n{again}"), {2})) == 2
 
 
-def test_what_is_no_such_file(tmp_path, monkeypatch):
+def test_other_files_are_rejected(tmp_path, monkeypatch):
     for path in (tmp_path / "none.csv", tmp_path):
         with pytest.raises(UserError, match=r"no such file"):
             read_results(path, {1})

@@ -82,7 +82,7 @@ def test_truncated_hidden_and_far_objects(plate):
     assert (labels.camera["depth_scale"], labels.depth[10, 5]) == (1.0, 20_000)
 
 
-def test_refuses_a_folder_of_something_else(boxes, tmp_path):
+def test_a_folder_of_other_data_is_rejected(boxes, tmp_path):
     parts = boxes[0]
     BopWriter(tmp_path / "a", parts).prepare()
     with pytest.raises(UserError, match=r"models_info\.json, written for other parts"):

@@ -100,7 +100,7 @@ def test_settings_are_written_for_one_camera_only(tmp_path, write_set, boxes):
     assert writer.written(1234) == {1_234_567}
 
 
-def test_writer_refuses_foreign_folders(tmp_path, boxes):
+def test_the_writer_rejects_folders_of_other_data(tmp_path, boxes):
     for _ in range(2):
         NddsWriter(tmp_path / "a", boxes[0]).prepare()
     with pytest.raises(UserError, match=r"_object_settings\.json of other parts"):
@@ -121,7 +121,7 @@ def test_samples_without_masks_depth_or_instances(tmp_path, write_set, boxes):
     assert source.sample(1).instances == []
 
 
-def test_corner_behind_the_camera_survives(tmp_path, write_set, boxes):
+def test_a_corner_behind_the_camera_is_written_finitely(tmp_path, write_set, boxes):
     (part, _), samples = boxes
     T = samples[0].instances[0].T_cam_obj.copy()
     T[:3, 3] = [0, 0, 0.02]
@@ -260,7 +260,7 @@ SLANTED[:3, 3] = [0.013, -0.04, 0.02]
     ],
     ids=["plain", "opengl", "nvisii", "old-nvisii", "fixed", "fixed-slanted"],
 )
-def test_every_habit_is_found(tmp_path, order, unit, habits, frame, caplog):
+def test_every_convention_is_determined(tmp_path, order, unit, habits, frame, caplog):
     wild = Wild(tmp_path, order=order, unit=unit, **habits)
     wild.items(3, BOX, CUBE)
     if "fixed" in habits:
@@ -311,7 +311,7 @@ def test_falling_things(tmp_path):
     assert NddsReader(tmp_path, [BOX], read_depth=False).sample(0).depth is None
 
 
-def test_models_moved_to_their_centre(tmp_path):
+def test_meshes_centred_at_their_box(tmp_path):
     """The pose is of the mesh moved by its box's centre, which no file states."""
     centre = np.eye(4)
     centre[:3, 3] = -BOX.cuboid[8]
@@ -331,7 +331,7 @@ def test_noise_in_the_projections(tmp_path):
     assert_read(wild, source)
 
 
-def test_orders_that_cannot_be_told_apart_are_said(tmp_path):
+def test_indistinguishable_orders_are_logged(tmp_path):
     wild, T = Wild(tmp_path), np.eye(4)
     T[:3, :3] = Rotation.from_quat([0.5, 0.5, 0.5, 0.5]).as_matrix()
     T[:3, 3] = [0.01, 0.0, 0.4]
@@ -347,7 +347,7 @@ def edit(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
     path.write_text(json.dumps(record))
 
 
-def test_an_item_that_contradicts_the_others(tmp_path):
+def test_an_item_with_another_convention_is_rejected(tmp_path):
     paths = Wild(tmp_path).items(12, BOX)
     edit(paths[7], lambda item: item["quaternion_xyzw"].insert(0, item["quaternion_xyzw"].pop()))
     source = NddsReader(tmp_path, [BOX])
@@ -374,7 +374,7 @@ def test_visible_fraction_of_a_truncated_object(tmp_path):
         assert instance.visible_fraction == pytest.approx(expected, abs=0.05)
 
 
-def test_other_classes_and_hidden_objects_are_left_out_and_counted(tmp_path):
+def test_other_classes_and_hidden_objects_are_ignored_and_counted(tmp_path):
     Wild(tmp_path).items(3, BOX, CUBE)
 
     def behind(item):
@@ -427,7 +427,7 @@ def test_image_of_another_size_than_its_camera(tmp_path):
         NddsReader(tmp_path, [BOX]).sample(0)
 
 
-def test_segmentation_of_two_of_a_class_is_no_mask(tmp_path):
+def test_objects_that_share_a_label_have_no_mask(tmp_path):
     wild = Wild(tmp_path)
     wild.item(0, BOX, BOX)
     wild.settings("box")

@@ -115,7 +115,7 @@ def image_files(key: str, **changes: object) -> list[tuple[str, bytes]]:
     return [*texts, (f"{key}.rgb.jpg", picture)]
 
 
-def test_a_shard_of_another_writer(tmp_path, block, write_shard):
+def test_reads_a_shard_of_another_writer(tmp_path, block, write_shard):
     files = [("./" + name, data) for name, data in image_files("000001_000005")]
     files += image_files("000000_000007", gt_json=None, gt_info_json=None)
     folder = tarfile.TarInfo("some")
@@ -135,7 +135,7 @@ def test_a_shard_of_another_writer(tmp_path, block, write_shard):
         assert (instance.visible_fraction, instance.mask, samples[0].depth) == (0.5, None, None)
 
 
-def test_hostile_members_are_refused(tmp_path, write_shard):
+def test_hostile_members_are_rejected(tmp_path, write_shard):
     good = image_files("000000_000000")
 
     def refused(message, files):
@@ -157,7 +157,7 @@ def test_hostile_members_are_refused(tmp_path, write_shard):
     refused("which is not KEY.EXTENSION", [*good, ("README", b"x")])
 
 
-def test_truncated_damaged_and_oversized_archives_are_refused(tmp_path, write_shard):
+def test_truncated_damaged_and_oversized_archives_are_rejected(tmp_path, write_shard):
     files = image_files("000000_000000") + image_files("000000_000001")
     path = write_shard(tmp_path / "shard-000000.tar", files)
     whole = path.read_bytes()

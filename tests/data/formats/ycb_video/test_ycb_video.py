@@ -48,7 +48,7 @@ def test_reads_pose_camera_depth_and_mask(ycb_tree, box):
 
 
 @pytest.mark.parametrize(("scene", "fx"), [("0059", 1066.778), ("0060", 1077.836)])
-def test_camera_by_scene_where_meta_has_none(ycb_tree, box, scene, fx):
+def test_the_scene_determines_a_missing_camera(ycb_tree, box, scene, fx):
     frame = f"{scene}/000001"
     ycb_tree.write(frame, intrinsic_matrix=None)
     image = np.zeros((480, 640, 3), np.uint8)
@@ -136,7 +136,7 @@ def test_root_that_is_missing_or_wrong(tmp_path, ycb_tree, box):
         YcbVideoReader(ycb_tree.root, [box], "train")
 
 
-def test_unknown_names_list_the_known_ones_and_wrong_arguments_are_refused(ycb_tree, box):
+def test_unknown_names_and_wrong_arguments_are_rejected(ycb_tree, box):
     ycb_tree.write_list("train", ["0007/000001", "0007/000002"])
     ycb_tree.write_list("odd", ["colour.png"])
     for part, image_set, message in (
