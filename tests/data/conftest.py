@@ -1,4 +1,4 @@
-"""Makers of miniature data sets, samples, parts and render jobs."""
+"""Fixtures: miniature data sets, samples, parts and render jobs."""
 
 import io
 import tarfile
@@ -80,7 +80,7 @@ def fake_source():
 
 
 class YcbTree:
-    """Writes a tiny YCB-Video folder; frames can be spoilt afterwards."""
+    """Writes a tiny YCB-Video folder."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -139,7 +139,7 @@ def ycb_tree(tmp_path):
 
 @pytest.fixture(scope="session")
 def contents():
-    """Read every file of a folder, and every folder as an empty one."""
+    """Read the files of a folder by relative path; subfolders have empty content."""
 
     def read(root):
         return {
@@ -216,7 +216,7 @@ def _boxes_at(parts, image):
 
 @pytest.fixture(scope="session")
 def block():
-    """Make a 40 × 20 × 10 mm block called as BOP's files are."""
+    """Make a block of 40 × 20 × 10 mm, named like BOP's files."""
     half = np.array([0.02, 0.01, 0.005])
     cuboid, diameter = cuboid_keypoints(-half, half), float(2 * np.linalg.norm(half))
     return lambda number: Part(f"obj_{number:06d}", cuboid, diameter, cuboid[:8])
@@ -240,7 +240,7 @@ def write_shard():
 
 @pytest.fixture(scope="session")
 def small_job():
-    """Make a job of small images, changed as asked."""
+    """Make a job of small images with other options."""
 
     def make(layout="bop", **options):
         defaults = {"preset": "quickstart", "size": "32x24", "layout": layout}

@@ -31,7 +31,7 @@ def make_tar() -> bytes:
 
 
 class Handler(BaseHTTPRequestHandler):
-    """What the path says: good, and every way to be bad."""
+    """Serves the file correctly or with the fault that the path names."""
 
     def do_GET(self) -> None:
         server: Server = self.server
@@ -70,7 +70,7 @@ class Server(ThreadingHTTPServer):
     ranges: list[str | None]
 
     def handle_error(self, *args: object) -> None:
-        """Say nothing of a client that hangs up: some of these tests do."""
+        """Ignore clients that close the connection, as in some tests."""
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ GEOMETRY = MapGeometry(stride=8, sigma=1.3, field_radius=2.5)
 def by_hand(
     keypoints: np.ndarray, objects: np.ndarray, count: int, size: tuple[int, int], g: MapGeometry
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The definition, cell by cell: slow, and written without the code under test."""
+    """Compute the maps cell by cell from their definition."""
     height, width = size
     beliefs = np.zeros((len(keypoints), 9 * count, height, width))
     fields = np.zeros((len(keypoints), 16 * count, height, width))
@@ -44,11 +44,11 @@ def test_maps_agree_with_their_definition():
     """Several images, objects and instances, padding, absent and off-map keypoints."""
     rng = np.random.default_rng(0)
     keypoints = rng.uniform(-30, 150, (3, 4, 9, 2))
-    # Discs overlap, and each corner has its own direction, so it shows whose vector stands.
+    # Discs overlap, and each corner has another direction, so the vector identifies its corner.
     keypoints[0, 1] = keypoints[0, 0] + rng.uniform(-12, 12, (9, 2))
     keypoints[0, 2, 8] = keypoints[1, 0, 3] = np.nan
     keypoints[1, 1, 8] = (900.0, -700.0)
-    # Absent, off the map, and just on it.
+    # Absent keypoints, then keypoints beside and on the border of the map.
     keypoints[2, 2, :5] = [[np.nan, 40], [np.inf, 40], [-0.6, 40], [40, 88], [1e30, 0]]
     keypoints[2, 2, 5:7] = [[-0.4, 40], [40, 87.4]]
     objects = np.array([[0, 0, 1, -1], [1, 1, 1, 0], [-1, -1, 0, 1]])

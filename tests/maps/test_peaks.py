@@ -27,14 +27,14 @@ def gaussians(
 
 
 def positions(peaks: Peaks, channel: int = 0) -> np.ndarray:
-    """Found peaks of the first image's channel in cells, (n, 2)."""
+    """Return the peaks of the first image's channel in cells, (n, 2)."""
     found = peaks.position[0, channel][peaks.score[0, channel] > 0]
     return np.asarray((found - 3.5) / 8)
 
 
 @pytest.mark.parametrize("sigma", [0.5, 1.0, 2.0])
 def test_decoding_an_encoded_pose_finds_its_keypoints(sigma):
-    """Bias under 0.1 px and 99 % of errors under 0.5 px, at the border too."""
+    """The bias is under 0.1 px and 99 % of errors are under 0.5 px, also at the border."""
     rng = np.random.default_rng(0)
     geometry = MapGeometry(stride=8, sigma=sigma)
     cuboid = cuboid_keypoints(np.array([-0.05, -0.03, -0.02]), np.array([0.05, 0.03, 0.02]))
@@ -75,7 +75,7 @@ EQUAL_NEIGHBOURS = [(10.5, 10.0), (10.0, 10.5), (10.5, 10.5), (0.5, 0.0), (28.5,
 @pytest.mark.parametrize("height", [1.0, 1e3, 1e15])
 @pytest.mark.parametrize("centre", BORDER + EQUAL_NEIGHBOURS)
 def test_a_peak_at_any_position_is_exact(centre, height):
-    """An identity activation does not bound beliefs; the fit must not care."""
+    """An identity activation does not bound beliefs; the fit is independent of the height."""
     found = positions(find_peaks(gaussians(centre, height=height), GEOMETRY))
     assert found == pytest.approx(np.array([centre]), abs=1e-3)
 
@@ -83,7 +83,7 @@ def test_a_peak_at_any_position_is_exact(centre, height):
 @pytest.mark.parametrize("height", [1.3, 2.0, 3.0])
 @pytest.mark.parametrize("sigma", [1.0, 1.5])
 def test_a_clamped_belief_has_one_peak_in_the_middle_of_its_top(height, sigma):
-    """The activation cuts beliefs off at 1; the flanks still tell where the peak is."""
+    """The activation clamps beliefs at 1; the flanks still determine the position."""
     rng = np.random.default_rng(1)
     for centre in rng.uniform(5, 25, (40, 2)):
         belief = gaussians((centre[0], centre[1]), sigma=sigma, height=height).clamp(max=1)
@@ -179,7 +179,7 @@ def test_a_constant_map_has_no_peak(value):
 
 @pytest.mark.parametrize("size", [(16, 16), (7, 31), (1, 9), (2, 3)])
 def test_peaks_are_the_highest_cells_of_their_neighbourhoods(size):
-    """As scipy finds them."""
+    """The peaks are SciPy's local maxima."""
     belief = torch.rand(2, 9, *size, generator=torch.Generator().manual_seed(1))
     score = find_peaks(belief, GEOMETRY, threshold=0.3, max_peaks=6).score
     for found, image in zip(score.reshape(18, 6), belief.reshape(18, *size).numpy(), strict=True):
@@ -205,7 +205,7 @@ def test_random_maps_give_finite_positions():
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_the_covariance_of_a_blurred_peak(noise):
-    """Target variance off, the rest is Σ with its xy term; noise of the map alone adds little."""
+    """The covariance is the excess over the target's variance, xy term included."""
     rng, generator = np.random.default_rng(5), torch.Generator().manual_seed(5)
     y, x = np.mgrid[:NUM_CELLS, :NUM_CELLS]
     for _ in range(20):
@@ -233,6 +233,6 @@ def test_the_vector_is_the_mean_of_its_disc():
     toward = keypoints[:, 0, 8:] - keypoints[:, 0, :8]
     expected = torch.nn.functional.normalize(toward, dim=-1).numpy()
     error = peaks.toward[:, :8, 0] - expected
-    # Some eight of the disc's cells count, so a third of one cell's noise is left.
+    # The mean over about eight cells of a disc reduces the noise to a third.
     assert np.sqrt((error**2).mean()) < 0.025
     assert_array_equal(peaks.toward[:, 8], 0)

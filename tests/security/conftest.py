@@ -1,4 +1,4 @@
-"""What every attack has in common: a tripwire, a bound on memory, a good file to spoil."""
+"""Fixtures of attacks: a tripwire, a bound on memory, and a correct file to damage."""
 
 import contextlib
 import copy
@@ -19,14 +19,14 @@ from dopepp.models.network import build_network
 from dopepp.parts.part import Mesh, make_part
 
 MOST_MB = 400
-"""What reading a small hostile file may take; most of it is the first import of a library."""
+"""Memory that reading a small hostile file may take, mostly for first imports of libraries."""
 
 _SPARE_BYTES = 6 * 2**30
-"""A safety belt for the machine the tests run on, where a bomb goes off after all."""
+"""Additional address space, which limits the memory of an undetected bomb."""
 
 
 class Call:
-    """Unpickling it calls a function: what a hostile pickle is made of."""
+    """Calls a function when it is unpickled."""
 
     def __init__(self, function: Callable[..., Any], *arguments: object) -> None:
         self.function, self.arguments = function, arguments
@@ -36,14 +36,14 @@ class Call:
 
 
 def status_bytes(field: str) -> int:
-    """Return a line of this process's status that is in kB."""
+    """Return a field of this process's status, in bytes."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(f"{field}:"))
 
 
 @contextlib.contextmanager
 def within(most_mb: int = MOST_MB) -> Iterator[None]:
-    """Fail where the block takes more memory at its peak, and never take the machine's."""
+    """Fail if the block's peak of memory is above a limit, which also protects the machine."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (status_bytes("VmSize") + _SPARE_BYTES, hard))
     try:
@@ -58,12 +58,12 @@ def within(most_mb: int = MOST_MB) -> Iterator[None]:
 
 @contextlib.contextmanager
 def one_line(match: str) -> Iterator[None]:
-    """Expect one line for the user, within bounded memory."""
+    """Expect a UserError of one line within bounded memory."""
     with within(), pytest.raises(UserError, match=match) as caught:
         yield
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 3000
-    # A bomb that went off and was caught afterwards.
+    # A message about memory would mean that a bomb was caught only after its allocation.
     assert "memory" not in caught.value.got.lower()
     assert "allocat" not in caught.value.got.lower()
 
@@ -87,7 +87,7 @@ def refused():
 
 @pytest.fixture
 def canary(tmp_path):
-    """A command that leaves a trace; at the end of the test there must be none."""
+    """A command that would leave a trace; the end of the test checks that there is none."""
     trace = tmp_path / "canary"
     yield f"touch {trace}"
     assert not trace.exists()
@@ -96,7 +96,7 @@ def canary(tmp_path):
 
 @pytest.fixture(scope="session")
 def content(tiny_spec):
-    """What is in a good checkpoint's file; to be copied before it is changed."""
+    """The content of a correct checkpoint; tests change copies only."""
     spec = tiny_spec | {"attention": {"_target_": "dopepp.models.attention.CBAM", "reduction": 4}}
     vertices = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.05, 0], [0, 0, 0.02]])
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
@@ -109,14 +109,14 @@ def content(tiny_spec):
 
 @pytest.fixture
 def good(content, tmp_path):
-    """A good checkpoint."""
+    """A correct checkpoint."""
     write_atomic(content, tmp_path / "good.ckpt")
     return tmp_path / "good.ckpt"
 
 
 @pytest.fixture
 def saved(content, tmp_path):
-    """Write a good checkpoint that a function has changed."""
+    """Write a correct checkpoint after a function has changed its content."""
 
     def save(edit):
         spoilt = copy.deepcopy(content)
@@ -129,7 +129,7 @@ def saved(content, tmp_path):
 
 @pytest.fixture(scope="session")
 def rejected():
-    """Expect that a checkpoint is not loaded, and one line for the user."""
+    """Expect that loading a checkpoint fails with one line for the user."""
 
     def load(path, match):
         with one_line(match):

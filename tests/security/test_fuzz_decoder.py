@@ -1,4 +1,4 @@
-"""The decoder on maps that no sound network makes: finite detections or a documented error."""
+"""The decoder on arbitrary maps gives finite detections or a documented error."""
 
 from typing import Any, Final
 
@@ -15,7 +15,7 @@ from dopepp.recovery import Detection, explain, recover, recover_batch
 
 QUICK: Final = 40
 THOROUGH: Final = 6000
-"""Maps: a few seconds, and some minutes."""
+"""Numbers of maps, for a few seconds and for some minutes."""
 
 VALUES: Final = (
     0.0, 1.0, -1.0, 0.02, 0.05, 0.5, 1e-30, 1e-7, 1e30, 3e38, -3e38, float("nan"), float("inf"),
@@ -78,7 +78,7 @@ PLAIN: Final[dict[str, Any]] = {
 
 
 def decode(case: dict[str, Any]) -> list[Detection]:
-    """Decode a case; whatever the maps hold, there is an answer."""
+    """Decode a case and check that the result is finite."""
     belief, field = make_maps(case)
     half = np.array(case["half"])
     with np.errstate(invalid="ignore", over="ignore"):
@@ -110,7 +110,7 @@ def check(case: dict[str, Any]) -> None:
 
 
 def sound(case: dict[str, Any]) -> bool:
-    """Tell whether camera and cuboid can be, whatever the maps are."""
+    """Return whether camera and cuboid are valid."""
     fits = case["focal"] in (60.0, 1.0, 1e6) and case["principal"] in (50.0, 0.0)
     return (
         fits and all(length in (0.05, 1e-3, 1.0) for length in case["half"]) and case["centre"] <= 1

@@ -1,4 +1,4 @@
-"""Every reader on damaged and twisted files: a result or one line for the user, nothing else.
+"""Every reader on damaged files returns a result or raises one line for the user.
 
 The same checks run twice: on few files with every test run, and, marked ``slow``, on as many as
 take about ten minutes together with ``test_fuzz_decoder.py``. What such runs find is kept as a case
@@ -50,10 +50,10 @@ from dopepp.parts.part import Mesh, make_part
 
 QUICK: Final = 6
 THOROUGH: Final = 300
-"""Files of each kind: seconds in all, and about ten minutes."""
+"""Numbers of files of each kind, for seconds and for about ten minutes."""
 
 MOST_CHARACTERS: Final = 3000
-"""Of the line for the user."""
+"""Largest length of the line for the user."""
 
 TOKENS: Final = (
     b"nan", b"inf", b"-1", b"1e999", b"9" * 30, b"0", b"", b"null", b"[]", b"{}", b'"', b"\\",
@@ -74,12 +74,12 @@ NAMES: Final = (
     "shards/train_pbr/key_to_shard.json", "shards/train_pbr/shard-000000.tar", "text.ply",
     "text.stl",
 )  # fmt: skip
-"""What is spoilt: a file, or a file of a data set."""
+"""The damaged file: a single file, or a file of a data set."""
 
 
 @st.composite
 def damage(draw: st.DrawFn) -> list[tuple[str, float, bytes | float]]:
-    """What is done to a file, at places that are shares of its length."""
+    """A damage of a file, at positions that are shares of its length."""
     share = st.floats(0, 1, exclude_max=True)
     step = st.one_of(
         st.tuples(st.just("put"), share, st.binary(min_size=1, max_size=4)),
@@ -93,7 +93,7 @@ def damage(draw: st.DrawFn) -> list[tuple[str, float, bytes | float]]:
 
 
 def damaged(content: bytes, steps: list[tuple[str, float, Any]]) -> bytes:
-    """Return a file with its damage."""
+    """Return the damaged content of a file."""
     for kind, share, what in steps:
         start = int(share * len(content))
         if kind == "put":
@@ -118,12 +118,12 @@ def damaged(content: bytes, steps: list[tuple[str, float, Any]]) -> bytes:
 
 @dataclass(frozen=True)
 class Target:
-    """A reader and the good file that is spoilt for it.
+    """A reader and the correct file that is damaged.
 
     Attributes:
-        folder: A good data set, or a folder with the file alone.
-        file: The file, in the folder.
-        reads: Ways to read it, given the folder.
+        folder: A correct data set, or a folder with a single file.
+        file: The damaged file's path in the folder.
+        reads: Functions that read the file, given the folder.
     """
 
     folder: Path
@@ -132,7 +132,7 @@ class Target:
 
 
 def read_all(source: Any) -> None:
-    """Ask a data source for everything it knows."""
+    """Call all methods of a data source."""
     for index in range(len(source)):
         sample = source.sample(index)
         assert np.isfinite(sample.K).all()
@@ -148,7 +148,7 @@ def read_finite_mesh(path: Path) -> None:
 
 
 def images(path: Path) -> tuple[Callable[[Path], object], ...]:
-    """The ways to read an image."""
+    """The readers of an image."""
 
     def picture(folder: Path) -> object:
         try:
@@ -171,7 +171,7 @@ def images(path: Path) -> tuple[Callable[[Path], object], ...]:
 
 @pytest.fixture(scope="session")
 def targets(tmp_path_factory, content):
-    """Good files of every kind."""
+    """Correct files of every kind."""
     root = tmp_path_factory.mktemp("good")
     return {**_files(root, content), **_datasets(root)}
 
@@ -252,7 +252,7 @@ def _extract(path: Path) -> None:
 
 
 def _datasets(root: Path) -> dict[str, Target]:
-    """Write two images in each layout that is written."""
+    """Write two images in each layout with a writer."""
     box = trimesh.creation.box((40.0, 30.0, 20.0))
     part = make_part("obj_000001", Mesh(box.vertices / 1000, box.faces.astype(np.int32)))
     T = np.eye(4)
@@ -285,7 +285,7 @@ def _datasets(root: Path) -> dict[str, Target]:
 
 
 def examine(target: Target, content: bytes, place: Path) -> int:
-    """Read a data set with one file replaced; return how many of its readers took it."""
+    """Read a data set with one file replaced; return how many of its readers accepted the file."""
     folder = place / "spoilt"
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(target.folder, folder)
@@ -307,7 +307,7 @@ def fuzz(target: Target, folder: Path, num_files: int, *, repeat: bool) -> None:
     """Damage a good file in many ways."""
     good = (target.folder / target.file).read_bytes()
     num_taken = examine(target, good, folder)
-    # Not every way to read an image takes every format.
+    # Not every reader of images accepts every format.
     assert num_taken == len(target.reads) or (num_taken and len(target.reads) > 2)
 
     @settings(

@@ -1,4 +1,4 @@
-"""Checkpoints whose archive lies, and checkpoints whose plain values ask for too much."""
+"""Checkpoints with a hostile archive or with values of huge size."""
 
 import struct
 import zipfile
@@ -31,7 +31,7 @@ def pack(path: Path, content: list[tuple[str, bytes]], method: int = zipfile.ZIP
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 @pytest.mark.parametrize("again", ["good/data.pkl", "GOOD/DATA.PKL", "good/data/0"])
 def test_two_members_of_one_name(again, good, tmp_path, rejected):
-    """One reader takes the first of them, another one the last."""
+    """Readers differ in which member of two equal names they read."""
     folder = next(iter(members(good))).split("/")[0]
     content = [(name.replace(folder, "good"), data) for name, data in members(good).items()]
     path = pack(tmp_path / "bad.ckpt", [*content, (again, b"\x80\x02N.")])
@@ -45,7 +45,7 @@ def test_two_pickles_in_two_folders(good, tmp_path, rejected):
 
 
 def test_an_archive_after_other_bytes(good, tmp_path, rejected):
-    """torch would read what comes first, which nobody has looked at."""
+    """torch would read the first pickle, which was not checked."""
     path = tmp_path / "bad.ckpt"
     for first in (b"\x80\x02}.", b"#!/bin/sh\n", bytes(512)):
         path.write_bytes(first + good.read_bytes())
@@ -68,7 +68,7 @@ def test_a_zip_bomb(method, tmp_path, rejected):
 
 
 def test_a_wrong_declared_size(tmp_path, rejected):
-    """The directory says 10 bytes, or 10 terabytes, of a member of a thousand."""
+    """The directory states 10 bytes or 10 terabytes for a member of 1,000 bytes."""
     path = pack(tmp_path / "bad.ckpt", [("a/data.pkl", bytes(1000))])
     content = bytearray(path.read_bytes())
     entry = content.rindex(b"PK\x01\x02")
@@ -79,7 +79,7 @@ def test_a_wrong_declared_size(tmp_path, rejected):
 
 
 def test_overlapping_members(tmp_path, rejected):
-    """A thousand entries of the directory that share one member's bytes."""
+    """A thousand entries of the directory share the bytes of one member."""
     path = pack(tmp_path / "one.ckpt", [("a/data/0", bytes(100_000))])
     content = path.read_bytes()
     first, end = content.index(b"PK\x01\x02"), content.index(b"PK\x05\x06")
@@ -92,7 +92,7 @@ def test_overlapping_members(tmp_path, rejected):
 
 
 def laughs(width: int = 10, depth: int = 12) -> list[Any]:
-    """A list that takes a kilobyte, and a terabyte where it is printed."""
+    """A list of one kilobyte whose text has a terabyte."""
     value: list[Any] = ["ha"]
     for _ in range(depth):
         value = [value] * width

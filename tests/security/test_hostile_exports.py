@@ -1,4 +1,4 @@
-"""Exported files whose graph, constants or description lie."""
+"""Exported files with a hostile graph, constants or description."""
 
 import json
 import re
@@ -31,7 +31,7 @@ def payload(content):
 
 @pytest.fixture(scope="module")
 def model(payload):
-    """The smallest graph that answers maps: eight by eight pixels' mean, and two 1×1 layers."""
+    """The smallest graph that returns maps: the mean of 8×8 pixels, and two 1×1 layers."""
     rng = np.random.default_rng(0)
     weights = {
         f"{name}_weight": rng.normal(size=(channels, 3, 1, 1)).astype(np.float32)
@@ -91,7 +91,7 @@ def external_constant(graph):
 
 
 def behind(graph, *nodes):
-    """Put nodes in front of the pooling; the last one answers ``floats``."""
+    """Put nodes in front of the pooling; the last node returns ``floats``."""
     graph.node[0].output[0] = "before"
     for number, node in enumerate(nodes, 1):
         graph.node.insert(number, node)
@@ -121,7 +121,7 @@ def filled(graph):
 
 
 def by_value(graph):
-    """A size that only the pixels tell."""
+    """A size that depends on the pixels."""
     graph.node.append(node("NonZero", ["pixels"], "anywhere"))
 
 
@@ -260,14 +260,14 @@ def test_other_files_than_onnx(spoilt, good, tmp_path, rejected):
 
 
 def test_a_description_builds_nothing(payload, canary):
-    """Parsing alone trusts no target: only :func:`build_network` would, behind its gate."""
+    """Parsing imports no target; only :func:`build_network` does, after checking the target."""
     described = parse_description(payload | {"data": {"masking": ATTACK | {"command": canary}}})
     assert described.state_dict == {}
 
 
 @pytest.fixture(scope="module")
 def translated(model, tmp_path_factory):
-    """The same model, as OpenVINO writes it."""
+    """The same model, written by OpenVINO."""
     pytest.importorskip("openvino")
     from dopepp.inference.runtimes.openvino import load_openvino
 

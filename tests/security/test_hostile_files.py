@@ -1,4 +1,4 @@
-"""Images, meshes, archives, tables and records from anybody: attacks beside plain damage."""
+"""Hostile and damaged images, meshes, archives, tables and records."""
 
 import gzip
 import io
@@ -37,7 +37,7 @@ def chunk(name: bytes, data: bytes) -> bytes:
 
 
 def png(width: int, height: int, *chunks: bytes, depth: int = 8, colour: int = 2) -> bytes:
-    """A PNG file with a header of one's choice."""
+    """Return a PNG file with any header."""
     header = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
     body = b"".join([chunk(b"IHDR", header), *chunks, chunk(b"IEND", b"")])
     return b"\x89PNG\r\n\x1a\n" + body
@@ -50,7 +50,7 @@ def encoded(kind: str, image: Image.Image, **options: Any) -> bytes:
 
 
 def jpeg_of(width: int, height: int) -> bytes:
-    """A small JPEG whose frame header claims another size."""
+    """Return a small JPEG whose frame header states another size."""
     content = bytearray(encoded("JPEG", Image.new("RGB", (8, 8))))
     frame = content.index(b"\xff\xc0")
     content[frame + 5 : frame + 9] = struct.pack(">HH", height, width)
@@ -58,7 +58,7 @@ def jpeg_of(width: int, height: int) -> bytes:
 
 
 def tiff(**fields: tuple[int, int, int]) -> bytes:
-    """A TIFF file with directory entries of one's choice: (type, count, value) by tag."""
+    """Return a TIFF file with any directory entries: (type, count, value) by tag."""
     entries = b"".join(
         struct.pack("<HHII", int(tag[1:]), *entry) for tag, entry in sorted(fields.items())
     )
@@ -108,7 +108,7 @@ IMAGES: dict[str, Any] = {  # bytes, or what makes them, where that takes long
 
 
 def made(content: Any) -> bytes:
-    """Return the bytes of a file, which may be made only now."""
+    """Return the bytes of a file, calling the function that makes a large file."""
     return bytes(content() if callable(content) else content)
 
 
@@ -244,7 +244,7 @@ def tar(*entries: tarfile.TarInfo, content: bytes = b"") -> bytes:
 
 
 def pax(records: dict[str, str]) -> bytes:
-    """A member whose extended header says something else than the plain one."""
+    """Return a member whose extended header contradicts its plain header."""
     lines = b""
     for key, value in records.items():
         body = f" {key}={value}\n".encode()
@@ -297,7 +297,7 @@ def test_hostile_archives(name, tmp_path, refused):
 
 @pytest.mark.parametrize("name", [name for name in ARCHIVES if "folder" not in name])
 def test_hostile_shards(name, tmp_path, bounded):
-    """A shard is never unpacked; what is in it may be refused or passed over."""
+    """A shard is never unpacked; its hostile members are rejected or skipped."""
     path = tmp_path / "shard-000000.tar"
     path.write_bytes(made(ARCHIVES[name]))
     line = ""

@@ -1,4 +1,4 @@
-"""Checkpoints whose pickle runs code, or asks torch for more than the file holds."""
+"""Checkpoints whose pickle runs code, or allocates more than the file contains."""
 
 import builtins
 import importlib
@@ -22,7 +22,7 @@ from dopepp.models.backbones import VGG19
 pytestmark = pytest.mark.timeout(60)
 
 SIZE = 10**9
-"""Bytes that a bomb asks for: seen at once, and borne by the machine if it goes off."""
+"""Bytes that a bomb allocates: enough to be detected, and little enough for the machine."""
 
 
 def first_weight(content: dict[str, Any]) -> str:
@@ -47,7 +47,7 @@ PLACES = {
 
 @pytest.fixture
 def write(saved):
-    """Write a checkpoint with something bad at a place."""
+    """Write a checkpoint with a hostile object at a position."""
     return lambda place, bad: saved(lambda content: PLACES[place](content, bad))
 
 
@@ -82,7 +82,7 @@ def test_torch_load_inside_of_a_checkpoint(write, Call, canary, rejected, tmp_pa
 
 
 class Subclass(torch.Tensor):
-    """A tensor of somebody's own class."""
+    """A tensor of an unknown class."""
 
 
 def test_a_tensor_of_another_class(write, rejected):
@@ -92,7 +92,7 @@ def test_a_tensor_of_another_class(write, rejected):
 
 
 def test_methods_set_on_a_tensor(write, Call, content, rejected):
-    """``_rebuild_from_type_v2`` sets any attribute, as one that a check would ask for."""
+    """``_rebuild_from_type_v2`` sets any attribute, also an attribute that a check reads."""
     weight = content["state_dict"][first_weight(content)]
     make, arguments, *_ = weight.__reduce_ex__(2)
     rebuild = torch._tensor._rebuild_from_type_v2
@@ -115,7 +115,7 @@ BOMBS = {
 @pytest.mark.parametrize("name", BOMBS)
 @pytest.mark.parametrize("place", ["data", "optimizer state"])
 def test_a_call_that_allocates_huge_memory(name, place, write, Call, rejected):
-    """torch's own list of harmless calls has some that allocate what their argument says."""
+    """torch's list of safe calls includes calls that allocate any given size."""
     try:
         path = write(place, BOMBS[name](Call))
     except NotImplementedError:  # torch cannot write a bare storage
@@ -125,7 +125,7 @@ def test_a_call_that_allocates_huge_memory(name, place, write, Call, rejected):
 
 
 def repacked(source: Path, target: Path, edit: Callable[[str, bytes], bytes]) -> Path:
-    """Copy a torch file, its members changed."""
+    """Copy a torch file with changed members."""
     with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
         for name in old.namelist():
             new.writestr(name, edit(name, old.read(name)))
@@ -133,7 +133,7 @@ def repacked(source: Path, target: Path, edit: Callable[[str, bytes], bytes]) ->
 
 
 def test_a_storage_that_reaches_beyond_its_bytes(tmp_path, rejected):
-    """Some versions of torch would read on in memory."""
+    """Some versions of torch would read beyond the storage."""
     torch.save({"dopepp": torch.arange(200.0)}, tmp_path / "good.ckpt")
 
     def enlarge(name, content):
@@ -179,14 +179,14 @@ def test_operations_that_no_checkpoint_needs(name, good, tmp_path, rejected):
 
 
 def storage_reference(count: int) -> bytes:
-    """The operations that refer to a storage of so many float32 numbers."""
+    """Return the operations that refer to a storage of this many float32 numbers."""
     number = b"\x8a\x08" + struct.pack("<q", count)
     storage = b"X\x07\x00\x00\x00storagectorch\nFloatStorage\nX\x01\x00\x00\x000"
     return b"(" + storage + b"X\x03\x00\x00\x00cpu" + number + b"NtQ"
 
 
 def legacy(content: bytes) -> bytes:
-    """Make a file of torch before 1.6: five pickles, then the numbers."""
+    """Make a file of torch before 1.6: five pickles, followed by the numbers."""
     magic = pickle.dumps(0x1950A86A20F9469CFC6C, 2)
     machine = pickle.dumps({"protocol_version": 1001, "little_endian": True, "type_sizes": {}}, 2)
     return magic + pickle.dumps(1001, 2) + machine + content + pickle.dumps(["0"], 2) + bytes(8)
@@ -213,7 +213,7 @@ LEGACY = {
 
 @pytest.mark.parametrize("name", LEGACY)
 def test_hostile_pretrained_weights(name, tmp_path, Call, canary, refused):
-    """Pretrained backbones come from anywhere, and torchvision's own is of the old format."""
+    """Pretrained weights are untrusted, and torchvision's file has the old format."""
     path = tmp_path / "vgg19.pth"
     path.write_bytes(LEGACY[name](Call, canary))
     with refused(r"vgg19\.pth, which torch cannot load"):

@@ -1,4 +1,4 @@
-"""Run folders from somebody else: what resuming, evaluating and comparing them may do."""
+"""Resuming, evaluating and comparing untrusted run folders."""
 
 import pytest
 
@@ -10,7 +10,7 @@ pytestmark = pytest.mark.timeout(120)
 
 @pytest.fixture
 def told(bounded, call, tmp_path, monkeypatch):
-    """Run ``train.py`` or ``evaluate.py`` and return the one line that it ends in."""
+    """Run ``train.py`` or ``evaluate.py``, and return its error of one line."""
     monkeypatch.chdir(tmp_path)
 
     def run(script, *arguments):
@@ -106,7 +106,7 @@ STORED = {
 
 @pytest.mark.parametrize("name", STORED)
 def test_a_checkpoint_with_invalid_data_settings(name, saved, told, tmp_path):
-    """``evaluate.py`` takes the data from the checkpoint: what is wrong there is one line, too."""
+    """``evaluate.py`` reads the data settings of the checkpoint; wrong settings give one line."""
     data = {"name": "x", "seed": 0, "config": STORED[name]}
     path = saved(lambda content: content["dopepp"].update(data=data))
     told("evaluate.py", f"ckpt_path={path}", f"output_dir={tmp_path / 'o'}")

@@ -1,4 +1,4 @@
-"""Safetensors files whose header lies, and those that are written and read as they should be."""
+"""Safetensors files: wrong headers, and round trips."""
 
 import json
 
@@ -17,7 +17,7 @@ A = {"dtype": "F32", "shape": [2], "data_offsets": [0, 8]}
 
 
 def packed(header: object, data: bytes = bytes(8), length: int | None = None) -> bytes:
-    """Put a file together by the format's description."""
+    """Assemble a file according to the format's description."""
     text = header if isinstance(header, bytes) else json.dumps(header).encode()
     return (len(text) if length is None else length).to_bytes(8, "little") + text + data
 

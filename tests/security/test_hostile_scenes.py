@@ -1,4 +1,4 @@
-"""GLB, 3MF and OFF files from anybody: bombs, links, lies, and assemblies without an end."""
+"""Hostile GLB, 3MF and OFF files: bombs, links, wrong counts and endless assemblies."""
 
 import io
 import json
@@ -22,7 +22,7 @@ BINARY = CORNERS + HALVES
 
 
 def glb(binary: bytes = BINARY, **changes: Any) -> bytes:
-    """A GLB file of one triangle, with other top-level fields."""
+    """Return a GLB file of one triangle with changed top-level fields."""
     header: dict[str, Any] = {
         "asset": {"version": "2.0"},
         "scenes": [{"nodes": [0]}],
@@ -42,7 +42,7 @@ def glb(binary: bytes = BINARY, **changes: Any) -> bytes:
 
 
 def linked(uri: str) -> bytes:
-    """A triangle whose corners lie elsewhere."""
+    """Return a triangle whose corners are in another file."""
     return glb(buffers=[{"byteLength": 60, "uri": uri}])
 
 
@@ -60,7 +60,7 @@ def array(**changes: Any) -> list[dict[str, Any]]:
 
 
 def textured(image: bytes) -> bytes:
-    """A triangle whose texture lies behind its corners."""
+    """Return a triangle whose texture follows its corners."""
     views = [
         {"buffer": 0, "byteLength": 36},
         {"buffer": 0, "byteOffset": 36, "byteLength": 24},
@@ -78,7 +78,7 @@ def textured(image: bytes) -> bytes:
 
 
 def png(side: int) -> bytes:
-    """A PNG file that claims to be larger than it is."""
+    """Return a PNG file whose header states a larger size."""
     parts = (
         (b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)),
         (b"IDAT", zlib.compress(bytes(9))),
@@ -111,7 +111,7 @@ def archive(**members: bytes) -> bytes:
 
 
 def one_model(resources: str, build: str = '<item objectid="1"/>', before: str = "") -> bytes:
-    """A 3MF file of a root model alone."""
+    """Return a 3MF file that consists of a root model."""
     return archive(model=model(resources, build, before))
 
 
@@ -125,7 +125,7 @@ def assembly(number: int, *parts: int) -> str:
 
 
 def lying_archive() -> bytes:
-    """A 3MF file whose directory says that it unpacks to 100 bytes."""
+    """Return a 3MF file whose directory states an unpacked size of 100 bytes."""
     content = archive(model=model(body(1)) + b" " * 30_000_000)
     size = struct.pack("<I", len(model(body(1))) + 30_000_000)
     assert size in content

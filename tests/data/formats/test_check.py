@@ -1,4 +1,4 @@
-"""``dopepp check``: good sets are clean, each damage is found, and the reader refuses it alike."""
+"""``dopepp check``: correct data sets pass, and check and reader report each damage."""
 
 import io
 import json
@@ -36,11 +36,11 @@ NOISE = np.random.default_rng(9).integers(0, 255, (SIZE, SIZE, 3), np.uint8)
 
 
 class Case(NamedTuple):
-    """A damage: what is spoilt, with what, and what the check says of it.
+    """A damage and the check's report.
 
-    ``place`` is a file, with a colon and the keys of a value in its JSON. A ``value`` of None
-    removes it, a function changes it, an array is an image. The reader refuses the damage with
-    file and field unless ``is_read``.
+    ``place`` is a file or, after a colon, the keys of a value in its JSON. A ``value`` of None
+    removes the file or value, a function changes it, and an array is an image. The reader rejects
+    the damage with file and field unless ``is_read``.
     """
 
     place: str
@@ -50,7 +50,7 @@ class Case(NamedTuple):
 
 
 def read(place: str, value: Any, found: str) -> Case:
-    """Make a damage that the reader copes with or cannot see."""
+    """Return a damage that the reader accepts or does not read."""
     return Case(place, value, found, is_read=True)
 
 
@@ -78,7 +78,7 @@ def spoil(root: Path, place: str, value: Any) -> None:
 
 
 def spoil_shard(root: Path, place: str, value: Any) -> None:
-    """Spoil a member of the shard's first image, in its place: an image's members lie together."""
+    """Damage a member of the shard's first image; the order of the members is kept."""
     name, _, keys = f"{FIRST}.{place}".partition(":")
     members = members_of(root / SHARD)
     members = {n: spoilt(c, keys, value) if n == name else c for n, c in members.items()}
@@ -343,7 +343,7 @@ LAYOUTS = {
 
 @pytest.fixture(scope="session")
 def good_sets(tmp_path_factory, boxes, write_set):
-    """A clean data set of each layout that is written, never to be changed."""
+    """A correct data set of each layout with a writer; tests change copies only."""
     root = tmp_path_factory.mktemp("good")
     for layout, (_, writer, _, _) in LAYOUTS.items():
         write_set(writer, root / layout, *boxes)
@@ -368,7 +368,7 @@ def test_a_correct_data_set_has_no_defects_at_any_level(good_sets, layout, below
 
 
 def assert_found(root: Path, *expected: str) -> None:
-    """Each damage is among the defects, with its file and field."""
+    """Check that the defects contain each damage with its file and field."""
     report = check_dataset(root)
     lines = report.defects
     for text in expected:
@@ -377,7 +377,7 @@ def assert_found(root: Path, *expected: str) -> None:
 
 
 def assert_refused(make_reader: Callable[[], Any], expected: str) -> None:
-    """The reader says in one line what the check finds, with file and field."""
+    """Check that the reader raises the check's message in one line, with file and field."""
 
     def read_all() -> None:
         reader = make_reader()
@@ -408,9 +408,9 @@ def test_check_and_reader_report_every_damage_with_file_and_field(copy_of, boxes
 INDEPENDENT = [
     ("BOP", ("rgb cut", "depth missing", "mask cut", "rotation scaled", "behind", "metres",
              "no camera", "diameter and box", "model cut", "K short", "fraction")),
-    # A number that is not finite makes the file no JSON, and its other records are checked still.
+    # NaN is not valid JSON, but the file's other records are checked.
     ("BOP", ("behind", "gt NaN")),
-    # Without a location, a projection would have nothing to be compared with.
+    # Without a location, no projection can be checked.
     ("NDDS", ("image cut", "depth missing", "seg size", "NaN", "unknown class", "no rotation",
               "visibility", "size", "settings class", "pose transform")),
 ]  # fmt: skip
@@ -546,7 +546,7 @@ def test_conventions_of_a_whole_data_set_are_notes(copy_of, field, change, note)
 
 
 def test_opengl_files_without_cuboids_have_no_defects(copy_of):
-    """As old nvisii writes them: y up, z backwards, projections and nothing in 3-D."""
+    """Files of old nvisii: y up, z backwards, projections and no cuboid in space."""
     root = copy_of("NDDS")
     (root / SETTINGS).unlink()
     for path in root.glob("0*.json"):
@@ -592,7 +592,7 @@ def ycb(ycb_tree):
 
 
 def poses(**changes: Any) -> Callable[[Any], None]:
-    """Write the frame again with a pose's elements changed: ``R00=2``, ``tz=-1``."""
+    """Write the frame with changed elements of its pose: ``R00=2``, ``tz=-1``."""
 
     def damage(tree: Any) -> None:
         stack = tree.write(FRAME)
@@ -634,7 +634,7 @@ YCB_VIDEO = {
         lambda tree: tree.write_list("train", ["0000/x"]), "image_sets/train.txt: line: line '0000"
     ),
 }  # fmt: skip
-"""What the check finds and the reader refuses."""
+"""Damages that the check reports and the reader rejects."""
 
 YCB_VIDEO_READ = {
     "colour missing": (file("color.png", None), "color.png: file: missing"),
@@ -664,7 +664,7 @@ YCB_VIDEO_READ = {
         lambda tree: tree.write_list("classes", ["003_box", "003_box"]), "classes.txt: names: "
     ),
 }  # fmt: skip
-"""What only the check finds, or the reader says in other words."""
+"""Damages that only the check reports, or the reader reports with another message."""
 
 
 @pytest.mark.parametrize("name", [*YCB_VIDEO, *YCB_VIDEO_READ])

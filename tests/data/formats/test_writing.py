@@ -1,4 +1,4 @@
-"""What the writers write: clean, without torch, and whole with several processes in one folder."""
+"""Writers: without defects, without torch, and safe with several processes in one folder."""
 
 import multiprocessing
 import pickle

@@ -1,4 +1,4 @@
-"""Processes of this machine and a Ray cluster write one set of bytes."""
+"""Pools of processes and Ray clusters write the same bytes."""
 
 import os
 import pickle

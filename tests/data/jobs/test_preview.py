@@ -1,4 +1,4 @@
-"""The sheet that a user looks at before rendering thousands."""
+"""The preview sheet of a render job."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""Render jobs in one process: resuming, shards, records, a full disk. Processes: see the others."""
+"""Render jobs in one process: resuming, shards, records and a full disk."""
 
 import errno
 import json
@@ -34,7 +34,7 @@ NUM = 10
 
 
 class InlinePool(Pool):
-    """Does every task at once, here; dies after some."""
+    """Performs tasks in this process; may be interrupted after some tasks."""
 
     batch_size = 2
 
@@ -60,7 +60,7 @@ class InlinePool(Pool):
 
 @pytest.fixture(scope="module", params=WRITERS)
 def layout(request):
-    """Each layout in turn, with small chunks."""
+    """A layout, with chunks of four images."""
     module, name = WRITERS[request.param]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(f"{module}.{name}.chunk_size", 4)
@@ -74,7 +74,7 @@ def job(layout, small_job):
 
 @pytest.fixture(scope="module")
 def whole(job, contents, tmp_path_factory):
-    """Read the files of a job that nobody stopped."""
+    """The files of a job that ran without an interruption."""
     root = tmp_path_factory.mktemp("whole")
     report = render_dataset(job, root, NUM, InlinePool)
     assert (report.num_images, report.num_rendered) == (NUM, NUM)
@@ -101,7 +101,7 @@ def test_a_job_can_be_extended(job, tmp_path, contents, whole):
 
 
 def test_simultaneous_shards_share_a_folder(job, tmp_path, contents, whole):
-    # They begin and end within chunks: the last to finish finalizes what it shares with others.
+    # Shards begin and end within chunks; the last shard of a chunk finalizes it.
     others = []
 
     def run_others(done, total):
@@ -126,7 +126,7 @@ def test_shards_of_separate_folders_are_merged_by_copying(job, tmp_path, content
 def test_a_full_disk_gives_one_line_and_no_partial_file(
     job, tmp_path, monkeypatch, contents, whole
 ):
-    # Room for the parts' meshes, and for half of all else.
+    # Enough space for the parts' meshes and for half of the other files.
     write = Path.write_bytes
     room = [sum(len(whole[name]) for name in whole if not name.startswith("models")) // 2]
 
@@ -218,7 +218,7 @@ def test_only_abandoned_partial_files_are_removed(tmp_path, small_job):
         path.touch()
     os.utime(old, (0, 0))
     render_dataset(job, tmp_path, 2, InlinePool)
-    # Of the first one the process runs; on another machine somebody may be writing the third.
+    # The process of the first file runs. Another machine may still write the third file.
     assert [path.exists() for path in (mine, dead, elsewhere, old)] == [True, False, True, False]
 
 

@@ -1,4 +1,4 @@
-"""Render jobs that die for real: killed at random moments."""
+"""Render jobs whose processes are killed at random moments."""
 
 import os
 import random
@@ -31,7 +31,7 @@ def run(out: Path, layout: str, workers: int) -> None:
 
 
 def wait_for_group(process: int) -> None:
-    """Wait until nobody of a process group is left."""
+    """Wait until all processes of a group have ended."""
     for _ in range(600):
         try:
             os.killpg(process, 0)
@@ -53,11 +53,11 @@ def test_a_job_killed_at_random_moments_writes_the_same_files(layout, tmp_path, 
             start_new_session=True, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
         )  # fmt: skip
         before = len(contents(out)) if out.exists() else 0
-        # From the first new file on, at any moment: while images are written, or chunks finalized.
+        # Killed at any moment after the first new file, while writing images or finalizing chunks.
         while process.poll() is None and (not out.exists() or len(contents(out)) <= before):
             time.sleep(0.01)
         time.sleep(rng.uniform(0, 0.5))
-        # Ctrl-C and a scheduler's signal reach the whole group; the first kill the parent alone.
+        # Ctrl-C and a scheduler's signal reach the group; the first kill reaches the parent only.
         (os.killpg if place else os.kill)(process.pid, number)
         _, err = process.communicate(timeout=60)
         codes.append(process.returncode)
@@ -65,7 +65,7 @@ def test_a_job_killed_at_random_moments_writes_the_same_files(layout, tmp_path, 
         if process.returncode > 0:
             assert err == "interrupted; run the same command again to continue\n"
             assert not list(out.rglob("*.partial"))
-    # A run that was done before its signal came is no failure of the job.
+    # A run may end before its signal arrives.
     allowed = {signal.SIGKILL: -9, signal.SIGINT: 130, signal.SIGTERM: 143}
     for code, number in zip(codes, kinds, strict=True):
         assert code in (allowed[number], 0)

@@ -58,7 +58,7 @@ def test_shares_are_exact_and_items_used_equally(real, virtual, synthetic, fract
         assert abs(counts["synthetic"] - expected) <= 0.5
         assert (counts["real"], counts["virtual"], counts["synthetic"]) == mix.counts
         used.update((name, key.partition("/")[2]) for name, key in epoch_items)
-        # An (epoch, index) of a source never comes twice, so no background or render repeats.
+        # No (epoch, index) of a source is repeated, so no background or render is.
         assert len(set(epoch_items)) == length
     for source in (real, virtual):
         uses = [used[source.name, str(i)] for i in range(len(source))]

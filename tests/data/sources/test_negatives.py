@@ -15,7 +15,7 @@ SIZE = 64, 48
 
 @pytest.fixture
 def folder(tmp_path):
-    """Images of the camera's own size, which fast compression leaves as they are."""
+    """Images of the camera's size, as PNG."""
     rng = np.random.default_rng(0)
     for number in range(4):
         noise = rng.integers(0, 256, (SIZE[1], SIZE[0], 3), np.uint8)
@@ -49,12 +49,12 @@ def test_the_second_round_is_mirrored_and_further_rounds_show_regions(folder):
 
 
 def test_a_larger_image_is_cropped_at_its_centre(tmp_path):
-    # Brightness grows along x and y, so that the corners state their place.
+    # The colour of a pixel encodes its position.
     y, x = np.mgrid[0:480, 0:800]
     picture = np.stack([x / 4, y / 4, 0 * x], axis=2).astype(np.uint8)
     assert cv2.imwrite(str(tmp_path / "wide.png"), picture[..., ::-1])
     image = PhotoFrames(PhotoBackgrounds(tmp_path), K, SIZE).sample(0).image.astype(float)
-    # The frame's aspect ratio is 4:3, of 480 rows these are 640 columns from column 80 on.
+    # At the frame's aspect ratio of 4:3, 480 rows have 640 columns, from column 80 on.
     np.testing.assert_allclose(image[0, 0, :2], (20, 0), atol=2)
     np.testing.assert_allclose(image[-1, -1, :2], (180, 120), atol=2)
 

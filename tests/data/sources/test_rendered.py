@@ -29,7 +29,7 @@ def test_sample_agrees_with_the_scene(factory):
     )
     np.testing.assert_allclose(instance.keypoints, expected[:, 0], atol=1e-6)
     assert instance.visible_fraction == rendered.visible_fractions[target]
-    # What is seen of the part lies inside the hull of its cuboid's corners.
+    # The visible pixels lie inside the hull of the cuboid's corners.
     hull = cv2.convexHull(instance.keypoints[:8].astype(np.float32))
     rows, columns = np.nonzero(instance.mask)
     inside = [

@@ -1,4 +1,4 @@
-"""Windows of frames: geometry, chance and what is left of objects that a window cuts."""
+"""Windows of frames: geometry, random positions and visible fractions of cut objects."""
 
 import numpy as np
 import pytest

@@ -25,7 +25,7 @@ def factory():
 
 
 def posed(rng: np.random.Generator) -> tuple[Sample, np.ndarray]:
-    """Return a grey image, of a camera whose pixels are not square, and its object's points."""
+    """Return a grey image of a camera with rectangular pixels, and its object's points."""
     K = np.array([[300.0, 0, 70], [0, 280, 40], [0, 0, 1]])
     T_cam_obj = make_transform(random_rotation(rng), np.array([0.02, -0.03, 0.6]))
     corners = rng.uniform(-0.05, 0.05, (9, 3))

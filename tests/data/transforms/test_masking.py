@@ -1,4 +1,4 @@
-"""Patches over objects: those of training, and the shading protocol's, by brute force."""
+"""Patches of random masks and of the shading protocol, compared with brute force."""
 
 from itertools import pairwise
 
@@ -17,7 +17,7 @@ SIZE = (72, 96)
 
 
 class Stripes:
-    """Another image that is told from any other by its colours 200 and 220."""
+    """Background images of the colours 200 and 220, which no other image has."""
 
     calls = 0
 
@@ -70,7 +70,7 @@ def test_bounds_share_and_origin_of_the_patch(mask, limit, seed):
     if min(int(limit * (bottom - top)), int(limit * (right - left))) < 2:
         np.testing.assert_array_equal(result.image, before)
         return
-    # The object's colour occurs nowhere else, so what is gone from it was covered.
+    # The object's colour occurs only on the object, so its missing pixels are covered.
     gone = mask & (result.image != (255, 0, 255)).any(axis=2)
     assert instance.masked_fraction == np.count_nonzero(gone) / np.count_nonzero(mask)
     assert instance.visible_fraction == pytest.approx(0.8 * (1 - instance.masked_fraction))
@@ -82,7 +82,7 @@ def test_bounds_share_and_origin_of_the_patch(mask, limit, seed):
         assert left <= start < stop <= right
         assert last - first <= limit * (bottom - top)
         assert stop - start <= limit * (right - left)
-        # Background never holds the object's colour, neither does another image.
+        # Neither the background nor another image has the object's colour.
         patch = result.image[first:last, start:stop]
         assert (patch != (255, 0, 255)).any(axis=2).all()
         assert patch.reshape(-1, 3).std(axis=0).max() > 0
@@ -115,7 +115,7 @@ def test_the_crop_comes_from_the_images_background():
 
 
 def test_the_crop_shrinks_to_fit_the_background():
-    # Three columns of background are left: no patch of this part is so narrow.
+    # The background has three columns, and every patch of this part is wider.
     mask = np.ones(SIZE, bool)
     mask[:, :3] = False
     own = {tuple(pixel) for pixel in sample_of(mask).image[~mask]}
@@ -190,13 +190,13 @@ def test_shares_outside_0_to_1_are_rejected(field):
 
 
 OBJECT_BLUE = 255
-# Shuffled, so that neighbours differ enough for any crop to have contrast.
+# Shuffled, so that every crop has contrast.
 ROWS, COLUMNS = (np.random.default_rng(length).permutation(length) for length in SIZE)
 SHARES = (0.2, 0.4, 0.6, 0.8)
 
 
 def addressed(*masks: np.ndarray) -> Sample:
-    """An image whose background pixels tell their row (red) and column (green)."""
+    """An image whose background pixels encode their row (red) and column (green)."""
     rows, columns = np.meshgrid(ROWS, COLUMNS, indexing="ij")
     image = np.stack([rows, columns, np.zeros_like(rows)], axis=2).astype(np.uint8)
     for mask in masks:
@@ -212,7 +212,7 @@ def is_object(image: np.ndarray) -> np.ndarray:
 
 
 def source_of(pixels: np.ndarray) -> np.ndarray:
-    """Return the row and column that background pixels were taken from."""
+    """Return the source row and column of pasted background pixels."""
     return np.column_stack([np.argsort(ROWS)[pixels[:, 0]], np.argsort(COLUMNS)[pixels[:, 1]]])
 
 
@@ -240,7 +240,7 @@ def test_the_share_is_reached_inside_the_box(mask, share, seed):
     np.testing.assert_array_equal(instance.mask, mask & left)
     assert instance.masked_fraction == covered
     assert instance.visible_fraction == pytest.approx(0.7 * (1 - covered))
-    # What a patch hides has no known depth.
+    # Depth is unknown under a patch.
     assert not shaded.sample.depth[mask & ~left].any()
     assert shaded.sample.depth[left].all()
 
@@ -256,7 +256,7 @@ def test_patches_are_several_crops_of_the_images_background(seed):
     source = source_of(pasted)
     assert (pasted[:, 2] == 0).all()
     assert not mask[source[:, 0], source[:, 1]].any()
-    # A crop keeps one offset between where it was taken and where it lies.
+    # All pixels of a crop have the same offset from their source.
     offsets = source - np.column_stack([rows, columns])
     patches = np.unique(offsets, axis=0)
     assert len(patches) >= 3
@@ -316,7 +316,7 @@ def test_instances_without_visible_pixels_are_not_shaded():
     assert shaded.reached[0] == pytest.approx(0.6, abs=TOLERANCE)
     assert shaded.reached[1:] == (None, None)
     assert shaded.sample.instances[1:] == sample.instances[1:]
-    # The unlabelled object's hull is no background to take crops from, either.
+    # Crops avoid the hull of the unlabelled object, too.
     pasted = shaded.sample.image[mask & ~is_object(shaded.sample.image)]
     taken_from = source_of(pasted)
     inside = (taken_from[:, 0] >= 20) & (taken_from[:, 0] <= 60)

@@ -70,7 +70,7 @@ def test_vertex_normals_are_weighted_by_angle(tmp_path):
     write_models(tmp_path, [make_part("box", mesh)])
     content = (tmp_path / "models" / "obj_000001.ply").read_bytes().partition(b"end_header\n")[2]
     columns = np.frombuffer(content, "<f4", 6 * 8).reshape(8, 6)
-    # Two triangles or one at a corner of a face: only the angle makes all three axes equal.
+    # A corner has one or two triangles of each face; weights by angle make the three axes equal.
     np.testing.assert_allclose(columns[:, 3:], box.vertices / (0.01 * np.sqrt(3)), atol=1e-6)
 
 

@@ -23,7 +23,7 @@ from dopepp.data.formats.images import decode_mask, decode_rgb, encode_png
 
 K = [100.0, 0.0, 31.5, 0.0, 101.0, 23.5, 0.0, 0.0, 1.0]
 R = [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
-"""Row by row: x_cam = −y_obj, y_cam = x_obj."""
+"""Rotation, row by row: x_cam = −y_obj, y_cam = x_obj."""
 
 
 def truth(number: int, t: tuple[float, float, float] = (5.0, -10.0, 250.0)) -> dict[str, Any]:
@@ -31,7 +31,7 @@ def truth(number: int, t: tuple[float, float, float] = (5.0, -10.0, 250.0)) -> d
 
 
 class Scene:
-    """Writes a scene by hand with literal numbers, without the package's own writer."""
+    """Writes a scene from literal numbers, without dopepp's writer."""
 
     def __init__(self, root: Path, split: str = "test", number: int = 1) -> None:
         self.root, self.folder = root, root / split / f"{number:06d}"
@@ -57,7 +57,7 @@ class Scene:
 
 @pytest.fixture
 def scene(tmp_path):
-    """Two images: one with two blocks, one without."""
+    """Two images, with two blocks on the first."""
     made = Scene(tmp_path)
     made.annotate({"3": [truth(9), truth(2)], "11": []}, {"3": [0.25, 0.75], "11": []})
     picture = np.zeros((48, 64, 3), np.uint8)
@@ -196,7 +196,7 @@ def test_absent_images_and_objects_behind_the_camera_are_counted(scene, caplog, 
 
 
 def bent(by: float) -> dict[str, Any]:
-    """A pose whose matrix is off from a rotation, R·Rᵀ by about ``by``."""
+    """A pose whose R·Rᵀ deviates from the identity by about ``by``."""
     shear = np.eye(3)
     shear[0, 1] = by
     return truth(2) | {"cam_R_m2c": (shear @ np.reshape(R, (3, 3))).ravel().tolist()}

@@ -1,4 +1,4 @@
-"""BOP challenge CSVs: as the BOP toolkit writes them, back again, and as nobody should."""
+"""BOP challenge CSVs: files of the BOP toolkit, round trips, and wrong files."""
 
 from pathlib import Path
 

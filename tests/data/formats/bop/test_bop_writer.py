@@ -24,7 +24,7 @@ def plate():
 
 
 def test_annotation_of_a_plate_in_literal_numbers(plate, tmp_path, write_set):
-    # It faces the camera at 200 mm: 0.2 px/mm·200 → 20 px × 10 px.
+    # The plate faces the camera at 200 mm, 0.5 px/mm: 20 px × 10 px.
     T = np.eye(4)
     T[:3, 3] = 0.0, 0.0, 0.201
     visible = np.zeros((24, 32), bool)

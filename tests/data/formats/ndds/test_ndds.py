@@ -1,4 +1,4 @@
-"""NDDS: written and read back, and read as others write it (synthesised with SciPy and OpenCV)."""
+"""NDDS: round trips, and files of other writers (synthesised with SciPy and OpenCV)."""
 
 import json
 import logging
@@ -137,7 +137,7 @@ def test_a_corner_behind_the_camera_is_written_finitely(tmp_path, write_set, box
 
 @dataclass
 class Wild:
-    """Writes NDDS the way others do; knows nothing of the package's own writer."""
+    """Writes NDDS in the conventions of other tools, without dopepp's writer."""
 
     root: Path
     order: str = "xyzw"
@@ -286,7 +286,7 @@ def test_a_single_instance_is_enough(tmp_path_factory, seed, order):
 
 
 def test_falling_things(tmp_path):
-    """Its folders, names, two cameras, classes with _16k, segmentation and depth."""
+    """FAT's folders, names, two cameras, classes with _16k, segmentation and depth."""
     wild = Wild(
         tmp_path / "mixed" / "kitchen_0",
         names="{:06d}.left", suffix=".jpg", own_camera=False, fixed=SLANTED, visibility=0.75,
@@ -312,7 +312,7 @@ def test_falling_things(tmp_path):
 
 
 def test_meshes_centred_at_their_box(tmp_path):
-    """The pose is of the mesh moved by its box's centre, which no file states."""
+    """Poses refer to the mesh with its box's centre at the origin, which no field states."""
     centre = np.eye(4)
     centre[:3, 3] = -BOX.cuboid[8]
     wild = Wild(tmp_path, fixed=centre, unit="m")
