@@ -20,6 +20,7 @@ from dopepp.data.sample import (
     Purpose,
     Sample,
     SourceInfo,
+    WrappedSource,
     crop_sample,
     item_rng,
     pad_sample,
@@ -139,7 +140,7 @@ class HybridSource:
         return entries
 
 
-class WindowedSource:
+class WindowedSource(WrappedSource):
     """Windows of another source's scaled images that contain the centre of an object.
 
     Networks that train on windows of renders need windows of photographs as well. Each epoch draws
@@ -152,11 +153,8 @@ class WindowedSource:
     """
 
     def __init__(self, source: DescribedSource, image: Size, window: Size, seed: int) -> None:
-        self._source, self.name = source, source.name
+        super().__init__(source, picture=list(image), window=list(window))
         self._image, self._window, self._seed = image, window, seed
-
-    def __len__(self) -> int:
-        return len(self._source)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Return a window of item ``index``."""
@@ -173,14 +171,3 @@ class WindowedSource:
         left, top = np.floor(first + rng.uniform(0, 1, 2) * (last - first + 1)).astype(int).tolist()
         window = crop_sample(sample, left, top, (int(size[0]), int(size[1])))
         return pad_sample(window, self._window)
-
-    def contains(self, label: str) -> bool:
-        """Return whether the whole images hold this object."""
-        return self._source.contains(label)
-
-    def describe(self) -> list[SourceInfo]:
-        """Describe the source with the sizes of image and window."""
-        sizes = {"picture": list(self._image), "window": list(self._window)}
-        return [
-            replace(info, identity={**info.identity, **sizes}) for info in self._source.describe()
-        ]

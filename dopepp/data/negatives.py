@@ -8,8 +8,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from dopepp.data.rendered import RenderedSource
-from dopepp.data.sample import DescribedSource, Purpose, Sample, SourceInfo, item_rng
+from dopepp.data.sample import (
+    DescribedSource,
+    Purpose,
+    Sample,
+    SourceInfo,
+    WrappedSource,
+    item_rng,
+)
 from dopepp.drawing.pictures import Size
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.virtual.backgrounds import PhotoBackgrounds
@@ -80,26 +86,16 @@ class PhotoFrames:
         return [SourceInfo(self.name, self._length, identity)]
 
 
-class UnlabelledRenders:
+class UnlabelledRenders(WrappedSource):
     """Rendered frames whose objects must not be detected."""
-
-    def __init__(self, renders: RenderedSource) -> None:
-        self.renders, self.name = renders, renders.name
-
-    def __len__(self) -> int:
-        return len(self.renders)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Return frame ``index`` without instances and depth."""
-        return replace(self.renders.sample(index, epoch), instances=[], depth=None)
+        return replace(self._source.sample(index, epoch), instances=[], depth=None)
 
     def contains(self, label: str) -> bool:
         """Return False: no object is labelled."""
         return False
-
-    def describe(self) -> list[SourceInfo]:
-        """Return the description of the renders without labels."""
-        return self.renders.describe()
 
 
 class FrameMix:

@@ -22,7 +22,14 @@ from jaxtyping import Shaped
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import draft, write_file
-from dopepp.data.sample import DescribedSource, Instance, Sample, SourceInfo, resize_sample
+from dopepp.data.sample import (
+    DescribedSource,
+    Instance,
+    Sample,
+    SourceInfo,
+    WrappedSource,
+    resize_sample,
+)
 from dopepp.drawing.pictures import Shape, Size
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.scene import Rendered
@@ -118,7 +125,7 @@ _FILLED: Final = 1 << 32
 """Added to a slot's CRC-32, so that only an empty slot has the checksum 0."""
 
 
-class CachedSource:
+class CachedSource(WrappedSource):
     """Caches another source's items of epoch 0, resized to the network's input size.
 
     The cache is an array with a slot for each item, in memory shared by forked workers or in a file
@@ -143,7 +150,8 @@ class CachedSource:
         folder: Path | None = None,
         identity: str = "",
     ) -> None:
-        self._source, self._input_size, self.name = source, input_size, source.name
+        super().__init__(source, cached=True)  # all epochs are equal
+        self._input_size = input_size
         first = self._resized(0)
         self._source_name = first.source
         self._shape, self._has_depth = first.image.shape[:2], first.depth is not None
@@ -171,26 +179,12 @@ class CachedSource:
             write_file(self.folder / "identity.json", text.encode())
         self._store(0, first)
 
-    def __len__(self) -> int:
-        return len(self._source)
-
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Return a copy of item ``index``; the epoch is ignored."""
         checksum = self._checksums[index]
         if not checksum or checksum != self._checksum(index):
             self._store(index, self._resized(index))
         return self._load(index)
-
-    def contains(self, label: str) -> bool:
-        """Return whether the cached source holds this object."""
-        return self._source.contains(label)
-
-    def describe(self) -> list[SourceInfo]:
-        """Describe the source, marked as cached, because all its epochs are equal."""
-        return [
-            replace(info, identity={**info.identity, "cached": True})
-            for info in self._source.describe()
-        ]
 
     def _shared_array(self, name: str, dtype: np.dtype[Any]) -> Shaped[np.ndarray, " items"]:
         """Map memory that forked processes share or, with a folder, a file, at first zeros."""

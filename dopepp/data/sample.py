@@ -112,6 +112,32 @@ class DescribedSource(SampleSource, Protocol):
         """Return whether any item of any epoch can hold an instance of this object."""
 
 
+class WrappedSource:
+    """Base of the sources that change the samples of another source.
+
+    Args:
+        source: The other source.
+        **identity: Settings that determine the change.
+    """
+
+    def __init__(self, source: DescribedSource, **identity: object) -> None:
+        self._source, self.name, self._identity = source, source.name, identity
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def contains(self, label: str) -> bool:
+        """Return whether the other source contains this object."""
+        return self._source.contains(label)
+
+    def describe(self) -> list[SourceInfo]:
+        """Describe the other source, with the settings of the change."""
+        return [
+            replace(info, identity={**info.identity, **self._identity})
+            for info in self._source.describe()
+        ]
+
+
 def silhouette(instance: Instance, shape: Shape) -> Mask:
     """Return the instance's mask, or else the hull of its cuboid (empty behind the camera).
 

@@ -20,7 +20,7 @@ from urllib.request import url2pathname
 import numpy as np
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import partial_path
+from dopepp.core.files import draft
 from dopepp.core.json import MAX_BYTES
 from dopepp.data.formats import ESTIMATED, bop, make_instance, share_slice
 from dopepp.data.formats.bop.bop_models import parts_by_id
@@ -307,10 +307,9 @@ def _download(url: str, scheme: str, path: Path) -> None:
         schemes = ", ".join(sorted(gopen_schemes.keys() - {"__default__", "pipe"}))
         fix = "download the shards and pass their folder"
         raise UserError(f"shards {url!r:.100}", f"URLs of {schemes}", fix)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft, size = partial_path(path), 0
+    size = 0
     try:
-        with gopen(url) as stream, draft.open("wb") as file:
+        with draft(path) as partial, gopen(url) as stream, partial.open("wb") as file:
             while piece := stream.read(_PIECE_BYTES):
                 size += len(piece)
                 if size > MAX_SHARD_BYTES:
@@ -318,11 +317,8 @@ def _download(url: str, scheme: str, path: Path) -> None:
                     problem = f"{url} of over {size / 1e9:.0f} GB"
                     raise UserError(problem, allowed, "divide this shard into smaller ones")
                 file.write(piece)
-        draft.replace(path)
     except OSError as error:
         problem = f"shard {url}, which cannot be downloaded to {path.parent}: {error!s:.200}"
         allowed = "a readable URL and enough disk space"
         fix = "open the URL in a browser to test it, and free space"
         raise UserError(problem, allowed, fix) from error
-    finally:
-        draft.unlink(missing_ok=True)
