@@ -86,7 +86,7 @@ def check_bop(report: CheckReport) -> None:
 class _SceneCheck:
     """Checks the JSON files of a scene and the files in its folders."""
 
-    def __init__(self, report: CheckReport, folder: Path, models: Models | None) -> None:
+    def __init__(self, report: CheckReport, folder: Path, models: ModelSizes | None) -> None:
         self._report, self._folder, self._models = report, folder, models
         self._images, self._depths = map(self._image_files, (bop.IMAGES, bop.DEPTHS))
         self._masks = {name: _mask_files(folder / name) for name in _MASKS}
@@ -110,16 +110,16 @@ class _SceneCheck:
                 report.report(folder / _TRUTH, "file", "missing")
             else:
                 report.note(f"{folder} has no {_TRUTH}: its poses are not published")
-        oddities = Oddities()
+        deviations = Deviations()
         images = sorted(cameras.keys() | self._images.keys() | truths.keys())
         for image in images:
             # An unreadable file is a single defect, not a defect of every image.
             for by_image, name in ((cameras, _CAMERA), (truths, _TRUTH)):
                 if by_image and image not in by_image:
                     report.report(folder / name, str(image), "missing")
-            oddities.count(self._check_image(image), self._models)
+            deviations.count(self._check_image(image), self._models)
             report.count_image()
-        oddities.note(report, folder)
+        deviations.note(report, folder)
         for name, by_number in (("depth", self._depths), (_INFO, infos)):
             for image in sorted(by_number.keys() - set(images)):
                 report.report(folder / name, str(image), "no such image in the scene")
@@ -174,21 +174,21 @@ def _mask_files(folder: Path) -> dict[int, dict[int, Path]]:
 
 
 @dataclass
-class Oddities:
+class Deviations:
     """Counts of deviations that every reader handles: notes, not defects."""
 
     inexact: int = 0
     without_fraction: int = 0
     without_model: Counter[int] = field(default_factory=Counter)
 
-    def count(self, poses: BopPoses, models: Models | None) -> None:
-        """Count the oddities of an image's annotation."""
+    def count(self, poses: BopPoses, models: ModelSizes | None) -> None:
+        """Count the deviations of an image's annotation."""
         self.inexact += int(poses.inexact.sum())
         self.without_fraction += int(np.isnan(poses.visible_fractions).sum())
         self.without_model += poses.without_model(models or ())
 
     def note(self, report: CheckReport, where: Path | str) -> None:
-        """Note the oddities and how a reader handles them."""
+        """Note the deviations and how a reader handles them."""
         if self.inexact:
             message = f"{self.inexact:,} rotations are orthogonal to {bop.INEXACT:g} only"
             report.note(f"{where}: {message}; readers use the nearest rotation")
@@ -201,17 +201,17 @@ class Oddities:
 
 
 @dataclass(frozen=True)
-class Model:
+class ModelSize:
     """An object's size in metres; None for a missing or damaged field."""
 
     diameter: float | None = None
     corners: Float[np.ndarray, "8 3"] | None = None
 
 
-Models = dict[int, Model]
+ModelSizes = dict[int, ModelSize]
 
 
-def load_models(report: CheckReport, roots: Sequence[Path]) -> Models | None:
+def load_models(report: CheckReport, roots: Sequence[Path]) -> ModelSizes | None:
     """Check the first ``models*/models_info.json`` below one of the folders, and its meshes.
 
     Returns:
@@ -241,7 +241,7 @@ def load_models(report: CheckReport, roots: Sequence[Path]) -> Models | None:
     return {number: size for number, size in sizes.items() if number in present}
 
 
-def _model(node: Node, record: object, stated: float) -> Model:
+def _model(node: Node, record: object, stated: float) -> ModelSize:
     """Check the diameter and the bounding box in a record of ``models_info.json``."""
     fields, diameter = mapping(record), None if np.isnan(stated) else stated
     if fields and "diameter" not in fields:
@@ -253,17 +253,17 @@ def _model(node: Node, record: object, stated: float) -> Model:
         diameter = None
     bounds = [fields.get(f"{bound}_{axis}") for bound in ("min", "size") for axis in "xyz"]
     if all(value is None for value in bounds):
-        return Model(diameter)
+        return ModelSize(diameter)
     low, size = node["min_x … size_z"].numbers(bounds, 2, 3) / MM
     if (size < 0).any():
         node["size_x … size_z"].report(f"{(size * MM).tolist()}", "0 and above")
     if not (size >= 0).all():
-        return Model(diameter)
+        return ModelSize(diameter)
     length = float(np.linalg.norm(size))
     if diameter is not None and not size.max() / _ROUNDING <= diameter <= length * _ROUNDING:
         message = f"{diameter * MM:.5g} mm for a box of {np.round(size * MM, 3).tolist()} mm"
         node["diameter"].report(message)
-    return Model(diameter, cuboid_keypoints(low, low + size)[:8])
+    return ModelSize(diameter, cuboid_keypoints(low, low + size)[:8])
 
 
 def check_image(
@@ -273,7 +273,7 @@ def check_image(
     infos: Sequence[Record | None],
     shape: Shape | None,
     has_depth: bool,
-    models: Models | None,
+    models: ModelSizes | None,
     read_mask: ReadMask,
 ) -> BopPoses:
     """Check camera, poses, boxes, counts and masks of one image; return the poses.
@@ -293,7 +293,7 @@ def check_image(
     for n, info in enumerate(infos):
         node, T_cam_obj, stated = nodes("gt", n), poses.T_cam_obj[n], poses.visible_fractions[n]
         fraction = None if np.isnan(stated) else float(stated)
-        model = (models or {}).get(int(poses.obj_ids[n]), Model())
+        model = (models or {}).get(int(poses.obj_ids[n]), ModelSize())
         is_posed = check_translation(node["cam_t_m2c"], T_cam_obj[:3, 3], model.diameter)
         whole, visible = read_mask("mask", n), read_mask("mask_visib", n)
         if whole is not None and visible is not None and whole.shape == visible.shape:

@@ -113,7 +113,7 @@ class BopReader:
         self._targets = None if targets is None else read_targets(self.root / targets)
         items = self._find_items()
         self._items = items[share_slice(len(items), part_of, self.name)]
-        self._log_oddities(with_model)
+        self._log_deviations(with_model)
 
     def _find_items(self) -> Int[np.ndarray, "items 2"]:
         """Return (scene, row) of the selected images on disk, in order."""
@@ -135,7 +135,7 @@ class BopReader:
             _log.warning("%s: %s listed images are absent", self.name, absent)
         return np.array(present, np.int64)
 
-    def _log_oddities(self, with_model: Collection[int]) -> None:
+    def _log_deviations(self, with_model: Collection[int]) -> None:
         """Log the ignored objects and the estimated or replaced values."""
         other = sum(scene.num_other for scene in self._scenes)
         behind = sum(scene.num_behind for scene in self._scenes)

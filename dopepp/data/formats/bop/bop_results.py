@@ -93,7 +93,7 @@ def read_results(path: Path, objects: Collection[int]) -> list[BopResult]:
         where = f"{path}: line {number}"
         values.extend((number, *_row(text, where, objects)))
         if len(values) > 18 * MAX_ROWS:
-            raise _bad(where, f"at most {MAX_ROWS:,} poses", "split the file by scene")
+            raise _error(where, f"at most {MAX_ROWS:,} poses", "split the file by scene")
     table = np.array(values, np.float64).reshape(-1, 18)
     _check_repeats(path, table)
     _check_unit(path, table)
@@ -109,30 +109,30 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Yield the lines with poses and their numbers."""
     allowed = f"a CSV file of {','.join(FIELDS)}"
     if not path.is_file():
-        raise _bad(f"{path}, no such file", allowed, "pass the path of an existing file")
+        raise _error(f"{path}, no such file", allowed, "pass the path of an existing file")
     number = 0
     with path.open("rb") as file:
         while content := file.readline(_MAX_LINE_BYTES + 1):
             number += 1
             if len(content) > _MAX_LINE_BYTES:
                 problem = f"{path}: line {number} of more than {_MAX_LINE_BYTES} bytes"
-                raise _bad(problem, allowed)
+                raise _error(problem, allowed)
             try:
                 text = content.decode("utf-8-sig" if number == 1 else "ascii").strip()
             except UnicodeDecodeError as error:
-                raise _bad(f"{path}: line {number}, which is not ASCII text", allowed) from error
+                raise _error(f"{path}: line {number}, which is not ASCII text", allowed) from error
             is_header = number == 1 and [f.strip() for f in text.split(",")] == list(FIELDS)
             if text and not is_header:
                 yield number, text
     if number == 0:
-        raise _bad(f"{path}, which is empty", allowed)
+        raise _error(f"{path}, which is empty", allowed)
 
 
 def _row(text: str, where: str, objects: Collection[int]) -> list[float]:
     """Return the 17 numbers of a line."""
     fields = [field.strip() for field in text.split(",")]
     if len(fields) != len(FIELDS):
-        raise _bad(f"{where} with {len(fields)} fields", f"7: {','.join(FIELDS)}")
+        raise _error(f"{where} with {len(fields)} fields", f"7: {','.join(FIELDS)}")
     numbers: list[float] = []
     for name, field in zip(FIELDS, fields, strict=True):
         if not name.endswith("_id"):
@@ -140,10 +140,10 @@ def _row(text: str, where: str, objects: Collection[int]) -> list[float]:
         elif _ID.fullmatch(field):
             numbers.append(int(field))
         else:
-            raise _bad(f"{where}: {name} {field!r:.40}", "a whole number 0 – 999999999")
+            raise _error(f"{where}: {name} {field!r:.40}", "a whole number 0 – 999999999")
         if name == "obj_id" and numbers[-1] not in objects:
             listed = ", ".join(map(str, sorted(objects)))
-            raise _bad(f"{where}: obj_id {field}", f"the data set's objects: {listed:.400}")
+            raise _error(f"{where}: obj_id {field}", f"the data set's objects: {listed:.400}")
     return numbers
 
 
@@ -152,10 +152,10 @@ def _numbers(name: str, field: str, where: str) -> list[float]:
     words, count = field.split(), _COUNTS[name]
     if len(words) != count:
         noun = "number" if count == 1 else "numbers between spaces"
-        raise _bad(f"{where}: {name} with {len(words)}: {field!r:.60}", f"{count} {noun}")
+        raise _error(f"{where}: {name} with {len(words)}: {field!r:.60}", f"{count} {noun}")
     for word in words:
         if not _NUMBER.fullmatch(word) or not math.isfinite(float(word)):
-            raise _bad(f"{where}: {name}: {word!r:.40}", "finite numbers")
+            raise _error(f"{where}: {name}: {word!r:.40}", "finite numbers")
     numbers = [float(word) for word in words]
     largest, allowed = max(map(abs, numbers)), ""
     # Numbers are bounded before squaring, because squares of numbers like 1e200 overflow.
@@ -166,7 +166,7 @@ def _numbers(name: str, field: str, where: str) -> list[float]:
     elif name == "time" and numbers[0] < 0 and numbers[0] != UNKNOWN_TIME:
         allowed = "seconds, or -1 if unknown"
     if allowed:
-        raise _bad(f"{where}: {name} {field!r:.90}", allowed)
+        raise _error(f"{where}: {name} {field!r:.90}", allowed)
     return numbers
 
 
@@ -179,7 +179,7 @@ def _check_repeats(path: Path, table: Table) -> None:
         first, second = table[order[:-1][same][0], 0], table[order[1:][same][0], 0]
         problem = f"{path}: line {second:.0f}, which repeats line {first:.0f}"
         fix = "remove one line, because a repeated pose counts as a false positive"
-        raise _bad(problem, "each pose once", fix)
+        raise _error(problem, "each pose once", fix)
 
 
 def _check_unit(path: Path, table: Table) -> None:
@@ -190,7 +190,7 @@ def _check_unit(path: Path, table: Table) -> None:
     middle = int(np.argsort(distances, kind="stable")[len(distances) // 2])
     low, high = _PLAUSIBLE_MM
     if not low <= distances[middle] <= high:
-        raise _bad(
+        raise _error(
             f"{path}: translations t with a median length of {distances[middle]:.4g}, e.g. in "
             f"line {table[middle, 0]:.0f}",
             f"millimetres: a median of {low:g} – {high:g}",
@@ -198,7 +198,7 @@ def _check_unit(path: Path, table: Table) -> None:
         )
 
 
-def _bad(
+def _error(
     problem: str, allowed: str, fix: str = "correct the line, or write the file again"
 ) -> UserError:
     """Return the error for a malformed results file."""

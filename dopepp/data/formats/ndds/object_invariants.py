@@ -139,10 +139,6 @@ class ObjectCheck:
         fraction = None if mask is None else self._visibility
         check_box(self._node["box"], points, K, visible_box, fraction, shape)
 
-    def _add(self, field: str, message: str) -> None:
-        """Report a problem in a field of the object."""
-        self._node[field].report(message)
-
     def _numbers(self, field: str, *shape: int) -> Float[np.ndarray, "..."] | None:
         """Return a field that readers ignore; None if missing or damaged."""
         value = self._item.get(field)
@@ -156,7 +152,7 @@ class ObjectCheck:
         norm = float(np.linalg.norm(stored))
         if abs(norm - 1) > NORM_TOLERANCE:
             message = f"not a rotation: norm {norm:.4g}; allowed: 1 ± {NORM_TOLERANCE}"
-            self._add("quaternion_xyzw", message)
+            self._node["quaternion_xyzw"].report(message)
             return {}
         orders = {"x, y, z, w": np.roll(stored, 1), "w, x, y, z": stored}
         return {order: quaternion_to_matrix(values) for order, values in orders.items()}
@@ -164,7 +160,7 @@ class ObjectCheck:
     def _compare_conventions(self, field: str, fits: dict[str, bool], problem: str) -> None:
         """Report a field that fits no convention, and vote if it fits only one convention."""
         if not any(fits.values()):
-            self._add(field, problem)
+            self._node[field].report(problem)
         elif not all(fits.values()):
             convention = next(convention for convention, fit in fits.items() if fit)
             self._majority.vote(field, convention, self._node[field])
@@ -182,9 +178,8 @@ class ObjectCheck:
             axes = np.asarray((means / lengths[:, None]).T)
             is_box &= np.abs(axes.T @ axes - np.eye(3)).max() <= EDGE_SHARE
         if not is_box:
-            self._add(
-                "cuboid", "not a box in NDDS order: edges must be parallel, equal, orthogonal"
-            )
+            message = "not a box in NDDS order: edges must be parallel, equal, orthogonal"
+            self._node["cuboid"].report(message)
             self._cuboid = None
             return
         lengths = np.linalg.norm(edges[:, 0], axis=1)
@@ -192,7 +187,7 @@ class ObjectCheck:
             power = np.log10(max(lengths.max(), 1e-12) / sides.max())
             is_power = abs(round(power)) >= 1 and abs(power - round(power)) < SIZE_SHARE
             message = f"edges {_text(lengths)}; its class has cuboid_dimensions {_text(sides)}"
-            self._add("cuboid.unit" if is_power else "cuboid.size", message)
+            self._node["cuboid"]["unit" if is_power else "size"].report(message)
         if axes is not None and rotations:
             fits = {
                 order: _quarter_turn_distance(rotation.T @ axes) <= ORIENTATION_RAD
@@ -209,7 +204,9 @@ class ObjectCheck:
                 continue
             upright = matrix[:3, :3] * np.sign(np.linalg.det(matrix[:3, :3]))
             if not is_rotation(upright, MATRIX_TOLERANCE):
-                self._add(name, f"not a rotation (mirrored or not) within {MATRIX_TOLERANCE}")
+                self._node[name].report(
+                    f"not a rotation (mirrored or not) within {MATRIX_TOLERANCE}"
+                )
                 continue
             distances = [
                 _quarter_turn_distance(rotation.T @ rotated)
@@ -217,7 +214,7 @@ class ObjectCheck:
                 for rotated in (upright, upright.T)
             ]
             if distances and min(distances) > ORIENTATION_RAD:
-                self._add(name, "another rotation than quaternion_xyzw, in either order")
+                self._node[name].report("another rotation than quaternion_xyzw, in either order")
             if self._location is not None:
                 candidates = matrix[3, :3], matrix[:3, 3]
                 scale = max(1.0, float(np.abs(self._location).max()))
@@ -225,7 +222,7 @@ class ObjectCheck:
                     message = (
                         f"translation {_text(candidates[0])}; location {_text(self._location)}"
                     )
-                    self._add(name, message)
+                    self._node[name].report(message)
 
     def _check_bounding_box(self, visible_box: Box | None) -> None:
         """Compare ``bounding_box``, which may contain hidden pixels, with the visible pixels."""
@@ -272,13 +269,12 @@ class ObjectCheck:
             return True
         middle = cuboid.mean(axis=0)
         if centroid is not None and np.linalg.norm(centroid - middle) > EDGE_SHARE * diagonal:
-            self._add(
-                "cuboid_centroid", f"{_text(centroid)}; the cuboid's centre is {_text(middle)}"
-            )
+            message = f"{_text(centroid)}; the cuboid's centre is {_text(middle)}"
+            self._node["cuboid_centroid"].report(message)
         if np.linalg.norm(location - middle) <= 2 * diagonal:
             return True
         message = f"{_text(location)}, far from its cuboid at {_text(middle)}: in another unit?"
-        self._add("location.unit", message)
+        self._node["location.unit"].report(message)
         return False
 
     def _check_projections(self, cuboid: Corners, K: CameraMatrix) -> None:
@@ -295,7 +291,7 @@ class ObjectCheck:
             distance = 0.0 if annotated is None else np.linalg.norm(annotated - true, axis=-1).max()
             if distance > allowed:
                 message = f"{distance:.3g} px from the cuboid's image (allowed {allowed:.2g} px)"
-                self._add(name, message)
+                self._node[name].report(message)
 
 
 def _finite(values: Float[np.ndarray, "..."] | None) -> Float[np.ndarray, "..."] | None:

@@ -14,7 +14,7 @@ from typing import Final
 from dopepp.data.formats import STAGING
 from dopepp.data.formats import webdataset as shards
 from dopepp.data.formats.bop import BopPoses
-from dopepp.data.formats.bop.bop_invariants import Models, Oddities, check_image, load_models
+from dopepp.data.formats.bop.bop_invariants import Deviations, ModelSizes, check_image, load_models
 from dopepp.data.formats.images import COLOUR_MODES, DEPTH_MODES, decode_one_channel, image_shape
 from dopepp.data.formats.problems import CheckReport, Node
 from dopepp.data.formats.webdataset.webdataset_reader import ShardRecords
@@ -39,7 +39,7 @@ def check_webdataset(report: CheckReport) -> None:
     models = load_models(report, (report.root, *report.root.resolve().parents[:1]))
     shard_names: dict[Path, dict[str, str]] = {}  # by folder and key
     for path in shard_paths(report.root):
-        keys, oddities = shard_names.setdefault(path.parent, {}), Oddities()
+        keys, deviations = shard_names.setdefault(path.parent, {}), Deviations()
         for key, group in groupby(shards.members(path, report), key=lambda member: member.key):
             if key in keys:
                 is_same = keys[key] == path.name
@@ -47,9 +47,9 @@ def check_webdataset(report: CheckReport) -> None:
                 report.report(f"{path}/{key}", "key", problem)
             keys[key] = path.name
             content = _content(report, path, group)
-            oddities.count(_check_image(report, f"{path}/{key}", content, models), models)
+            deviations.count(_check_image(report, f"{path}/{key}", content, models), models)
             report.count_image()
-        oddities.note(report, path)
+        deviations.note(report, path)
         if staged := len(list((path.parent / STAGING).glob("**/[0-9]*.tar"))):
             report.note(f"{path.parent}: {staged} images written and not yet finalized")
     for folder, keys in shard_names.items():
@@ -75,7 +75,7 @@ def _content(report: CheckReport, path: Path, group: Iterator[shards.TarMember])
 
 
 def _check_image(
-    report: CheckReport, start: str, content: Content, models: Models | None
+    report: CheckReport, start: str, content: Content, models: ModelSizes | None
 ) -> BopPoses:
     """Check the members of one key; return its poses."""
     names = {shards.field_of(name): name for name in reversed(content)}

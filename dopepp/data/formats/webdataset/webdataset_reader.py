@@ -230,14 +230,14 @@ def find_shards(root: Path, shards: str, download_dir: Path | None = None) -> li
         UserError: A shard is missing or listed twice, a brace is wrong, or a download fails.
     """
     paths = []
-    for text in _expanded(shards):
+    for text in _expand_braces(shards):
         scheme = _SCHEME.match(text)
         if scheme is None:
-            paths += _local(root / text)
+            paths += _local_shards(root / text)
         elif scheme[1].lower() == "file":
-            paths += _local(Path(url2pathname(urlsplit(text).path)))
+            paths += _local_shards(Path(url2pathname(urlsplit(text).path)))
         else:
-            paths.append(_fetched(text, scheme[1].lower(), download_dir))
+            paths.append(_fetch_shard(text, scheme[1].lower(), download_dir))
     if len(set(paths)) < len(paths):
         twice = next(path for path in paths if paths.count(path) > 1)
         fix = "name every shard once in data.image_sets"
@@ -245,7 +245,7 @@ def find_shards(root: Path, shards: str, download_dir: Path | None = None) -> li
     return paths
 
 
-def _expanded(text: str) -> list[str]:
+def _expand_braces(text: str) -> list[str]:
     """Expand the braces in a name of shards to at most MAX_SHARDS names."""
     from braceexpand import braceexpand  # comes with the webdataset library
 
@@ -265,7 +265,7 @@ def _expanded(text: str) -> list[str]:
     raise UserError(f"shards {text!r:.100}", allowed, fix)
 
 
-def _local(path: Path) -> list[Path]:
+def _local_shards(path: Path) -> list[Path]:
     """Return the shard at a path, or all shards in a folder."""
     if path.is_file():
         return [path]
@@ -278,7 +278,7 @@ def _local(path: Path) -> list[Path]:
     raise UserError(f"shards {path}, {problem}", allowed, fix)
 
 
-def _fetched(url: str, scheme: str, folder: Path | None) -> Path:
+def _fetch_shard(url: str, scheme: str, folder: Path | None) -> Path:
     """Download a shard unless the folder contains it; return its path."""
     problem = f"shards {url!r:.100}"
     if scheme == "pipe":  # an untrusted config must not run commands
