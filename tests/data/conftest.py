@@ -210,8 +210,8 @@ def _boxes_at(parts, image):
         Instance(part.name, T, project_keypoints(part.cuboid, T, K), mask.sum() / all_.sum(), mask)
         for part, T, mask, all_ in zip(parts, poses, seen, wholes, strict=True)
     ]
-    picture = rng.integers(0, 256, (128, 128, 3), np.uint8)
-    return Sample(picture, K, instances, np.full((128, 128), 0.4, np.float32))
+    pixels = rng.integers(0, 256, (128, 128, 3), np.uint8)
+    return Sample(pixels, K, instances, np.full((128, 128), 0.4, np.float32))
 
 
 @pytest.fixture(scope="session")

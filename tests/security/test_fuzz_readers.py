@@ -150,7 +150,7 @@ def read_finite_mesh(path: Path) -> None:
 def images(path: Path) -> tuple[Callable[[Path], object], ...]:
     """The readers of an image."""
 
-    def picture(folder: Path) -> object:
+    def read_any_format(folder: Path) -> object:
         try:
             return read_picture(folder / path.name)
         except ValueError as error:  # which its callers turn into one line
@@ -160,7 +160,7 @@ def images(path: Path) -> tuple[Callable[[Path], object], ...]:
         return lambda folder: decode((folder / path.name).read_bytes(), path.name, *arguments)
 
     return (
-        picture,
+        read_any_format,
         lambda folder: read_image(folder / path.name),
         lambda folder: read_rgb(folder / path.name),
         decoder(decode_rgb),
@@ -178,7 +178,7 @@ def targets(tmp_path_factory, content):
 
 def _files(root: Path, content: dict[str, Any]) -> dict[str, Target]:
     box = trimesh.creation.box((10.0, 20.0, 30.0))
-    picture = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 256, (24, 32, 3), np.uint8),
+    pixels = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 256, (24, 32, 3), np.uint8),
                                (5, 5), 2)  # fmt: skip
     tensors = {"a": torch.arange(6.0).view(2, 3), "b": torch.zeros(0, dtype=torch.int8)}
     rows = "scene_id,im_id,obj_id,score,R,t,time\n" + "1,4,2,0.75,1 0 0 0 0 -1 0 1 0,-10 20 812,1\n"
@@ -202,16 +202,16 @@ def _files(root: Path, content: dict[str, Any]) -> dict[str, Target]:
         "binary.ply": export_ply(box),
         "text.ply": export_ply(box, encoding="ascii"),
     }
-    colour = Image.fromarray(picture)
-    pictures = {
+    colour = Image.fromarray(pixels)
+    photos = {
         **{f"colour.{suffix}": colour for suffix in ("png", "jpg", "tiff", "webp", "bmp", "tga")},
         "palette.png": colour.convert("P"),
-        "deep.png": Image.fromarray(picture[..., 0].astype(np.uint16) * 200),
+        "deep.png": Image.fromarray(pixels[..., 0].astype(np.uint16) * 200),
         "print.jpg": colour.convert("CMYK"),
     }
     files: dict[str, tuple[Callable[[Path], object], Callable[[Path], object] | None]] = {
         **{name: (partial(_put, data), read_finite_mesh) for name, data in meshes.items()},
-        **{name: (image.save, None) for name, image in pictures.items()},
+        **{name: (image.save, None) for name, image in photos.items()},
         **{name: (partial(_put, data.encode()), read_yaml) for name, data in text.items()},
         "archive.tar": (_pack, _extract),
         "a.ckpt": (lambda path: torch.save(content, path), load_network),

@@ -29,8 +29,8 @@ def test_images_of_the_camera_are_unchanged(folder):
     samples = [source.sample(index) for index in range(4)]
     assert sorted(sample.key for sample in samples) == [f"{number}.png/0" for number in range(4)]
     for sample in samples:
-        picture = cv2.imread(str(folder / sample.key.rpartition("/")[0]))[..., ::-1]
-        np.testing.assert_array_equal(sample.image, picture)
+        photo = cv2.imread(str(folder / sample.key.rpartition("/")[0]))[..., ::-1]
+        np.testing.assert_array_equal(sample.image, photo)
         np.testing.assert_array_equal(sample.K, K)
         assert (sample.source, sample.instances, sample.depth) == ("desk", [], None)
     assert not source.contains("anything")
@@ -51,8 +51,8 @@ def test_the_second_round_is_mirrored_and_further_rounds_show_regions(folder):
 def test_a_larger_image_is_cropped_at_its_centre(tmp_path):
     # The colour of a pixel encodes its position.
     y, x = np.mgrid[0:480, 0:800]
-    picture = np.stack([x / 4, y / 4, 0 * x], axis=2).astype(np.uint8)
-    assert cv2.imwrite(str(tmp_path / "wide.png"), picture[..., ::-1])
+    photo = np.stack([x / 4, y / 4, 0 * x], axis=2).astype(np.uint8)
+    assert cv2.imwrite(str(tmp_path / "wide.png"), photo[..., ::-1])
     image = PhotoFrames(PhotoBackgrounds(tmp_path), K, SIZE).sample(0).image.astype(float)
     # At the frame's aspect ratio of 4:3, 480 rows have 640 columns, from column 80 on.
     np.testing.assert_allclose(image[0, 0, :2], (20, 0), atol=2)

@@ -21,8 +21,8 @@ def frames():
 
 @pytest.fixture(scope="module")
 def windows(frames):
-    def make(number: int, window=(96, 64), picture=(160, 120)) -> list[Sample]:
-        source = WindowedSource(frames, picture, window, 5)
+    def make(number: int, window=(96, 64), size=(160, 120)) -> list[Sample]:
+        source = WindowedSource(frames, size, window, 5)
         return [source.sample(index % 4, index // 4) for index in range(number)]
 
     return make

@@ -23,9 +23,9 @@ class Stripes:
 
     def draw(self, rng: np.random.Generator, width: int, height: int) -> np.ndarray:
         self.calls += 1
-        picture = np.full((height, width, 3), 200, np.uint8)
-        picture[:, ::2] = 220
-        return picture
+        image = np.full((height, width, 3), 200, np.uint8)
+        image[:, ::2] = 220
+        return image
 
 
 class Solid:

@@ -60,10 +60,10 @@ def scene(tmp_path):
     """Two images, with two blocks on the first."""
     made = Scene(tmp_path)
     made.annotate({"3": [truth(9), truth(2)], "11": []}, {"3": [0.25, 0.75], "11": []})
-    picture = np.zeros((48, 64, 3), np.uint8)
-    picture[..., 0] = 200
+    image = np.zeros((48, 64, 3), np.uint8)
+    image[..., 0] = 200
     for stem in ("000003", "000011"):
-        made.image(f"rgb/{stem}.png", picture)
+        made.image(f"rgb/{stem}.png", image)
         made.image(f"depth/{stem}.png", np.full((48, 64), 500, np.uint16))
     mask = np.zeros((48, 64), np.uint8)
     mask[10:20, 30:40] = 255

@@ -103,7 +103,7 @@ def test_damaged_runs(record, message):
 
 
 def image_files(key: str, **changes: object) -> list[tuple[str, bytes]]:
-    picture = cv2.imencode(".jpg", np.full((48, 64, 3), 90, np.uint8))[1].tobytes()
+    image = cv2.imencode(".jpg", np.full((48, 64, 3), 90, np.uint8))[1].tobytes()
     truth = {"cam_R_m2c": np.eye(3).ravel().tolist(), "cam_t_m2c": [5, -10, 250], "obj_id": 2}
     values: dict[str, object] = {
         "camera.json": {"cam_K": K, "depth_scale": 1.0},
@@ -112,7 +112,7 @@ def image_files(key: str, **changes: object) -> list[tuple[str, bytes]]:
     }
     values |= {name.replace("_json", ".json"): value for name, value in changes.items()}
     texts = [(f"{key}.{n}", json.dumps(v).encode()) for n, v in values.items() if v is not None]
-    return [*texts, (f"{key}.rgb.jpg", picture)]
+    return [*texts, (f"{key}.rgb.jpg", image)]
 
 
 def test_reads_a_shard_of_another_writer(tmp_path, block, write_shard):
