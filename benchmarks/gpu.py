@@ -108,7 +108,7 @@ class Measurements:
 
     def inference(self, model: str, precision: str, compiled: bool) -> Values:
         """Measure single images and batches, from pixels on the device to maps on the device."""
-        network = runtimes.placed(self._system(model)[0].network, self.device)
+        network = runtimes.move_to_device(self._system(model)[0].network, self.device)
         network = network.to(DTYPES[precision])
         if compiled:
             network.compile(dynamic=False)

@@ -126,7 +126,7 @@ def torch_run(network, size: int) -> Callable[[], None]:
 
     from dopepp.inference import runtimes
 
-    placed = runtimes.placed(network, torch.device("cpu"))
+    placed = runtimes.move_to_device(network, torch.device("cpu"))
     pixels = torch.randint(0, 256, (1, 3, size, size), dtype=torch.uint8)
 
     def run() -> None:

@@ -37,7 +37,7 @@ from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.refinement.refiner import Refiner
 from dopepp.metrics.functional import add, add_s
 from dopepp.parts.part import Part
-from dopepp.recovery.detection import Detection, RecoveryOptions, recalibrated
+from dopepp.recovery.detection import Detection, RecoveryOptions, recalibrate
 
 SYMMETRIC = (10, 11)  # eggbox and glue of LINEMOD, by a half turn about z
 LEAST_VISIBLE = 0.1
@@ -129,7 +129,7 @@ class DrawnEstimator:
         part, nothing = self.solid_parts[0], np.full((9, 2), np.nan)
         keypoints = project_keypoints(part.cuboid, T, K)
         start = Detection(part.name, 0.5, 0.5, T, keypoints, nothing, 0.0, self.covariance)
-        return recalibrated([self.refiner(start, image, K, None)], self.recovery)
+        return recalibrate([self.refiner(start, image, K, None)], self.recovery)
 
 
 def with_half_turn(part: Part) -> Part:

@@ -252,7 +252,7 @@ def near_truth(monkeypatch):
             covariance = np.diag([0.03**2] * 3 + [0.001**2] * 3)
             return Detection(self.part.name, score, score, T, points, peaks, 0.0, covariance)
 
-    def background_log_odds(part, distances, tilt, loudest):
+    def background_log_odds(part, distances, tilt, measure):
         return 0.0
 
     monkeypatch.setattr("dopepp.inference.template_estimator.TemplateDetector", NearTruth)

@@ -203,11 +203,11 @@ def serve(
     with report_errors():
         require("gradio", "dopepp serve", "web")
         check_region(refine)
-        from dopepp.inference.page import served
+        from dopepp.inference.page import serve_page
 
         estimator = load_estimator(model, device, unit, working_distance, tilt)
         estimator = estimator if refine is None else estimator.refining(refine)
         estimator = estimator.reporting(conf)
-        with suppress(Interruption), interruptible(""), served(estimator, port) as address:
+        with suppress(Interruption), interruptible(""), serve_page(estimator, port) as address:
             typer.echo(f"{address} (press Ctrl-C to stop)")
             Event().wait()

@@ -242,7 +242,7 @@ class _Session:
         if not self._estimator.has_network:
             return result, "no pose at these distances passes the verification"
         from dopepp.inference.frames.source import Lens
-        from dopepp.recovery.recover import explained
+        from dopepp.recovery.recover import format_reasons
 
         options, image, K = self._options, result.image, result.K
         depth = options["depth"]
@@ -258,7 +258,7 @@ class _Session:
                 typer.echo(text, err=True)
                 return replace(result, detections=detections, weaker=weaker), ""
         reason = self._estimator.explain(image, K, metres, options["distances"], *region)
-        return result, explained(reason)
+        return result, format_reasons(reason)
 
     def _records(self, result: PoseResult) -> list[dict[str, object]]:
         """Return the detections as plain values; with ``--verify``, with their agreement."""

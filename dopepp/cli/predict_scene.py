@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from dopepp.geometry.camera_file import Camera
     from dopepp.inference.estimator import PoseEstimator
     from dopepp.inference.frames import FrameSource
-    from dopepp.inference.picture import Distances
+    from dopepp.inference.network_input import Distances
 
 
 def refuse_options(options: dict[str, object]) -> None:

@@ -16,18 +16,18 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.picture import network_views
+from dopepp.inference.network_input import network_views
 from dopepp.inference.pose_result import STEPS
 
 WARM_UP: Final = 3
-"""Frames after the first that are not timed: memory is allocated, kernels are selected."""
+"""Number of frames after the first that are not timed: they allocate memory and select kernels."""
 
-# Differences that float32 of another runtime may cause in maps, positions and rotations.
+# Largest differences of maps (relative), positions and rotations that rounding in float32 causes.
 MAX_MAPS: Final = 1e-4
 MAX_MM: Final = 0.1
 MAX_DEG: Final = 0.05
 
-Pictures = Sequence[tuple[RGBImage, CameraMatrix]]
+CameraImages = Sequence[tuple[RGBImage, CameraMatrix]]
 """Images with their camera matrices."""
 
 
@@ -41,8 +41,8 @@ class Timing:
     num_found: float  # mean number of poses per frame
 
 
-def time_frames(estimator: PoseEstimator, images: Pictures, num_frames: int) -> Timing:
-    """Time a freshly loaded estimator on images, which are used in turn."""
+def time_frames(estimator: PoseEstimator, images: CameraImages, num_frames: int) -> Timing:
+    """Time a freshly loaded estimator on ``num_frames`` frames, cycling through the images."""
     rows, num_found = [], []
     for image, K in islice(cycle(images), 1 + WARM_UP + num_frames):
         before, start = estimator.spent_ms.copy(), time.perf_counter()
@@ -63,7 +63,7 @@ class ExportAgreement:
     rotation_deg: float
     num_poses: int  # best-scored poses that both networks detect
     num_single: int  # best-scored poses that only one network detects
-    num_pictures: int
+    num_images: int
 
     @property
     def is_exact(self) -> bool:
@@ -72,16 +72,16 @@ class ExportAgreement:
         return close and self.rotation_deg <= MAX_DEG and not self.num_single
 
     def __str__(self) -> str:
-        poses = "no pose found by both"
+        poses = "no pose detected by both"
         if self.num_poses:
             difference = f"{self.position_mm:.3g} mm and {self.rotation_deg:.3g}°"
             poses = f"{self.num_poses} poses within {difference}"
-        single = f", {self.num_single} found by one alone" if self.num_single else ""
-        return f"maps within {self.maps:.1e}, {poses}{single}, on {self.num_pictures} images"
+        single = f", {self.num_single} detected by one network only" if self.num_single else ""
+        return f"maps within {self.maps:.1e}, {poses}{single}, on {self.num_images} images"
 
 
 def compare_export(
-    exported: PoseEstimator, original: PoseEstimator, images: Pictures
+    exported: PoseEstimator, original: PoseEstimator, images: CameraImages
 ) -> ExportAgreement:
     """Compare maps, and the best-scored pose of each object on each image.
 
@@ -95,13 +95,13 @@ def compare_export(
                 scale = expected.abs().max().clamp(min=1.0)
                 largest = float((values - expected).abs().max() / scale)
                 maps.append(largest if math.isfinite(largest) else math.inf)
-        # Detections are sorted by score: the best of an object overwrites the others.
+        # Detections are sorted by score: in reverse order, an object's best overwrites the others.
         poses, expected_poses = (
             {
                 detection.object: detection.T_cam_obj
-                for detection in reversed(network.predict(image, K, cropped=True))
+                for detection in reversed(estimator.predict(image, K, cropped=True))
             }
-            for network in (exported, original)
+            for estimator in (exported, original)
         )
         for name in poses.keys() & expected_poses.keys():
             T, U = poses[name], expected_poses[name]

@@ -21,7 +21,7 @@ from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.inference import runtimes
-from dopepp.inference.picture import (
+from dopepp.inference.network_input import (
     Coefficients,
     Depth,
     Distances,
@@ -34,8 +34,8 @@ from dopepp.inference.picture import (
 from dopepp.inference.pose_result import STEPS
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Part
-from dopepp.recovery.detection import CANDIDATE, Detection, RecoveryOptions, recalibrated
-from dopepp.recovery.recover import Reason, explain, recover, rejected_refined
+from dopepp.recovery.detection import CANDIDATE, Detection, RecoveryOptions, recalibrate
+from dopepp.recovery.recover import Reason, explain, recover, refined_reason
 
 if TYPE_CHECKING:
     from dopepp.geometry.camera_file import Camera
@@ -83,8 +83,8 @@ class PoseEstimator:
         self.checkpoint = checkpoint
         self.max_ms, self.scale_error = max_ms, scale_error
         self._refine_by(refine, parts or checkpoint.parts)
-        self.device = checked_device(device)
-        self.network = runtimes.placed(network, self.device)
+        self.device = check_device(device)
+        self.network = runtimes.move_to_device(network, self.device)
         self.cuboids = np.stack([part.cuboid for part in checkpoint.parts])
         self._names = [part.name for part in checkpoint.parts]
         self._cuboid_of = dict(zip(self._names, self.cuboids, strict=True))
@@ -133,7 +133,7 @@ class PoseEstimator:
                 dependency is missing, or the refinement is not possible.
         """
         enable(extensions)
-        chosen = checked_device(device)
+        chosen = check_device(device)
         return cls(*runtimes.load(Path(path), chosen), chosen, refine, parts, max_ms, scale_error)
 
     @staticmethod
@@ -190,9 +190,9 @@ class PoseEstimator:
         return True
 
     def depth_range(self, name: str) -> tuple[float, float] | None:
-        """Return the nearest and farthest depth that are searched by default; None if unknown.
+        """Return the depths (nearest, farthest) that are searched by default, metres.
 
-        Depths are metres. For a network, this is the training range.
+        For a network, this is the training range; None if the checkpoint does not record it.
         """
         seen = self.checkpoint.seen.get(name)
         return None if seen is None else (seen.nearest, seen.farthest)
@@ -234,7 +234,7 @@ class PoseEstimator:
         """Detect the parts on an image; leave out detections with a score below :attr:`min_score`.
 
         The image is resized so that parts have the same size as in training
-        (:mod:`dopepp.inference.picture`).
+        (:mod:`dopepp.inference.network_input`).
 
         Args:
             image: RGB, uint8, any size.
@@ -291,38 +291,29 @@ class PoseEstimator:
         """Return the detections before refinement, best score first."""
         with self._timed("pre"):
             views = self.views(image, K, distances, roi)
+        stride, options = self.network.stride, self._recovery_options(0.0)
         scales: list[list[Detection]] = []
         for view in views:
             with self._timed("network"):
                 belief, field = self.maps(view.pixels)
             with self._timed("decode"):
-                stride, options = self.network.stride, self._recovery_options(0.0)
                 detections = recover(
                     belief, field, self.cuboids, view.K, stride, self._names, **options
                 )
             scales.append(
-                [
-                    view.to_image(detection, self._cuboid_of[detection.object], K)
-                    for detection in detections
-                ]
+                [view.to_image(item, self._cuboid_of[item.object], K) for item in detections]
             )
         return merge_scales(scales)
 
     def _recalibrated(self, refined: Sequence[Detection], by_depth: bool) -> list[Detection]:
-        """Replace scores and covariances by those fitted for refined poses; sort by score.
-
-        Args:
-            refined: Detections after refinement and verification.
-            by_depth: Whether a depth image was used for refinement.
-        """
-        return recalibrated(refined, self.recovery, by_depth)
+        """Replace scores and covariances by those fitted for refined poses; see `recalibrate`."""
+        return recalibrate(refined, self.recovery, by_depth)
 
     @property
     def min_score(self) -> float:
-        """Minimum score of a detection.
+        """Minimum score of a detection: the checkpoint's threshold, or that of :meth:`reporting`.
 
-        It is the checkpoint's threshold unless :meth:`reporting` has replaced it. Verified poses
-        have a separate threshold.
+        Verified poses have a separate threshold in the checkpoint.
         """
         is_verified = self.refiner is not None and self.refiner.verifies
         return self.recovery.refined_min_score if is_verified else self.recovery.min_score
@@ -338,9 +329,9 @@ class PoseEstimator:
         """
         if min_score is None:
             return self
-        least = check("min_score", min_score, float, Range(0, 1))
+        checked = check("min_score", min_score, float, Range(0, 1))
         changed = copy.copy(self)
-        changed.recovery = replace(self.recovery, min_score=least, refined_min_score=least)
+        changed.recovery = replace(self.recovery, min_score=checked, refined_min_score=checked)
         return changed
 
     def split(self, candidates: Sequence[Detection]) -> tuple[list[Detection], list[float]]:
@@ -356,7 +347,7 @@ class PoseEstimator:
         K: CameraMatrix,
         depth: Depth | None = None,
     ) -> list[Detection]:
-        """Refine detections; return them unchanged if the estimator has no refinement.
+        """Refine detections; without a refinement, return the given detections.
 
         Args:
             detections: Detections of these parts, from any source.
@@ -371,8 +362,8 @@ class PoseEstimator:
         with self._timed("refine"):
             for detection in detections:
                 if self.max_ms is not None and 1000 * (time.perf_counter() - start) > self.max_ms:
-                    given = replace(detection, kept=f"max_ms={self.max_ms:g} was spent")
-                    refined.append(self.refiner.verified(given, image, K))
+                    unrefined = replace(detection, kept=f"max_ms={self.max_ms:g} was spent")
+                    refined.append(self.refiner.verified(unrefined, image, K))
                 else:
                     refined.append(self.refiner(detection, image, K, depth))
         return refined
@@ -414,8 +405,9 @@ class PoseEstimator:
             T_world_cam: Pose of each camera, metres; any frame that does not move is the world.
             depths: Depth of each image; see :meth:`predict`.
             distances: See :meth:`predict`.
-            camera_error: Standard deviations of each camera's pose along and about each axis,
-                metres and radians (default: 0.2 mm and 0.02°, as after a hand-eye calibration).
+            camera_error: Standard deviations of each camera's pose: position along each axis
+                (metres) and rotation about each axis (radians). The default, 0.2 mm and 0.02°, is
+                typical after a hand-eye calibration.
             names: Name of each image, for findings and files.
 
         Returns:
@@ -426,10 +418,10 @@ class PoseEstimator:
             UserError: The estimator does not refine by region, an argument is invalid, or the
                 numbers of images, cameras and poses differ.
         """
-        from dopepp.inference.several_views import CAMERA_ERROR, predict_views
+        from dopepp.inference import several_views
 
-        error = CAMERA_ERROR if camera_error is None else camera_error
-        return predict_views(self, images, cameras, T_world_cam, depths, distances, error, names)
+        given = images, cameras, T_world_cam, depths, distances, camera_error, names
+        return several_views.predict_views(self, *given)
 
     def explain(
         self,
@@ -453,12 +445,12 @@ class PoseEstimator:
             return reasons
         candidates = self.candidates(image, K, None, depth, distances, roi, cropped)
         rejected = [candidate for candidate in candidates if candidate.score < self.min_score]
-        return reasons + [rejected_refined(candidate, self.min_score) for candidate in rejected]
+        return reasons + [refined_reason(candidate, self.min_score) for candidate in rejected]
 
     def _missing(
         self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
     ) -> list[Reason]:
-        """Return the reasons why there are no further start detections."""
+        """Return a reason for each part or candidate without a detection before refinement."""
         stride, options = self.network.stride, self._recovery_options(self.min_score)
         reasons: list[Reason] = []
         for view in self.views(image, K, distances, roi):
@@ -478,16 +470,16 @@ class PoseEstimator:
         return network_views(self.checkpoint, multiple, image, K, distances, roi)
 
     def maps(self, image: RGBImage) -> Maps:
-        """Run the network on an RGB image; its sides must be multiples of ``size_multiple``."""
+        """Run the network on an RGB image whose sides are multiples of ``size_multiple``."""
         pixels = torch.from_numpy(image).to(self.device).permute(2, 0, 1)[None]
         with torch.inference_mode():
             belief, field = self.network.maps(pixels)
         return belief[0].float(), field[0].float()
 
     def _recovery_options(self, min_score: float) -> dict[str, float]:
-        """Return the options of the recovery; with refinement, all candidates pass."""
-        least = min_score if self.refiner is None else CANDIDATE
-        return vars(replace(self.recovery, min_score=least))
+        """Return the options of the recovery; with refinement, the threshold is `CANDIDATE`."""
+        threshold = min_score if self.refiner is None else CANDIDATE
+        return vars(replace(self.recovery, min_score=threshold))
 
     @contextmanager
     def _timed(self, step: str) -> Iterator[None]:
@@ -499,7 +491,7 @@ class PoseEstimator:
         self.spent_ms[step] += 1000 * (time.perf_counter() - start)
 
 
-def checked_device(device: str | torch.device) -> torch.device:
+def check_device(device: str | torch.device) -> torch.device:
     """Return a device after a test allocation on it.
 
     Raises:

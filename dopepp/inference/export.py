@@ -1,8 +1,8 @@
 """Export of a network: normalisation, network and activation as one graph in a file.
 
-The graph maps pixels (batch, 3, height, width), uint8 RGB, to belief maps and vector field. Batch,
-height and width are free; the network's size multiple divides the sides. To add a format, write an
-:data:`Exporter` and a line in :data:`EXPORTERS`.
+The graph computes belief maps and vector fields from pixels (batch, 3, height, width), uint8 RGB.
+Batch, height and width are free; height and width must be multiples of the network's size multiple.
+To add a format, write an :data:`Exporter` and a line in :data:`EXPORTERS`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from torch.export import Dim, ExportedProgram
 
 from dopepp.core.errors import UserError, require
 from dopepp.core.files import write_file
-from dopepp.inference.runtimes import INPUT, OUTPUTS, Export, Pixels, described, pack
+from dopepp.inference.runtimes import INPUT, OUTPUTS, Export, Pixels, describe_export, pack
 from dopepp.inference.runtimes.openvino import NAME, load_openvino
 from dopepp.models.checkpoint import KEY, SUFFIX, Checkpoint, write_content
 from dopepp.models.network import PoseNetwork
@@ -34,7 +34,7 @@ Save = Callable[[Path, Checkpoint, Export], None]
 """Writes a graph with its description to a new file or folder."""
 
 Exporter = Callable[[PoseNetwork, str, Sequence[Pixels]], Save]
-"""Function that converts a network to a graph of a precision; int8 is calibrated on its inputs.
+"""Function that converts a network to a graph of a precision; int8 is calibrated on the images.
 
 Raises:
     UserError: The format or precision does not support the network. (:func:`check_possible` has
@@ -48,10 +48,10 @@ _PACKAGES: Final = {
 }
 
 _CHATTY: Final = ("torch.onnx", "onnxscript", "onnx_ir")
-"""Loggers of every step of a conversion."""
+"""Loggers that report every step of a conversion."""
 
 _SMALL: Final = 1024
-"""Elements up to which a constant stays in full precision; shapes have fewer."""
+"""Number of elements up to which a constant stays in full precision; shapes have fewer elements."""
 
 _FLOAT16_MAX: Final = 65504.0
 
@@ -86,8 +86,8 @@ def check_possible(layout: str, precision: str) -> None:
 
 def to_onnx(network: PoseNetwork, precision: str, images: Sequence[Pixels]) -> Save:
     """Convert to an ONNX model; see :data:`Exporter`."""
-    program = _traced(network)
-    with _translating(network, "ONNX"):
+    program = _trace(network)
+    with _conversion(network, "ONNX"):
         names: dict[str, Any] = {"input_names": [INPUT], "output_names": list(OUTPUTS)}
         exported: Any = torch.onnx.export(
             program, **names, dynamo=True, external_data=False, verbose=False
@@ -98,7 +98,7 @@ def to_onnx(network: PoseNetwork, precision: str, images: Sequence[Pixels]) -> S
         _halve(model.graph)
     if precision == "int8":
         batches = [{INPUT: image} for image in images]
-        model = _quantised(model, batches, _last_convolutions(model.graph))
+        model = _quantise(model, batches, _last_convolutions(model.graph))
 
     def save(path: Path, checkpoint: Checkpoint, export: Export) -> None:
         del model.metadata_props[:]
@@ -111,15 +111,15 @@ def to_onnx(network: PoseNetwork, precision: str, images: Sequence[Pixels]) -> S
 def to_openvino(network: PoseNetwork, precision: str, images: Sequence[Pixels]) -> Save:
     """Convert to an OpenVINO model; see :data:`Exporter`."""
     openvino = load_openvino("--format openvino")
-    program = _traced(network)
-    with _translating(network, "OpenVINO"):
+    program = _trace(network)
+    with _conversion(network, "OpenVINO"):
         model = openvino.convert_model(program)
     model.reshape({model.inputs[0]: [-1, 3, -1, -1]})
     model.inputs[0].set_names({INPUT})
     for output, name in zip(model.outputs, OUTPUTS, strict=True):
         output.set_names({name})
     if precision == "int8":
-        model = _quantised(model, list(images), _last_openvino_convolutions(model))
+        model = _quantise(model, list(images), _last_openvino_convolutions(model))
 
     def save(folder: Path, checkpoint: Checkpoint, export: Export) -> None:
         model.set_rt_info(pack(checkpoint, export), [KEY])
@@ -127,7 +127,7 @@ def to_openvino(network: PoseNetwork, precision: str, images: Sequence[Pixels]) 
         try:
             openvino.save_model(model, folder / NAME, compress_to_fp16=precision == "fp16")
         except RuntimeError as error:  # OpenVINO does not state the operating system's reason
-            raise OSError(errno.EIO, "OpenVINO could not write it, is the disk full?") from error
+            raise OSError(errno.EIO, "OpenVINO cannot write; is the disk full?") from error
 
     return save
 
@@ -138,7 +138,7 @@ def to_safetensors(network: PoseNetwork, precision: str, images: Sequence[Pixels
 
     def save(path: Path, checkpoint: Checkpoint, export: Export) -> None:
         whole = Checkpoint(**{**vars(checkpoint), "state_dict": weights})
-        write_content(described(whole, export), path, half=precision == "fp16")
+        write_content(describe_export(whole, export), path, half=precision == "fp16")
 
     return save
 
@@ -151,18 +151,18 @@ EXPORTERS: Final[dict[str, tuple[Exporter, str]]] = {
 """Exporter of each format, and suffix of its file or folder."""
 
 
-def _traced(network: PoseNetwork) -> ExportedProgram:
+def _trace(network: PoseNetwork) -> ExportedProgram:
     """Trace a network for any batch, height and width."""
     multiple = network.size_multiple
     example = torch.zeros(2, 3, 3 * multiple, 4 * multiple, dtype=torch.uint8)
     free = {0: Dim("batch"), 2: multiple * Dim("rows"), 3: multiple * Dim("columns")}
     maps = _Maps(network.cpu()).eval()
-    with _translating(network, "torch.export"):
+    with _conversion(network, "torch.export"):
         return torch.export.export(maps, (example,), dynamic_shapes=(free,))
 
 
 @contextmanager
-def _translating(network: PoseNetwork, language: str) -> Iterator[None]:
+def _conversion(network: PoseNetwork, language: str) -> Iterator[None]:
     """Silence a conversion, and report an unsupported operator in one line."""
     levels = {logger: logger.level for logger in map(logging.getLogger, _CHATTY)}
     for logger in levels:
@@ -245,7 +245,7 @@ def _last_openvino_convolutions(model: Any) -> list[str]:
     return ends
 
 
-def _quantised(model: Any, images: Sequence[Any], ends: Sequence[str]) -> Any:
+def _quantise(model: Any, images: Sequence[Any], ends: Sequence[str]) -> Any:
     """Return a graph that computes in 8 bits, except the last convolutions.
 
     Weights use 7 bits: without VNNI, sums of two 8-bit products overflow.

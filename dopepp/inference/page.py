@@ -1,8 +1,8 @@
-"""The page of ``dopepp serve``: image and camera in; poses drawn, listed and as a file.
+"""Web page of ``dopepp serve``: upload an image and its camera; see and download the poses.
 
-The server responds to this machine only, and the page loads nothing from other hosts. Errors about
-files and numbers appear on the page as one line, as on the command line. Uploaded images are
-deleted when the server stops.
+The server accepts requests from this machine only, and the page loads nothing from other hosts.
+Errors about files and numbers appear on the page as one line, as on the command line. Uploaded
+images are deleted when the server stops.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.pose_result import PoseResult, make_shape
 from dopepp.parts.size import part_in_words
-from dopepp.recovery.recover import explained
+from dopepp.recovery.recover import format_reasons
 
 HOST: Final = "127.0.0.1"  # reachable from this machine only
 MAX_UPLOAD: Final = "64mb"  # size of an uncompressed image of 20 megapixels
@@ -78,7 +78,7 @@ Outputs = tuple[RGBImage | None, str, list[list[object]], Any, RGBImage | None]
 
 
 @contextmanager
-def served(estimator: PoseEstimator, port: int | None = None) -> Iterator[str]:
+def serve_page(estimator: PoseEstimator, port: int | None = None) -> Iterator[str]:
     """Serve the page in another thread while the block runs; yield its address.
 
     Args:
@@ -86,7 +86,7 @@ def served(estimator: PoseEstimator, port: int | None = None) -> Iterator[str]:
         port: Port (default: the first free port from 7860 on).
 
     Raises:
-        UserError: The port is taken.
+        UserError: Another program uses the port.
     """
     with TemporaryDirectory(prefix="dopepp-") as folder:
         os.environ["GRADIO_TEMP_DIR"] = folder
@@ -120,11 +120,11 @@ def make_page(estimator: PoseEstimator, folder: Path) -> gr.Blocks:
     page = gr.Blocks(title="DOPE++", analytics_enabled=False)
     with page:
         parts = "; ".join(part_in_words(part) for part in estimator.parts)
-        gr.Markdown(f"# DOPE++\nlooks for {parts}")
+        gr.Markdown(f"# DOPE++\ndetects {parts}")
         with gr.Row():
             with gr.Column(scale=1, min_width=320):
                 formats = "Image: PNG, JPEG, TIFF, BMP or WEBP"
-                picture = gr.File(label=formats, height=160, elem_id="picture")
+                image = gr.File(label=formats, height=160, elem_id="image")
                 camera = _camera_inputs()
                 button = gr.Button("Find poses", variant="primary")
                 maps = _image("Belief maps", "maps", estimator.has_network)
@@ -135,7 +135,7 @@ def make_page(estimator: PoseEstimator, folder: Path) -> gr.Blocks:
                 table = gr.Dataframe(headers=COLUMNS, label=FRAME, interactive=False)
                 file = gr.DownloadButton("Download JSON", interactive=False)
         outputs = [drawn, message, table, file, maps]
-        button.click(find_poses, [picture, *camera], outputs, api_visibility="private")
+        button.click(find_poses, [image, *camera], outputs, api_visibility="private")
     return page
 
 
@@ -175,16 +175,16 @@ def _outputs(
     estimator: PoseEstimator, path: Path, kind: str, inputs: Sequence[Any], folder: Path
 ) -> Outputs:
     """Estimate the poses on an uploaded image."""
-    picture = read_photo(path)
-    size = (picture.shape[1], picture.shape[0])
+    photo = read_photo(path)
+    size = (photo.shape[1], photo.shape[0])
     camera = _camera(kind, inputs, *size).for_picture(size)
-    image, K = camera.undistorted(picture), camera.K
+    image, K = camera.undistorted(photo), camera.K
     (detections, weaker), remark = estimator.split(estimator.candidates(image, K)), ""
     if not detections and estimator.has_network:
         detections, weaker = estimator.split(estimator.candidates(image, K, distances="any"))
         remark = " (not at the trained sizes, but in a search at all sizes)"
     if not detections and estimator.has_network:
-        remark = f": {explained(estimator.explain(image, K))}"
+        remark = f": {format_reasons(estimator.explain(image, K))}"
     shapes = {part.name: make_shape(part) for part in estimator.parts}
     result = PoseResult(
         image,

@@ -1,8 +1,7 @@
 """PoseResult: the detections on one frame, which can be drawn, saved and exported.
 
-All poses are in the camera frame (:data:`FRAME`), which every output states. Silhouettes are
-drawn from the part's mesh: at a correct pose they end at the part's outline, which a cuboid cannot
-show.
+All poses are in the camera frame (:data:`FRAME`), which every output states. Silhouettes are drawn
+from the part's mesh: at a correct pose, they coincide with the part's outline on the image.
 """
 
 from __future__ import annotations
@@ -73,7 +72,7 @@ AXIS: Final = 0.35  # length of a drawn axis, diameters
 LINE: Final = 1 / 640  # width of a line, share of the image width
 
 FINEST: Final = 1 / 60
-"""Widest line, share of the instance's extent: a small part on a large image stays visible."""
+"""Largest width of a line, share of the instance's extent: lines do not hide a small part."""
 
 COLUMNS: Final = ("image", "number", "time", "identity", "object", "score", "frame")
 COLUMNS_POSE: Final = ("x", "y", "z", "qw", "qx", "qy", "qz")
@@ -118,7 +117,7 @@ class PoseResult:
 
     @property
     def weaker_in_words(self) -> str:
-        """Number of weaker candidates with the threshold; empty without weaker candidates."""
+        """Number of candidates below the threshold as text; empty if there are none."""
         return f"{self.num_weaker} weaker below {self.min_score:.2g}" if self.weaker else ""
 
     @property
@@ -131,7 +130,7 @@ class PoseResult:
     def plot(self) -> RGBImage:
         """Return the image with every part's silhouette, cuboid, axes, name and score.
 
-        A caption states the number of weaker candidates. An image below 640 pixels in width is
+        A caption states the number of weaker candidates. Images narrower than 640 pixels are
         enlarged by an integer factor.
         """
         labels = [
@@ -187,8 +186,8 @@ class PoseResult:
             UserError: pandas is not installed.
         """
         if find_spec("pandas") is None:
-            problem, fix = "to_dataframe() without the package pandas", "pip install pandas"
-            raise UserError(problem, "an installation with pandas", f"{fix}, or use to_json()")
+            fix = "pip install pandas, or use to_json()"
+            raise UserError("to_dataframe() without pandas", "an installation with pandas", fix)
         import pandas as pd
 
         rows = []
@@ -231,8 +230,8 @@ def format_speed(speed: Mapping[str, float]) -> str:
     return ", ".join(f"{step} {speed.get(step, 0.0):.1f}" for step in STEPS) + " ms"
 
 
-def spent_between(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str, float]:
-    """Return the milliseconds of each step between two readings of the estimator's clock."""
+def elapsed_by_step(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str, float]:
+    """Return the milliseconds of each step between two copies of ``PoseEstimator.spent_ms``."""
     return {step: after[step] - before[step] for step in STEPS}
 
 
@@ -271,10 +270,9 @@ def silhouette_contours(
 
     The list is empty without a mesh, or if a vertex is not in front of the camera.
     """
-    posed_mesh = None if shape.mesh is None else posed(shape.mesh, T_cam_obj, K)
-    if posed_mesh is None or shape.mesh is None:
+    if shape.mesh is None or (posed_mesh := posed(shape.mesh, T_cam_obj, K)) is None:
         return []
-    # One pixel beyond the image, so that a part that leaves it has no line along the border.
+    # One pixel beyond the image, so that no line follows the border where the part is cut off.
     limit = np.array(image.shape[1::-1]) + 2
     low = np.maximum(np.floor(posed_mesh.pixels.min(axis=0)) - 1, -2).astype(int)
     high = np.minimum(np.ceil(posed_mesh.pixels.max(axis=0)) + 2, limit)

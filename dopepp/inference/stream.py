@@ -1,4 +1,4 @@
-"""Estimation of poses on every frame of a file, video or camera."""
+"""Estimation of poses on every frame of an image file, video, camera or recording."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from dopepp.geometry.camera_file import Camera, Crop
 from dopepp.geometry.camera_formats import Size
 from dopepp.inference.frames import CameraFrame, SourceLike, open_sources
 from dopepp.inference.frames.source import Lens, choose_camera
-from dopepp.inference.picture import Distances, Region
-from dopepp.inference.pose_result import PoseResult, make_shape, spent_between
+from dopepp.inference.network_input import Distances, Region
+from dopepp.inference.pose_result import PoseResult, elapsed_by_step, make_shape
 from dopepp.inference.tracker import PoseTracker
 
 if TYPE_CHECKING:
@@ -47,8 +47,8 @@ def stream(
 ) -> Iterator[PoseResult]:
     """Yield the detections on each frame of a source as soon as they are estimated.
 
-    Frames of a camera or stream that arrive while the estimator is busy are dropped: each result
-    belongs to the newest frame. Files are read to the end, cameras without end.
+    Frames of a camera or network stream that arrive while the estimator is busy are dropped: each
+    result belongs to the newest frame. Files are read to their end, cameras without end.
 
     Args:
         estimator: Detects the parts.
@@ -106,7 +106,7 @@ def _process(
         image,
         K,
         detections,
-        spent_between(before, estimator.spent_ms),
+        elapsed_by_step(before, estimator.spent_ms),
         frame.name,
         frame.number,
         frame.time,

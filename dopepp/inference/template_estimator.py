@@ -20,37 +20,30 @@ from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.picture import (
+from dopepp.inference.network_input import (
     METRES,
     Depth,
     Distances,
-    NetworkView,
     Region,
-    checked_region,
+    check_region,
     merge_scales,
 )
 from dopepp.inference.refinement.refiner import Refine, refine_terms
 from dopepp.inference.templates import TemplateDetector
+from dopepp.inference.templates.background_level import background_log_odds
 from dopepp.inference.templates.ranking import learned_ranking
-from dopepp.inference.templates.silence import background_log_odds
-from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Part, check_name
 from dopepp.parts.symmetry_finder import find_symmetries
-from dopepp.recovery.detection import (
-    Detection,
-    RecoveryOptions,
-    log_odds,
-    recalibrated,
-)
+from dopepp.recovery.detection import Detection, RecoveryOptions, log_odds, recalibrate
 from dopepp.recovery.recover import Reason
 
-NUM_REPEATED: Final = 10  # most probable refined poses that are refined again
-REPEATS: Final = 2  # how often they are refined again
+NUM_REPEATED: Final = 10  # number of refined poses that are refined again, the most probable
+REPEATS: Final = 2  # number of further refinements
 
 SCALE_ERROR: Final = 0.001
-"""Default of ``scale_error``. It is small, so that refinement corrects the distance. Templates
-determine it only roughly."""
+"""Default of ``scale_error``. It is small, so that refinement corrects the distance, because
+templates determine the distance only roughly."""
 
 
 class TemplateEstimator(PoseEstimator):
@@ -79,7 +72,7 @@ class TemplateEstimator(PoseEstimator):
         self.max_ms = max_ms
         self.scale_error = SCALE_ERROR if scale_error is None else scale_error
         self.levels: dict[str, float] = {}
-        """Log odds of verification at which a pose of each part has a score of 0.5."""
+        """Log odds of verification at which a pose of a part has the score 0.5, by part name."""
         self.device = torch.device("cpu")
         self.recovery = RecoveryOptions.of(learned_ranking().score)
         self._refine_by(refine, self.parts)
@@ -99,18 +92,24 @@ class TemplateEstimator(PoseEstimator):
         Raises:
             UserError: A part has no mesh, or an option is invalid or missing.
         """
-        checked = _checked_distances(distances)
+        if distances is None:
+            raise UserError(
+                "a mesh without a working distance",
+                "the nearest and farthest distance of the part from the camera, metres",
+                "state it: --working-distance 0.3,0.5 (working_distance=(0.3, 0.5) in Python)",
+            )
+        checked = check("working_distance", distances, tuple[float, float], METRES)
         tilt = check("tilt_deg", tilt_deg, float, Range(0, 180, "degrees"))
         detectors = [TemplateDetector(part, checked, tilt) for part in parts]
         estimator = cls(detectors, checked, refine, max_ms, scale_error)
         for detector in detectors:
-            loudest = partial(_largest_log_odds, detector, checked)
-            level = background_log_odds(detector.part, checked, tilt, loudest)
+            measure = partial(_largest_log_odds, detector, checked)
+            level = background_log_odds(detector.part, checked, tilt, measure)
             estimator.levels[detector.part.name] = level
         return estimator
 
     def _refine_by(self, refine: Refine | None, parts: Sequence[Part]) -> None:
-        """Set the refinement, which must include the image region."""
+        """Set the refinement, which must include ``region``."""
         if "region" not in refine_terms(refine):
             fix = "leave out refine, or set it to one of these"
             raise UserError(f"templates with refine={refine}", "region, or region and depth", fix)
@@ -139,7 +138,7 @@ class TemplateEstimator(PoseEstimator):
     ) -> list[Detection]:
         """Return start poses of all parts, best score first."""
         with self._timed("decode"):
-            roi, depths = checked_region(roi, image), self._range(distances)
+            roi, depths = check_region(roi, image), self._range(distances)
             starts = [
                 start
                 for detector in self.detectors
@@ -156,8 +155,8 @@ class TemplateEstimator(PoseEstimator):
     ) -> list[Detection]:
         """Refine detections; the most probable results are refined again.
 
-        Start poses are so inaccurate that a single refinement may stop too early. Poses are refined
-        only once if they are tracked or if there is a time limit.
+        Start poses are so inaccurate that a single refinement may stop too early. Tracked poses are
+        refined only once, and so are all poses under a time limit.
         """
         refined = super().refined(detections, image, K, depth)
         if any(detection.agreement is not None for detection in detections):
@@ -185,7 +184,7 @@ class TemplateEstimator(PoseEstimator):
             handicap = _silhouette_handicap(detectors[detection.object], detection)
             bias = -slope * (handicap + self.levels.get(detection.object, 0.0))
             options = replace(self.recovery, refined_bias=bias)
-            scored += recalibrated([detection], options, by_depth)
+            scored += recalibrate([detection], options, by_depth)
         return merge_scales([[detection] for detection in scored])
 
     def _missing(
@@ -215,35 +214,13 @@ class TemplateEstimator(PoseEstimator):
         raise _networks_only("a network")
 
     @property
-    def checkpoint(self) -> Checkpoint:  # type: ignore[override]
+    def checkpoint(self) -> NoReturn:  # type: ignore[override]
         """Not available.
 
         Raises:
             UserError: Templates have no checkpoint.
         """
         raise _networks_only("a checkpoint")
-
-    def views(
-        self,
-        image: RGBImage,
-        K: CameraMatrix,
-        distances: Distances | None = None,
-        roi: Region | None = None,
-    ) -> list[NetworkView]:
-        """Not available.
-
-        Raises:
-            UserError: Templates have no network.
-        """
-        raise _networks_only("inputs of a network")
-
-    def maps(self, image: RGBImage) -> NoReturn:
-        """Not available.
-
-        Raises:
-            UserError: Templates have no belief maps.
-        """
-        raise _networks_only("belief maps")
 
 
 def _probability(detection: Detection) -> float:
@@ -252,7 +229,7 @@ def _probability(detection: Detection) -> float:
 
 
 def _silhouette_handicap(detector: TemplateDetector, detection: Detection) -> float:
-    """Return the log odds that a pose needs in addition, because its silhouette is small.
+    """Return the additional log odds that a pose with a small silhouette must have.
 
     Small silhouettes resemble many objects: a plate seen edge-on fits every stick.
     """
@@ -279,21 +256,6 @@ def _largest_log_odds(
         odds = [log_odds(_probability(end)) - _silhouette_handicap(detector, end) for end in ends]
         levels.append(max(odds, default=0.0))
     return levels
-
-
-def _checked_distances(distances: object) -> tuple[float, float]:
-    """Return a working distance after checking it.
-
-    Raises:
-        UserError: The working distance is missing, or is not a range of metres.
-    """
-    if distances is None:
-        raise UserError(
-            "a mesh without a working distance",
-            "the nearest and farthest distance of the part from the camera, metres",
-            "state it: --working-distance 0.3,0.5 (working_distance=(0.3, 0.5) in Python)",
-        )
-    return check("working_distance", distances, tuple[float, float], METRES)
 
 
 def load_solid_part(

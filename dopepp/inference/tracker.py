@@ -1,14 +1,14 @@
 """PoseTracker: tracks parts from frame to frame and runs the network only where necessary.
 
-A part of the last frame is searched where its motion predicts it, by refinement alone
-(:mod:`dopepp.inference.refinement.region`): first close to the prediction, then as far as a hand
-may have moved it. If neither pose is accepted, the network is run on the surroundings. If it does
-not detect the part either, the part is lost, and the network is run on every frame until the part
-reappears, under the same identity.
+Refinement alone (:mod:`dopepp.inference.refinement.region`) searches a part of the last frame near
+the pose that its motion predicts: first close to the prediction, then as far as a hand may have
+moved the part. If neither pose is accepted, the network is run on the surroundings. If the network
+does not detect the part either, the part is lost, and the network is run on every frame until the
+part reappears, under the same identity.
 
-A part's motion is a Kalman filter over pose and velocity. The covariance of each frame's pose
-already contains the filter's prediction (it was the refinement's prior), so the velocity follows
-from the correction of the pose: a pose that is still converging is not mistaken for motion.
+A Kalman filter estimates pose and velocity of a part. The covariance of each frame's pose already
+contains the filter's prediction, because the prediction was the refinement's prior. The velocity is
+therefore updated by the correction of the pose, and a converging pose does not appear as motion.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from dopepp.geometry.camera import (
     step_between,
     transform,
 )
-from dopepp.inference.picture import Region, prepare_image
+from dopepp.inference.network_input import Region, prepare_image
 from dopepp.recovery.detection import Detection
 
 if TYPE_CHECKING:
@@ -49,22 +49,22 @@ NEAR: Final = 0.5
 ELSEWHERE: Final = 0.1
 """Mean distance between keypoints above which track and detection disagree, diameters."""
 
-OUTVOTED: Final = 2  # disagreeing detections in a row after which a track is moved to them
+OUTVOTED: Final = 2  # consecutive disagreeing detections after which a track moves to them
 
 DOUBTFUL: Final = 0.8
-"""Share of its usual agreement below which a track is doubtful: on rendered sequences, correct
-poses kept 0.97 of it, and poses that an occluder had displaced kept half."""
+"""Share of the usual agreement below which a track is doubtful. On rendered sequences, the share
+was 0.97 at correct poses, and 0.5 at poses that an occluder had displaced."""
 
 TRUSTED: Final = 0.6
-"""Agreement below which a pose is rejected, except the first: half of a wrong pose's outline may
-coincide with other edges."""
+"""Agreement below which a pose is rejected (unless the first pose agreed less): half of a wrong
+pose's outline may coincide with other edges."""
 
 SURE: Final = 0.85  # agreement below which the network is run every OFTEN frames
 OFTEN: Final = 5
 USUAL: Final = 0.1  # weight of a frame in the usual agreement
 
 PATIENCE: Final = 6
-"""Doubtful frames in a row in which a part continues its motion, before it is lost."""
+"""Number of consecutive doubtful frames in which a part continues its motion before it is lost."""
 
 FORGOTTEN: Final = 300  # frames after which a lost part is no longer searched
 
@@ -73,10 +73,11 @@ STILL: Final = (math.radians(0.05), 2e-4)
 axis, and metres per metre of distance. Smaller values reduce jitter."""
 
 SUDDEN: Final = (math.radians(4.0), 0.025)
-"""Like :data:`STILL`, for a part that a hand lifts or rotates: half of 8° and of 5 % per frame."""
+"""Like :data:`STILL`, for a part that a hand moves by up to 8° and 5 % of the distance per frame
+(two standard deviations)."""
 
 SWERVE: Final = 0.6
-"""Share of the speed, and of the last correction, by which the velocity may change in addition."""
+"""Factor on speed plus last correction: further standard deviation of the change in velocity."""
 
 PERSISTENCE: Final = 0.95  # share of the velocity that remains after a frame
 
@@ -231,7 +232,7 @@ class PoseTracker:
         return [track for track in tracks if track.detection.score >= self.estimator.min_score]
 
     def _is_doubtful(self, state: _State) -> bool:
-        """Return whether the network has to search for a part on this frame."""
+        """Return whether the network must search a part on this frame."""
         unsure = _agreement(state.track.detection) < SURE and self._frame % OFTEN == 0
         return bool(unsure or state.unseen or state.doubts or state.disagreements)
 
@@ -286,10 +287,7 @@ class PoseTracker:
                     state.move_to(detection)
 
     def _assigned(self, detections: Sequence[Detection]) -> list[tuple[_State | None, Detection]]:
-        """Assign detections to parts of the same name: tracked ones first, then lost or doubtful.
-
-        None: a new part.
-        """
+        """Assign detections to tracked parts, then to lost or doubtful parts; None: a new part."""
         pairs: list[tuple[_State | None, Detection]] = []
         for name in self._cuboid_of:
             left = [detection for detection in detections if detection.object == name]
@@ -320,13 +318,13 @@ class PoseTracker:
 
 
 def _region_around(detections: Sequence[Detection], image: RGBImage) -> Region | None:
-    """Return a region around detections; None for the whole image."""
+    """Return a region around detections; None if they are almost outside the image."""
     points = np.concatenate([detection.keypoints for detection in detections])
     margin = AROUND * max(np.ptp(detection.keypoints, axis=0).max() for detection in detections)
     limits = np.array(image.shape[1::-1])
     start = np.clip(np.floor(points.min(axis=0) - margin), 0, limits)
     end = np.clip(np.ceil(points.max(axis=0) + margin), 0, limits)
-    if (end - start).min() < margin:  # the part is almost outside the image
+    if (end - start).min() < margin:
         return None
     (x, y), (width, height) = start.astype(int), (end - start).astype(int)
     return x, y, width, height

@@ -1,7 +1,7 @@
 """Viewer: results in Rerun (extra ``rerun``), in a window or a file.
 
-It shows the image with cuboids and silhouettes, the parts' meshes, cuboids and axes in space with
-the ellipsoid of their position's uncertainty, and the network's belief maps, on a timeline.
+The viewer shows the image with cuboids and silhouettes; the parts' meshes, cuboids and axes in 3D,
+with an ellipsoid for the uncertainty of each position; and the network's belief maps.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ ELLIPSOID: Final = 2.8
 """Half axes of the ellipsoid, standard deviations: 95 % of a normal distribution in space."""
 
 JPEG_QUALITY: Final = 90
-SINCE_1970: Final = 1e8  # seconds above which a time is a date, not a position in a video
+SINCE_1970: Final = 1e8  # seconds above which a time counts from 1970, not from a video's start
 
 
 class Viewer:
@@ -93,7 +93,7 @@ class Viewer:
             image_plane_distance=1.5 * distance,
         )
         log("world/camera", pinhole)
-        log("world/camera/picture", rr.Image(result.image).compress(JPEG_QUALITY))
+        log("world/camera/image", rr.Image(result.image).compress(JPEG_QUALITY))
         log("world/camera/outlines", _outlines(result))
         log("summary", rr.TextDocument(result.summary))
         for name, belief in belief_images(self._estimator, result).items():
@@ -196,9 +196,9 @@ class Viewer:
 
 
 def belief_images(estimator: PoseEstimator, result: PoseResult) -> Mapping[str, RGBImage]:
-    """Return the strongest belief of each part's keypoints as colours; none without a network.
+    """Return the strongest belief of each part's keypoints as a colour image; empty for templates.
 
-    The network is run again, on the largest of its image sizes.
+    The network runs again, on the largest of its image sizes.
     """
     if not estimator.has_network:
         return {}
@@ -227,8 +227,7 @@ def _is_listening(port: int) -> bool:
 def _blueprint(distance: float) -> Any:
     """Return the layout: a 3D view on the left; image, belief maps and summary on the right.
 
-    Args:
-        distance: Distance of the parts from the camera, metres.
+    ``distance`` is that of the parts from the camera, metres.
     """
     import rerun.blueprint as rrb
 
@@ -238,11 +237,11 @@ def _blueprint(distance: float) -> Any:
         eye_up=(0, -1, 0),
     )
     space = rrb.Spatial3DView(origin="world", name="space", eye_controls=eye)
-    picture = rrb.Spatial2DView(origin="world/camera", contents="world/camera/**", name="picture")
+    image = rrb.Spatial2DView(origin="world/camera", contents="world/camera/**", name="image")
     beliefs = rrb.Spatial2DView(origin="beliefs", name="belief maps")
     summary = rrb.TextDocumentView(origin="summary", name="summary")
     return rrb.Blueprint(
-        rrb.Horizontal(space, rrb.Vertical(picture, beliefs, summary, row_shares=[8, 4, 1])),
+        rrb.Horizontal(space, rrb.Vertical(image, beliefs, summary, row_shares=[8, 4, 1])),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline="frame"),
@@ -266,7 +265,7 @@ def _outlines(result: PoseResult) -> rr.LineStrips2D:
 
 
 def _mesh(vertices: Any, faces: Any, colour: tuple[int, int, int]) -> rr.Mesh3D:
-    """Return a mesh with one normal per triangle: flat shading shows its shape."""
+    """Return a mesh with one normal per triangle, because flat shading shows the shape."""
     import rerun as rr
 
     corners = np.asarray(vertices)[np.asarray(faces)]

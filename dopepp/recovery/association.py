@@ -31,28 +31,29 @@ Evidence = Float[np.ndarray, "instances 8 peaks"]
 CornerPeaks = Float[np.ndarray, "8 peaks 2"]
 Corners = Float[np.ndarray, "instances 8 2"]
 
-MIN_DEVIATION: Final = 0.05  # Smallest standard deviation of a vector's direction, radians
-POSITION_PX: Final = 1.0  # Error of positions that rotates the direction from peak to centroid
-MIN_LENGTH: Final = 1e-3  # A shorter mean vector has no direction
-PREDICTION_PX: Final = 4.0  # Deviation of a keypoint from its prediction: half a cell of stride 8
-CANDIDATES: Final = 3  # Most likely peaks of a corner, by belief and direction, that are tried
+MIN_DEVIATION: Final = 0.05  # smallest standard deviation of a vector's direction, radians
+POSITION_PX: Final = 1.0  # position error that rotates the direction from peak to centroid
+MIN_LENGTH: Final = 1e-3  # a shorter mean vector has no direction
+PREDICTION_PX: Final = 4.0  # deviation of a keypoint from its prediction: half a cell of stride 8
+CANDIDATES: Final = 3  # number of peaks per corner, by belief and direction, that form triples
 
 PERSPECTIVE: Final = 0.1
-"""Deviation of corners from the affine camera, over their distance from the centroid: a part seen
-from five times its size away has corners ±10 % nearer or farther."""
+"""Deviation of corners from the affine camera, over their distance from the centroid: at a distance
+of five times the part's size, corners are up to 10 % nearer or farther than the centroid."""
 
-SIGMA_FLOOR_PX: Final = 1.0  # Bounds the weight of a sharp peak against a blurred one
-WIDENINGS: Final = (1.0, 2.0, 4.0)  # Factors on the peaks' deviations, until most keypoints agree
-ROUNDS: Final = 3  # Maximum number of times that poses regroup the keypoints
+SIGMA_FLOOR_PX: Final = 1.0  # bounds the weight of a sharp peak against a blurred peak
+WIDENINGS: Final = (1.0, 2.0, 4.0)  # factors on the peaks' deviations, until most keypoints agree
+ROUNDS: Final = 3  # maximum number of times that poses regroup the keypoints
 
-BORDER: Final = 1.0  # Distance from the maps' border within which a keypoint may lie beyond, cells
+BORDER: Final = 1.0  # cells from the maps' border within which a keypoint may lie outside the maps
 BORDER_DEVIATION: Final = 0.75
-"""RMS error of such a peak for trained networks, cells: half of the belief lies beyond the maps, so
-the peak is pulled inward."""
+"""RMS error of a peak at the border for trained networks, cells: half of the belief lies outside
+the maps, which shifts the peak inward."""
 
 DIAGONALS: Final = np.array([(0, 6), (1, 7), (2, 4), (3, 5)])  # Opposite corners
-ALTERNATING: Final = np.array([1.0, -1.0, 1.0, -1.0])  # Arms of first corners sum to 0 with these
-RIVALS: Final = -2  # marks a peak that is the best of two instances
+ALTERNATING: Final = np.array([1.0, -1.0, 1.0, -1.0])
+"""Weights with which the arms of the diagonals' first corners sum to 0."""
+RIVALS: Final = -2  # marks a corner whose best peak is the same for two instances
 
 
 @dataclass(frozen=True)
@@ -99,8 +100,8 @@ def select_peaks(
         peaks: Peaks of all channels of a batch.
         image: Index of the image.
         number: Index of the object.
-        threshold: Belief below which a centroid does not count as an instance.
-        cells: Width and height of the maps.
+        threshold: Belief from which a centroid is an instance.
+        cells: (width, height) of the maps, cells.
         stride: Pixels per cell.
     """
     first = number * NUM_KEYPOINTS
@@ -161,7 +162,7 @@ def solve_group(group: KeypointGroup, cuboid: Cuboid, K: CameraMatrix) -> PnPRes
 
 
 def direction_evidence(peaks: ObjectPeaks, max_angle: float, coincident_px: float) -> Evidence:
-    """Return how likely belief and direction make each corner peak a part of each instance.
+    """Return the evidence of belief and direction that each corner peak belongs to each instance.
 
     The likelihood of the angle is divided by the likelihood of a uniform angle, so a vector without
     a direction is neutral. Unit vectors whose angles deviate by σ have a mean of length exp(−σ²/2).
@@ -217,16 +218,11 @@ def associate(
     return [KeypointGroup(*group) for group in zip(position, score, covariance, strict=True)]
 
 
-@compiled()
 def _border_covariance(position: Array, covariance: Array, extent: Array, stride: float) -> Array:
     """Widen the covariance of peaks at the border of the maps; the outermost pixel ends at −½."""
+    inward = np.minimum(position + 0.5, extent - 0.5 - position).min(axis=-1)
     widened = covariance.copy()
-    for k, m in np.ndindex(position.shape[:2]):
-        x, y = position[k, m, 0], position[k, m, 1]
-        inward = min(x + 0.5, y + 0.5, extent[0] - 0.5 - x, extent[1] - 0.5 - y)
-        if inward < BORDER * stride:
-            for axis in range(2):
-                widened[k, m, axis, axis] += (BORDER_DEVIATION * stride) ** 2
+    widened[inward < BORDER * stride] += (BORDER_DEVIATION * stride) ** 2 * np.eye(2)
     return widened
 
 
@@ -250,20 +246,7 @@ def _direction_evidence(
     max_angle: float,
     coincident_px: float,
 ) -> Array:
-    """Compute :func:`direction_evidence` for arrays.
-
-    Args:
-        position: (x, y) of each corner peak, pixels, by corner.
-        score: Belief of each corner peak; 0 for none.
-        toward: Mean field vector at each corner peak.
-        centroid: (x, y) of each instance's centroid, pixels.
-        centroid_score: Belief of each centroid.
-        max_angle: Largest angle between vector and centroid, radians.
-        coincident_px: Distance to the centroid within which the direction does not matter.
-
-    Returns:
-        Evidence by instance, corner and peak; −∞ for peaks in another direction.
-    """
+    """Compute :func:`direction_evidence` from the fields of :class:`ObjectPeaks`."""
     evidence = np.full((len(centroid), *score.shape), -math.inf)
     beliefs = np.log(centroid_score)
     for k, m in np.ndindex(score.shape):
@@ -301,16 +284,9 @@ def _gain(
 ) -> Array:
     """Add the evidence of each peak's distance from its expected position; negative sums become 0.
 
-    This evidence is the ratio of a Gaussian density to the density of a peak anywhere on the maps.
-    Without an expected position, the ratio is 1.
-
-    Args:
-        evidence: Logarithmic evidence by instance, corner and peak.
-        position: (x, y) of each peak, pixels.
-        covariance_px: Covariance of each peak.
-        expected: Expected (x, y) of each instance's corners, pixels; NaN if unknown.
-        deviation: Standard deviation of each instance's expected positions, pixels.
-        area_px: Area of the maps, squared pixels.
+    The evidence of a distance is the logarithm of a ratio: a Gaussian density around the expected
+    position (``deviation``: its standard deviation for each instance, pixels) over the density of a
+    peak anywhere on the maps. Without an expected position, the evidence is 0.
     """
     gain = np.zeros(evidence.shape)
     for i, k, m in np.ndindex(evidence.shape):
@@ -329,7 +305,7 @@ def _gain(
 
 @compiled()
 def _unrivalled(gain: Array) -> Array:
-    """Return each instance's best peak per corner: −1 for none, RIVALS if two share a best peak."""
+    """Return each instance's best peak per corner; −1: none, RIVALS: two instances share it."""
     chosen = np.full(gain.shape[:2], -1, np.int64)
     for k in range(gain.shape[1]):
         for i in range(len(gain)):
@@ -349,17 +325,17 @@ def _unrivalled(gain: Array) -> Array:
 def _predict(
     position: Array, evidence: Array, centroid: Array, area_px: float
 ) -> tuple[Array, Array]:
-    """Return the corner positions with which the most and likeliest peaks agree.
+    """Predict each instance's corners from the three corner peaks that agree best with the others.
 
     Returns:
-        Positions, NaN for instances with fewer than three usable corners, and their standard
-        deviations, pixels.
+        (x, y) of the corners, NaN for instances with fewer than three usable corners, and their
+        standard deviation for each instance, pixels.
     """
     count = len(evidence)
     expected, deviation = np.full((count, NUM_CORNERS, 2), math.nan), np.empty(count)
     arms = np.empty((NUM_CORNERS, CANDIDATES, 2))
     likeliest = np.empty((NUM_CORNERS, CANDIDATES))
-    # No agreement with other peaks outweighs evidence below this.
+    # Even perfect agreement of the position does not outweigh evidence below this limit.
     hopeless = -math.log(area_px / (2 * math.pi * PREDICTION_PX**2))
     usable = np.zeros(NUM_CORNERS, np.int64)
     for i in range(count):
@@ -395,15 +371,8 @@ def _best_triple(
 ) -> float:
     """Predict the corners of an instance from the three corner peaks that agree with most others.
 
-    Args:
-        arms: Vector from the centroid to each candidate peak, by corner, pixels.
-        evidence: Logarithmic evidence of each candidate.
-        usable: Number of candidates of each corner.
-        area_px: Area of the maps, squared pixels.
-        expected: Filled with the predicted vector of each corner.
-
-    Returns:
-        The standard deviation of the predictions, pixels.
+    The ``usable[k]`` candidates of corner k have the vectors ``arms[k]`` from the centroid, pixels.
+    ``expected`` is filled with the predicted vectors, and their standard deviation is returned.
     """
     best, best_variance = -math.inf, PREDICTION_PX**2
     diagonals, given = np.empty((4, 2)), np.empty(3, np.int64)
@@ -445,15 +414,8 @@ def _agreement(
 ) -> tuple[float, float]:
     """Sum the evidence of all candidates near the corners that four diagonals predict.
 
-    The summation stops early, with an upper bound, once the sum cannot exceed ``least``.
-
-    Args:
-        diagonals: Vector from the centroid to one end of each diagonal, pixels.
-        arms: Vector from the centroid to each candidate peak, by corner, pixels.
-        evidence: Logarithmic evidence of each candidate.
-        usable: Number of candidates of each corner.
-        area_px: Area of the maps, squared pixels.
-        least: Sum to exceed.
+    The diagonals are vectors from the centroid to one end, pixels. The summation stops early, with
+    an upper bound, once the sum cannot exceed ``least``.
 
     Returns:
         The sum, and the variance of the predicted positions, squared pixels.

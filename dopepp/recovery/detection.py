@@ -30,20 +30,20 @@ from dopepp.geometry.cuboid import NUM_CORNERS, Cuboid
 from dopepp.geometry.pnp import PnPResult
 from dopepp.recovery.association import KeypointGroup
 
-FEATURES: Final = ("bias", "belief", "spread", "misfit", "found")  # features of the score, in order
+FEATURES: Final = ("bias", "belief", "spread", "misfit", "found")  # features of the score
 REFINED_FEATURES: Final = ("bias", "score", "verification")  # features of a refined pose's score
 
 _FORMER_FEATURES: Final = frozenset({"refined_agreement", "refined_support"})
 
 CANDIDATE: Final = 0.005
-"""Score of the network from which a detection is refined: verification distinguishes a false
-detection from a part that the network was unsure of."""
+"""Network score from which a detection is refined. It is low, because verification distinguishes
+false detections from parts with a low score."""
 
-DISTANCE_FACTORS: Final = (0.5, 2.0)  # Range; factors of trained networks are within a tenth of 1
-COVARIANCE_FACTORS: Final = (0.5, 4.0)  # Range; factors of trained networks are 0.8 to 3
+DISTANCE_FACTORS: Final = (0.5, 2.0)  # range; factors of trained networks are 0.9 to 1.1
+COVARIANCE_FACTORS: Final = (0.5, 4.0)  # range; factors of trained networks are 0.8 to 3
 REFINED_COVARIANCE_FACTORS: Final = (0.1, 4.0)
 """Range for refined poses. Refinement assumes errors that renders do not have, e.g. shadows and
-inaccurate meshes, so that its covariances on renders are too large."""
+inaccurate meshes, so its covariances are too large on renders."""
 
 PASSING: Final = 0.1  # ADD over the diameter below which a pose is correct
 
@@ -51,14 +51,14 @@ PASSING: Final = 0.1  # ADD over the diameter below which a pose is correct
 _QUARTER: Final = 3.455
 _TENTH_BEYOND: Final = 10.645
 _WRONG_RANGE: Final = math.log(1e6)  # range of ln(squared distance) of wrong poses
-_CERTAIN: Final = 1e-3  # Beliefs within this distance of 0 or 1 are treated alike
-_EXPONENTS: Final = 4.0  # Logarithms are clipped beyond this, so that outliers do not dominate
-_TYPICAL_MISFIT: Final = 0.01  # Average reprojection error over the size in the image
-_RIDGE: Final = 0.1  # Weight of the squared weights, in detections, which keeps them finite
-_DEFAULTS_RIDGE: Final = 1.0  # Weight of the squared distance from default weights, in detections
-_STEPS: Final = 50  # Maximum number of Newton steps
+_CERTAIN: Final = 1e-3  # beliefs are clipped to this distance from 0 and 1
+_EXPONENTS: Final = 4.0  # limit of logarithms and Newton steps, so that outliers do not dominate
+_TYPICAL_MISFIT: Final = 0.01  # average reprojection error over the size in the image
+_RIDGE: Final = 0.1  # weight of the squared weights, in detections; keeps the weights finite
+_DEFAULTS_RIDGE: Final = 1.0  # weight of the squared distance from default weights, in detections
+_STEPS: Final = 50  # maximum number of iterations of a fit
 _MEAN_BELIEF: Final = tuple(float(name == "belief") for name in FEATURES)
-_VERIFIED: Final = 1e-4  # smallest distance of a verified probability from 0 and 1
+_VERIFIED: Final = 1e-4  # probabilities of verification are clipped to this distance from 0 and 1
 
 
 @dataclass(frozen=True)
@@ -73,8 +73,8 @@ class Detection:
             agree with the pose count 0.
         T_cam_obj: Object-to-camera transform, metres, OpenCV camera frame.
         keypoints: The cuboid's corners and centroid projected with this pose, pixels.
-        peaks: The measured keypoints, pixels; NaN for keypoints that are missing or do not agree
-            with the pose.
+        peaks: Measured keypoints, pixels; NaN for keypoints that are missing or do not agree with
+            the pose.
         reprojection_error_px: RMS distance between ``keypoints`` and ``peaks``, pixels.
         covariance: Covariance of a small rotation about the object's origin (rotation vector in
             the camera frame, radians) and a small translation (camera frame, metres).
@@ -161,7 +161,8 @@ class RecoveryOptions:
     def of(cls, options: Mapping[str, float]) -> RecoveryOptions:
         """Check the options of a config, a checkpoint or a caller.
 
-        Scores of refined poses that were fitted to other features are left out: tune again.
+        Checkpoints of former versions have weights for other features of refined poses. Their
+        ``refined_`` options are ignored, so the checkpoint must be tuned again.
 
         Raises:
             UserError: A name is unknown, or a value is out of its range.
@@ -172,12 +173,12 @@ class RecoveryOptions:
 
     @property
     def score_weights(self) -> tuple[float, ...]:
-        """Weights of the score's features, in their order."""
+        """Weights of :data:`FEATURES`."""
         return tuple(getattr(self, f"score_{name}") for name in FEATURES)
 
     @property
     def refined_weights(self) -> tuple[float, ...]:
-        """Weights of the features of a refined pose's score, in their order."""
+        """Weights of :data:`REFINED_FEATURES`."""
         return tuple(getattr(self, f"refined_{name}") for name in REFINED_FEATURES)
 
     def unrefined(self) -> RecoveryOptions:
@@ -220,10 +221,10 @@ def make_detection(
         reprojection_error_px=result.reprojection_error_px,
         covariance=result.covariance,
     )
-    return calibrated(detection, cuboid, K, options)
+    return calibrate(detection, cuboid, K, options)
 
 
-def calibrated(
+def calibrate(
     detection: Detection, cuboid: Cuboid, K: CameraMatrix, options: RecoveryOptions
 ) -> Detection:
     """Return a detection with corrected distance and covariance, and with its score.
@@ -244,18 +245,19 @@ def calibrated(
     return replace(detection, keypoints=keypoints, score=probability, covariance=covariance)
 
 
-def recalibrated(
+def recalibrate(
     refined: Sequence[Detection], options: RecoveryOptions, by_depth: bool = False
 ) -> list[Detection]:
     """Return refined detections with the scores and covariances of refined poses, best first.
 
-    Detections that were not verified keep the network's score, and those that were not refined keep
-    its covariance.
+    Detections without verification keep the network's score. Detections that were not refined keep
+    the network's covariance.
 
     Args:
         refined: Detections after refinement and verification.
         options: Options with the fitted weights and the factor.
-        by_depth: Whether a depth image was used; the factor was fitted without.
+        by_depth: Whether a depth image was used. The covariance factor was fitted without depth
+            images and is not applied then.
     """
     weights, factor = np.array(options.refined_weights), options.refined_covariance_factor
     calibrated = []
@@ -282,8 +284,7 @@ def detection_features(
 ) -> Float[np.ndarray, "features"]:
     """Return the features of a detection for the logistic model of its score.
 
-    The features are listed in :data:`FEATURES`, in this order, and do not depend on the present
-    score.
+    The features are those of :data:`FEATURES`; they do not depend on the detection's score.
 
     Args:
         detection: Detection before refinement.
@@ -296,7 +297,7 @@ def detection_features(
     # A corner without a peak may lie behind the camera, where it has no pixel.
     visible = pixels[np.isfinite(pixels).all(axis=1)]
     extent = max(float(np.ptp(visible, axis=0).max()), 1.0) if len(visible) else 1.0
-    spread = _expected_distance(detection.covariance, corners @ T[:3, :3].T) / size
+    spread = expected_distance(detection.covariance, corners @ T[:3, :3].T) / size
     misfit = max(detection.reprojection_error_px, 1e-9) / (extent * _TYPICAL_MISFIT)
     logarithms = np.log([_odds(detection.belief), max(spread, 1e-9) / PASSING, misfit])
     missing = float(np.isfinite(detection.peaks).all(axis=1).mean()) - 1
@@ -304,7 +305,7 @@ def detection_features(
 
 
 def log_odds(probability: float) -> float:
-    """Return the logarithm of the odds of a probability that verification may have overstated."""
+    """Return the log odds of a probability of verification, clipped to about ±9."""
     return math.log(_odds(probability, _VERIFIED))
 
 
@@ -338,8 +339,9 @@ def fit_covariance_factor(
 
     The squared distances are a mixture of correct poses, a multiple of χ² with six degrees of
     freedom, and of wrong poses, whose logarithms are uniform. Expectation-maximisation separates
-    them. The factor matches the 90 % quantile of the correct poses, because their tails are heavier
-    than Gaussian tails, and refinement, whose prior this is, must reach the true pose.
+    the two. The factor matches the 90 % quantile of the correct poses: their errors have heavier
+    tails than a Gaussian, and refinement, which uses the covariance as its prior, must reach the
+    true pose.
 
     Args:
         squared_distances: Squared Mahalanobis distances of true poses, with a factor of 1.
@@ -416,8 +418,13 @@ def fit_weights(
 
 
 @compiled()
-def _expected_distance(covariance: Array, points: Array) -> float:
-    """Return the RMS uncertainty of points (relative to the origin, camera axes), metres."""
+def expected_distance(covariance: Array, points: Array) -> float:
+    """Return the RMS error of an object's points that a pose's covariance predicts, metres.
+
+    Args:
+        covariance: 6×6 covariance of rotation vector (radians) and translation (metres).
+        points: Points relative to the object's origin, in the axes of the covariance, metres.
+    """
     total = 0.0
     moves = np.zeros((3, 6))
     for row in range(3):

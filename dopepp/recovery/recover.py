@@ -170,11 +170,7 @@ def explain(
 
 
 def _check_shapes(belief: Beliefs, field: Fields, num_objects: int, K: Cameras) -> None:
-    """Check the shapes of maps and cameras.
-
-    Raises:
-        ValueError: The shapes do not match.
-    """
+    """Raise a ValueError if maps, objects and cameras do not fit each other."""
     expected = (num_objects * NUM_KEYPOINTS, num_objects * NUM_CORNERS * 2)
     if belief.ndim != 4 or field.ndim != 4 or 0 in belief.shape[2:]:
         raise ValueError(
@@ -211,15 +207,7 @@ def _rejected(
     cells: tuple[int, int],
     stride: int,
 ) -> tuple[Kind, float, str]:
-    """Explain why a candidate is rejected.
-
-    Args:
-        group: The candidate's keypoints.
-        result: Its pose from PnP.
-        detection: Its detection; None without a pose.
-        options: Thresholds of the recovery.
-        cells: (width, height) of the maps, cells.
-        stride: Input pixels per cell.
+    """Explain why a candidate is rejected; ``cells`` is the (width, height) of the maps.
 
     Returns:
         Kind of the reason, the value compared with the threshold, and the explanation.
@@ -239,14 +227,14 @@ def _rejected(
     return kind, best, f"at pixel ({x:.0f}, {y:.0f}) of {size}: {text}"
 
 
-def rejected_refined(detection: Detection, min_score: float) -> Reason:
+def refined_reason(detection: Detection, min_score: float) -> Reason:
     """Return why a refined detection was dropped."""
     text = f"once refined, score {detection.score:.3f} below {min_score:.3g}"
     text += f" ({detection.kept})" if detection.kept else ""
     return Reason(detection.object, "refined", detection.score, text)
 
 
-def furthest(reasons: Sequence[Reason]) -> list[Reason]:
+def main_reasons(reasons: Sequence[Reason]) -> list[Reason]:
     """Return each object's reason for rejecting its best candidate, sorted by progress."""
     order = list(KINDS)
     best: dict[str, Reason] = {}
@@ -256,11 +244,11 @@ def furthest(reasons: Sequence[Reason]) -> list[Reason]:
     return list(best.values())
 
 
-def explained(reasons: Sequence[Reason]) -> str:
+def format_reasons(reasons: Sequence[Reason]) -> str:
     """Return the reasons for missing detections on one image as a line of text."""
     counts = Counter(reason.object for reason in reasons)
     lines = []
-    for reason in reversed(furthest(reasons)):
+    for reason in reversed(main_reasons(reasons)):
         count = counts[reason.object]
         lines.append(f"{reason} (the best of {count})" if count > 1 else str(reason))
     return "; ".join(lines)

@@ -56,7 +56,7 @@ def test_a_good_picture_is_well(run, folder):
 @pytest.mark.parametrize(
     ("options", "line"),
     [
-        (["plain.png", "--camera", "K.txt"], "!! visibility: nothing like pivconnector is seen"),
+        (["plain.png", "--camera", "K.txt"], "!! visibility: pivconnector is not detected"),
         (
             ["good.png", "--camera", "K.txt", "--at", "5,5"],
             "!! elsewhere: 1 of 1 detections above",

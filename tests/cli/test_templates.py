@@ -67,7 +67,7 @@ def test_node_doctor_and_benchmark_take_a_mesh(run, truth, rendered):
     words = ("part.png", "--model", "piv.stl", "--camera", "K.txt", "--unit", "mm", *RANGE)
     lines = run("doctor", *words).stdout.splitlines()
     assert all(line.startswith("ok ") for line in lines), lines
-    assert "piv is seen, score" in lines[5]
+    assert "piv is detected, score" in lines[5]
     four = ("--K", *rendered.scene.K[[0, 1, 0, 1], [0, 1, 2, 2]])
     table = run(
         "benchmark", "piv.stl", "--unit", "mm", *RANGE, "--image", "part.png", *four, "-n", 1

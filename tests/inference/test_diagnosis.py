@@ -1,4 +1,4 @@
-"""What a diagnosis names first on rendered images whose fault is known."""
+"""First diagnosis on rendered images with a known fault."""
 
 import re
 from collections import Counter
@@ -12,7 +12,7 @@ from dopepp import PoseEstimator
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.diagnosis import CHECKS, Case, diagnose
-from dopepp.inference.diagnosis.case import clipped, edge_width, highlights
+from dopepp.inference.diagnosis.case import clipped_share, edge_width, highlights
 from dopepp.models.checkpoint import load_network
 from dopepp.parts.catalogue import pivconnector
 from dopepp.virtual import PRESETS, Factory
@@ -37,25 +37,25 @@ def empty():
 
 
 def first(estimator, image, K, parts=None, **options):
-    """Return the subject of the first thing that is wrong, or nothing."""
+    """Return the subject of the first diagnosis with a fix; empty if all is well."""
     findings = diagnose(Case(estimator, image, K, parts or estimator.parts, **options))
     assert len(findings) == len(CHECKS)
     assert all(
         finding.sentence and str(finding).startswith(f"{finding.subject}: ") for finding in findings
     )
-    return next((one.subject for one in findings if one.fix), "")
+    return next((finding.subject for finding in findings if finding.fix), "")
 
 
 def longer(K, factor):
     return K * np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
 
 
-def test_good_pictures_raise_no_alarm(estimator, factory):
+def test_good_images_have_no_diagnosis(estimator, factory):
     firsts = Counter()
     for index in range(8):
         rendered = factory.render(0, index)
         firsts[first(estimator, rendered.image, rendered.scene.K)] += 1
-    # Of a hundred images a few are lost, and those are told.
+    # The part is not detected on a few of a hundred images; these are diagnosed.
     assert firsts[""] >= 7, firsts
     assert not set(firsts) - {"", "visibility", "pose"}
 
@@ -71,7 +71,7 @@ def test_good_pictures_raise_no_alarm(estimator, factory):
     ],
     ids=["blurred", "dark", "bright", "K too long", "K too short"],
 )
-def test_what_spoils_a_picture_is_named_first(estimator, factory, fault, subject):
+def test_fault_of_the_image_is_diagnosed_first(estimator, factory, fault, subject):
     firsts = Counter()
     for index in range(4):
         rendered = factory.render(0, index)
@@ -79,7 +79,7 @@ def test_what_spoils_a_picture_is_named_first(estimator, factory, fault, subject
     assert firsts[subject] >= 3, firsts
 
 
-def test_a_part_that_is_too_small_is_named_with_its_distance(estimator, factory):
+def test_too_small_part_is_reported_with_its_distance(estimator, factory):
     rendered = factory.render(0, 3, scale=0.4)
     case = Case(estimator, rendered.image, rendered.scene.K, estimator.parts)
     (wrong,) = [finding for finding in diagnose(case) if finding.fix]
@@ -93,7 +93,7 @@ def test_a_part_that_is_too_small_is_named_with_its_distance(estimator, factory)
     assert again in ("", "pose")
 
 
-def test_a_part_out_of_the_picture_or_covered_is_missed(estimator, factory, empty):
+def test_absent_or_covered_part_is_not_visible(estimator, factory, empty):
     missing, covered = Counter(), Counter()
     for index in range(4):
         without, rendered = empty.render(0, index), factory.render(0, index)
@@ -109,7 +109,7 @@ def test_a_part_out_of_the_picture_or_covered_is_missed(estimator, factory, empt
     assert covered["visibility"] + covered["pose"] >= 3, covered
 
 
-def test_detections_beside_the_part_and_on_pictures_without_it_are_named(estimator, factory, empty):
+def test_detections_away_from_the_part_are_reported(estimator, factory, empty):
     rendered = factory.render(0, 0)
     T, K = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj, rendered.scene.K
     u, v = project_keypoints(PART.cuboid, T, K)[CENTROID]
@@ -138,13 +138,13 @@ def test_detections_beside_the_part_and_on_pictures_without_it_are_named(estimat
     assert [(each.subject, each.fix) for each in findings] == [("part", ""), ("elsewhere", "")]
 
 
-def test_a_part_that_is_larger_than_the_picture_is_missed(estimator, factory):
+def test_part_larger_than_the_image_is_not_visible(estimator, factory):
     rendered = [factory.render(0, index, scale=2.0) for index in range(4)]
     firsts = Counter(first(estimator, item.image, item.scene.K) for item in rendered)
     assert firsts["visibility"] + firsts["size"] >= 3, firsts
 
 
-def test_a_distance_where_the_part_is_not_is_told(estimator, factory):
+def test_wrong_distance_range_is_reported(estimator, factory):
     rendered = factory.render(0, 1)
     case = Case(estimator, rendered.image, rendered.scene.K, estimator.parts, distances=(1.0, 3.0))
     wrong = next(finding for finding in diagnose(case) if finding.fix)
@@ -155,7 +155,7 @@ def test_a_distance_where_the_part_is_not_is_told(estimator, factory):
 @pytest.mark.parametrize(
     ("factor", "fix"), [(10, "--unit mm"), (1 / 25.4, "--unit inch"), (1.3, "--part")]
 )
-def test_a_mesh_of_another_size_is_named_before_all_else(estimator, factory, factor, fix):
+def test_mesh_of_another_size_is_diagnosed_first(estimator, factory, factor, fix):
     mesh = replace(PART.mesh, vertices=factor * PART.mesh.vertices)
     image, K = np.zeros((128, 128, 3), np.uint8), factory.scene(0, 0).K
     case = Case(estimator, image, K, [replace(estimator.parts[0], mesh=mesh)])
@@ -165,7 +165,7 @@ def test_a_mesh_of_another_size_is_named_before_all_else(estimator, factory, fac
     assert fix in wrong.fix
 
 
-def test_a_part_without_mesh_or_sizes_is_diagnosed(factory):
+def test_part_without_mesh_or_trained_sizes_is_diagnosed(factory):
     network, checkpoint = load_network("pretrained/pivconnector")
     checkpoint.seen.clear()
     checkpoint.parts[0] = replace(checkpoint.parts[0], mesh=None)
@@ -173,7 +173,7 @@ def test_a_part_without_mesh_or_sizes_is_diagnosed(factory):
     for image in (rendered.image, np.full_like(rendered.image, 90)):
         case = Case(PoseEstimator(network, checkpoint), image, rendered.scene.K, checkpoint.parts)
         findings = {finding.subject: finding for finding in diagnose(case)}
-        assert "does not know in which sizes" in findings["size"].sentence
+        assert "does not record the trained sizes" in findings["size"].sentence
         assert (findings["visibility"].fix == "") == (image is rendered.image)
 
 
@@ -189,7 +189,7 @@ def shapes(noise: float = 0.0) -> np.ndarray:
 @pytest.mark.parametrize(
     ("sigma", "noise"), [(1.5, 0.0), (1.5, 3.0), (2.5, 3.0), (4.0, 0.0), (4.0, 3.0), (6.0, 0.0)]
 )
-def test_a_known_blur_is_measured(sigma, noise):
+def test_edge_width_measures_a_known_blur(sigma, noise):
     blurred = cv2.GaussianBlur(shapes(), (0, 0), sigma).astype(float)
     blurred += np.random.default_rng(1).normal(size=blurred.shape) * noise
     width = edge_width(np.clip(blurred, 0, 255).astype(np.uint8))
@@ -202,21 +202,21 @@ def test_sharp_edges_are_narrow(noise):
 
 
 @pytest.mark.parametrize("level", [0, 90, 255])
-def test_a_plain_picture_does_not_tell(level):
+def test_plain_image_has_no_edge_width(level):
     assert edge_width(np.full((64, 64, 3), level, np.uint8)) is None
 
 
-def test_highlights_and_white_are_shares_of_the_picture():
+def test_highlights_and_clipped_share():
     image = np.full((100, 100, 3), 40, np.uint8)
     image[:20] = 255
     image[20:30] = (255, 255, 90)  # yellow has detail left
-    assert clipped(image) == 0.2
+    assert clipped_share(image) == 0.2
     assert (highlights(image), highlights(image[30:])) == (255, 40)
 
 
 @pytest.mark.slow
-def test_the_faults_of_many_pictures_are_named(estimator, factory, empty):
-    """Each on forty images, as docs/how-to/doctor.md lists them."""
+def test_faults_of_many_images_are_diagnosed(estimator, factory, empty):
+    """Measure the shares in docs/how-to/doctor.md on forty images."""
     right = Counter()
     for index in range(40):
         rendered, without = factory.render(0, index), empty.render(0, index)

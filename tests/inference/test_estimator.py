@@ -21,7 +21,7 @@ from dopepp.geometry.camera import (
 )
 from dopepp.geometry.rotation import random_rotation, rotation_angle, rotation_vector_to_matrix
 from dopepp.inference import estimator as module
-from dopepp.inference.picture import letterboxed
+from dopepp.inference.network_input import resize_and_pad
 from dopepp.maps import MapGeometry, encode
 from dopepp.models.checkpoint import Checkpoint, write_atomic
 from dopepp.models.network import build_network
@@ -68,7 +68,7 @@ def image(width: int, height: int) -> np.ndarray:
 
 
 class Oracle(PoseEstimator):
-    """Knows where the objects are and draws their maps instead of running its network."""
+    """An estimator whose maps are computed from true poses instead of by a network."""
 
     def show(
         self, size: tuple[int, int], K: np.ndarray, poses: list[tuple[int, np.ndarray]]
@@ -91,7 +91,7 @@ class Oracle(PoseEstimator):
         return belief[0], field[0]
 
 
-def test_loads_what_was_saved(estimator, parts):
+def test_estimator_has_the_parts_and_options_of_its_checkpoint(estimator, parts):
     assert [part.name for part in estimator.parts] == ["bracket", "plate"]
     for ours, theirs in zip(estimator.parts, parts, strict=True):
         assert_allclose(ours.cuboid, theirs.cuboid)
@@ -100,7 +100,7 @@ def test_loads_what_was_saved(estimator, parts):
     assert estimator.recovery.sigma == 1.5
 
 
-def test_it_says_what_it_knows():
+def test_repr_describes_network_parts_and_thresholds():
     text = repr(PoseEstimator.load("pretrained/pivconnector", refine="region"))
     assert "128×128 pixels, cpu, refine=region)" in text
     assert (
@@ -110,7 +110,7 @@ def test_it_says_what_it_knows():
 
 
 @pytest.mark.parametrize("size", [(416, 416), (640, 480), (97, 301), (33, 32), (1, 1), (900, 20)])
-def test_any_image_size(estimator, size):
+def test_images_of_any_size(estimator, size):
     longest = max(size)
     K = camera_matrix(longest, longest, size[0] / 2 - 0.5, size[1] / 2 - 0.5)
     for detection in estimator.predict(image(*size), K):
@@ -118,9 +118,9 @@ def test_any_image_size(estimator, size):
         assert np.isfinite(detection.T_cam_obj).all()
 
 
-def test_the_network_sees_the_letterboxed_image(estimator):
+def test_network_input_is_the_letterboxed_image(estimator):
     picture = image(640, 480)
-    padded = letterboxed(picture, Letterbox.fit((640, 480), (416, 416)), 32)
+    padded = resize_and_pad(picture, Letterbox.fit((640, 480), (416, 416)), 32)
     assert padded.shape == (320, 416, 3)
     expected = cv2.resize(picture, (416, 312), interpolation=cv2.INTER_AREA)
     assert_array_equal(padded[:312], expected)
@@ -171,13 +171,13 @@ def test_distorted_images_are_undistorted_first(estimator, monkeypatch):
     picture, distortion = cv2.blur(image(640, 480), (9, 9)), [-0.3, 0.1, 0.001, -0.002, 0.01]
     estimator.predict(picture, K_VGA, np.array(distortion))
     by_hand = cv2.undistort(picture, K_VGA, np.array(distortion))
-    assert_array_equal(seen[0], letterboxed(by_hand, Letterbox.fit((640, 480), (416, 416)), 32))
+    assert_array_equal(seen[0], resize_and_pad(by_hand, Letterbox.fit((640, 480), (416, 416)), 32))
     estimator.predict(picture, K_VGA, np.zeros((1, 4)))
     estimator.predict(picture, K_VGA)
     assert_array_equal(seen[1], seen[2])
 
 
-def test_views_and_lists_are_taken(estimator):
+def test_array_views_and_lists_are_accepted(estimator):
     bgr = image(640, 480)
     flipped = estimator.predict(bgr[..., ::-1], K_VGA)
     copied = estimator.predict(np.ascontiguousarray(bgr[..., ::-1]), K_VGA)
@@ -226,12 +226,12 @@ def test_bad_input(estimator, checkpoint_path, bad, message):
         ),
     ],
 )
-def test_only_what_is_needed_is_imported(code, absent, command):
+def test_unneeded_packages_are_not_imported(code, absent, command):
     done = command("-c", f"import sys; {code}; print({absent} & set(sys.modules))", code=0)
     assert done.out == "set()\n"
 
 
-def test_an_unknown_name_of_the_package():
+def test_unknown_attribute_of_the_package():
     import dopepp
 
     with pytest.raises(AttributeError, match="PoseEstimater"):
@@ -249,7 +249,7 @@ def parts_path(save):
 
 
 def seen(path, refine, nearer=0.012, **options):
-    """What an estimator whose network is off along the viewing axis finds on a rendered part."""
+    """Return an oracle with a distance error (``nearer``, metres) and a render of the part."""
     from dopepp.virtual import Scene, SceneObject, make_surface, render
 
     off = TRUE.copy()
@@ -266,7 +266,7 @@ def error(pose):
     return np.linalg.norm(pose[:3, 3] - TRUE[:3, 3])
 
 
-def test_refines_with_depth_where_it_is_given(parts_path):
+def test_depth_image_refines_the_distance(parts_path):
     estimator, rendered = seen(parts_path, "depth")
     detection = estimator.predict(rendered.image, K_VGA, depth=rendered.depth)[0]
     alone = estimator.candidates(rendered.image, K_VGA)[0]
@@ -277,7 +277,7 @@ def test_refines_with_depth_where_it_is_given(parts_path):
     )
 
 
-def test_refines_on_the_picture(parts_path):
+def test_region_refines_on_the_image(parts_path):
     estimator, rendered = seen(parts_path, "region", nearer=0.0)
     detection = estimator.predict(rendered.image, K_VGA)[0]
     turned = rotation_vector_to_matrix(np.array([0.04, 0.04, -0.03])) @ TRUE[:3, :3]
@@ -303,19 +303,19 @@ def test_refines_on_the_picture(parts_path):
     assert_allclose(alone.T_cam_obj, TRUE, atol=1e-5)  # the network's
 
 
-def test_refines_no_longer_than_it_may(parts_path):
+def test_refinement_stops_at_the_time_limit(parts_path):
     estimator, rendered = seen(parts_path, "region", max_ms=0.0)
     assert estimator.predict(rendered.image, K_VGA)[0].kept == "max_ms=0 was spent"
 
 
-def test_the_scale_error_is_a_share(parts_path):
+def test_scale_error_is_a_share(parts_path):
     estimator = PoseEstimator.load(parts_path, refine="region", scale_error=0.002)
     assert estimator.refining("region").scale_error == 0.002
     with pytest.raises(UserError, match="scale_error"):
         PoseEstimator.load(parts_path, refine="region", scale_error=2.0)
 
 
-def test_a_checkpoint_without_meshes_names_the_option(parts_path):
+def test_error_about_a_missing_mesh_names_the_option(parts_path):
     estimator, _ = seen(parts_path, None)
     bare = replace(
         estimator.checkpoint, parts=[replace(part, mesh=None) for part in estimator.parts]
@@ -326,7 +326,7 @@ def test_a_checkpoint_without_meshes_names_the_option(parts_path):
     PoseEstimator.load(parts_path, refine="region", parts=estimator.parts)
 
 
-def test_candidates_below_the_threshold_are_not_reported(checkpoint_path):
+def test_candidates_below_the_threshold_are_not_detections(checkpoint_path):
     estimator, picture = Oracle.load(checkpoint_path), image(640, 480)
     places = [(-0.2, -0.1, 0.7), (0.2, -0.1, 0.8), (-0.2, 0.15, 0.9), (0.2, 0.15, 1.0)]
     poses = [(0, make_transform(TRUE[:3, :3], np.array(place))) for place in places]
@@ -347,7 +347,7 @@ def test_candidates_below_the_threshold_are_not_reported(checkpoint_path):
         estimator.reporting(1.1)
 
 
-def test_a_refined_pose_has_a_threshold_of_its_own(parts_path):
+def test_refined_poses_have_a_separate_threshold(parts_path):
     estimator, rendered = seen(parts_path, "region", nearer=0.0)
     estimator.recovery = replace(estimator.recovery, min_score=0.2, refined_min_score=0.6)
     assert estimator.min_score == 0.6

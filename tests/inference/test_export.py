@@ -1,4 +1,4 @@
-"""Networks out of files: the same maps and poses as PyTorch's, whatever they are called."""
+"""Exported networks: the same maps and poses as PyTorch's."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ PYRAMID = {"_target_": "dopepp.models.backbones.Pyramid", "width": 0.0625}
 
 @pytest.fixture(scope="module", params=["small", pytest.param("large", marks=pytest.mark.slow)])
 def original(request, tiny_spec, tmp_path_factory):
-    """A network of random weights whose maps are far from flat, with attention and batch norm."""
+    """A network with attention, batch norm and random weights whose maps vary strongly."""
     attention = {"_target_": "dopepp.models.attention.CBAM", "reduction": 4}
     head = {**(CASCADE if request.param == "small" else SCALES), "batch_norm": True}
     spec = {**tiny_spec, "attention": attention, "head": head}
@@ -46,7 +46,7 @@ def original(request, tiny_spec, tmp_path_factory):
             nn.init.normal_(module.running_mean)
             nn.init.uniform_(module.running_var, 0.5, 2)
     for branch in (*network.head.belief_branches, *network.head.field_branches):
-        nn.init.normal_(branch.outputs[-1].weight, std=0.5)  # untrained ones answer a constant
+        nn.init.normal_(branch.outputs[-1].weight, std=0.5)  # default weights yield constant maps
     checkpoint = Checkpoint(
         spec, network.state_dict(), [pivconnector()], (128, 96), 8, 1.5, {"peak_threshold": 1e-3}
     )
@@ -76,7 +76,7 @@ def pictures(*shape: int) -> torch.Tensor:
     return torch.from_numpy(np.random.default_rng(0).integers(0, 256, shape, np.uint8))
 
 
-def test_the_same_maps_for_any_batch_height_and_width(exported, original):
+def test_export_has_the_same_maps_for_any_batch_and_size(exported, original):
     theirs, ours = PoseEstimator.load(exported), PoseEstimator.load(original)
     assert theirs.network.size_multiple == ours.network.size_multiple
     for shape in ((1, 3, 96, 128), (1, 3, 32, 32), (3, 3, 160, 64)):
@@ -90,7 +90,7 @@ def test_the_same_maps_for_any_batch_height_and_width(exported, original):
             torch.testing.assert_close(first / size, other / size, atol=1e-4, rtol=0)
 
 
-def test_a_renamed_file_is_the_same_estimator(exported, original, tmp_path):
+def test_renamed_export_is_the_same_estimator(exported, original, tmp_path):
     ending = "".join(exported.suffixes)
     moved = tmp_path / f"renamed{ending}"
     (shutil.copytree if exported.is_dir() else shutil.copy)(exported, moved)
@@ -105,7 +105,7 @@ def test_a_renamed_file_is_the_same_estimator(exported, original, tmp_path):
 
 
 @pytest.mark.slow
-def test_weights_in_half_precision_take_half_the_place(original, tmp_path):
+def test_half_precision_halves_the_file(original, tmp_path):
     pytest.importorskip("onnxscript")
     whole, half = (written(original, "onnx", tmp_path / item, item) for item in ("fp32", "fp16"))
     described = len(half.read_bytes()) - 2 * len(whole.read_bytes())
@@ -117,7 +117,7 @@ def test_weights_in_half_precision_take_half_the_place(original, tmp_path):
     assert 0 < (belief - expected).abs().max() < 0.01
 
 
-def test_no_export_names_a_file_of_ours(exported):
+def test_export_contains_no_source_path(exported):
     for path in [exported, *exported.glob("*")]:
         if path.is_file():
             content = path.read_bytes()
@@ -125,9 +125,9 @@ def test_no_export_names_a_file_of_ours(exported):
             assert b"network.py" not in content
 
 
-def test_an_export_runs_on_the_cpu_alone(original, tmp_path, monkeypatch):
+def test_export_runs_on_the_cpu_only(original, tmp_path, monkeypatch):
     path = tmp_path / "a.onnx"
-    monkeypatch.setattr("dopepp.inference.estimator.checked_device", torch.device)
+    monkeypatch.setattr("dopepp.inference.estimator.check_device", torch.device)
     with pytest.raises(UserError, match=r"device cuda for .*a\.onnx; allowed: cpu"):
         PoseEstimator.load(path, "cuda")
 
@@ -135,7 +135,7 @@ def test_an_export_runs_on_the_cpu_alone(original, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("layout", "package"), [("onnx", "onnxscript"), ("openvino", "openvino"), ("onnx", "onnx")]
 )
-def test_a_missing_extra_is_named(layout, package, tmp_path, monkeypatch):
+def test_missing_extra_is_reported(layout, package, tmp_path, monkeypatch):
     monkeypatch.setattr("dopepp.core.errors.find_spec", lambda name: None if name == package else 1)
     with pytest.raises(UserError, match=rf"without the package {package}.*dopepp\[{layout}\]"):
         check_possible(layout, "fp32")
@@ -147,7 +147,7 @@ def test_a_missing_extra_is_named(layout, package, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("package", ["nncf", "openvino"])
-def test_int8_of_onnx_needs_both_extras(package, monkeypatch):
+def test_int8_of_onnx_requires_both_extras(package, monkeypatch):
     monkeypatch.setattr("dopepp.core.errors.find_spec", lambda name: None if name == package else 1)
     check_possible("onnx", "fp16")
     with pytest.raises(UserError, match=rf"int8 without the package {package}.*dopepp\[openvino\]"):
@@ -155,7 +155,7 @@ def test_int8_of_onnx_needs_both_extras(package, monkeypatch):
 
 
 class Cubed(Backbone):
-    """Has an operator that only this process knows."""
+    """A backbone with a custom operator that no format supports."""
 
     out_channels, stride, cell_multiple = 8, 8, 1
 
@@ -168,7 +168,7 @@ class Cubed(Backbone):
 
 
 @pytest.mark.parametrize("layout", ["onnx", pytest.param("openvino", marks=pytest.mark.slow)])
-def test_an_operator_that_a_format_does_not_have(layout, original, tmp_path, monkeypatch):
+def test_unsupported_operator_is_reported(layout, original, tmp_path, monkeypatch):
     pytest.importorskip("onnxscript" if layout == "onnx" else "openvino")
     if not hasattr(torch.ops.dopepp_test, "cubed"):
         operator = torch.library.custom_op("dopepp_test::cubed", mutates_args=())(_cubed)

@@ -1,4 +1,4 @@
-"""The next best view, against draws of poses and against real predictions."""
+"""The next best view, and its expected error compared with sampled poses."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ def mesh():
 
 
 def beside(degrees: float, axis: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> np.ndarray:
-    """Return T_world_cam of a camera that looks at the part from beside the first."""
+    """Return T_world_cam of a camera rotated about the part by an angle."""
     turn = rotation_vector_to_matrix(math.radians(degrees) * np.array(axis))
     return invert_transform(make_transform(turn, POSE[:3, 3] - turn @ POSE[:3, 3]))
 
 
 def along_the_ray(millimetres: float) -> np.ndarray:
-    """Return the covariance of a pose whose distance is known badly."""
+    """Return the covariance of a pose with a large error along the viewing ray."""
     ray = POSE[:3, 3] / np.linalg.norm(POSE[:3, 3])
     covariance = np.diag(np.repeat([math.radians(0.2), 1e-4], 3) ** 2)
     covariance[3:, 3:] += (1e-3 * millimetres) ** 2 * np.outer(ray, ray)
     return covariance
 
 
-def test_a_view_from_beside_is_better_than_the_same_view(mesh):
+def test_view_from_the_side_is_better_than_the_same_view(mesh):
     views = [beside(0), beside(10), beside(30)]
     chosen = next_best_view(mesh, POSE, along_the_ray(1.4), views, K, SIZE)
     same, near, far = chosen.expected
@@ -57,7 +57,7 @@ def test_a_view_from_beside_is_better_than_the_same_view(mesh):
     assert "1.4 to" in chosen.reason
 
 
-def test_views_that_do_not_show_the_part_are_left_out(mesh):
+def test_views_that_do_not_show_the_part_are_excluded(mesh):
     away = beside(0)
     away[0, 3] += 0.3
     below = np.diag([1.0, 1.0, -1.0, 1.0])  # the camera at the origin is under this bench
@@ -74,7 +74,7 @@ def test_views_that_do_not_show_the_part_are_left_out(mesh):
         next_best_view(mesh, POSE, along_the_ray(3.0), [], K, SIZE)
 
 
-def test_the_error_of_points_is_that_of_drawn_poses(mesh):
+def test_point_error_is_the_rms_error_of_sampled_poses(mesh):
     rng = np.random.default_rng(0)
     spread = rng.normal(size=(6, 6)) * np.repeat([0.01, 0.001], 3)[:, None]
     covariance, pose = spread @ spread.T, make_transform(random_rotation(rng), rng.normal(size=3))

@@ -1,4 +1,4 @@
-"""The page of ``dopepp serve`` in a browser, as somebody without a command line uses it."""
+"""The page of ``dopepp serve`` in a browser."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> Path:
-    """An image with the part, one without, files that are no image, and the camera's numbers."""
+    """Folder with an image of the part, an empty image, a text file and a camera file."""
     folder = tmp_path_factory.mktemp("files")
     rendered = Factory([pivconnector()], PRESETS["quickstart"].reframed(640, 480), 2).render(0, 9)
     cv2.imwrite(str(folder / "part.png"), rendered.image[..., ::-1])
@@ -46,12 +46,12 @@ def files(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def opened() -> Iterator[tuple[object, list[str]]]:
-    """The open page, and the addresses elsewhere that it has asked for."""
-    from dopepp.inference.page import served
+    """The open page, and the external addresses that it has requested."""
+    from dopepp.inference.page import serve_page
 
     elsewhere: list[str] = []
     estimator = PoseEstimator.load("pretrained/pivconnector")
-    with served(estimator) as address, sync_api.sync_playwright() as browsers:
+    with serve_page(estimator) as address, sync_api.sync_playwright() as browsers:
         browser = browsers.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         page = browser.new_page()
         page.set_default_timeout(120_000)  # beside other work
@@ -71,7 +71,7 @@ def page(opened):
 
 
 def upload(page, place, path):
-    """Put a file into one of the two places for one."""
+    """Upload a file to an input field of the page."""
     area = page.locator(place)
     if area.get_by_label("Clear").count():
         area.get_by_label("Clear").click()
@@ -80,7 +80,7 @@ def upload(page, place, path):
 
 
 def said(page):
-    """Find poses; return what the page says then."""
+    """Click on the button that finds poses; return the new message."""
     line = page.locator(".said")
     before = line.inner_text()
     page.get_by_role("button", name=FIND).click()
@@ -88,8 +88,8 @@ def said(page):
     return line.inner_text()
 
 
-def test_a_picture_becomes_an_overlay_and_a_file_as_predict_prints_it(page, files, tmp_path):
-    upload(page, "#picture", files / "part.png")
+def test_image_yields_an_overlay_and_the_json_of_predict(page, files, tmp_path):
+    upload(page, "#image", files / "part.png")
     page.get_by_label("camera file", exact=True).check()
     upload(page, "#camera", files / "K.txt")
     assert said(page) == "1 pose"
@@ -115,33 +115,36 @@ def test_a_picture_becomes_an_overlay_and_a_file_as_predict_prints_it(page, file
 
 
 @pytest.mark.parametrize(
-    ("picture", "view", "line"),
+    ("name", "view", "line"),
     [
         ("words.png", "60", "got image words.png: cannot identify the format"),
         ("part.png", "179", "got field of view=179; allowed: a number from 5 to 150 (degrees)"),
         ("empty.png", "60", "nothing found: pivconnector: its maps are empty"),
     ],
 )
-def test_what_is_wrong_is_told_in_a_sentence(page, files, picture, view, line):
-    upload(page, "#picture", files / picture)
+def test_errors_are_shown_in_a_sentence(page, files, name, view, line):
+    upload(page, "#image", files / name)
     page.get_by_label("field of view", exact=True).check()
     page.get_by_label("Degrees across").fill(view)
     assert said(page).startswith(line)
-    assert page.locator("#poses img").count() == (picture == "empty.png")
+    assert page.locator("#poses img").count() == (name == "empty.png")
 
 
-def test_numbers_of_another_size_are_told(page, files):
-    upload(page, "#picture", files / "part.png")
+def test_camera_of_another_image_size_is_reported(page, files):
+    upload(page, "#image", files / "part.png")
     page.get_by_label("K", exact=True).check()
     for name in ("fx", "fy", "cx", "cy"):
         page.get_by_label(name, exact=True).fill("100")
     assert "likely of 201×201 (--K-size)" in said(page)
 
 
-def test_a_port_that_is_taken_is_told(page):
-    from dopepp.inference.page import served
+def test_used_port_is_reported(page):
+    from dopepp.inference.page import serve_page
 
     port = int(page.url.rstrip("/").rsplit(":", 1)[1])
     estimator = PoseEstimator.load("pretrained/pivconnector")
-    with pytest.raises(UserError, match=f"--port {port}, which is taken"), served(estimator, port):
+    with (
+        pytest.raises(UserError, match=f"--port {port}, which is taken"),
+        serve_page(estimator, port),
+    ):
         raise AssertionError

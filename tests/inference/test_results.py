@@ -1,4 +1,4 @@
-"""PoseResult: what is drawn lies where the part is, and what is handed on says all."""
+"""PoseResult: drawing, text, JSON and table."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def result(*poses: np.ndarray, size: tuple[int, int] = (640, 480), **fields: obj
 
 
 @pytest.mark.parametrize("image", range(4))
-def test_the_silhouette_is_the_renderers(image):
+def test_silhouette_is_the_renderers_mask(image):
     from dopepp.virtual import PRESETS, Factory
 
     rendered = Factory([PART], PRESETS["quickstart"].reframed(320, 240), 5).render(0, image)
@@ -56,8 +56,8 @@ def test_the_silhouette_is_the_renderers(image):
 
 
 @pytest.mark.parametrize("factor", [0.2, 1.0, 4.0])
-def test_lines_and_text_grow_with_the_picture(factor):
-    """The same scene in another size is the same drawing, of any size that is not enlarged."""
+def test_lines_and_text_scale_with_the_image(factor):
+    """Compare the drawings of a scene in two image sizes."""
     width, height = round(640 * factor), round(480 * factor)
     own_K = K.copy()
     own_K[:2] *= factor
@@ -76,7 +76,7 @@ def test_lines_and_text_grow_with_the_picture(factor):
     assert own.sum() == pytest.approx(touched.sum(), rel=0.5)
 
 
-def test_neighbours_have_their_own_colours_and_nothing_is_drawn_far_away():
+def test_neighbours_have_distinct_colours():
     drawn = result(pose(-0.03), pose(0.03)).plot()
     for colour in COLOURS[:2]:
         assert (np.abs(drawn.astype(int) - colour).sum(axis=2) < 12).sum() > 200
@@ -84,7 +84,7 @@ def test_neighbours_have_their_own_colours_and_nothing_is_drawn_far_away():
     assert (drawn[-60:] == 128).all()
 
 
-def test_no_pose_is_too_odd_to_be_drawn():
+def test_poses_outside_the_image_can_be_drawn():
     behind, through = pose(z=-0.3), pose(z=0.01)
     aside, far = pose(x=5.0), pose(z=90.0)
     drawn = result(behind, through, aside, far, size=(40, 30)).plot()
@@ -93,7 +93,7 @@ def test_no_pose_is_too_odd_to_be_drawn():
     assert (bare.plot() != 128).any()
 
 
-def test_a_picture_is_saved_as_its_suffix_says(tmp_path):
+def test_image_format_follows_the_suffix(tmp_path):
     for name in ("a.png", "new/b.JPG"):
         result(pose()).save(tmp_path / name)
         assert cv2.imread(str(tmp_path / name)).shape == (480, 640, 3)
@@ -101,7 +101,7 @@ def test_a_picture_is_saved_as_its_suffix_says(tmp_path):
         result(pose()).save(tmp_path / "a.gif")
 
 
-def test_weaker_candidates_are_counted_in_words_on_the_picture_and_in_json():
+def test_weaker_candidates_are_counted_in_every_output():
     plain, loud = result(pose()), result(pose(), weaker=[0.3, 0.051], min_score=0.312)
     assert (plain.summary, loud.summary) == ("1 pose", "1 pose; 2 weaker below 0.31")
     assert result(weaker=[0.1], min_score=0.5).summary == "nothing found; 1 weaker below 0.5"
@@ -116,7 +116,7 @@ def test_weaker_candidates_are_counted_in_words_on_the_picture_and_in_json():
     ]
 
 
-def test_json_names_frame_units_and_what_is_no_number():
+def test_json_states_frame_and_null_for_nan():
     whole = json.loads(result(pose(), pose(0.1), time=0.4, number=7, identities=[3, 5]).to_json())
     assert (whole["image"], whole["number"], whole["time"], whole["frame"]) == (
         "a.png", 7, 0.4, FRAME,
@@ -135,7 +135,7 @@ def test_json_names_frame_units_and_what_is_no_number():
     assert "identity" not in line
 
 
-def test_the_table_is_the_poses():
+def test_table_contains_the_poses():
     pytest.importorskip("pandas")
     table = result(pose(), pose(0.1, turn=2.0)).to_dataframe()
     turns = Rotation.from_quat(table[["qw", "qx", "qy", "qz"]].to_numpy(), scalar_first=True)
@@ -147,7 +147,7 @@ def test_the_table_is_the_poses():
     assert math.isclose(table["score"][1], 0.8)
 
 
-def test_without_pandas_it_is_named(monkeypatch):
+def test_missing_pandas_is_reported(monkeypatch):
     monkeypatch.setattr("dopepp.inference.pose_result.find_spec", lambda _: None)
     with pytest.raises(UserError, match="pip install pandas, or use to_json"):
         result(pose()).to_dataframe()

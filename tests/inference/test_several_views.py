@@ -64,7 +64,7 @@ def errors(T: np.ndarray, true: np.ndarray) -> tuple[float, float, float]:
     return turn, abs(along), float(np.linalg.norm(shift - along * ray))
 
 
-def test_a_second_view_fixes_the_distance(estimator, scene, views, true):
+def test_second_view_determines_the_distance(estimator, scene, views, true):
     images, poses = views
     (alone,) = estimator.predict(images[0], scene.K)
     ray = true[:3, 3] / np.linalg.norm(true[:3, 3])
@@ -84,7 +84,7 @@ def test_a_second_view_fixes_the_distance(estimator, scene, views, true):
             assert view.detections == [item.detection]
 
 
-def test_the_world_is_any_frame(estimator, scene, views):
+def test_world_may_be_any_frame(estimator, scene, views):
     images, poses = views
     T_other_world = make_transform(
         rotation_vector_to_matrix(np.array([0.4, -1.2, 2.0])), np.array([1.0, -2.0, 0.5])
@@ -110,7 +110,7 @@ def predicted(estimator, scene, views, order=(0, 1), **changes):
 
 
 @pytest.mark.parametrize(("axis", "millimetres"), [(0, 15), (1, 8), (0, 50), (2, 50)])
-def test_a_wrong_camera_pose_is_named(estimator, scene, views, axis, millimetres):
+def test_wrong_camera_pose_is_reported(estimator, scene, views, axis, millimetres):
     _, poses = views
     wrong = poses[1].copy()
     wrong[axis, 3] += 1e-3 * millimetres
@@ -123,7 +123,7 @@ def test_a_wrong_camera_pose_is_named(estimator, scene, views, axis, millimetres
     assert apart == pytest.approx(millimetres, abs=3)
 
 
-def test_views_that_disagree_are_named(estimator, scene, views):
+def test_disagreeing_views_are_reported(estimator, scene, views):
     """An error along the baseline changes the distance only, and a consistent pose remains."""
     _, poses = views
     wrong = poses[1].copy()
@@ -139,7 +139,7 @@ def test_views_that_disagree_are_named(estimator, scene, views):
     assert ratio > 0
 
 
-def test_the_third_view_tells_whose_camera_is_wrong(estimator, scene, views):
+def test_third_view_identifies_the_wrong_camera(estimator, scene, views):
     _, poses = views
     wrong = poses[1].copy()
     wrong[:3, 3] += 0.05
@@ -149,14 +149,14 @@ def test_the_third_view_tells_whose_camera_is_wrong(estimator, scene, views):
     assert three.findings
 
 
-def test_swapped_views_are_named(estimator, scene, views):
+def test_swapped_views_are_reported(estimator, scene, views):
     _, poses = views
     result = predicted(estimator, scene, views, poses=[poses[1], poses[0]])
     assert result.detections == []
     assert "camera poses of view 0 and view 1 are swapped" in result.findings[0]
 
 
-def test_a_moved_part_is_not_averaged(estimator, scene, views, true):
+def test_moved_part_is_not_averaged(estimator, scene, views, true):
     images, poses = views
     shift = np.eye(4)
     shift[:3, 3] = 0.0, 0.02, 0.01
@@ -168,7 +168,7 @@ def test_a_moved_part_is_not_averaged(estimator, scene, views, true):
     assert "the part was moved between the images" in result.findings[0]
 
 
-def test_a_view_without_the_part_leaves_the_single_view(estimator, scene, views):
+def test_part_in_one_view_keeps_its_single_view_pose(estimator, scene, views):
     images, _ = views
     (alone,) = estimator.predict(images[0], scene.K)
     empty = np.full_like(images[1], 90)
@@ -187,7 +187,7 @@ def test_a_view_without_the_part_leaves_the_single_view(estimator, scene, views)
     assert result.detections[0].score == pytest.approx(alone.score, abs=1e-6)
 
 
-def test_a_detection_that_the_image_did_not_refine_does_not_veto_the_others(
+def test_unrefined_detection_does_not_overrule_the_other_views(
     estimator, scene, views, true, monkeypatch
 ):
     candidates, calls = estimator.candidates, []
@@ -241,7 +241,7 @@ def test_depth_images_are_used(estimator, scene, views, true):
     assert detection.views == ["view 0", "view 1"]
 
 
-def test_wrong_arguments_are_refused(estimator, scene, views):
+def test_wrong_arguments_are_rejected(estimator, scene, views):
     images, poses = views
     with pytest.raises(UserError, match="1 T_world_cam for 2 images"):
         estimator.predict_views(images[:2], [scene.K] * 2, poses[:1])

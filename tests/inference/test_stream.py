@@ -1,4 +1,4 @@
-"""``estimator.stream``: what ``predict`` gives, from any source, with where the time went."""
+"""``estimator.stream``: detections, tracks and times on images and videos."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def clip(rendered, tmp_path_factory):
     return path
 
 
-def test_a_picture_gives_what_predict_gives(estimator, rendered, K, tmp_path):
+def test_stream_of_an_image_equals_predict(estimator, rendered, K, tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), rendered.image[..., ::-1])
     (expected,) = estimator.predict(rendered.image, K)
     (result,) = estimator.stream(tmp_path / "a.png", K)
@@ -54,7 +54,7 @@ def test_a_picture_gives_what_predict_gives(estimator, rendered, K, tmp_path):
     assert none.weaker == pytest.approx([expected.score])
 
 
-def test_a_video_is_followed(estimator, clip, K):
+def test_parts_are_tracked_through_a_video(estimator, clip, K):
     results = list(estimator.stream(clip, K, track=True))
     assert [frame.time for frame in results] == pytest.approx([0, 0.1, 0.2, 0.3])
     assert [list(one.identities) for one in results] == [[0]] * 4
@@ -63,7 +63,7 @@ def test_a_video_is_followed(estimator, clip, K):
     assert [item.number for item in estimator.stream(clip, K, stride=3)] == [0, 3]
 
 
-def test_a_track_begins_with_a_pose_that_passes_the_threshold(estimator, clip, K):
+def test_track_starts_with_a_detection_above_the_threshold(estimator, clip, K):
     results = list(estimator.stream(clip, K, track=True, min_score=1.0))
     assert [result.detections for result in results] == [[]] * 4
     assert [result.num_weaker for result in results] == [1] * 4
@@ -81,6 +81,6 @@ def test_a_track_begins_with_a_pose_that_passes_the_threshold(estimator, clip, K
         ({"K": np.eye(3), "depth": "d.png"}, "--depth with 4 images"),
     ],
 )
-def test_what_cannot_be_is_refused(estimator, clip, options, message):
+def test_invalid_options_are_rejected(estimator, clip, options, message):
     with pytest.raises(UserError, match=message):
         list(estimator.stream(clip, **options))

@@ -1,4 +1,4 @@
-"""An estimator by templates: its detector is replaced by one that returns poses near the truth."""
+"""Template estimator; its detector is replaced by a detector with start poses near the truth."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dopepp.core.errors import UserError
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.inference.tracker import PoseTracker
 from dopepp.parts.catalogue import pivconnector
-from dopepp.recovery.recover import explained
+from dopepp.recovery.recover import format_reasons
 from dopepp.virtual import PRESETS, Factory
 
 NEAR, FAR = 0.08, 0.2
@@ -61,14 +61,14 @@ def test_an_empty_image_is_explained(near_truth, estimator, rendered):
     image, K = rendered.image, rendered.scene.K
     assert estimator.predict(image, K) == []
     text = "pivconnector: no view of the part fits the image at 0.08 – 0.2 m"
-    assert explained(estimator.explain(image, K)) == text
+    assert format_reasons(estimator.explain(image, K)) == text
     T = true_pose(rendered).copy()
     T[:3, 3] += [0.03, 0.03, 0.05]  # beside the part
     near_truth.truth = [T]
-    assert "once refined, score" in explained(estimator.reporting(1.0).explain(image, K))
+    assert "once refined, score" in format_reasons(estimator.reporting(1.0).explain(image, K))
 
 
-def test_it_tracks_and_streams_as_a_network_does(near_truth, estimator, rendered, tmp_path):
+def test_template_estimator_tracks_and_streams(near_truth, estimator, rendered, tmp_path):
     near_truth.truth = [true_pose(rendered)]
     tracker, identities = PoseTracker(estimator), set()
     for _ in range(3):
@@ -115,7 +115,7 @@ def test_options_reach_the_part_and_the_detector(near_truth, tmp_path):
         ({"name": ""}, "part name"),
     ],
 )
-def test_wrong_options_are_refused(near_truth, tmp_path, options, words):
+def test_wrong_options_are_rejected(near_truth, tmp_path, options, words):
     path = tmp_path / "part.stl"
     path.write_text("")
     mesh = path if "unit" in options else "pivconnector"
@@ -124,12 +124,12 @@ def test_wrong_options_are_refused(near_truth, tmp_path, options, words):
 
 
 @pytest.mark.parametrize("name", ["network", "checkpoint"])
-def test_what_only_networks_have_is_refused(estimator, rendered, name):
+def test_features_of_networks_are_rejected(estimator, rendered, name):
     with pytest.raises(UserError, match=f"a {name}, which a template estimator.*train"):
         getattr(estimator, name)
-    with pytest.raises(UserError, match="belief maps, which a template estimator"):
+    with pytest.raises(UserError, match="a network, which a template estimator"):
         estimator.maps(rendered.image)
-    with pytest.raises(UserError, match="inputs of a network"):
+    with pytest.raises(UserError, match="a network, which a template estimator"):
         estimator.views(rendered.image, rendered.scene.K)
     with pytest.raises(UserError, match="refine=None"):
         estimator.refining(None)

@@ -227,7 +227,7 @@ def test_a_match_becomes_the_pose_at_its_pixel_size_and_turn(detector):
         np.testing.assert_allclose(T[:3, :3], expected.as_matrix(), atol=1e-9)
 
 
-def test_a_start_is_near_the_true_pose_and_ends_there(detector, rendered):
+def test_refined_start_pose_is_the_true_pose(detector, rendered):
     image, K, T_true = rendered
     assert is_near(detector.detect(image, K), detector.part, T_true)
     best, *_ = TemplateEstimator([detector], DISTANCES).predict(image, K)
@@ -235,7 +235,7 @@ def test_a_start_is_near_the_true_pose_and_ends_there(detector, rendered):
 
 
 @pytest.mark.parametrize("case", ["grey", "region", "range of 1:10", "4k"])
-def test_unusual_input_is_searched(detector, rendered, case):
+def test_part_is_detected_on_unusual_input(detector, rendered, case):
     image, K, T_true = rendered
     u, v = project(T_true[None, :3, 3], K)[0]
     options = {}
@@ -268,7 +268,7 @@ def test_a_ball_without_creases_is_detected_at_its_distance():
     assert best.T_cam_obj[2, 3] == pytest.approx(0.3, rel=0.08)
 
 
-def test_impossible_requests_are_refused(detector):
+def test_impossible_requests_are_rejected(detector):
     points = np.random.default_rng(0).normal(size=(50, 3)) * 0.02
     with pytest.raises(UserError, match="cloud, which has no mesh"):
         TemplateDetector(make_part("cloud", None, points), DISTANCES)

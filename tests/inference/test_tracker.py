@@ -27,10 +27,10 @@ IMAGE = np.zeros((480, 640, 3), np.uint8)
 
 
 class Stage:
-    """An estimator of a play: it knows where the actors are, and who can be seen.
+    """A simulated estimator with known poses of parts (``actors``).
 
-    Refinement finds an actor within three standard deviations of where it is told to look; the
-    network finds all that are not hidden from it.
+    Refinement detects a part within three standard deviations of the start pose. The network
+    detects all parts except ``hidden`` and ``unknown_to_network``.
     """
 
     def __init__(self, *parts):
@@ -85,21 +85,21 @@ def stage():
 
 @pytest.fixture
 def tracker(stage):
-    """A tracker that has seen one part for a frame."""
+    """A tracker after one frame with one part."""
     stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
     tracker = PoseTracker(stage)
     assert len(tracker.track(IMAGE, K)) == 1
     return tracker
 
 
-def test_the_network_settles_a_doubt_where_it_agrees_better(stage, tracker):
+def test_better_detection_replaces_a_doubtful_track(stage, tracker):
     stage.agreement, stage.network_agreement = 0.5, 0.4
     assert not tracker.track(IMAGE, K)[0].detected
     stage.network_agreement = 0.8
     assert tracker.track(IMAGE, K)[0].detected
 
 
-def test_follows_a_part_and_looks_only_when_due(stage):
+def test_tracked_part_needs_the_network_only_when_due(stage):
     tracker = PoseTracker(stage, detect_every=10)
     for frame in range(30):
         angle = math.radians(8) * frame
@@ -111,7 +111,7 @@ def test_follows_a_part_and_looks_only_when_due(stage):
     assert stage.looks == 3
 
 
-def test_a_steady_motion_is_foreseen(stage):
+def test_steady_motion_is_predicted(stage):
     tracker = PoseTracker(stage)
     for frame in range(12):
         turn = (0.0, math.radians(6) * frame, 0.0)
@@ -122,10 +122,10 @@ def test_a_steady_motion_is_foreseen(stage):
     before = stage.refinements
     stage.put("a", pivconnector(), (0.12, 0.0, 0.3), (0.0, math.radians(72), 0.0))
     tracker.track(IMAGE, K)
-    assert stage.refinements == before + 1  # where it was expected, at once
+    assert stage.refinements == before + 1  # the first prediction was accurate enough
 
 
-def test_a_lost_part_is_looked_for_and_keeps_its_identity(stage, tracker):
+def test_lost_part_is_searched_and_keeps_its_identity(stage, tracker):
     stage.hidden = {"a"}
     for _ in range(7):
         assert tracker.track(IMAGE, K) == []
@@ -139,7 +139,7 @@ def test_a_lost_part_is_looked_for_and_keeps_its_identity(stage, tracker):
     assert stage.looks == 9
 
 
-def test_only_parts_from_the_threshold_on_are_tracked(stage):
+def test_only_parts_above_the_threshold_are_tracked(stage):
     stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
     stage.min_score = 0.95
     tracker = PoseTracker(stage)
@@ -152,7 +152,7 @@ def test_only_parts_from_the_threshold_on_are_tracked(stage):
     assert tracker.track(IMAGE, K) == []
 
 
-def test_a_part_is_forgotten(stage):
+def test_lost_part_is_forgotten(stage):
     tracker = PoseTracker(stage, detect_every=1_000_000)
     stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
     stage.put("b", servoholder(), (0.1, 0.0, 0.3))
@@ -166,7 +166,7 @@ def test_a_part_is_forgotten(stage):
     assert [one.identity for one in tracker.track(IMAGE, K)] == [1]
 
 
-def test_two_parts_of_a_kind_keep_their_identities_when_one_comes_back(stage):
+def test_equal_parts_keep_their_identities_when_one_reappears(stage):
     tracker = PoseTracker(stage, detect_every=5)
     stage.put("left", pivconnector(), (-0.1, 0.0, 0.4))
     stage.put("right", pivconnector(), (0.1, 0.0, 0.4))
@@ -180,7 +180,7 @@ def test_two_parts_of_a_kind_keep_their_identities_when_one_comes_back(stage):
     assert again == {**places, 2: 0.0}
 
 
-def test_a_sudden_move_is_followed_without_the_network(stage, tracker):
+def test_sudden_motion_is_tracked_without_the_network(stage, tracker):
     for _ in range(4):
         tracker.track(IMAGE, K)
     stage.unknown_to_network = {"a"}
@@ -191,7 +191,7 @@ def test_a_sudden_move_is_followed_without_the_network(stage, tracker):
     assert tracker.track(IMAGE, K) == []
 
 
-def test_the_network_outvotes_a_track_that_sits_elsewhere(stage):
+def test_repeated_detections_elsewhere_move_the_track(stage):
     tracker = PoseTracker(stage, detect_every=5)
     stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
     tracker.track(IMAGE, K)
@@ -201,11 +201,11 @@ def test_the_network_outvotes_a_track_that_sits_elsewhere(stage):
         replace(option, T_cam_obj=turned) for option in true(*given, **options)
     ]
     detected = [tracker.track(IMAGE, K)[0].detected for _ in range(6)]
-    # Frame 5 disagrees, so frame 6 looks again.
+    # The detection of frame 5 disagrees, so the network also runs on frame 6.
     assert detected == [False] * 5 + [True]
 
 
-def test_the_network_looks_at_what_agrees_little_and_must_agree_more(stage, tracker):
+def test_track_moves_only_to_a_detection_that_agrees_better(stage, tracker):
     stage.agreement = 0.84  # not enough less than usual to be in doubt
     elsewhere = make_transform(np.eye(3), np.array([0.0, 0.03, 0.3]))
     beside = replace(stage._detection("pivconnector", elsewhere), agreement=0.8)
@@ -218,13 +218,13 @@ def test_the_network_looks_at_what_agrees_little_and_must_agree_more(stage, trac
     assert max(places) == pytest.approx(0.03)
 
 
-def test_a_part_in_doubt_goes_on_as_it_was_going(stage):
+def test_doubtful_part_continues_its_motion(stage):
     tracker = PoseTracker(stage)
     for frame in range(10):
         stage.put("a", pivconnector(), (0.005 * frame, 0.0, 0.3))
         tracker.track(IMAGE, K)
     assert stage.looks == 1
-    # A hand comes: what is found agrees with half of the outline, and the network sees nothing.
+    # A hand covers the part: half of the outline agrees, and the network detects nothing.
     stage.agreement, stage.unknown_to_network = 0.5, {"a"}
     stage.put("a", pivconnector(), (0.047, 0.006, 0.3))
     for number in range(1, PATIENCE + 1):
@@ -232,7 +232,7 @@ def test_a_part_in_doubt_goes_on_as_it_was_going(stage):
         place = track.detection.T_cam_obj[:3, 3]
         assert 0.045 < place[0] < 0.045 + 0.005 * number
         assert place[1] == 0.0
-        # The network looks around where the part goes on.
+        # The network searches the region around the predicted part.
         x, y, width, height = stage.roi
         for corner in track.detection.keypoints:
             assert np.all((corner > (x, y)) & (corner < (x + width, y + height)))
@@ -264,14 +264,14 @@ NOISE = np.repeat([math.radians(0.5), 0.0005], 3)
 
 
 def filtered(motion: Motion, T: np.ndarray) -> Motion:
-    """Let a frame see a pose with NOISE, fused with the forecast as refinement does it."""
+    """Update a prediction by a pose measured with NOISE, as refinement fuses the two."""
     prior, own = np.linalg.inv(motion.pose_covariance), np.diag(1 / NOISE**2)
     covariance = np.linalg.inv(prior + own)
     step = covariance @ own @ step_between(motion.T_cam_obj, T)
     return motion.update(move_pose(motion.T_cam_obj, step), covariance)
 
 
-def test_what_a_frame_says_is_kalmans_update() -> None:
+def test_update_is_the_kalman_update() -> None:
     rng = np.random.default_rng(0)
     root = rng.normal(size=(12, 12)) * np.tile(NOISE, 2)[:, None]
     forecast = Motion(START, rng.normal(size=6) * 0.01, root @ root.T, np.zeros(6))
@@ -286,7 +286,7 @@ def test_what_a_frame_says_is_kalmans_update() -> None:
     assert_allclose(result.velocity, forecast.velocity + after[6:], atol=1e-9)
 
 
-def test_a_filter_foresees_a_steady_motion() -> None:
+def test_filter_predicts_a_steady_motion() -> None:
     step = np.array([0, math.radians(6), 0, 0.01, 0, 0])
     motion, T = at_rest(START, np.diag(NOISE**2)), START
     for _ in range(15):
@@ -297,7 +297,7 @@ def test_a_filter_foresees_a_steady_motion() -> None:
     assert np.abs(miss[3:]).max() < 0.001
 
 
-def test_a_part_at_rest_trembles_less_than_what_is_seen_of_it() -> None:
+def test_filter_reduces_the_jitter_of_a_part_at_rest() -> None:
     rng = np.random.default_rng(1)
     motion, steps = at_rest(START, np.diag(NOISE**2)), []
     for _ in range(80):
@@ -310,7 +310,7 @@ def test_a_part_at_rest_trembles_less_than_what_is_seen_of_it() -> None:
 
 
 @pytest.mark.parametrize("sudden", [False, True])
-def test_unseen_it_becomes_less_certain_and_slower(sudden: bool) -> None:
+def test_prediction_is_slower_and_less_certain(sudden: bool) -> None:
     motion = at_rest(START, np.diag(NOISE**2))
     motion = Motion(START, np.array([0, 0, 0.02, 0.003, 0, 0]), motion.covariance, np.zeros(6))
     later = motion.predict(sudden)

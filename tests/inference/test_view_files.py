@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.inference.several_views.view_files import read_camera_poses, transform_of
+from dopepp.inference.several_views.view_files import parse_transform, read_camera_poses
 
 TURN = Rotation.from_euler("xyz", [20, -30, 140], degrees=True)
 SHIFT = np.array([0.3, -0.2, 0.7])
@@ -28,8 +28,8 @@ FORMS = (
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_a_pose_has_several_forms(form):
-    assert_allclose(transform_of(form, "here"), T_WORLD_CAM, atol=1e-12)
+def test_every_form_of_a_pose_is_read(form):
+    assert_allclose(parse_transform(form, "here"), T_WORLD_CAM, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -39,12 +39,12 @@ def test_a_pose_has_several_forms(form):
      "quaternion_wxyz": [1, 0, 0, 0]}, {"position": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 0]},
      {"translation": {"x": 0, "y": 0}, "rotation": {"x": 0, "y": 0, "z": 0, "w": 1}}],
 )  # fmt: skip
-def test_another_form_is_refused(form):
+def test_other_forms_are_rejected(form):
     with pytest.raises(UserError, match="here"):
-        transform_of(form, "here")
+        parse_transform(form, "here")
 
 
-def test_views_share_a_camera_or_have_their_own(tmp_path):
+def test_camera_of_all_views_or_of_a_single_view(tmp_path):
     (tmp_path / "one.txt").write_text("600 601 319.5 239.5")
     (tmp_path / "two.txt").write_text("700 701 319.5 239.5")
     views = {
@@ -64,7 +64,7 @@ def test_views_share_a_camera_or_have_their_own(tmp_path):
         poses.of(tmp_path / "c.png")
 
 
-def test_flange_poses_need_the_hand_eye_result(tmp_path):
+def test_flange_poses_require_the_hand_eye_result(tmp_path):
     T_flange_cam = np.eye(4)
     T_flange_cam[:3, 3] = 0.01, 0.02, 0.03
     (tmp_path / "hand_eye.yaml").write_text(

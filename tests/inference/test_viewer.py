@@ -1,4 +1,4 @@
-"""The Rerun recording: it has what was seen and where it is, and is there whole or not at all."""
+"""Contents of Rerun recordings, and errors of the viewer."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def result(estimator):
     return PoseResult(item.image, item.scene.K, detections, {}, "clip.mp4", 3, 0.3, shapes=shapes)
 
 
-def test_a_recording_has_everything(estimator, result, tmp_path):
+def test_recording_contains_every_entity(estimator, result, tmp_path):
     path = tmp_path / "new" / "out.rrd"
     with Viewer(estimator, path) as viewer:
         viewer.write(result)
@@ -42,7 +42,7 @@ def test_a_recording_has_everything(estimator, result, tmp_path):
     logged = {chunk.entity_path for chunk in chunks}
     name = "pivconnector_0"
     assert logged >= {
-        "/world", "/world/camera", "/world/camera/picture", "/world/camera/outlines",
+        "/world", "/world/camera", "/world/camera/image", "/world/camera/outlines",
         "/beliefs/pivconnector", "/summary",
         f"/world/parts/{name}", f"/world/parts/{name}/cuboid", f"/world/meshes/{name}",
         f"/world/uncertainty/{name}",
@@ -58,18 +58,18 @@ def test_beliefs_peak_where_the_part_is(estimator, result):
     assert nearest < 2 * scale.max()
 
 
-def test_a_place_that_cannot_be_is_refused(estimator, tmp_path):
+def test_wrong_suffix_is_rejected(estimator, tmp_path):
     with pytest.raises(UserError, match=r"\.rrd"):
         Viewer(estimator, tmp_path / "out.mp4")
 
 
-def test_without_the_extra_it_is_named(estimator, tmp_path, monkeypatch):
+def test_missing_extra_is_reported(estimator, tmp_path, monkeypatch):
     monkeypatch.setattr("dopepp.core.errors.find_spec", lambda _: None)
     with pytest.raises(UserError, match=r"dopepp\[rerun\]"):
         Viewer(estimator, tmp_path / "out.rrd")
 
 
-def test_without_a_display_a_file_is_offered(estimator, monkeypatch):
+def test_error_without_a_display_names_the_file_option(estimator, monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr("sys.platform", "linux")

@@ -1,4 +1,4 @@
-"""One scene in many images: what is done to an image and to its K leaves the metric pose."""
+"""Transformed images of a scene, with transformed K, yield the same metric pose."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ SIZE = (1920, 1080)
 MOST_MM, MOST_DEG = 1.0, 0.4
 AROUND_PX = 40
 LENS = np.array([-0.18, 0.06, 0.0015, -0.001, 0.01])
-"""Up to 40 pixels off at the corners of the whole image."""
+"""Distortion coefficients: up to 40 pixels at the corners of the whole image."""
 
 
 @dataclass(frozen=True)
 class View:
-    """What is done to the image, in this order.
+    """Transformations of the image, in this order.
 
     Attributes:
-        cut: Shares of width and height that go left, above, right and below, as far as the part
-            and some pixels around it stay.
-        scale: Pixels per pixel; the image is resized to whole pixels, so that fx and fy differ.
-        turns: Quarter turns, anticlockwise.
-        lens: Whether a lens distorts it.
-        flipped: Whether its channels lie in memory the other way round, as in ``bgr[..., ::-1]``.
+        cut: Shares of width and height that are cropped left, above, right and below, but never
+            the part and the pixels around it.
+        scale: Scale factor; the size is rounded to whole pixels, so that fx and fy differ.
+        turns: Number of quarter turns, anticlockwise.
+        lens: Whether lens distortion is applied.
+        flipped: Whether the channels are reversed in memory, as in ``bgr[..., ::-1]``.
     """
 
     cut: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
@@ -87,7 +87,7 @@ def whole(estimator, scene, picture):
 @example(View(turns=1))
 @example(View(lens=True))
 @example(View(scale=1 / 3, lens=True, flipped=True))
-def test_the_metric_pose_stays(estimator, scene, picture, whole, view):
+def test_pose_is_the_same_in_every_view(estimator, scene, picture, whole, view):
     keypoints = project_keypoints(pivconnector().cuboid, whole, scene.K)
     seen, K = made(view, picture, scene.K, keypoints)
     assert view is not VGA or seen.shape == (480, 640, 3)
@@ -103,7 +103,7 @@ def test_the_metric_pose_stays(estimator, scene, picture, whole, view):
 def made(
     view: View, picture: RGBImage, K: CameraMatrix, keypoints: np.ndarray
 ) -> tuple[RGBImage, CameraMatrix]:
-    """Return the image of a view and its K, by formulas of this file's own."""
+    """Return the image of a view and its K, by formulas independent of the package."""
     limit = np.array(picture.shape[1::-1])
     lower, upper = keypoints.min(0) - AROUND_PX, keypoints.max(0) + AROUND_PX
     left, top = np.clip(np.minimum(view.cut[:2] * limit, lower), 0, limit).astype(int)
@@ -130,13 +130,13 @@ def made(
 
 
 def quarter_turn(turns: int) -> np.ndarray:
-    """Return what turns the camera's axes as the image is turned, anticlockwise."""
+    """Return the rotation of the camera's axes for anticlockwise quarter turns of the image."""
     once = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     return np.linalg.matrix_power(once, turns % 4)
 
 
 def distorted(picture: RGBImage, K: CameraMatrix) -> RGBImage:
-    """Return an image as the lens shows it: each of its pixels is read where the ray ends."""
+    """Return an image distorted by LENS: sample each pixel at its undistorted position."""
     rows, columns = picture.shape[:2]
     pixels = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).reshape(-1, 1, 2)
     straight = cv2.undistortPoints(pixels.astype(np.float64), K, LENS, P=K)

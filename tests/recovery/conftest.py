@@ -14,7 +14,7 @@ from dopepp.maps import MapGeometry, encode
 
 
 class Scene:
-    """Poses of some objects, and the perfect maps that belong to them."""
+    """Poses of objects, and their perfect maps."""
 
     def __init__(
         self, cuboids: Sequence[np.ndarray], K: np.ndarray, cells: tuple[int, int] = (52, 52)
@@ -43,7 +43,7 @@ class Scene:
         return belief[0], field[0]
 
     def errors(self, index: int, T_cam_obj: np.ndarray) -> list[float]:
-        """ADD of the cuboid to each instance of an object, in diameters."""
+        """Return the ADD between a pose and each instance of an object, diameters of the cuboid."""
         cuboid = self.cuboids[index]
         moved = transform(T_cam_obj, cuboid)
         diameter = np.linalg.norm(cuboid[0] - cuboid[6])
@@ -54,7 +54,7 @@ class Scene:
         ]
 
     def error(self, index: int, T_cam_obj: np.ndarray) -> float:
-        """ADD to the nearest instance."""
+        """Return the ADD between a pose and the nearest instance, diameters of the cuboid."""
         return min(self.errors(index, T_cam_obj))
 
 
@@ -79,7 +79,7 @@ def pose():
     def draw(
         rng: np.random.Generator, x: float = 0.0, y: float = 0.0, z: float = 0.4
     ) -> np.ndarray:
-        """A random rotation at a place, moved by up to a centimetre."""
+        """Return a random rotation at a position (metres), shifted by up to a centimetre."""
         return make_transform(
             random_rotation(rng), rng.uniform(-0.01, 0.01, 3) + np.array([x, y, z])
         )

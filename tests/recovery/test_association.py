@@ -24,7 +24,7 @@ WIDE = math.radians(45)
 def peaks(
     corners: np.ndarray, toward: np.ndarray, centroids: object, score: object = 1.0
 ) -> ObjectPeaks:
-    """Peaks of known place, (8, n, 2); NaN where there is none."""
+    """Return peaks at known positions, (8, n, 2); NaN for missing peaks."""
     centroid = np.array(centroids, float).reshape(-1, 2)
     there = np.isfinite(corners[..., 0])
     return ObjectPeaks(
@@ -50,13 +50,13 @@ def group(found: ObjectPeaks, max_angle: float = WIDE, coincident_px: float = 8.
 
 
 def crowd(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Affine images of cuboids, their corners shuffled per channel; (8, n, 2) and centroids."""
+    """Return affine projections of cuboids: corners (8, n, 2) and centroids (n, 2)."""
     centroids = rng.uniform(0, 400, (count, 2))
     affine = rng.normal(scale=25, size=(count, 2, 3))
     return centroids[None] + np.einsum("nij,kj->kni", affine, CORNER_SIGNS), centroids
 
 
-def test_a_corner_goes_where_its_vector_points():
+def test_corner_joins_the_centroid_its_vector_points_to():
     left, right = group(one_corner([[40, 0], [60, 0]], [[1, 0], [-1, 0]], [[0, 0], [100, 0]]))
     assert_array_equal(left.position[0], [60, 0])
     assert_array_equal(right.position[0], [40, 0])
@@ -65,12 +65,12 @@ def test_a_corner_goes_where_its_vector_points():
 
 
 @pytest.mark.parametrize("vector", [[0, 1], [1, 0], [np.nan, 0], [np.inf, 0]])
-def test_a_vector_that_points_elsewhere_joins_nobody(vector):
+def test_corner_with_another_direction_is_not_assigned(vector):
     (alone,) = group(one_corner([[40, 0]], [vector], [[0, 0]]))
     assert np.isnan(alone.position[0]).all()
 
 
-def test_the_stronger_of_two_peaks_wins():
+def test_stronger_of_two_peaks_is_assigned():
     score = np.array([0.5, 0.9])
     (item,) = group(one_corner([[40, 0], [0, 50]], [[-1, 0], [0, -1]], [[0, 0]], score))
     assert_array_equal(item.position[0], [0, 50])
@@ -82,8 +82,8 @@ def test_a_corner_on_the_centroid_needs_no_direction():
     assert direction_evidence(result, WIDE, 2.0)[0, 0, 0] == -np.inf
 
 
-def test_corners_in_one_direction_are_told_apart_by_the_others():
-    """Vectors say only which way; the affine camera says how far."""
+def test_affine_camera_separates_corners_in_one_direction():
+    """Vectors have a direction only; the affine camera predicts the length."""
     rng = np.random.default_rng(0)
     right = total = 0
     for _ in range(30):
@@ -102,7 +102,7 @@ def test_corners_in_one_direction_are_told_apart_by_the_others():
 
 
 def test_the_triple_with_the_most_evidence_predicts_the_corners():
-    """Against all triples without an opposite pair, each corner as the triple's weighted sum."""
+    """Compare with all triples without opposite corners, as weighted sums of their arms."""
     rng = np.random.default_rng(3)
     for _ in range(3):
         corners, centroids = crowd(rng, 3)
@@ -132,7 +132,7 @@ def test_the_triple_with_the_most_evidence_predicts_the_corners():
             assert_allclose(deviation[i], answer[1])
 
 
-def test_a_pose_found_before_decides():
+def test_expected_corner_of_a_pose_decides():
     result = one_corner([[40, 0], [60, 0]], [[-1, 0], [-1, 0]], [[0, 0]])
     expected = np.full((1, 8, 2), np.nan)
     expected[0, 0] = 61, 1
@@ -140,7 +140,7 @@ def test_a_pose_found_before_decides():
     assert_array_equal(associate(result, evidence, expected)[0].position[0], [60, 0])
 
 
-def test_no_centroid_no_instance():
+def test_no_instance_without_a_centroid():
     assert group(one_corner([[1, 1]], [[1, 0]], np.zeros((0, 2)))) == []
 
 
@@ -150,8 +150,8 @@ def error(T: np.ndarray | None, truth: np.ndarray, cuboid: np.ndarray) -> float:
     return float(np.linalg.norm(transform(T, cuboid) - transform(truth, cuboid), axis=1).mean())
 
 
-def test_wide_peaks_count_less(box, K, pose):
-    """The same noisy pixels with and without the width that betrays the noisy ones."""
+def test_wide_peaks_have_less_weight(box, K, pose):
+    """Compare poses from noisy pixels with their true and with equal covariances."""
     rng = np.random.default_rng(0)
     errors = []
     for _ in range(40):
@@ -168,7 +168,7 @@ def test_wide_peaks_count_less(box, K, pose):
     assert told < 0.5 * untold
 
 
-def test_maps_narrower_than_their_errors_still_give_poses(box, K, pose):
+def test_peaks_narrower_than_their_errors_yield_poses(box, K, pose):
     rng = np.random.default_rng(1)
     good = 0
     for _ in range(40):

@@ -19,12 +19,12 @@ from dopepp.recovery.detection import (
     FEATURES,
     Detection,
     RecoveryOptions,
-    calibrated,
+    calibrate,
     detection_features,
     fit_covariance_factor,
     fit_distance_factor,
     fit_weights,
-    recalibrated,
+    recalibrate,
     score,
 )
 
@@ -45,7 +45,7 @@ def test_without_fitted_weights_the_score_is_the_mean_belief():
         assert score(features, weights) == pytest.approx(belief)
 
 
-def test_the_spread_is_what_poses_with_this_covariance_scatter_by():
+def test_spread_is_the_rms_error_of_sampled_poses():
     rng = np.random.default_rng(0)
     root = rng.normal(0, 1, (6, 6)) * [0.01, 0.01, 0.01, 0.001, 0.001, 0.001]
     covariance = root.T @ root
@@ -62,7 +62,7 @@ def test_the_spread_is_what_poses_with_this_covariance_scatter_by():
 
 def test_the_distance_changes_along_the_ray_through_the_origin():
     before = detection(belief=0.7)
-    after = calibrated(before, CUBOID, K, RecoveryOptions(distance_factor=0.9))
+    after = calibrate(before, CUBOID, K, RecoveryOptions(distance_factor=0.9))
     assert np.array_equal(after.T_cam_obj[:3, :3], T[:3, :3])
     assert np.allclose(after.T_cam_obj[:3, 3], [0.018, 0, 0.54], atol=1e-15)
     # The origin stays where it is in the image; the measured peaks stay as they are.
@@ -73,7 +73,7 @@ def test_the_distance_changes_along_the_ray_through_the_origin():
     assert np.allclose(after.keypoints, project(transform(after.T_cam_obj, CUBOID), K))
     assert np.array_equal(after.peaks, before.peaks)
     assert after.score == before.belief
-    same = calibrated(before, CUBOID, K, RecoveryOptions())
+    same = calibrate(before, CUBOID, K, RecoveryOptions())
     assert np.array_equal(same.T_cam_obj, T)
 
 
@@ -89,15 +89,15 @@ def test_the_factor_is_the_median_ratio_of_distances():
     assert fit_distance_factor(100 * true, true) == DISTANCE_FACTORS[0]
 
 
-def test_the_covariance_grows_and_the_score_does_not():
+def test_covariance_factor_leaves_the_score_unchanged():
     fitted = RecoveryOptions(score_bias=0.5, score_spread=-1.0, covariance_factor=2.5)
     sure = replace(fitted, covariance_factor=1.0)
-    before, after = (calibrated(detection(), CUBOID, K, item) for item in (sure, fitted))
+    before, after = (calibrate(detection(), CUBOID, K, item) for item in (sure, fitted))
     assert after.score == before.score
     np.testing.assert_allclose(after.covariance, 2.5 * before.covariance)
 
 
-def test_the_covariance_factor_is_that_of_chi_squared():
+def test_covariance_factor_of_chi_squared_distances():
     drawn = 3.0 * chi2(6).rvs(20_000, random_state=0)
     assert fit_covariance_factor(drawn) == pytest.approx(3.0, rel=0.05)
     assert fit_covariance_factor(drawn[:0]) == 1.0
@@ -115,57 +115,57 @@ def test_wrong_poses_do_not_raise_the_covariance_factor(share):
 
 @pytest.mark.parametrize(("factor", "lean"), [(30.0, "too confident"), (0.05, "too cautious")])
 @pytest.mark.parametrize("refined", [False, True])
-def test_a_covariance_factor_beyond_all_experience_is_refused(factor, lean, refined):
+def test_extreme_covariance_factor_is_rejected(factor, lean, refined):
     whose = "refinement" if refined else "network"
     with pytest.raises(UserError, match=f"{whose} is far {lean}"):
         fit_covariance_factor(factor * chi2(6).rvs(500, random_state=0), refined=refined)
 
 
-def test_refined_poses_may_be_far_better_than_stated():
+def test_refined_poses_may_have_a_smaller_factor():
     drawn = 0.3 * chi2(6).rvs(20_000, random_state=0)
     assert fit_covariance_factor(drawn, refined=True) == pytest.approx(0.3, rel=0.05)
     with pytest.raises(UserError, match=r"a factor from 0\.5 to 4"):
         fit_covariance_factor(drawn)
 
 
-def test_the_refined_factor_scales_poses_refined_on_the_image_and_no_others():
+def test_refined_factor_applies_to_poses_refined_on_the_image():
     refined = detection(agreement=0.9, probability=0.8)
     kept, by_depth_alone = detection(probability=0.7, kept="occluded"), detection()
     options = RecoveryOptions(refined_covariance_factor=0.25)
-    found = recalibrated([refined, kept, by_depth_alone], options)
+    found = recalibrate([refined, kept, by_depth_alone], options)
     factors = [item.covariance[0, 0] / refined.covariance[0, 0] for item in found]
     assert factors == [0.25, 1.0, 1.0]
-    before = recalibrated([refined, kept, by_depth_alone], RecoveryOptions())
+    before = recalibrate([refined, kept, by_depth_alone], RecoveryOptions())
     assert [item.score for item in found] == [item.score for item in before]
-    with_depth = recalibrated([refined], options, by_depth=True)[0]
+    with_depth = recalibrate([refined], options, by_depth=True)[0]
     assert np.array_equal(with_depth.covariance, refined.covariance)
 
 
 @pytest.mark.parametrize("factor", [0.05, 5.0, float("nan"), "half"])
-def test_an_impossible_refined_factor_is_refused(factor):
+def test_impossible_refined_factor_is_rejected(factor):
     with pytest.raises(UserError, match="refined_covariance_factor"):
         RecoveryOptions.of({"refined_covariance_factor": factor})
 
 
-def test_a_refined_pose_has_the_probability_of_its_verification():
+def test_refined_score_is_the_verified_probability():
     judged = [
         replace(detection(), score=0.9, probability=0.2),
         replace(detection(), score=0.3, probability=0.8),
         replace(detection(), score=0.5),  # not verified
     ]
-    scores = [estimate.score for estimate in recalibrated(judged, RecoveryOptions())]
+    scores = [estimate.score for estimate in recalibrate(judged, RecoveryOptions())]
     assert scores == pytest.approx([0.8, 0.5, 0.2])
     fitted = RecoveryOptions(
         min_score=0.5, refined_bias=-2.0, refined_score=1.0, refined_verification=0.5
     )
     assert fitted.unrefined() == RecoveryOptions(min_score=0.5)
-    best = max(recalibrated(judged, fitted), key=lambda estimate: estimate.score)
+    best = max(recalibrate(judged, fitted), key=lambda estimate: estimate.score)
     assert best.score == 0.5
-    (once,) = recalibrated(judged[:1], fitted)
+    (once,) = recalibrate(judged[:1], fitted)
     assert once.score == pytest.approx(expit(-2 + np.log(0.9 / 0.1) + 0.5 * np.log(0.2 / 0.8)))
 
 
-def test_scores_fitted_to_other_features_are_left_out():
+def test_weights_of_former_features_are_ignored():
     former = {"min_score": 0.3, "refined_min_score": 0.6, "refined_agreement": 2.0}
     assert RecoveryOptions.of(former) == RecoveryOptions(min_score=0.3)
     with pytest.raises(UserError, match="refined_colour"):
@@ -183,7 +183,7 @@ def test_few_refined_poses_hardly_change_the_weights():
     np.testing.assert_allclose(fitted, truth, atol=0.2)
 
 
-def test_missing_keypoints_and_worse_fits_are_seen():
+def test_features_show_missing_keypoints_and_worse_fits():
     peaks = project(transform(T, CUBOID), K)
     peaks[[1, 4, 6]] = np.nan
     whole, poor = (
@@ -196,7 +196,7 @@ def test_missing_keypoints_and_worse_fits_are_seen():
     assert poor[misfit] - whole[misfit] == pytest.approx(np.log(5))
 
 
-def test_corners_behind_the_camera_have_no_say():
+def test_corners_behind_the_camera_are_ignored():
     near = T.copy()
     near[2, 3] = 0.02
     assert np.isnan(project(transform(near, CUBOID[:8]), K)).any()
@@ -205,7 +205,7 @@ def test_corners_behind_the_camera_have_no_say():
 
 @settings(max_examples=50)
 @given(belief=st.floats(0, 1), error=st.floats(0, 1e6), variance=st.floats(0, 1e12))
-def test_features_are_finite_whatever_the_detection(belief, error, variance):
+def test_features_of_any_detection_are_finite(belief, error, variance):
     item = detection(belief=belief, reprojection_error_px=error, covariance=variance * np.eye(6))
     features = detection_features(item, CUBOID, K)
     assert features.shape == (len(FEATURES),)
@@ -231,6 +231,6 @@ def test_the_fit_is_the_maximum_of_the_likelihood():
 
 
 @pytest.mark.parametrize("correct", [np.ones(5, bool), np.zeros(5, bool), np.zeros(0, bool)])
-def test_right_and_wrong_ones_are_needed(correct):
+def test_correct_and_incorrect_detections_are_required(correct):
     with pytest.raises(ValueError, match="correct and incorrect"):
         fit_weights(np.ones((len(correct), 2)), correct)

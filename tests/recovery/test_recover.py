@@ -13,14 +13,14 @@ from dopepp.maps import MapGeometry, encode
 from dopepp.maps.codec import Peaks
 from dopepp.recovery import Reason, explain, recover, recover_batch
 from dopepp.recovery.association import BORDER_DEVIATION, select_peaks
-from dopepp.recovery.recover import explained, furthest, summary
+from dopepp.recovery.recover import format_reasons, main_reasons, summary
 
 PLACES = [(-0.09, -0.09), (0.09, -0.09), (-0.09, 0.09), (0.09, 0.09)]
 
 
 @pytest.mark.parametrize("name", ["box", "plate", "origin elsewhere"])
 @pytest.mark.parametrize("count", [1, 4])
-def test_all_instances_come_back(name, count, box, plate, make_scene, pose):
+def test_all_instances_are_recovered(name, count, box, plate, make_scene, pose):
     elsewhere = cuboid_keypoints(np.array([0.1, 0.2, 0.3]), np.array([0.2, 0.25, 0.307]))
     cuboid = {"box": box, "plate": plate, "origin elsewhere": elsewhere}[name]
     rng = np.random.default_rng(count)
@@ -55,7 +55,7 @@ def test_two_objects_in_one_network(make_scene, box, plate, pose):
 
 
 @pytest.mark.parametrize("name", ["box", "plate"])
-def test_three_missing_corners_are_borne(name, request, make_scene, pose):
+def test_three_corners_may_be_missing(name, request, make_scene, pose):
     cuboid, rng = request.getfixturevalue(name), np.random.default_rng(3)
     good = 0
     for _ in range(40):
@@ -72,7 +72,7 @@ def test_three_missing_corners_are_borne(name, request, make_scene, pose):
     assert good >= 36
 
 
-def test_what_a_detection_says(make_scene, box, pose):
+def test_fields_of_a_detection(make_scene, box, pose):
     scene = make_scene(box).place(0, pose(np.random.default_rng(4)))
     (detection,) = recover(*scene.maps(), scene.cuboids, scene.K, names=["bracket"])
     assert detection.object == "bracket"
@@ -86,7 +86,7 @@ def test_what_a_detection_says(make_scene, box, pose):
     assert_array_equal(detection.T_cam_obj[3], [0, 0, 0, 1])
 
 
-def test_best_score_comes_first_and_stays_within_one(make_scene, box, pose):
+def test_best_score_is_first_and_at_most_one(make_scene, box, pose):
     rng = np.random.default_rng(5)
     scene = make_scene(box).place(0, pose(rng, -0.1)).place(0, pose(rng, 0.1))
     belief, field = scene.maps()
@@ -99,7 +99,7 @@ def test_best_score_comes_first_and_stays_within_one(make_scene, box, pose):
     assert len(recover(belief, field, scene.cuboids, scene.K, centroid_threshold=0.7)) == 1
 
 
-def test_what_is_absent_is_not_found(make_scene, box, plate, pose):
+def test_absent_object_is_not_detected(make_scene, box, plate, pose):
     scene = make_scene(box, plate).place(1, pose(np.random.default_rng(2)))
     belief, field = scene.maps()
     assert [detection.object for detection in recover(belief, field, scene.cuboids, scene.K)] == [
@@ -108,7 +108,7 @@ def test_what_is_absent_is_not_found(make_scene, box, plate, pose):
     assert recover(0 * belief, 0 * field, scene.cuboids, scene.K) == []
 
 
-def test_a_batch_is_its_images_each_with_its_own_camera(make_scene, box, plate, pose):
+def test_batch_equals_its_single_images(make_scene, box, plate, pose):
     rng = np.random.default_rng(7)
     cameras = [camera_matrix(f, 1.02 * f, 200.0 + k, 210.0) for k, f in enumerate((450, 500, 600))]
     scenes = [
@@ -132,7 +132,7 @@ def test_a_batch_is_its_images_each_with_its_own_camera(make_scene, box, plate, 
 
 
 def test_maps_in_half_precision_and_channels_last(make_scene, box, pose):
-    """What a network under autocast hands over."""
+    """A network under autocast returns such maps."""
     scene = make_scene(box).place(0, pose(np.random.default_rng(8)))
     belief, field = (
         maps[None].bfloat16().to(memory_format=torch.channels_last) for maps in scene.maps()
@@ -167,9 +167,7 @@ def test_bad_option(option, value, make_scene, box):
         (1.0, {"min_score": 1.0}, "score", r"box: at pixel \(.* below 1"),
     ],
 )
-def test_what_ends_the_way_is_told_with_how_far_it_got(
-    factor, options, kind, text, make_scene, box, pose
-):
+def test_reason_names_the_rejecting_step(factor, options, kind, text, make_scene, box, pose):
     scene = make_scene(box).place(0, pose(np.random.default_rng(10)))
     belief, field = scene.maps()
     assert explain(belief, field, scene.cuboids, scene.K) == []
@@ -180,7 +178,7 @@ def test_what_ends_the_way_is_told_with_how_far_it_got(
         assert detection.best == pytest.approx(factor, rel=0.25)
 
 
-def test_too_few_corners_and_a_part_of_two_cells_are_reasons(make_scene, box, pose):
+def test_few_corners_and_small_parts_are_reasons(make_scene, box, pose):
     scene = make_scene(box).place(0, pose(np.random.default_rng(10)))
     belief, field = scene.maps()
     belief[:6] = 0
@@ -197,16 +195,16 @@ def reason(kind, best, name="plate"):
     return Reason(name, kind, best, f"{kind} {best}")
 
 
-def test_the_best_candidate_of_each_object_and_many_images_in_a_line():
+def test_reasons_are_formatted_in_a_line():
     reasons = [
         reason("pose", 0.9), reason("score", 0.1), reason("score", 0.2), reason("centroid", 0.99),
         reason("refined", 0.1, "box"), reason("empty", 0.0, "disc"),
     ]  # fmt: skip
     line = "box: refined 0.1; plate: score 0.2 (the best of 4); disc: empty 0.0"
-    assert [str(item) for item in reversed(furthest(reasons))] == line.replace(
+    assert [str(item) for item in reversed(main_reasons(reasons))] == line.replace(
         " (the best of 4)", ""
     ).split("; ")
-    assert (explained(reasons), explained([])) == (line, "")
+    assert (format_reasons(reasons), format_reasons([])) == (line, "")
     assert summary([*reasons[1:3], reasons[-1]], 300) == (
         "3 of 300 images without detections: 1 with empty maps (best belief 0), "
         "2 below the threshold (best score 0.2)"
@@ -214,7 +212,7 @@ def test_the_best_candidate_of_each_object_and_many_images_in_a_line():
 
 
 @pytest.mark.parametrize(("name", "sigma"), [("box", 2.0), ("plate", 2.0), ("box", 0.5)])
-def test_crowds_with_noise_on_their_maps(name, sigma, request, make_scene, pose):
+def test_crowds_are_recovered_from_noisy_maps(name, sigma, request, make_scene, pose):
     cuboid, rng = request.getfixturevalue(name), np.random.default_rng(11)
     generator = torch.Generator().manual_seed(11)
     places = [(x, y) for x in (-0.13, -0.04, 0.04, 0.13) for y in (-0.1, 0.0, 0.1)]
@@ -232,8 +230,7 @@ def test_crowds_with_noise_on_their_maps(name, sigma, request, make_scene, pose)
     assert right >= 36
 
 
-def test_the_covariance_is_that_of_the_peaks(make_scene, box, pose):
-    """Wider peaks, a wider pose; symmetric and positive."""
+def test_wider_peaks_yield_a_larger_covariance(make_scene, box, pose):
     scene = make_scene(box).place(0, pose(np.random.default_rng(12)))
     (sharp,) = recover(*scene.maps(), scene.cuboids, scene.K)
     (wide,) = recover(*scene.maps(1.5), scene.cuboids, scene.K)
@@ -257,8 +254,8 @@ def test_peaks_at_the_border_are_less_certain():
     assert own.area_px == 80 * 48
 
 
-def test_corners_pulled_in_at_the_border_harm_the_pose_less(plate, pose):
-    """A network's peaks in the outermost cells lie half a cell too far inside."""
+def test_shifted_corners_at_the_border_have_less_weight(plate, pose):
+    """Peaks of a network in the outermost cells are shifted inward by half a cell."""
     rng, K, size = np.random.default_rng(11), camera_matrix(153, 153, 63.5, 63.5), 128
     ours, plain = [], []
     while len(ours) < 30:

@@ -38,7 +38,7 @@ from dopepp.experiment.results.pages import write_run_readme
 from dopepp.experiment.results.report import Cost
 from dopepp.geometry.camera import Letterbox
 from dopepp.inference.estimator import Maps, PoseEstimator
-from dopepp.inference.picture import letterboxed
+from dopepp.inference.network_input import resize_and_pad
 from dopepp.maps.codec import MapGeometry
 from dopepp.models.network import build_network, network_cost
 from dopepp.training.targets import draw_maps
@@ -221,7 +221,9 @@ def likely_maps(
     """
     size = estimator.checkpoint.input_size
     letterbox = Letterbox.fit(sample.size, size)
-    rows, columns, _ = letterboxed(sample.image, letterbox, estimator.network.size_multiple).shape
+    rows, columns, _ = resize_and_pad(
+        sample.image, letterbox, estimator.network.size_multiple
+    ).shape
     seen = pad_sample(resize_sample(sample, size), (columns, rows))
     batch = collate([seen], {part.name: number for number, part in enumerate(estimator.parts)})
     true = draw_maps(batch, batch.keypoints, len(estimator.parts), geometry)

@@ -37,7 +37,7 @@ from dopepp.metrics.pose import PoseMetrics, PredictedPose
 from dopepp.metrics.row import PoseRow
 from dopepp.models.network import build_network, network_cost
 from dopepp.parts.part import Part, Parts
-from dopepp.recovery.recover import Reason, furthest
+from dopepp.recovery.recover import Reason, main_reasons
 from dopepp.virtual.renderers.raster.visibility import draw_alone, project_object
 from dopepp.virtual.scene import SceneObject
 from dopepp.virtual.surface import Surface, make_surface
@@ -110,7 +110,7 @@ class EstimatorMethod:
 
     def rejection(self, sample: Sample) -> Reason | None:
         """Return why the best candidate in an image without detections was rejected, if any."""
-        reasons = furthest(
+        reasons = main_reasons(
             self.estimator.explain(sample.image, sample.K, sample.depth, cropped=True)
         )
         return next((reason for reason in reversed(reasons) if reason.object in self._names), None)

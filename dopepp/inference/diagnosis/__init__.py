@@ -1,9 +1,9 @@
 """Diagnosis of missing or bad poses: one sentence and one fix per check.
 
-The image is processed as :meth:`PoseEstimator.predict` does and in further sizes, and detections
-are compared with their outline. Checks are in the order of causes: a wrong mesh or a blurred image
-affects all checks after it. Thresholds were measured on rendered images with known faults
-(``benchmarks/doctor.py``).
+Parts are detected as by :meth:`PoseEstimator.predict` and in further image sizes, and detections
+are compared with the outlines on the image. Checks are in the order of causes: a wrong mesh or a
+blurred image affects all later checks. Thresholds were measured on rendered images with known
+faults (``benchmarks/doctor.py``).
 
 To add a check, write a function from a :class:`Case` to a :class:`Diagnosis` and insert it into
 :data:`CHECKS` before the checks whose failures it explains.
@@ -21,47 +21,57 @@ import numpy as np
 from dopepp.geometry.camera import Letterbox, focal_length
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.focal import focal_factor
-from dopepp.inference.diagnosis.case import Case, clipped, edge_width, highlights, num_keypoints
-from dopepp.inference.picture import MARGIN
+from dopepp.inference.diagnosis.case import (
+    Case,
+    clipped_share,
+    edge_width,
+    highlights,
+    num_keypoints,
+)
+from dopepp.inference.network_input import MARGIN
 from dopepp.parts.part import UNITS
 from dopepp.parts.size import is_plausible, size_in_words
 
 __all__ = ["CHECKS", "Case", "Diagnosis", "diagnose"]
 
-SAME: Final = 1.05  # factor on a part's size that simplification of the mesh may cause
+SAME: Final = 1.05  # ratio of two sizes of a part that simplification of its mesh may cause
 
 DARK: Final = 70.0
-"""Grey level of highlights, 0 to 255: above 105 in good renders, 35 to 60 at 1/16 of the light."""
+"""Grey level (0 to 255) of highlights below which an image is dark: above 105 in good renders, 35
+to 60 at 1/16 of the light."""
 
 CLIPPED, CLIPPED_PART = 0.25, 0.15
-"""Shares of white in an image and around the part: up to 0.1 in good renders, 0.2 to 0.8 with eight
-times the light."""
+"""Shares of white pixels above which the image, or the region of the part, is overexposed: up to
+0.1 in good renders, 0.2 to 0.8 with eight times the light."""
 
 BLURRED: Final = 2.5
-"""Width of edges, pixels of the network's input: a blur of two pixels measures 1.1 to 2 and is
-harmless, a blur of five measures 3.2 to 4.7 and costs a quarter of the parts."""
+"""Width of edges above which an image is blurred, pixels of the network's input. A blur of two
+pixels measures 1.1 to 2 and is harmless. A blur of five pixels measures 3.2 to 4.7, and a quarter
+of the parts is missed."""
 
-# K is reported as wrong if a focal length that differs by FOCAL reduces the keypoint error by GAIN,
-# and its logarithm has a standard deviation below CERTAIN. The error decreases 0.9 to 2.3 times
-# with the correct K, and 3 to 20 times on a third of the images with a focal length off by 2.
+# K is reported as wrong if a focal length that differs by the factor FOCAL reduces the keypoint
+# error by the factor GAIN, and the standard deviation of its logarithm is below CERTAIN. The error
+# is reduced by a factor of 0.9 to 2.3 if K is correct. If the focal length is wrong by a factor of
+# 2, the error is reduced by a factor of 3 to 20 on a third of the images.
 FOCAL, GAIN, CERTAIN = 1.35, 3.0, 0.2
 
 PARTLY: Final = 0.3
-"""Belief at a part's centre: 0.4 to 0.8 if half occluded, mostly below 0.2 on images without it."""
+"""Belief at a part's centre from which the part is partly visible: 0.4 to 0.8 for half-occluded
+parts, mostly below 0.2 on images without the part."""
 
 MIN_SCORE: Final = 0.03
 """Smallest score of a correct detection; false positives of an untuned network score lower."""
 
 OFF: Final = 0.08
-"""Reprojection error, share of the part's length on the image: up to 0.06 for good poses."""
+"""Reprojection error above which a pose is reported, share of the part's length on the image: up to
+0.06 for good poses."""
 
-AGREEING: Final = 0.6  # share of the outline that agrees: 0.68 to 1 in good renders
+AGREEING: Final = 0.6  # smallest share of the outline that agrees: 0.68 to 1 in good renders
 
 ABSENT: Final = (
-    "check that it is on the image, uncovered, with a side that training showed; else its "
-    "appearance differs from training: train with such materials, light and backgrounds"
+    "check that the part is on the image, uncovered, and shows a side that training images showed; "
+    "otherwise train with its materials, light and backgrounds"
 )
-
 
 TUNE: Final = (
     "tune with images that do not show the part: python evaluate.py ckpt_path=MODEL tune=true "
@@ -103,10 +113,10 @@ def part_size(case: Case) -> Diagnosis:
 
 def exposure(case: Case) -> Diagnosis:
     """Check whether the image is dark, or overexposed at the part."""
-    brightest, white, near = highlights(case.image), clipped(case.image), 0.0
+    brightest, white, near = highlights(case.image), clipped_share(case.image), 0.0
     sentence = f"highlights of {brightest:.0f} of 255, {white:.0%} white without detail"
     if case.detection is not None:
-        near = clipped(case.around())
+        near = clipped_share(case.around())
         sentence += f", {near:.0%} around the part"
     if brightest < DARK:
         return Diagnosis("exposure", f"too dark: {sentence}", "expose longer, or add light")
@@ -141,7 +151,7 @@ def camera(case: Case) -> Diagnosis:
     detection, name = case.detection, case.part.name
     lens = focal_factor(case.part.cuboid, detection.peaks, detection.T_cam_obj, case.K)
     if lens and lens.gain > GAIN and lens.deviation < CERTAIN and not _near(lens.factor, FOCAL):
-        other = f"{name} is seen in the perspective of a focal length {lens.factor:.2g} times K's"
+        other = f"{name} has the perspective of a focal length {lens.factor:.2g} times K's"
         return Diagnosis("camera", f"{sentence}, but {other}", fix)
     ratio = _lens_ratio(case)
     if ratio is not None:
@@ -156,7 +166,7 @@ def size(case: Case) -> Diagnosis:
     """Check whether the part's distance and size lie within the training range."""
     name, depths = case.part.name, case.estimator.depth_range(case.part.name)
     if depths is None:
-        return Diagnosis("size", f"the checkpoint does not know in which sizes {name} was trained")
+        return Diagnosis("size", f"the checkpoint does not record the trained sizes of {name}")
     near, far = case.distances or depths
     trained = f"{near:.2g} – {far:.2g} m"
     if case.detection is None:
@@ -172,11 +182,11 @@ def size(case: Case) -> Diagnosis:
 
 
 def visibility(case: Case) -> Diagnosis:
-    """Check how much of the part the network sees, and what its maps lack."""
+    """Check how many keypoints of the part the network detects."""
     name = case.part.name
     if not case.estimator.has_network:
         if case.detection is not None:
-            return Diagnosis("visibility", f"{name} is seen, score {case.detection.score:.2g}")
+            return Diagnosis("visibility", f"{name} is detected, score {case.detection.score:.2g}")
         problem = f"no pose of {name} passes the verification"
         fix = "check that all of it is on the image and uncovered; add light from the side, or "
         fix += "train it (experiment=my_part): a network sees more in clutter"
@@ -186,13 +196,13 @@ def visibility(case: Case) -> Diagnosis:
         sentence = f"{count} of 9 keypoints of {name}, score {score:.2g}"
         if score >= MIN_SCORE:
             return Diagnosis("visibility", sentence)
-        problem = f"the best candidate hardly looks like {name}: {sentence}"
+        problem = f"the best candidate is probably not {name}: {sentence}"
         return Diagnosis("visibility", problem, ABSENT)
     beliefs = case.strongest_beliefs()
     centre, count = float(beliefs[CENTROID]), int((beliefs > PARTLY).sum())
     if centre < PARTLY:
         belief = f"the belief of its centre is {centre:.2g} at most"
-        return Diagnosis("visibility", f"nothing like {name} is seen, {belief}", ABSENT)
+        return Diagnosis("visibility", f"{name} is not detected, {belief}", ABSENT)
     return Diagnosis(
         "visibility",
         f"{name} is only partly visible: a belief of {centre:.2g} in its centre and {count} of 9 "
@@ -269,8 +279,8 @@ def diagnose(case: Case) -> list[Diagnosis]:
 def _lens_ratio(case: Case) -> float | None:
     """Return the ratio of K's and training's focal lengths if it explains a wrong distance.
 
-    None if the part's distance lies within the training range, if its size on the image does not,
-    or if the focal lengths hardly differ.
+    Otherwise return None: the part's distance lies within the training range, its size on the image
+    does not, or the focal lengths hardly differ.
     """
     if case.seen is None or case.distances is not None or case.detection is None:
         return None
@@ -289,9 +299,9 @@ def _near(ratio: float, factor: float) -> bool:
 
 
 def _unit_fix(ratio: float) -> str:
-    """Return the fix for a mesh that is too large by a ratio, such as a ratio of two units."""
+    """Return the fix for a mesh that is too large by a ratio, e.g. the ratio of two units."""
     for read, metres in UNITS.items():
         for actual, actual_metres in UNITS.items():
             if read != actual and _near(ratio * actual_metres / metres, SAME):
                 return f"it was read in {read} and is in {actual}: --unit {actual}"
-    return "pass the mesh of the part that the network learned: --part"
+    return "pass the mesh of the trained part: --part"

@@ -15,7 +15,7 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Letterbox, focal_length
 from dopepp.geometry.cuboid import CENTROID, NUM_KEYPOINTS
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.picture import letterboxes
+from dopepp.inference.network_input import letterboxes
 from dopepp.parts.part import Part
 from dopepp.parts.size import Seen
 from dopepp.recovery.detection import Detection
@@ -28,10 +28,11 @@ BELIEVED: Final = (0.4, 6)
 MIN_PX: Final = 24  # smallest side of an image whose sharpness can be measured
 
 NARROWEST: Final = 0.5  # pixels: narrower edges cannot be distinguished
-FEWEST: Final = 8  # edge pixels that a measurement of sharpness needs
+FEWEST: Final = 8  # smallest number of edge pixels for a measurement of sharpness
 
 STRONG: Final = 0.3
-"""Share of the strongest gradient: weaker edges are shading, noise, or out of focus."""
+"""Share of the strongest gradient above which an edge is measured: weaker edges are shading, noise
+or out-of-focus background."""
 
 WHITE: Final = 250  # a pixel is clipped if all its channels reach this level
 
@@ -131,7 +132,7 @@ class Case:
 
     @cached_property
     def box(self) -> Letterbox:
-        """Image size in which the network sees the detected part best; templates use all pixels."""
+        """Image size that shows the part closest to its trained size; for templates, full size."""
         if not self.estimator.has_network:
             return Letterbox.scaled(self.image.shape[1::-1], 1.0)
         boxes = letterboxes(self.estimator.checkpoint, self.K, self.image, self.distances)
@@ -152,16 +153,16 @@ class Case:
 
     def around(self) -> RGBImage:
         """Return a crop around the detected part in the size of :attr:`box`, or the whole image."""
-        picture = self.box.image(self.image)
+        image = self.box.image(self.image)
         if self.detection is None:
-            return picture
+            return image
         keypoints = self.detection.keypoints
         points = self.box.points(keypoints[np.isfinite(keypoints[:, 0])])
-        size = (picture.shape[1], picture.shape[0])
+        size = (image.shape[1], image.shape[0])
         low = np.clip(np.floor(points.min(axis=0)), 0, size).astype(int)
         high = np.clip(np.ceil(points.max(axis=0)) + 1, 0, size).astype(int)
-        crop = picture[low[1] : high[1], low[0] : high[0]]
-        return crop if min(crop.shape[:2]) >= MIN_PX else picture
+        crop = image[low[1] : high[1], low[0] : high[0]]
+        return crop if min(crop.shape[:2]) >= MIN_PX else image
 
     def strongest_beliefs(self) -> Float[np.ndarray, "9"]:
         """Return the strongest belief of each keypoint of the part in all image sizes."""
@@ -188,14 +189,14 @@ def num_keypoints(detection: Detection) -> int:
     return int(np.isfinite(detection.peaks[:, 0]).sum())
 
 
-def edge_width(picture: RGBImage) -> float | None:
-    """Return the blur's standard deviation at the strongest edges, pixels; None without edges.
+def edge_width(image: RGBImage) -> float | None:
+    """Return the standard deviation of the blur at the strongest edges, pixels; None without edges.
 
     A step blurred by σ, and then by s, has a gradient proportional to 1/√(σ² + s²). The ratio of
     gradients for s and 2s determines σ (Zhuo and Sim 2011); s is a pixel. Close edges and strong
     noise reduce the result by up to a third. Motion along an edge is not measured.
     """
-    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     fine, coarse = _gradient(grey, 1.0), _gradient(grey, 2.0)
     least = max(STRONG * float(np.percentile(fine, 99.5)), 2 * _noise(grey), 1.0)
     edges = (fine >= cv2.dilate(fine, np.ones((3, 3)))) & (fine > least)
@@ -206,14 +207,14 @@ def edge_width(picture: RGBImage) -> float | None:
     return max(NARROWEST, math.sqrt((4 - ratio) / (ratio - 1)))
 
 
-def highlights(picture: RGBImage) -> float:
+def highlights(image: RGBImage) -> float:
     """Return the 99th percentile of the grey levels."""
-    return float(np.percentile(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), 99))
+    return float(np.percentile(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), 99))
 
 
-def clipped(picture: RGBImage) -> float:
+def clipped_share(image: RGBImage) -> float:
     """Return the share of clipped pixels."""
-    return float((picture.min(axis=2) >= WHITE).mean())
+    return float((image.min(axis=2) >= WHITE).mean())
 
 
 def _gradient(

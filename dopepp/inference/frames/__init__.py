@@ -26,7 +26,7 @@ from dopepp.inference.frames.source import CameraFrame, FrameSource
 __all__ = ["CameraFrame", "FrameSource", "SourceLike", "open_sources"]
 
 SourceLike = str | Path | int | FrameSource
-"""Path of an image, folder, video or ROS recording, glob pattern, camera number, device or URL, or
+"""Path of an image, folder, video or ROS recording; glob pattern; camera number, device or URL; or
 an open source."""
 
 

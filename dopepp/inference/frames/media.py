@@ -1,8 +1,8 @@
 """Frames read by OpenCV: image files, video files, cameras and network streams.
 
 OpenCV and camera drivers buffer frames, so a slow reader falls behind the camera. :class:`Live`
-therefore reads in a thread and keeps the newest frame only: no frame is older than the camera's
-interval when it is processed.
+therefore reads in a thread and keeps the newest frame only. A frame's age at the start of its
+processing is at most the camera's frame interval.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from dopepp.inference.frames.ros import BAGS, is_bag_folder
 from dopepp.inference.frames.source import CameraFrame, FrameSource
 
 SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
-"""Image files of a folder; a file that is named explicitly may have any suffix."""
+"""Suffixes of image files in a folder; a file whose path is given may have any suffix."""
 
 VIDEOS: Final = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts")
 
 HIGHEST_RATE: Final = 1000.0
 
-# FFmpeg would also open playlists, which name other files, so the container is checked first.
+# FFmpeg also opens playlists, which refer to other files, so the container is checked first.
 _VIDEO_HEADER: Final = re.compile(
     rb".{4}(ftyp|moov|mdat|wide|free)|RIFF|\x1aE\xdf\xa3|\x00\x00\x01[\xba\xb3]|G", re.DOTALL
 )
@@ -116,7 +116,7 @@ class Video(FrameSource):
         self.count = int(count) if 0 < count < math.inf else None
 
     def frames(self, stride: int = 1) -> Iterator[CameraFrame]:
-        """Yield every ``stride``-th frame; warn if the file has fewer than its header states.
+        """Yield every ``stride``-th frame; warn about frames missing at the end.
 
         Raises:
             UserError: No frame can be read.
@@ -196,7 +196,7 @@ class Live(FrameSource):
         """Yield the newest frame at every ``stride``-th request, without end.
 
         Raises:
-            UserError: There is no such camera.
+            UserError: The camera or stream cannot be opened.
             RunError: The camera has stopped delivering frames.
         """
         capture = self._opened(self._address)

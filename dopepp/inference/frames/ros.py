@@ -1,8 +1,8 @@
 """Frames of ROS: image and camera messages, live or recorded, and recordings (extra ``bags``).
 
 Recordings are ``.bag`` of ROS 1, and ``.mcap``, ``.db3`` and folders of ROS 2. Their messages are
-decoded by ROS's own definitions, never by definitions in the file. Messages are accessed by field
-names, so any library may have created them.
+decoded with ROS's definitions, never with definitions in the file. Functions access messages by
+field name, so messages of rclpy and of rosbags are both supported.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ def decode_image(message: Any) -> RGBImage:
         ValueError: The encoding is not supported, or the image's size is inconsistent or too large.
     """
     if hasattr(message, "format"):
-        picture = whole_image(bytes(message.data), ("JPEG", "PNG"))
-        return np.ascontiguousarray(np.asarray(picture.convert("RGB")))
+        image = whole_image(bytes(message.data), ("JPEG", "PNG"))
+        return np.ascontiguousarray(np.asarray(image.convert("RGB")))
     if message.encoding not in ENCODINGS:
         supported = ", ".join(ENCODINGS)
         raise ValueError(f"unsupported encoding {message.encoding!r:.40}; supported: {supported}")
@@ -75,7 +75,7 @@ def decode_image(message: Any) -> RGBImage:
 
 
 def is_rectified(topic: str) -> bool:
-    """Return whether a topic's images are undistorted, so that K is the left part of P."""
+    """Return whether a topic's images are undistorted; their K is then the left 3×3 part of P."""
     return topic.removesuffix("/compressed").rpartition("/")[2].startswith("image_rect")
 
 
@@ -92,7 +92,7 @@ class CameraInfo:
     model: str  # distortion model
     D: Sequence[float]  # distortion coefficients
     K: Sequence[float]  # camera matrix, 9 numbers row by row
-    P: Sequence[float]  # projection of undistorted images, 12 numbers row by row
+    P: Sequence[float]  # projection matrix of undistorted images, 12 numbers row by row
     binning: tuple[int, int] = (1, 1)  # sensor pixels per image pixel, across and down
     roi: Crop | None = None  # region of the sensor that is read out; None is the whole sensor
     frame_id: str = ""  # camera frame
@@ -119,8 +119,8 @@ class CameraInfo:
         """Return the pinhole camera of the images.
 
         Args:
-            source: Origin, for messages.
-            rectified: Whether the images are undistorted, so that P describes them.
+            source: Origin of the message, for error messages.
+            rectified: Whether the images are undistorted, so that P applies instead of K.
 
         Raises:
             UserError: The camera is not calibrated, or is not a pinhole camera.

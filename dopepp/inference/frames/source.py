@@ -1,4 +1,4 @@
-"""The interface of frame sources, and the camera that took the frames."""
+"""Interface of frame sources, and the camera of their images."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.camera_file import Camera, Crop, read_camera
 from dopepp.geometry.camera_formats import Size
-from dopepp.inference.picture import Depth32, read_depth_image, undistorted_depth
+from dopepp.inference.network_input import Depth32, read_depth_image, undistort_depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +21,7 @@ class CameraFrame:
 
     image: RGBImage  # RGB, with the lens distortion of the camera
     name: str  # image file, or name of a source of many frames
-    number: int  # index in the source, or the number in the name of every image file (BOP)
+    number: int  # index in the source, or the file's number if all file names are numbers (BOP)
     time: float | None = None  # seconds since a video's start or since 1970; None of an image
 
 
@@ -71,7 +71,7 @@ class Lens:
     def read_depth(self, path: Path, scale: float, K: CameraMatrix) -> Depth32:
         """Read a depth image in metres and remove the lens distortion."""
         metres, coefficients = read_depth_image(path, scale), self.camera.coefficients
-        return metres if coefficients is None else undistorted_depth(metres, K, coefficients)
+        return metres if coefficients is None else undistort_depth(metres, K, coefficients)
 
 
 def given_camera(K: CameraMatrix | None, camera: Camera | Path | str | None) -> Camera | None:

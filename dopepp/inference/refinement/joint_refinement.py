@@ -20,7 +20,7 @@ import numpy as np
 from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.geometry.rotation import RotationMatrix, Vector
-from dopepp.inference.picture import Depth
+from dopepp.inference.network_input import Depth
 from dopepp.inference.refinement.depth import DepthEvidence
 from dopepp.inference.refinement.part_surface import SurfacePoints
 from dopepp.inference.refinement.region import RegionRefiner, necessary_rounds, search_distance

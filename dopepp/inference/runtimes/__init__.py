@@ -1,8 +1,9 @@
 """Runtimes of a network: PyTorch, or the runtime of an exported file.
 
-An exported file describes itself: the checkpoint's description and how the network was exported are
-one JSON text in its metadata, under ``dopepp``, so a renamed file loads the same. To add a runtime,
-write a module with ``read_network(path) -> ExportedNetwork`` and a line in :data:`SUFFIXES`.
+The metadata of an exported file contain the checkpoint's description and the options of the export,
+as one JSON text under ``dopepp``. Loading therefore does not depend on the file's name. To add a
+runtime, write a module with ``read_network(path) -> ExportedNetwork`` and a line in
+:data:`SUFFIXES`.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ Arrays = tuple[
 
 @dataclass(frozen=True)
 class Export:
-    """How a network was exported."""
+    """Options and measurements of an export."""
 
     __pydantic_config__ = STRICT
 
@@ -85,12 +86,12 @@ class Runtime(Protocol):
 
 
 class ExportedNetwork(ABC):
-    """A network from a file, run by another runtime than PyTorch; see :class:`Runtime`.
+    """An exported network, executed by another runtime than PyTorch; see :class:`Runtime`.
 
     Args:
         path: File, for messages.
         checkpoint: Parts, input size and thresholds of the network, without weights.
-        export: How the network was exported.
+        export: Options and measurements of the export.
     """
 
     def __init__(self, path: Path, checkpoint: Checkpoint, export: Export) -> None:
@@ -139,14 +140,14 @@ def load(path: Path, device: torch.device) -> tuple[Runtime, Checkpoint]:
     if not is_export(path):
         return load_network(path)
     if device.type != "cpu":
-        fix = "leave the device out, or load the checkpoint that it was exported from"
+        fix = "leave out the device, or load the checkpoint that was exported"
         raise UserError(f"device {device} for {path}", "cpu for an exported network", fix)
     runtime = import_module(SUFFIXES[".xml" if path.is_dir() else path.suffix])
     exported = runtime.read_network(path)
     return exported, exported.checkpoint
 
 
-def placed(network: Runtime, device: torch.device) -> Runtime:
+def move_to_device(network: Runtime, device: torch.device) -> Runtime:
     """Return a network ready for inference; a PyTorch network is moved to the device."""
     if isinstance(network, PoseNetwork):
         network = network.for_inference().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -189,7 +190,7 @@ def check_shapes(path: Path, shapes: Mapping[str, Iterable[int] | None], num_pix
 
 
 def invalid_export(path: Path, problem: object, allowed: str = "") -> UserError:
-    """Return the error about a file that differs from what ``dopepp export`` writes."""
+    """Return the error about a file that ``dopepp export`` did not write, or that is damaged."""
     reason = " ".join(str(problem).split()) or type(problem).__name__
     return UserError(
         f"{path}: {reason:.300}",
@@ -200,10 +201,10 @@ def invalid_export(path: Path, problem: object, allowed: str = "") -> UserError:
 
 def pack(checkpoint: Checkpoint, export: Export) -> str:
     """Return the description for a file's metadata."""
-    return payload_json(described(checkpoint, export)[KEY])
+    return payload_json(describe_export(checkpoint, export)[KEY])
 
 
-def described(checkpoint: Checkpoint, export: Export) -> dict[str, Any]:
+def describe_export(checkpoint: Checkpoint, export: Export) -> dict[str, Any]:
     """Return a checkpoint's content (:meth:`Checkpoint.to_file`) with an :class:`Export`."""
     content = checkpoint.to_file()
     content[KEY][_SECTION] = asdict(export)
@@ -222,13 +223,9 @@ def unpack(text: str | None, path: Path) -> tuple[Checkpoint, Export]:
             class that may not be built.
     """
     if text is None or len(text) > MAX_HEADER_BYTES:
-        problem = (
-            "no description of the network"
-            if text is None
-            else f"a description of {len(text)} characters"
-        )
+        size = "no description" if text is None else f"a description of {len(text)} characters"
         allowed = f"at most {MAX_HEADER_BYTES} characters under {KEY!r}, written by `dopepp export`"
-        raise UserError(f"{path}: {problem}", allowed, _FIX)
+        raise UserError(f"{path}: {size}", allowed, _FIX)
     payload = parse_json(text, f"{path}, description under {KEY!r}")
     try:
         checkpoint = parse_description(payload)

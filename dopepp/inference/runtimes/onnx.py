@@ -1,7 +1,7 @@
 """ONNX files, run by onnxruntime on the CPU.
 
 An ONNX file can refer to other files, operators of libraries and nested graphs. ``dopepp export``
-writes none of these, so a file with any of them is rejected before the runtime reads it.
+writes no such references, and a file with any of them is rejected before ONNX Runtime reads it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _DOMAINS: Final = ("", "ai.onnx")  # namespaces of ONNX's standard operators
 
 _SMALL: Final = 1024
-"""Elements up to which a constant may be a shape or a factor; larger constants are weights."""
+"""Number of elements up to which a constant may be a shape or a factor; weights are larger."""
 
 _ARITHMETIC: Final = {"Add", "Cast", "Div", "Mul", "Shape", "Sub"}
 _SHAPE_OPERATORS: Final = _ARITHMETIC | {"Concat", "Gather", "Slice", "Squeeze", "Unsqueeze"}
@@ -154,10 +154,9 @@ def _tensors(graph: onnx.GraphProto) -> Iterator[onnx.TensorProto]:
 def _shapes(
     model: onnx.ModelProto, path: Path, pixels: tuple[int, ...]
 ) -> dict[str, list[int] | None]:
-    """Infer the shape of every tensor for an input of a given shape; None if unknown.
+    """Infer the shape of every tensor for an input of shape ``pixels``; None: unknown.
 
-    Operators are evaluated in order. The few integers that shapes are computed from are evaluated
-    as well.
+    The integers from which operators compute shapes are evaluated as well.
     """
     from onnx import TensorProto, defs, helper, shape_inference
 

@@ -1,7 +1,7 @@
 """OpenVINO files, a folder with ``model.xml`` and ``model.bin``, run by OpenVINO on the CPU.
 
 The XML can contain nested graphs and operators of libraries, and its constants are offsets into the
-other file. What ``dopepp export`` does not write is rejected before the runtime reads it.
+weights file. Content that ``dopepp export`` does not write is rejected before OpenVINO reads it.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ _OPSET: Final = re.compile(r"opset\d{1,2}", re.ASCII)  # versions of OpenVINO's 
 def load_openvino(choice: str) -> Any:
     """Import OpenVINO without its telemetry.
 
-    OpenVINO reports every import to its makers, and NNCF every call, if the telemetry package is
-    installed. This function therefore hides the package from OpenVINO and NNCF.
+    If the telemetry package is installed, OpenVINO reports every import to its developers, and NNCF
+    reports every call. This function therefore hides the package from OpenVINO and NNCF.
 
     Args:
         choice: The user's choice that requires OpenVINO, for messages.
@@ -102,8 +102,8 @@ class OpenVinoNetwork(ExportedNetwork):
 def compile_model(model: Any) -> Any:
     """Compile a model for single images, in float32 unless it is quantised.
 
-    By default OpenVINO would compute in bfloat16 on some processors, and pin its threads to cores
-    that another program may be using.
+    By default, OpenVINO computes in bfloat16 on some processors, and pins its threads to cores that
+    another program may be using.
     """
     options = {
         "ENABLE_CPU_PINNING": False,

@@ -1,8 +1,8 @@
 """Poses of parts from several images of a static scene with known camera poses.
 
 1. Each view is searched alone.
-2. Detections of several views that agree in the world are joined to a part
-   (:mod:`~dopepp.inference.several_views.sightings`).
+2. Detections of several views that agree in the world are associated with one part
+   (:mod:`~dopepp.inference.several_views.observations`).
 3. The pose of each part is refined on all views together and verified in each view
    (:mod:`~dopepp.inference.several_views.joint`).
 4. Of several parts with the same pose, the most probable remains.
@@ -26,20 +26,25 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Transform, invert_transform
 from dopepp.geometry.camera_file import Camera
 from dopepp.geometry.rotation import is_rigid
-from dopepp.inference.picture import Depth, Distances, prepare_image
-from dopepp.inference.pose_result import PoseResult, Shape, spent_between
+from dopepp.inference.network_input import Depth, Distances, prepare_image
+from dopepp.inference.pose_result import PoseResult, Shape, elapsed_by_step
 from dopepp.inference.refinement.joint_refinement import PosedImage
 from dopepp.inference.several_views.contradictions import contradictions
 from dopepp.inference.several_views.joint import JointEstimator
-from dopepp.inference.several_views.sightings import PartGeometry, PartSighting, associate, sight
+from dopepp.inference.several_views.observations import (
+    PartGeometry,
+    PartObservation,
+    associate,
+    make_observation,
+)
 from dopepp.inference.several_views.views_result import ViewsResult
 
 if TYPE_CHECKING:
     from dopepp.inference.estimator import PoseEstimator
 
 CAMERA_ERROR: Final = (2e-4, math.radians(0.02))
-"""Default standard deviations of a camera's pose along and about each axis: metres and radians.
-These are the errors after a hand-eye calibration."""
+"""Default standard deviations of a camera's pose: position along each axis (metres), rotation about
+each axis (radians). These errors are typical after a hand-eye calibration."""
 
 
 def predict_views(
@@ -49,33 +54,27 @@ def predict_views(
     T_world_cam: Sequence[Transform],
     depths: Sequence[Depth] | None = None,
     distances: Distances | None = None,
-    camera_error: tuple[float, float] = CAMERA_ERROR,
+    camera_error: tuple[float, float] | None = None,
     names: Sequence[str] | None = None,
 ) -> ViewsResult:
-    """Estimate the poses of parts from several images of a static scene.
-
-    The arguments and the result are described in :meth:`PoseEstimator.predict_views`.
-
-    Raises:
-        UserError: The estimator does not refine by region, an argument is invalid, or the numbers
-            of images, cameras and poses differ.
-    """
+    """Estimate the poses of parts on several images; see :meth:`PoseEstimator.predict_views`."""
     refiner = estimator.refiner
     if refiner is None or not refiner.verifies:
         fix = "load the estimator with refine='region'"
         problem = f"several views with refine={estimator.refine}"
         raise UserError(problem, "refine='region', or region and depth", fix)
     names = names or [f"view {number}" for number in range(len(images))]
-    views = _posed_images(images, cameras, T_world_cam, depths, camera_error, names)
-    sightings, speeds = _search(estimator, views, distances)
+    error = CAMERA_ERROR if camera_error is None else camera_error
+    views = _posed_images(images, cameras, T_world_cam, depths, error, names)
+    observations, speeds = _search(estimator, views, distances)
     start = time.perf_counter()
     geometries = {part.name: PartGeometry.of(part) for part in estimator.solid_parts}
     associated = partial(associate, geometries=geometries)
     slope, least = estimator.recovery.refined_verification, estimator.min_score
     joint = JointEstimator(refiner, views, names, geometries, slope)
-    parts = [part.detection for part in joint.parts(associated(sightings))]
+    parts = [part.detection for part in joint.parts(associated(observations))]
     joint_ms = 1000 * (time.perf_counter() - start)
-    strong = [[item for item in view if item.detection.score >= least] for view in sightings]
+    strong = [[item for item in view if item.detection.score >= least] for view in observations]
     passed, findings = contradictions(
         [part for part in parts if part.score >= least], strong, views, names, associated
     )
@@ -112,41 +111,31 @@ def _posed_images(
         for n, error in enumerate(camera_error)
     )
     error = np.diag(np.repeat([rotation_error, shift], 3) ** 2)
-    return [
-        _posed(image, cameras[n], T_world_cam[n], depths[n] if depths else None, error, names[n])
-        for n, image in enumerate(images)
-    ]
+    views = []
+    for number, (image, camera) in enumerate(zip(images, cameras, strict=True)):
+        if isinstance(camera, Camera):
+            resized = camera.for_picture((image.shape[1], image.shape[0]))
+            K, distortion = resized.K, resized.coefficients
+        else:
+            K, distortion = camera, None
+        depth = depths[number] if depths else None
+        image, K, depth = prepare_image(image, K, distortion, depth)
+        T = np.asarray(T_world_cam[number], np.float64)
+        if not is_rigid(T):
+            problem = f"T_world_cam of {names[number]}: {T.tolist()!s:.200}"
+            raise UserError(problem, "a rigid 4×4 transform", "pass the camera's pose in the world")
+        views.append(PosedImage(image, K, invert_transform(T), error, depth))
+    return views
 
 
 def _search(
     estimator: PoseEstimator, views: Sequence[PosedImage], distances: Distances | None
-) -> tuple[list[list[PartSighting]], list[dict[str, float]]]:
-    """Search each view alone; return its sightings and the spent milliseconds by step."""
-    sightings, speeds = [], []
+) -> tuple[list[list[PartObservation]], list[dict[str, float]]]:
+    """Search each view alone; return its observations and the milliseconds of each step."""
+    observations, speeds = [], []
     for number, view in enumerate(views):
         before = dict(estimator.spent_ms)
         candidates = estimator.candidates(view.image, view.K, None, view.depth, distances)
-        sightings.append([sight(number, candidate, view) for candidate in candidates])
-        speeds.append(spent_between(before, estimator.spent_ms))
-    return sightings, speeds
-
-
-def _posed(
-    image: RGBImage,
-    camera: Camera | CameraMatrix,
-    T_world_cam: Transform,
-    depth: Depth | None,
-    error: np.ndarray,
-    name: str,
-) -> PosedImage:
-    """Check the arguments of a view and remove the lens distortion."""
-    distortion = None
-    if isinstance(camera, Camera):
-        camera = camera.for_picture((image.shape[1], image.shape[0]))
-        distortion, camera = camera.coefficients, camera.K
-    image, K, depth = prepare_image(image, camera, distortion, depth)
-    T = np.asarray(T_world_cam, np.float64)
-    if not is_rigid(T):
-        problem = f"T_world_cam of {name}: {T.tolist()!s:.200}"
-        raise UserError(problem, "a rigid 4×4 transform", "pass the camera's pose in the world")
-    return PosedImage(image, K, invert_transform(T), error, depth)
+        observations.append([make_observation(number, candidate, view) for candidate in candidates])
+        speeds.append(elapsed_by_step(before, estimator.spent_ms))
+    return observations, speeds

@@ -1,9 +1,9 @@
 """Contradictions between views: wrong or swapped camera poses, and moved parts.
 
-Two views contradict each other if each shows the same kind of part at a different pose, the
-covariances do not explain the difference, and one of them shows something else at the other's pose.
-If the two views agree on no part, a camera pose is wrong, and the detections that depend on it are
-rejected. If they agree on another part, the contradicting part was moved.
+Two views contradict each other if they show a part of the same name at different poses, the
+covariances do not explain the difference, and one view shows something else at the other view's
+pose. If the two views agree on no part, a camera pose is wrong, and the detections that depend on
+this camera pose are rejected. If the views agree on another part, the contradicting part was moved.
 """
 
 from __future__ import annotations
@@ -19,21 +19,25 @@ import numpy as np
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.inference.refinement.joint_refinement import PosedImage
 from dopepp.inference.several_views.joint import CONSISTENT
-from dopepp.inference.several_views.sightings import PartSighting, separation, sight
+from dopepp.inference.several_views.observations import (
+    PartObservation,
+    make_observation,
+    separation,
+)
 from dopepp.inference.several_views.views_result import WorldDetection
 
 DISAGREEING: Final = 1.2
-"""Disagreement of views on a part above which it is reported. With exact camera poses, the largest
-of 30 on rendered scenes was 0.9."""
+"""Disagreement of views on a part from which it is reported. With exact camera poses, the largest
+of 30 disagreements on rendered scenes was 0.9."""
 
-Views = Sequence[Sequence[PartSighting]]  # sightings of each view
-Associate = Callable[[Views], list[list[PartSighting]]]
+Views = Sequence[Sequence[PartObservation]]  # observations of each view
+Associate = Callable[[Views], list[list[PartObservation]]]
 
 
 class _Conflict(NamedTuple):
-    """Two detections of the same kind of part, of which a view supports one only."""
+    """Two detections of parts with the same name that contradict each other."""
 
-    views: tuple[int, int]  # a view that supports the first detection, and one for the second
+    views: tuple[int, int]  # for each detection, a view that supports it
     detections: tuple[WorldDetection, WorldDetection]
     is_mutual: bool  # whether both views show something else at the other's pose
 
@@ -48,7 +52,7 @@ class _Conflict(NamedTuple):
 
 def contradictions(
     detections: Sequence[WorldDetection],
-    sightings: Views,
+    observations: Views,
     images: Sequence[PosedImage],
     names: Sequence[str],
     associated: Associate,
@@ -57,10 +61,10 @@ def contradictions(
 
     Args:
         detections: Detections that pass the threshold.
-        sightings: Sightings of each view that pass the threshold.
+        observations: Observations of each view that pass the threshold.
         images: Images with the poses of their cameras.
         names: Name of each view.
-        associated: Function that joins the sightings of several views.
+        associated: Function that groups the observations of several views by part.
 
     Returns:
         Detections that no contradiction rejects, and a message for each contradiction.
@@ -84,7 +88,7 @@ def contradictions(
         blamed = [n for n in (0, 1) if views[n] not in trusted]
         blamed = blamed if len(blamed) == 1 else [0, 1]
         rejected += [conflict.detections[number] for number in blamed]
-        swapped = swapped or _swapped(sightings, images, associated)
+        swapped = swapped or _swapped(observations, images, associated)
         if len(blamed) == 1:
             cause = f"the camera pose of {names[views[blamed[0]]]} is wrong"
         else:
@@ -123,24 +127,20 @@ def _conflict(first: WorldDetection, second: WorldDetection) -> _Conflict | None
 
 
 def _swapped(
-    sightings: Views, images: Sequence[PosedImage], associated: Associate
+    observations: Views, images: Sequence[PosedImage], associated: Associate
 ) -> tuple[int, int] | None:
-    """Return the two views whose detections agree better if their camera poses are exchanged.
-
-    Returns:
-        None if no exchange makes more detections agree.
-    """
+    """Return the two views whose camera poses are swapped; None if no swap improves agreement."""
 
     def agreeing(order: Sequence[int]) -> int:
         views = [
             replace(image, T_cam_world=images[other].T_cam_world)
             for image, other in zip(images, order, strict=True)
         ]
-        moved_sightings = [
-            [sight(item.view, item.detection, views[item.view]) for item in view]
-            for view in sightings
+        moved_observations = [
+            [make_observation(item.view, item.detection, views[item.view]) for item in view]
+            for view in observations
         ]
-        return sum(len(cluster) - 1 for cluster in associated(moved_sightings))
+        return sum(len(cluster) - 1 for cluster in associated(moved_observations))
 
     order = list(range(len(images)))
     exchanged = {}

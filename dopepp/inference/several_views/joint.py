@@ -1,8 +1,8 @@
-"""Joint pose of the sightings of one part: refinement on all views, and verification in each.
+"""Joint pose of the observations of one part: refinement on all views, and verification in each.
 
-Views that do not show the part at the joint pose are left out, and the pose is refined again
-without them. A part that fewer than two views show keeps its best single-view pose, and loses its
-other sightings.
+Views that do not show the part at the joint pose are excluded, and the pose is refined again on the
+remaining views. If fewer than two views show the part, it keeps the pose and the observation of its
+best single view.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from jaxtyping import Float
 
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID
-from dopepp.inference.picture import are_same
+from dopepp.inference.network_input import are_same
 from dopepp.inference.refinement.joint_refinement import PosedImage
 from dopepp.inference.refinement.refiner import LOOSER, Refiner
 from dopepp.inference.refinement.region.round import OutlineAgreement
 from dopepp.inference.refinement.solver import Prior, UndecidedError
-from dopepp.inference.several_views.sightings import PartGeometry, PartSighting, separation
+from dopepp.inference.several_views.observations import PartGeometry, PartObservation, separation
 from dopepp.inference.several_views.views_result import Status, ViewEvidence, WorldDetection
 from dopepp.recovery.detection import log_odds
 
@@ -34,28 +34,28 @@ AGREEING: Final = 0.7
 correct poses it is above 0.9. If a camera is off by 4 mm at 20 cm, it is below 0.7 in one view."""
 
 WEAKER: Final = (0.5, 0.15)
-"""A view with its own detection also supports a pose that is a little worse than the detection:
-factor on the detection's probability, and decrease of its agreement."""
+"""A view with a detection also supports a slightly worse pose: factor on the probability of the
+detection, and decrease of its agreement."""
 
 CONSISTENT: Final = 4.5
 """Largest Mahalanobis distance of a joint pose from a detection that the image did not refine."""
 
 AGAINST: Final = -1.5
-"""Lower bound of a view's log odds, because the part may be occluded or hardly visible there."""
+"""Lower bound of a view's log odds, because the part may be occluded or hardly visible."""
 
 COINCIDENCE: Final = 1.5
-"""Log odds that each further detection at the same pose adds, or view whose outline agrees: wrong
-poses rarely fit two views."""
+"""Log odds added by each further view that detects the part at the same pose, or whose outline
+agrees: wrong poses rarely fit two views."""
 
 USUAL_MOVE: Final = 1.0
-"""Assumed Mahalanobis distance between start and refined pose, which the verification asks for."""
+"""Assumed Mahalanobis distance between start and refined pose, a feature of the verification."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointPart:
-    """A part in the world, with the sightings that belong to it."""
+    """A part in the world, with the observations that belong to it."""
 
-    sightings: Sequence[PartSighting]
+    observations: Sequence[PartObservation]
     detection: WorldDetection
 
 
@@ -81,17 +81,17 @@ class JointEstimator:
         self._refiner, self._views, self._names = refiner, views, names
         self._geometries, self._slope = geometries, slope
 
-    def parts(self, clusters: Sequence[Sequence[PartSighting]]) -> list[JointPart]:
+    def parts(self, clusters: Sequence[Sequence[PartObservation]]) -> list[JointPart]:
         """Estimate the parts of all clusters, without duplicates, best score first.
 
-        Sightings that do not agree with the joint pose of their cluster form clusters of their own.
+        An observation that does not agree with the joint pose of its cluster forms another cluster.
         """
         parts: list[JointPart] = []
         waiting = list(clusters)
         while waiting:
             cluster = waiting.pop()
             parts.append(self.estimate(cluster))
-            waiting += [[other] for other in cluster if other not in parts[-1].sightings]
+            waiting += [[other] for other in cluster if other not in parts[-1].observations]
         parts.sort(key=lambda part: -part.detection.score)
         kept: list[JointPart] = []
         for part in parts:
@@ -99,28 +99,28 @@ class JointEstimator:
                 kept.append(part)
         return kept
 
-    def estimate(self, sightings: Sequence[PartSighting]) -> JointPart:
+    def estimate(self, observations: Sequence[PartObservation]) -> JointPart:
         """Refine the pose of a part on all views that show it.
 
         Args:
-            sightings: Sightings of the part, best first.
+            observations: Observations of the part, best first.
 
         Returns:
-            The part with the sightings that agree with the joint pose. If no two views agree, the
-            pose is taken from the best sighting.
+            The part with the observations that agree with the joint pose. If no two views agree,
+            the pose is that of the best observation.
         """
-        name, all_views = sightings[0].detection.object, set(range(len(self._views)))
+        name, all_views = observations[0].detection.object, set(range(len(self._views)))
         geometry = self._geometries[name]
         # Refine on the selected views, select the views that support the result, and repeat.
         selected, tried = all_views, list[tuple[set[int], int]]()
-        while len(selected) > 1 and (selected, len(sightings)) not in tried:
-            tried.append((selected, len(sightings)))
-            start = geometry.mean([sighting.pose for sighting in sightings])
+        while len(selected) > 1 and (selected, len(observations)) not in tried:
+            tried.append((selected, len(observations)))
+            start = geometry.mean([observation.pose for observation in observations])
             search_range = Prior(start.T_cam_obj, start.information / LOOSER**2)
-            views_with_sighting = {sighting.view for sighting in sightings}
+            views_with_observation = {observation.view for observation in observations}
             numbers = sorted(selected)
-            starts = [item.start for item in sightings if item.view in selected]
-            prior = geometry.mean(starts or [sightings[0].start])
+            starts = [item.start for item in observations if item.view in selected]
+            prior = geometry.mean(starts or [observations[0].start])
             try:
                 views = [self._views[number] for number in numbers]
                 joint = self._refiner.refine_views(name, views, search_range, prior)
@@ -129,21 +129,22 @@ class JointEstimator:
             pose = Prior(joint.T_world_obj, np.linalg.inv(joint.covariance))
             shown = dict(zip(numbers, joint.agreements, strict=True))
             evidence = [
-                self._evidence(number, pose, sightings, shown.get(number)) for number in all_views
+                self._evidence(number, pose, observations, shown.get(number))
+                for number in all_views
             ]
             supporting = {n for n in all_views if evidence[n].status == "supports"}
-            # A sighting that its image could not refine (`kept`) may be wrong. If it contradicts
-            # the pose that several views support, refine again without this sighting.
+            # An observation whose refinement failed (`kept`) may be wrong. If it contradicts the
+            # pose that several views support, refine again without this observation.
             consistent = [
                 item
-                for item in sightings
+                for item in observations
                 if not item.detection.kept or geometry.separation(pose, item.pose) <= CONSISTENT
             ]
-            if len(supporting) > 1 and 0 < len(consistent) < len(sightings):
-                sightings, selected = consistent, supporting
+            if len(supporting) > 1 and 0 < len(consistent) < len(observations):
+                observations, selected = consistent, supporting
                 continue
             if supporting >= selected:
-                agreeing = [item for item in sightings if item.view in selected] or sightings
+                agreeing = [item for item in observations if item.view in selected] or observations
                 disagreement = max(joint.disagreements)
                 if len(agreeing) > 1:
                     separations = [geometry.separation(pose, item.pose) for item in agreeing]
@@ -152,8 +153,8 @@ class JointEstimator:
                 looser = Prior(pose.T_cam_obj, pose.information / max(1.0, disagreement) ** 2)
                 return self._part(agreeing, looser, evidence, disagreement)
             several = len(supporting & selected) > 1
-            selected = supporting & selected if several else views_with_sighting
-        best = max(sightings, key=lambda sighting: sighting.detection.score)
+            selected = supporting & selected if several else views_with_observation
+        best = max(observations, key=lambda observation: observation.detection.score)
         detection = best.detection
         probability = detection.probability or 0.0
         evidence = [
@@ -168,20 +169,20 @@ class JointEstimator:
         self,
         number: int,
         pose: Prior,
-        sightings: Sequence[PartSighting],
+        observations: Sequence[PartObservation],
         agreement: OutlineAgreement | None,
     ) -> ViewEvidence:
         """Return whether a view shows the part at a pose in the world."""
         view = self._views[number]
-        sighting = next((item for item in sightings if item.view == number), None)
+        observation = next((item for item in observations if item.view == number), None)
         distribution = view.to_camera(pose.T_cam_obj, np.linalg.inv(pose.information))
-        original = sightings[0].detection if sighting is None else sighting.detection
+        original = observations[0].detection if observation is None else observation.detection
         geometry = self._geometries[original.object]
         detection = replace(
             original,
             T_cam_obj=distribution.T_cam_obj,
             keypoints=project_keypoints(geometry.cuboid, distribution.T_cam_obj, view.K),
-            peaks=np.full_like(original.peaks, np.nan) if sighting is None else original.peaks,
+            peaks=np.full_like(original.peaks, np.nan) if observation is None else original.peaks,
             covariance=np.linalg.inv(distribution.information),
             agreement=None if agreement is None else agreement.share,
             support=None if agreement is None else agreement.support,
@@ -189,13 +190,13 @@ class JointEstimator:
         detection = self._refiner.verified(detection, view.image, view.K, USUAL_MOVE)
         probability, share = detection.probability or 0.0, detection.agreement or 0.0
         least, least_share = SUPPORTING, AGREEING
-        if sighting is not None and not original.kept:
+        if observation is not None and not original.kept:
             factor, decrease = WEAKER
             least = min(least, factor * (original.probability or 0.0))
             least_share = min(least_share, (original.agreement or 0.0) - decrease)
         is_shown = agreement is not None and probability >= least and share >= least_share
-        if sighting is not None and original.kept:
-            is_shown |= geometry.separation(pose, sighting.pose) <= CONSISTENT
+        if observation is not None and original.kept:
+            is_shown |= geometry.separation(pose, observation.pose) <= CONSISTENT
         status: Status = "supports" if is_shown else "hidden"
         if not _is_inside(detection.keypoints[CENTROID], view):
             status = "outside"
@@ -203,13 +204,13 @@ class JointEstimator:
 
     def _part(
         self,
-        sightings: Sequence[PartSighting],
+        observations: Sequence[PartObservation],
         pose: Prior,
         evidence: Sequence[ViewEvidence],
         disagreement: float = 0.0,
     ) -> JointPart:
         """Combine the evidence of all views to the probability and score of a part."""
-        best = max((item.detection for item in sightings), key=lambda detection: detection.score)
+        best = max((item.detection for item in observations), key=lambda detection: detection.score)
         single_odds, odds = log_odds(best.probability or 0.0), 0.0
         for item in evidence:
             seen = max(AGAINST, log_odds(item.probability))
@@ -223,23 +224,22 @@ class JointEstimator:
             and (item.detection.agreement or 0.0) >= AGREEING
             for item in evidence
         )
-        odds += COINCIDENCE * (max(len(sightings), agreeing) - 1)
+        odds += COINCIDENCE * (max(len(observations), agreeing) - 1)
         # The score of the best single view, with the odds of all views instead of its own.
         score = _probability(log_odds(best.score) + self._slope * (odds - single_odds))
         covariance = np.linalg.inv(pose.information)
         given = best.object, score, _probability(odds), pose.T_cam_obj, covariance
-        return JointPart(sightings, WorldDetection(*given, evidence, disagreement))
+        return JointPart(observations, WorldDetection(*given, evidence, disagreement))
 
 
 def _is_duplicate(part: JointPart, better: JointPart) -> bool:
     """Return whether two parts are the same instance, detected twice.
 
     Both must be at the same position in every view. If a view supports only the first part, the
-    covariances must also explain the difference of the poses. Otherwise the views contradict each
-    other.
+    covariances must also explain the difference of the poses, or else the views contradict.
     """
     detection, other = part.detection, better.detection
-    shared = {item.view for item in part.sightings} & {item.view for item in better.sightings}
+    shared = {item.view for item in part.observations} & {item.view for item in better.observations}
     pairs = zip(detection.evidence, other.evidence, strict=True)
     if shared or not all(are_same(a.detection, b.detection) for a, b in pairs):
         return False

@@ -1,8 +1,8 @@
 """The next best view: the camera pose from which an image reduces a pose's covariance most.
 
-The information that a view would add comes from the part's outline in this view. Every point of the
-outline counts as measured with a usual precision (:data:`USUAL_PX`), and the outline has the errors
-of offset and scale that refinement assumes. The part may hide itself; other objects are ignored.
+A view adds information about the pose through the part's outline. Each point of the outline has the
+same standard deviation (:data:`USUAL_PX`), and the outline has the common errors of offset and
+scale that refinement assumes. Self-occlusion is computed; other objects are ignored.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from dopepp.inference.refinement.outline import (
 from dopepp.inference.refinement.region.shared_errors import SCALE_ERROR, region_terms
 from dopepp.inference.refinement.region.shifts import Shifts
 from dopepp.inference.refinement.solver import PoseMatrix
+from dopepp.recovery.detection import expected_distance
 
 USUAL_PX: Final = 0.7
 """Standard deviation of a point of the outline, pixels."""
@@ -49,7 +50,7 @@ class NextView:
 
     number: int  # index of the camera pose
     before: float  # present expected error of the part's points, metres
-    # Expected error after each view; infinite if the view does not show the whole part
+    # Expected error after each view, metres; infinite if the view does not show the whole part
     expected: Sequence[float]
     reason: str  # expected gain, in words
 
@@ -82,18 +83,17 @@ def next_best_view(
         UserError: No candidate shows the whole part.
     """
     prior, expected = np.linalg.inv(covariance), []
+    T_bench_world = None if T_world_bench is None else invert_transform(T_world_bench)
     for T_world_cam in candidates:
-        information = None
-        if T_world_bench is None or _height(T_world_bench, T_world_cam) > 0:
-            T_cam_world = invert_transform(T_world_cam)
-            given = rotate_covariance(T_cam_world[:3, :3], prior)
-            seen = _information(mesh, T_cam_world @ T_world_obj, K, size, given, scale_error)
-            information = None if seen is None else rotate_covariance(T_world_cam[:3, :3], seen)
-        expected.append(
-            math.inf
-            if information is None
-            else point_error(mesh, T_world_obj, np.linalg.inv(prior + information))
-        )
+        expected.append(math.inf)
+        if T_bench_world is not None and transform(T_bench_world, T_world_cam[:3, 3])[2] <= 0:
+            continue
+        T_cam_world = invert_transform(T_world_cam)
+        given = rotate_covariance(T_cam_world[:3, :3], prior)
+        added = _information(mesh, T_cam_world @ T_world_obj, K, size, given, scale_error)
+        if added is not None:
+            posterior = prior + rotate_covariance(T_world_cam[:3, :3], added)
+            expected[-1] = point_error(mesh, T_world_obj, np.linalg.inv(posterior))
     if not candidates or min(expected) == math.inf:
         problem = f"no view of {len(candidates)} shows the whole part"
         fix = "pass more camera poses, or poses farther away that look at the part"
@@ -105,17 +105,7 @@ def next_best_view(
 
 def point_error(mesh: OutlineMesh, T_world_obj: Transform, covariance: PoseMatrix) -> float:
     """Return the expected error of a part's points under a pose's covariance (RMS), metres."""
-    arms = mesh.vertices @ T_world_obj[:3, :3].T
-    moment = arms.T @ arms / len(arms)
-    inertia = np.trace(moment) * np.eye(3) - moment  # mean of |ω × arm|² as a form of ω
-    cross = np.cross(np.eye(3), arms.mean(axis=0))  # mean of ω × arm as a map of ω
-    variance = np.trace(covariance[3:, 3:]) + (inertia * covariance[:3, :3]).sum()
-    return math.sqrt(max(0.0, float(variance + 2 * (cross * covariance[:3, 3:]).sum())))
-
-
-def _height(T_world_bench: Transform, T_world_cam: Transform) -> float:
-    """Return the height of a camera above the bench, metres."""
-    return float(transform(invert_transform(T_world_bench), T_world_cam[:3, 3])[2])
+    return float(expected_distance(covariance, mesh.vertices @ T_world_obj[:3, :3].T))
 
 
 def _information(
@@ -126,15 +116,10 @@ def _information(
     prior: PoseMatrix,
     scale_error: float,
 ) -> PoseMatrix | None:
-    """Return the information an image of the outline would add; None if the part is cut off.
+    """Return the information about the pose that the outline on an image of this size adds.
 
-    Args:
-        mesh: Mesh of the part.
-        T_cam_obj: Pose of the part in the camera.
-        K: Camera matrix, pixels.
-        size: (width, height) of the image.
-        prior: Information about the pose before the image.
-        scale_error: Largest relative error of the part's size or of the focal length.
+    The information is in camera axes, as is ``prior``, the information before the image. None: the
+    image does not show the whole part.
     """
     posed_mesh = posed(mesh, T_cam_obj, K)
     if posed_mesh is None:

@@ -1,9 +1,9 @@
-"""Files of camera poses: which camera took which image from where.
+"""Files with the camera and the camera pose of each image.
 
 - YAML with a mapping ``views`` from each image to its pose ``T_world_cam``, in one of the forms
-  that :func:`transform_of` reads. With ``hand_eye``, a file that ``dopepp calibrate handeye``
-  wrote, images have the robot's pose ``T_base_flange`` instead. ``camera`` is a camera file, for
-  all views or for a single view.
+  that :func:`parse_transform` accepts. With ``hand_eye``, a file of ``dopepp calibrate handeye``,
+  images have the robot's pose ``T_base_flange`` instead. ``camera`` is a camera file, for all views
+  or for a single view.
 - BOP's ``scene_camera.json``, with ``cam_R_w2c`` and ``cam_t_w2c``.
 - COLMAP's ``images.txt``, with ``cameras.txt`` in the same folder.
 
@@ -64,7 +64,7 @@ class CameraPoses:
     source: str
 
     def of(self, image: Path) -> CameraPose:
-        """Return the camera of an image, named by the image, its number or its folder.
+        """Return the camera of an image, looked up by the image's name, number or folder.
 
         Raises:
             UserError: The file has no pose of the image.
@@ -101,12 +101,12 @@ def read_camera_poses(path: Path) -> CameraPoses:
         mount = read_yaml(path.parent / str(hand_eye))
         where = f"{hand_eye}: T_flange_cam"
         values = mount.get("T_flange_cam") if isinstance(mount, Mapping) else None
-        T_flange_cam = transform_of(values, where)
+        T_flange_cam = parse_transform(values, where)
     pose_name = "T_world_cam" if T_flange_cam is None else "T_base_flange"
     poses = {}
     for name, view in views.items():
         fields = view if isinstance(view, Mapping) else {}
-        T = transform_of(fields.get(pose_name), f"{path}: {name}: {pose_name}")
+        T = parse_transform(fields.get(pose_name), f"{path}: {name}: {pose_name}")
         T_world_cam = T if T_flange_cam is None else T @ T_flange_cam
         file = fields.get("camera", camera)
         lens = None if file is None else read_camera(path.parent / str(file))
@@ -114,7 +114,7 @@ def read_camera_poses(path: Path) -> CameraPoses:
     return CameraPoses(poses, None if error is None else _error(error, path), str(path))
 
 
-def transform_of(value: object, where: str) -> Transform:
+def parse_transform(value: object, where: str) -> Transform:
     """Parse a rigid transform.
 
     Args:
@@ -170,7 +170,7 @@ def _bop(path: Path) -> CameraPoses:
             allowed = "cam_R_w2c (9 numbers) and cam_t_w2c (3 numbers, millimetres)"
             problem = f"{where} without a valid camera pose"
             raise UserError(problem, allowed, "use a data set with camera poses") from None
-        T_cam_world = transform_of({"matrix": make_transform(R, t)}, where)
+        T_cam_world = parse_transform({"matrix": make_transform(R, t)}, where)
         camera = camera_of_fields({"cam_K": record.get("cam_K")}, where)
         poses[name] = CameraPose(invert_transform(T_cam_world), camera)
     return CameraPoses(poses, None, str(path))
@@ -194,7 +194,7 @@ def _colmap(path: Path) -> CameraPoses:
             allowed = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of points"
             raise UserError(f"{path}: {line:.100}", allowed, "export the model as text again")
         fields = {"quaternion_wxyz": words[1:5], "position": words[5:8]}
-        T_cam_world = transform_of(fields, f"{path}: {words[9]}")
+        T_cam_world = parse_transform(fields, f"{path}: {words[9]}")
         name = Path(words[9]).name
         poses[name] = CameraPose(invert_transform(T_cam_world), cameras[words[8]])
     return CameraPoses(poses, None, str(path))

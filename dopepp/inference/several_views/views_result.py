@@ -1,4 +1,4 @@
-"""ViewsResult: the parts that several views of a static scene show, in the world."""
+"""ViewsResult: the parts detected in several views of a static scene, with poses in the world."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ WORLD_FRAME: Final = "world, the frame of the camera poses; metres"
 """Frame of ``T_world_obj``, which maps from the mesh's frame to this frame."""
 
 Status = Literal["supports", "hidden", "outside"]
-"""Whether a view shows the part at its pose (``supports``) or something else (``hidden``), or the
-pose is not on the image (``outside``)."""
+"""``supports``: the view shows the part at its pose. ``hidden``: the view shows something else at
+this position. ``outside``: the pose is outside the image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ class ViewsResult:
 
     @property
     def summary(self) -> str:
-        """Number of parts, and the number of views that show each of them."""
+        """Number of parts, and the number of views that show each part, in words."""
         count, shares = len(self.detections), [len(item.views) for item in self.detections]
         shown = ", ".join(f"{share} of {len(self.views)} views" for share in shares)
         return f"{count} part{'s' * (count > 1)}: {shown}" if count else "nothing found"

@@ -1,10 +1,10 @@
-"""Detection of a part by templates of its mesh; needs no training.
+"""Detection of a part by templates of its mesh, without training.
 
 1. :mod:`~dopepp.inference.templates.views` draws the part from 600 directions.
 2. :mod:`~dopepp.inference.templates.responses` finds the image's edges by orientation.
 3. :mod:`~dopepp.inference.templates.matching` compares the drawings with the edges at every
-   fourth pixel. The drawings are rotated in the image plane and resized to the working distances.
-   Each small cell of the image keeps its best matches.
+   fourth pixel. Drawings are rotated in the image plane and resized to the working distances. Each
+   small cell of the image keeps its best matches.
 4. :mod:`~dopepp.inference.templates.ranking` moves these matches, replaces their views by better
    neighbouring views, and ranks them.
 
@@ -33,7 +33,7 @@ from dopepp.geometry.camera import (
 )
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.geometry.symmetry import symmetry_group
-from dopepp.inference.picture import MAX_PIXELS, Region
+from dopepp.inference.network_input import MAX_PIXELS, Region
 from dopepp.inference.refinement.outline import filled_mask, make_outline_mesh, posed
 from dopepp.inference.templates.matching import STRIDE, Matches, match
 from dopepp.inference.templates.ranking import (
@@ -43,16 +43,21 @@ from dopepp.inference.templates.ranking import (
     move_nearby,
 )
 from dopepp.inference.templates.responses import edge_responses
-from dopepp.inference.templates.views import NEAREST, joined, make_templates, view_rotations
+from dopepp.inference.templates.views import (
+    NEAREST,
+    concatenate_templates,
+    make_templates,
+    view_rotations,
+)
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 
-COARSE_PX: Final = 80.0  # largest diameter of the part on the image that is searched everywhere
-FINE_PX: Final = 140.0  # largest diameter of the part on the image that matches are ranked on
+COARSE_PX: Final = 80.0  # largest diameter of the part on the searched image; larger: shrink it
+FINE_PX: Final = 140.0  # largest diameter of the part on the image for ranking
 SMALLEST_PX: Final = 12.0  # smallest diameter that templates can detect
 SCALE_STEP: Final = 1.13  # ratio of neighbouring distances
 PERSPECTIVE: Final = 0.15  # step of diameter over distance between two sets of drawings
-OCTAVE: Final = 2.0  # ratio of the diameters that are ranked on one image
+OCTAVE: Final = 2.0  # largest ratio of the diameters that are ranked on the same resized image
 COARSE_SPREAD: Final = 5  # `spread` of the edges in the search, pixels
 FINE_SPREAD: Final = 3  # `spread` of the edges in the ranking, pixels
 
@@ -99,7 +104,7 @@ class TemplateDetector:
         self._centre = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
         group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous, max_step=0.1)
         rotations = view_rotations(tilt_deg, group[:, :3, :3])
-        # Near the camera, a part looks different at each distance.
+        # Near the camera, the perspective of a part changes strongly with its distance.
         nearness = np.minimum(part.diameter / np.array(working_distance), 1 / NEAREST)
         count = max(1, math.ceil((nearness[0] - nearness[1]) / PERSPECTIVE))
         steps = (np.arange(count) + 0.5) / count
@@ -108,7 +113,7 @@ class TemplateDetector:
             make_templates(mesh, self._centre, part.diameter, part.diameter / near, rotations)
             for near in self._nearness
         ]
-        self._templates = joined(self._groups)
+        self._templates = concatenate_templates(self._groups)
 
     def detect(
         self,
@@ -193,7 +198,7 @@ class TemplateDetector:
         """
         sizes = self._sizes(image, K, distances)
         groups = [self._matches(image, size, size / focal_length(K)) for size in sizes]
-        matches = _joined(groups)
+        matches = _concatenate(groups)
         promise = matches.scores + EXTENT * self._templates.extents[matches.views]
         matches = matches.at(np.argsort(-promise)[:NUM_RANKED])
         octaves = np.floor(np.log(sizes[0] / matches.poses[:, 3]) / math.log(OCTAVE) + 1e-9)
@@ -201,7 +206,7 @@ class TemplateDetector:
         ranked, features = zip(
             *(self._ranked_octave(image, group) for group in members), strict=True
         )
-        matches = _joined(ranked)
+        matches = _concatenate(ranked)
         return matches.views, matches.poses, np.concatenate(features)
 
     def _sizes(
@@ -210,7 +215,7 @@ class TemplateDetector:
         """Return the projected diameters to search, pixels, largest first.
 
         Raises:
-            UserError: The smallest is too small on the image, which is shrunk to MAX_PIXELS.
+            UserError: The smallest diameter is too small after the image is shrunk to MAX_PIXELS.
         """
         near, far = distances
         length = self.part.diameter * focal_length(K)  # at a depth of one metre, pixels
@@ -241,7 +246,7 @@ class TemplateDetector:
         best = np.argsort(-before @ learned_ranking().weights)[:NUM_TURNED]
         matches = matches.at(best)
         improved, after = improve_views(matches, self._templates, responses, small)
-        both = _joined([matches, improved])
+        both = _concatenate([matches, improved])
         both.poses[:, [0, 1, 3]] /= scale
         # Better neighbouring views exist for wrong matches, too: half of the gain counts.
         return both, np.concatenate([before[best], (before[best] + after) / 2])
@@ -249,10 +254,7 @@ class TemplateDetector:
     def _matches(self, image: RGBImage, size: float, nearness: float) -> Matches:
         """Return the best matches of all templates at one distance.
 
-        Args:
-            image: RGB.
-            size: Projected diameter of the part at this distance, pixels.
-            nearness: Diameter of the part over this distance.
+        ``size`` is the projected diameter, pixels, and ``nearness`` the diameter over the distance.
         """
         most = math.sqrt(MAX_PIXELS / (image.shape[0] * image.shape[1]))
         scale = min(1.0, most, COARSE_PX / size)
@@ -291,7 +293,7 @@ class TemplateDetector:
         return transforms
 
 
-def _joined(groups: Sequence[Matches]) -> Matches:
+def _concatenate(groups: Sequence[Matches]) -> Matches:
     """Concatenate groups of matches."""
     return Matches(*(np.concatenate(columns) for columns in zip(*groups, strict=True)))
 

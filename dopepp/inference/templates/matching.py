@@ -125,7 +125,7 @@ def _match(
     """Write the best matches of all templates and in-plane rotations in each cell of the image.
 
     Args:
-        phases: Edge responses, rearranged by orientation and position modulo the stride.
+        phases: Result of :func:`_by_phase`.
         rows: Number of positions from top to bottom.
         columns: Number of positions from left to right.
         margin: Number of positions added around the image.

@@ -4,9 +4,12 @@ Each match first moves to the best position nearby. Because views are 8 degrees 
 the best matches are then replaced by neighbouring views that fit better.
 
 Edges alone do not separate the part from busy texture. Colours do: the part has even colours, and
-its surroundings differ from them. A linear model of :data:`FEATURES` ranks the matches. It was
-learned from procedural parts (``benchmarks/learn_ranking.py``), and its numbers are in
-``ranking.json``.
+its surroundings differ from them. A linear model of :data:`FEATURES` ranks the matches. Its weights
+were learned from procedural parts (``benchmarks/learn_ranking.py``) and are in ``ranking.json``.
+
+The compiled functions share the names of their arrays: ``maps`` are edge responses by orientation,
+row and column; ``points`` (diameters) and ``normals`` (radians) are the edge points of a view or of
+all views; ``poses`` has column, row, in-plane rotation and projected diameter of each match.
 """
 
 from __future__ import annotations
@@ -45,12 +48,11 @@ LEVEL: Final = 16.0  # difference of colours, grey levels, at which the contrast
 EVEN: Final = 64.0  # added to the variance of colours, so that noise counts as even
 MIN_INNER: Final = 8  # smallest number of inner points on the image for features of a match
 ACROSS: Final = (2.5, 0.03)  # pixels and diameters between the outline and the compared colours
-ROLL_STEP: Final = math.radians(5.0)  # step of the in-plane rotation in the grid search
+ROLL_STEP: Final = math.radians(5.0)  # step of the in-plane rotation on the grid
 GROWTH: Final = 0.03  # first relative step of the size
-FEW: Final = 32  # first points of a template, used in the grid search; they are far apart
+FEW: Final = 32  # number of a template's points compared on the grid: its first, far apart
 REACH_PX: Final = 1.5  # first step of the position after a change of view
 MAX_CHANGES: Final = 4  # largest number of changes of a match's view
-
 
 Features = Float[np.ndarray, "matches features"]
 
@@ -133,17 +135,7 @@ def _features(
 def _response(
     maps: Array, points: Array, normals: Array, u: float, v: float, roll: float, scale: float
 ) -> float:
-    """Return the mean edge response at the points of a posed template.
-
-    Args:
-        maps: Edge responses by orientation, row and column.
-        points: Points of the template, diameters.
-        normals: Direction of each point's normal, radians.
-        u: Column of the template's centre, pixels.
-        v: Row of the template's centre, pixels.
-        roll: Rotation in the image plane, radians.
-        scale: Projected diameter, pixels.
-    """
+    """Return the mean edge response at the points of a template with its centre at pixel (u, v)."""
     bins, height, width = maps.shape
     c, s, total = scale * math.cos(roll), scale * math.sin(roll), 0
     for p in range(len(points)):
@@ -161,16 +153,10 @@ def _climb(
 ) -> float:
     """Maximise the response over the four numbers of a pose, changing one number at a time.
 
-    Args:
-        maps: Edge responses by orientation, row and column.
-        points: Points of the template, diameters.
-        normals: Direction of each point's normal, radians.
-        pose: Column, row, in-plane rotation and projected diameter, updated in place.
-        reach: First step of column and row, pixels.
-        rounds: Number of rounds; each has smaller steps.
+    ``reach`` (pixels) is the first step of the position. Each round has smaller steps.
 
     Returns:
-        The highest response.
+        The highest response; ``pose`` is updated in place.
     """
     most = _response(maps, points, normals, pose[0], pose[1], pose[2], pose[3])
     steps = np.array([reach, reach, ROLL_STEP / 2, GROWTH * pose[3]])
@@ -199,15 +185,8 @@ def _search(
 ) -> None:
     """Move each match to the highest response nearby: first on a grid, then by :func:`_climb`.
 
-    Args:
-        maps: Edge responses by orientation, row and column.
-        points: Points of each view, diameters.
-        normals: Direction of each point's normal, radians.
-        views: View of each match.
-        poses: Column, row, in-plane rotation and projected diameter of each match, updated in
-            place.
-        reach: Half the side of the grid, pixels.
-        best: Filled with the response of each match.
+    ``reach`` is half the side of the grid, pixels. ``poses`` is updated in place, and ``best`` is
+    filled with the response of each match.
     """
     for i in range(len(views)):
         edges, angles, scale = points[views[i]], normals[views[i]], poses[i, 3]
@@ -238,16 +217,8 @@ def _improve_views(
 ) -> None:
     """Replace the view of each match by its best neighbour, until no neighbour is better.
 
-    Args:
-        maps: Edge responses by orientation, row and column.
-        points: Points of each view, diameters.
-        normals: Direction of each point's normal, radians.
-        neighbours: Neighbouring views of each view.
-        twists: In-plane rotation that aligns each neighbour with the view, radians.
-        views: View of each match, updated in place.
-        poses: Column, row, in-plane rotation and projected diameter of each match, updated in
-            place.
-        responses: Filled with the response of each match.
+    ``views`` and ``poses`` are updated in place, and ``responses`` is filled with the response of
+    each match.
     """
     pose, best = np.empty(4), np.empty(4)
     for i in range(len(views)):
@@ -282,19 +253,7 @@ def _describe(
     poses: Array,
     features: Array,
 ) -> None:
-    """Write the features of each match that depend on the image.
-
-    Args:
-        maps: Edge responses by orientation, row and column.
-        image: RGB.
-        points: Edge points of each view, diameters.
-        normals: Direction of each point's normal, radians.
-        is_outline: Whether each point is on the outline.
-        inner: Points of each view inside the outline, diameters.
-        views: View of each match.
-        poses: Column, row, in-plane rotation and projected diameter of each match.
-        features: Filled with the features.
-    """
+    """Write the features of each match that depend on the image, except the mean response."""
     bins, height, width = maps.shape
     mean, colours = np.zeros(3), np.zeros((inner.shape[1], 3))
     for i in range(len(views)):

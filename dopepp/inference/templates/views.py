@@ -29,7 +29,7 @@ NUM_INNER: Final = 48  # number of points inside a view, far from its edges
 DRAWN_PX: Final = 96  # diameter of the part on the drawing of a view
 MARGIN_PX: Final = 4  # margin of the drawing
 SPACING_PX: Final = 1.5  # distance between the edge points that a template's points are chosen from
-INNER_PX: Final = 4.0  # distance of inner points from edges; smaller in views without such pixels
+INNER_PX: Final = 4.0  # distance of inner points from edges; smaller in narrow views
 MAX_INNER: Final = 400  # largest number of pixels from which inner points are chosen
 SLACK: Final = 0.02  # overlap of the regions that symmetries map to each other, cosine
 NEAREST: Final = 1.1  # smallest distance of a drawing, diameters
@@ -62,8 +62,8 @@ def view_rotations(
 
     Args:
         tilt_deg: Largest angle between the part's z axis and the direction to the camera, degrees.
-        group: Rotations that leave the part unchanged. Only one of the directions that they map to
-            each other is used.
+        group: Rotations that leave the part unchanged. Of directions that a rotation maps to each
+            other, only the first is used.
     """
     number = np.arange(NUM_VIEWS) + 0.5
     z = 1 - 2 * number / NUM_VIEWS
@@ -120,7 +120,7 @@ def make_templates(
     )
 
 
-def joined(groups: Sequence[Templates]) -> Templates:
+def concatenate_templates(groups: Sequence[Templates]) -> Templates:
     """Concatenate groups of templates with equal numbers of views."""
     templates = Templates(
         *(
@@ -135,14 +135,7 @@ def joined(groups: Sequence[Templates]) -> Templates:
 def _neighbours(
     rotations: Rotations,
 ) -> tuple[Int[np.ndarray, "views neighbours"], Float[np.ndarray, "views neighbours"]]:
-    """Find the neighbouring views of each view.
-
-    Args:
-        rotations: Rotations from the object to the camera of the views.
-
-    Returns:
-        Indices of the neighbours, and in-plane rotations (radians) that align them with the view.
-    """
+    """Return ``neighbours`` and ``twists`` of :class:`Templates`."""
     directions = rotations[:, 2]
     count = min(NUM_NEIGHBOURS, len(rotations) - 1)
     nearest = np.argsort(-directions @ directions.T, axis=1)[:, 1 : count + 1]
@@ -160,28 +153,18 @@ def _drawn(
     K: CameraMatrix,
     size: tuple[int, int],
 ) -> tuple[Float[np.ndarray, "points 5"], Float[np.ndarray, "inner 2"]]:
-    """Draw a part from one direction, and choose points of the drawing.
-
-    Args:
-        mesh: Mesh of the part.
-        edges: Creases of the mesh.
-        centre: Centre of the part, object frame, metres.
-        distance: Distance of the centre from the camera, metres.
-        R: Rotation from the object to the camera frame.
-        K: Camera matrix of the drawing, pixels.
-        size: (width, height) of the drawing.
+    """Draw a part from one direction, with its centre on the optical axis.
 
     Returns:
-        Pixel, normal and kind (1: outline, 0: crease) of edge points, and the pixels inside.
+        Pixel, normal and kind (1: outline, 0: crease) of edge points; and pixels inside the
+        outline, far from edges.
     """
     posed_mesh = posed(mesh, make_transform(R, np.array([0.0, 0.0, distance]) - R @ centre), K)
     assert posed_mesh is not None  # the whole part is in front of the camera
     ids = edges.drawn(posed_mesh, size)
     mask = (ids >= 0).astype(np.uint8)
-    contour, creases = (
-        find_contour(mesh, posed_mesh, mask, SPACING_PX),
-        edges.visible(posed_mesh, ids, SPACING_PX),
-    )
+    contour = find_contour(mesh, posed_mesh, mask, SPACING_PX)
+    creases = edges.visible(posed_mesh, ids, SPACING_PX)
     outline = np.column_stack([contour.pixels, contour.normals, np.ones(len(contour))])
     lines = np.concatenate([outline, np.column_stack([creases, np.zeros(len(creases))])])
     columns, rows = np.rint(lines[:, :2]).astype(int).clip(0, np.array(size) - 1).T

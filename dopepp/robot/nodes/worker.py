@@ -18,7 +18,7 @@ from dopepp.geometry.camera_file import Camera
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.frames import CameraFrame
 from dopepp.inference.frames.ros import CameraInfo, decode_image, is_rectified
-from dopepp.inference.pose_result import PoseResult, make_shape, spent_between
+from dopepp.inference.pose_result import PoseResult, elapsed_by_step, make_shape
 from dopepp.inference.tracker import PoseTracker
 
 PATIENCE: Final = 5
@@ -212,7 +212,7 @@ class Worker:
             image,
             camera.K,
             detections,
-            spent_between(before, estimator.spent_ms),
+            elapsed_by_step(before, estimator.spent_ms),
             frame.name,
             frame.number,
             frame.time,

@@ -1,4 +1,4 @@
-"""ROS recordings, as ``rosbags`` writes them: every image in RGB, and the camera that took it."""
+"""Images and cameras of ROS recordings that ``rosbags`` wrote."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Recording:
 
 
 @pytest.mark.parametrize("kind", ["bag", "mcap", "sqlite3"])
-def test_pictures_times_and_camera_of_a_recording(kind, tmp_path):
+def test_recording_has_images_times_and_camera(kind, tmp_path):
     with Recording(kind, tmp_path) as bag:
         bag.camera("/cam/camera_info")
         bag.camera("/other/camera_info", width=640)
@@ -95,7 +95,7 @@ def test_pictures_times_and_camera_of_a_recording(kind, tmp_path):
 
 @pytest.mark.parametrize("encoding", ["rgb8", "rgba8", "bgra8", "mono8", "8UC3", "bayer_rggb8",
                                       "yuv422_yuy2", "png", "jpeg"])  # fmt: skip
-def test_every_encoding_is_rgb(encoding, tmp_path):
+def test_every_encoding_is_converted_to_rgb(encoding, tmp_path):
     smooth = cv2.resize(IMAGE[:6, :8], (64, 48), interpolation=cv2.INTER_CUBIC)
     expected, tolerance = smooth, 0.0
     with Recording("mcap", tmp_path) as bag:
@@ -116,7 +116,7 @@ def test_every_encoding_is_rgb(encoding, tmp_path):
 
 
 def coded_as(encoding: str, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return an image's bytes, what they show, and how far off a decoder may be on average."""
+    """Return encoded pixels, the expected image, and the tolerated mean error of a decoder."""
     if encoding == "mono8":
         grey = rgb[..., 1]
         return grey[..., None], np.repeat(grey[..., None], 3, 2), 0.0
@@ -136,7 +136,7 @@ def coded_as(encoding: str, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray, fl
     }[encoding], rgb, 0.0  # fmt: skip
 
 
-def test_rectified_pictures_have_the_lens_of_p(tmp_path):
+def test_rectified_images_have_the_camera_of_p(tmp_path):
     with Recording("mcap", tmp_path) as bag:
         bag.camera("/cam/camera_info")
         bag.picture("/cam/image_rect_color", "rgb8", IMAGE)
@@ -144,7 +144,7 @@ def test_rectified_pictures_have_the_lens_of_p(tmp_path):
     assert (source.camera.K[0, 0], source.camera.distortion) == (500, ())
 
 
-def test_several_topics_must_be_named(tmp_path):
+def test_choice_among_several_topics_is_required(tmp_path):
     with Recording("bag", tmp_path) as bag:
         bag.picture("/left/image_raw", "rgb8", IMAGE)
         bag.picture("/right/image_raw", "rgb8", IMAGE // 2)
@@ -160,7 +160,7 @@ def test_several_topics_must_be_named(tmp_path):
         assert "/left/image_raw, /right/image_raw" in str(raised.value)
 
 
-def test_damaged_recordings_are_told_in_one_line(tmp_path):
+def test_damaged_recordings_are_reported_in_one_line(tmp_path):
     with Recording("mcap", tmp_path) as bag:
         bag.picture("/cam/image_raw", "mono16", IMAGE[..., :2])
         bag.picture("/odd/image_raw", "rgb8", IMAGE)
@@ -183,7 +183,7 @@ def test_damaged_recordings_are_told_in_one_line(tmp_path):
         open_sources([tmp_path / "folder"])
 
 
-def test_without_the_extra_it_is_named(tmp_path, monkeypatch):
+def test_missing_extra_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr("dopepp.core.errors.find_spec", lambda _: None)
     (tmp_path / "run.mcap").touch()
     with pytest.raises(UserError, match=r"dopepp\[bags\]"):

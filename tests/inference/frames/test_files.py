@@ -1,4 +1,4 @@
-"""Images, folders, patterns and videos: all frames, in order, or one line that names the file."""
+"""Frames of images, folders, patterns and videos, and errors about unreadable sources."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def levels(*given: object, stride: int = 1) -> list[int]:
     return [round(float(one.image.mean()) / 20) for one in frames]
 
 
-def test_a_folder_a_pattern_and_the_shells_list_are_one_sequence(folder):
+def test_folder_pattern_and_list_of_files_are_one_sequence(folder):
     assert levels(folder) == levels(f"{folder}/*.png") == [0, 2, 10]
     assert levels(*sorted(folder.glob("*.png"))) == [0, 10, 2]  # the shell's order
     assert len(open_sources(sorted(folder.glob("*.png")))) == 1
@@ -53,14 +53,14 @@ def test_a_folder_a_pattern_and_the_shells_list_are_one_sequence(folder):
     assert (source.count, source.rate) == (3, None)
 
 
-def test_pictures_named_by_numbers_have_these(folder):
+def test_frame_numbers_are_the_numbers_of_the_files(folder):
     for name in ("000007", "000012"):
         (folder / "frame0.png").with_stem(name).write_bytes((folder / "frame0.png").read_bytes())
     (source,) = open_sources([f"{folder}/0*.png"])
     assert [frame.number for frame in source.frames()] == [7, 12]
 
 
-def test_a_video_has_numbers_and_times(clip):
+def test_video_has_frame_numbers_and_times(clip):
     (source,) = open_sources([clip])
     assert (source.count, source.rate) == (12, 10)
     assert levels(clip) == list(range(12))
@@ -74,7 +74,7 @@ def test_sources_of_several_kinds_keep_their_order(folder, clip):
     assert levels(folder, clip, folder / "frame2.png") == [0, 2, 10, *range(12), 2]
 
 
-def test_colours_stay_in_their_channels(tmp_path):
+def test_colour_channels_are_rgb(tmp_path):
     red = np.zeros((24, 32, 3), np.uint8)
     red[..., 2] = 200
     writer = cv2.VideoWriter(
@@ -88,7 +88,7 @@ def test_colours_stay_in_their_channels(tmp_path):
 
 
 @pytest.mark.parametrize("mode", ["L", "I;16", "RGBA", "CMYK", "P"])
-def test_pictures_of_any_mode_are_rgb(tmp_path, mode):
+def test_images_of_any_mode_are_converted_to_rgb(tmp_path, mode):
     levels = np.arange(64 * 48).reshape(48, 64) % 200
     image = Image.fromarray(levels.astype(np.uint8)).convert("RGB")
     if mode == "I;16":
@@ -105,7 +105,7 @@ def test_pictures_of_any_mode_are_rgb(tmp_path, mode):
     assert np.abs(frame.image.mean(axis=2) - levels).max() <= 2
 
 
-def test_a_turned_picture_is_upright(tmp_path):
+def test_exif_orientation_is_applied(tmp_path):
     picture = Image.fromarray(grey(0, (64, 48)))
     exif = Image.Exif()
     exif[274] = 6
@@ -130,7 +130,7 @@ def test_a_turned_picture_is_upright(tmp_path):
         ("text.jpg", b"hello", "cannot identify"),
     ],
 )
-def test_what_cannot_be_read_is_told_in_one_line(
+def test_unreadable_sources_are_reported_in_one_line(
     tmp_path, name, content, message, monkeypatch, capfd
 ):
     monkeypatch.chdir(tmp_path)
@@ -143,7 +143,7 @@ def test_what_cannot_be_read_is_told_in_one_line(
     assert capfd.readouterr().err == ""  # neither OpenCV nor FFmpeg says anything of its own
 
 
-def test_a_video_that_is_cut_short_gives_what_there_is_and_says_so(tmp_path, caplog, capfd):
+def test_truncated_video_yields_its_frames(tmp_path, caplog, capfd):
     path = tmp_path / "clip.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
     for number in range(12):

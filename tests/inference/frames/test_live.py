@@ -1,4 +1,4 @@
-"""Cameras: the newest image each time, whatever OpenCV and the driver have kept."""
+"""Live cameras: the newest frame, although OpenCV and the driver buffer frames."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ INFERENCE = 0.2
 
 
 class Camera:
-    """Thirty images a second by a clock of its own; what nobody has read waits in a buffer."""
+    """A simulated camera with 30 frames per second, which buffers unread frames."""
 
     def __init__(self) -> None:
         self._buffer: queue.Queue[int] = queue.Queue()
@@ -28,11 +28,11 @@ class Camera:
         return self._now
 
     def taken(self, image: np.ndarray) -> float:
-        """Return when an image was taken, which is written on it."""
+        """Return the capture time that an image encodes, seconds."""
         return (int(image[0, 0, 0]) + 256 * int(image[0, 0, 1])) * PERIOD
 
     def advance(self, seconds: float, wait: bool = True) -> None:
-        """Let time pass, and with ``wait`` whoever reads come to a rest."""
+        """Advance the clock; with ``wait``, until all frames are read."""
         self._now += seconds
         while self._made * PERIOD <= self._now:
             self._buffer.put(self._made)
@@ -61,8 +61,8 @@ class Camera:
         self.released.set()
 
 
-def test_a_slow_reader_sees_the_present():
-    """A minute of a camera and of inference that takes six of its periods."""
+def test_slow_reader_gets_the_newest_frame():
+    """Simulate a minute in which each inference takes six camera periods."""
     camera = Camera()
     camera.advance(0, wait=False)
     source = Live(0, lambda _: camera, camera.now)
@@ -77,7 +77,7 @@ def test_a_slow_reader_sees_the_present():
     assert source.rate == pytest.approx(30)
 
 
-def test_the_same_camera_read_in_turn_falls_behind():
+def test_sequential_reading_falls_behind_the_camera():
     camera = Camera()
     for _ in range(300):
         camera.advance(INFERENCE, wait=False)
@@ -85,7 +85,7 @@ def test_the_same_camera_read_in_turn_falls_behind():
     assert camera.now() - camera.taken(image[..., ::-1]) > 40
 
 
-def test_frames_tell_when_they_came():
+def test_frames_have_their_arrival_times():
     camera = Camera()
     camera.advance(0, wait=False)
     times = []
@@ -96,7 +96,7 @@ def test_frames_tell_when_they_came():
 
 
 class Dead(Camera):
-    """Delivers ``alive`` images and then nothing, or never answers."""
+    """Delivers ``alive`` images, then no image; with ``hangs``, ``read`` never returns."""
 
     def __init__(self, alive: int, hangs: bool) -> None:
         super().__init__()
@@ -113,14 +113,14 @@ class Dead(Camera):
 
 @pytest.mark.parametrize("hangs", [False, True])
 @pytest.mark.parametrize(("alive", "said"), [(0, "since it was opened"), (1, "no image for")])
-def test_a_camera_that_delivers_no_more_is_told(hangs, alive, said):
+def test_camera_without_further_frames_is_an_error(hangs, alive, said):
     source = Live(3, lambda _: Dead(alive, hangs), first_s=0.2, stalled_s=0.2)
     with pytest.raises(RunError, match=said) as raised:
         list(source.frames())
     assert str(raised.value).startswith("camera 3: no image for 0.2 s")
 
 
-def test_what_does_not_open_is_one_line_without_the_password(capfd):
+def test_unopened_camera_is_reported_without_its_password(capfd):
     for address, name in ((97, "camera 97"), ("rtsp://me:secret@127.0.0.1:9/x", "127.0.0.1:9")):
         with pytest.raises(UserError, match=name) as raised:
             next(Live(address).frames())

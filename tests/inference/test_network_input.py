@@ -1,4 +1,4 @@
-"""Scales of an image: what is looked for is shown in sizes that the network has learned."""
+"""Sizes of the network's input, merging of their detections, and checks of depth images."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from numpy.testing import assert_allclose
 from dopepp import PoseEstimator
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import Letterbox, camera_matrix, resize_camera, transform
-from dopepp.inference.picture import (
+from dopepp.inference.network_input import (
     MARGIN,
     MAX_PIXELS,
-    checked_depth,
+    check_depth,
     letterboxes,
     merge_scales,
     read_depth_image,
-    undistorted_depth,
+    undistort_depth,
 )
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.size import Seen
@@ -47,7 +47,7 @@ def boxes(size, focal, distances=None, **what):
     return letterboxes(checkpoint(**what), K, picture(*size), distances)
 
 
-def test_the_camera_of_training_gets_the_size_of_training():
+def test_training_camera_uses_the_training_size():
     focal = 48.0 * 0.25 / 0.1
     assert boxes((128, 128), focal) == [Letterbox.fit((128, 128), (128, 128))]
     assert boxes((256, 256), 2 * focal) == [Letterbox.fit((256, 256), (128, 128))]
@@ -55,7 +55,7 @@ def test_the_camera_of_training_gets_the_size_of_training():
 
 
 @pytest.mark.parametrize("size", [(640, 480), (1920, 1080), (1080, 1920), (2592, 1944)])
-def test_a_camera_with_more_pixels_shows_the_part_as_large(size):
+def test_camera_with_more_pixels_shows_the_part_at_the_trained_size(size):
     focal = 120.0 * min(size) / 128
     whole, box = boxes(size, focal)
     assert whole == Letterbox.fit(size, (128, 128))
@@ -63,7 +63,7 @@ def test_a_camera_with_more_pixels_shows_the_part_as_large(size):
     assert box.width / box.height == pytest.approx(size[0] / size[1], rel=0.02)
 
 
-def test_a_checkpoint_that_does_not_know_sizes_looks_in_that_of_its_images():
+def test_checkpoint_without_trained_sizes_uses_its_input_size():
     assert boxes((640, 480), 600.0, seen=None) == [Letterbox.fit((640, 480), (128, 128))]
 
 
@@ -73,19 +73,19 @@ def test_a_checkpoint_that_does_not_know_sizes_looks_in_that_of_its_images():
     ratio=st.floats(1, 10),
     share=st.floats(0, 1),
 )
-def test_every_distance_is_looked_at_in_a_size_that_was_learned(focal, near, ratio, share):
+def test_every_distance_has_an_image_at_a_trained_size(focal, near, ratio, share):
     far = near * ratio
     result = boxes((1280, 960), focal, (near, far))
     native = 0.1 * focal / (near * ratio**share)
     shown = [native * box.scale_x for box in result]
     fits = any(48 / MARGIN**2 <= item <= 98 * MARGIN**2 for item in shown)
-    # Farther away than the largest image shows.
+    # The part is too far away for the largest allowed image.
     too_small = native * np.sqrt(MAX_PIXELS / (1280 * 960)) < 98 * MARGIN**2
     assert fits or too_small
     assert all(box.width * box.height <= 1.01 * MAX_PIXELS for box in result)
 
 
-def test_anywhere_reaches_from_a_part_that_fills_the_picture_to_the_smallest():
+def test_any_distance_covers_all_detectable_sizes():
     result = boxes((640, 480), 600.0, "any")
     assert result[0].scale_x * 480 <= 98 * MARGIN
     assert result[-1].scale_x > 0.6
@@ -93,7 +93,7 @@ def test_anywhere_reaches_from_a_part_that_fills_the_picture_to_the_smallest():
 
 
 @pytest.mark.parametrize("distances", [(0.5, 0.3), (0.0, 1.0), (0.1, np.inf), (0.1, 0.2, 0.3)])
-def test_distances_that_are_no_range_are_refused(distances):
+def test_invalid_distances_are_rejected(distances):
     with pytest.raises(UserError, match="distances="):
         boxes((640, 480), 600.0, distances)
 
@@ -103,13 +103,13 @@ def detection(x, score, side=20.0, name="part"):
     return SimpleNamespace(object=name, score=score, keypoints=np.vstack([corners, [x + 10, 10]]))
 
 
-def test_the_best_of_all_scales_is_kept():
+def test_best_detection_of_all_scales_is_kept():
     near, far = detection(0, 0.5), detection(100, 0.4)
     better, other = detection(4, 0.9), detection(3, 0.8, name="other")
     assert merge_scales([[near, far], [better, other]]) == [better, other, far]
 
 
-def test_two_of_one_scale_are_two():
+def test_two_detections_of_one_scale_are_two_instances():
     first, two = detection(0, 0.5), detection(4, 0.4)
     assert merge_scales([[first, two], []]) == [first, two]
 
@@ -127,7 +127,7 @@ def scenes(estimator):
 
 
 def through(scene, size):
-    """Return a scene as a camera of other size sees it, its shorter side as wide."""
+    """Return a scene for a camera of another image size and the same angle of the shorter side."""
     scale = min(size) / 128
     K = resize_camera(scene.K, scale, scale)
     K[:2, 2] = (np.array(size) - 1) / 2
@@ -146,17 +146,17 @@ def num_right(estimator, scenes):
 
 
 @pytest.mark.parametrize("size", [(320, 240), (480, 853), (1280, 720)])
-def test_other_cameras_find_as_much_as_that_of_training(estimator, scenes, size):
+def test_other_cameras_detect_as_many_parts_as_the_training_camera(estimator, scenes, size):
     usual = num_right(estimator, scenes)
     assert usual >= 5
     assert num_right(estimator, [through(scene, size) for scene in scenes]) >= usual - 2
 
 
-def test_a_part_out_of_reach_is_found_where_one_looks_farther(estimator, scenes):
+def test_farther_part_is_detected_with_a_farther_range(estimator, scenes):
     scene = through(scenes[0], (1280, 720))
     true = scene.objects[scene.targets[0]].T_cam_obj
     image, K = render(scene).image, scene.K
-    # A lens of a third of the angle: the same pixels are of a part three times as far away.
+    # With three times the focal length, the same image shows a part three times as far away.
     K = K * np.array([[3.0], [3.0], [1.0]])
     K[:2, 2] = scene.K[:2, 2]
 
@@ -172,7 +172,7 @@ def test_a_part_out_of_reach_is_found_where_one_looks_farther(estimator, scenes)
     assert found("any")
 
 
-def test_a_region_is_looked_at_as_a_picture_of_its_own(estimator, scenes):
+def test_region_is_processed_like_a_separate_image(estimator, scenes):
     image, K = render(scenes[0]).image, scenes[0].K
     canvas = np.full((300, 400, 3), 90, np.uint8)
     canvas[50:178, 70:198] = image
@@ -189,7 +189,7 @@ def test_a_region_is_looked_at_as_a_picture_of_its_own(estimator, scenes):
 
 
 @pytest.mark.parametrize("roi", [(-1, 0, 10, 10), (0, 0, 200, 10), (5, 5, 0, 10)])
-def test_a_region_outside_of_the_picture_is_refused(estimator, roi):
+def test_region_outside_the_image_is_rejected(estimator, roi):
     with pytest.raises(UserError, match="roi"):
         estimator.predict(picture(128, 128), camera_matrix(110, 110, 63.5, 63.5), roi=roi)
 
@@ -203,17 +203,17 @@ def test_a_region_outside_of_the_picture_is_refused(estimator, roi):
         (np.full((3, 4), -1.0, np.float32), "values down to -1"),
     ],
 )
-def test_depth_that_cannot_be_right(depth, message):
+def test_impossible_depth_is_rejected(depth, message):
     with pytest.raises(UserError, match=message):
-        checked_depth(depth, (4, 3))
+        check_depth(depth, (4, 3))
     unknown = np.array([[np.nan, np.inf], [0.0, 1.5]])
-    assert_allclose(checked_depth(unknown, (2, 2)), [[0, 0], [0, 1.5]])
+    assert_allclose(check_depth(unknown, (2, 2)), [[0, 0], [0, 1.5]])
 
 
-def test_depth_is_undistorted_without_mixing():
+def test_undistorted_depth_has_no_new_values():
     depth = np.where(np.arange(64) < 32, 0.5, 2.0).astype(np.float32)[None].repeat(48, axis=0)
     small = camera_matrix(60, 60, 31.5, 23.5)
-    moved = undistorted_depth(depth, small, np.array([-0.2, 0.05, 0, 0]))
+    moved = undistort_depth(depth, small, np.array([-0.2, 0.05, 0, 0]))
     assert set(np.unique(moved)) <= {0.0, 0.5, 2.0}
 
 

@@ -2,7 +2,7 @@
 
 The best of many start poses can fit an ordinary edge well, and a plain part fits more edges than an
 intricate part. Therefore a few photos that ship with the package are searched for the part. The
-verification of the best pose on each photo sets the level, which the user's cache folder keeps.
+verified probabilities of the best poses determine the level. The user's cache folder stores it.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ MARGIN: Final = 2.5  # distance of the level from the photos' mean, standard dev
 LOWEST: Final = 0.0  # lower bound of the level, log odds
 VERSION: Final = 6  # part of the cache's key; increase it when search or verification change
 
-Loudest = Callable[[Iterable[RGBImage], CameraMatrix], list[float]]
+Measure = Callable[[Iterable[RGBImage], CameraMatrix], list[float]]
 """Function that returns the largest log odds of the verified poses on each image."""
 
 
 def background_log_odds(
-    part: Part, distances: tuple[float, float], tilt: float, loudest: Loudest
+    part: Part, distances: tuple[float, float], tilt: float, measure: Measure
 ) -> float:
     """Return the log odds that verified poses on images without the part rarely exceed.
 
     Args:
-        part: Part.
+        part: Part to search.
         distances: Nearest and farthest depth, metres.
         tilt: Largest angle between the part's z axis and the direction to the camera, degrees.
-        loudest: Measures images without the part; called if the cache has no level of the part.
+        measure: Searches images for the part; called if the cache has no level of the part.
     """
     symmetries = [part.symmetries_discrete, part.symmetries_continuous]
     key = repr((VERSION, MARGIN, part.mesh_hash, part.diameter, distances, tilt, symmetries))
@@ -57,11 +57,11 @@ def background_log_odds(
         if isinstance(level, float):
             return level
     except (OSError, UserError):
-        pass  # the level was not measured yet, or its file is damaged
+        pass  # the level has not been measured yet, or its file is damaged
     logger.info("%s: measuring false detections on photos; the result is cached", part.name)
     focal = PART_PX * float(np.sqrt(distances[0] * distances[1])) / part.diameter
     K = camera_matrix(focal, focal, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
-    levels = loudest(_photos(), K)
+    levels = measure(_photos(), K)
     level = max(LOWEST, float(np.mean(levels) + MARGIN * np.std(levels)))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -2,8 +2,8 @@
 
 A network detects a part in a limited range of sizes. A part of diameter d at depth z is d·f/z
 pixels long in an image of focal length f; in training, from ``smallest_px`` to ``largest_px``. The
-image is resized so that parts at the expected distances have such sizes. Several sizes are used if
-the distances vary more than in training.
+image is resized so that parts at the expected distances have sizes in this range. If the distances
+vary more than in training, the network runs on the image in several sizes.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 Region = tuple[int, int, int, int]  # x, y, width and height, pixels
 
 Distances = tuple[float, float] | Literal["any"]
-"""Nearest and farthest depth, metres; ``any``: all depths at which the network can see a part."""
+"""Nearest and farthest depth, metres; ``any``: all depths at which the network detects parts."""
 
 Depth = Float[np.ndarray, "height width"]
 Depth32 = Float32[np.ndarray, "height width"]  # metres along z of every pixel
@@ -49,12 +49,12 @@ Depth32 = Float32[np.ndarray, "height width"]  # metres along z of every pixel
 Coefficients = Float[np.ndarray, "coefficients"]  # lens distortion, in OpenCV's order
 
 FARTHEST: Final = 50.0
-"""Metres: beyond the range of any depth camera for parts, so larger values are millimetres."""
+"""Median depth above which a depth image is rejected, metres: its values must be millimetres."""
 
 METRES: Final = Span(0.001, 1000.0, "metres")  # valid distances
 
 MAX_PIXELS: Final = 640 * 480  # largest resized image; limits the smallest detectable part
-MARGIN: Final = 1.1  # size ratio that a network does not notice
+MARGIN: Final = 1.1  # ratio of sizes that hardly affects a network
 
 
 def prepare_image(
@@ -69,9 +69,9 @@ def prepare_image(
     Args:
         image: RGB, uint8.
         K: Camera matrix, pixels.
-        distortion: OpenCV's coefficients of image and depth, if they are distorted.
+        distortion: OpenCV's distortion coefficients of image and depth; None: undistorted images.
         depth: Metres along z, aligned to the image.
-        cropped: Whether the principal point may lie anywhere.
+        cropped: Whether the image may be a crop, with the principal point anywhere.
 
     Returns:
         Image, K and depth, without distortion.
@@ -89,7 +89,7 @@ def prepare_image(
     # Flipped views, e.g. bgr[..., ::-1], have strides that OpenCV and torch do not accept.
     image, size = np.ascontiguousarray(image), (image.shape[1], image.shape[0])
     K = check_camera(K, size, "predict", ANYWHERE if cropped else WHOLE)
-    checked = None if depth is None else checked_depth(depth, size)
+    checked = None if depth is None else check_depth(depth, size)
     if distortion is None:
         return image, K, checked
     coefficients = np.asarray(distortion, np.float64).ravel()
@@ -99,11 +99,11 @@ def prepare_image(
             "4, 5, 8, 12 or 14 finite numbers in OpenCV's order (k1, k2, p1, p2, k3, …)",
             "pass the camera's calibration, or None for an undistorted image",
         )
-    checked = None if checked is None else undistorted_depth(checked, K, coefficients)
+    checked = None if checked is None else undistort_depth(checked, K, coefficients)
     return cv2.undistort(image, K, coefficients), K, checked
 
 
-def checked_depth(depth: Depth, image_size: Size) -> Depth32:
+def check_depth(depth: Depth, image_size: Size) -> Depth32:
     """Return depth as float32, with 0 where it is unknown (0, NaN or infinite).
 
     Args:
@@ -162,7 +162,7 @@ def read_depth_image(path: Path, scale: float) -> Depth32:
     return (units * scale).astype(np.float32)
 
 
-def undistorted_depth(depth: Depth32, K: CameraMatrix, distortion: Coefficients) -> Depth32:
+def undistort_depth(depth: Depth32, K: CameraMatrix, distortion: Coefficients) -> Depth32:
     """Undistort a depth image.
 
     Nearest-neighbour interpolation is used, because the mean of depths on both sides of an edge is
@@ -220,18 +220,19 @@ def network_views(
         UserError: The region extends beyond the image, or the distances are not a range of metres.
     """
     x, y = 0, 0
-    region = checked_region(roi, image)
+    region = check_region(roi, image)
     if region is not None:
         x, y, columns, rows = region
         image = np.ascontiguousarray(image[y : y + rows, x : x + columns])
         K = crop_camera(K, x, y)
     boxes = letterboxes(checkpoint, K, image, distances)
     return [
-        NetworkView(letterboxed(image, box, multiple), box, box.camera(K), (x, y)) for box in boxes
+        NetworkView(resize_and_pad(image, box, multiple), box, box.camera(K), (x, y))
+        for box in boxes
     ]
 
 
-def checked_region(roi: Region | None, image: RGBImage) -> Region | None:
+def check_region(roi: Region | None, image: RGBImage) -> Region | None:
     """Return a region of an image in whole pixels.
 
     Raises:
@@ -247,7 +248,7 @@ def checked_region(roi: Region | None, image: RGBImage) -> Region | None:
     return x, y, columns, rows
 
 
-def letterboxed(
+def resize_and_pad(
     image: RGBImage, letterbox: Letterbox, multiple: int
 ) -> UInt8[np.ndarray, "rows columns 3"]:
     """Resize an image into a letterbox and pad its sides to a multiple, at the right and bottom."""
@@ -259,11 +260,11 @@ def letterboxed(
 def letterboxes(
     checkpoint: Checkpoint, K: CameraMatrix, image: RGBImage, distances: Distances | None = None
 ) -> list[Letterbox]:
-    """Return the sizes of an image that the network is run on, the smallest first.
+    """Return the sizes of an image on which the network runs, the smallest first.
 
-    By default, one group of sizes shows parts at the training distances. A further size is the size
-    of training images, for parts that fill the image. Both are equal for the training camera. A
-    checkpoint without distances has only the size of training images.
+    By default, one group of sizes shows parts at the training distances. A further size is that of
+    training images, for parts that fill the image. Both are equal for the training camera. For a
+    checkpoint that records no training distances, only the size of training images is used.
     """
     size = image.shape[1], image.shape[0]
     learned = Letterbox.fit(size, checkpoint.input_size)
@@ -278,7 +279,7 @@ def letterboxes(
     for scale in sorted(scales):
         if boxes and scale < MARGIN * boxes[-1].scale_x:
             continue
-        # The camera of training gets the size of training to the pixel.
+        # For the training camera, use exactly the size of training images.
         is_trained_size = 1 / MARGIN < scale / learned.scale_x < MARGIN
         boxes.append(learned if is_trained_size else Letterbox.scaled(size, scale))
     fitting = [box for box in boxes if box.width * box.height <= MAX_PIXELS]
@@ -288,8 +289,8 @@ def letterboxes(
 def merge_scales(scales: Sequence[Sequence[Detection]]) -> list[Detection]:
     """Merge the detections of all image sizes, and keep the best of each instance, best first.
 
-    Detections of two sizes show the same instance if their centres are nearer than half the larger
-    extent.
+    Detections of two image sizes belong to one instance if their centres are closer than half the
+    larger extent.
     """
     ranked = [(detection, scale) for scale, group in enumerate(scales) for detection in group]
     ranked.sort(key=lambda pair: -pair[0].score)
@@ -306,13 +307,9 @@ def _depths(
 ) -> tuple[float, float]:
     """Return the nearest and farthest depth at which the part is searched, metres.
 
-    Args:
-        seen: Depths and sizes of the part in the training images.
-        reach: Length of the part's image at a depth of one metre, pixels.
-        size: (width, height) of the image, pixels.
-        distances: Depths in metres; None for the depths of training; ``any`` for all depths from
-            where the part fills the image to where it is as small as in training, after the image
-            is reduced to MAX_PIXELS.
+    ``reach`` is the part's length on the image at a depth of one metre, pixels. By default, the
+    depths are those of training. For ``any``, the part fills the image at the nearest depth. At the
+    farthest depth it is as small as in training, after the image is reduced to MAX_PIXELS.
     """
     if distances is None:
         return seen.nearest, seen.farthest
@@ -327,12 +324,8 @@ def _depths(
 def _scales(seen: Seen, reach: float, depths: tuple[float, float]) -> Sequence[float]:
     """Return the smallest set of scales at which a part has a trained size at all depths.
 
-    Each scale shows the part in the middle size at the middle depth of its range.
-
-    Args:
-        seen: Sizes of the part in the training images.
-        reach: Length of the part's image at a depth of one metre, pixels.
-        depths: Smallest and largest depth of the part, metres.
+    ``reach`` is the part's length on the image at a depth of one metre, pixels. At the middle depth
+    of a scale's range, the part has the middle size.
     """
     near, far = depths
     learned = math.log(MARGIN**2 * seen.largest_px / seen.smallest_px)

@@ -1,9 +1,8 @@
 """Association of the detections of several views, in the world.
 
 Two detections can show the same part if the Mahalanobis distance between their poses is at most
-:data:`GATE`. A symmetric part has several equivalent poses, of which the nearest counts. Detections
-are taken in the order of their scores. Each is joined with the nearest free detection of every
-other view.
+:data:`GATE`. Of the equivalent poses of a symmetric part, the nearest pair counts. In the order of
+scores, each detection is associated with the nearest free detection of every other view.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 
 GATE: Final = 4.5 * LOOSER
-"""Largest Mahalanobis distance between detections of one part. It is generous, because covariances
+"""Largest Mahalanobis distance between detections of one part. The limit is generous: covariances
 were fitted to images like the training images, and the joint pose is verified."""
 
 
@@ -40,9 +39,8 @@ class PartGeometry:
     @classmethod
     def of(cls, part: Part) -> PartGeometry:
         """Return the geometry of a part."""
-        return cls(
-            part.cuboid, symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
-        )
+        group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
+        return cls(part.cuboid, group)
 
     def nearest(self, pose: Prior, to: Transform) -> Prior:
         """Return the equivalent of a pose that is nearest to another pose."""
@@ -66,7 +64,7 @@ class PartGeometry:
 
 
 @dataclass(frozen=True, eq=False)
-class PartSighting:
+class PartObservation:
     """A detection of one view, expressed in the world."""
 
     view: int  # index of the view
@@ -75,13 +73,15 @@ class PartSighting:
     start: Prior  # pose before refinement, with a covariance that admits the refined pose
 
 
-def sight(view: int, detection: Detection, image: PosedImage) -> PartSighting:
+def make_observation(view: int, detection: Detection, image: PosedImage) -> PartObservation:
     """Express a detection in the world."""
     pose = _in_world(image, detection.T_cam_obj, detection.covariance)
     assert detection.start is not None
     start = _in_world(image, *detection.start)
     surprise = max(1.0, start.squared_distance(pose.T_cam_obj) / 6)
-    return PartSighting(view, detection, pose, Prior(start.T_cam_obj, start.information / surprise))
+    return PartObservation(
+        view, detection, pose, Prior(start.T_cam_obj, start.information / surprise)
+    )
 
 
 def _in_world(image: PosedImage, T_cam_obj: Transform, covariance: PoseMatrix) -> Prior:
@@ -97,22 +97,23 @@ def separation(first: Prior, second: Prior) -> float:
 
 
 def associate(
-    views: Sequence[Sequence[PartSighting]], geometries: Mapping[str, PartGeometry]
-) -> list[list[PartSighting]]:
-    """Join the sightings that can show the same part.
+    views: Sequence[Sequence[PartObservation]], geometries: Mapping[str, PartGeometry]
+) -> list[list[PartObservation]]:
+    """Group the observations that can show the same part.
 
     Args:
-        views: Sightings of each view.
+        views: Observations of each view.
         geometries: Geometry of each part.
 
     Returns:
-        Sightings of each possible part, at most one of each view. The part with the best detection
-        is first.
+        Observations of each possible part, at most one per view, best detection first. Parts are
+        sorted by their best detection.
     """
     free = sorted(
-        (sighting for view in views for sighting in view), key=lambda item: -item.detection.score
+        (observation for view in views for observation in view),
+        key=lambda item: -item.detection.score,
     )
-    clusters: list[list[PartSighting]] = []
+    clusters: list[list[PartObservation]] = []
     while free:
         seed, *free = free
         name, cluster = seed.detection.object, [seed]
