@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
-from jaxtyping import Int
 
 from dopepp.core.errors import UserError
 from dopepp.core.json import read_json
@@ -115,15 +114,15 @@ class BopReader:
         self._items = items[share_slice(len(items), part_of, self.name)]
         self._log_deviations(with_model)
 
-    def _find_items(self) -> Int[np.ndarray, "items 2"]:
-        """Return (scene, row) of the selected images on disk, in order."""
+    def _find_items(self) -> list[tuple[BopScene, int]]:
+        """Return scene and row of each selected image on disk, in order."""
         listed = [
-            (number, row)
-            for number, scene in enumerate(self._scenes)
+            (scene, row)
+            for scene in self._scenes
             for row, image in enumerate(scene.image_ids.tolist())
             if self._targets is None or (int(scene.folder.name), image) in self._targets
         ]
-        present = [(number, row) for number, row in listed if self._scenes[number].files[row]]
+        present = [(scene, row) for scene, row in listed if scene.files[row]]
         num_listed = len(listed) if self._targets is None else len(self._targets)
         if not present:
             problem = f"no image under {self.root / self.split} ({num_listed:,} listed)"
@@ -133,7 +132,7 @@ class BopReader:
         if len(present) < num_listed:
             absent = f"{num_listed - len(present):,} of {num_listed:,}"
             _log.warning("%s: %s listed images are absent", self.name, absent)
-        return np.array(present, np.int64)
+        return present
 
     def _log_deviations(self, with_model: Collection[int]) -> None:
         """Log the ignored objects and the estimated or replaced values."""
@@ -155,8 +154,7 @@ class BopReader:
         if unknown := int(np.isnan(fractions).sum()):
             _log.info("%s: %s objects' visible fractions are estimated", self.name, f"{unknown:,}")
         lacking = 0
-        for number, row in self._items.tolist() if self._targets is not None else ():
-            scene = self._scenes[number]
+        for scene, row in self._items if self._targets is not None else ():
             present = Counter(scene.poses.obj_ids[scene.objects(row)].tolist())
             counts = self._target_counts(scene, row) or Counter()
             counted = self._parts.keys() | (counts.keys() - with_model if with_model else set())
@@ -176,15 +174,11 @@ class BopReader:
     @cached_property
     def image_ids(self) -> list[tuple[str, int]]:
         """Folder of the scene and number of each image."""
-        return [
-            (self._scenes[number].folder.name, int(self._scenes[number].image_ids[row]))
-            for number, row in self._items.tolist()
-        ]
+        return [(scene.folder.name, int(scene.image_ids[row])) for scene, row in self._items]
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Read an image; the epoch is ignored."""
-        number, row = self._items[index].tolist()
-        scene = self._scenes[number]
+        scene, row = self._items[index]
         path = scene.folder / scene.files[row]
         image = decode_rgb(read_content(path), str(path))
         shape: Shape = image.shape[:2]
@@ -244,8 +238,7 @@ class BopReader:
         """Describe the images by hashes of annotation and objects, and the fractions' origin."""
         digest = hashlib.sha256()
         unknown = 0
-        for number, row in self._items.tolist():
-            scene = self._scenes[number]
+        for scene, row in self._items:
             poses, objects = scene.poses, scene.objects(row)
             digest.update(f"{scene.folder.name}/{scene.image_ids[row]}".encode())
             for array in (scene.K[row], poses.T_cam_obj[objects], poses.obj_ids[objects]):
@@ -263,8 +256,7 @@ class BopReader:
     def _num_instances(self) -> dict[str, int]:
         """Count the instances of each part on the selected images."""
         counts: Counter[int] = Counter()
-        for number, row in self._items.tolist():
-            scene = self._scenes[number]
+        for scene, row in self._items:
             counts.update(scene.poses.obj_ids[scene.objects(row)].tolist())
         return {part.name: counts[object_id] for object_id, part in self._parts.items()}
 

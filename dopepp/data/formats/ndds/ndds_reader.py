@@ -101,7 +101,7 @@ class NddsReader:
             listed = ", ".join(f"{name} ({number})" for name, number in others.most_common(8))
             names = f"{', '.join(self._parts)}; other classes: {listed or 'none'}"
             problem = f"{self.folder}: no instance with projected_cuboid of the parts {names}"
-            fix = "name the parts like the classes, or set classes={class: part}"
+            fix = "name the parts like the classes, or set data.classes={CLASS: part}"
             raise UserError(problem, "at least one instance whose class is a part's name", fix)
         # Hidden objects may be behind the camera, where projections are meaningless.
         return conventions.find_convention(visible or hidden, str(self.folder))

@@ -78,7 +78,7 @@ class WebdatasetReader:
         folder = None if download_dir is None else Path(download_dir)
         self._shards = [index_shard(path) for path in find_shards(self.root, shards, folder)]
         _check_keys(self._shards)
-        items = [(n, i) for n, shard in enumerate(self._shards) for i in range(len(shard.keys))]
+        items = [(shard, row) for shard in self._shards for row in range(len(shard.keys))]
         self._items = items[share_slice(len(items), part_of, self.name)]
 
     def __len__(self) -> int:
@@ -86,8 +86,7 @@ class WebdatasetReader:
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Read an image; the epoch is ignored."""
-        number, row = self._items[index]
-        shard = self._shards[number]
+        shard, row = self._items[index]
         records = _records(shard, row)
         content = shard.read(row, "image")
         assert content is not None  # index_shard requires an image for every key
@@ -120,8 +119,8 @@ class WebdatasetReader:
     def contains(self, label: str) -> bool:
         """Return whether any image shows this object, reading ground truth until one does."""
         object_ids = {number for number, part in self._parts.items() if part.name == label}
-        for number, row in self._items if object_ids else ():
-            poses = _records(self._shards[number], row).poses()
+        for shard, row in self._items if object_ids else ():
+            poses = _records(shard, row).poses()
             if any(int(poses.obj_ids[k]) in object_ids for k in self._select_objects(poses)):
                 return True
         return False
@@ -129,8 +128,7 @@ class WebdatasetReader:
     def describe(self) -> list[SourceInfo]:
         """Describe the data by hashes of files and objects, and the origin of the fractions."""
         digest, has_infos = hashlib.sha256(), True
-        for number, row in self._items:
-            shard = self._shards[number]
+        for shard, row in self._items:
             digest.update(shard.keys[row].encode())
             digest.update(shard.spans[row, :, 1].tobytes())
             has_infos &= bool(shard.spans[row, FIELDS.index("gt_info"), 0] >= 0)
