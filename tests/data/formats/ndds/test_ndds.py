@@ -136,7 +136,7 @@ def test_a_corner_behind_the_camera_is_written_finitely(tmp_path, write_set, box
 
 
 @dataclass
-class Wild:
+class ForeignWriter:
     """Writes NDDS in the conventions of other tools, without dopepp's writer."""
 
     root: Path
@@ -230,10 +230,10 @@ class Wild:
         (self.root / "_camera_settings.json").write_text(json.dumps({"camera_settings": cameras}))
 
 
-def assert_read(wild: Wild, source: NddsReader, atol: float = 1e-6) -> None:
+def assert_read(foreign: ForeignWriter, source: NddsReader, atol: float = 1e-6) -> None:
     for index in range(len(source)):
         sample = source.sample(index)
-        for instance, T in zip(sample.instances, wild.poses[sample.key], strict=True):
+        for instance, T in zip(sample.instances, foreign.poses[sample.key], strict=True):
             np.testing.assert_allclose(instance.T_cam_obj, T, atol=atol)
             cuboid = {"box": BOX, "cube": CUBE}[instance.label].cuboid
             expected = cv2.projectPoints(cuboid, cv2.Rodrigues(T[:3, :3])[0], T[:3, 3], K, None)
@@ -249,7 +249,7 @@ SLANTED[:3, 3] = [0.013, -0.04, 0.02]
 @pytest.mark.parametrize("order", ["xyzw", "wxyz"])
 @pytest.mark.parametrize("unit", ["cm", "m", "mm"])
 @pytest.mark.parametrize(
-    ("habits", "frame"),
+    ("convention", "frame"),
     [
         ({}, "mesh"),
         ({"opengl": True, "nine": True}, "mesh"),
@@ -260,16 +260,16 @@ SLANTED[:3, 3] = [0.013, -0.04, 0.02]
     ],
     ids=["plain", "opengl", "nvisii", "old-nvisii", "fixed", "fixed-slanted"],
 )
-def test_every_convention_is_determined(tmp_path, order, unit, habits, frame, caplog):
-    wild = Wild(tmp_path, order=order, unit=unit, **habits)
-    wild.items(3, BOX, CUBE)
-    if "fixed" in habits:
-        wild.settings("box", "cube")
+def test_every_convention_is_determined(tmp_path, order, unit, convention, frame, caplog):
+    foreign = ForeignWriter(tmp_path, order=order, unit=unit, **convention)
+    foreign.items(3, BOX, CUBE)
+    if "fixed" in convention:
+        foreign.settings("box", "cube")
     with caplog.at_level(logging.INFO):
         source = NddsReader(tmp_path, [BOX, CUBE])
-    assert_read(wild, source)
+    assert_read(foreign, source)
     result = source.finding.convention
-    expected = (order, unit, "opengl" if habits.get("opengl") else "opencv", frame)
+    expected = (order, unit, "opengl" if convention.get("opengl") else "opencv", frame)
     assert (result.quaternion, result.unit, result.camera, result.frame) == expected
     assert f"quaternion {','.join(order)}, lengths in {unit}" in caplog.text
     (info,) = source.describe()
@@ -279,32 +279,32 @@ def test_every_convention_is_determined(tmp_path, order, unit, habits, frame, ca
 @given(seed=st.integers(0, 2**32 - 1), order=st.sampled_from(["xyzw", "wxyz"]))
 @settings(max_examples=25)
 def test_a_single_instance_is_enough(tmp_path_factory, seed, order):
-    wild = Wild(tmp_path_factory.mktemp("one"), order=order)
-    wild.rng = np.random.default_rng(seed)
-    wild.item(0, CUBE)
-    assert_read(wild, NddsReader(wild.root, [CUBE]))
+    foreign = ForeignWriter(tmp_path_factory.mktemp("one"), order=order)
+    foreign.rng = np.random.default_rng(seed)
+    foreign.item(0, CUBE)
+    assert_read(foreign, NddsReader(foreign.root, [CUBE]))
 
 
 def test_falling_things(tmp_path):
     """FAT's folders, names, two cameras, classes with _16k, segmentation and depth."""
-    wild = Wild(
+    foreign = ForeignWriter(
         tmp_path / "mixed" / "kitchen_0",
         names="{:06d}.left", suffix=".jpg", own_camera=False, fixed=SLANTED, visibility=0.75,
     )  # fmt: skip
     for number in range(3):
-        wild.item(number, BOX, label="box_16k")
+        foreign.item(number, BOX, label="box_16k")
         stem = f"{number:06d}.left"
         seg = np.zeros((HEIGHT, WIDTH), np.uint8)
         seg[20:60, 30:90] = 12
-        cv2.imwrite(str(wild.root / f"{stem}.seg.png"), seg)
-        cv2.imwrite(str(wild.root / f"{stem}.depth.png"), np.full_like(seg, 5000, np.uint16))
-    wild.settings("box_16k")
-    wild.cameras("left", "right")
+        cv2.imwrite(str(foreign.root / f"{stem}.seg.png"), seg)
+        cv2.imwrite(str(foreign.root / f"{stem}.depth.png"), np.full_like(seg, 5000, np.uint16))
+    foreign.settings("box_16k")
+    foreign.cameras("left", "right")
     source = NddsReader(tmp_path, [BOX])
     sample = source.sample(1)
     (instance,) = sample.instances
     assert (sample.key, instance.label) == ("mixed/kitchen_0/000001.left", "box")
-    np.testing.assert_allclose(instance.T_cam_obj, wild.poses["000001.left"][0], atol=1e-6)
+    np.testing.assert_allclose(instance.T_cam_obj, foreign.poses["000001.left"][0], atol=1e-6)
     assert instance.mask.sum() == 40 * 60
     assert instance.visible_fraction == pytest.approx(0.75)
     np.testing.assert_allclose(sample.depth, 0.5)
@@ -315,29 +315,29 @@ def test_meshes_centred_at_their_box(tmp_path):
     """Poses refer to the mesh with its box's centre at the origin, which no field states."""
     centre = np.eye(4)
     centre[:3, 3] = -BOX.cuboid[8]
-    wild = Wild(tmp_path, fixed=centre, unit="m")
-    wild.items(4, BOX)
+    foreign = ForeignWriter(tmp_path, fixed=centre, unit="m")
+    foreign.items(4, BOX)
     source = NddsReader(tmp_path, [BOX])
     assert source.finding.convention.frame == "centred"
-    assert_read(wild, source)
+    assert_read(foreign, source)
 
 
 def test_noise_in_the_projections(tmp_path):
-    wild = Wild(tmp_path, order="wxyz", noise=1.5)
-    wild.items(20, BOX, CUBE)
+    foreign = ForeignWriter(tmp_path, order="wxyz", noise=1.5)
+    foreign.items(20, BOX, CUBE)
     source = NddsReader(tmp_path, [BOX, CUBE])
     assert source.finding.convention.quaternion == "wxyz"
     assert 0.5 < source.finding.error_px < 3
-    assert_read(wild, source)
+    assert_read(foreign, source)
 
 
 def test_indistinguishable_orders_are_logged(tmp_path):
-    wild, T = Wild(tmp_path), np.eye(4)
+    foreign, T = ForeignWriter(tmp_path), np.eye(4)
     T[:3, :3] = Rotation.from_quat([0.5, 0.5, 0.5, 0.5]).as_matrix()
     T[:3, 3] = [0.01, 0.0, 0.4]
-    wild.item(0, BOX, pose=T)
+    foreign.item(0, BOX, pose=T)
     source = NddsReader(tmp_path, [BOX])
-    assert_read(wild, source)
+    assert_read(foreign, source)
     assert "equal poses under: quaternion w,x,y,z" in str(source.finding)
 
 
@@ -348,7 +348,7 @@ def edit(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
 
 
 def test_an_item_with_another_convention_is_rejected(tmp_path):
-    paths = Wild(tmp_path).items(12, BOX)
+    paths = ForeignWriter(tmp_path).items(12, BOX)
     edit(paths[7], lambda item: item["quaternion_xyzw"].insert(0, item["quaternion_xyzw"].pop()))
     source = NddsReader(tmp_path, [BOX])
     source.sample(6)
@@ -357,7 +357,7 @@ def test_an_item_with_another_convention_is_rejected(tmp_path):
 
 
 def test_no_convention_fits(tmp_path):
-    Wild(tmp_path).items(4, BOX)
+    ForeignWriter(tmp_path).items(4, BOX)
     inch = make_box("box", (0.2, 0.127, 0.076), (0.025, -0.05, 0.0127))
     with pytest.raises(UserError, match=r"no known convention fits.* px: quaternion .*, lengths"):
         NddsReader(tmp_path, [inch])
@@ -365,17 +365,17 @@ def test_no_convention_fits(tmp_path):
 
 def test_visible_fraction_of_a_truncated_object(tmp_path):
     for visibility in (1, 0.5, -1, None):
-        wild, T = Wild(tmp_path / str(visibility), visibility=visibility), np.eye(4)
+        foreign, T = ForeignWriter(tmp_path / str(visibility), visibility=visibility), np.eye(4)
         # The centre of the face towards the camera is on the left border.
         T[:3, 3] = [(-0.5 - 79.0) / 180 * 0.4 - BOX.cuboid[8, 0], 0, 0.4]
-        wild.item(0, BOX, pose=T)
-        (instance,) = NddsReader(wild.root, [BOX]).sample(0).instances
+        foreign.item(0, BOX, pose=T)
+        (instance,) = NddsReader(foreign.root, [BOX]).sample(0).instances
         expected = 0.5 * (0.5 if visibility == 0.5 else 1)
         assert instance.visible_fraction == pytest.approx(expected, abs=0.05)
 
 
 def test_other_classes_and_hidden_objects_are_ignored_and_counted(tmp_path):
-    Wild(tmp_path).items(3, BOX, CUBE)
+    ForeignWriter(tmp_path).items(3, BOX, CUBE)
 
     def behind(item):
         item["location"][2] *= -1
@@ -400,36 +400,36 @@ def test_other_classes_and_hidden_objects_are_ignored_and_counted(tmp_path):
 
 
 def test_missing_camera_images_and_folders(tmp_path, caplog):
-    wild = Wild(tmp_path / "set", own_camera=False)
-    wild.item(0, BOX)
+    foreign = ForeignWriter(tmp_path / "set", own_camera=False)
+    foreign.item(0, BOX)
     with pytest.raises(UserError, match=r"camera_data\.intrinsics: 0 cameras.*_camera_settings"):
-        NddsReader(wild.root, [BOX])
-    wild.cameras("one", "two")
+        NddsReader(foreign.root, [BOX])
+    foreign.cameras("one", "two")
     with pytest.raises(UserError, match=r"camera_data\.intrinsics: 2 cameras"):
-        NddsReader(wild.root, [BOX])
-    wild.cameras("one")
-    wild.item(1, BOX)
-    (wild.root / "000001.png").unlink()
+        NddsReader(foreign.root, [BOX])
+    foreign.cameras("one")
+    foreign.item(1, BOX)
+    (foreign.root / "000001.png").unlink()
     with caplog.at_level(logging.WARNING):
-        assert len(NddsReader(wild.root, [BOX])) == 1
+        assert len(NddsReader(foreign.root, [BOX])) == 1
     assert "ignoring 1 annotations without an image" in caplog.text
     for folder in (tmp_path / "nowhere", tmp_path):
         if folder == tmp_path:
-            (wild.root / "000000.png").unlink()
+            (foreign.root / "000000.png").unlink()
         with pytest.raises(UserError, match="without an annotated image"):
             NddsReader(folder, [BOX])
 
 
 def test_image_of_another_size_than_its_camera(tmp_path):
-    Wild(tmp_path).item(0, BOX)
+    ForeignWriter(tmp_path).item(0, BOX)
     cv2.imwrite(str(tmp_path / "000000.png"), np.zeros((40, 50, 3), np.uint8))
     with pytest.raises(UserError, match=r"for the 50×40 image of .*000000\.json"):
         NddsReader(tmp_path, [BOX]).sample(0)
 
 
 def test_objects_that_share_a_label_have_no_mask(tmp_path):
-    wild = Wild(tmp_path)
-    wild.item(0, BOX, BOX)
-    wild.settings("box")
+    foreign = ForeignWriter(tmp_path)
+    foreign.item(0, BOX, BOX)
+    foreign.settings("box")
     cv2.imwrite(str(tmp_path / "000000.seg.png"), np.full((HEIGHT, WIDTH), 12, np.uint8))
     assert all(i.mask is None for i in NddsReader(tmp_path, [BOX]).sample(0).instances)
