@@ -4,9 +4,8 @@
 (nvisii) or millimetres; camera axes are OpenCV's or, in old nvisii files, OpenGL's. Poses refer to
 the mesh frame or to a frame into which ``fixed_model_transform`` maps the mesh (FAT). No field
 states these conventions, but every object has ``projected_cuboid``, its box in the image.
-:func:`find_convention` applies each :class:`PoseConvention` to objects with known meshes and keeps
-the convention that projects the mesh's box onto the stated box. :func:`check_observation` later
-compares every object.
+:func:`find_convention` keeps the :class:`PoseConvention` that projects the mesh's box onto this
+box. :func:`check_observation` later compares every object.
 
 To add a convention, add its value to a ``Literal`` below, and its meaning to
 :meth:`Observation.T_cam_obj`.

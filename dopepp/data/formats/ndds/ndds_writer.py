@@ -1,19 +1,12 @@
 """Write NDDS: ``000000.png``, ``.depth.png``, ``.seg.png`` and, last, ``000000.json``.
 
-Files follow the documented conventions of NDDS. Every annotation repeats the conventions under
-``conventions``, which other readers ignore:
+Files follow the conventions of NDDS in ``docs/reference/formats_ndds.md``, and every annotation
+repeats them under ``conventions``. In addition:
 
-- Lengths are centimetres. The camera frame is OpenCV's. ``quaternion_xyzw`` is x, y, z, w.
-- The object frame is the mesh frame, so ``fixed_model_transform`` is the identity times 100 (mesh
-  metres to centimetres), transposed as NDDS transposes it.
-- ``pose_transform`` is NDDS's: with R and t the pose, its rows are ``P·Rᵀ`` and t, where P maps
-  (x, y, z) to (z, x, −y) (Unreal's axes). ``R = (first 3×3)ᵀ·P`` inverts it.
-- ``bounding_box`` bounds the visible pixels or, without visible pixels, the projected cuboid;
-  corners are (row, column).
+- ``fixed_model_transform`` is the identity times 100 (metres to centimetres).
+- ``pose_transform`` has the rows ``P·Rᵀ`` and t, where P maps (x, y, z) to Unreal's (z, x, −y).
+- ``bounding_box`` bounds the projected cuboid if no pixel is visible.
 - ``projected_cuboid`` of a corner behind the camera is its projection through the camera's centre.
-- ``visibility`` is the visible share of the whole silhouette; occlusion and border both count.
-- ``.depth.png`` has the unit 0.1 mm as in FAT, 0 for unknown or beyond 6.55 m; ``.seg.png`` holds
-  an object's ``segmentation_id``, 0 elsewhere.
 """
 
 from __future__ import annotations
