@@ -1,4 +1,4 @@
-"""Docstrings name things as Sphinx does, ``:class:`X```; the site shows that as code."""
+"""Griffe extension that converts Sphinx roles in docstrings, ``:class:`X```, to code spans."""
 
 import re
 from typing import Any
@@ -7,10 +7,10 @@ import griffe
 
 
 class Roles(griffe.Extension):
-    """Takes the role off: ``:class:`~dopepp.parts.Part``` becomes ```Part```."""
+    """Removes roles: ``:class:`~dopepp.parts.Part``` becomes ```dopepp.parts.Part```."""
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
-        """Rewrite the docstring of whatever was loaded."""
+        """Rewrite the docstring of a loaded object."""
         if obj.docstring is not None:
             text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", obj.docstring.value)
             obj.docstring.value = text.replace("``", "`")

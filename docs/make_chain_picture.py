@@ -1,4 +1,4 @@
-"""The image on top of the README: STL → renders → belief maps → pose, each by its own function.
+"""Draw the image at the top of the README: STL → renders → belief maps → pose.
 
 python docs/make_chain_picture.py
 """
@@ -30,11 +30,11 @@ SIDE = 320
 """Pixels of each of the four panels."""
 
 SEED, INDEX = 2024, 12
-"""Of a scene that no training has seen."""
+"""Seed and index of a scene that was not used in training."""
 
 
-def alone(part: Part) -> RGBImage:
-    """Draw a part on white, from above its face."""
+def part_on_white(part: Part) -> RGBImage:
+    """Render a part on a white background, viewed from above its face."""
     assert part.mesh is not None
     K = camera_matrix(2.6 * SIDE, 2.6 * SIDE, (SIDE - 1) / 2, (SIDE - 1) / 2)
     R = Rotation.from_euler("xyz", [205, 25, 20], degrees=True).as_matrix()
@@ -50,7 +50,7 @@ def alone(part: Part) -> RGBImage:
 
 
 def chain() -> RGBImage:
-    """Make the image."""
+    """Return the image with its four panels."""
     part, preset = pivconnector(), PRESETS["quickstart"]
     estimator = PoseEstimator.load("pretrained/pivconnector", refine="region")
     training = Factory([part], preset.resized(SIDE // 2, SIDE // 2), seed=1)
@@ -60,7 +60,7 @@ def chain() -> RGBImage:
     beliefs = estimator.maps(np.asarray(small, np.uint8))[0].numpy()[:CENTROID].max(axis=0)
     pose = estimator.predict(scene.image, scene.K)[0]
     tiles = [
-        Tile(alone(part), "an STL"),
+        Tile(part_on_white(part), "an STL"),
         Tile(renders, "renders, which a network learns"),
         Tile(heat_picture(scene.image, beliefs, SIDE // beliefs.shape[0]),
              "where it believes corners on a new image"),

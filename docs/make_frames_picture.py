@@ -1,4 +1,4 @@
-"""Draw the frames that poses are in, ``docs/images/frames.png``.
+"""Draw the coordinate frames of poses, ``docs/images/frames.png``.
 
 python docs/make_frames_picture.py
 """
@@ -26,7 +26,7 @@ from dopepp.parts.catalogue import pivconnector
 
 SIZE: Final = (1280, 720)
 WATCH: Final = camera_matrix(1750, 1750, 620, 400)
-"""Of the one who looks at camera and part."""
+"""Camera matrix of the viewer of the drawing."""
 
 IMAGE: Final = (320, 240)
 K: Final = camera_matrix(420, 420, 159.5, 119.5)
@@ -39,23 +39,23 @@ T_CAM_OBJ: Final = make_transform(
     @ rotation_vector_to_matrix(np.array([np.pi, 0.0, 0.0])),
     np.array([0.005, 0.005, 0.25]),
 )
-"""The part's face, at +z, looks at the camera."""
+"""The part's +z face points to the camera."""
 
 OPTICAL_TO_LINK: Final = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 """``camera_link`` has x forward, y left and z up (REP 103); the rows are its axes."""
 
 
-def look_at(place: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return T_watch_cam of somebody at a place in the camera's frame; the camera's y is down."""
-    forward = (target - place) / np.linalg.norm(target - place)
+def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return T_watch_cam of a viewer at a position in the camera frame, whose y axis is down."""
+    forward = (target - position) / np.linalg.norm(target - position)
     right = np.cross([0.0, 1.0, 0.0], forward)
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(forward, right), forward], 1)
-    return invert_transform(make_transform(axes, place))
+    return invert_transform(make_transform(axes, position))
 
 
 def draw_part(canvas: np.ndarray, T: np.ndarray, camera: np.ndarray) -> None:
-    """Draw the part's triangles IN PLACE, the farthest first, lit from the viewer's upper left."""
+    """Draw the part's triangles IN PLACE, from far to near, lit from the viewer's upper left."""
     mesh = pivconnector().mesh
     assert mesh is not None
     corners = transform(T, mesh.vertices)[mesh.faces]
@@ -71,7 +71,7 @@ def draw_part(canvas: np.ndarray, T: np.ndarray, camera: np.ndarray) -> None:
 def draw_frame(
     canvas: np.ndarray, T_watch_frame: np.ndarray, length: float, name: str, away: tuple[int, int]
 ) -> None:
-    """Draw a frame's axes IN PLACE, and its name so many pixels away from its origin."""
+    """Draw a frame's axes IN PLACE, and its name at an offset in pixels from its origin."""
     tips = np.vstack([np.zeros(3), length * np.eye(3), 1.2 * length * np.eye(3)])
     points = project(transform(T_watch_frame, tips), WATCH)
     for axis, (letter, colour) in enumerate(AXES):
@@ -82,15 +82,15 @@ def draw_frame(
 
 
 def write(
-    canvas: np.ndarray, text: str, place: np.ndarray, size_px: int, colour: tuple[int, int, int]
+    canvas: np.ndarray, text: str, pixel: np.ndarray, size_px: int, colour: tuple[int, int, int]
 ) -> None:
-    """Write a line IN PLACE at a pixel."""
-    column, row = np.rint(place).astype(int).tolist()
+    """Write a line of text IN PLACE at a pixel."""
+    column, row = np.rint(pixel).astype(int).tolist()
     draw_text(canvas, text, (max(column, 0), max(row, 0)), size_px, colour)
 
 
-def seen() -> np.ndarray:
-    """Return what the camera sees, with the part's cuboid."""
+def camera_image() -> np.ndarray:
+    """Return the camera's image of the part, with its cuboid."""
     image = np.full((IMAGE[1], IMAGE[0], 3), 95, np.uint8)
     draw_part(image, T_CAM_OBJ, K)
     keypoints = project_keypoints(pivconnector().cuboid, T_CAM_OBJ, K)
@@ -101,7 +101,7 @@ def main() -> None:
     """Draw and write the image."""
     canvas = np.full((SIZE[1], SIZE[0], 3), 45, np.uint8)
     T_watch_cam = look_at(np.array([0.36, -0.25, -0.14]), np.array([0.0, 0.01, 0.12]))
-    # The image hangs in front of the camera, where a ray through each pixel crosses it.
+    # The image is drawn on a plane in front of the camera, crossed by the ray of each pixel.
     depth, (width, height) = 0.11, IMAGE
     corners = np.array([[-0.5, -0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5],
                         [-0.5, height - 0.5]])  # fmt: skip
@@ -111,13 +111,13 @@ def main() -> None:
     draw_part(canvas, T_watch_cam @ T_CAM_OBJ, WATCH)
     cuboid = project_keypoints(pivconnector().cuboid, T_watch_cam @ T_CAM_OBJ, WATCH)
     canvas = draw_wireframe(canvas, cuboid, YELLOW)
-    shown = cv2.warpPerspective(seen(), warp, SIZE)
-    there = cv2.warpPerspective(np.ones((height, width), np.float32), warp, SIZE)[..., None]
-    canvas = np.rint(canvas * (1 - 0.85 * there) + shown * 0.85 * there).astype(np.uint8)
+    shown = cv2.warpPerspective(camera_image(), warp, SIZE)
+    mask = cv2.warpPerspective(np.ones((height, width), np.float32), warp, SIZE)[..., None]
+    canvas = np.rint(canvas * (1 - 0.85 * mask) + shown * 0.85 * mask).astype(np.uint8)
     origin = project(transform(T_watch_cam, np.zeros((1, 3))), WATCH)[0]
-    for one, other in zip(plane, np.roll(plane, 1, 0), strict=True):
-        draw_line(canvas, origin, one, (150, 150, 150), 1)
-        draw_line(canvas, one, other, (200, 200, 200), 2)
+    for corner, neighbour in zip(plane, np.roll(plane, 1, 0), strict=True):
+        draw_line(canvas, origin, corner, (150, 150, 150), 1)
+        draw_line(canvas, corner, neighbour, (200, 200, 200), 2)
     draw_line(canvas, plane[0], plane[0], WHITE, 9)
     centre = project(transform(T_watch_cam, T_CAM_OBJ[None, :3, 3]), WATCH)[0]
     draw_line(canvas, origin, centre, WHITE, 1)

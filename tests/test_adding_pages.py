@@ -1,4 +1,4 @@
-"""The pages "adding a …", read and run: what they tell a reader to write works as it stands."""
+"""The code of the how-to pages "Adding a …" works as printed."""
 
 import itertools
 import json
@@ -32,7 +32,7 @@ def documented(page: str) -> str:
 
 
 def module_of(page: str, name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """Run a page's module under the name that the page gives it."""
+    """Run a page's module under the module name of the page."""
     module = ModuleType(name)
     exec(documented(page), vars(module))
     monkeypatch.setitem(sys.modules, name, module)
@@ -57,7 +57,7 @@ def test_the_documented_format_works(monkeypatch, tmp_path):
 
 
 def test_the_documented_backbone_works(monkeypatch):
-    # The page puts the class into backbones.py, so it sees that module's names and one import.
+    # On the page, the class is part of backbones.py and has one additional import.
     monkeypatch.setattr(backbones, "pairwise", itertools.pairwise, raising=False)
     monkeypatch.setattr(backbones, "Strided", None, raising=False)
     exec(documented("adding-a-backbone.md"), vars(backbones))
@@ -76,7 +76,7 @@ def test_the_documented_renderer_works(monkeypatch):
         for renderer in ("raster", "grey_depth")
     )
     np.testing.assert_array_equal(grey.depth, usual.depth)
-    # The factory's sensor adds its noise to both.
+    # The sensor adds noise to both images.
     assert grey.image[usual.depth > 0].max() > 200
     assert grey.image[usual.depth == 0].max() < 30
 
@@ -95,7 +95,7 @@ def test_the_documented_error_is_the_angle_between_axes(monkeypatch):
 
 
 class OneWeight(LightningModule):
-    """Learns one number: the gradient of ``3·w`` has length 3."""
+    """A module with a single weight w and the loss 3·w, whose gradient has length 3."""
 
     def __init__(self) -> None:
         super().__init__()

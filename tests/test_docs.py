@@ -1,4 +1,4 @@
-"""Documents name only what exists: linked files and headings, commands and options, config keys."""
+"""Links, commands, options and config keys in the documentation exist."""
 
 import re
 import shlex
@@ -26,18 +26,18 @@ FENCE: Final = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 SPAN: Final = re.compile(r"`([^`\n]+)`")
 LINK: Final = re.compile(r"\]\(([^)\s]+)\)")
 OTHER_TOOLS: Final = {"--cfg"}
-"""Options of Hydra's own that documents name alone."""
+"""Hydra's options that documents name without a command."""
 
 USAGE_ERROR: Final = typer.BadParameter.__mro__[1]
-"""Of the click that Typer brings along or imports."""
+"""The usage error of the click version that Typer uses."""
 APP: Final = typer.main.get_command(app)
 APP_OPTIONS: Final = {text for parameter in APP.params for text in parameter.opts}
 COMMANDS: Final = APP.commands
 OPTIONS: Final = {
     name: {
         text
-        for one in (command, *getattr(command, "commands", {}).values())  # of `dopepp calibrate …`
-        for parameter in one.params
+        for subcommand in (command, *getattr(command, "commands", {}).values())
+        for parameter in subcommand.params
         for text in parameter.opts
     }
     | {"--help"}
@@ -51,7 +51,7 @@ ENTRIES: Final = {
     ("python", "evaluate.py"): EVALUATION_SHORT_NAMES,
     ("dopepp", "evaluate"): EVALUATION_SHORT_NAMES,
 }
-"""What takes Hydra's overrides, and its short names."""
+"""Programs that accept Hydra's overrides, with their short option names."""
 
 
 def fenced(text: str, language: str) -> list[str]:
@@ -65,7 +65,7 @@ def typed_commands(text: str) -> Iterator[list[str]]:
 
 
 def commands(text: str) -> Iterator[list[str]]:
-    """Yield the words of every shell command in a document, of fenced blocks and of code spans."""
+    """Yield the words of every shell command in a document's fenced blocks and code spans."""
     yield from typed_commands(text)
     yield from words_of(SPAN.findall(FENCE.sub("", text)))
 
@@ -75,7 +75,7 @@ def words_of(lines: Sequence[str]) -> Iterator[list[str]]:
         for command in line.split("&&"):
             try:
                 words = shlex.split(command, comments=True)
-            except ValueError:  # an apostrophe in a span that is no command
+            except ValueError:  # an apostrophe in a span that is not a command
                 continue
             if words:
                 yield words
@@ -90,9 +90,9 @@ def config_keys() -> set[str]:
     keys: set[str] = set()
     for path in CONF.rglob("*.yaml"):
         text = path.read_text()
-        place = path.parent.relative_to(CONF).parts
-        in_root = not place or "@package _global_" in text
-        collect(yaml.safe_load(text), "" if in_root else ".".join(place), keys)
+        folders = path.parent.relative_to(CONF).parts
+        in_root = not folders or "@package _global_" in text
+        collect(yaml.safe_load(text), "" if in_root else ".".join(folders), keys)
     return keys
 
 
@@ -104,13 +104,13 @@ def collect(node: object, start: str, keys: set[str]) -> None:
 
 
 def is_preset_field(path: list[str]) -> bool:
-    """Tell whether some preset has a field, given by its groups' names and its own."""
+    """Return whether any preset has a field, given by its path."""
 
     def has(value: object, names: list[str]) -> bool:
         if not names:
             return True
-        known = {entry.name for entry in fields(value)} if is_dataclass(value) else ()
-        return names[0] in known and has(getattr(value, names[0]), names[1:])
+        existing = {entry.name for entry in fields(value)} if is_dataclass(value) else ()
+        return names[0] in existing and has(getattr(value, names[0]), names[1:])
 
     return any(has(preset, path) for preset in PRESETS.values())
 
@@ -119,7 +119,7 @@ KEYS: Final = config_keys()
 
 
 def option_problem(override: str) -> str | None:
-    """Say what is wrong with ``key=value`` or ``group=file`` of train.py, None where nothing is."""
+    """Return the problem of an override ``key=value`` or ``group=file``, or None."""
     key, _, value = override.partition("=")
     key = key.lstrip("+")
     if key.startswith("virtual.scene."):
@@ -131,7 +131,7 @@ def option_problem(override: str) -> str | None:
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
-def test_links_lead_somewhere(path):
+def test_linked_files_and_headings_exist(path):
     bad = []
     for target in LINK.findall(FENCE.sub("", path.read_text())):
         if re.match(r"[a-z]+:", target):
@@ -171,7 +171,7 @@ def preset_problems(words: list[str]) -> list[str]:
 
 
 GUIDES: Final = [path for path in DOCUMENTS if path.name not in {"CHANGELOG.md", "options.md"}]
-"""The change log also names options that are gone; the page of options comes from the code."""
+"""The changelog also names removed options, and options.md is generated from the code."""
 
 
 @pytest.mark.parametrize("path", GUIDES, ids=lambda path: path.name)
@@ -180,7 +180,7 @@ def test_options_of_training_and_evaluation_exist(path):
     text, bad = path.read_text(), []
     for words in commands(text):
         entry = tuple(words[:2]) in ENTRIES
-        # A span on its own: data/test=photoreal, virtual.backgrounds=DIR, data.cache_dir.
+        # A span without a command: data/test=photoreal, virtual.backgrounds=DIR, data.cache_dir.
         alone = re.match(r"(\w+)(/\w+)*=|(\w+)\.[\w.]+(=|$)", words[0])
         if entry:
             overrides = [word for word in words[2:] if "=" in word and not word.startswith("-")]
@@ -191,20 +191,20 @@ def test_options_of_training_and_evaluation_exist(path):
         short = ENTRIES.get(tuple(words[:2]), SHORT_NAMES)
         overrides = [re.sub(r"^\w+", lambda key, short=short: short.get(key[0], key[0]), override)
                      for override in overrides]  # fmt: skip
-        problems = [problem for one in overrides if (problem := option_problem(one))]
-        # A guide may tell its reader to write the file.
+        problems = [problem for override in overrides if (problem := option_problem(override))]
+        # The reader of a guide may be asked to write the file.
         bad += [problem for problem in problems if f"`{problem.removeprefix('no ')}`" not in text]
     assert not bad
 
 
 @pytest.mark.parametrize("path", GUIDES, ids=lambda path: path.name)
-def test_fenced_commands_are_ones_that_their_programs_read(path):
-    told = {" ".join(words): parse_problem(words) for words in typed_commands(path.read_text())}
-    assert not {command: problem for command, problem in told.items() if problem}
+def test_fenced_commands_are_accepted_by_their_parsers(path):
+    results = {" ".join(words): parse_problem(words) for words in typed_commands(path.read_text())}
+    assert not {command: problem for command, problem in results.items() if problem}
 
 
 def parse_problem(words: list[str]) -> str | None:
-    """Hand a command to its parser, which runs nothing; return what it objects to."""
+    """Parse a command without running it; return the parser's error message, or None."""
     program, arguments = tuple(words[:2]), words[2:]
     try:
         if program in ENTRIES:
@@ -229,8 +229,8 @@ def test_python_of_the_pages_compiles(path):
         compile(lines, f"{path.name}, block {number}", "exec")
 
 
-def test_it_finds_what_does_not_exist():
-    """The checks above would find nothing in an empty list, too."""
+def test_the_checks_detect_missing_options():
+    """Guard against checks that pass because they find no commands."""
     assert option_problem("data=cbp") == "no conf/data/cbp.yaml"
     assert option_problem("data.preset=paper") == "no option data.preset"
     assert option_problem("virtual.scene.lighting.lamps=3") is not None

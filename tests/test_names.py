@@ -21,7 +21,7 @@ def module_name(path: Path) -> str:
 
 
 def collisions(places: dict[str, list[str]]) -> dict[str, list[str]]:
-    """Return public names that stand in several modules."""
+    """Return public names that are defined in several modules."""
     public = {name: paths for name, paths in places.items() if name and name[0] != "_"}
     return {name: paths for name, paths in public.items() if len(paths) > 1}
 

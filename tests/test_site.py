@@ -1,4 +1,4 @@
-"""The pages as a site: two builders read one mkdocs.yml, and refuse a link that leads nowhere."""
+"""The site of the pages: navigation, build by two builders without broken links, notebook."""
 
 import ast
 import json
@@ -16,7 +16,7 @@ NOTEBOOK = ROOT / "docs" / "notebooks" / "from_stl_to_poses.ipynb"
 
 
 def named(node: object) -> list[str]:
-    """Return the pages of a node of the navigation, in order."""
+    """Return the pages below a node of the navigation, in order."""
     if isinstance(node, str):
         return [node]
     children = node.values() if isinstance(node, dict) else node
@@ -26,14 +26,13 @@ def named(node: object) -> list[str]:
 def test_the_navigation_names_every_page_once():
     pages = named(yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"])
     docs = ROOT / "docs"
-    there = {str(path.relative_to(docs)) for path in docs.rglob("*.md")}
-    assert sorted(pages) == sorted(there)
+    assert sorted(pages) == sorted(str(path.relative_to(docs)) for path in docs.rglob("*.md"))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("builder", ["mkdocs", "zensical"])
-def test_the_site_builds_without_a_complaint(builder, tmp_path):
-    """In a copy: Zensical writes where its configuration says, and its cache beside it."""
+def test_the_site_builds_without_warnings(builder, tmp_path):
+    """Build a copy, because Zensical writes its site and cache next to the configuration."""
     for name in ("docs", "dopepp"):
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "mkdocs.yml", tmp_path)
@@ -50,7 +49,7 @@ def test_the_site_builds_without_a_complaint(builder, tmp_path):
     assert ":class:" not in reference
 
 
-def test_the_notebook_and_its_page_say_the_same():
+def test_the_page_contains_the_cells_of_the_notebook():
     page = (ROOT / "docs" / "tutorials" / "from_stl_to_poses.md").read_text()
     notebook = json.loads(NOTEBOOK.read_text())
     for cell in notebook["cells"]:
@@ -62,7 +61,7 @@ def test_the_notebook_and_its_page_say_the_same():
     assert sum(path.stat().st_size for path in images) < 300_000
 
 
-def test_what_scripts_and_the_notebook_import_is_there():
+def test_imports_of_scripts_and_notebook_exist():
     scripts = {str(path): path.read_text() for path in (ROOT / "benchmarks").glob("*.py")}
     scripts |= {str(path): path.read_text() for path in (ROOT / "docs").rglob("*.py")}
     cells = json.loads(NOTEBOOK.read_text())["cells"]

@@ -1,4 +1,4 @@
-"""The wheel: it holds every file that the program reads, and works where there is no repository."""
+"""The wheel contains every file that the program reads, and works without the repository."""
 
 import os
 import shutil
@@ -20,29 +20,26 @@ ROOT = Path(__file__).parents[1]
 COMPILED = shutil.ignore_patterns("__pycache__")
 
 
-def test_it_holds_every_file_that_the_program_reads(monkeypatch):
+def test_it_contains_every_file_that_the_program_reads(monkeypatch):
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr("setuptools.setup", lambda **options: seen.update(options))
-    seen: dict[str, Any] = {}
+    monkeypatch.setattr("setuptools.setup", lambda **options: setup_options.update(options))
+    setup_options: dict[str, Any] = {}
     exec((ROOT / "setup.py").read_text(), {})
-    build = Distribution({**seen, "script_name": "setup.py"}).get_command_obj("build_py")
+    build = Distribution({**setup_options, "script_name": "setup.py"}).get_command_obj("build_py")
     build.ensure_finalized()
-    held = {str(Path(item).relative_to(build.build_lib)) for item in build.get_outputs(False)}
-    wanted = {
+    built = {str(Path(item).relative_to(build.build_lib)) for item in build.get_outputs(False)}
+    sources = {
         path.relative_to(ROOT)
         for folder in ("dopepp", "hydra_plugins", "conf")
         for path in (ROOT / folder).rglob("*")
         if path.is_file() and "__pycache__" not in path.parts
     }
-    there = {
-        str(Path("dopepp", element) if element.parts[0] == "conf" else element)
-        for element in wanted
-    }
-    assert there == held
-    assert {"dopepp/conf/train.yaml", "dopepp/conf/model/backbone/dsc.yaml"} <= held
+    expected = {str(Path("dopepp", file) if file.parts[0] == "conf" else file) for file in sources}
+    assert built == expected
+    assert {"dopepp/conf/train.yaml", "dopepp/conf/model/backbone/dsc.yaml"} <= built
 
 
-def test_the_version_is_said_once():
+def test_the_version_is_defined_once():
     options = tomllib.loads((ROOT / "pyproject.toml").read_text())
     assert options["project"]["dynamic"] == ["version"]
     assert options["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "dopepp.__version__"}
@@ -53,7 +50,7 @@ Run = Callable[..., "CompletedProcess[str]"]
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory) -> Run:
-    """Build the wheel, install it beside this environment's libraries; run it in a bare folder."""
+    """Build the wheel, and install it with this environment's libraries; run it in any folder."""
     base = tmp_path_factory.mktemp("wheel")
     own = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     for name in ("dopepp", "hydra_plugins", "conf"):  # a build leaves its own files in the sources
@@ -71,7 +68,7 @@ def installed(tmp_path_factory) -> Run:
     python = base / "venv" / "bin" / "python"
     pip("--python", str(python), "install", "--no-deps", "--no-index", str(path))
     (site,) = (base / "venv" / "lib").glob("python*/site-packages")
-    # Paths of a .pth file are searched, their own .pth files are not: no editable dopepp comes in.
+    # .pth files of this path are not read, so an editable dopepp is not imported.
     (site / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
 
     def run(*arguments: str, folder: Path) -> "CompletedProcess[str]":

@@ -1,4 +1,4 @@
-"""Executes the notebooks and writes them as pages, with their images as JPEG.
+"""Execute the notebooks and write them as pages, with their images as JPEG.
 
 python docs/notebooks/render.py
 """
