@@ -16,7 +16,7 @@ from dopepp.geometry.rotation import rotation_angle
 Value = TypeVar("Value")
 
 
-class PoseErrors(NamedTuple):
+class PoseError(NamedTuple):
     """Errors of an estimated pose: rotation in degrees, translation and ADD in millimetres."""
 
     rotation: float
@@ -24,10 +24,10 @@ class PoseErrors(NamedTuple):
     add: float
 
 
-def pose_errors(T: Transform, true: Transform, points: np.ndarray) -> PoseErrors:
+def pose_errors(T: Transform, true: Transform, points: np.ndarray) -> PoseError:
     """Return the errors of a pose; ``points`` (V, 3) are the part's ADD points in metres."""
     distances = np.linalg.norm(transform(T, points) - transform(true, points), axis=1)
-    return PoseErrors(
+    return PoseError(
         math.degrees(float(rotation_angle(T[:3, :3] @ true[:3, :3].T))),
         1e3 * float(np.linalg.norm(T[:3, 3] - true[:3, 3])),
         1e3 * float(distances.mean()),

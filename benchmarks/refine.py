@@ -16,7 +16,7 @@ import math
 
 import cv2
 import numpy as np
-from common import PoseErrors, pose_errors, print_head, print_row, timed
+from common import PoseError, pose_errors, print_head, print_row, timed
 from depth import structured_light
 
 from dopepp.data.part_symmetries import with_symmetries
@@ -36,7 +36,7 @@ DEVIATIONS = np.repeat([math.radians(9.0), 0.005], 3) / MEDIAN_NORM
 WORSE_MM = 1.0
 
 
-def errors(T: np.ndarray, true: np.ndarray, part: Part, group: np.ndarray) -> PoseErrors:
+def errors(T: np.ndarray, true: np.ndarray, part: Part, group: np.ndarray) -> PoseError:
     """Return the errors relative to the nearest equivalent pose."""
     some, equal = part.points[::50], true @ group
     away = transform(T, some) - (some @ equal[:, :3, :3].swapaxes(1, 2) + equal[:, None, :3, 3])

@@ -67,14 +67,14 @@ def static_scene(
     ]
     images = []
     for number, T_new_cam in enumerate(poses):
-        seen = scene.seen_from(T_new_cam)
-        rendered, sensor = render(seen), replace(seen.sensor, noise_seed=number)
+        view = scene.seen_from(T_new_cam)
+        rendered, sensor = render(view), replace(view.sensor, noise_seed=number)
         image = capture(rendered.image, sensor)
         if hidden:
-            part, at = target.part, seen.objects[scene.targets[0]]
+            part, at = target.part, view.objects[scene.targets[0]]
             assert part is not None
             mask = rendered.instances == scene.targets[0]
-            keypoints = seen.keypoints(scene.targets[0])
+            keypoints = view.keypoints(scene.targets[0])
             instance = Instance(part.name, at.T_cam_obj, keypoints, 1.0, mask)
             sample = Sample(image, scene.K, [instance])
             image = shade(sample, [hidden], SEED, 10 * index + number)[0].sample.image
@@ -142,8 +142,8 @@ def main() -> None:
                 row = min(row, (*errors, surprise)) if errors[0] < PASSING else row
             rows[count].append(row)
             if options.verbose and (not math.isfinite(row[0]) or result.findings):
-                seen = [(it.score, it.views) for it in (*result.detections, *result.weaker)]
-                print(index, count, row, seen, result.findings)
+                scores = [(it.score, it.views) for it in (*result.detections, *result.weaker)]
+                print(index, count, row, scores, result.findings)
     print_head(
         "views", "scenes", "along mm, 50 % (90 %)", "across mm", "rotation °", "missed", "wrong",
         "normalised error", "ms",

@@ -66,8 +66,8 @@ class Frames:
             }
             self.visible[frame] = {
                 item["obj_id"]
-                for item, seen in zip(objects, info[frame], strict=True)
-                if seen["visib_fract"] >= LEAST_VISIBLE
+                for item, visibility in zip(objects, info[frame], strict=True)
+                if visibility["visib_fract"] >= LEAST_VISIBLE
             }
 
     def image(self, frame: str) -> np.ndarray:
