@@ -25,9 +25,9 @@ from dopepp.data.batch import collate
 from dopepp.data.sample import Sample, crop_sample, resize_sample
 from dopepp.drawing.pictures import RGBImage
 from dopepp.experiment.assembly.build_parts import build_parts
-from dopepp.experiment.assembly.build_sources import fitted_to_camera, labelled_images
+from dopepp.experiment.assembly.build_sources import fit_to_camera, labelled_images
 from dopepp.experiment.assembly.build_system import build_system
-from dopepp.experiment.assembly.renders import seen_preset
+from dopepp.experiment.assembly.renders import training_preset
 from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.results.folder import CONFIG_FILE
 from dopepp.geometry.cuboid import CENTROID
@@ -70,7 +70,7 @@ def windows(config: RunConfig, parts: Parts, rng: np.random.Generator) -> list[t
 
 def variants(config: RunConfig, parts: Parts, rng: np.random.Generator) -> dict[str, list[Sample]]:
     """Return the variants of every window, by name."""
-    preset = seen_preset(config.data)
+    preset = training_preset(config.data)
     photos = find_backgrounds(config.data.virtual.backgrounds)
     behind = ClutteredBackgrounds(photos, preset.clutter, preset.background_contrast)
     bodies, render = [make_body(part, is_target=True) for part in parts], find_renderer("raster")
@@ -129,7 +129,7 @@ def main() -> None:
     for run in options.runs:
         config = RunConfig.of(read_yaml(run / CONFIG_FILE))
         parts = build_parts(config.data)
-        config = fitted_to_camera(config, parts)
+        config = fit_to_camera(config, parts)
         made = made or variants(config, parts, np.random.default_rng(options.seed))
         trained = replace(config, init_from=str(run / "checkpoints" / "best.ckpt"))
         system = build_system(trained, parts, "").eval()

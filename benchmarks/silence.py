@@ -15,7 +15,7 @@ from dopepp.data.negatives import PhotoFrames
 from dopepp.data.sample import SampleSource
 from dopepp.experiment.assembly.build_parts import build_parts
 from dopepp.experiment.assembly.negative_frames import frame_view, negative_frames
-from dopepp.experiment.config.data_config import chosen_data, trained_on
+from dopepp.experiment.config.data_config import evaluation_data, stored_config
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.virtual.backgrounds import PhotoBackgrounds, find_backgrounds
 
@@ -27,7 +27,7 @@ def main() -> None:
     parser.add_argument("--num-frames", type=int, default=90)
     options = parser.parse_args()
     network = PoseEstimator.load(options.checkpoint)
-    data = chosen_data({}, {}, trained_on(network.checkpoint.data), options.checkpoint)
+    data = evaluation_data({}, {}, stored_config(network.checkpoint.data), options.checkpoint)
     parts = build_parts(data)
     sources: list[SampleSource] = [negative_frames(data, parts, "test", options.num_frames)]
     photos = find_backgrounds(data.virtual.backgrounds, "train")

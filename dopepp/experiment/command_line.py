@@ -36,8 +36,8 @@ EVALUATION_SHORT_NAMES: Final = {**SHORT_NAMES, "scale": "scale_factors"}
 def prepare(open_nodes: Sequence[str], short_names: Mapping[str, str], num_words: int) -> None:
     """Rewrite ``sys.argv`` for Hydra and for the further processes of Lightning.
 
-    Records and worker processes use the same list. Interpolations of Hydra cannot replace short
-    names, because both options would appear in the config.
+    The records of a run and its worker processes use the rewritten list. Interpolations of Hydra
+    cannot replace short names, because both options would appear in the config.
 
     Args:
         open_nodes: Nodes that accept keys missing in ``conf/``; they are checked later.
@@ -65,19 +65,14 @@ def _spelled_out(argument: str, short_names: Mapping[str, str], open_nodes: Sequ
 
 
 def _refuse_used_folder(arguments: Sequence[str]) -> None:
-    """Check that the folder of a new run contains no other run, before Hydra writes there.
-
-    Further processes of a run receive the folder of the first process and are not checked.
-
-    Raises:
-        UserError: The folder contains a run.
-    """
+    """Check that the folder of a new run contains no other run, before Hydra writes there."""
     words = dict(text.partition("=")[::2] for text in arguments)
     folder = words.get("hydra.run.dir", "")
     if not folder or words.get("resume", "null") not in ("", "null"):
         return
     from dopepp.experiment.results.folder import VERSIONS_FILE
 
+    # Further processes of a run receive the folder of the first process.
     if Path(folder, VERSIONS_FILE).is_file() and program.is_first_process():
         raise UserError(
             f"hydra.run.dir={folder}, which holds a run",
@@ -101,7 +96,7 @@ def _resumed(arguments: list[str]) -> list[str]:
     return [*overrides, *arguments, f"hydra.run.dir={run}", "hydra.output_subdir=null"]
 
 
-def explain(error: Exception) -> UserError:
+def convert_error(error: Exception) -> UserError:
     """Convert an error of Hydra or OmegaConf into a user error."""
     text = " ".join(f"{error} {error.__cause__ or ''}".split())
     if match := re.search(r"Could not override '([^']+)'", text):

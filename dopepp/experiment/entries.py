@@ -1,7 +1,7 @@
 """Entry points of ``train.py`` (``dopepp train``) and ``evaluate.py`` (``dopepp evaluate``).
 
-The module turns the command into a plain config, and errors into one line. Slow imports happen only
-after a job has printed its folder.
+The module converts the command into a plain config, and each error into one line. Slow imports
+happen only after a job has printed its folder.
 
 Exit codes: 0 success, 1 failure, 2 user error, 130 interrupted, 143 terminated (SIGTERM).
 """
@@ -115,7 +115,7 @@ def entry(
             line = f"{line}; {multirun.requeue()}"
         _exit(line, interruption.exit_code)
     except (HydraException, OmegaConfBaseException) as error:  # some HydraExceptions are OSErrors
-        _exit(command_line.explain(error), USERS_MISTAKE)
+        _exit(command_line.convert_error(error), USERS_MISTAKE)
     except OSError as error:  # jobs handle their own errors, so this is an error of Hydra
         if error.errno not in _REFUSALS:
             raise
@@ -151,7 +151,7 @@ def run_job(config: DictConfig, job: Job) -> float | None:
         with multirun.redirected_output(run_dir / multirun.LOG_FILE):
             return _run_one_of_many(config, job, run_dir)
     if program.is_first_process():
-        program.say(f"begins in {program.shown(run_dir)}")
+        program.print_line(f"begins in {program.relative_path(run_dir)}")
     # Hydra's own file may be truncated. A resumed run stores its overrides after the checks.
     resumed = any(text.startswith("resume=") for text in hydra.overrides.task)
     try:
@@ -165,7 +165,7 @@ def run_job(config: DictConfig, job: Job) -> float | None:
     except (UserError, OmegaConfBaseException) as error:
         if not resumed and program.is_first_process():
             _remove_unused(run_dir)
-        mistake = error if isinstance(error, UserError) else command_line.explain(error)
+        mistake = error if isinstance(error, UserError) else command_line.convert_error(error)
         _exit(mistake, USERS_MISTAKE)
     except RunError as error:
         _exit(error, FAILED)

@@ -16,20 +16,20 @@ _RANKS: Final = ("RANK", "LOCAL_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK")
 """Environment variables with the rank of a process (torchrun, Lightning, SLURM, LSF)."""
 
 
-def typed(verb: str) -> str:
+def entry_command(verb: str) -> str:
     """Return the command for ``train`` or ``evaluate`` in the style of the present command."""
     script = Path(sys.argv[0]).name in _SCRIPTS
     return f"python {verb}.py" if script else f"dopepp {verb}"
 
 
-def shown(path: Path) -> str:
+def relative_path(path: Path) -> str:
     """Return a path relative to the working directory if possible, else absolute."""
     path = path.absolute()
     below = path.is_relative_to(Path.cwd())
     return str(path.relative_to(Path.cwd()) if below else path)
 
 
-def say(line: str) -> None:
+def print_line(line: str) -> None:
     """Print a line immediately, without Rich, whose import is slow."""
     sys.stdout.write(f"{line}\n")
     sys.stdout.flush()

@@ -29,7 +29,7 @@ class _RemoteLauncher(Launcher):
         """Run the jobs, numbered from ``initial_job_idx``, and wait for all."""
         from dopepp.experiment.sweep import job_runners
 
-        common = job_runners.Jobs.of(self.hydra_context, self.config, self.task_function)
+        common = job_runners.Jobs(self.hydra_context, self.config, self.task_function)
         runner = getattr(job_runners, self.function)(*self.options)
         return job_runners.launch(common, job_overrides, initial_job_idx, runner)
 

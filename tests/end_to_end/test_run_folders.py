@@ -36,7 +36,7 @@ def test_a_fast_dev_run_does_everything_and_keeps_no_weights(call, tiny, tmp_pat
     (run,) = (tmp_path / "debug").iterdir()
     assert (run / "metrics.json").is_file()
     assert not list(run.rglob("*.ckpt"))
-    assert "nothing to go on with" in (run / "README.md").read_text()
+    assert "kept no checkpoints" in (run / "README.md").read_text()
     done = call("train.py", f"resume={run}")
     assert "keep_checkpoints=false" in done.line
 

@@ -48,7 +48,8 @@ _log = logging.getLogger(__name__)
 _TRAINING_SHARE: Final = 0.8
 """Share of training in an image folder that is also used for validation or test."""
 
-_DIVIDED: Final = ("bop", "ndds", "webdataset")  # formats whose folders `share_of` divides
+_DIVIDED: Final = ("bop", "ndds", "webdataset")
+"""Formats whose folders :func:`share_of` divides between the splits."""
 
 
 def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModule:
@@ -83,8 +84,8 @@ def held_out_source(data: DataConfig, parts: Parts, split: Split) -> DescribedSo
     if data.is_rendered(split):
         return held_out_renders(data, parts, split)
     labelled = labelled_images(data, parts, data.eval_seed, split)
-    seen = split == "test" or any(labelled.contains(part.name) for part in parts)
-    if seen or any(part.mesh is None for part in parts):
+    has_objects = split == "test" or any(labelled.contains(part.name) for part in parts)
+    if has_objects or any(part.mesh is None for part in parts):
         return labelled
     _log.warning(
         "%s shows none of %s: validating on renders, as with data.image_sets.val=null",
@@ -112,8 +113,8 @@ def _train_source(
             "no real images (data.root is not set): training on renders of %s only",
             ", ".join(part.name for part in parts),
         )
-    if data.root is not None and data.synthetic_fraction > 0 and data.real_fraction < 1:
-        synthetic = synthetic_companions(data, parts, seed, backgrounds)
+    if data.synthetic_fraction > 0 and data.real_fraction < 1:
+        synthetic = _synthetic_images(data, parts, seed, backgrounds)
     virtual = None if data.real_fraction == 1 else training_renders(data, parts, seed, backgrounds)
     return HybridSource(
         real,
@@ -150,15 +151,13 @@ def labelled_images(data: DataConfig, parts: Parts, seed: int, split: Split) -> 
     added = extensions.components("formats")
     if data.format not in added:
         formats, advice = ", ".join((*FORMATS, *added)), extensions.advice("formats", data.format)
-        problem = f"data.format={data.format}"
-        raise UserError(
-            problem, formats, f"set data.format to the format of the images, or {advice}"
-        )
+        fix = f"set data.format to the format of the images, or {advice}"
+        raise UserError(f"data.format={data.format}", formats, fix)
     opener: Opener = resolve_name(added[data.format])
     return opener(data, data.root, parts, seed, split)
 
 
-def synthetic_companions(
+def _synthetic_images(
     data: DataConfig, parts: Parts, seed: int, backgrounds: Backgrounds
 ) -> DescribedSource | None:
     """Open the synthetic images in the training list of YCB-Video, if any."""
@@ -233,7 +232,7 @@ FORMATS: Final[dict[str, Opener]] = {
 """Functions that open the images of each format."""
 
 
-def share_in_words(data: DataConfig) -> str | None:
+def note_on_shared_folder(data: DataConfig) -> str | None:
     """Return a remark if the test images are only a share of their folder, else None."""
     if data.is_rendered("test") or data.format not in _DIVIDED:
         return None
@@ -250,11 +249,11 @@ def share_in_words(data: DataConfig) -> str | None:
     )
 
 
-def fitted_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
+def fit_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
     """Choose the camera scale and the input size by the apparent size of the parts.
 
-    Without a camera, only renders of a BOP data set's models are fitted, to the data set's camera.
-    The chosen values are logged and stored in the config.
+    Without a camera, renders of the models of a BOP data set use the data set's camera. Otherwise
+    the config stays unchanged. The chosen values are logged and stored in the config.
 
     Raises:
         UserError: A part is larger than ``data.input_size``, or the working distance is unknown.
@@ -281,26 +280,20 @@ def fitted_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
         "data": {**config.plain["data"], "input_size": list(size)},
         "virtual": {**config.plain["virtual"], "camera_scale": scale},
     }
-    seen = replace(data, input_size=size, virtual=replace(virtual, camera_scale=scale))
-    return replace(config, plain=plain, data=seen)
+    fitted = replace(data, input_size=size, virtual=replace(virtual, camera_scale=scale))
+    return replace(config, plain=plain, data=fitted)
 
 
 def _with_camera_of_images(config: RunConfig, parts: Parts) -> RunConfig:
-    """Return a config with the camera and the distances of the BOP test images.
-
-    The config changes only if training uses renders and neither a camera nor, with real images, an
-    input size is given.
-    """
+    """Give the renders of a training the camera and the distances of the BOP test images."""
     data, virtual = config.data, config.data.virtual
     rendered = data.real_fraction == 0 or (data.real_fraction < 1 and data.input_size is None)
-    if not rendered or virtual.camera is not None:
-        return config
-    if data.format != "bop" or data.is_rendered("test"):
+    labelled = data.format == "bop" and not data.is_rendered("test")
+    if virtual.camera is not None or not (rendered and labelled):
         return config
     source = labelled_images(data, parts, data.eval_seed, "test")
-    if not isinstance(source, BopReader):
-        return config
-    (width, height), K, annotated = source.view()
+    assert isinstance(source, BopReader)
+    size, K, annotated = source.view()
     distance = virtual.working_distance or annotated
     if distance is None:
         raise UserError(
@@ -315,8 +308,7 @@ def _with_camera_of_images(config: RunConfig, parts: Parts) -> RunConfig:
             source.name,
             *distance,
         )
-    (fx, _, cx), (_, fy, cy), _ = K.tolist()
-    lens = LensConfig(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+    lens = LensConfig.of(size, K)
     chosen = replace(virtual, camera=lens, working_distance=distance)
     changed = {"camera": vars(lens), "working_distance": list(distance)}
     plain = {**config.plain, "virtual": {**config.plain["virtual"], **changed}}

@@ -27,7 +27,7 @@ from dopepp.core.errors import UserError
 from dopepp.core.pool import cpu_fact
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment import program
-from dopepp.experiment.config.run_config import AUTO, MapsConfig, RunConfig, TrainerConfig
+from dopepp.experiment.config.run_config import AUTO, RunConfig, TrainerConfig
 from dopepp.maps.codec import MapGeometry
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.network import LOSSES, PoseNetwork, build_network
@@ -128,7 +128,7 @@ def build_system(
         network,
         LOSSES.build(config.model.loss),
         parts,
-        map_geometry(config.maps, network.stride),
+        MapGeometry(network.stride, config.maps.sigma, config.maps.field_radius),
         RecoveryOptions.of(description.recovery),
         optimizer_factory(config.optimizer),
         scheduler_factory(config.scheduler),
@@ -147,10 +147,10 @@ def _initialise(network: PoseNetwork, config: RunConfig) -> None:
         return
     fits = start_from_parts(network)
     if config.resume is None and is_first_process():
-        program.say(
+        program.print_line(
             "initial weights: learned on random parts (init_from=auto)"
             if fits
-            else f"initial weights: the model's own, because those of random parts fit {FITS}"
+            else f"initial weights: default, because the weights of random parts fit only {FITS}"
         )
 
 
@@ -168,11 +168,6 @@ def build_untrained(config: RunConfig, parts: list[Part]) -> tuple[PoseNetwork, 
     recovery = vars(RecoveryOptions.of({"sigma": sigma, **config.recovery}))
     size = config.data.network_input
     return network, Checkpoint(spec, {}, parts, size, network.stride, sigma, recovery)
-
-
-def map_geometry(maps: MapsConfig, stride: int) -> MapGeometry:
-    """Return the geometry of the target maps."""
-    return MapGeometry(stride, maps.sigma, maps.field_radius)
 
 
 def build_trainer(
@@ -199,7 +194,7 @@ def build_trainer(
         accelerator = "cpu"
     precision, reason = choose_precision(options.precision, accelerator)
     if is_first_process():
-        program.say(f"precision {precision}: {reason}")
+        program.print_line(f"precision {precision}: {reason}")
     callbacks = [*(CALLBACKS.build(node) for node in config.callbacks.values()), *further]
     if config.ema is not None:
         callbacks.append(AveragedWeights(config.ema))
@@ -246,11 +241,9 @@ def choose_precision(requested: str, accelerator: str) -> tuple[str, str]:
         return requested, "as requested"
     if accelerator == "cuda":
         fast = torch.cuda.is_bf16_supported(including_emulation=False)
-        return (
-            ("bf16-mixed", "this GPU supports bf16")
-            if fast
-            else ("32-true", "this GPU has no bf16")
-        )
+        if fast:
+            return "bf16-mixed", "this GPU supports bf16"
+        return "32-true", "this GPU has no bf16"
     if accelerator != "cpu":
         return "32-true", f"bf16 support is not checked on {accelerator}"
     useful = _BF16_FLAGS | ({_AMD_BF16_FLAG} if cpu_fact("vendor_id") == "AuthenticAMD" else set())

@@ -18,7 +18,7 @@ from dopepp.data.rendered import RenderedSource
 from dopepp.data.sample import DescribedSource
 from dopepp.drawing.pictures import Size
 from dopepp.experiment.assembly.build_parts import build_negatives
-from dopepp.experiment.assembly.photos import held_out_photos, own_photos
+from dopepp.experiment.assembly.photos import held_out_photos, negative_photos
 from dopepp.experiment.config.data_config import DataConfig
 from dopepp.geometry.camera import crop_camera
 from dopepp.parts.lookalikes import lookalikes
@@ -68,7 +68,7 @@ def negative_frames(
         UserError: A folder of photos has too few photos to be divided.
     """
     view, preset = frame_view(data, parts), data.preset
-    photos, user_photos = held_out_photos(data, split), own_photos(data, split)
+    photos, user_photos = held_out_photos(data, split), negative_photos(data, split)
     dense = _as_dense(preset, view.size) if data.virtual.view is None else preset
     preset = view.whole(dense, data.virtual.camera_scale or 1.0)
     if data.virtual.view is None:

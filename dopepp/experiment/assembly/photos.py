@@ -41,7 +41,7 @@ def training_backgrounds(data: DataConfig) -> Backgrounds:
             data.virtual.backgrounds,
             3 * MIN_PHOTOS,
         )
-    user_photos = own_photos(data, "train")
+    user_photos = negative_photos(data, "train")
     return (
         backgrounds
         if user_photos is None
@@ -68,7 +68,7 @@ def held_out_photos(data: DataConfig, split: Literal["val", "test"]) -> PhotoBac
     )
 
 
-def own_photos(data: DataConfig, split: PhotoSplit) -> PhotoBackgrounds | None:
+def negative_photos(data: DataConfig, split: PhotoSplit) -> PhotoBackgrounds | None:
     """Return a split of the user's own images without the parts, or None without a folder.
 
     Raises:

@@ -11,7 +11,7 @@ from dopepp.data.rendered import CachedSource, RenderedSource, Split
 from dopepp.data.sample import DescribedSource
 from dopepp.drawing.pictures import Size
 from dopepp.experiment.assembly.build_parts import build_negatives
-from dopepp.experiment.config.data_config import Cache, DataConfig, chosen_data, trained_on
+from dopepp.experiment.config.data_config import Cache, DataConfig, evaluation_data, stored_config
 from dopepp.geometry.camera import Letterbox
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.catalogue import with_meshes
@@ -25,7 +25,7 @@ def training_renders(
     data: DataConfig, parts: Parts, seed: int, backgrounds: Backgrounds
 ) -> DescribedSource:
     """Render the training images at the size of the network's input, which saves time."""
-    factory = _factory(data, parts, seen_preset(data), seed, backgrounds)
+    factory = _factory(data, parts, training_preset(data), seed, backgrounds)
     source = RenderedSource(factory, data.samples_per_epoch)
     return with_cache(source, data, data.cache, data.network_input)
 
@@ -33,7 +33,7 @@ def training_renders(
 def validation_windows(data: DataConfig, parts: Parts) -> DescribedSource:
     """Render the validation images of the user's camera in the windows that training uses."""
     backgrounds = find_backgrounds(data.virtual.backgrounds, "val")
-    factory = _factory(data, parts, seen_preset(data), data.eval_seed, backgrounds)
+    factory = _factory(data, parts, training_preset(data), data.eval_seed, backgrounds)
     return RenderedSource(factory, data.num_val, "val")
 
 
@@ -89,7 +89,7 @@ def validation_renders(
         count: Number of images.
         size: Image size; ignored if the checkpoint was trained for a camera.
     """
-    data = chosen_data({}, {}, trained_on(checkpoint.data), str(path))
+    data = evaluation_data({}, {}, stored_config(checkpoint.data), str(path))
     virtual = replace(data.virtual, preset=data.preset_name)
     data = replace(data, root=None, objects=None, virtual=virtual, num_val=count)
     if size is not None and data.virtual.view is None:
@@ -114,7 +114,7 @@ def with_cache(
     return CachedSource(source, input_size, folder, identity=code_hash())
 
 
-def seen_preset(data: DataConfig) -> Preset:
+def training_preset(data: DataConfig) -> Preset:
     """Return the preset at the network's input size: resized, or in windows of the images."""
     preset, view = data.preset, data.virtual.view
     if view is not None:

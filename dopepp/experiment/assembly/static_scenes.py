@@ -1,7 +1,6 @@
 """Test images of static scenes, each with further images of its scene.
 
-Of a scene's images, those are chosen whose cameras look from about :data:`ANGLE_DEG` beside the
-others.
+The optical axes of the chosen cameras differ by about :data:`ANGLE_DEG`.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ class StaticScenes:
     """The images of a BOP split with ``others`` and the poses of their cameras.
 
     Args:
-        reader: The images; every folder is a static scene.
-        num_views: Number of images of each item, with its own.
+        reader: Reader of the images; every folder is a static scene.
+        num_views: Number of images of each item, including the item's main image.
 
     Raises:
         UserError: A scene has no camera poses, or too few images.
@@ -57,20 +56,18 @@ class StaticScenes:
         """Read an image, further images of its scene (``others``) and all camera poses."""
         first, *others = (
             replace(self._reader.sample(number), T_world_cam=self._T_world_cam[number])
-            for number in [index, *self._beside(index)]
+            for number in [index, *self._further_views(index)]
         )
         return replace(first, others=others)
 
-    def _beside(self, index: int) -> Sequence[int]:
-        """Return the indices of further images of an image's scene.
-
-        The optical axis of each camera is about ``ANGLE_DEG`` from the nearest axis chosen before.
-        """
+    def _further_views(self, index: int) -> Sequence[int]:
+        """Return the indices of further images of an image's scene."""
         scene = self._reader.image_ids[index][0]
         left, chosen = [number for number in self._scenes[scene] if number != index], [index]
         axes = {number: self._T_world_cam[number][:3, 2] for number in self._scenes[scene]}
         for _ in range(self._num_others):
             cosines = np.array([[axes[a] @ axes[b] for b in chosen] for a in left])
+            # Angle of each remaining camera to the nearest camera chosen before.
             angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))).min(axis=1)
             chosen.append(left.pop(int(np.abs(angles - ANGLE_DEG).argmin())))
         return chosen[1:]

@@ -1,7 +1,7 @@
 """The config nodes ``data`` (images) and ``virtual`` (renders).
 
-A training states both nodes. An evaluation reads both nodes from its checkpoint and applies the
-user's changes.
+The config of a training contains both nodes. An evaluation reads both nodes from its checkpoint and
+applies the user's changes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from typing import Annotated, Any, Final, Literal
 from dopepp.core.errors import UserError
 from dopepp.core.validation import STRICT, Range, parse, short_repr
 from dopepp.data.rendered import MAX_ITEMS, Split
-from dopepp.geometry.camera import camera_matrix
+from dopepp.drawing.pictures import Size
+from dopepp.geometry.camera import CameraMatrix, camera_matrix
 from dopepp.virtual.presets import Preset, preset_of, written_out
 from dopepp.virtual.presets.view import View, read_lens
 
@@ -54,6 +55,12 @@ class LensConfig:
     cx: float
     cy: float
 
+    @classmethod
+    def of(cls, size: Size, K: CameraMatrix) -> LensConfig:
+        """Convert an image size (width, height) and a camera matrix, both in pixels."""
+        (fx, _, cx), (_, fy, cy), _ = K.tolist()
+        return cls(width=size[0], height=size[1], fx=fx, fy=fy, cx=cx, cy=cy)
+
 
 @dataclass(frozen=True, kw_only=True)
 class VirtualConfig:
@@ -71,7 +78,8 @@ class VirtualConfig:
         renderer: ``raster`` or ``photoreal``.
         camera: Camera of the application; None uses the camera of the preset.
         working_distance: Nearest and farthest distance of the parts from the camera, metres.
-        camera_scale: Scale of the camera's images at the network's input; None selects it.
+        camera_scale: Scale of the camera's images at the network's input; None selects a scale that
+            suits the parts.
     """
 
     __pydantic_config__ = STRICT
@@ -166,7 +174,7 @@ class DataConfig:
         eval_seed: Seed of validation and test renders and of the patches of shading, independent of
             the training seed.
         input_size: Input size (width, height) of the network, pixels, multiples of 32; None selects
-            it for ``virtual.camera``.
+            a size that suits ``virtual.camera``.
         batch_size: Images per step and process.
         num_workers: Loader processes; None uses one per core.
 
@@ -274,7 +282,9 @@ class DataConfig:
         return chosen
 
 
-def chosen_data(data: Node | None, virtual: Node | None, stored: object, source: str) -> DataConfig:
+def evaluation_data(
+    data: Node | None, virtual: Node | None, stored: object, source: str
+) -> DataConfig:
     """Return the data to evaluate on: the data of the checkpoint with the user's changes.
 
     Args:
@@ -310,7 +320,7 @@ def chosen_data(data: Node | None, virtual: Node | None, stored: object, source:
         ) from error
 
 
-def trained_on(description: Mapping[str, Any]) -> dict[str, Any] | None:
+def stored_config(description: Mapping[str, Any]) -> dict[str, Any] | None:
     """Return the data config in a checkpoint's description, or None."""
     config = description.get("config")
     return config if isinstance(config, dict) else None
@@ -325,9 +335,7 @@ def with_files(virtual: object) -> object:
         return virtual
     written = dict(virtual)
     if isinstance(virtual.get("camera"), str):
-        (width, height), K = read_lens(virtual["camera"])
-        (fx, _, cx), (_, fy, cy), _ = K.tolist()
-        written["camera"] = vars(LensConfig(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy))
+        written["camera"] = vars(LensConfig.of(*read_lens(virtual["camera"])))
     if isinstance(virtual.get("preset"), str):
         preset, scene = written_out(virtual["preset"], virtual.get("scene"))
         written |= {"preset": preset, "scene": scene}

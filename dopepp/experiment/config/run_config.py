@@ -241,7 +241,7 @@ class Protocols:
 def _levels(
     option: str, value: object, bounds: tuple[float, float], standard_level: float, allowed: str
 ) -> tuple[float, ...]:
-    """Read levels; the ``standard_level`` level is omitted, because it is always measured."""
+    """Read levels without ``standard_level``, which is always measured."""
     levels = [] if value is None else value if isinstance(value, list) else [value]
     numbers: list[float] = [n for n in levels if isinstance(n, int | float) and type(n) is not bool]
     wrong = len(numbers) < len(levels) or not all(bounds[0] <= n <= bounds[1] for n in numbers)
@@ -315,13 +315,14 @@ class RunConfig(MeasurementConfig):
         seed: Seed of initial weights, order and training images.
         compile: Whether to compile the network with torch.
         ema: Decay of an exponential moving average of the weights; None disables it.
-        stop_at: Share of the parts with a right refined pose that ends the training, once it is
-            confirmed on held-out images; None: the training has its full length.
+        stop_at: Share of the parts with a correct refined pose that ends the training, once the
+            share is confirmed on held-out images; None: the training has its full length.
         keep_checkpoints: Whether to keep the checkpoints after the measurement.
         resume: Folder of the interrupted run to resume.
         resume_anyway: Whether to resume even if the training data or the loss have changed.
         init_from: Checkpoint with the initial weights. ``auto``: weights learned on random parts if
-            they fit the network (:mod:`dopepp.models.start`). None: the model's own.
+            they fit the network (:mod:`dopepp.models.start`). None: the default initialisation of
+            the network.
         model: Network and loss.
         maps: Target maps.
         recovery: Options of the recovery from maps to poses, by the names of
@@ -390,9 +391,9 @@ class EvaluationConfig(MeasurementConfig):
             meshes are measured; None for no templates.
         negatives: Folder of images that show none of the parts.
         negatives_camera: Camera file of these images; None for the camera of the data.
-        method: Name of that method; None derives it from the file name.
+        method: Name of the method of ``results``; None derives the name from the file name.
         data: Data to measure on: a whole node, or changes to the data of the checkpoint; see
-            :func:`~dopepp.experiment.config.data_config.chosen_data`.
+            :func:`~dopepp.experiment.config.data_config.evaluation_data`.
         virtual: Options of the renders: a whole node, or changes to the checkpoint's options.
         bop_csv: Whether to write the poses of every method as a BOP challenge CSV.
         all_measures: Whether to print the symmetric measures of parts without symmetries.
@@ -436,15 +437,15 @@ def _parsed(kind: type[C], options: Mapping[str, Any]) -> C:
     return replace(parse(kind, options), plain=options)
 
 
-def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
+def flatten(value: object, name: str = "") -> Iterator[tuple[str, object]]:
     """Yield the leaves of nested mappings by their dotted names; lists are leaves."""
     if isinstance(value, Mapping):
         for key, item in value.items():
-            yield from flat(item, f"{name}.{key}" if name else str(key))
+            yield from flatten(item, f"{name}.{key}" if name else str(key))
     else:
         yield name, value
 
 
-def below(key: str, nodes: Sequence[str]) -> bool:
-    """Return whether an option is one of the nodes or below one of them."""
+def is_below(key: str, nodes: Sequence[str]) -> bool:
+    """Return whether an option is one of the nodes, or belongs to one of the nodes."""
     return any(key == node or key.startswith(f"{node}.") for node in nodes)

@@ -197,7 +197,7 @@ def record_breakdown(
         span = f" [{100 * value.low:.0f}, {100 * value.high:.0f}]" if value.ends else ""
         return {**row, f"{prefix}{value.heading}": f"{value.text}{span}"}
 
-    def recorded(value: Value) -> dict[str, object]:
+    def csv_cells(value: Value) -> dict[str, object]:
         low, high, middle = by_middle[value.condition]
         row = {"method": value.method, "from": low, "to": high, "median": middle}
         ends = {"low": value.low, "high": value.high} if value.ends else {}
@@ -209,7 +209,7 @@ def record_breakdown(
     parts = list(metrics.values())[-1].parts
     display.console.print(radius_note({n: matching_radius(part) for n, part in parts.items()}))
     path = run_dir / f"by_{quantity}"
-    write_csv(path.with_suffix(".csv"), pivot(values, ["condition", "method"], recorded))
+    write_csv(path.with_suffix(".csv"), pivot(values, ["condition", "method"], csv_cells))
     panels = {
         rate.title: rate_curves([value for value in values if value.measure == rate.field])
         for rate in rates

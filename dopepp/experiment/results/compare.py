@@ -31,18 +31,18 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.drawing.sheet import Tile, contact_sheet, grid, message_image
 from dopepp.experiment.assembly.build_parts import build_parts
 from dopepp.experiment.assembly.build_sources import held_out_source
-from dopepp.experiment.config.data_config import chosen_data, trained_on
+from dopepp.experiment.config.data_config import evaluation_data, stored_config
 from dopepp.experiment.results import display
 from dopepp.experiment.results.compared_runs import (
     BASELINE,
     Entry,
     Run,
+    baseline_first,
     find_runs,
     group,
-    ordered,
     with_refined,
 )
-from dopepp.experiment.results.differences import compared, full, headline, notes
+from dopepp.experiment.results.differences import compact_table, comparison_frame, full_table, notes
 from dopepp.experiment.results.frame import header_of, markdown
 from dopepp.experiment.results.pages import write_page
 from dopepp.experiment.results.paper import PaperTable, write_paper_table
@@ -88,15 +88,15 @@ _TOO_WIDE: Final = (
 def compare_reports(reports: Sequence[Report], folder: Path, baseline: str) -> None:
     """Compare methods that were measured together; ``baseline`` is a method's name."""
     entries = [Entry(report.name, [report], [None]) for report in reports]
-    write_comparison(ordered(entries, baseline), folder)
+    write_comparison(baseline_first(entries, baseline), folder)
 
 
 def write_comparison(entries: Sequence[Entry], folder: Path) -> dict[str, Any]:
     """Print and write the table and the AUC curves; return the content of ``compare.md``."""
-    table = compared(entries)
+    table = comparison_frame(entries)
     means = [report.mean for entry in entries for report in entry.reports]
-    compact = headline(table, any(row.num_symmetries > 1 for row in means))
-    sentences, rows = notes(entries, table), full(table)
+    compact = compact_table(table, any(row.num_symmetries > 1 for row in means))
+    sentences, rows = notes(entries, table), full_table(table)
     narrow_rows = [{key: row[key] for key in row if key not in _TOO_WIDE} for row in compact]
     display.show_table("comparison", narrow_rows, num_labels=2)
     for sentence in sentences:
@@ -160,9 +160,9 @@ def compare_runs(
 ) -> list[Entry]:
     """Compare runs, print and write the comparison, and return the methods.
 
-    A method that was also measured with refinement counts as two methods. Images and training
-    curves show the networks only. The table is written first, so it exists even if drawing curves
-    or images fails.
+    A method that was also measured with refinement counts as two methods. Test images and training
+    curves show the networks without refinement. The table is written first, so the table exists
+    even if drawing curves or images fails.
 
     Raises:
         UserError: The baseline is not among the methods.
@@ -172,7 +172,7 @@ def compare_runs(
     if baseline is not None and baseline not in names:
         fix = "pass --baseline with one of these names"
         raise UserError(f"baseline {baseline!r}", ", ".join(names), fix)
-    networks = ordered(networks, baseline or BASELINE)
+    networks = baseline_first(networks, baseline or BASELINE)
     entries = with_refined(networks)
     page = write_comparison(entries, folder)
     panels = _panels(entries, folder)
@@ -234,7 +234,7 @@ def training_lines(
     """
     lines = []
     for entry in (entry for entry in entries if not entry.refine):
-        logs = [logged(run.folder / LOG_FILE, column) for run in entry.runs]
+        logs = [read_log_column(run.folder / LOG_FILE, column) for run in entry.runs]
         series = [log for log in logs if log]
         steps = sorted(set(series[0]).intersection(*series[1:])) if series else []
         if steps:
@@ -243,7 +243,7 @@ def training_lines(
     return lines
 
 
-def logged(path: Path, column: str) -> dict[int, float]:
+def read_log_column(path: Path, column: str) -> dict[int, float]:
     """Return the finite numbers of a column of a log, by step."""
     numbers = {}
     for row in read_csv(path):
@@ -258,7 +258,7 @@ def image_tiles(entries: Sequence[Entry], num: int = NUM_PICTURES) -> tuple[list
     The first seed of each method is shown. Networks of different parts have separate rows.
 
     Returns:
-        Tiles row by row (a row per image, a tile per method), and the reason for missing images.
+        Tiles row by row (one row per image, one tile per method), and why images are missing.
     """
     measured = [run for entry in entries for run in entry.runs if run.report]
     kinds = list(dict.fromkeys(map(_parts, measured))) or [()]
@@ -295,11 +295,11 @@ class _Model:
     def test_images(self, num: int) -> list[Sample]:
         """Open the images on which the run was measured."""
         assert self.estimator is not None
-        stored, config = trained_on(self.estimator.checkpoint.data), self.run.config
+        stored, config = stored_config(self.estimator.checkpoint.data), self.run.config
         # Only the config of an evaluation contains changes to the data of the checkpoint.
         given = config if "ckpt_path" in config else {}
         path = str(self.run.checkpoint)
-        data = chosen_data(given.get("data"), given.get("virtual"), stored, path)
+        data = evaluation_data(given.get("data"), given.get("virtual"), stored, path)
         if data.root is not None:
             data = replace(data, objects=tuple(part.name for part in self.estimator.parts))
         source = held_out_source(data, build_parts(data), "test")
@@ -341,7 +341,7 @@ def _rows(models: Sequence[_Model], num: int) -> tuple[list[Tile], str]:
         except UserError as error:
             reasons.append(f"{model.name}: {error}")
     if not samples:
-        return [], f"No images of common test images. {'; '.join(reasons)}" if num else ""
+        return [], f"No test images are shown. {'; '.join(reasons)}" if num else ""
     return [
         model.tile(sample, BLUE if model is loaded[0] and len(models) > 1 else YELLOW)
         for sample in samples

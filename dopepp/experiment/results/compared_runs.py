@@ -141,11 +141,7 @@ def find_runs(paths: Sequence[Path]) -> list[Run]:
 
 
 def _folders(path: Path) -> list[Path]:
-    """Return the run folders in a folder, which may be a run or a multirun.
-
-    Raises:
-        UserError: The folder is neither a run nor a multirun.
-    """
+    """Return the run folders in a folder, which must be a run or a multirun."""
     if any((path / trace).exists() for trace in _TRACES):
         return [path]
     jobs = [job for job in path.iterdir() if job.name.isdigit()] if path.is_dir() else []
@@ -260,7 +256,7 @@ def _yaml(path: Path) -> Any:
         return None
 
 
-def ordered(entries: Sequence[Entry], baseline: str = BASELINE) -> list[Entry]:
+def baseline_first(entries: Sequence[Entry], baseline: str = BASELINE) -> list[Entry]:
     """Sort the baseline, given by its name or the first word of the name, to the front."""
     return sorted(entries, key=lambda e: baseline not in (e.name, e.name.split(" ")[0]))
 
@@ -328,11 +324,7 @@ def _join(method: Sequence[Entry]) -> Entry:
 
 
 def _name(entries: Sequence[Entry]) -> None:
-    """Name each entry after its model and the overrides in which the entries differ.
-
-    Names that are too long or not unique contain the folder's name, or its path if the folder names
-    are equal as well.
-    """
+    """Name each entry after its model and the overrides in which the entries differ."""
     overrides = [
         [text for text in entry.runs[0].overrides if all(text in r.overrides for r in entry.runs)]
         for entry in entries
@@ -343,7 +335,7 @@ def _name(entries: Sequence[Entry]) -> None:
         entry.name = " ".join([entry.runs[0].model, *rest])
         if len(entry.name) > _LONGEST_NAME:
             entry.name = f"{entry.runs[0].model} {entry.runs[0].short_path}"
-    for suffix in ("short_path", "folder"):
+    for suffix in ("short_path", "folder"):  # makes equal names unique
         counts = Counter(entry.name for entry in entries)
         for entry in entries:
             if counts[entry.name] > 1:

@@ -47,7 +47,7 @@ from dopepp.experiment.results.measurement import (
     accumulators,
     image_id,
     measure,
-    reported,
+    reported_candidates,
 )
 from dopepp.experiment.results.report import Report
 from dopepp.metrics.pose import MEAN, MIN_VISIBLE_FRACTION, PoseMetrics
@@ -190,7 +190,7 @@ def record_condition(
     def cells(value: Value) -> Row:
         return {**value.names, condition.heading(value.condition): value.text}
 
-    def recorded(value: Value) -> dict[str, object]:
+    def csv_cells(value: Value) -> dict[str, object]:
         return {**value.names, condition.level: value.condition, value.measure: value.plain}
 
     tables = {
@@ -208,7 +208,7 @@ def record_condition(
         notes.append(radius_note(radii))
         display.console.print(notes[-1])
     path = run_dir / f"{condition.name}.md"
-    write_csv(path.with_suffix(".csv"), pivot(values, (*_LABELS, "condition"), recorded))
+    write_csv(path.with_suffix(".csv"), pivot(values, (*_LABELS, "condition"), csv_cells))
     sections = [f"## {title}\n\n{markdown(table)}" for title, table in tables.items()]
     text = "\n".join([f"{condition.introduction}\n", *(f"{line}\n" for line in notes), *sections])
     write_file(path, text.encode())
@@ -293,7 +293,7 @@ def measure_shading(
             for name, method in methods.items():
                 candidates, _ = method.detect(variant.sample, image_id(sample, index))
                 accumulator = metrics[variant.share][name]
-                poses = reported(method, candidates)
+                poses = reported_candidates(method, candidates)
                 accumulator.update(poses, sample.instances, sample.K, sample.size[0])
         num_shown = len(tiles) // (len(shares) + 1)
         if num_shown < min(num_examples, MAX_EXAMPLES) and any(counts):
@@ -368,25 +368,17 @@ def measure_scales(
         measured[scale] = measure(methods, samples, num_examples)
     in_order = dict(sorted(measured.items()))
     levels = [_scale_level(scale, level, unmoved) for scale, level in in_order.items()]
-    pictures = zip(*(level.tiles[:num_examples] for level in in_order.values()), strict=True)
+    scenes = zip(*(level.tiles[:num_examples] for level in in_order.values()), strict=True)
     tiles = [
         replace(tile, caption=f"{tile.caption}, {SCALE.heading(scale)}")
-        for same_scene in pictures
-        for scale, tile in zip(in_order, same_scene, strict=True)
+        for scene in scenes
+        for scale, tile in zip(in_order, scene, strict=True)
     ]
     return levels, tiles
 
 
 def _scale_level(scale: float, measured: Measured, unmoved: Measured) -> Level:
-    """Summarise the results at one scale.
-
-    A note states the evaluated instances if their number or visibility differs from scale 1.
-
-    Args:
-        scale: Factor on the apparent size of the parts.
-        measured: Measurement at this scale.
-        unmoved: Measurement at scale 1.
-    """
+    """Summarise a scale, with a note if number or visibility of instances differ from scale 1."""
     rows = {report.name: report.rows for report in measured.reports}
     visible, reference = _visible_fractions(measured), _visible_fractions(unmoved)
     mean = float(visible.mean()) if len(visible) else math.nan

@@ -29,8 +29,8 @@ from dopepp.data.batch import collate
 from dopepp.data.sample import Sample, pad_sample, resize_sample
 from dopepp.drawing.curves import PlotLine, figure_image, lines_figure
 from dopepp.experiment.assembly.build_parts import build_parts
-from dopepp.experiment.assembly.build_sources import fitted_to_camera, held_out_source
-from dopepp.experiment.assembly.build_system import build_untrained, map_geometry
+from dopepp.experiment.assembly.build_sources import fit_to_camera, held_out_source
+from dopepp.experiment.assembly.build_system import build_untrained
 from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import VERSIONS_FILE, environment, write_config, write_json
@@ -97,7 +97,7 @@ class NetworkCost:
         """Return texts for tables, by heading."""
         (width, height), (columns, rows) = self.picture_size, self.input_size
         return {
-            "picture": f"{width}×{height}",
+            "image": f"{width}×{height}",
             "input": f"{columns}×{rows}",
             "CPU threads": str(self.threads),
             "backbone weights": f"{self.backbone_weights:,}",
@@ -138,14 +138,14 @@ def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
     torch.manual_seed(config.seed)
     has_gpu = torch.cuda.is_available() and config.trainer.accelerator != "cpu"
     parts = build_parts(config.data)
-    config = fitted_to_camera(config, parts)
+    config = fit_to_camera(config, parts)
     network, description = build_untrained(config, parts)
     parameters, gmacs = network_cost(network, description.input_size)
     source = held_out_source(config.data, parts, "test")
     # Images are prepared first so that frame times exclude reading and rendering.
     samples = [source.sample(index) for index in range(min(_NUM_IMAGES, len(source)))]
     estimator = SimulatedMapsEstimator(network, description, "cuda" if has_gpu else "cpu")
-    geometry = map_geometry(config.maps, network.stride)
+    geometry = MapGeometry(network.stride, config.maps.sigma, config.maps.field_radius)
     frames = time_frames(estimator, samples, geometry, config.cost.num_frames, config.seed)
     convolutions = [layer for layer in network.backbone.modules() if isinstance(layer, nn.Conv2d)]
     cost = NetworkCost(
@@ -198,11 +198,9 @@ def time_frames(
         network and ``recovery_seconds`` for the recovery.
     """
     generator = torch.Generator().manual_seed(seed)
-    rehearsed = [
-        (picture, likely_maps(picture, estimator, geometry, generator)) for picture in samples
-    ]
+    prepared = [(sample, likely_maps(sample, estimator, geometry, generator)) for sample in samples]
     rows = []
-    for sample, estimator.answer in islice(cycle(rehearsed), WARM_UP + num_frames):
+    for sample, estimator.answer in islice(cycle(prepared), WARM_UP + num_frames):
         began = time.perf_counter()
         estimator.predict(sample.image, sample.K, cropped=True)
         ended = time.perf_counter()
@@ -224,8 +222,8 @@ def likely_maps(
     rows, columns, _ = resize_and_pad(
         sample.image, letterbox, estimator.network.size_multiple
     ).shape
-    seen = pad_sample(resize_sample(sample, size), (columns, rows))
-    batch = collate([seen], {part.name: number for number, part in enumerate(estimator.parts)})
+    padded = pad_sample(resize_sample(sample, size), (columns, rows))
+    batch = collate([padded], {part.name: number for number, part in enumerate(estimator.parts)})
     true = draw_maps(batch, batch.keypoints, len(estimator.parts), geometry)
     belief, field = (
         (maps[0] + noise * torch.randn(maps[0].shape, generator=generator)).to(estimator.device)

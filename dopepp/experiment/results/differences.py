@@ -121,7 +121,7 @@ def _by_seed(entry: Entry) -> list[Report]:
     return [report for _, report in sorted(pairs, key=lambda pair: str(pair[0]))]
 
 
-def compared(entries: Sequence[Entry]) -> pd.DataFrame:
+def comparison_frame(entries: Sequence[Entry]) -> pd.DataFrame:
     """Build the frame of a comparison, averaged over seeds, ordered by method and object.
 
     The baseline is the first entry with a result (see :func:`_baseline_of`). The reference rows of
@@ -152,12 +152,10 @@ def _values(entries: Sequence[Entry]) -> Iterator[Value]:
 
 
 def _baseline_of(entry: Entry, entries: Sequence[Entry]) -> Entry | None:
-    """Return the baseline of an entry: the first result with the same kind of refinement.
-
-    The first refined entry is compared with the first entry, which has no baseline.
-    """
+    """Return the baseline of an entry: the first result with the same kind of refinement."""
     measured = [each for each in entries if each.reports]
     alike = [each for each in measured if each.refine == entry.refine]
+    # The first refined entry is compared with the first entry, which has no baseline.
     return next((each for each in (alike[0], measured[0]) if each is not entry), None)
 
 
@@ -172,7 +170,7 @@ def _cost_values(entry: Entry, name: str) -> Iterator[Value]:
             yield Value(entry.name, name, f"{prefix}{measure}", number)
 
 
-def headline(table: pd.DataFrame, symmetric: bool = False) -> list[Row]:
+def compact_table(table: pd.DataFrame, symmetric: bool = False) -> list[Row]:
     """Return the compact table, with ``value ± deviation`` and ``Δ [interval]`` as cells.
 
     Args:
@@ -189,7 +187,7 @@ def headline(table: pd.DataFrame, symmetric: bool = False) -> list[Row]:
     return pivot(values_of(table[table["measure"].isin(chosen)]), ("method", "object"), cells)
 
 
-def full(table: pd.DataFrame) -> list[Row]:
+def full_table(table: pd.DataFrame) -> list[Row]:
     """Return the full table, with one cell per measure, deviation, Δ, interval end and verdict."""
     several = _has_seeds(table)
 
@@ -228,7 +226,7 @@ def notes(entries: Sequence[Entry], table: pd.DataFrame) -> list[str]:
         sentences.append(radius_note(radii))
     networks = [entry for entry in measured if not entry.refine]
     if len(measured) > 1:
-        sentences += _baseline_notes(measured[0], networks[1:] or measured[1:], noise(table))
+        sentences += _baseline_notes(measured[0], networks[1:] or measured[1:], noise_notes(table))
     if len(measured) > len(networks) > 1:
         sentences.append(REFINED_NOTE)
     models = [run.config.get("model") for entry in entries for run in entry.runs]
@@ -242,13 +240,7 @@ def notes(entries: Sequence[Entry], table: pd.DataFrame) -> list[str]:
 def _baseline_notes(
     baseline: Entry, others: Sequence[Entry], doubts: Sequence[str]
 ) -> Iterator[str]:
-    """Yield sentences about the baseline, the intervals and the methods without Δ.
-
-    Args:
-        baseline: Baseline of Δ.
-        others: The other methods.
-        doubts: Sentences about differences that may be chance.
-    """
+    """Yield sentences about the baseline, the intervals (with ``doubts``) and methods without Δ."""
     alike = [entry for entry in others if comparable(entry, baseline)]
     if alike:
         yield _interval_note(baseline, alike)
@@ -256,10 +248,8 @@ def _baseline_notes(
     seeds = set(baseline.seeds)
     several = [entry for entry in alike if max(len(entry.seeds), len(seeds)) > 1]
     if unpaired := [entry.name for entry in several if set(entry.seeds) != seeds]:
-        reason = (
-            f"Not paired over seeds, because the seeds differ from the seeds of {baseline.name}"
-        )
-        yield f"{reason}: {', '.join(unpaired)}."
+        sentence = "Not paired over seeds, because the seeds differ from the seeds of"
+        yield f"{sentence} {baseline.name}: {', '.join(unpaired)}."
     if not baseline.test_set:
         sentence = f"Without Δ: the result of {baseline.name} does not identify its test images"
         yield f"{sentence}; measure again with evaluate.py."
@@ -285,7 +275,7 @@ def _interval_note(baseline: Entry, alike: Sequence[Entry]) -> str:
     return f"{sentence} and over the seeds of the trainings."
 
 
-def noise(table: pd.DataFrame) -> list[str]:
+def noise_notes(table: pd.DataFrame) -> list[str]:
     """Return sentences that list, by method and object, the differences that may be chance."""
     changes = table[table["num_differing"].notna()]
     several = changes["object"].nunique() > 1

@@ -1,7 +1,6 @@
 """Count false detections of estimators on images that show none of their parts.
 
-The user provides the images, taken with the camera of the test data or with another camera, whose
-file the user names.
+The user provides the images, and the camera file if the camera is not that of the test data.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ class FalseAlarms:
         best = next(iter(self.loudest.values()), None)
         return {
             "method": method,
-            "pictures": f"{self.num_pictures:,}",
+            "images": f"{self.num_pictures:,}",
             "detections per image": f"{self.per_picture:.3f}",
             "threshold": f"{self.threshold:.3g}",
             "highest score": NOT_AVAILABLE if best is None else f"{best:.3g}",
@@ -129,14 +128,11 @@ def count_false_alarms(
             num_reported += len(estimator.split(candidates)[0])
             loud += [(candidates[0].score, index)] if candidates else []
         loud.sort(key=lambda pair: (-pair[0], pair[1]))
-        samples = {score_index: frames.sample(score_index[1]) for score_index in loud[:NUM_LOUDEST]}
-        alarms[name] = FalseAlarms(
-            len(frames),
-            num_reported / len(frames),
-            estimator.min_score,
-            {sample.key: score for (score, _), sample in samples.items()},
-        )
-        tiles = [_tile(estimator, sample) for sample in samples.values()]
+        loudest = [(frames.sample(index), score) for score, index in loud[:NUM_LOUDEST]]
+        scores = {sample.key: score for sample, score in loudest}
+        rate = num_reported / len(frames)
+        alarms[name] = FalseAlarms(len(frames), rate, estimator.min_score, scores)
+        tiles = [_tile(estimator, sample) for sample, _ in loudest]
     return alarms, tiles
 
 

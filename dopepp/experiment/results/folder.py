@@ -154,10 +154,8 @@ def _git(*arguments: str) -> bytes | None:
 
 
 def _git_state() -> dict[str, Any] | None:
-    """Return the commit of the package and its uncommitted files, or None outside git.
-
-    A package installed inside another repository is outside git.
-    """
+    """Return the commit of the package and its uncommitted files, or None outside git."""
+    # A package that is installed inside another repository is outside git.
     is_part = _git("ls-files", "--error-unmatch", "__init__.py") is not None
     commit, status = _git("rev-parse", "HEAD"), _git("status", "--porcelain")
     if not is_part or commit is None or status is None:

@@ -80,7 +80,7 @@ class Method(Protocol):
         """Return the cost of the method, given the known times of all images in order."""
 
 
-def reported(method: Method, candidates: Sequence[ScoredPose]) -> list[ScoredPose]:
+def reported_candidates(method: Method, candidates: Sequence[ScoredPose]) -> list[ScoredPose]:
     """Return the candidates that a method reports."""
     return [candidate for candidate in candidates if candidate.score >= method.min_score]
 
@@ -135,13 +135,13 @@ class ViewsMethod(EstimatorMethod):
 
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
         """Run the estimator on all images and return the candidates of measured objects."""
-        pictures = [sample, *sample.others]
-        poses = [view.T_world_cam for view in pictures if view.T_world_cam is not None]
-        depths = [view.depth for view in pictures if view.depth is not None]
-        images, cameras = [view.image for view in pictures], [view.K for view in pictures]
+        views = [sample, *sample.others]
+        poses = [view.T_world_cam for view in views if view.T_world_cam is not None]
+        depths = [view.depth for view in views if view.depth is not None]
+        images, cameras = [view.image for view in views], [view.K for view in views]
         start = time.perf_counter()
         result = self.estimator.predict_views(
-            images, cameras, poses, depths if len(depths) == len(pictures) else None
+            images, cameras, poses, depths if len(depths) == len(views) else None
         )
         seconds = time.perf_counter() - start
         # Poses that the views contradict keep their scores, and are not reported.
@@ -266,9 +266,9 @@ class Measured:
 
     Attributes:
         reports: One report per method.
-        tiles: Images of the first images.
-        poses: Candidates of each method with their image and the seconds per image, or None if
-            unknown.
+        tiles: Drawings of the first images.
+        poses: Candidates of each method, each with its image and the seconds for this image, or
+            None if unknown.
         metrics: Accumulator of each method.
         silent: Indices of images with instances in which a method detected nothing.
         bop: BOP scores of each method, if requested and the images have targets.
@@ -292,8 +292,8 @@ def measure(
     """Run methods over the same images at their native size.
 
     AP, BOP scores and files of poses include all candidates; every other measure includes the
-    reported poses only. Images show the ground truth in green, predictions of the
-    last method in yellow and predictions of other methods in blue (paper Fig. 14).
+    reported poses only. The tiles show the ground truth in green, predictions of the last method in
+    yellow and predictions of other methods in blue (paper Fig. 14).
 
     Args:
         methods: Methods by name, the baseline first.
@@ -316,7 +316,7 @@ def measure(
         wireframes = [Wireframe(instance.keypoints, GREEN, "true") for instance in sample.instances]
         for number, (name, method) in enumerate(methods.items()):
             candidates, taken = method.detect(sample, image)
-            poses, truths = reported(method, candidates), sample.instances
+            poses, truths = reported_candidates(method, candidates), sample.instances
             seconds[name] += [] if taken is None else [taken]
             metrics[name].update(poses, truths, sample.K, sample.size[0])
             ranked[name].update(candidates, truths, sample.K, sample.size[0])

@@ -53,8 +53,8 @@ FILES: Final = {
     "coverage.png": "share of true poses inside their covariance region, over its level",
     "auc.png": "share of test instances below each error (numbers in `auc.csv`)",
     "val_overlay.png": "validation images of the last epoch",
-    "val_belief.png": "their belief maps: strongest corner and centroid",
-    "val_auc.png": "their errors (numbers in `val_auc.csv`)",
+    "val_belief.png": "belief maps of these images: strongest corner and centroid",
+    "val_auc.png": "errors on these images (numbers in `val_auc.csv`)",
     "shading.png": "pass rate of partly covered objects (`shading.csv`)",
     "scale.png": "pass rate at other camera distances (`scale.csv`)",
     "scale_examples.png": "the same scenes at every scale, drawn as in `overlay.png`",
@@ -144,11 +144,11 @@ class RunReadme:
 
     def _next_commands(self, state: str, report: Report | None) -> list[str]:
         """Return the commands that a user may want to run after this state."""
-        run = shlex.quote(program.shown(self._folder))
+        run = shlex.quote(program.relative_path(self._folder))
         checkpoint = {} if report is None else report.details
         best = self._folder / checkpoint.get("checkpoint", BEST_CHECKPOINT)
-        best = shlex.quote(program.shown(best))
-        train, evaluate = program.typed("train"), program.typed("evaluate")
+        best = shlex.quote(program.relative_path(best))
+        train, evaluate = program.entry_command("train"), program.entry_command("evaluate")
         lines = [f"{train} resume={run}  # continue"]
         if state == FINISHED:
             epochs = 2 * self._config.trainer.max_epochs

@@ -29,13 +29,8 @@ from dopepp.experiment.config.run_config import AUTO
 from dopepp.experiment.results import display
 from dopepp.experiment.results.compared_runs import Entry
 from dopepp.experiment.results.conditions import SHADING
-from dopepp.experiment.results.cost import (
-    COST_FILE,
-    FRAMES_FILE,
-    NOTE,
-    save_frame_rates,
-)
-from dopepp.experiment.results.differences import REFINED_NOTE, compared, noise
+from dopepp.experiment.results.cost import COST_FILE, FRAMES_FILE, NOTE, save_frame_rates
+from dopepp.experiment.results.differences import REFINED_NOTE, comparison_frame, noise_notes
 from dopepp.experiment.results.folder import read_json
 from dopepp.experiment.results.frame import (
     ADD_5CM,
@@ -209,17 +204,17 @@ def _starts_untrained(config: Mapping[str, Any]) -> bool:
     return backbone.get("_target_") == _UNTRAINED and backbone.get("weights_path") is None
 
 
-Laid = tuple[list[Row], list[str]]
+RowsAndNotes = tuple[list[Row], list[str]]
 """Rows of a table, and notes on their uncertainty."""
 
 
-def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
+def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> RowsAndNotes:
     """Return a row per object and method, with the paper's measures and stricter measures.
 
     The baseline of Δ is the first method with a result, or the first refined method for refined
     poses. The reference rows come last.
     """
-    table = compared([replace(entry, name=label) for label, entry in methods.items()])
+    table = comparison_frame([replace(entry, name=label) for label, entry in methods.items()])
     texts: dict[tuple[str, str], Row] = {}
     for value in values_of(table):
         texts.setdefault((value.method, value.object), {})[value.measure] = value.summary
@@ -251,17 +246,17 @@ def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
                 row = by_object[name]
                 cells = {value.measure: value.text for value in row_values(row)}
                 rows.append(_pose_row(layout, row.method, name, cells, {}))
-    return rows, noise(table)
+    return rows, noise_notes(table)
 
 
 def _pose_row(
     layout: PaperTable, method: str, name: str, texts: Row, printed: Mapping[str, float]
 ) -> Row:
-    """Return a table row with every measure, the paper's value for it, and Δ to the baseline.
+    """Return a table row with every measure, the paper's value for the measure, and Δ.
 
     Args:
         layout: Layout of the paper's table.
-        method: The method.
+        method: First cell of the row.
         name: Name of the object.
         texts: Text of each measure and Δ, by field.
         printed: Values that the paper prints, by key of the layout.
@@ -283,7 +278,7 @@ def _number(value: float | None) -> str:
     return "" if value is None else f"{value:,}"
 
 
-def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
+def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> RowsAndNotes:
     """Return the pass rates at every share with the paper's values and Δ, and plot their curves.
 
     Rates are means over seeds. Δ refers to the first method at the same share, or to the first
@@ -352,10 +347,7 @@ def _shading(label: str, entry: Entry, measures: Sequence[str]) -> pd.DataFrame:
 
 
 def _pooled(rates: pd.DataFrame) -> Iterator[Value]:
-    """Yield the mean rate over seeds of each method and share, with its 95 % Wilson interval.
-
-    The interval counts the instances of all seeds.
-    """
+    """Yield the mean rate of each method and share, with Wilson's interval over all seeds."""
     for (method, share), seeds in rates.groupby(["method", "share"], sort=False):
         rate = float(seeds["rate"].mean())
         low, high = interval(rate, int(seeds["num_instances"].sum()))
@@ -381,7 +373,7 @@ def _change(points: pd.Series[float]) -> str:
     return f"{mean:+.1f} [{mean - half:+.1f}, {mean + half:+.1f}]"
 
 
-def parameter_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
+def parameter_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> RowsAndNotes:
     """Return a row per network with its parameters and operations."""
 
     def row(label: str, cost: Mapping[str, Any]) -> Row:
@@ -395,7 +387,7 @@ def parameter_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Pat
     return _cost_rows(methods, row), []
 
 
-def time_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
+def time_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> RowsAndNotes:
     """Return a row per network with its times, then a row per other method of the paper.
 
     Plots of the frame rates are written to ``frame_rate.png`` in ``folder``.
@@ -438,7 +430,7 @@ def _failed(label: str, entry: Entry) -> str:
     return f"{label}: {entry.failure or 'not measured'}"
 
 
-KINDS: Final[Mapping[str, Callable[[PaperTable, Mapping[str, Entry], Path], Laid]]] = {
+KINDS: Final[Mapping[str, Callable[[PaperTable, Mapping[str, Entry], Path], RowsAndNotes]]] = {
     "poses": pose_rows,
     "shading": shading_rows,
     "parameters": parameter_rows,

@@ -15,8 +15,8 @@ from dopepp.core import extensions
 from dopepp.core.errors import UserError
 from dopepp.experiment import program
 from dopepp.experiment.assembly.build_parts import build_parts
-from dopepp.experiment.assembly.build_sources import share_in_words
-from dopepp.experiment.config.data_config import DataConfig, chosen_data, trained_on
+from dopepp.experiment.assembly.build_sources import note_on_shared_folder
+from dopepp.experiment.config.data_config import DataConfig, evaluation_data, stored_config
 from dopepp.experiment.config.run_config import EvaluationConfig, FalsePositiveTarget
 from dopepp.experiment.results import display
 from dopepp.experiment.results.false_alarms import frames_without_parts
@@ -136,8 +136,8 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     loaded = _load(options)
     checkpoint = loaded[-1].checkpoint if loaded else None
     measured = str(options.ckpt_path or options.baseline or options.results or TEMPLATES)
-    stored = None if checkpoint is None else trained_on(checkpoint.data)
-    data = chosen_data(options.data, options.virtual, stored, measured)
+    stored = None if checkpoint is None else stored_config(checkpoint.data)
+    data = evaluation_data(options.data, options.virtual, stored, measured)
     refines = "region" in (options.refine or ()) or options.templates is not None
     if data.views > 1 and not refines:
         problem, fix = f"data.views={data.views} without refine=region", "add refine=region"
@@ -146,13 +146,18 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     fingerprint = "" if checkpoint is None else checkpoint.data_fingerprint
     write_environment(run_dir, data.eval_seed, fingerprint)
     parts = parts_of(loaded, data)
-    share = share_in_words(data)
+    share = note_on_shared_folder(data)
     if share is not None:
         display.console.print(share)
     if checkpoint is not None:
         warn_of_other_images(checkpoint, data, parts)
     if options.tune:
-        _tune_only(options, loaded, parts, data, run_dir)
+        if not isinstance(loaded[0].network, PoseNetwork):
+            fix = "tune the checkpoint, then export the tuned checkpoint"
+            raise UserError(f"tune=true of {measured}, which is an export", "a checkpoint", fix)
+        estimator = refining(loaded[0], options.refine, parts)
+        tune_and_record(estimator, Path(measured), parts, data, run_dir, options)
+        display.show_files(run_dir)
         return []
     estimators, files = _methods(options, loaded, parts)
     without_parts = None
@@ -212,79 +217,61 @@ def _methods(
 
 
 def _check_combination(options: EvaluationConfig) -> None:
-    """Check for options that exclude or require each other.
-
-    Raises:
-        UserError: Two options exclude each other, or a required option is missing.
-    """
+    """Raise the error of the first combination of options that is impossible."""
     has_network = options.ckpt_path is not None or options.baseline is not None
-    if options.ckpt_path is None and options.results is None and options.templates is None:
-        fix = "add ckpt_path=FILE for a checkpoint, results=FILE for a file of poses, or "
-        fix += "templates=[0.3,0.5] for the meshes alone"
-        allowed = "one or more of ckpt_path=…, results=… and templates=…"
-        raise UserError("nothing to evaluate", allowed, fix)
-    if options.refine is not None and not has_network:
-        allowed = "refine=… together with ckpt_path=… (poses from a file are not refined)"
-        fix = "leave out refine, or add ckpt_path"
-        raise UserError(f"refine={options.refine} without ckpt_path", allowed, fix)
-    if options.scale_error is not None and options.refine is None and options.templates is None:
-        fix = "add refine=region, or leave out scale_error"
-        raise UserError(
-            f"scale_error={options.scale_error} without refine", "both options together", fix
-        )
-    if options.negatives_camera is not None and options.negatives is None:
-        fix = "add negatives=FOLDER, or leave out negatives_camera"
-        raise UserError(
+    uses_templates, both = options.templates is not None, "both options together"
+    further = options.protocols or options.negatives is not None or uses_templates
+    combinations: list[tuple[bool, str, str, str]] = [
+        (
+            options.ckpt_path is None and options.results is None and not uses_templates,
+            "nothing to evaluate",
+            "one or more of ckpt_path=…, results=… and templates=…",
+            "add ckpt_path=FILE for a checkpoint, results=FILE for a file of poses, or "
+            "templates=[0.3,0.5] for the meshes alone",
+        ),
+        (
+            options.refine is not None and not has_network,
+            f"refine={options.refine} without ckpt_path",
+            "refine=… together with ckpt_path=… (poses from a file are not refined)",
+            "leave out refine, or add ckpt_path",
+        ),
+        (
+            options.scale_error is not None and options.refine is None and not uses_templates,
+            f"scale_error={options.scale_error} without refine",
+            both,
+            "add refine=region, or leave out scale_error",
+        ),
+        (
+            options.negatives_camera is not None and options.negatives is None,
             f"negatives_camera={options.negatives_camera} without negatives",
-            "both options together",
-            fix,
-        )
-    if options.negatives is not None and not has_network and options.templates is None:
-        fix = "add ckpt_path, or leave out negatives (a file has no poses on these images)"
-        raise UserError(
-            f"negatives={options.negatives} without ckpt_path", "both options together", fix
-        )
-    if options.tune and (options.protocols or options.negatives is not None or options.templates):
-        problem = "tune=true with shading, scale, by, negatives or templates"
-        fix = "tune first, then evaluate"
-        raise UserError(problem, "tune=true without these options", fix)
-
-
-def _tune_only(
-    options: EvaluationConfig,
-    loaded: Sequence[PoseEstimator],
-    parts: Parts,
-    data: DataConfig,
-    run_dir: Path,
-) -> None:
-    """Tune the checkpoint; measure nothing else.
-
-    Args:
-        options: Options of the evaluation.
-        loaded: Estimators of the checkpoints.
-        parts: Parts to tune on.
-        data: Images to tune on.
-        run_dir: Folder of the results.
-
-    Raises:
-        UserError: Other options are given, or there is not exactly one checkpoint.
-    """
-    if options.protocols:
-        raise UserError(
-            "tune=true with shading, scale or by",
+            both,
+            "add negatives=FOLDER, or leave out negatives_camera",
+        ),
+        (
+            options.negatives is not None and not has_network and not uses_templates,
+            f"negatives={options.negatives} without ckpt_path",
+            both,
+            "add ckpt_path, or leave out negatives (a file has no poses on these images)",
+        ),
+        (
+            options.tune and bool(further),
+            "tune=true with shading, scale, by, negatives or templates",
             "tune=true without these options",
             "tune first, then evaluate the tuned checkpoint with these options",
-        )
-    if options.ckpt_path is None or len(loaded) > 1:
-        is_missing = options.ckpt_path is None
-        problem = f"tune=true {'without ckpt_path' if is_missing else 'with a baseline'}"
-        fix = "add ckpt_path=FILE" if is_missing else "leave out baseline"
-        raise UserError(problem, "one ckpt_path, and no baseline", fix)
-    if not isinstance(loaded[0].network, PoseNetwork):
-        fix = "tune the checkpoint, then export the tuned checkpoint"
-        raise UserError(
-            f"tune=true of {options.ckpt_path}, which is an export", "a checkpoint", fix
-        )
-    estimator = refining(loaded[0], options.refine, parts)
-    tune_and_record(estimator, Path(options.ckpt_path), parts, data, run_dir, options)
-    display.show_files(run_dir)
+        ),
+        (
+            options.tune and options.ckpt_path is None,
+            "tune=true without ckpt_path",
+            "one ckpt_path, and no baseline",
+            "add ckpt_path=FILE",
+        ),
+        (
+            options.tune and options.baseline is not None,
+            "tune=true with a baseline",
+            "one ckpt_path, and no baseline",
+            "leave out baseline",
+        ),
+    ]
+    for is_impossible, problem, allowed, fix in combinations:
+        if is_impossible:
+            raise UserError(problem, allowed, fix)

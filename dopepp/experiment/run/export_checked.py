@@ -16,8 +16,8 @@ from dopepp.core.errors import RunError, UserError
 from dopepp.core.files import draft
 from dopepp.data.sample import Sample, SampleSource
 from dopepp.experiment.assembly.renders import validation_renders
-from dopepp.experiment.config.data_config import trained_on
-from dopepp.experiment.program import typed
+from dopepp.experiment.config.data_config import stored_config
+from dopepp.experiment.program import entry_command
 from dopepp.experiment.results.measurement import EstimatorMethod, measure
 from dopepp.inference import runtimes
 from dopepp.inference.benchmark import ExportAgreement, compare_export
@@ -34,7 +34,7 @@ NUM_IMAGES: Final = 100  # scenes to calibrate on, and further scenes to measure
 
 
 @dataclass(frozen=True)
-class Exported:
+class ExportResult:
     """Path of an export, its description, its agreement with the checkpoint and next commands."""
 
     path: Path
@@ -49,7 +49,7 @@ def export(
     precision: str = "fp32",
     out: Path | None = None,
     num_images: int = NUM_IMAGES,
-) -> Exported:
+) -> ExportResult:
     """Write the network of a checkpoint as one file (OpenVINO: a folder).
 
     Args:
@@ -64,7 +64,7 @@ def export(
         UserError: The checkpoint, an option or the path is wrong, or an extra is missing.
         RunError: The export disagrees with the checkpoint; nothing was written.
     """
-    target = _target(path, layout, precision, out)
+    target = _output_path(path, layout, precision, out)
     if runtimes.is_export(path):
         fix = "pass the original checkpoint"
         raise UserError(f"{path}, which is an export", "a checkpoint", fix)
@@ -77,10 +77,10 @@ def export(
     if precision == "int8":
         _log.info("rendering %d validation scenes to calibrate on", num_images)
         for index in range(num_images, 2 * num_images):
-            images += _seen(original, source.sample(index))
+            images += _network_inputs(original, source.sample(index))
     save = EXPORTERS[layout][0](network, precision, images)
     described = Export(layout, precision, network.size_multiple, *cost)
-    with _written(target) as draft_path:
+    with _draft_output(target) as draft_path:
         save(draft_path, checkpoint, described)
         if precision == "int8":
             described = replace(
@@ -89,20 +89,16 @@ def export(
                 add_01d=_accuracy(original, PoseEstimator.load(draft_path), source, num_images),
             )
             save(draft_path, checkpoint, described)
-        pictures = [(sample.image, sample.K) for sample in map(source.sample, range(NUM_CHECKED))]
-        agreement = compare_export(PoseEstimator.load(draft_path), original, pictures)
+        checked = [(sample.image, sample.K) for sample in map(source.sample, range(NUM_CHECKED))]
+        agreement = compare_export(PoseEstimator.load(draft_path), original, checked)
         if not (agreement.is_exact if precision == "fp32" else np.isfinite(agreement.maps)):
             raise RunError(f"{target} was not written: it differs from {path}: {agreement}")
-    return Exported(target, described, agreement, _commands(target, checkpoint))
+    return ExportResult(target, described, agreement, _commands(target, checkpoint))
 
 
 @contextmanager
-def _written(target: Path) -> Iterator[Path]:
-    """Yield a temporary path, which is moved to the target at the end.
-
-    Raises:
-        RunError: The target cannot be written.
-    """
+def _draft_output(target: Path) -> Iterator[Path]:
+    """Yield a temporary path, which is moved to the target at the end."""
     try:
         with draft(target) as draft_path:
             yield draft_path
@@ -111,12 +107,8 @@ def _written(target: Path) -> Iterator[Path]:
         raise RunError(f"cannot write {target}: {error.strerror}; {fix}") from error
 
 
-def _target(path: Path, layout: str, precision: str, out: Path | None) -> Path:
-    """Return the path of the export.
-
-    Raises:
-        UserError: An option or the path is wrong.
-    """
+def _output_path(path: Path, layout: str, precision: str, out: Path | None) -> Path:
+    """Check the options and return the path of the export."""
     choices = {"format": (layout, EXPORTERS), "precision": (precision, PRECISIONS)}
     for name, (value, allowed) in choices.items():
         if value not in allowed:
@@ -142,7 +134,7 @@ def _target(path: Path, layout: str, precision: str, out: Path | None) -> Path:
     return out
 
 
-def _seen(estimator: PoseEstimator, sample: Sample) -> list[Pixels]:
+def _network_inputs(estimator: PoseEstimator, sample: Sample) -> list[Pixels]:
     """Return an image at the input sizes of the network."""
     views = estimator.views(sample.image, sample.K)
     return [np.ascontiguousarray(view.pixels.transpose(2, 0, 1)[None]) for view in views]
@@ -162,16 +154,13 @@ def _accuracy(
 
 
 def _commands(path: Path, checkpoint: Checkpoint) -> tuple[str, str]:
-    """Return the commands that predict with an export and evaluate it.
-
-    An export contains no folders of this machine, so the second command states them if needed.
-    """
-    config = trained_on(checkpoint.data) or {}
+    """Return the commands that predict with an export and evaluate the export."""
+    config = stored_config(checkpoint.data) or {}
     words = [f"ckpt_path={path}"]
-    if config.get("root"):
+    if config.get("root"):  # an export contains no folders of this machine
         words.append(f"data.root={config['root']}")
     parts = [str(part) for part in config.get("parts") or ()]
     if not config.get("root") and any(Path(part).suffix for part in parts):
         words.append(f"data.parts=[{','.join(parts)}]")
     predict = f"dopepp predict {shlex.quote(str(path))} IMAGE --K FX FY CX CY"
-    return predict, " ".join([typed("evaluate"), *map(shlex.quote, words)])
+    return predict, " ".join([entry_command("evaluate"), *map(shlex.quote, words)])

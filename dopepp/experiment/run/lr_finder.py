@@ -24,7 +24,7 @@ from dopepp.core.files import write_csv, write_png
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.drawing.curves import figure_image, figure_with_axes
 from dopepp.experiment.assembly.build_parts import build_parts
-from dopepp.experiment.assembly.build_sources import build_datamodule, fitted_to_camera
+from dopepp.experiment.assembly.build_sources import build_datamodule, fit_to_camera
 from dopepp.experiment.assembly.build_system import build_system, build_trainer
 from dopepp.experiment.config.run_config import LearningRateConfig, RunConfig
 from dopepp.experiment.results import display
@@ -81,7 +81,7 @@ def find_learning_rate(config: RunConfig, run_dir: Path) -> Suggestion | None:
         )
     seed_everything(config.seed, verbose=False)
     parts = build_parts(config.data)
-    config = fitted_to_camera(config, parts)
+    config = fit_to_camera(config, parts)
     datamodule = build_datamodule(config.data, parts, config.seed)
     datamodule.check_objects()
     short = _short_training(config)

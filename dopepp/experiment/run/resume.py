@@ -28,8 +28,8 @@ from dopepp.core.files import write_file
 from dopepp.core.yaml import read_yaml
 from dopepp.data.sample import DescribedSource, Sample
 from dopepp.experiment.assembly.build_sources import held_out_source
-from dopepp.experiment.config.data_config import DataConfig, chosen_data, trained_on
-from dopepp.experiment.config.run_config import RunConfig, below, flat
+from dopepp.experiment.config.data_config import DataConfig, evaluation_data, stored_config
+from dopepp.experiment.config.run_config import RunConfig, flatten, is_below
 from dopepp.experiment.results.folder import (
     BEST_CHECKPOINT,
     CONFIG_FILE,
@@ -100,7 +100,7 @@ def check_resume(
     differences = config_differences(before, config.plain)
     state = [change for change in differences if change.key == _OPTIMIZER]
     if saved.spec != payload["spec"] or state:
-        network = [change for change in differences if below(change.key, _NETWORK)]
+        network = [change for change in differences if is_below(change.key, _NETWORK)]
         raise UserError(
             f"resume={run}, whose network differs from the chosen one ({_listed(network + state)})"
             if not state
@@ -109,8 +109,8 @@ def check_resume(
             "restore these options, or start a new run with "
             f"init_from={run / BEST_CHECKPOINT} if the network is the same",
         )
-    learnt = [change for change in differences if below(change.key, LEARNT_FROM)]
-    learnt = [change for change in learnt if not below(change.key, _NOT_LEARNT_FROM)]
+    learnt = [change for change in differences if is_below(change.key, LEARNT_FROM)]
+    learnt = [change for change in learnt if not is_below(change.key, _NOT_LEARNT_FROM)]
     if not learnt:  # changed options already explain changed images
         learnt = image_differences(saved.data.get("images"), payload["data"].get("images"))
     if learnt and not config.resume_anyway:
@@ -124,11 +124,11 @@ def check_resume(
 
 def config_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[ConfigDifference]:
     """Return the options in which two configs differ, except options of a single call."""
-    before, after = dict(flat(old)), dict(flat(new))
+    before, after = dict(flatten(old)), dict(flatten(new))
     return [
         ConfigDifference(key, (str(before.get(key, _ABSENT)), str(after.get(key, _ABSENT))))
         for key in {**before, **after}
-        if before.get(key) != after.get(key) and not below(key, _THIS_CALL)
+        if before.get(key) != after.get(key) and not is_below(key, _THIS_CALL)
     ]
 
 
@@ -234,7 +234,7 @@ def differing_images(stored: Mapping[str, Any], present: Mapping[str, Any]) -> l
     A new version may add fields to a preset and describe it in other words, so that the first image
     shows whether a preset has changed.
     """
-    old, new = dict(flat(stored["sources"])), dict(flat(present["sources"]))
+    old, new = dict(flatten(stored["sources"])), dict(flatten(present["sources"]))
     presets = {f"{source}.preset" for source in present["sources"]}
     lines = [
         f"{key}: {_shown(old.get(key))} → {_shown(new.get(key))}"
@@ -294,11 +294,11 @@ def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Parts)
     others = [a.name for a, b in pairs if a.mesh_hash and b.mesh_hash and not a.has_shape_of(b)]
     if others:
         _log.warning("the checkpoint was trained on another shape of %s", ", ".join(others))
-    stored, config = checkpoint.data.get("images"), trained_on(checkpoint.data)
+    stored, config = checkpoint.data.get("images"), stored_config(checkpoint.data)
     if not isinstance(stored, dict) or config is None:
         return  # the checkpoint was not written by train.py
     try:
-        trained_data = chosen_data(None, None, config, "the checkpoint")
+        trained_data = evaluation_data(None, None, config, "the checkpoint")
     except UserError:
         return  # the data config of the checkpoint cannot be read
     if _test_set(trained_data) != _test_set(data):

@@ -38,7 +38,7 @@ _UNSAID: Final = ("experiment=", "scale=", "logger", "model=", "data=", "resume"
 
 
 @contextmanager
-def tracked(config: RunConfig, run_dir: Path) -> Iterator[list[GuardedLogger]]:
+def open_trackers(config: RunConfig, run_dir: Path) -> Iterator[list[GuardedLogger]]:
     """Yield the trackers of a training and close them when the training ends."""
     chosen = [override for override in overrides_of(run_dir) if not override.startswith(_UNSAID)]
     name = " ".join([config.model.name, config.data.name, *chosen])

@@ -24,7 +24,7 @@ from dopepp.core.errors import Interruption, RunError, UserError
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment import program
 from dopepp.experiment.assembly.build_parts import build_parts
-from dopepp.experiment.assembly.build_sources import build_datamodule, fitted_to_camera
+from dopepp.experiment.assembly.build_sources import build_datamodule, fit_to_camera
 from dopepp.experiment.assembly.build_system import (
     build_system,
     build_trainer,
@@ -55,7 +55,7 @@ from dopepp.experiment.run.resume import (
     describe_images,
     remember_overrides,
 )
-from dopepp.experiment.run.tracking import log_report, tracked
+from dopepp.experiment.run.tracking import log_report, open_trackers
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.refinement.refiner import refine_terms
 from dopepp.parts.part import Parts
@@ -87,11 +87,7 @@ def do_job(config: Mapping[str, Any], run_dir: Path) -> object:
 
 
 def _refuse_parallel_multirun(trainer: TrainerConfig) -> None:
-    """Check that a multirun uses one process, because each process would start the sweep again.
-
-    Raises:
-        UserError: The multirun would use several processes.
-    """
+    """Check that a multirun uses one process, because each process would start the sweep again."""
     if not HydraConfig.initialized() or HydraConfig.get().mode != RunMode.MULTIRUN:
         return
     if trainer.num_processes > 1:
@@ -111,29 +107,29 @@ def run_training(config: RunConfig, run_dir: Path) -> Report:
         PrunedError: A search stopped the training.
         Interruption: A signal ended the training; the message names the last checkpoint.
     """
-    explanation = pages.RunReadme(config, run_dir)
+    readme = pages.RunReadme(config, run_dir)
     try:
-        with tracked(config, run_dir) as trackers:
-            report = _train(config, run_dir, explanation, trackers)
+        with open_trackers(config, run_dir) as trackers:
+            report = _train(config, run_dir, readme, trackers)
     except KeyboardInterrupt as interrupt:
         number = getattr(interrupt, "number", signal.SIGINT)
         advice = _advice(run_dir)
-        explanation.end(pages.INTERRUPTED, advice)
+        readme.end(pages.INTERRUPTED, advice)
         raise Interruption(number, advice) from interrupt
     except PrunedError as pruned:
-        explanation.end(pages.PRUNED, str(pruned))
+        readme.end(pages.PRUNED, str(pruned))
         raise
     except Exception as error:
-        explanation.end(pages.FAILED, " ".join(str(error).split()) or repr(error))
+        readme.end(pages.FAILED, " ".join(str(error).split()) or repr(error))
         raise
-    explanation.end(pages.FINISHED, report=report)
+    readme.end(pages.FINISHED, report=report)
     return report
 
 
 def _train(
     config: RunConfig,
     run_dir: Path,
-    explanation: pages.RunReadme,
+    readme: pages.RunReadme,
     trackers: Sequence[GuardedLogger],
 ) -> Report:
     """Train and measure the best checkpoint; see :func:`run_training`."""
@@ -148,7 +144,7 @@ def _train(
     # Only the first process reports.
     display.console.quiet = not is_first_process()
     parts = build_parts(config.data)
-    config = fitted_to_camera(config, parts)
+    config = fit_to_camera(config, parts)
     if config.tune:
         held_out_photos(config.data, "val")  # reports too few photos before the training
     datamodule = build_datamodule(config.data, parts, config.seed)
@@ -173,7 +169,7 @@ def _train(
         write_environment(run_dir, config.seed, fingerprint, [str(change) for change in changes])
         if config.resume is not None:
             remember_overrides(run_dir)
-        explanation.begin()
+        readme.begin()
         for tracker in trackers:
             tracker.log_hyperparams(dict(config.plain))
     display.show_sources(datamodule.summary())
@@ -194,11 +190,7 @@ def _train(
 
 
 def _progress(config: RunConfig, datamodule: PoseDataModule) -> list[Callback]:
-    """Return the measurement of refined poses during the training, if poses are refined.
-
-    Raises:
-        UserError: ``stop_at`` is set without ``refine=region``, which verifies the poses.
-    """
+    """Return the measurement of refined poses during the training, if poses are refined."""
     if "region" in (terms := refine_terms(config.refine)):
         return [RefinedProgress(datamodule.val_images, terms, config.stop_at)]
     if config.stop_at is not None:
@@ -254,7 +246,7 @@ def _announce_duration(
     seconds = estimate_training_s(system.network, datamodule, options, str(trainer.precision))
     hours = seconds / 3600
     duration = f"{hours:,.1f} hours" if hours >= 1 else f"{max(1, round(seconds / 60))} min"
-    quick = f"; for a first result in minutes: {program.typed('train')} {QUICKSTART}"
+    quick = f"; for a first result in minutes: {program.entry_command('train')} {QUICKSTART}"
     advice = quick if hours >= 1 else ""
     display.console.print(f"no accelerator: about {duration} to finish{advice}")
 

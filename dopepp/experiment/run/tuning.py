@@ -91,7 +91,7 @@ Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
-class Scored:
+class ScoredDetections:
     """Detections on a set of images."""
 
     features: Float[np.ndarray, "n features"]  # features of the score
@@ -191,20 +191,20 @@ def _chosen_factors(
     empty: SampleSource,
     rate: float,
     old: RecoveryOptions,
-) -> tuple[RecoveryOptions, Scored, str]:
+) -> tuple[RecoveryOptions, ScoredDetections, str]:
     """Fit the factors of network poses, and keep the old factors if they give better poses.
 
     The average precision of the estimator's final poses decides, because a wrong covariance of the
     network's poses misleads the refinement. The score of network poses is fitted for both.
 
     Returns:
-        Options, their detections on the validation images, and why the old factors were kept (an
-        empty string if they were replaced).
+        Options, the detections with these options on the validation images, and why the old factors
+        were kept (an empty string if the factors were replaced).
     """
     plain = _without_refinement(estimator)
     plain.recovery = replace(_without_thresholds(old), distance_factor=1.0, covariance_factor=1.0)
     factors = fit_factors(matched_poses(plain, parts, validation))
-    results: list[tuple[RecoveryOptions, Scored, float]] = []
+    results: list[tuple[RecoveryOptions, ScoredDetections, float]] = []
     for base in (replace(old, **factors), old):  # type: ignore[arg-type]
         plain.recovery = _without_thresholds(base)
         with_objects, without = (
@@ -324,8 +324,8 @@ def squared_distances(
 
 
 def choose(
-    shown: Scored,
-    empty: Scored,
+    shown: ScoredDetections,
+    empty: ScoredDetections,
     false_positive_rate: float = FalsePositiveTarget.false_positive_rate,
     *,
     refined: bool = False,
@@ -378,18 +378,13 @@ def choose(
 
 
 def _refined_threshold(
-    silent: float, shown: Scored, weights: Float[np.ndarray, "features"]
+    silent: float, shown: ScoredDetections, weights: Float[np.ndarray, "features"]
 ) -> float:
     """Return the threshold of refined poses.
 
     The threshold for the rate of false positives (``silent``) applies if it rejects at most the
     share :data:`MAX_LOST` of the correct poses, because otherwise a single frame with a high score
     could cost most poses. The threshold is at least :data:`MIN_REFINED_SCORE`.
-
-    Args:
-        silent: Threshold that satisfies the rate of false positives.
-        shown: Features of the poses on images with the objects, and which poses are correct.
-        weights: Weights of the features in the score.
     """
     correct = score(shown.features, weights)[shown.correct]
     most = float(np.quantile(correct, MAX_LOST)) if len(correct) else 1.0
@@ -404,7 +399,9 @@ def _refined_threshold(
     return max(min(silent, most), MIN_REFINED_SCORE)
 
 
-def score_images(estimator: PoseEstimator, parts: Parts, *sources: SampleSource) -> Scored:
+def score_images(
+    estimator: PoseEstimator, parts: Parts, *sources: SampleSource
+) -> ScoredDetections:
     """Run an estimator on all images of sources, and judge every detection."""
     refined = estimator.refiner is not None and estimator.refiner.verifies
     names = REFINED_FEATURES if refined else FEATURES
@@ -421,7 +418,7 @@ def score_images(estimator: PoseEstimator, parts: Parts, *sources: SampleSource)
                 features = detection_features(detection, part.cuboid, sample.K)
             rows.append((features, detection.score, bool(is_right), number))
     table, scores, correct, images = zip(*rows, strict=True) if rows else ((), (), (), ())
-    return Scored(
+    return ScoredDetections(
         np.reshape(table, (-1, len(names))),
         np.array(scores, np.float64),
         np.array(correct, bool),
@@ -484,10 +481,8 @@ def write_tuned(checkpoint: Checkpoint, path: Path, options: Mapping[str, float]
 def _judge(
     part: Part, detections: Sequence[Detection], true: Sequence[Instance]
 ) -> tuple[Bool[np.ndarray, "found"], Bool[np.ndarray, "found"]]:
-    """Return which detections are correct (ADD(-S) below 0.1 d), and which count.
-
-    As in every evaluation, detections of heavily occluded instances do not count.
-    """
+    """Return which detections are correct (ADD(-S) below 0.1 d), and which count."""
+    # As in every evaluation, detections of heavily occluded instances do not count.
     numbers = assign(part, detections, true)
     counts = np.array([number < 0 or is_evaluated(true[number]) for number in numbers], bool)
     matched = np.flatnonzero(counts & (numbers >= 0)).tolist()
@@ -502,14 +497,8 @@ def _judge(
     return right, counts
 
 
-def _quality(test: Scored, empty: Scored, threshold: float) -> DetectionQuality:
-    """Measure the quality of detections on test images.
-
-    Args:
-        test: Detections on images of the parts.
-        empty: Detections on images without the parts.
-        threshold: Lowest score of a reported detection.
-    """
+def _quality(test: ScoredDetections, empty: ScoredDetections, threshold: float) -> DetectionQuality:
+    """Measure the quality of detections on test images with and without (``empty``) the parts."""
     scores, correct = torch.from_numpy(test.scores), torch.from_numpy(test.correct)
     error = expected_calibration_error(scores, correct)
     loud = empty.best_scores(np.where(empty.scores >= threshold, 1.0, 0.0))

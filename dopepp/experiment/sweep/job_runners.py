@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -51,12 +51,7 @@ class Jobs:
     context: HydraContext
     config: DictConfig
     task: TaskFunction
-    state: dict[Any, Any]
-
-    @classmethod
-    def of(cls, context: HydraContext, config: DictConfig, task: TaskFunction) -> Jobs:
-        """Collect the data in the launching process."""
-        return cls(context, config, task, Singleton.get_state())
+    state: dict[Any, Any] = field(default_factory=Singleton.get_state)  # of the launching process
 
     @property
     def folder(self) -> Path:

@@ -29,6 +29,7 @@ from dopepp.experiment import program
 
 # Hydra creates its hooks before any job, even in a single run, so slow imports are in functions.
 
+_log = logging.getLogger(__name__)
 
 LOG_FILE: Final = "job.log"
 _OWN_PROCESS: Final = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
@@ -41,9 +42,9 @@ class AnnounceJobs(Callback):
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Print the folder of the multirun and the log file of remote jobs."""
         folder = config.hydra.sweep.dir
-        program.say(f"begins in {folder}")
+        program.print_line(f"begins in {folder}")
         if is_remote(config.hydra):
-            program.say(f"each job prints to {folder}/JOB/{LOG_FILE}")
+            program.print_line(f"each job prints to {folder}/JOB/{LOG_FILE}")
 
 
 class CompareJobs(Callback):
@@ -153,9 +154,6 @@ def can_resume(config: Mapping[str, Any], run_dir: Path) -> bool:
         return False
     before = read_yaml(stored)
     return isinstance(before, dict) and not config_differences(before, config)
-
-
-_log = logging.getLogger(__name__)
 
 
 def job_id() -> str | None:

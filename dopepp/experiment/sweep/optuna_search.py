@@ -35,7 +35,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from dopepp.core.errors import UserError
 from dopepp.core.validation import Range, check
-from dopepp.experiment.config.run_config import below, flat
+from dopepp.experiment.config.run_config import flatten, is_below
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import (
     FAILURE_FILE,
@@ -94,9 +94,9 @@ def search(
     folder = Path(str(config.hydra.sweep.dir))
     plain = OmegaConf.to_container(config, resolve=False)
     # All options that affect the result of a trial, and the search space.
-    facts = {key: str(value) for key, value in flat(plain) if not below(key, _NO_PART)}
+    facts = {key: str(value) for key, value in flatten(plain) if not is_below(key, _NO_PART)}
     facts |= {f"search.space {key}": text for key, text in space.texts.items()}
-    with alone(folder, str(options["study"])):
+    with exclusive_search(folder, str(options["study"])):
         study = open_study(options, facts, int(config.seed))
         trials = _Trials(study, space, launcher, folder)
         OmegaConf.save(config, folder / "multirun.yaml")
@@ -175,7 +175,7 @@ def _report(study: optuna.Study, options: Mapping[str, Any]) -> None:
     display.console.print(f"study {study.study_name}: {counts}; {options['storage']}")
     if states[TrialState.COMPLETE.name.lower()]:
         best = study.best_trial
-        options_of = " ".join(chosen(best.params))
+        options_of = " ".join(search_overrides(best.params))
         display.console.print(f"best trial {best.number}, objective {best.value:.4f}: {options_of}")
 
 
@@ -258,10 +258,10 @@ def _ends(distribution: Any) -> list[object]:
 
 def overrides(space: Space, params: dict[str, object]) -> list[str]:
     """Return the overrides of a trial."""
-    return [*space.fixed, *chosen(params)]
+    return [*space.fixed, *search_overrides(params)]
 
 
-def chosen(params: dict[str, object]) -> list[str]:
+def search_overrides(params: dict[str, object]) -> list[str]:
     """Return the varied options as overrides, with four significant digits."""
     return [
         f"{key}={value:.4g}" if isinstance(value, float) else f"{key}={value}"
@@ -270,7 +270,7 @@ def chosen(params: dict[str, object]) -> list[str]:
 
 
 @contextmanager
-def alone(folder: Path, study: str) -> Iterator[None]:
+def exclusive_search(folder: Path, study: str) -> Iterator[None]:
     """Lock a folder against a second search; the lock ends with the process.
 
     Raises:
@@ -322,16 +322,7 @@ def open_study(options: Mapping[str, Any], facts: Mapping[str, str], seed: int) 
 
 
 def _check_same(stored: Mapping[str, str], now: Mapping[str, str], study: str) -> None:
-    """Check that the trials of a study can be compared.
-
-    Args:
-        stored: Fixed options of the study's first command.
-        now: Fixed options of this command.
-        study: Name of the study.
-
-    Raises:
-        UserError: The configurations differ in more than the searched options.
-    """
+    """Check that this command has the fixed options of the study's first command (``stored``)."""
     keys = sorted(key for key in {*stored, *now} if stored.get(key) != now.get(key))
     if not keys:
         return

@@ -17,7 +17,7 @@ from dopepp.data.rendered import RenderedSource
 from dopepp.experiment.assembly.build_parts import build_negatives, build_parts
 from dopepp.experiment.assembly.build_sources import (
     build_datamodule,
-    fitted_to_camera,
+    fit_to_camera,
     held_out_source,
 )
 from dopepp.experiment.assembly.renders import validation_renders
@@ -66,7 +66,7 @@ def test_renders_are_as_the_pictures_camera_sees_the_models(config, caplog):
     caplog.set_level("INFO")
     given = config("virtual.preset=upright")
     parts = build_parts(given.data)
-    chosen = fitted_to_camera(given, parts)
+    chosen = fit_to_camera(given, parts)
     assert vars(chosen.data.virtual.camera) == {
         "width": 96, "height": 64, "fx": 210.0, "fy": 211.0, "cx": 47.0, "cy": 30.0
     }  # fmt: skip
@@ -80,7 +80,7 @@ def test_renders_are_as_the_pictures_camera_sees_the_models(config, caplog):
     assert isinstance(module.test_source, BopReader)
     assert module.test_source.sample(0).K[0, 0] == 210.0
     said = config("virtual.working_distance=[0.4,0.7]")
-    assert fitted_to_camera(said, parts).data.virtual.working_distance == (0.4, 0.7)
+    assert fit_to_camera(said, parts).data.virtual.working_distance == (0.4, 0.7)
 
 
 def test_pictures_without_annotation_have_a_camera_all_the_same(config, root, tmp_path):
@@ -90,16 +90,16 @@ def test_pictures_without_annotation_have_a_camera_all_the_same(config, root, tm
     given = config(f"data.root={private}", "virtual.preset=upright")
     parts = build_parts(given.data)
     with pytest.raises(UserError, match=r"no annotated object in bop/test.*working_distance="):
-        fitted_to_camera(given, parts)
+        fit_to_camera(given, parts)
     said = config(f"data.root={private}", "virtual.working_distance=[0.4,0.7]")
-    virtual = fitted_to_camera(said, parts).data.virtual
+    virtual = fit_to_camera(said, parts).data.virtual
     assert (virtual.camera.fx, virtual.working_distance) == (210.0, (0.4, 0.7))
 
 
 def test_models_that_are_not_learned_are_shown_all_the_same(config):
     given = config("virtual.preset=upright", "data.objects=[red]")
     parts = build_parts(given.data)
-    factory = held_out_source(fitted_to_camera(given, parts).data, parts, "val").factory
+    factory = held_out_source(fit_to_camera(given, parts).data, parts, "val").factory
     assert [part.name for part in factory.parts] == ["red"]
     assert factory.negatives[0].name == "blue"
     assert build_negatives(given.data, parts)[0] is factory.negatives[0]  # read once
@@ -108,7 +108,7 @@ def test_models_that_are_not_learned_are_shown_all_the_same(config):
 def test_a_checkpoint_renders_its_own_parts_where_its_data_set_is_not(config, tmp_path):
     given = config("data.objects=[red]")
     parts = build_parts(given.data)
-    stored = fitted_to_camera(given, parts).stored_data()
+    stored = fit_to_camera(given, parts).stored_data()
     elsewhere = {**stored, "root": str(tmp_path / "elsewhere")}
     checkpoint = Checkpoint({}, {}, parts, (64, 64), 8, 1.0, data={"config": elsewhere})
     source = validation_renders(checkpoint, tmp_path / "best.ckpt", 3)
@@ -127,7 +127,7 @@ def test_a_model_of_the_same_mesh_is_no_other_part(config, root, tmp_path):
     (models / "models_info.json").write_text(json.dumps(info))
     given = config(f"data.root={copy}", "virtual.preset=upright", "data.objects=[red]")
     parts = build_parts(given.data)
-    factory = held_out_source(fitted_to_camera(given, parts).data, parts, "val").factory
+    factory = held_out_source(fit_to_camera(given, parts).data, parts, "val").factory
     assert "twin" not in [part.name for part in factory.negatives]
     assert factory.negatives[0].name == "blue"
 
@@ -138,7 +138,7 @@ def test_real_frames_among_renders_are_windows_of_the_same_scale(config, root):
         "virtual.camera_scale=0.9",
     )  # fmt: skip
     parts = build_parts(given.data)
-    data = fitted_to_camera(given, parts).data
+    data = fit_to_camera(given, parts).data
     width, height = data.network_input
     module = build_datamodule(data, parts, 0)
     samples = [module.train_item(0, index) for index in range(8)]

@@ -11,10 +11,10 @@ from dopepp.core.errors import UserError
 from dopepp.experiment.assembly.build_parts import build_parts
 from dopepp.experiment.assembly.build_sources import (
     build_datamodule,
-    fitted_to_camera,
+    fit_to_camera,
     held_out_source,
 )
-from dopepp.experiment.config.data_config import chosen_data
+from dopepp.experiment.config.data_config import evaluation_data
 from dopepp.experiment.run.train import template_commands
 from dopepp.parts.catalogue import pivconnector
 
@@ -48,7 +48,7 @@ def my_part(parsed, camera):
     def make(*overrides, distance="[0.4,0.7]"):
         given = (f"virtual.camera={camera}", f"virtual.working_distance={distance}")
         config = parsed("experiment=my_part", *SMALL, *given, *overrides)
-        return fitted_to_camera(config, build_parts(config.data))
+        return fit_to_camera(config, build_parts(config.data))
 
     return make
 
@@ -77,7 +77,7 @@ def test_what_was_chosen_stands_in_the_config_and_in_the_checkpoint(my_part, cam
     lens = {"width": 1280, "height": 720, "fx": FOCAL, "fy": FOCAL, "cx": 640.0, "cy": 360.0}
     assert stored["virtual"]["camera"] == lens
     camera.unlink()  # a checkpoint needs no file
-    data = chosen_data(None, None, stored, "best.ckpt")
+    data = evaluation_data(None, None, stored, "best.ckpt")
     assert data == config.data
 
 
@@ -142,9 +142,9 @@ def test_a_camera_without_a_size_is_refused(my_part, camera):
 
 def test_without_a_camera_nothing_is_chosen(parsed):
     config = parsed("experiment=quickstart")
-    assert fitted_to_camera(config, []) is config
+    assert fit_to_camera(config, []) is config
     config = parsed("experiment=my_part")
-    assert fitted_to_camera(config, []) is config
+    assert fit_to_camera(config, []) is config
     with pytest.raises(
         UserError, match=r"neither data\.input_size nor a camera.*add the camera's file"
     ):

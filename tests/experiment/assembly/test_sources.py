@@ -11,7 +11,7 @@ from dopepp.experiment.assembly.build_parts import PAPER_OBJECTS, build_parts
 from dopepp.experiment.assembly.build_sources import (
     build_datamodule,
     held_out_source,
-    share_in_words,
+    note_on_shared_folder,
 )
 from dopepp.experiment.assembly.build_system import build_untrained
 from dopepp.experiment.config.data_config import DataConfig
@@ -188,6 +188,6 @@ def test_preset_changes_reach_the_renders(tiny):
 )  # fmt: skip
 def test_a_share_of_a_folder_is_said_with_what_changes_it(overrides, words, tiny):
     root = () if "data=virtual" in overrides else ("data.root=somewhere",)
-    said = share_in_words(tiny(*overrides, *root).data)
+    said = note_on_shared_folder(tiny(*overrides, *root).data)
     assert (said is None) == (words is None)
     assert words is None or words in said

@@ -27,7 +27,7 @@ from dopepp.experiment.assembly.build_system import (
     scheduler_factory,
 )
 from dopepp.experiment.config.run_config import RunConfig
-from dopepp.experiment.run.tracking import tracked
+from dopepp.experiment.run.tracking import open_trackers
 from dopepp.models.network import ATTENTIONS, BACKBONES, HEADS, LOSSES
 from dopepp.models.registry import Registry
 
@@ -183,7 +183,7 @@ def build_all(config: RunConfig, run_dir: Path) -> None:
     parts = build_parts(config.data)
     build_datamodule(config.data, parts, seed=0)
     build_system(config, parts, "")
-    with tracked(config, run_dir) as trackers:
+    with open_trackers(config, run_dir) as trackers:
         build_trainer(config, run_dir, trackers=trackers)
 
 

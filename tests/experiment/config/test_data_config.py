@@ -7,7 +7,7 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.assembly.build_sources import share_of
-from dopepp.experiment.config.data_config import DataConfig, chosen_data, trained_on
+from dopepp.experiment.config.data_config import DataConfig, evaluation_data, stored_config
 from dopepp.experiment.config.run_config import EvaluationConfig
 from dopepp.models.checkpoint import read
 
@@ -31,7 +31,7 @@ def evaluated(composed):
 
     def choose(stored: object, *overrides: str) -> DataConfig:
         asked = EvaluationConfig.of(composed(*overrides, config="evaluate"))
-        return chosen_data(asked.data, asked.virtual, stored, "best.ckpt")
+        return evaluation_data(asked.data, asked.virtual, stored, "best.ckpt")
 
     return choose
 
@@ -91,7 +91,7 @@ def test_a_checkpoint_without_data_asks_for_them(override, message, evaluated):
 
 @pytest.mark.parametrize("path", PRETRAINED, ids=lambda path: path.stem)
 def test_the_data_of_released_checkpoints_are_read(path, evaluated):
-    stored = trained_on(read(path).data)
+    stored = stored_config(read(path).data)
     data = evaluated(stored)
     assert data.virtual.preset == stored["virtual"]["preset"]
     assert (data.num_test, data.is_rendered("test")) == (300, True)

@@ -14,10 +14,20 @@ import yaml
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import read_csv
-from dopepp.experiment.results.compare import compare_paths, compare_reports, compare_runs, logged
+from dopepp.experiment.results.compare import (
+    compare_paths,
+    compare_reports,
+    compare_runs,
+    read_log_column,
+)
 from dopepp.experiment.results.compared_runs import Entry, find_runs, group, read_run, with_refined
 from dopepp.experiment.results.cost import COST_FILE
-from dopepp.experiment.results.differences import compared, differences, full, headline
+from dopepp.experiment.results.differences import (
+    compact_table,
+    comparison_frame,
+    differences,
+    full_table,
+)
 from dopepp.experiment.results.folder import CONFIG_FILE, METRICS_FILE, write_config, write_json
 from dopepp.experiment.results.report import Report
 from dopepp.metrics.pose import MEAN
@@ -69,7 +79,7 @@ def test_an_interval_of_shares_ends_at_one(entry):
 def test_what_has_other_objects_or_no_instances_is_not_set_off(entry):
     base = entry("dope", {"bolt": BAD, "nut": BAD})
     method = entry("x", {"bolt": GOOD, "nut": GOOD, "cap": GOOD})
-    table = compared([base, method])
+    table = comparison_frame([base, method])
     changes = table[(table["method"] == "x") & table["num_differing"].notna()]
     assert set(changes["object"]) == {"bolt", "nut"}
     assert set(table[table["method"] == "dope"]["object"]) == {"bolt", "nut", MEAN}
@@ -79,7 +89,7 @@ def test_what_has_other_objects_or_no_instances_is_not_set_off(entry):
 
 
 def test_a_measure_that_one_seed_lacks_does_not_exist(entry):
-    (row, *_) = full(compared([entry("x", [np.inf] * 32, GOOD)]))
+    (row, *_) = full_table(comparison_frame([entry("x", [np.inf] * 32, GOOD)]))
     assert (row["rotation °"], row["± rotation °"]) == ("n/a", "n/a")
 
 
@@ -91,13 +101,13 @@ def test_refined_poses_stand_behind_their_network(entry, report_of):
         Entry("dope", [report_of("dope", BAD, refined=GOOD)], [0]),
         Entry("dopepp", [report_of("dopepp", BAD, refined=BEST)], [0]),
     ]
-    rows = full(compared(with_refined(methods)))
+    rows = full_table(comparison_frame(with_refined(methods)))
     # Refined ones are set off against dope's refined, and those against its network.
     assert [(row["method"], row["Δ ADD-0.1d %"]) for row in rows[:4]] == [
         ("dope", ""), ("dope + region", "+62.5"), ("dopepp", "+0.0"), ("dopepp + region", "+6.2"),
     ]  # fmt: skip
     # Without a refined baseline the network is the baseline.
-    rows = full(compared(with_refined([entry("dope", BAD), methods[1]])))
+    rows = full_table(comparison_frame(with_refined([entry("dope", BAD), methods[1]])))
     changes = {row["method"]: row.get("Δ ADD-0.1d %") for row in rows}
     assert changes["dopepp + region"] == "+68.8"
     # Refined in one seed of two is no row.
@@ -165,7 +175,7 @@ def test_jobs_are_named_by_what_differs_and_no_two_alike(tmp_path, write_run):
     folders = [write_run(tmp_path / place / "run", ["model=dope"], "gone") for place in "ab"]
     entries = group(find_runs(folders))
     assert [one.name for one in entries] == [f"dope run {folder}" for folder in folders]
-    assert len(headline(compared(entries))) == 2
+    assert len(compact_table(comparison_frame(entries))) == 2
 
 
 def test_an_evaluation_is_what_its_checkpoint_was_trained_as(tmp_path, report_of, write_run):
@@ -224,9 +234,12 @@ def test_a_folder_given_twice_counts_once_and_one_without_runs_is_a_mistake(
 
 def test_a_log_is_read_as_far_as_it_goes(tmp_path):
     path = tmp_path / "metrics.csv"
-    assert logged(path, "train/loss") == {}
+    assert read_log_column(path, "train/loss") == {}
     path.write_text("step,train/loss\n0,1.5\n1,\n2,nan\nx,1\n3,0.5\n4")
-    assert (logged(path, "train/loss"), logged(path, "val/loss")) == ({0: 1.5, 3: 0.5}, {})
+    assert (read_log_column(path, "train/loss"), read_log_column(path, "val/loss")) == (
+        {0: 1.5, 3: 0.5},
+        {},
+    )
 
 
 # The whole

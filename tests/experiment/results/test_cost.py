@@ -12,7 +12,7 @@ from dopepp.data.sample import DescribedSource
 from dopepp.drawing.pictures import read_rgb
 from dopepp.experiment.assembly.build_parts import build_parts
 from dopepp.experiment.assembly.build_sources import held_out_source
-from dopepp.experiment.assembly.build_system import build_untrained, map_geometry
+from dopepp.experiment.assembly.build_system import build_untrained
 from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.results.cost import (
     WARM_UP,
@@ -61,7 +61,7 @@ def test_an_impossible_job_leaves_nothing(composed, tmp_path):
 def estimator_of(config: RunConfig) -> tuple[SimulatedMapsEstimator, MapGeometry, DescribedSource]:
     parts = build_parts(config.data)
     network, description = build_untrained(config, parts)
-    geometry = map_geometry(config.maps, network.stride)
+    geometry = MapGeometry(network.stride, config.maps.sigma, config.maps.field_radius)
     return (
         SimulatedMapsEstimator(network, description),
         geometry,

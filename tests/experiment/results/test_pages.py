@@ -43,9 +43,9 @@ def test_nothing_is_written_before_a_run_has_begun(run, monkeypatch):
 
 
 def test_paths_are_typed_as_from_here(run, monkeypatch):
-    assert program.shown(run) == str(run)
+    assert program.relative_path(run) == str(run)
     monkeypatch.chdir(run.parent)
-    assert program.shown(run / "x") == "a run/x"
+    assert program.relative_path(run / "x") == "a run/x"
 
 
 def test_a_readme_that_cannot_be_written_ends_no_run(run, caplog):

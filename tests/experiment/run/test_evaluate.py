@@ -8,7 +8,7 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.assembly.build_sources import held_out_source
-from dopepp.experiment.config.data_config import chosen_data, trained_on
+from dopepp.experiment.config.data_config import evaluation_data, stored_config
 from dopepp.experiment.config.run_config import FalsePositiveTarget
 from dopepp.experiment.results.folder import METRICS_FILE, read_json
 from dopepp.experiment.results.recording import made_worse
@@ -84,8 +84,8 @@ def test_silent_images_are_counted_by_reason(composed, tmp_path, capsys):
 
 
 def test_templates_are_a_method_beside_the_network(composed, tmp_path, near_truth):
-    stored = trained_on(read(Path("pretrained/pivconnector")).data)
-    data = replace(chosen_data({}, {}, stored, "the release"), num_test=1)
+    stored = stored_config(read(Path("pretrained/pivconnector")).data)
+    data = replace(evaluation_data({}, {}, stored, "the release"), num_test=1)
     sample = held_out_source(data, [pivconnector()], "test").sample(0)
     near_truth.truth = [sample.instances[0].T_cam_obj]
     options = ("ckpt_path=pretrained/pivconnector", "templates=[0.08,0.2]", "+data.num_test=1")

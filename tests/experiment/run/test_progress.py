@@ -2,7 +2,7 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.assembly.build_parts import build_parts
-from dopepp.experiment.assembly.build_sources import build_datamodule, fitted_to_camera
+from dopepp.experiment.assembly.build_sources import build_datamodule, fit_to_camera
 from dopepp.experiment.run.train import _progress
 from dopepp.training.refined_progress import RefinedProgress
 
@@ -41,7 +41,7 @@ def test_whole_pictures_are_measured_where_training_sees_windows(tiny, tmp_path)
     )
     seen = ("experiment=my_part", f"virtual.camera={camera}", "virtual.working_distance=[0.3,0.5]")
     config = tiny(*seen, "data.input_size=[128,128]")
-    data = fitted_to_camera(config, parts := build_parts(config.data)).data
+    data = fit_to_camera(config, parts := build_parts(config.data)).data
     datamodule = build_datamodule(data, parts, config.seed)
     (progress,) = _progress(config, datamodule)
     assert progress.pictures.sample(0).image.shape == (240, 320, 3)

@@ -18,7 +18,7 @@ from dopepp.experiment.run.tuning import (
     MIN_REFINED,
     MIN_REFINED_FACTOR,
     MIN_REFINED_SCORE,
-    Scored,
+    ScoredDetections,
     WrongFocalLengths,
     choose,
     fit_factors,
@@ -38,7 +38,7 @@ from dopepp.parts import load_part
 from dopepp.recovery.detection import FEATURES, REFINED_FEATURES, Detection, score
 
 K = camera_matrix(300, 300, 64, 64)
-NOTHING = Scored(
+NOTHING = ScoredDetections(
     np.zeros((0, len(FEATURES))),
     np.zeros(0),
     np.zeros(0, bool),
@@ -48,14 +48,14 @@ NOTHING = Scored(
 )
 
 
-def scored(seed: int, count: int, right: bool = True) -> Scored:
+def scored(seed: int, count: int, right: bool = True) -> ScoredDetections:
     """Detections whose belief and spread say how likely they are right."""
     rng = np.random.default_rng(seed)
     features = np.column_stack([np.ones(count), rng.normal(size=(count, 4)) - (0 if right else 2)])
     truth = score(features, np.array([0.0, 2.0, -1.0, -0.5, 0.0]))
     correct = (rng.random(count) < truth) & right
     image = rng.permutation(count)
-    return Scored(features, rng.random(count), correct, image, ["photos"] * count, count)
+    return ScoredDetections(features, rng.random(count), correct, image, ["photos"] * count, count)
 
 
 def test_chosen_scores_are_calibrated_and_silent_on_other_images():
@@ -276,7 +276,9 @@ def test_refined_poses_far_below_even_odds_are_not_reported(caplog):
     rng = np.random.default_rng(0)
     features = np.column_stack([np.ones(200), rng.normal(size=(200, 2))])
     correct = rng.random(200) < score(features, np.array([0.0, 0.0, 1.0]))
-    shown = Scored(features, rng.random(200), correct, np.arange(200), ["photos"] * 200, 200)
+    shown = ScoredDetections(
+        features, rng.random(200), correct, np.arange(200), ["photos"] * 200, 200
+    )
     nothing = replace(NOTHING, features=np.zeros((0, 3)))
     assert choose(shown, nothing, refined=True)["refined_min_score"] == MIN_REFINED_SCORE
     loud = replace(nothing, features=np.array([[1.0, 0.0, 20.0]]), correct=np.zeros(1, bool))

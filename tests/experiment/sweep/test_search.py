@@ -15,7 +15,7 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 from optuna.trial import FrozenTrial, TrialState
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.sweep.optuna_search import chosen, examples, overrides, read_space
+from dopepp.experiment.sweep.optuna_search import examples, overrides, read_space, search_overrides
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_what_is_no_range_is_refused(bad, loader):
 
 
 def test_numbers_are_written_as_they_are_run():
-    written = chosen({"lr": 1.23456e-4, "n": 123456, "m": "cbam"})
+    written = search_overrides({"lr": 1.23456e-4, "n": 123456, "m": "cbam"})
     assert written == ["lr=0.0001235", "n=123456", "m=cbam"]
 
 
