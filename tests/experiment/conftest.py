@@ -25,13 +25,13 @@ CONF = Path(__file__).parents[2] / "conf"
 
 @pytest.fixture(scope="session")
 def compositions():
-    """Earlier compositions by config and overrides; one takes a third of a second."""
+    """Cache of composed configs; composing takes a third of a second."""
     return {}
 
 
 @pytest.fixture
 def composed(compositions):
-    """Compose ``conf/train.yaml`` (or another one) with overrides, as a plain dict."""
+    """Compose ``conf/train.yaml`` (or another config) with overrides, as a plain dict."""
 
     def make(*overrides: str, config: str = "train") -> dict[str, Any]:
         key = (config, *overrides)
@@ -47,13 +47,13 @@ def composed(compositions):
 
 @pytest.fixture
 def parsed(composed):
-    """The same as ``train.py`` parses it."""
+    """Compose and parse the config of ``train.py``."""
     return lambda *overrides: RunConfig.of(composed(*overrides))
 
 
 @pytest.fixture
 def tiny(parsed, tiny_options):
-    """The same with a network and data that take no time."""
+    """Compose and parse a config with a tiny network and tiny data."""
     return partial(parsed, *tiny_options)
 
 
@@ -95,7 +95,7 @@ def train(config, run_dir):
     write_json(run_dir / METRICS_FILE, {"objective": value})
 
 def end(run_dir, how):
-    """Fail, die or be interrupted as the test asks, the first time."""
+    """Fail, die or be interrupted as the test demands, on the first run only."""
     if how is None or (run_dir / "ended_once").exists():
         return
     (run_dir / "ended_once").touch()
@@ -115,7 +115,7 @@ if __name__ == "__main__":
 
 @pytest.fixture
 def fast_training(tmp_path):
-    """An entry point like ``train.py`` whose jobs take no time; END_<job>=how ends one early."""
+    """An entry point like ``train.py`` whose jobs take no time; END_<job>=how ends a job early."""
     path = tmp_path / "fast_training.py"
     path.write_text(FAST_TRAINING)
     (tmp_path / "conf").symlink_to(CONF)
@@ -124,7 +124,7 @@ def fast_training(tmp_path):
 
 @pytest.fixture
 def call_fast(call, fast_training, tmp_path):
-    """Run it inside this process."""
+    """Run the fast training in this process."""
     return partial(call, fast_training, f"output_dir={tmp_path}", "~hydra.callbacks.compare")
 
 
@@ -139,7 +139,7 @@ def report_of(
     test_set: str = "images",
     num_symmetries: int = 1,
 ) -> Report:
-    """Return a report of objects with these ADD errors (metres); 1 mm comes with 10°."""
+    """Return a report of objects with these ADD errors, metres; the rotation is 10° per mm."""
     add = add if isinstance(add, Mapping) else {"part": add}
     errors = {part: np.array(values, np.float64) for part, values in add.items()}
     rows, constant = {}, {}
@@ -168,7 +168,7 @@ def report_of(
 def write_run(
     folder: Path, overrides: Sequence[str] = (), result: Report | str | None = None, **config: Any
 ) -> Path:
-    """Write what a run leaves: its report, or the reason of its failure."""
+    """Write the files of a run: its report, or the reason for its failure."""
     (folder / ".hydra").mkdir(parents=True)
     (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(list(overrides)))
     if isinstance(result, Report):

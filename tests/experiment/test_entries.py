@@ -1,4 +1,4 @@
-"""``dopepp train`` and ``dopepp evaluate``: what is told before PyTorch is there, what is left."""
+"""``dopepp train`` and ``dopepp evaluate``: early answers, files of rejected runs, completion."""
 
 import json
 import re
@@ -30,7 +30,7 @@ ANSWERS = {
 }
 
 
-def test_the_console_answers_before_it_imports_pytorch(command):
+def test_the_console_answers_before_pytorch_is_imported(command):
     done = command("-c", CONSOLE, json.dumps([words.split() for words in ANSWERS]), code=0)
     ends, imported = json.loads(done.out)
     assert imported == []
@@ -38,7 +38,7 @@ def test_the_console_answers_before_it_imports_pytorch(command):
         assert (ended, bool(re.search(said, output))) == (code, True), (words, output)
 
 
-def test_a_refused_run_leaves_no_folder(call, tiny_options, tmp_path):
+def test_a_rejected_run_leaves_no_folder(call, tiny_options, tmp_path):
     output = f"output_dir={tmp_path}"
     call("train.py", *tiny_options, "data.parts=[none.stl]", output, code=2)
     call("train.py", *tiny_options, "trainer.max_epochs=many", output, code=2)
@@ -47,7 +47,7 @@ def test_a_refused_run_leaves_no_folder(call, tiny_options, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_refused_run_leaves_what_was_there(call, tiny_options, tmp_path):
+def test_a_rejected_run_keeps_existing_files(call, tiny_options, tmp_path):
     (tmp_path / "mine.txt").touch()
     call("train.py", *tiny_options, "data.parts=[none.stl]", f"hydra.run.dir={tmp_path}", code=2)
     assert (tmp_path / "mine.txt").is_file()

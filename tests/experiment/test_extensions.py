@@ -1,4 +1,4 @@
-"""A package of a user's own: found by its entry points, used where it is enabled by name."""
+"""A user package is found by its entry points and used if its name is enabled."""
 
 import shutil
 import sys

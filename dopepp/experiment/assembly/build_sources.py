@@ -180,8 +180,8 @@ def _synthetic_images(
 def share_of(image_sets: Mapping[str, str | None], split: Split) -> tuple[float, float]:
     """Return the range of a folder's images that belongs to a split, as fractions.
 
-    Splits that share a folder divide it in the order training, validation, test. Training gets
-    80 %; the remaining splits get equal shares.
+    Splits that share a folder divide the folder in the order training, validation, test. Training
+    gets 80 %; the remaining splits get equal shares.
     """
     sharing = [name for name in ("train", "val", "test") if image_sets[name] == image_sets[split]]
     first = _TRAINING_SHARE if sharing[0] == "train" and len(sharing) > 1 else 1 / len(sharing)

@@ -1,7 +1,7 @@
 """Build the LightningModule and the Trainer from a config, with devices and precision.
 
 To allow an optimiser, scheduler, callback or logger of your own, register its dotted name before
-the run starts (``CALLBACKS.register("my_package.my_module.MyCallback")``) or list it here.
+the run starts (``CALLBACKS.register("my_package.my_module.MyCallback")``) or list the name here.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ _BF16_FLAGS: Final = frozenset({"amx_bf16", "bf16"})
 """Names of the instruction sets on x86 and Arm."""
 
 _AMD_BF16_FLAG: Final = "avx512_bf16"
-"""Instruction set that makes bf16 fast on AMD only. On Intel it is slower than float32, and AMX is
-needed instead (``benchmarks/train_step.py``)."""
+"""Instruction set that makes bf16 fast on AMD only. On Intel, AVX-512 bf16 is slower than float32,
+and AMX is needed instead (``benchmarks/train_step.py``)."""
 
 OPTIMIZERS: Registry[Optimizer] = Registry(
     "optimizer",

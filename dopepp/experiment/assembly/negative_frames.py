@@ -47,8 +47,8 @@ separate row."""
 FRAME: Final[Size] = (640, 480)
 """(width, height) of the frames if there is no camera and the preset's images are smaller."""
 
-_MAX_DISTRACTORS: Final = 12  # in a frame, which bounds the time to render it
-_LOOKALIKES_SHOWN: Final = (1, 3)  # in a frame
+_MAX_DISTRACTORS: Final = 12  # per frame; limits the rendering time
+_LOOKALIKES_SHOWN: Final = (1, 3)  # smallest and largest number per frame
 _MARGIN: Final = 0.3  # border without look-alikes, share of the frame, if there is no camera
 _NUM_POSES: Final = 64  # number of drawn poses per part for measuring the preset's distances
 

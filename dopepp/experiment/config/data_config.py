@@ -70,9 +70,10 @@ class VirtualConfig:
         preset: Name of the scene preset (:mod:`dopepp.virtual.presets`); None selects ``ycb`` with
             a ``data.root``, else ``paper``.
         scene: Changed fields of the preset (:class:`~dopepp.virtual.presets.Preset`).
-        backgrounds: Folder of photos, or ``skimage`` for its photos; None uses procedural images.
+        backgrounds: Folder of photos, or ``skimage`` for the photos of that package; None uses
+            procedural images.
         negative_photos: Folder of the user's own images without the parts. Like ``backgrounds``,
-            it is divided between training, tuning and test.
+            the folder is divided between training, tuning and test.
         negatives: Parts to show that must not be detected: built-in names or mesh files. Models of
             a BOP data set that are not in ``data.objects`` are always shown.
         renderer: ``raster`` or ``photoreal``.

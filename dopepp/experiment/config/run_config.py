@@ -1,7 +1,7 @@
 """The configs of ``train.py`` and ``evaluate.py``, parsed once.
 
 To add a protocol of the evaluation, give :class:`Protocols` its option, write a module that
-measures and records it, and call the module in
+measures and records the protocol, and call the module in
 :func:`dopepp.experiment.results.recording.measure_and_record`.
 """
 
@@ -190,8 +190,8 @@ class FalsePositiveTarget:
     """Permitted rate of false positives on camera frames without objects.
 
     Attributes:
-        num_empty: Number of frames without objects to choose the threshold, and as many to check
-            it (:mod:`dopepp.experiment.assembly.negative_frames`).
+        num_empty: Number of frames without objects to choose the threshold, and of further frames
+            to check the threshold (:mod:`dopepp.experiment.assembly.negative_frames`).
         false_positive_rate: Permitted share of these frames with a detection; with 1 every
             candidate is reported.
     """

@@ -329,7 +329,7 @@ class _Model:
 
 
 def _rows(models: Sequence[_Model], num: int) -> tuple[list[Tile], str]:
-    """Return the tiles of some images, one per method, and the reason if there are none."""
+    """Return one tile per image and method, and the reason if there are no tiles."""
     reasons = [f"{model.name}: {model.reason}" for model in models]
     loaded = [model for model in models if model.estimator is not None]
     samples: list[Sample] = []
@@ -341,7 +341,7 @@ def _rows(models: Sequence[_Model], num: int) -> tuple[list[Tile], str]:
         except UserError as error:
             reasons.append(f"{model.name}: {error}")
     if not samples:
-        return [], f"No test images are shown. {'; '.join(reasons)}" if num else ""
+        return [], f"Predictions cannot be displayed. {'; '.join(reasons)}" if num else ""
     return [
         model.tile(sample, BLUE if model is loaded[0] and len(models) > 1 else YELLOW)
         for sample in samples

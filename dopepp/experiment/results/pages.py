@@ -50,7 +50,7 @@ FILES: Final = {
     "versions.json": "command, commit, packages, hardware, seed and fingerprint of the data",
     "without_part.png": "highest-scoring images without the part, with the best candidates",
     "overlay.png": "test images: truth in green, prediction in yellow",
-    "coverage.png": "share of true poses inside their covariance region, over its level",
+    "coverage.png": "share of true poses inside the covariance region, over the region's level",
     "auc.png": "share of test instances below each error (numbers in `auc.csv`)",
     "val_overlay.png": "validation images of the last epoch",
     "val_belief.png": "belief maps of these images: strongest corner and centroid",

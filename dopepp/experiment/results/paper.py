@@ -189,7 +189,7 @@ def _notes(table: PaperTable, entries: Sequence[Entry]) -> list[str]:
         if any(_starts_untrained(run.config) for entry in entries for run in entry.runs):
             sentence = "DOPE's VGG19 started untrained, because nothing is downloaded"
             option = "model.backbone.weights_path=FILE"
-            notes.append(f"{sentence}; {option} starts it from a file of torchvision's.")
+            notes.append(f"{sentence}; {option} loads weights in torchvision's format.")
     if not table.paper:
         notes.append("The paper has no table of these values.")
     return notes

@@ -3,7 +3,7 @@
 Lightning's tuner runs the sweep: a short training whose rate grows from step to step (Smith,
 "Cyclical Learning Rates for Training Neural Networks", WACV 2017, section 3.3). This module derives
 the suggestion. Lightning's own suggestion uses the slope over the rate instead of its logarithm, so
-it is always near the beginning of the sweep, and its running mean lags behind.
+that suggestion is always near the beginning of the sweep, and the running mean lags behind.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _MOST: Final = 10**6
 """Maximum number of epochs; the number of steps ends the sweep."""
 
 _SMOOTHING: Final = 0.05
-"""Standard deviation of the smoothing as a share of the sweep; it removes the noise of batches."""
+"""Standard deviation of the smoothing as a share of the sweep, against the noise of batches."""
 _SKIPPED: Final = 0.1
 """Ignored share at the beginning of the sweep, in which the optimiser's averages and the statistics
 of batch norm settle."""

@@ -1,7 +1,7 @@
 """Check whether a run can be resumed with the present config and images.
 
-Every difference between the stored and the present config is reported. Options that affect what the
-network learns (:data:`LEARNT_FROM`) and the images may change only with ``resume_anyway=true``. The
+Every difference between the stored and the present config is reported. Options that affect
+learning (:data:`LEARNT_FROM`) and the images may change only with ``resume_anyway=true``. The
 network and the kind of optimiser must not change, because the saved state would not fit. All other
 options may change, such as the duration, the device and the callbacks.
 
@@ -102,7 +102,7 @@ def check_resume(
     if saved.spec != payload["spec"] or state:
         network = [change for change in differences if is_below(change.key, _NETWORK)]
         raise UserError(
-            f"resume={run}, whose network differs from the chosen one ({_listed(network + state)})"
+            f"resume={run}, whose network differs from the config's ({_listed(network + state)})"
             if not state
             else f"resume={run} with another optimiser ({_listed(state)})",
             "the model, the number of objects and the optimiser of the interrupted run",
@@ -231,8 +231,8 @@ def describe_images(source: DescribedSource) -> dict[str, Any]:
 def differing_images(stored: Mapping[str, Any], present: Mapping[str, Any]) -> list[str]:
     """Return the differences between two descriptions of images.
 
-    A new version may add fields to a preset and describe it in other words, so that the first image
-    shows whether a preset has changed.
+    Descriptions of presets are ignored, because a new version may add fields to a preset. The first
+    image shows whether a preset has changed.
     """
     old, new = dict(flatten(stored["sources"])), dict(flatten(present["sources"]))
     presets = {f"{source}.preset" for source in present["sources"]}

@@ -265,8 +265,8 @@ class WrongFocalLengths:
 
     The relative error of the focal length is uniformly distributed up to the scale error that
     refinement assumes. With exact cameras, covariances would be fitted to errors that no real
-    camera reaches. The principal point moves too, so that the line of sight to the first object
-    stays: the error changes its distance alone, like an error of its size.
+    camera reaches. The principal point moves too, so that the line of sight to the first object is
+    unchanged. The error then changes only the object's distance, like an error of its size.
     """
 
     def __init__(self, source: SampleSource) -> None:
@@ -340,8 +340,8 @@ def choose(
         empty: Detections on images without objects.
         false_positive_rate: Permitted share of the images without objects with a reported pose.
         refined: Whether the score of refined poses is chosen. The fewer refined poses there are,
-            the closer its weights stay to the weights of the verification. They stay equal if all
-            poses are correct or all are incorrect.
+            the closer its weights stay to the weights of the verification. The weights of the
+            verification are used if all poses are correct or all are incorrect.
 
     Returns:
         Values of :class:`RecoveryOptions`.
@@ -368,7 +368,7 @@ def choose(
     best = empty.best_scores(score(empty.features, weights))[~empty.shows_lookalikes()]
     best = np.sort(best)[::-1]
     allowed = int(false_positive_rate * len(best))
-    # A score equal to the threshold passes, so it lies just above the first rejected score.
+    # A score equal to the threshold passes, so the threshold exceeds the first rejected score.
     threshold = float(np.nextafter(best[allowed], 1.0)) if allowed < len(best) else 0.0
     names = ["min_score", *(f"score_{feature}" for feature in FEATURES)]
     if refined:

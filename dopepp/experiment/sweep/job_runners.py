@@ -78,7 +78,7 @@ class Jobs:
         return result
 
     def checkpoint(self, job: tuple[int, list[str]]) -> Any:
-        """Submit the same job again near SLURM's time limit; it resumes in its folder."""
+        """Submit the same job again near SLURM's time limit; the job resumes in its folder."""
         from submitit.helpers import DelayedSubmission
 
         return DelayedSubmission(self, job)
@@ -103,7 +103,9 @@ def launch(
             folder = jobs.folder / str(number)
             folder.mkdir(parents=True, exist_ok=True)
             reason = f"{type(result).__name__}: {' '.join(str(result).split())}"
-            write_json(folder / FAILURE_FILE, {"reason": f"its process was lost: {reason}"})
+            write_json(
+                folder / FAILURE_FILE, {"reason": f"the process of the job was lost: {reason}"}
+            )
             # An error status would make Hydra end the multirun.
             result = JobReturn(status=JobStatus.COMPLETED)
         returns[number] = result

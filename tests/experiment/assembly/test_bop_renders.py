@@ -1,4 +1,4 @@
-"""Renders of a BOP data set's models learned, its own images measured: ``data=bop_renders``."""
+"""``data=bop_renders``: train on renders of BOP models and evaluate on the real images."""
 
 import json
 import re
@@ -52,7 +52,7 @@ def root(tmp_path_factory):
 
 @pytest.fixture
 def config(parsed, root):
-    """The one option, and images that take no time."""
+    """Parse ``data=bop_renders`` with few, small images."""
 
     def make(*overrides):
         given = ("data.samples_per_epoch=8", "data.batch_size=4", "data.num_val=2",
@@ -62,7 +62,7 @@ def config(parsed, root):
     return make
 
 
-def test_renders_are_as_the_pictures_camera_sees_the_models(config, caplog):
+def test_renders_have_the_camera_of_the_real_images(config, caplog):
     caplog.set_level("INFO")
     given = config("virtual.preset=upright")
     parts = build_parts(given.data)
@@ -83,7 +83,7 @@ def test_renders_are_as_the_pictures_camera_sees_the_models(config, caplog):
     assert fit_to_camera(said, parts).data.virtual.working_distance == (0.4, 0.7)
 
 
-def test_pictures_without_annotation_have_a_camera_all_the_same(config, root, tmp_path):
+def test_images_without_annotations_need_only_the_working_distance(config, root, tmp_path):
     private = shutil.copytree(root, tmp_path / "set")
     for annotation in private.glob("**/scene_gt*.json"):
         annotation.unlink()
@@ -96,7 +96,7 @@ def test_pictures_without_annotation_have_a_camera_all_the_same(config, root, tm
     assert (virtual.camera.fx, virtual.working_distance) == (210.0, (0.4, 0.7))
 
 
-def test_models_that_are_not_learned_are_shown_all_the_same(config):
+def test_models_outside_data_objects_are_negatives(config):
     given = config("virtual.preset=upright", "data.objects=[red]")
     parts = build_parts(given.data)
     factory = held_out_source(fit_to_camera(given, parts).data, parts, "val").factory
@@ -105,7 +105,7 @@ def test_models_that_are_not_learned_are_shown_all_the_same(config):
     assert build_negatives(given.data, parts)[0] is factory.negatives[0]  # read once
 
 
-def test_a_checkpoint_renders_its_own_parts_where_its_data_set_is_not(config, tmp_path):
+def test_validation_renders_of_a_checkpoint_do_not_need_the_data_set(config, tmp_path):
     given = config("data.objects=[red]")
     parts = build_parts(given.data)
     stored = fit_to_camera(given, parts).stored_data()
@@ -118,7 +118,7 @@ def test_a_checkpoint_renders_its_own_parts_where_its_data_set_is_not(config, tm
     assert {instance.label for instance in sample.instances} <= {"red"}
 
 
-def test_a_model_of_the_same_mesh_is_no_other_part(config, root, tmp_path):
+def test_a_model_with_the_mesh_of_a_learned_part_is_no_negative(config, root, tmp_path):
     copy = shutil.copytree(root, tmp_path / "set")
     models = copy / "models"
     shutil.copy(models / "obj_000001.ply", models / "obj_000003.ply")
@@ -132,7 +132,7 @@ def test_a_model_of_the_same_mesh_is_no_other_part(config, root, tmp_path):
     assert factory.negatives[0].name == "blue"
 
 
-def test_real_frames_among_renders_are_windows_of_the_same_scale(config, root):
+def test_real_frames_and_renders_are_windows_of_equal_scale(config, root):
     given = config(
         "virtual.preset=upright", "data.real_fraction=0.5", "data.image_sets.train=test",
         "virtual.camera_scale=0.9",
@@ -153,13 +153,13 @@ def test_real_frames_among_renders_are_windows_of_the_same_scale(config, root):
             np.testing.assert_allclose(instance.keypoints, shown, atol=1e-6)
 
 
-def test_labelled_training_images_must_be_there_where_a_share_of_them_is_asked_for(config):
+def test_a_real_fraction_requires_an_image_set_for_training(config):
     data = config("data.real_fraction=0.5").data
     with pytest.raises(UserError, match=r"data.image_sets.train=null with data.real_fraction=0.5"):
         build_datamodule(data, build_parts(data), 0)
 
 
-def test_validation_is_on_renders_where_pictures_show_no_object(config, root, tmp_path, caplog):
+def test_validation_falls_back_to_renders(config, root, tmp_path, caplog):
     empty = tmp_path / "set"
     (empty / "val" / "000000" / "rgb").mkdir(parents=True)
     (empty / "models").symlink_to(root / "models")
@@ -175,7 +175,7 @@ def test_validation_is_on_renders_where_pictures_show_no_object(config, root, tm
     assert "bop/val shows none of red, blue: validating on renders" in caplog.text
 
 
-def test_true_poses_from_a_file_have_full_marks_in_every_score(call, root, tmp_path):
+def test_true_poses_from_a_file_have_perfect_scores(call, root, tmp_path):
     source = BopReader(root, bop_parts(root), "test", targets="auto")
     numbers = {"red": 1, "blue": 2}
     rows = [

@@ -1,4 +1,4 @@
-"""A training in the user's camera: what is chosen, what is stored, and who sees what."""
+"""A training for the user's camera: automatic sizes, stored options and image sizes."""
 
 import logging
 import math
@@ -53,7 +53,7 @@ def my_part(parsed, camera):
     return make
 
 
-def test_the_command_that_needs_no_training_is_printed(my_part):
+def test_template_commands(my_part):
     lens = my_part().data.virtual.camera
     K = " ".join(f"{value:g}" for value in (lens.fx, lens.fy, lens.cx, lens.cy))
     end = f"IMAGE --K {K} --working-distance 0.4,0.7 --tilt 60 --save out"
@@ -65,7 +65,7 @@ def test_the_command_that_needs_no_training_is_printed(my_part):
     assert template_commands(replace(data, virtual=replace(data.virtual, camera=None))) == []
 
 
-def test_what_was_chosen_stands_in_the_config_and_in_the_checkpoint(my_part, camera, caplog):
+def test_automatic_sizes_are_stored_in_config_and_checkpoint(my_part, camera, caplog):
     with caplog.at_level(logging.INFO):
         config = my_part()
     assert config.data.network_input == (128, 128)
@@ -81,7 +81,7 @@ def test_what_was_chosen_stands_in_the_config_and_in_the_checkpoint(my_part, cam
     assert data == config.data
 
 
-def test_training_sees_windows_and_who_measures_whole_pictures(my_part):
+def test_training_uses_windows_and_evaluation_whole_images(my_part):
     data = my_part().data
     parts = build_parts(data)
     module = build_datamodule(data, parts, 0)
@@ -96,7 +96,7 @@ def test_training_sees_windows_and_who_measures_whole_pictures(my_part):
     assert len(corners) == 4
 
 
-def test_options_that_are_given_are_taken(my_part):
+def test_given_sizes_are_kept(my_part):
     config = my_part("data.input_size=[96,96]")
     assert config.data.network_input == (96, 96)
     assert config.data.virtual.camera_scale * FOCAL * DIAMETER / 0.4 < 96 / 1.29
@@ -134,13 +134,13 @@ def test_a_mistake_is_one_line(distance, overrides, got, my_part):
     assert "\n" not in str(error.value)
 
 
-def test_a_camera_without_a_size_is_refused(my_part, camera):
+def test_a_camera_file_without_image_size_is_rejected(my_part, camera):
     camera.write_text("\n".join(CAMERA.splitlines()[:2] + CAMERA.splitlines()[4:]) + "\n")
     with pytest.raises(UserError, match="does not state the size of its images"):
         my_part()
 
 
-def test_without_a_camera_nothing_is_chosen(parsed):
+def test_without_a_camera_the_config_is_unchanged(parsed):
     config = parsed("experiment=quickstart")
     assert fit_to_camera(config, []) is config
     config = parsed("experiment=my_part")
@@ -151,7 +151,7 @@ def test_without_a_camera_nothing_is_chosen(parsed):
         build_datamodule(config.data, build_parts(config.data), 0)
 
 
-def test_the_numbers_of_a_camera_may_stand_in_a_file_of_their_own(parsed):
+def test_a_camera_can_be_given_as_numbers(parsed):
     lens = "{width: 640, height: 480, fx: 600, fy: 600, cx: 320, cy: 240}"
     config = parsed(
         "experiment=my_part", f"virtual.camera={lens}", "virtual.working_distance=[0.3,0.4]"

@@ -1,4 +1,4 @@
-"""Frames without the part: their size, kinds and photos."""
+"""Frames without the part: sizes, kinds and photos."""
 
 import logging
 
@@ -34,7 +34,7 @@ def frames(config, split, count=6):
     return negative_frames(config.data, build_parts(config.data), split, count)
 
 
-def test_frames_of_a_preset_are_large_and_of_each_kind_in_turn(tiny, photos):
+def test_frames_of_a_preset_are_large_and_alternate_between_kinds(tiny, photos):
     config = tiny(f"virtual.backgrounds={photos}")
     source = frames(config, "val", 4)
     samples = [source.sample(index) for index in range(len(source))]
@@ -52,7 +52,7 @@ def test_frames_of_a_preset_are_large_and_of_each_kind_in_turn(tiny, photos):
     assert all((a.image != b.image).any() for a, b in zip(samples, others, strict=True))
 
 
-def test_frames_of_a_camera_are_its_own(tiny):
+def test_frames_have_size_and_matrix_of_the_camera(tiny):
     lens = "{width: 800, height: 600, fx: 700.0, fy: 700.0, cx: 402.0, cy: 297.0}"
     distance = "virtual.working_distance=[0.3,0.5]"
     config = tiny("virtual.preset=wide", f"virtual.camera={lens}", distance)
@@ -64,7 +64,7 @@ def test_frames_of_a_camera_are_its_own(tiny):
         np.testing.assert_array_equal(sample.K, view.K)
 
 
-def test_drawn_backgrounds_are_tuned_and_tested_on_the_packages_photos(tiny):
+def test_procedural_backgrounds_are_tuned_and_tested_on_the_photos_of_the_package(tiny):
     data = tiny().data
     val, test = (held_out_photos(data, split) for split in ("val", "test"))
     assert (len(val.paths), len(test.paths)) == (12, 12)
@@ -72,7 +72,7 @@ def test_drawn_backgrounds_are_tuned_and_tested_on_the_packages_photos(tiny):
     assert training_backgrounds(data).identity() == ["procedural"]
 
 
-def test_own_pictures_are_learned_tuned_on_and_tested(tiny, photos):
+def test_negative_photos_are_divided_between_training_tuning_and_test(tiny, photos):
     config = tiny(f"virtual.negative_photos={photos}")
     keys = {}
     for split in ("val", "test"):
@@ -91,7 +91,7 @@ def test_own_pictures_are_learned_tuned_on_and_tested(tiny, photos):
         training_backgrounds(config.data)
 
 
-def test_other_photos_are_other_data_for_a_resumed_run(tiny, photos):
+def test_changed_photos_change_the_described_images(tiny, photos):
     config = tiny(f"virtual.backgrounds={photos}")
 
     def described(split):
@@ -109,7 +109,7 @@ def test_other_photos_are_other_data_for_a_resumed_run(tiny, photos):
             assert differing_images(before[split][0], images)
 
 
-def test_too_few_photos_are_refused(tiny, photos):
+def test_too_few_photos_are_rejected(tiny, photos):
     for number in range(6, 12):
         (photos / f"{number}.png").unlink()
     assert len(frames(tiny(f"virtual.backgrounds={photos}"), "val")) == 6
@@ -118,7 +118,7 @@ def test_too_few_photos_are_refused(tiny, photos):
         frames(tiny(f"virtual.backgrounds={photos}"), "val")
 
 
-def test_training_on_a_folder_that_cannot_be_divided_is_said(tiny, photos, caplog):
+def test_training_on_an_undivided_folder_is_warned_about(tiny, photos, caplog):
     for number in range(5, 12):
         (photos / f"{number}.png").unlink()
     with caplog.at_level(logging.WARNING):

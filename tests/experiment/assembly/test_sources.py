@@ -23,7 +23,7 @@ from dopepp.metrics.row import shown_columns
 
 
 def counts(data: DataConfig) -> dict[tuple[str, str], tuple[int, int]]:
-    """(split, source) to (images, images per epoch)."""
+    """Return the numbers of images and of images per epoch, by split and source."""
     module = build_datamodule(data, build_parts(data), seed=0)
     return {
         (split, info.name): (info.num_images, info.num_per_epoch or info.num_images)
@@ -31,7 +31,7 @@ def counts(data: DataConfig) -> dict[tuple[str, str], tuple[int, int]]:
     }
 
 
-def test_without_a_root_all_is_rendered_and_that_is_said_once(tiny, caplog):
+def test_without_a_root_all_images_are_rendered_with_one_warning(tiny, caplog):
     data = tiny("data=hybrid", "data.parts=[servoholder,pivconnector]").data
     with caplog.at_level(logging.WARNING):
         assert counts(data) == {
@@ -45,7 +45,7 @@ def test_without_a_root_all_is_rendered_and_that_is_said_once(tiny, caplog):
     assert "servoholder, pivconnector" in lines[0]
 
 
-def test_every_seed_is_measured_on_the_same_images_and_splits_share_none(tiny):
+def test_held_out_images_are_equal_for_all_seeds_and_differ_between_splits(tiny):
     data = tiny().data
     parts = build_parts(data)
     part, other = (build_datamodule(data, parts, seed) for seed in (1, 2))
@@ -60,7 +60,7 @@ def test_every_seed_is_measured_on_the_same_images_and_splits_share_none(tiny):
 
 
 @pytest.mark.usefixtures("quick_sky")
-def test_a_real_root_mixes_its_frames_with_renders_of_its_objects(parsed, ycb_root):
+def test_a_root_mixes_real_frames_with_renders(parsed, ycb_root):
     data = parsed(
         "data=hybrid", f"data.root={ycb_root}", "data.samples_per_epoch=100", "data.num_workers=0"
     ).data
@@ -86,7 +86,7 @@ def test_an_object_in_no_training_source_is_named(parsed, ycb_root):
         module.check_objects()
 
 
-def test_an_object_without_ground_truth_in_the_test_set_is_not_available(tiny, ycb_root, tmp_path):
+def test_an_object_without_ground_truth_in_the_test_set_has_no_rates(tiny, ycb_root, tmp_path):
     objects = "data.objects=[003_cracker_box,010_potted_meat_can]"
     config = tiny("data=hybrid", "virtual.preset=null", f"data.root={ycb_root}", objects)
     data = replace(config.data, frames=("0050/000003",))
@@ -106,7 +106,7 @@ def test_an_object_without_ground_truth_in_the_test_set_is_not_available(tiny, y
     assert report.mean.add_01d == report.rows["003_cracker_box"].add_01d
 
 
-def test_test_data_without_symmetries_take_those_of_the_checkpoint(parsed):
+def test_test_data_without_symmetries_use_the_symmetries_of_the_checkpoint(parsed):
     data = parsed("data=virtual", "data.parts=[servoholder]").data
     (part,) = build_parts(data)
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])[None]
@@ -155,7 +155,7 @@ def test_a_mistake_in_the_data_is_one_line(override, got, tiny):
     assert "\n" not in str(error.value)
 
 
-def test_a_unit_matters_to_files_only(tiny):
+def test_a_unit_applies_to_mesh_files_only(tiny):
     (part,) = build_parts(tiny("data.unit=parsec").data)
     assert part.name == "pivconnector"
 
@@ -186,7 +186,9 @@ def test_preset_changes_reach_the_renders(tiny):
         (("data=virtual",), None),
     ],
 )  # fmt: skip
-def test_a_share_of_a_folder_is_said_with_what_changes_it(overrides, words, tiny):
+def test_a_shared_folder_is_reported_with_the_overrides_that_change_the_share(
+    overrides, words, tiny
+):
     root = () if "data=virtual" in overrides else ("data.root=somewhere",)
     said = note_on_shared_folder(tiny(*overrides, *root).data)
     assert (said is None) == (words is None)

@@ -36,7 +36,7 @@ def reader(root):
     return BopReader(root, [pivconnector()], "train_pbr")
 
 
-def test_a_folder_is_a_static_scene(reader):
+def test_static_scenes_add_images_of_the_same_scene(reader):
     assert {scene for scene, _ in reader.image_ids} == {f"{n:06d}" for n in range(NUM_SCENES)}
     scenes = StaticScenes(reader, NUM_VIEWS)
     assert len(scenes) == NUM_SCENES * NUM_VIEWS
@@ -54,7 +54,7 @@ def test_a_folder_is_a_static_scene(reader):
             np.testing.assert_allclose(place, places[0], atol=1e-6)
 
 
-def test_pictures_from_about_25_degrees_beside_are_chosen(root, tmp_path):
+def test_views_about_25_degrees_apart_are_chosen(root, tmp_path):
     cameras = root / "train_pbr" / "000000" / "scene_camera.json"
     for degrees, chosen in (((80, 24), 2), ((30, 2), 1)):
         changed = json.loads(cameras.read_text())
@@ -68,7 +68,7 @@ def test_pictures_from_about_25_degrees_beside_are_chosen(root, tmp_path):
         assert [other.key for other in scenes.sample(0).others] == [f"000000/{chosen:06d}"]
 
 
-def test_scenes_without_enough_pictures_or_poses_are_refused(reader, tmp_path):
+def test_scenes_without_enough_images_or_poses_are_rejected(reader, tmp_path):
     with pytest.raises(UserError, match=r"data\.views=4 with 3 test images of scene 000000"):
         StaticScenes(reader, NUM_VIEWS + 1)
     job = make_job(["pivconnector"], preset="wide", size="64x48")
@@ -79,7 +79,7 @@ def test_scenes_without_enough_pictures_or_poses_are_refused(reader, tmp_path):
 
 
 @pytest.mark.parametrize("preset", ["wide", "table"])
-def test_further_cameras_look_at_the_part_from_above_the_table(preset):
+def test_further_cameras_are_above_the_table(preset):
     factory = Factory([pivconnector()], PRESETS[preset].resized(64, 48), 0)
     for index in range(6):
         first, second = factory.render(0, index).scene, factory.render(0, index, view=1).scene
@@ -98,7 +98,7 @@ def test_further_cameras_look_at_the_part_from_above_the_table(preset):
             assert np.dot(first.plane.normal, centre) > first.plane.offset + 0.02
 
 
-def test_several_views_are_measured_beside_one(root, composed, tmp_path):
+def test_several_views_are_measured_in_addition(root, composed, tmp_path):
     options = (
         "ckpt_path=pretrained/pivconnector_wide", "data=bop", f"data.root={root}",
         "data.image_sets={train: null, val: null, test: train_pbr}", "num_pictures=1",

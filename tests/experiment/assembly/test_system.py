@@ -29,7 +29,7 @@ from dopepp.experiment.config.run_config import TrainerConfig
         ("mps", "AuthenticAMD", "avx512_bf16", True, "32-true"),
     ],
 )
-def test_bf16_is_taken_only_where_it_is_fast(
+def test_bf16_is_selected_only_on_fast_hardware(
     accelerator, vendor, flags, gpu_is_fast, expected, monkeypatch
 ):
     facts = {("vendor_id",): vendor, ("flags", "Features"): flags}
@@ -39,7 +39,7 @@ def test_bf16_is_taken_only_where_it_is_fast(
     assert choose_precision("16-mixed", accelerator) == ("16-mixed", "as requested")
 
 
-def test_the_estimate_grows_with_the_run_and_leaves_the_network_alone(tiny):
+def test_the_estimated_duration_grows_with_the_steps_and_the_network_is_unchanged(tiny):
     config = tiny("model.backbone.batch_norm=true")
     parts = build_parts(config.data)
     module, system = build_datamodule(config.data, parts, 0), build_system(config, parts, "")
@@ -81,18 +81,18 @@ def alone(monkeypatch):
         ({"devices": 2, "num_nodes": 3}, 6),
     ],
 )
-def test_how_many_processes_there_will_be(options, count, monkeypatch):
+def test_number_of_processes(options, count, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
     assert TrainerConfig(max_epochs=1, **options).num_processes == count
 
 
-def test_processes_that_torchrun_has_started_count_too(monkeypatch):
+def test_processes_of_torchrun_count(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     assert TrainerConfig(max_epochs=1, devices=1).num_processes == 2
 
 
 @pytest.mark.parametrize("devices", [0, [], "all", 1.5, True, None, -2], ids=repr)
-def test_a_number_that_means_nothing_is_refused(devices):
+def test_impossible_devices_are_rejected(devices):
     with pytest.raises(UserError, match=r"trainer\.devices="):
         _ = TrainerConfig(max_epochs=1, devices=devices).num_processes

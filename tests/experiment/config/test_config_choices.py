@@ -66,7 +66,7 @@ def targets(node: object) -> Iterator[str]:
             yield from targets(value)
 
 
-def test_there_are_choices_to_check():
+def test_conf_has_choices():
     assert len(CHOICES) > 25
     assert set(REGISTRIES) <= {group for group, _ in CHOICES}
 
@@ -124,7 +124,7 @@ def test_every_model_choice_trains_one_step(choice, tiny):
 
 @pytest.mark.parametrize("name", ["adam", "adamw", "muon", "sgd"])
 @pytest.mark.parametrize("schedule", ["constant", "cosine", "onecycle"])
-def test_every_optimizer_takes_every_schedule_to_its_end(name, schedule, tiny):
+def test_every_optimizer_runs_every_schedule(name, schedule, tiny):
     config = tiny(f"optimizer={name}", f"scheduler={schedule}", "optimizer.lr=0.01")
     system = build_system(config, build_parts(config.data), "")
     optimizer = system.make_optimizer(system.network.parameters())
@@ -209,13 +209,13 @@ def test_nested_targets_are_refused(place, tiny, tmp_path):
         build_all(config, tmp_path)
 
 
-def test_a_value_that_an_optimizer_refuses_shows_at_once():
+def test_a_rejected_optimizer_value_is_reported_immediately():
     with pytest.raises(UserError, match="learning rate"):
         optimizer_factory({"_target_": "torch.optim.Adam", "lr": -1.0})
 
 
 @pytest.mark.parametrize("num_steps", [0, 1, 2, 9, 10, 11, 20])
-def test_a_cycle_may_be_as_short_as_it_likes(num_steps):
+def test_one_cycle_accepts_any_number_of_steps(num_steps):
     node = {"_target_": "torch.optim.lr_scheduler.OneCycleLR", "max_lr": 0.1, "pct_start": 0.1}
     factory = scheduler_factory(node)
     optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=0.1)
@@ -227,13 +227,13 @@ def test_a_cycle_may_be_as_short_as_it_likes(num_steps):
 
 
 @pytest.mark.parametrize("name", ["optimizer", "scheduler", "callbacks", "logger"])
-def test_what_a_registry_lists_it_resolves(name):
+def test_registries_resolve_all_listed_targets(name):
     registry = REGISTRIES[name]
     for target in registry.targets:
         assert issubclass(registry.resolve(target), registry.base)
 
 
-def test_every_scheduler_learns_the_number_of_steps():
+def test_every_scheduler_receives_the_number_of_steps():
     for target in SCHEDULERS.targets:
         node = {"_target_": target} | ({"max_lr": 0.1} if "OneCycle" in target else {})
         factory = scheduler_factory(node)

@@ -21,13 +21,13 @@ def trained(tiny):
 
 @pytest.fixture
 def stored(trained):
-    """What a checkpoint says of the data it was trained on."""
+    """Data config as stored in a checkpoint."""
     return trained.stored_data()
 
 
 @pytest.fixture
 def evaluated(composed):
-    """The data that ``evaluate.py`` with overrides chooses, given what a checkpoint says."""
+    """Select the data of ``evaluate.py`` from the stored config and overrides."""
 
     def choose(stored: object, *overrides: str) -> DataConfig:
         asked = EvaluationConfig.of(composed(*overrides, config="evaluate"))
@@ -40,7 +40,7 @@ def test_the_checkpoints_own_data_by_default(evaluated, stored, trained):
     assert evaluated(stored) == trained.data
 
 
-def test_single_options_replace_the_stored_ones(evaluated, stored, trained):
+def test_single_options_replace_stored_options(evaluated, stored, trained):
     data = evaluated(
         stored, "++data.num_test=7", "data/test=photoreal", "++data.image_sets.test=other",
         "++virtual.preset=wide", "++virtual.scene.turning.tilt_deg=10",
@@ -52,7 +52,7 @@ def test_single_options_replace_the_stored_ones(evaluated, stored, trained):
     assert stored["num_test"] == 300
 
 
-def test_a_whole_data_set_keeps_only_how_to_render(evaluated, stored, trained):
+def test_a_whole_data_node_keeps_only_the_stored_render_options(evaluated, stored, trained):
     data = evaluated(stored, "data=virtual", "data.num_test=5")
     assert (data.name, data.num_test, data.samples_per_epoch) == ("virtual", 5, 10000)
     assert data.virtual == trained.data.virtual
@@ -72,7 +72,7 @@ def test_a_whole_data_set_keeps_only_how_to_render(evaluated, stored, trained):
         ("++data.virtual.preset=bin", r"data\.virtual=.*"),
     ],
 )
-def test_what_does_not_exist_is_named(override, message, evaluated, stored):
+def test_unknown_options_are_named(override, message, evaluated, stored):
     with pytest.raises(UserError, match=message):
         evaluated(stored, override)
 
@@ -84,7 +84,7 @@ def test_what_does_not_exist_is_named(override, message, evaluated, stored):
         ("data=virtual", r"best\.ckpt, which contains no options of the renders"),
     ],
 )
-def test_a_checkpoint_without_data_asks_for_them(override, message, evaluated):
+def test_a_checkpoint_without_a_data_config_is_rejected(override, message, evaluated):
     with pytest.raises(UserError, match=message):
         evaluated(None, override)
 
@@ -113,7 +113,7 @@ def test_a_folder_that_splits_share_is_divided():
     [(None, "wide", "facing"), ("front", "wide", "facing"), ("any", "wide", "free"),
      ("table", "table", "free"), ("bin", "heap", "free")],
 )  # fmt: skip
-def test_the_recipe_for_a_part_takes_the_views_that_are_asked_for(seen_on, preset, turning, parsed):
+def test_seen_on_selects_preset_and_rotations(seen_on, preset, turning, parsed):
     chosen = () if seen_on is None else (f"seen_on={seen_on}",)
     scenes = parsed("experiment=my_part", *chosen).data.preset
     assert (scenes.name, scenes.turning.kind) == (preset, turning)

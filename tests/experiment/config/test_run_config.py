@@ -1,4 +1,4 @@
-"""Options are read once: what one may not be is refused in a line."""
+"""Options are parsed once; wrong values are rejected in one line."""
 
 from pathlib import Path
 
@@ -46,7 +46,7 @@ from dopepp.experiment.config.run_config import EvaluationConfig, RunConfig
         ("trainer.profiler=slow", "trainer.profiler='slow'"),
     ],
 )  # fmt: skip
-def test_a_mistake_is_told_by_its_options_name(override, got, composed):
+def test_a_wrong_option_is_named(override, got, composed):
     with pytest.raises(UserError) as error:
         RunConfig.of(composed(override))
     assert error.value.got == got
@@ -59,7 +59,7 @@ def test_a_mistake_is_told_by_its_options_name(override, got, composed):
     [("bop_csv=1", "bop_csv=1"), ("num_pictures=-1", "num_pictures=-1"), ("+x=1", "x=1"),
      ("tune=1", "tune=1"), ("ckpt_path=[a]", "ckpt_path=['a']")],
 )  # fmt: skip
-def test_a_mistake_in_an_evaluation(override, got, composed):
+def test_a_wrong_option_of_an_evaluation_is_named(override, got, composed):
     with pytest.raises(UserError) as error:
         EvaluationConfig.of(composed(override, config="evaluate"))
     assert error.value.got == got
@@ -70,13 +70,13 @@ def test_a_mistake_in_an_evaluation(override, got, composed):
     [("refine=null", None), ("refine=depth", "depth"),
      ("refine=[region,depth]", ("region", "depth"))],
 )  # fmt: skip
-def test_terms_of_a_refinement_are_one_or_a_list(override, terms, composed):
+def test_refine_is_a_term_or_a_list_of_terms(override, terms, composed):
     assert EvaluationConfig.of(composed(override, config="evaluate")).refine == terms
     with pytest.raises(UserError, match=r"refine\[0\]=3"):
         EvaluationConfig.of(composed("refine=[3]", config="evaluate"))
 
 
-def test_values_are_typed_and_the_plain_config_stays(composed):
+def test_values_are_typed_and_the_plain_config_is_unchanged(composed):
     plain = composed("data.root=photos", "+trainer.limit_val_batches=2", "ema=0.5", "shading=0.4")
     config = RunConfig.of(plain)
     assert (config.plain, config.data.root) == (plain, Path("photos"))

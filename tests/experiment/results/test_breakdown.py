@@ -52,7 +52,7 @@ def poses(num: int, seed: int = 0) -> list[Array]:
 def fed(
     parts: list[Part], offsets: dict[str, Array], truths: dict[str, list[Array]]
 ) -> PoseMetrics:
-    """Give each instance an image of its own and a pose that is off along x; NaN misses it."""
+    """Return metrics with one image per instance and a pose with an offset along x, NaN: missed."""
     metrics = PoseMetrics(parts)
     for name, own in truths.items():
         for number, (T, offset) in enumerate(zip(own, offsets[name], strict=True)):
@@ -95,7 +95,7 @@ def test_quantities_in_closed_form(measured):
 @given(
     values=st.lists(st.integers(0, 12) | st.floats(0, 12), max_size=60), num_bins=st.integers(1, 8)
 )
-def test_bins_ascend_and_equal_values_share_one(values, num_bins):
+def test_bins_ascend_and_equal_values_share_a_bin(values, num_bins):
     array = np.array(values, np.float64)
     bins = bin_numbers(array, num_bins)
     order = np.argsort(array, kind="stable")
@@ -109,7 +109,7 @@ def test_bins_ascend_and_equal_values_share_one(values, num_bins):
         assert np.ptp(counts) <= 1
 
 
-def test_rates_of_bins_are_those_of_their_instances(measured, tmp_path):
+def test_rates_of_bins_by_brute_force(measured, tmp_path):
     metrics, truths, offsets = measured
     record_breakdown(tmp_path, {"dopepp": metrics}, "distance", 4, RATES)
     rows = read_csv(tmp_path / "by_distance.csv")
@@ -145,7 +145,7 @@ def test_rates_of_bins_are_those_of_their_instances(measured, tmp_path):
     assert image.std() > 0
 
 
-def test_numbers_that_are_printed_alike_share_a_bin(measured, monkeypatch):
+def test_numbers_with_equal_text_share_a_bin(measured, monkeypatch):
     metrics, *_ = measured
     fractions = iter([0.99991, 0.99994, 0.99998, 1.0] * 50)
     alike = QUANTITIES["visibility"]._replace(
@@ -156,7 +156,7 @@ def test_numbers_that_are_printed_alike_share_a_bin(measured, monkeypatch):
     assert [(each.low, each.high) for each in bins] == [(0.99991, 1.0)]
 
 
-def test_methods_share_the_bins_and_keep_their_own_objects(measured):
+def test_methods_share_bins_and_score_their_own_objects(measured):
     metrics, truths, _ = measured
     perfect = fed([part("a")], {"a": np.zeros(30)}, {"a": truths["a"]})
     both = {"dope": perfect, "dopepp": metrics}
@@ -178,7 +178,7 @@ def test_without_instances_there_is_a_warning(tmp_path, caplog):
     assert not list(tmp_path.iterdir())
 
 
-def test_the_papers_rate_goes_with_the_data():
+def test_the_reported_rate_depends_on_the_data():
     data: Any = SimpleNamespace(format="ycb_video", root=Path("data"))
     parts = [part("a")]
     assert [column.field for column in reported_rates(data, parts)] == ["pass_10cm", "add_01d"]
@@ -186,7 +186,7 @@ def test_the_papers_rate_goes_with_the_data():
     assert [one.field for one in reported_rates(data, parts)] == ["pass_5cm", "add_01d"]
 
 
-def test_of_a_symmetric_part_its_symmetries_count(tmp_path):
+def test_symmetric_parts_have_a_symmetric_rate(tmp_path):
     half_turn = np.diag([-1.0, -1, 1, 1])
     symmetric = replace(part("a"), symmetries_discrete=half_turn[None])
     data: Any = SimpleNamespace(format="bop", root=None)

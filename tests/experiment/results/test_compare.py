@@ -1,4 +1,4 @@
-"""Comparisons: run folders, seeds and parts of one method, differences, and what is written.
+"""Comparisons: run folders, seeds and parts of a method, differences and written files.
 
 Tables and sentences are compared to the character in ``test_golden.py``.
 """
@@ -38,7 +38,7 @@ BEST = [0.001] * 32
 
 @pytest.fixture
 def entry(report_of):
-    """Make a method of trainings with these errors."""
+    """Return a method of trainings with the given errors."""
 
     def make(name, *errors, seeds=None, **options):
         reports = [report_of(name, error, **options) for error in errors]
@@ -50,7 +50,7 @@ def entry(report_of):
 # Differences
 
 
-def test_differences_are_those_of_the_rows(entry):
+def test_differences_equal_differences_of_the_rows(entry):
     rng = np.random.default_rng(0)
     first, other = (entry(name, rng.gamma(1, 0.02, 60)) for name in "ab")
     for field, difference in differences(first, other, "part").items():
@@ -58,8 +58,8 @@ def test_differences_are_those_of_the_rows(entry):
         assert difference.value == pytest.approx(mine - theirs, abs=1e-12)
 
 
-def test_seeds_are_paired_by_number_not_by_order(entry):
-    """Row by row one seed is better than the baseline's and the other as much worse."""
+def test_seeds_are_paired_by_number(entry):
+    """Paired by order, a seed would be better than the baseline and the other equally worse."""
     shift = np.linspace(0, 0.001, 32)
     a, b = 0.02 + shift, 0.03 + shift
     base = entry("dope", a, b, seeds=[1, 2])
@@ -76,7 +76,7 @@ def test_an_interval_of_shares_ends_at_one(entry):
     assert (difference.low, difference.high) == (-1, 1)
 
 
-def test_what_has_other_objects_or_no_instances_is_not_set_off(entry):
+def test_other_objects_and_objects_without_instances_have_no_difference(entry):
     base = entry("dope", {"bolt": BAD, "nut": BAD})
     method = entry("x", {"bolt": GOOD, "nut": GOOD, "cap": GOOD})
     table = comparison_frame([base, method])
@@ -88,7 +88,7 @@ def test_what_has_other_objects_or_no_instances_is_not_set_off(entry):
     assert all(np.isnan(value.value) for value in differences(empty, empty, "part").values())
 
 
-def test_a_measure_that_one_seed_lacks_does_not_exist(entry):
+def test_a_measure_missing_for_one_seed_is_not_available(entry):
     (row, *_) = full_table(comparison_frame([entry("x", [np.inf] * 32, GOOD)]))
     assert (row["rotation °"], row["± rotation °"]) == ("n/a", "n/a")
 
@@ -96,13 +96,13 @@ def test_a_measure_that_one_seed_lacks_does_not_exist(entry):
 # Network and refined
 
 
-def test_refined_poses_stand_behind_their_network(entry, report_of):
+def test_refined_poses_follow_their_network(entry, report_of):
     methods = [
         Entry("dope", [report_of("dope", BAD, refined=GOOD)], [0]),
         Entry("dopepp", [report_of("dopepp", BAD, refined=BEST)], [0]),
     ]
     rows = full_table(comparison_frame(with_refined(methods)))
-    # Refined ones are set off against dope's refined, and those against its network.
+    # Refined poses are compared with dope's refined poses, and these with dope's network.
     assert [(row["method"], row["Δ ADD-0.1d %"]) for row in rows[:4]] == [
         ("dope", ""), ("dope + region", "+62.5"), ("dopepp", "+0.0"), ("dopepp + region", "+6.2"),
     ]  # fmt: skip
@@ -110,12 +110,12 @@ def test_refined_poses_stand_behind_their_network(entry, report_of):
     rows = full_table(comparison_frame(with_refined([entry("dope", BAD), methods[1]])))
     changes = {row["method"]: row.get("Δ ADD-0.1d %") for row in rows}
     assert changes["dopepp + region"] == "+68.8"
-    # Refined in one seed of two is no row.
+    # A method that was refined in one seed of two has no refined row.
     both = Entry("x", [report_of("x", BAD, refined=GOOD), report_of("x", BAD)], [0, 1])
     assert [item.name for item in with_refined([both])] == ["x"]
 
 
-def test_networks_of_a_part_each_have_a_mean(report_of):
+def test_networks_of_single_parts_are_joined_with_a_mean(report_of):
     bolt = report_of("x", {"bolt": BAD}, refined=GOOD)
     nut = report_of("x", {"nut": BAD}, refined=BEST)
     joined = Report.joined([nut, bolt])
@@ -130,7 +130,7 @@ def test_networks_of_a_part_each_have_a_mean(report_of):
 
 
 @pytest.mark.parametrize(("asked", "count"), [(None, 1), (0.5, 2)])
-def test_a_scale_that_was_chosen_for_the_object_is_no_other_recipe(
+def test_an_automatic_camera_scale_does_not_change_the_recipe(
     asked, count, tmp_path, report_of, write_run
 ):
     for part, scale in (("bolt", 0.5), ("nut", 0.9)):
@@ -155,7 +155,7 @@ def test_runs_that_differ_in_the_seed_are_one_method(tmp_path, report_of, write_
     assert entries[2].failure == "out of memory"
 
 
-def test_whatever_else_differs_keeps_runs_apart(tmp_path, report_of, write_run):
+def test_runs_with_other_differences_are_separate_methods(tmp_path, report_of, write_run):
     write_run(tmp_path / "0", ["seed=1"], report_of("dopepp", GOOD))
     write_run(tmp_path / "1", ["seed=2", "lr=3"], report_of("dopepp", GOOD), lr=3)
     write_run(tmp_path / "2", ["seed=3"], report_of("dopepp", GOOD, test_set="others"))
@@ -165,7 +165,7 @@ def test_whatever_else_differs_keeps_runs_apart(tmp_path, report_of, write_run):
     assert names == unlike
 
 
-def test_jobs_are_named_by_what_differs_and_no_two_alike(tmp_path, write_run):
+def test_methods_have_unique_names_of_differing_overrides(tmp_path, write_run):
     common = ["data=virtual", "seed=1", "output_dir=x", "hydra.verbose=true"]
     write_run(tmp_path / "0", [*common, "model=dope", "+optimizer=adam"])
     write_run(tmp_path / "1", [*common, "model=dopepp", "optimizer=sgd"])
@@ -178,7 +178,9 @@ def test_jobs_are_named_by_what_differs_and_no_two_alike(tmp_path, write_run):
     assert len(compact_table(comparison_frame(entries))) == 2
 
 
-def test_an_evaluation_is_what_its_checkpoint_was_trained_as(tmp_path, report_of, write_run):
+def test_evaluations_are_grouped_by_the_training_of_their_checkpoint(
+    tmp_path, report_of, write_run
+):
     for seed in (1, 2):
         overrides = ["lr=2", f"seed={seed}"]
         run = write_run(tmp_path / f"run{seed}", overrides, report_of("dopepp", BAD), lr=2)
@@ -195,7 +197,7 @@ def test_an_evaluation_is_what_its_checkpoint_was_trained_as(tmp_path, report_of
     assert first.checkpoint == tmp_path / "run1" / "checkpoints" / "best.ckpt"
     (entry,) = group(find_runs(evaluations))
     assert entry.seeds == [1, 2]
-    # Beside the trainings themselves it is something else: measured with other options.
+    # The trainings were measured with other options, so they are a separate method.
     assert len(group(find_runs([*evaluations, tmp_path / "run1"]))) == 2
 
 
@@ -209,9 +211,7 @@ def test_an_evaluation_is_what_its_checkpoint_was_trained_as(tmp_path, report_of
         ("checkpoints/last.ckpt", "", "no metrics.json; continue with resume="),
     ],
 )
-def test_a_damaged_or_unfinished_run_is_a_row_with_the_reason(
-    file, content, reason, tmp_path, write_run
-):
+def test_damaged_or_unfinished_runs_state_the_reason(file, content, reason, tmp_path, write_run):
     run = write_run(tmp_path / "0")
     assert read_run(run).failure == "unfinished: no metrics.json"
     (run / file).parent.mkdir(exist_ok=True)
@@ -222,7 +222,7 @@ def test_a_damaged_or_unfinished_run_is_a_row_with_the_reason(
     assert "\n" not in entry.failure
 
 
-def test_a_folder_given_twice_counts_once_and_one_without_runs_is_a_mistake(
+def test_repeated_folders_count_once_and_folders_without_runs_are_rejected(
     tmp_path, report_of, write_run
 ):
     for path in (tmp_path, tmp_path / "missing"):
@@ -232,7 +232,7 @@ def test_a_folder_given_twice_counts_once_and_one_without_runs_is_a_mistake(
     assert len(find_runs([tmp_path, tmp_path / "0", tmp_path / "." / "0"])) == 1
 
 
-def test_a_log_is_read_as_far_as_it_goes(tmp_path):
+def test_truncated_logs_are_read(tmp_path):
     path = tmp_path / "metrics.csv"
     assert read_log_column(path, "train/loss") == {}
     path.write_text("step,train/loss\n0,1.5\n1,\n2,nan\nx,1\n3,0.5\n4")
@@ -245,7 +245,7 @@ def test_a_log_is_read_as_far_as_it_goes(tmp_path):
 # The whole
 
 
-def test_curves_of_unfinished_runs_are_drawn_and_checkpoints_that_are_none_told(
+def test_unfinished_runs_have_curves_and_broken_checkpoints_are_reported(
     tmp_path, report_of, write_run
 ):
     write_run(tmp_path / "0", ["model=dope"], report_of("dope", BAD))
@@ -276,7 +276,7 @@ def test_a_comparison_is_never_overwritten(tmp_path, monkeypatch, report_of, wri
         compare_paths([run], out=first)
     with pytest.raises(UserError, match="baseline 'x'; allowed: dopepp"):
         compare_runs([read_run(run)], tmp_path / "new", baseline="x")
-    # One that is allowed stands before DOPE.
+    # A given baseline comes before DOPE.
     reports = [report_of("dopepp", GOOD), report_of("dope", BAD)]
     compare_reports(reports, tmp_path, "dopepp")
     assert [row["method"] for row in read_csv(tmp_path / "compare.csv")][:2] == ["dopepp", "dope"]

@@ -1,4 +1,4 @@
-"""Shading and scale with methods whose answers are known, and untrained networks end to end."""
+"""Shading and scale, measured with methods of known poses."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -36,7 +36,7 @@ COLOUR = 255
 
 
 class Finder:
-    """Gives the true pose, a bit beside it, of the instances that it sees."""
+    """Method that reports the true pose with an offset for every instance that it detects."""
 
     min_score = 0.0
 
@@ -58,7 +58,7 @@ class Finder:
 
 
 class Discs:
-    """Noise with a disc on it, of which a third is visible."""
+    """Images of noise with a disc whose visible fraction is 0.3."""
 
     name = "discs"
 
@@ -81,7 +81,7 @@ class Discs:
 
 
 def disc_finder(needed: float, offset: float) -> Finder:
-    """Finds the disc while a share of its 709 pixels is in sight."""
+    """Return a method that detects the disc while a share of its 709 pixels is visible."""
     points = np.random.default_rng(0).uniform(-0.05, 0.05, (30, 3))
     disc = Part("disc", cuboid_keypoints(points.min(0), points.max(0)), 0.1, points)
 
@@ -108,7 +108,7 @@ def check_pictures(folder: Path, condition: Condition, columns: int) -> None:
 
 
 class Doubtful(Finder):
-    """Reports poses half a metre beside the discs, and has the true poses as weaker candidates."""
+    """Method that reports wrong poses, with the true poses as candidates of lower score."""
 
     min_score = 0.5
 
@@ -135,7 +135,7 @@ def test_all_candidates_count_for_ap_and_reported_poses_for_everything_else():
 def test_every_method_is_measured_at_every_share(tmp_path):
     run_shading(Discs(), tmp_path)
     rows = read_csv(tmp_path / "shading.csv")
-    # At 80 % less than a tenth of the object is left, and it counts all the same.
+    # At 80 %, less than a tenth of the object is visible, and the object still counts.
     assert {row["num_instances"] for row in rows} == {str(NUM_IMAGES)}
     assert {row["num_outside_tolerance"] for row in rows} == {"0"}
     table = {(row["method"], float(row["share"])): row for row in rows}
@@ -151,14 +151,14 @@ def test_every_method_is_measured_at_every_share(tmp_path):
     check_pictures(tmp_path, SHADING, 4)
 
 
-def test_shares_that_are_not_reached_are_counted_and_said(tmp_path, caplog):
+def test_unreached_shares_are_counted_and_reported(tmp_path, caplog):
     run_shading(Discs(contrast=False), tmp_path, 0)
     said = f"At 60 %, the covered share of {NUM_IMAGES} of {NUM_IMAGES} instances is off"
     assert said in caplog.text
     assert not (tmp_path / "shading_examples.png").exists()
 
 
-def test_what_cannot_be_measured_is_refused_before_anything_is(tiny):
+def test_impossible_conditions_are_rejected_early(tiny):
     check_masks(Discs())
     with pytest.raises(UserError, match="shading on discs, 6 images without an instance mask"):
         check_masks(Discs(masks=False))

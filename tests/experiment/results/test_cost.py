@@ -28,7 +28,7 @@ from dopepp.maps.codec import MapGeometry
 SMALL = ("scale=laptop", "data.input_size=[32,32]", "cost.num_frames=4", "cost.batch_size=2")
 
 
-def test_counts_are_the_papers_and_times_are_written(parsed, tmp_path, capsys):
+def test_counts_match_the_paper_and_times_are_written(parsed, tmp_path, capsys):
     config = parsed("experiment=table4_parameters", *SMALL, "model.width=1", "job=cost")
     cost = measure_cost(config, tmp_path)
     assert torch.is_grad_enabled()  # as before
@@ -52,7 +52,7 @@ def test_counts_are_the_papers_and_times_are_written(parsed, tmp_path, capsys):
     assert read_rgb(tmp_path / "frame_rate.png").std() > 0
 
 
-def test_an_impossible_job_leaves_nothing(composed, tmp_path):
+def test_a_rejected_job_writes_nothing(composed, tmp_path):
     with pytest.raises(UserError, match=r"recovery\.max_peaks=0"):
         do_job(composed(*SMALL, "job=cost", "recovery.max_peaks=0"), tmp_path)
     assert not any(tmp_path.iterdir())
@@ -69,8 +69,8 @@ def estimator_of(config: RunConfig) -> tuple[SimulatedMapsEstimator, MapGeometry
     )
 
 
-def test_an_untrained_networks_frames_end_in_the_pictures_poses(parsed):
-    """So recovery has as much to do as behind a trained network."""
+def test_likely_maps_yield_the_poses_of_the_image(parsed):
+    """Recovery then needs as much time as with a trained network."""
     estimator, geometry, source = estimator_of(
         parsed("scale=laptop", "model.width=0.0625", "virtual.preset=wide")
     )
@@ -95,8 +95,8 @@ def test_an_untrained_networks_frames_end_in_the_pictures_poses(parsed):
 
 
 @pytest.mark.parametrize("size", ["[128,128]", "[96,64]"])
-def test_the_exchanged_maps_have_the_networks_own_shape(parsed, size):
-    """Images are padded no further than the network needs, not to the whole input."""
+def test_likely_maps_have_the_shape_of_the_networks_maps(parsed, size):
+    """Images are padded to the multiple that the network needs, not to the whole input size."""
     config = parsed(
         "scale=laptop", "model.width=0.0625", "virtual.preset=paper", f"data.input_size={size}",
         "data.parts=[servoholder,pivconnector]",

@@ -1,4 +1,4 @@
-"""Detections on images without the part: counted by hand, and the camera of the images."""
+"""Detections on images without the part: numbers counted by hand, and cameras."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -39,7 +39,7 @@ def folder(tmp_path):
 
 
 class Estimator:
-    """Gives image k candidates of the scores k/10 and k/20, from image 1 on."""
+    """Estimator with candidates of the scores k/10 and k/20 on image k > 0."""
 
     min_score = 0.39
 
@@ -66,7 +66,7 @@ def test_detections_are_counted_from_the_threshold_on(folder, tiny):
     assert [tile.caption for tile in tiles] == list(loudest)
 
 
-def test_pictures_have_the_named_camera_or_that_of_the_data(folder, tiny):
+def test_images_have_the_named_camera_or_the_camera_of_the_data(folder, tiny):
     data = tiny().data
     grid = np.zeros((48, 64, 3), np.uint8)
     grid[::8], grid[:, ::8] = 255, 255

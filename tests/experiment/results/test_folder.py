@@ -55,7 +55,7 @@ def test_the_state_of_the_working_tree(working_tree, tmp_path):
     assert (tree / "dopepp" / "__init__.py").read_text() == "one = 2\n"
 
 
-def test_a_run_that_goes_on_keeps_what_it_was_made_with(tmp_path):
+def test_a_resumed_run_keeps_its_earlier_environments(tmp_path):
     for seed, changes in ((1, []), (2, ["seed: 1 → 2"]), (3, ["seed: 2 → 3", "a: b → c"])):
         write_environment(tmp_path, seed, f"data{seed}", changes)
     written = read_json(tmp_path / VERSIONS_FILE)

@@ -1,6 +1,6 @@
 """Every table, page and sentence of the results, compared with a stored text to the character.
 
-``WRITE_GOLDEN=1 pytest tests/experiment/results/test_golden.py`` writes the texts anew.
+``WRITE_GOLDEN=1 pytest tests/experiment/results/test_golden.py`` updates the texts.
 """
 
 import os
@@ -60,7 +60,7 @@ def compare_golden(tmp_path, monkeypatch, capsys):
 
 
 def end(folder: str, table: dict[str, Any] | None = None) -> None:
-    """Do what Hydra does when the last job of a sweep has ended."""
+    """Run Hydra's hook at the end of a multirun."""
     config = OmegaConf.create({"hydra": {"sweep": {"dir": folder}}, "table": table})
     with suppress(SystemExit):
         CompareJobs().on_multirun_end(config)
@@ -86,7 +86,7 @@ def test_a_sweep_of_seeds_refined_failed_and_costs(compare_golden, report_of, wr
     compare_golden("sweep", "sweep/compare.md", "sweep/compare.csv", "sweep/README.md")
 
 
-def test_one_training_each(compare_golden, report_of):
+def test_a_single_training_per_method(compare_golden, report_of):
     entries = [
         Entry("dope", [report_of("dope", BAD)], [None]),
         Entry("dopepp", [report_of("dopepp", GOOD)], [None]),
@@ -155,7 +155,7 @@ def test_paper_tables_of_poses(experiment, compare_golden, report_of, write_run)
     )
 
 
-def test_a_table_of_one_network_a_part(compare_golden, report_of, write_run):
+def test_a_table_of_one_network_per_part(compare_golden, report_of, write_run):
     errors = {
         "none": {"bolt": [0.06, 0.06], "nut": [0.004] * 8 + [0.06] * 2},
         "random": {"bolt": [0.004, 0.06], "nut": [0.004] * 9 + [0.06]},
@@ -310,13 +310,13 @@ def report(report_of):
 
 
 @pytest.mark.parametrize("all_measures", [False, True])
-def test_the_report_in_the_terminal(report, all_measures, compare_golden):
+def test_a_report_in_the_terminal(report, all_measures, compare_golden):
     display.show_report(report, all_measures)
     compare_golden(f"report_{'all' if all_measures else 'usual'}")
 
 
 @pytest.mark.parametrize("keep", [True, False])
-def test_the_readme_of_a_run(keep, report, compare_golden):
+def test_readme_of_a_run(keep, report, compare_golden):
     config: Any = SimpleNamespace(
         model=SimpleNamespace(name="dopepp"),
         data=SimpleNamespace(name="hybrid"),
@@ -343,7 +343,7 @@ def test_the_readme_of_a_run(keep, report, compare_golden):
     compare_golden(f"readme_{'kept' if keep else 'trial'}", "pages", terminal=False)
 
 
-def test_the_readmes_of_jobs_and_sweeps(report, compare_golden):
+def test_readmes_of_jobs_and_multiruns(report, compare_golden):
     folder = Path("run")
     write_json(folder / VERSIONS_FILE, {"command": ["evaluate.py", "a=b c"]})
     (folder / "frame_rate.png").touch()

@@ -1,4 +1,4 @@
-"""When a run's README is written, and what a release refuses; texts are in ``test_golden.py``."""
+"""READMEs of runs and rejected releases; ``test_golden.py`` compares the texts."""
 
 import logging
 from types import SimpleNamespace
@@ -26,13 +26,13 @@ CONFIG: Any = SimpleNamespace(
 
 @pytest.fixture
 def run(tmp_path):
-    """A run's folder, with a blank in its name."""
+    """Return a run folder with a space in its name."""
     folder = tmp_path / "a run"
     write_json(folder / VERSIONS_FILE, {"command": ["train.py", "data.parts=[a,b]"]})
     return folder
 
 
-def test_nothing_is_written_before_a_run_has_begun(run, monkeypatch):
+def test_the_readme_is_not_written_before_the_run_begins(run, monkeypatch):
     monkeypatch.setattr("sys.argv", ["/somewhere/bin/dopepp", "train", "seed=1"])
     page, path = pages.RunReadme(CONFIG, run), run / pages.README_FILE
     page.end(pages.FAILED, "too early")
@@ -42,20 +42,20 @@ def test_nothing_is_written_before_a_run_has_begun(run, monkeypatch):
     assert f"\ndopepp train resume='{run}'  # continue" in path.read_text()
 
 
-def test_paths_are_typed_as_from_here(run, monkeypatch):
+def test_paths_are_relative_to_the_working_directory(run, monkeypatch):
     assert program.relative_path(run) == str(run)
     monkeypatch.chdir(run.parent)
     assert program.relative_path(run / "x") == "a run/x"
 
 
-def test_a_readme_that_cannot_be_written_ends_no_run(run, caplog):
+def test_a_failing_readme_does_not_end_the_run(run, caplog):
     (run / pages.README_FILE).mkdir()
     with caplog.at_level(logging.WARNING):
         pages.RunReadme(CONFIG, run).begin()
     assert f"cannot write {run / pages.README_FILE}" in caplog.text
 
 
-def test_releases_and_what_cannot_be_released(tmp_path, tiny_spec, report_of, monkeypatch):
+def test_releases_and_rejected_releases(tmp_path, tiny_spec, report_of, monkeypatch):
     checkpoint = Checkpoint(
         tiny_spec, build_network(tiny_spec).state_dict(), [load_part("pivconnector")],
         (64, 64), 8, 1.0, data={"name": "dopepp", "config": {"cache_dir": "/x/y"}},

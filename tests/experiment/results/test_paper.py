@@ -1,4 +1,4 @@
-"""The paper's tables: what becomes a row of what, and what is refused.
+"""The paper's tables: rows of methods, and rejected layouts.
 
 The tables themselves are compared to the character in ``test_golden.py``.
 """
@@ -25,13 +25,13 @@ ERRORS = [0.004, 0.06]
 
 
 def end(folder, table):
-    """Return the table that a sweep ends with."""
+    """End a multirun and return its table."""
     hydra = {"sweep": {"dir": str(folder)}}
     CompareJobs().on_multirun_end(OmegaConf.create({"hydra": hydra, "table": table}))
     return read_csv(folder / "table.csv")
 
 
-def test_a_sweep_ends_with_its_table_and_fails_after_it(tmp_path, report_of, write_run):
+def test_a_multirun_writes_its_table_before_it_fails(tmp_path, report_of, write_run):
     end(tmp_path, {"title": "6"})  # of no jobs: nothing to say
     write_run(tmp_path / "0", ["model=dopepp"], report_of("dopepp", ERRORS))
     write_run(tmp_path / "10", ["model=dopepp"])
@@ -42,14 +42,14 @@ def test_a_sweep_ends_with_its_table_and_fails_after_it(tmp_path, report_of, wri
     assert rows[1]["method"].endswith("unfinished: no metrics.json")
 
 
-def test_a_part_with_other_seeds_stands_alone(tmp_path, report_of, write_run):
+def test_parts_with_other_seeds_are_not_joined(tmp_path, report_of, write_run):
     for number, part in enumerate(("bolt", "nut")):
         result = report_of("x", {part: ERRORS}, test_set=part)
         write_run(tmp_path / str(number), [f"seed={number}"], result, data={"parts": [part]})
     assert "mean" not in [row["object"] for row in end(tmp_path, {"title": "Table 2"})]
 
 
-def test_shading_has_a_line_refined_and_none_of_another_checkpoint(tmp_path, report_of, write_run):
+def test_shading_table_has_refined_rows_and_no_other_methods(tmp_path, report_of, write_run):
     for number, model in enumerate(("dope", "dopepp")):
         result = report_of("x", ERRORS, refined=ERRORS)
         folder = write_run(tmp_path / str(number), [f"model={model}"], result, model=model)
@@ -85,7 +85,7 @@ def test_costs(composed, tmp_path, write_run):
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 @pytest.mark.parametrize("scale", ["paper", "laptop"])
 def test_every_experiment_composes(composed, experiment, scale):
-    """Tables of trainings train as the paper does at its scale, and as we do on a laptop."""
+    """Tables of trainings use the paper's recipe at full scale, and our recipe on a laptop."""
     config = composed(f"experiment={experiment}", f"scale={scale}")
     table = PaperTable.of(config["table"])
     assert set(table.labels.values()) & set(table.paper) or not table.paper
@@ -102,7 +102,7 @@ def test_every_experiment_composes(composed, experiment, scale):
         assert (config["data"]["batch_size"], config["trainer"]["max_epochs"]) == (32, 60)
 
 
-def test_recipes_are_ours_unless_the_papers_are_asked_for(composed):
+def test_recipe_of_experiments(composed):
     assert composed()["recipe"] == "ours"
     assert composed("experiment=paper")["optimizer"] == {"_target_": "torch.optim.Adam", "lr": 1e-4}
     table = composed("experiment=table6_dope_vs_dopepp", "recipe=ours")
@@ -132,9 +132,7 @@ def test_finished_runs_in_another_tables_layout(tmp_path, report_of, write_run):
 
 
 @pytest.mark.parametrize("text", ["model: dope\n", "table: Table 6\n", "- table\n"])
-def test_an_experiment_without_a_table_is_refused_before_anything_is_written(
-    text, tmp_path, report_of, write_run
-):
+def test_an_experiment_without_a_table_is_rejected_early(text, tmp_path, report_of, write_run):
     write_run(tmp_path / "0", ["model=dope"], report_of("dope", ERRORS))
     path = tmp_path / "experiment.yaml"
     path.write_text(text)

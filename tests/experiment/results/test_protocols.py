@@ -1,4 +1,4 @@
-"""The options of an evaluation's protocols: read, put in order, and refused in one line."""
+"""Options of an evaluation's protocols: parsed, sorted, and rejected in one line."""
 
 import sys
 from dataclasses import replace
@@ -30,13 +30,13 @@ FACTORS = r"scale=.*; allowed: factors from 0\.05 to 20"
         ("num_bins", 0, "num_bins=0; allowed: an integer from 1"),
     ],
 )  # fmt: skip
-def test_wrong_options_are_told_in_one_line(option, given, message):
+def test_wrong_options_are_reported_in_one_line(option, given, message):
     with pytest.raises(UserError, match=message) as error:
         Protocols.of({**OPTIONS, option: given})
     assert "\n" not in str(error.value)
 
 
-def test_options_are_put_in_order():
+def test_levels_are_sorted_and_unique():
     assert not Protocols.of(OPTIONS)
     given = Protocols.of({**OPTIONS, "shading": [0.8, 0, 0.2, 0.2, 1], "by": "size"})
     assert given == Protocols((0.2, 0.8, 1.0), by=("size",), num_bins=5)
@@ -45,7 +45,7 @@ def test_options_are_put_in_order():
     assert Protocols.of({**OPTIONS, "scale_factors": 2}).scales == (2.0,)
 
 
-def test_scale_is_short_for_an_option(composed, monkeypatch):
+def test_scale_is_a_short_name(composed, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["evaluate.py", "scale=[0.5,1,2]", "data.num_test=3"])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     seen: list[str] = []

@@ -1,4 +1,4 @@
-"""Another method's poses through the tables of an evaluation, and out of one again."""
+"""Poses of another method are read, measured and written by an evaluation."""
 
 import csv
 import json
@@ -59,7 +59,7 @@ def options(root: Path, *others: str) -> list[str]:
     return ["data=bop", f"data.root={root}", SPLITS, "num_pictures=1", *others]
 
 
-def test_a_file_goes_through_tables_and_curves_and_comes_back(root, composed, tmp_path, capsys):
+def test_poses_of_a_file_are_measured_and_written_again(root, composed, tmp_path, capsys):
     path = tmp_path / "posecnn_two-test.csv"
     write_results(path, results(root, 0.002))
     config = composed(*options(root, f"results={path}", "bop_csv=true"), config="evaluate")
@@ -93,7 +93,7 @@ def test_a_file_goes_through_tables_and_curves_and_comes_back(root, composed, tm
         assert next(csv.reader(stream))[1:] == ["servoholder", "pivconnector"]
 
 
-def test_a_folder_is_the_networks_whatever_file_is_measured_beside_it(root, composed, tmp_path):
+def test_metrics_json_describes_the_network_not_the_file(root, composed, tmp_path):
     path = tmp_path / "other_two-test.csv"
     write_results(path, results(root))
     network = ("ckpt_path=pretrained/pivconnector", "refine=region")
@@ -118,7 +118,7 @@ def test_poses_beside_the_test_set_are_left_out(root, composed, tmp_path, caplog
     assert f"ignoring 1 poses on images outside the test set and {others} poses" in caplog.text
 
 
-def test_a_file_that_does_not_fit_the_data(root, composed, tmp_path):
+def test_a_results_file_of_other_data_is_rejected(root, composed, tmp_path):
     path = tmp_path / "results.csv"
     write_results(path, [replace(results(root)[0], scene_id=3)])
     config = composed(*options(root, f"results={path}"), config="evaluate")

@@ -48,7 +48,7 @@ def test_a_report_survives_json(errors, share, ms):
     assert back.refined.to_record() == report.refined.to_record()
 
 
-def test_json_that_nobody_else_could_read_is_not_written(tmp_path):
+def test_json_with_nan_is_not_written(tmp_path):
     path = tmp_path / "x.json"
     write_json(path, {"a": 1})
     with pytest.raises(ValueError, match="JSON"):

@@ -18,7 +18,7 @@ from dopepp.models.checkpoint import read, write_atomic
 from dopepp.parts.catalogue import pivconnector
 
 
-def test_refined_poses_are_measured_beside_the_networks(composed, tmp_path):
+def test_refined_poses_are_measured_in_addition(composed, tmp_path):
     options = ("ckpt_path=pretrained/pivconnector", "refine=region", "+data.num_test=8")
     network, refined = run_evaluation(composed(*options, config="evaluate"), tmp_path)
     assert (network.name, refined.name) == ("dopepp_fast", "dopepp_fast + region")
@@ -40,7 +40,7 @@ def test_refined_poses_are_measured_beside_the_networks(composed, tmp_path):
     assert "Matching radius, half a diameter" in (tmp_path / "compare.md").read_text()
 
 
-def test_an_exact_scale_lets_refinement_move_the_distance(composed, tmp_path):
+def test_a_small_scale_error_improves_the_distance(composed, tmp_path):
     options = ("ckpt_path=pretrained/pivconnector", "refine=region", "+data.num_test=4",
                "num_pictures=0")  # fmt: skip
     translations = []
@@ -51,7 +51,7 @@ def test_an_exact_scale_lets_refinement_move_the_distance(composed, tmp_path):
     assert translations[0] < 0.8 * translations[1]
 
 
-def test_worse_is_by_more_than_a_millimetre():
+def test_made_worse_counts_increases_over_a_millimetre():
     part = pivconnector()
 
     def measured(*offsets):
@@ -83,7 +83,7 @@ def test_silent_images_are_counted_by_reason(composed, tmp_path, capsys):
     assert "below the threshold (best score" in line
 
 
-def test_templates_are_a_method_beside_the_network(composed, tmp_path, near_truth):
+def test_templates_are_measured_with_a_network(composed, tmp_path, near_truth):
     stored = stored_config(read(Path("pretrained/pivconnector")).data)
     data = replace(evaluation_data({}, {}, stored, "the release"), num_test=1)
     sample = held_out_source(data, [pivconnector()], "test").sample(0)
@@ -106,7 +106,7 @@ def test_templates_are_measured_without_a_checkpoint(composed, tmp_path, near_tr
     assert "images without detections" not in capsys.readouterr().out
 
 
-def test_pictures_without_the_part_are_counted(composed, tmp_path, capsys):
+def test_detections_on_images_without_the_part_are_counted(composed, tmp_path, capsys):
     folder = tmp_path / "desk"
     folder.mkdir()
     noise = np.random.default_rng(0).integers(0, 256, (96, 128, 3), np.uint8)
@@ -130,13 +130,13 @@ def test_pictures_without_the_part_are_counted(composed, tmp_path, capsys):
         (["ckpt_path=x", "tune=true", "negatives=y"], "tune=true with shading, scale, by, neg"),
     ],
 )
-def test_options_that_need_each_other(options, message, composed, tmp_path):
+def test_impossible_combinations_of_options(options, message, composed, tmp_path):
     with pytest.raises(UserError, match=message):
         run_evaluation(composed(*options, config="evaluate"), tmp_path)
 
 
 @pytest.mark.parametrize(("rate", "lines"), [(0.005, []), (1.0, ["every candidate is reported"])])
-def test_a_tuning_without_a_threshold_is_warned_of(monkeypatch, tmp_path, caplog, rate, lines):
+def test_a_false_positive_rate_of_one_is_warned_about(monkeypatch, tmp_path, caplog, rate, lines):
     def stop(*_):
         raise InterruptedError
 

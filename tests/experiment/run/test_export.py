@@ -1,4 +1,4 @@
-"""From a checkpoint to a file that is checked, or to none at all."""
+"""Exports are checked before they are written."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _few_pictures(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
 
 
-def test_a_released_checkpoint_for_pytorch(tmp_path):
+def test_safetensors_exports_of_a_released_checkpoint(tmp_path):
     done = export(RELEASED, "safetensors")
     assert done.path == Path("pivconnector.safetensors")
     assert done.agreement.is_exact
@@ -37,7 +37,7 @@ def test_a_released_checkpoint_for_pytorch(tmp_path):
     assert PoseEstimator.load(again.path).parts[0].name == "pivconnector"
 
 
-def test_a_check_that_fails_writes_nothing(monkeypatch, tmp_path):
+def test_a_failed_check_writes_nothing(monkeypatch, tmp_path):
     compare_export = module.compare_export
 
     monkeypatch.setattr(
@@ -49,7 +49,7 @@ def test_a_check_that_fails_writes_nothing(monkeypatch, tmp_path):
     assert export(RELEASED, "safetensors", "fp16").agreement.maps == 2e-4
 
 
-def test_a_full_disk_leaves_the_old_file_and_nothing_else(monkeypatch, tmp_path):
+def test_a_full_disk_keeps_the_old_file(monkeypatch, tmp_path):
     old = tmp_path / "a.safetensors"
     old.write_bytes(b"old")
 
@@ -88,7 +88,7 @@ def test_wrong_options(options, message, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", ["onnx", "openvino"])
-def test_eight_bits_are_measured_before_and_after(layout):
+def test_int8_exports_state_both_accuracies(layout):
     pytest.importorskip("nncf")
     done = export(RELEASED, layout, "int8", num_images=20)
     assert set(done.export.add_01d) == {"fp32", "int8"}

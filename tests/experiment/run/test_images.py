@@ -1,4 +1,4 @@
-"""The fingerprint of a test set changes with what is measured, and with nothing else."""
+"""The fingerprint of a test set depends on the evaluated ground truth only."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ def word(*samples: Sample) -> str:
     return fingerprint.hexdigest()
 
 
-def test_the_same_images_have_one_word():
+def test_equal_images_have_equal_fingerprints():
     again = sample()
     again.image += 1  # pixels may differ in a bit from machine to machine
     again.instances[0].T_cam_obj = again.instances[0].T_cam_obj + 1e-10
@@ -52,11 +52,11 @@ ONE = sample().instances[0]
         {"image": np.zeros((6, 4, 3), np.uint8)},
     ],
 )  # fmt: skip
-def test_other_images_have_another(change):
+def test_changed_images_have_other_fingerprints(change):
     assert word(sample()) != word(replace(sample(), **change))
 
 
-def test_number_order_and_objects_count():
+def test_fingerprints_depend_on_number_order_and_objects():
     a, b = sample("a"), sample("b")
     assert len({word(a), word(a, b), word(b, a), word(a, b, b)}) == 4
     fingerprint = Fingerprint([pivconnector(), servoholder()])

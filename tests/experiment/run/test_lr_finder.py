@@ -22,14 +22,14 @@ def losses(middle: float, noise: float = 0.0, seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize("middle", [1e-4, 1e-3])
 @pytest.mark.parametrize("noise", [0.0, 0.1])
-def test_the_rate_at_which_the_loss_falls_fastest(middle, noise):
+def test_the_suggestion_is_where_the_loss_falls_fastest(middle, noise):
     for seed in range(10):
         result = suggest(RATES, losses(middle, noise, seed))
         assert middle / 4 < result.steepest < 4 * middle
         assert result.steepest < result.lowest < 300 * middle
 
 
-def test_a_loss_that_does_not_fall_suggests_nothing():
+def test_a_loss_that_does_not_fall_has_no_suggestion():
     noise = 0.01 * np.random.default_rng(0).normal(size=200)
     assert suggest(RATES, 1 + noise) is None
     assert suggest(RATES, np.linspace(1, 3, 200)) is None
@@ -44,7 +44,7 @@ def test_smoothing_keeps_constants_and_lies_between_the_extremes():
     assert values.min() < smoothed.min() < smoothed.max() < values.max()
 
 
-def test_a_sweep_ends_where_the_loss_is_not_finite(tiny, tmp_path, monkeypatch):
+def test_a_sweep_ends_at_a_non_finite_loss(tiny, tmp_path, monkeypatch):
     number, forward = itertools.count(), SpatialCrossEntropy.forward
 
     def broken(self: SpatialCrossEntropy, *maps: Any) -> Any:

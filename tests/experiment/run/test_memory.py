@@ -1,4 +1,4 @@
-"""What tuning makes once: images and maps; and that it is the same as made anew."""
+"""The tuning cache: images and maps are computed once and equal a new computation."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ K = camera_matrix(100, 100, 31.5, 31.5)
 
 
 class Noise:
-    """Images of noise, and how often each was asked for."""
+    """Images of noise that record their requests."""
 
     name = "noise"
 
@@ -34,7 +34,7 @@ class Noise:
         return Sample(image, K, [Instance("servoholder", np.eye(4), np.zeros((9, 2)), mask=mask)])
 
 
-def test_a_sources_items_are_made_once_as_far_as_memory_goes():
+def test_items_of_a_source_are_cached_up_to_the_limit():
     source, other = Noise(), Noise()
     cache = TuningCache(max_bytes=2 * 64 * 64 * 4)  # of two images with their masks
     remembered, its = cache.of(source), cache.of(other)
@@ -49,7 +49,7 @@ def test_a_sources_items_are_made_once_as_far_as_memory_goes():
     assert other.asked == [(0, 0)]  # no other source's item
 
 
-def test_a_network_runs_once_on_a_picture(tiny_spec):
+def test_a_network_runs_once_per_image(tiny_spec):
     torch.manual_seed(0)
     network = build_network(tiny_spec)
     part = load_part("servoholder")

@@ -11,7 +11,7 @@ def progress_of(config):
     return _progress(config, build_datamodule(config.data, build_parts(config.data), config.seed))
 
 
-def test_refined_poses_are_measured_where_they_are_verified(tiny):
+def test_verified_refined_poses_are_measured_during_training(tiny):
     config = tiny("experiment=quickstart", "stop_at=0.9", "data.num_val=3")
     (progress,) = progress_of(config)
     assert isinstance(progress, RefinedProgress)
@@ -19,7 +19,7 @@ def test_refined_poses_are_measured_where_they_are_verified(tiny):
 
 
 @pytest.mark.parametrize("refine", ["null", "depth"])
-def test_a_goal_needs_verified_poses(tiny, refine):
+def test_stop_at_needs_verified_poses(tiny, refine):
     config = tiny("experiment=quickstart", "stop_at=0.9", f"refine={refine}")
     with pytest.raises(UserError, match=r"stop_at=0\.9 with refine=") as error:
         progress_of(config)
@@ -28,12 +28,12 @@ def test_a_goal_needs_verified_poses(tiny, refine):
     assert progress_of(without) == []
 
 
-def test_a_goal_is_a_share(tiny):
+def test_stop_at_is_a_share(tiny):
     with pytest.raises(UserError, match="stop_at"):
         tiny("stop_at=1.5")
 
 
-def test_whole_pictures_are_measured_where_training_sees_windows(tiny, tmp_path):
+def test_progress_is_measured_on_whole_images(tiny, tmp_path):
     camera = tmp_path / "cam.yaml"
     camera.write_text(
         "image_width: 320\nimage_height: 240\ncamera_matrix: {rows: 3, cols: 3, "

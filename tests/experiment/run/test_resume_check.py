@@ -1,4 +1,4 @@
-"""What may change between the parts of one run, and what a run's folder may say."""
+"""Options and images that may change when a run is resumed, and overrides of a run folder."""
 
 import contextlib
 import copy
@@ -47,7 +47,7 @@ class Pictures:
         return True
 
 
-def test_a_description_of_images_tells_what_is_another():
+def test_descriptions_of_images_reveal_differences():
     first = describe_images(Pictures(files="ab" * 32, parts={"a": "1"}))
     # Through a file and back, and with another machine's rounding, it is the same.
     again = yaml.safe_load(yaml.safe_dump(first))
@@ -65,7 +65,7 @@ def test_a_description_of_images_tells_what_is_another():
         assert len(line) < 120
 
 
-def test_a_preset_with_a_new_field_and_equal_images_is_the_same_preset():
+def test_a_new_preset_field_with_equal_images_is_no_difference():
     first, new = (describe_images(Pictures(preset=text)) for text in ("Preset()", "Preset(a=1)"))
     assert differing_images(first, new) == []
     (line,) = differing_images(first, describe_images(Pictures(110, preset="Preset(a=1)")))
@@ -79,7 +79,7 @@ def test_a_part_that_is_called_preset_is_compared():
 
 @pytest.fixture
 def resumed(tiny, tmp_path):
-    """Resume a run with these overrides and say which differences are accepted."""
+    """Resume a run with overrides and return the accepted differences."""
     (tmp_path / "run").mkdir()
     started = tiny()
     write_config(tmp_path / "run", started.plain)
@@ -110,13 +110,13 @@ ACCEPTED = {
 }
 
 
-def test_how_a_run_goes_on_may_change_and_is_told(resumed):
+def test_options_without_effect_on_learning_may_change(resumed):
     accepted = resumed(*ACCEPTED)
     assert set(ACCEPTED.values()) <= set(accepted)
     assert len(accepted) < len(ACCEPTED) + 5  # what hangs on them: the other logger's options
 
 
-def test_nothing_is_told_where_nothing_changed(resumed):
+def test_unchanged_runs_have_no_differences(resumed):
     assert resumed() == []
     assert resumed("output_dir=/elsewhere", "resume=x", "resume_anyway=true") == []
     assert resumed(test=Pictures(50)) == []  # other test images change nothing that is learnt
@@ -139,7 +139,7 @@ LEARNT_FROM = {
 }
 
 
-def test_what_is_learnt_from_changes_only_when_that_is_said(resumed):
+def test_learning_options_change_only_with_resume_anyway(resumed):
     harmless = "trainer.max_epochs=9"
     with pytest.raises(UserError, match="with other data or another loss") as error:
         resumed(*LEARNT_FROM, harmless)
@@ -153,7 +153,7 @@ def test_what_is_learnt_from_changes_only_when_that_is_said(resumed):
 
 
 @pytest.mark.parametrize("split", ["train", "val"])
-def test_images_that_changed_behind_the_same_options_are_other_data(split, resumed):
+def test_changed_images_with_equal_options_are_rejected(split, resumed):
     changed: dict[str, Any] = {split: Pictures(50)}
     with pytest.raises(UserError, match=rf"{split} images: as trained on → changed \(pixels of"):
         resumed(**changed)
@@ -161,7 +161,7 @@ def test_images_that_changed_behind_the_same_options_are_other_data(split, resum
 
 
 @pytest.mark.parametrize("anyway", ["true", "false"])
-def test_another_network_or_optimiser_is_refused_whatever_is_said(anyway, resumed):
+def test_another_network_or_optimiser_is_always_rejected(anyway, resumed):
     with pytest.raises(UserError, match=r"network differs.*model\.width: 0\.0625 → 0\.5") as error:
         resumed("model.width=0.5", f"resume_anyway={anyway}", spec="b")
     assert "init_from=" in error.value.fix
@@ -171,18 +171,18 @@ def test_another_network_or_optimiser_is_refused_whatever_is_said(anyway, resume
         resumed("optimizer=sgd", f"resume_anyway={anyway}")
 
 
-def test_a_run_that_wrote_no_config_is_compared_by_its_checkpoint(resumed, tmp_path):
+def test_a_run_without_config_is_compared_by_its_checkpoint(resumed, tmp_path):
     (tmp_path / "run" / CONFIG_FILE).unlink()
     assert resumed("seed=1") == []
     with pytest.raises(UserError, match="network differs"):
         resumed(spec="b")
 
 
-def test_an_option_that_a_later_version_added_is_no_difference():
+def test_a_new_option_with_null_is_no_difference():
     assert config_differences({"data": {"a": 1}}, {"data": {"a": 1, "new": None}}) == []
 
 
-def test_a_runs_own_overrides_are_kept():
+def test_overrides_of_the_task_are_kept():
     stored = [
         "model=dope", "data/augment=none", "data.parts=[pivconnector]", "+trainer.num_nodes=1",
         "++virtual.scene.turning={tilt_deg: 3}", "~callbacks.overlays", "output_dir=/a b/ö=1",
@@ -205,7 +205,7 @@ OF_HYDRA = (
 
 
 @pytest.mark.parametrize("text", OF_HYDRA)
-def test_nothing_of_hydras_own_comes_from_a_runs_folder(text):
+def test_options_of_hydra_are_not_read_from_a_run(text):
     """Hostile files are in tests/security/test_hostile_runs.py."""
     kept = []
     with contextlib.suppress(UserError):
@@ -213,5 +213,5 @@ def test_nothing_of_hydras_own_comes_from_a_runs_folder(text):
     assert kept in ([], ["model=dope"])
 
 
-def test_a_folder_without_overrides_has_none(tmp_path):
+def test_a_folder_without_overrides(tmp_path):
     assert read_overrides(tmp_path) is None

@@ -1,4 +1,4 @@
-"""Weights and threshold from detections; the tuned checkpoint beside the old one."""
+"""Weights, factors and thresholds from detections, and the tuned checkpoint."""
 
 import math
 from dataclasses import replace
@@ -49,7 +49,7 @@ NOTHING = ScoredDetections(
 
 
 def scored(seed: int, count: int, right: bool = True) -> ScoredDetections:
-    """Detections whose belief and spread say how likely they are right."""
+    """Return detections whose features determine the probability of being correct."""
     rng = np.random.default_rng(seed)
     features = np.column_stack([np.ones(count), rng.normal(size=(count, 4)) - (0 if right else 2)])
     truth = score(features, np.array([0.0, 2.0, -1.0, -0.5, 0.0]))
@@ -58,7 +58,7 @@ def scored(seed: int, count: int, right: bool = True) -> ScoredDetections:
     return ScoredDetections(features, rng.random(count), correct, image, ["photos"] * count, count)
 
 
-def test_chosen_scores_are_calibrated_and_silent_on_other_images():
+def test_scores_are_calibrated_and_low_on_images_without_objects():
     options = choose(scored(0, 3000), scored(1, 1000, right=False))
     weights = np.array([options[f"score_{name}"] for name in FEATURES])
     shown, empty = scored(2, 3000), scored(3, 1000, right=False)
@@ -70,7 +70,7 @@ def test_chosen_scores_are_calibrated_and_silent_on_other_images():
     assert options["min_score"] < 1
 
 
-def test_the_threshold_lets_no_more_pass_than_it_may():
+def test_the_threshold_meets_the_false_positive_rate():
     shown, empty = scored(4, 500), scored(5, 250, right=False)
     for rate in (0.0, 0.005, 0.1):
         options = choose(shown, empty, rate)
@@ -82,7 +82,7 @@ def test_the_threshold_lets_no_more_pass_than_it_may():
 
 
 @pytest.mark.parametrize(("correct", "what"), [(False, "incorrect"), (True, "correct")])
-def test_nothing_to_learn_from_is_said(correct, what):
+def test_tuning_needs_correct_and_incorrect_detections(correct, what):
     with pytest.raises(UserError, match=f"all of them {what}"):
         choose(replace(scored(7, 50), correct=np.full(50, correct)), NOTHING)
     with pytest.raises(UserError, match="no detection on any"):
@@ -90,7 +90,7 @@ def test_nothing_to_learn_from_is_said(correct, what):
 
 
 class Images:
-    """Two images of one part: at a place, and nowhere."""
+    """Two images: one of a part at a pose, one without parts."""
 
     name = "two"
 
@@ -113,7 +113,7 @@ VERIFIES = SimpleNamespace(verifies=True)
 
 
 def found(T: np.ndarray, certainty: float, shift: float = 0.0) -> Detection:
-    """A detection at a pose, shifted by a share of the part's diameter."""
+    """Return a detection at a pose, shifted by a share of the part's diameter."""
     moved = T.copy()
     moved[0, 3] += shift * PART.diameter
     keypoints = project_keypoints(PART.cuboid, moved, K)
@@ -126,25 +126,25 @@ def estimator(*detections: Detection, refiner: object = None) -> Any:
     return SimpleNamespace(candidates=lambda image, K, **_: list(detections), refiner=refiner)
 
 
-def test_right_is_matched_once_and_within_a_tenth_of_the_diameter():
+def test_correct_detections_match_once_within_a_tenth_of_the_diameter():
     detections = [found(POSE, 0.9, 0.05), found(POSE, 0.8, 0.05), found(POSE, 0.7, 0.2)]
     result = score_images(estimator(*detections), [PART], Images(POSE))
-    # A duplicate is wrong, and so is everything on the image without the part.
+    # A duplicate is wrong, and so are all detections on the image without the part.
     assert result.correct.tolist() == [True, False, False, False, False, False]
     assert (result.num_images, result.num_instances) == (2, 1)
     far = estimator(found(POSE, 0.9, 0.2))
     assert not score_images(far, [PART], Images(POSE)).correct.any()
 
 
-def test_what_finds_a_hidden_instance_is_not_judged():
+def test_detections_of_occluded_instances_do_not_count():
     result = score_images(estimator(found(POSE, 0.9), found(POSE, 0.8)), [PART], Images(POSE, 0.05))
-    # One explains itself by the instance that is hardly visible; its duplicate is wrong, and so
-    # are both on the image without the part.
+    # The best detection matches the occluded instance and does not count. The duplicate is wrong,
+    # and so are both detections on the image without the part.
     assert result.correct.tolist() == [False, False, False]
     assert (result.scores.tolist(), result.num_instances) == ([0.8, 0.9, 0.8], 0)
 
 
-def test_poses_are_paired_with_the_instances_that_they_find():
+def test_matched_poses_include_equivalent_poses():
     near, stray = found(POSE, 0.9, 0.05), found(POSE, 0.8, 3.0)
     ((pose, true),) = matched_poses(estimator(near, stray), [PART], Images(POSE))
     assert pose is near
@@ -156,7 +156,7 @@ def test_poses_are_paired_with_the_instances_that_they_find():
     assert matched_poses(estimator(near), [PART], Images(POSE, 0.05)) == []
 
 
-def test_the_factors_of_a_network_that_is_too_near_and_too_sure():
+def test_factors_of_a_biased_and_overconfident_network():
     rng = np.random.default_rng(0)
     deviation = np.array([0.02, 0.02, 0.01, 0.002, 0.002, 0.004])
     flip = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -210,7 +210,7 @@ class Refining:
 
 
 @pytest.mark.parametrize(("true", "fitted"), [(0.8, 0.8), (0.3, MIN_REFINED_FACTOR)])
-def test_the_factor_of_refined_poses_is_that_of_the_right_ones(true, fitted):
+def test_the_refined_factor_is_fitted_to_correct_poses(true, fitted):
     factor = fit_refined_factor(Refining(true), [PART], Many(250))  # type: ignore[arg-type]
     assert factor == pytest.approx(fitted, rel=0.15)
 
@@ -262,7 +262,7 @@ def test_refined_poses_are_scored_by_their_verification():
     assert score_images(unverified, [PART], Images(POSE)).features.shape == (2, len(FEATURES))
 
 
-def test_look_alikes_do_not_raise_the_threshold():
+def test_lookalikes_do_not_raise_the_threshold():
     shown, empty = scored(8, 500), scored(9, 100, right=False)
     alike = replace(empty, kinds=["look-alikes" if k % 2 else "photos" for k in range(100)])
     options = choose(shown, alike, 0.0)
@@ -291,19 +291,19 @@ def test_refined_poses_far_below_even_odds_are_not_reported(caplog):
     assert options["refined_min_score"] < 0.9
     assert lost.mean() == pytest.approx(MAX_LOST, abs=0.02)
     assert "a higher threshold would lose" in caplog.text
-    # Poses that are all right do not say how to weigh the features.
+    # If all poses are correct, the weights stay at their defaults.
     same = choose(replace(shown, correct=np.ones(200, bool)), nothing, refined=True)
     assert [same[f"refined_{name}"] for name in ("bias", "score", "verification")] == [0, 0, 1]
 
 
-def test_several_sources_are_judged_as_one():
+def test_several_sources_are_scored_together():
     images = Images(POSE)
     both = score_images(estimator(found(POSE, 0.9)), [PART], images, Images(POSE))
     assert (both.num_images, both.num_instances) == (4, 2)
     assert both.image.tolist() == [0, 1, 2, 3]
 
 
-def test_a_symmetric_part_is_right_at_any_of_its_poses():
+def test_equivalent_poses_of_a_symmetric_part_are_correct():
     flip = np.diag([-1.0, -1.0, 1.0, 1.0])
     mirrored = replace(PART, points=np.vstack([PART.points, PART.points @ flip[:3, :3]]))
     turned = estimator(found(POSE @ flip, 0.9))
@@ -313,7 +313,7 @@ def test_a_symmetric_part_is_right_at_any_of_its_poses():
 
 
 @pytest.mark.parametrize("name", ["best.ckpt", "best.safetensors"])
-def test_the_tuned_checkpoint_stands_beside_the_old_one(tiny_spec, tmp_path, name):
+def test_the_tuned_checkpoint_is_written_next_to_the_original(tiny_spec, tmp_path, name):
     weights = build_network(tiny_spec).state_dict()
     former = {"max_angle_deg": 30.0, "refined_agreement": 2.0}  # of an older tuning
     old = Checkpoint(tiny_spec, weights, [PART], (128, 96), 8, 1.0, former)

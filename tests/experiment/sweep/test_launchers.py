@@ -1,4 +1,4 @@
-"""Multiruns in other processes: the same rows, whichever launcher runs the jobs."""
+"""Multiruns in other processes have the same results with every launcher."""
 
 import json
 import os
@@ -19,7 +19,7 @@ SWEPT = f"optimizer.lr={','.join(RATES)}"
 
 @pytest.fixture
 def sweep(command, fast_training, tmp_path):
-    """Run a multirun of jobs that take no time as a process; END_<job>=how ends one early."""
+    """Run a multirun of jobs that take no time as a process; END_<job>=how ends a job early."""
     places = ("~hydra.callbacks.compare", f"hydra.sweep.dir={tmp_path / 'sweep'}")
     return lambda *arguments, **ends: command(fast_training, "-m", *places, *arguments, env=ends)
 
@@ -64,13 +64,15 @@ def test_processes_of_this_machine(package, options, sweep, tmp_path):
 
 
 @pytest.mark.slow
-def test_joblib_with_a_process_that_is_lost(sweep, tmp_path):
+def test_joblib_with_a_lost_process(sweep, tmp_path):
     pytest.importorskip("joblib")
     code, out, err = sweep("hydra/launcher=joblib", "seed=0,1,2,3,4", END_1="kill")
     assert code == 0, err
     lost = {number for number in range(5) if (tmp_path / f"sweep/{number}/failed.json").exists()}
     assert lost == {1}
-    assert reason(tmp_path, 1).startswith("its process was lost: LostWorkerError: a worker process")
+    assert reason(tmp_path, 1).startswith(
+        "the process of the job was lost: LostWorkerError: a worker process"
+    )
     for number in {0, 1, 2, 3, 4} - lost:
         assert (tmp_path / f"sweep/{number}/metrics.json").is_file()
     assert "ended, 5 of 5" in out
@@ -101,7 +103,7 @@ for task in 0 1 2; do echo "77_$task|RUNNING|here"; done
 
 @pytest.mark.slow
 def test_slurm_gets_an_array_with_the_options(sweep, tmp_path):
-    """With stand-ins for SLURM's commands, that run the script they are given."""
+    """Replace SLURM's commands by scripts that run the submitted script on this machine."""
     pytest.importorskip("submitit")
     for name, script in (("sbatch", SBATCH), ("srun", SRUN), ("sacct", SACCT)):
         path = tmp_path / "bin" / name
@@ -140,18 +142,18 @@ def test_ray_on_a_cluster_of_two_nodes(sweep, two_nodes, tmp_path):
 
 
 @pytest.mark.parametrize(("package", "extra"), [("joblib", "joblib"), ("submitit", "slurm")])
-def test_without_its_package_it_says_what_to_install(package, extra, monkeypatch):
+def test_without_the_package_the_error_names_the_extra(package, extra, monkeypatch):
     monkeypatch.setattr("dopepp.core.errors.find_spec", lambda name: None)
     with pytest.raises(UserError, match=rf"without the package {package}.*dopepp\[{extra}\]"):
         on_joblib(2) if package == "joblib" else on_slurm("x", "slurm", 0, {})
 
 
-def test_joblib_wants_a_number_of_processes():
+def test_joblib_needs_a_positive_number_of_processes():
     with pytest.raises(UserError, match=r"hydra\.launcher\.n_jobs=0"):
         on_joblib(0)
 
 
-def test_a_job_goes_on_in_its_folder_only_with_its_own_config(tmp_path):
+def test_a_job_resumes_only_with_an_equal_config(tmp_path):
     config = {"seed": 1, "model": {"width": 0.5}, "resume": None}
     assert not multirun.can_resume(config, tmp_path)
     write_config(tmp_path, {**config, "resume": "outputs/x"})
@@ -163,7 +165,7 @@ def test_a_job_goes_on_in_its_folder_only_with_its_own_config(tmp_path):
     assert not multirun.can_resume({**config, "resume": "outputs/y"}, tmp_path)
 
 
-def test_what_children_print_is_in_the_file_too(tmp_path, capfd):
+def test_output_of_child_processes_is_redirected(tmp_path, capfd):
     with multirun.redirected_output(tmp_path / "job" / "job.log"):
         os.write(1, b"by this process\n")
         subprocess.run(["bash", "-c", "echo by a child; echo as an error >&2"], check=True)
@@ -179,7 +181,7 @@ def slurm_job(tmp_path, monkeypatch):
     monkeypatch.setenv("SLURM_JOB_ID", "12")
 
 
-def test_only_a_requeued_job_goes_on_and_with_its_own_command(slurm_job, tmp_path, monkeypatch):
+def test_a_requeued_job_resumes_the_run_of_its_command(slurm_job, tmp_path, monkeypatch):
     multirun.record_run(["seed=1"], tmp_path / "a")
     multirun.record_run(["seed=2"], tmp_path / "b")
     assert multirun.requeued_run(["seed=1"]) is None  # the first time: no restart
@@ -201,13 +203,13 @@ def test_only_a_requeued_job_goes_on_and_with_its_own_command(slurm_job, tmp_pat
         ({"SLURM_JOB_ID": "--help"}, None),
     ],
 )
-def test_a_job_is_named(variables, named, slurm_job, monkeypatch):
+def test_slurm_job_ids(variables, named, slurm_job, monkeypatch):
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     assert multirun.job_id() == named
 
 
-def test_a_refused_or_missing_scontrol_is_told(slurm_job, tmp_path, monkeypatch):
+def test_a_failing_scontrol_is_reported(slurm_job, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     assert multirun.requeue().startswith("SLURM did not requeue job 12: ")
     script = tmp_path / "scontrol"

@@ -1,4 +1,4 @@
-"""Hydra's sweeps as Optuna's distributions; searches as a user runs them, of no training time."""
+"""Hydra's sweeps as Optuna's distributions, and searches over trainings that take no time."""
 
 import fcntl
 import json
@@ -39,12 +39,12 @@ def loader():
         ("a,b", CategoricalDistribution(["a", "b"])),
     ],
 )
-def test_every_form(text, expected, loader):
+def test_sweeps_become_distributions(text, expected, loader):
     space = read_space(loader, [f"x.y={text}"], [])
     assert (space.varied, space.texts) == ({"x.y": expected}, {"x.y": text})
 
 
-def test_the_command_line_adds_replaces_and_fixes(loader):
+def test_the_command_line_extends_and_fixes_the_space(loader):
     listed = ["a=interval(0, 1)", "b=choice(1, 2)", "c=interval(0, 1)"]
     space = read_space(loader, listed, ["model=dope", "b=7", "c=interval(0, 9)", "+d=x,y"])
     assert list(space.varied) == ["a", "c", "+d"]
@@ -54,18 +54,18 @@ def test_the_command_line_adds_replaces_and_fixes(loader):
     assert written == ["model=dope", "b=7", "a=0.1235", "+d=x"]
 
 
-def test_every_choice_is_tried_before_the_search(loader):
+def test_examples_cover_every_choice(loader):
     space = read_space(loader, ["a=choice(1, 2)", "b=interval(0, 1)", "c=choice(x, y)"], [])
     assert examples(space) == [["a=1", "b=0", "c=x"], ["a=2", "b=0", "c=x"], ["a=1", "b=0", "c=y"]]
 
 
 @pytest.mark.parametrize("bad", ["a=1", "a=", "a=interval(1,", "a=interval(2, 1)", "a"])
-def test_what_is_no_range_is_refused(bad, loader):
+def test_entries_that_are_no_sweep_are_rejected(bad, loader):
     with pytest.raises(UserError, match=r"search\.space with .*allowed: interval\(low, high\)"):
         read_space(loader, [bad], [])
 
 
-def test_numbers_are_written_as_they_are_run():
+def test_overrides_have_four_significant_digits():
     written = search_overrides({"lr": 1.23456e-4, "n": 123456, "m": "cbam"})
     assert written == ["lr=0.0001235", "n=123456", "m=cbam"]
 
@@ -85,7 +85,7 @@ def started(folder: Path) -> list[list[str]]:
     return [line.split() for line in lines]
 
 
-def test_the_same_command_goes_on_and_the_best_trial_is_named(call_fast, tmp_path):
+def test_a_repeated_command_continues_and_names_the_best_trial(call_fast, tmp_path):
     assert call_fast(*FAST, "search.num_trials=1")[0] == 0
     for _ in range(2):  # the second time, nothing is missing
         code, out, err = call_fast(*FAST, "search.num_trials=3")
@@ -120,7 +120,7 @@ def test_interrupted_trials_run_again_under_their_numbers(call_fast, tmp_path, m
     assert [int(number) for number, _ in started(tmp_path)] == [0, 0, 1, 1, 2]
 
 
-def test_a_result_that_was_not_told_is_not_computed_again(call_fast, tmp_path):
+def test_unreported_results_are_not_computed_again(call_fast, tmp_path):
     """The command died after a job's end: here, one of two that run at a time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("END_1", "interrupt")
@@ -172,7 +172,7 @@ def test_a_study_is_not_mixed_with_another_configuration(call_fast):
     assert "search.study=NAME" in done.line
 
 
-def test_a_folder_of_another_study_or_command_is_refused(call_fast, tmp_path):
+def test_a_folder_of_another_study_or_command_is_rejected(call_fast, tmp_path):
     folder = tmp_path / "search" / "s"
     (folder / "0").mkdir(parents=True)
     assert "with the jobs 0 of another study" in call_fast(*FAST).line
@@ -196,11 +196,11 @@ def test_a_folder_of_another_study_or_command_is_refused(call_fast, tmp_path):
         (["search.storage=nowhere://x"], "search.storage=nowhere://x"),
     ],
 )
-def test_mistakes_are_told_in_one_line(arguments, message, call_fast, tmp_path):
+def test_mistakes_are_reported_in_one_line(arguments, message, call_fast, tmp_path):
     assert message in call_fast("search=optuna", "search.study=s", *arguments).line
     assert not (tmp_path / "search" / "s" / "started.txt").exists()
 
 
-def test_without_optuna_it_says_what_to_install(call_fast, monkeypatch):
+def test_without_optuna_the_error_names_the_extra(call_fast, monkeypatch):
     monkeypatch.setattr("dopepp.core.errors.find_spec", lambda name: None)
     assert "pip install 'dopepp[search]'" in call_fast(*FAST).line
