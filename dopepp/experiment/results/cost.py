@@ -54,8 +54,8 @@ NOTE: Final = (
 
 BELIEF_NOISE: Final = 0.005
 FIELD_NOISE: Final = 0.05
-"""Standard deviation per cell of the noise on the true maps. With this noise, recovery takes about as
-long as on the maps of trained networks (``benchmarks/decode.py``)."""
+"""Standard deviation per cell of the noise on the true maps. With this noise, recovery takes about
+as long as on the maps of trained networks (``benchmarks/decode.py``)."""
 
 WARM_UP: Final = 3
 """Number of untimed passes, which allocate memory, select kernels and compile."""
