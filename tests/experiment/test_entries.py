@@ -12,12 +12,12 @@ import contextlib, io, json, sys
 from dopepp.cli import app
 ends = []
 for words in json.loads(sys.argv[1]):
-    sys.argv, said = ["dopepp", *words], io.StringIO()
-    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+    sys.argv, output = ["dopepp", *words], io.StringIO()
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
         try:
             app()
         except SystemExit as end:
-            ends.append((end.code or 0, said.getvalue()))
+            ends.append((end.code or 0, output.getvalue()))
 print(json.dumps([ends, list({"torch", "lightning", "cv2"} & set(sys.modules))]))
 """
 ANSWERS = {
@@ -34,8 +34,8 @@ def test_the_console_answers_before_pytorch_is_imported(command):
     done = command("-c", CONSOLE, json.dumps([words.split() for words in ANSWERS]), code=0)
     ends, imported = json.loads(done.out)
     assert imported == []
-    for (words, (code, said)), (ended, output) in zip(ANSWERS.items(), ends, strict=True):
-        assert (ended, bool(re.search(said, output))) == (code, True), (words, output)
+    for (words, (code, pattern)), (ended, output) in zip(ANSWERS.items(), ends, strict=True):
+        assert (ended, bool(re.search(pattern, output))) == (code, True), (words, output)
 
 
 def test_a_rejected_run_leaves_no_folder(call, tiny_options, tmp_path):

@@ -79,8 +79,8 @@ def test_renders_have_the_camera_of_the_real_images(config, caplog):
     assert names == [("train", "virtual"), ("val", "virtual"), ("test", "bop/test")]
     assert isinstance(module.test_source, BopReader)
     assert module.test_source.sample(0).K[0, 0] == 210.0
-    said = config("virtual.working_distance=[0.4,0.7]")
-    assert fit_to_camera(said, parts).data.virtual.working_distance == (0.4, 0.7)
+    changed = config("virtual.working_distance=[0.4,0.7]")
+    assert fit_to_camera(changed, parts).data.virtual.working_distance == (0.4, 0.7)
 
 
 def test_images_without_annotations_need_only_the_working_distance(config, root, tmp_path):
@@ -91,8 +91,8 @@ def test_images_without_annotations_need_only_the_working_distance(config, root,
     parts = build_parts(given.data)
     with pytest.raises(UserError, match=r"no annotated object in bop/test.*working_distance="):
         fit_to_camera(given, parts)
-    said = config(f"data.root={private}", "virtual.working_distance=[0.4,0.7]")
-    virtual = fit_to_camera(said, parts).data.virtual
+    changed = config(f"data.root={private}", "virtual.working_distance=[0.4,0.7]")
+    virtual = fit_to_camera(changed, parts).data.virtual
     assert (virtual.camera.fx, virtual.working_distance) == (210.0, (0.4, 0.7))
 
 
@@ -142,7 +142,7 @@ def test_real_frames_and_renders_are_windows_of_equal_scale(config, root):
     width, height = data.network_input
     module = build_datamodule(data, parts, 0)
     samples = [module.train_item(0, index) for index in range(8)]
-    by_source = {one.source: one for one in samples}
+    by_source = {sample.source: sample for sample in samples}
     assert set(by_source) == {"bop/test", "virtual"}
     cuboids = {part.name: part.cuboid for part in parts}
     for sample in samples:
@@ -189,9 +189,9 @@ def test_true_poses_from_a_file_have_perfect_scores(call, root, tmp_path):
         "evaluate.py", "data=bop_renders", f"data.root={root}", f"results={path}",
         f"output_dir={tmp_path}", "virtual=default", code=0,
     )  # fmt: skip
-    said = re.search(r"BOP, (\d+) targets: AR ([\d.]+)% \(VSD ([\d.]+)%", done.out)
-    assert said, done.out[-3000:]
-    assert float(said[2]) > 99
+    match = re.search(r"BOP, (\d+) targets: AR ([\d.]+)% \(VSD ([\d.]+)%", done.out)
+    assert match, done.out[-3000:]
+    assert float(match[2]) > 99
     (metrics,) = tmp_path.glob("**/metrics.json")
     scores = json.loads(metrics.read_text())["bop"]
     assert scores["num_targets"] == sum(len(source.sample(i).instances) for i in range(4))

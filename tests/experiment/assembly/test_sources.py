@@ -190,6 +190,6 @@ def test_a_shared_folder_is_reported_with_the_overrides_that_change_the_share(
     overrides, words, tiny
 ):
     root = () if "data=virtual" in overrides else ("data.root=somewhere",)
-    said = note_on_shared_folder(tiny(*overrides, *root).data)
-    assert (said is None) == (words is None)
-    assert words is None or words in said
+    note = note_on_shared_folder(tiny(*overrides, *root).data)
+    assert (note is None) == (words is None)
+    assert words is None or words in note

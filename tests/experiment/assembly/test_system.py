@@ -68,7 +68,7 @@ def alone(monkeypatch):
         ({"devices": "1"}, 1),
         ({"devices": [3]}, 1),
         ({"devices": "3,"}, 1),
-        ({"devices": 1, "strategy": "ddp"}, 1),  # one process, whatever it is called
+        ({"devices": 1, "strategy": "ddp"}, 1),  # the strategy does not change the number
         ({"devices": 2}, 2),
         ({"devices": "2"}, 2),
         ({"devices": [0, 1]}, 2),

@@ -30,8 +30,8 @@ def evaluated(composed):
     """Select the data of ``evaluate.py`` from the stored config and overrides."""
 
     def choose(stored: object, *overrides: str) -> DataConfig:
-        asked = EvaluationConfig.of(composed(*overrides, config="evaluate"))
-        return evaluation_data(asked.data, asked.virtual, stored, "best.ckpt")
+        options = EvaluationConfig.of(composed(*overrides, config="evaluate"))
+        return evaluation_data(options.data, options.virtual, stored, "best.ckpt")
 
     return choose
 

@@ -162,7 +162,7 @@ def test_methods_share_bins_and_score_their_own_objects(measured):
     both = {"dope": perfect, "dopepp": metrics}
     bins, values = break_down(both, "size", 3, RATES)
     alone = break_down({"dopepp": metrics}, "size", 3, RATES)
-    assert (bins, str([one for one in values if one.method == "dopepp"])) == (
+    assert (bins, str([value for value in values if value.method == "dopepp"])) == (
         alone[0],
         str(alone[1]),
     )
@@ -183,7 +183,7 @@ def test_the_reported_rate_depends_on_the_data():
     parts = [part("a")]
     assert [column.field for column in reported_rates(data, parts)] == ["pass_10cm", "add_01d"]
     data.root = None
-    assert [one.field for one in reported_rates(data, parts)] == ["pass_5cm", "add_01d"]
+    assert [rate.field for rate in reported_rates(data, parts)] == ["pass_5cm", "add_01d"]
 
 
 def test_symmetric_parts_have_a_symmetric_rate(tmp_path):

@@ -129,15 +129,15 @@ def test_networks_of_single_parts_are_joined_with_a_mean(report_of):
 # Run folders
 
 
-@pytest.mark.parametrize(("asked", "count"), [(None, 1), (0.5, 2)])
+@pytest.mark.parametrize(("camera_scale", "count"), [(None, 1), (0.5, 2)])
 def test_an_automatic_camera_scale_does_not_change_the_recipe(
-    asked, count, tmp_path, report_of, write_run
+    camera_scale, count, tmp_path, report_of, write_run
 ):
     for part, scale in (("bolt", 0.5), ("nut", 0.9)):
         config = {"data": {"objects": [part]}, "virtual": {"camera_scale": scale}}
         result = report_of("x", {part: GOOD})
         folder = write_run(tmp_path / part, [f"data.objects=[{part}]"], result, **config)
-        given = {"virtual": {"camera_scale": asked}}
+        given = {"virtual": {"camera_scale": camera_scale}}
         (folder / ".hydra" / "config.yaml").write_text(yaml.safe_dump(given))
     entries = group(find_runs([tmp_path / "bolt", tmp_path / "nut"]))
     assert len(entries) == count
@@ -151,7 +151,7 @@ def test_runs_that_differ_in_the_seed_are_one_method(tmp_path, report_of, write_
     write_run(tmp_path / "4", ["model=dope", "seed=3"], "out of memory")
     entries = group(find_runs([tmp_path]))
     assert [entry.name for entry in entries] == ["dope", "dopepp", "dope seed=3"]
-    assert [one.seeds for one in entries] == [[1, 2], [1, 2], []]
+    assert [entry.seeds for entry in entries] == [[1, 2], [1, 2], []]
     assert entries[2].failure == "out of memory"
 
 
@@ -174,7 +174,7 @@ def test_methods_have_unique_names_of_differing_overrides(tmp_path, write_run):
     assert names == ["dope optimizer=adam", "dopepp optimizer=sgd", f"dopepp {tmp_path.name}/10"]
     folders = [write_run(tmp_path / place / "run", ["model=dope"], "gone") for place in "ab"]
     entries = group(find_runs(folders))
-    assert [one.name for one in entries] == [f"dope run {folder}" for folder in folders]
+    assert [entry.name for entry in entries] == [f"dope run {folder}" for folder in folders]
     assert len(compact_table(comparison_frame(entries))) == 2
 
 

@@ -76,8 +76,8 @@ class Discs:
         image[mask] = COLOUR
         T = np.eye(4)
         T[:3, 3] = [0, 0, 0.5]
-        one = Instance("disc", T, np.zeros((9, 2)), 0.3, mask if self.masks else None)
-        return Sample(image, np.diag([80.0, 80, 1]), [one], None, self.name, str(index))
+        disc = Instance("disc", T, np.zeros((9, 2)), 0.3, mask if self.masks else None)
+        return Sample(image, np.diag([80.0, 80, 1]), [disc], None, self.name, str(index))
 
 
 def disc_finder(needed: float, offset: float) -> Finder:
@@ -85,7 +85,7 @@ def disc_finder(needed: float, offset: float) -> Finder:
     points = np.random.default_rng(0).uniform(-0.05, 0.05, (30, 3))
     disc = Part("disc", cuboid_keypoints(points.min(0), points.max(0)), 0.1, points)
 
-    def sees(sample: Sample, one: Instance) -> bool:
+    def sees(sample: Sample, instance: Instance) -> bool:
         return bool(np.count_nonzero((sample.image == COLOUR).all(axis=2)) >= needed * 709)
 
     return Finder(disc, offset, sees)
@@ -153,8 +153,8 @@ def test_every_method_is_measured_at_every_share(tmp_path):
 
 def test_unreached_shares_are_counted_and_reported(tmp_path, caplog):
     run_shading(Discs(contrast=False), tmp_path, 0)
-    said = f"At 60 %, the covered share of {NUM_IMAGES} of {NUM_IMAGES} instances is off"
-    assert said in caplog.text
+    note = f"At 60 %, the covered share of {NUM_IMAGES} of {NUM_IMAGES} instances is off"
+    assert note in caplog.text
     assert not (tmp_path / "shading_examples.png").exists()
 
 
@@ -180,14 +180,14 @@ def test_every_method_is_measured_at_every_scale(tiny, tmp_path, caplog):
     scaled = {scale: scaled_test_renders(data, [part], scale) for scale in (0.5, 20.0)}
     usual = [source.sample(index).instances[0] for index in range(3)]
     far = [scaled[0.5].sample(index).instances[0] for index in range(3)]
-    for one, other in zip(usual, far, strict=True):
-        centre, farther = (i.T_cam_obj @ [*part.cuboid[8], 1] for i in (one, other))
+    for pair in zip(usual, far, strict=True):
+        centre, farther = (instance.T_cam_obj @ [*part.cuboid[8], 1] for instance in pair)
         np.testing.assert_allclose(farther[:3], 2 * centre[:3])
     assert not any(scaled[20.0].sample(index).instances for index in range(3))  # too near to stand
 
     farthest = 1.05 * max(detection.T_cam_obj[2, 3] for detection in usual)
     methods = {
-        "dope": Finder(part, 0.02, lambda _, one: bool(one.T_cam_obj[2, 3] < farthest)),
+        "dope": Finder(part, 0.02, lambda _, instance: bool(instance.T_cam_obj[2, 3] < farthest)),
         "dopepp": Finder(part, 0.005, lambda *_: True),
     }
     unmoved = measure(methods, [source.sample(index) for index in range(3)], 1)

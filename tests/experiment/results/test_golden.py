@@ -348,8 +348,8 @@ def test_readmes_of_jobs_and_multiruns(report, compare_golden):
     write_json(folder / VERSIONS_FILE, {"command": ["evaluate.py", "a=b c"]})
     (folder / "frame_rate.png").touch()
     texts = []
-    for known in (None, report):
-        pages.write_run_readme(folder, "Cost of x", known)
+    for result in (None, report):
+        pages.write_run_readme(folder, "Cost of x", result)
         texts.append((folder / "README.md").read_text())
     command = ["train.py", "-m", "seed=1,2"]
     for jobs in ({}, {"0": "finished", "1": "failed: a | b"}):

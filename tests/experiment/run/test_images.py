@@ -19,7 +19,7 @@ def sample(key: str = "0/1") -> Sample:
     )
 
 
-def word(*samples: Sample) -> str:
+def hash_of(*samples: Sample) -> str:
     fingerprint = Fingerprint([pivconnector()])
     for sample in samples:
         fingerprint.add(sample)
@@ -32,17 +32,17 @@ def test_equal_images_have_equal_fingerprints():
     again.instances[0].T_cam_obj = again.instances[0].T_cam_obj + 1e-10
     again.instances[0].T_cam_obj[0, 1] = -0.0
     again.instances[0].visible_fraction = 0.81
-    assert word(sample()) == word(again)
+    assert hash_of(sample()) == hash_of(again)
 
 
-ONE = sample().instances[0]
+INSTANCE = sample().instances[0]
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        *({"instances": [replace(ONE, **fields)]} for fields in (
-            {"T_cam_obj": ONE.T_cam_obj + 1e-4}, {"label": "servoholder"},
+        *({"instances": [replace(INSTANCE, **fields)]} for fields in (
+            {"T_cam_obj": INSTANCE.T_cam_obj + 1e-4}, {"label": "servoholder"},
             {"visible_fraction": 0.05}, {"masked_fraction": 0.4},
         )),
         {"instances": []},
@@ -53,12 +53,12 @@ ONE = sample().instances[0]
     ],
 )  # fmt: skip
 def test_changed_images_have_other_fingerprints(change):
-    assert word(sample()) != word(replace(sample(), **change))
+    assert hash_of(sample()) != hash_of(replace(sample(), **change))
 
 
 def test_fingerprints_depend_on_number_order_and_objects():
     a, b = sample("a"), sample("b")
-    assert len({word(a), word(a, b), word(b, a), word(a, b, b)}) == 4
+    assert len({hash_of(a), hash_of(a, b), hash_of(b, a), hash_of(a, b, b)}) == 4
     fingerprint = Fingerprint([pivconnector(), servoholder()])
     fingerprint.add(a)
-    assert fingerprint.hexdigest() != word(a)
+    assert fingerprint.hexdigest() != hash_of(a)

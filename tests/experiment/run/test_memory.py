@@ -22,13 +22,13 @@ class Noise:
     name = "noise"
 
     def __init__(self) -> None:
-        self.asked: list[tuple[int, int]] = []
+        self.requests: list[tuple[int, int]] = []
 
     def __len__(self) -> int:
         return 3
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        self.asked.append((index, epoch))
+        self.requests.append((index, epoch))
         image = np.random.default_rng([index, epoch]).integers(0, 256, (64, 64, 3), np.uint8)
         mask = np.zeros((64, 64), bool)
         return Sample(image, K, [Instance("servoholder", np.eye(4), np.zeros((9, 2)), mask=mask)])
@@ -37,16 +37,16 @@ class Noise:
 def test_items_of_a_source_are_cached_up_to_the_limit():
     source, other = Noise(), Noise()
     cache = TuningCache(max_bytes=2 * 64 * 64 * 4)  # of two images with their masks
-    remembered, its = cache.of(source), cache.of(other)
-    assert len(remembered) == 3
+    cached, other_cached = cache.of(source), cache.of(other)
+    assert len(cached) == 3
     for _ in range(2):
         for index in range(3):
-            assert (remembered.sample(index).image == source.sample(index).image).all()
-    assert [source.asked.count((index, 0)) for index in range(3)] == [3, 3, 4]
-    remembered.sample(0, epoch=1)
-    assert (0, 1) in source.asked
-    its.sample(0)
-    assert other.asked == [(0, 0)]  # no other source's item
+            assert (cached.sample(index).image == source.sample(index).image).all()
+    assert [source.requests.count((index, 0)) for index in range(3)] == [3, 3, 4]
+    cached.sample(0, epoch=1)
+    assert (0, 1) in source.requests
+    other_cached.sample(0)
+    assert other.requests == [(0, 0)]  # items of other sources are separate
 
 
 def test_a_network_runs_once_per_image(tiny_spec):
@@ -63,5 +63,5 @@ def test_a_network_runs_once_per_image(tiny_spec):
         for left, same in zip(cached.maps(image), estimator.maps(image), strict=True):
             torch.testing.assert_close(left, same, rtol=0, atol=0)
     assert len(passes) == 5 + 3
-    cached.recovery = None  # its own: the estimator's stays
+    cached.recovery = None  # the original estimator is unchanged
     assert estimator.recovery is not None

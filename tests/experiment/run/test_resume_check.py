@@ -23,10 +23,10 @@ from dopepp.experiment.run.resume import (
 from dopepp.models.checkpoint import Checkpoint
 
 
-class Pictures:
+class ConstantImages:
     """A source of one image."""
 
-    name = "pictures"
+    name = "images"
 
     def __init__(self, level: int = 100, shift: float = 0.0, **identity: object) -> None:
         self.level, self.shift, self.identity = level, shift, identity
@@ -48,17 +48,17 @@ class Pictures:
 
 
 def test_descriptions_of_images_reveal_differences():
-    first = describe_images(Pictures(files="ab" * 32, parts={"a": "1"}))
+    first = describe_images(ConstantImages(files="ab" * 32, parts={"a": "1"}))
     # Through a file and back, and with another machine's rounding, it is the same.
     again = yaml.safe_load(yaml.safe_dump(first))
-    rounded = describe_images(Pictures(101, 1e-7, files="ab" * 32, parts={"a": "1"}))
+    rounded = describe_images(ConstantImages(101, 1e-7, files="ab" * 32, parts={"a": "1"}))
     assert (differing_images(first, again), differing_images(first, rounded)) == ([], [])
     for other, expected in (
-        (Pictures(files="cd" * 32, parts={"a": "1"}), "0 images.files: abab"),
-        (Pictures(files="ab" * 32, parts={"a": "2"}), "0 images.parts.a: 1 → 2"),
-        (Pictures(files="ab" * 32), "0 images.parts.a: 1 → None"),
-        (Pictures(100, 0.01, files="ab" * 32, parts={"a": "1"}), "labels of the first image"),
-        (Pictures(110, 0.0, files="ab" * 32, parts={"a": "1"}), "pixels of the first image"),
+        (ConstantImages(files="cd" * 32, parts={"a": "1"}), "0 images.files: abab"),
+        (ConstantImages(files="ab" * 32, parts={"a": "2"}), "0 images.parts.a: 1 → 2"),
+        (ConstantImages(files="ab" * 32), "0 images.parts.a: 1 → None"),
+        (ConstantImages(100, 0.01, files="ab" * 32, parts={"a": "1"}), "labels of the first image"),
+        (ConstantImages(110, 0.0, files="ab" * 32, parts={"a": "1"}), "pixels of the first image"),
     ):
         (line,) = differing_images(first, describe_images(other))
         assert line.startswith(expected)
@@ -66,14 +66,16 @@ def test_descriptions_of_images_reveal_differences():
 
 
 def test_a_new_preset_field_with_equal_images_is_no_difference():
-    first, new = (describe_images(Pictures(preset=text)) for text in ("Preset()", "Preset(a=1)"))
+    first, new = (
+        describe_images(ConstantImages(preset=text)) for text in ("Preset()", "Preset(a=1)")
+    )
     assert differing_images(first, new) == []
-    (line,) = differing_images(first, describe_images(Pictures(110, preset="Preset(a=1)")))
+    (line,) = differing_images(first, describe_images(ConstantImages(110, preset="Preset(a=1)")))
     assert line == "pixels of the first image"
 
 
 def test_a_part_that_is_called_preset_is_compared():
-    first, other = (describe_images(Pictures(parts={"preset": mesh})) for mesh in "12")
+    first, other = (describe_images(ConstantImages(parts={"preset": mesh})) for mesh in "12")
     assert differing_images(first, other) == ["0 images.parts.preset: 1 → 2"]
 
 
@@ -83,9 +85,9 @@ def resumed(tiny, tmp_path):
     (tmp_path / "run").mkdir()
     started = tiny()
     write_config(tmp_path / "run", started.plain)
-    images = {split: describe_images(Pictures()) for split in ("train", "val", "test")}
+    images = {split: describe_images(ConstantImages()) for split in ("train", "val", "test")}
 
-    def go_on(*overrides: str, spec: str = "a", **splits: Pictures) -> list[str]:
+    def go_on(*overrides: str, spec: str = "a", **splits: ConstantImages) -> list[str]:
         saved = Checkpoint({"net": "a"}, {}, [], (64, 64), 8, 1.0, data={"images": images})
         present = {**images, **{name: describe_images(first) for name, first in splits.items()}}
         payload = {"spec": {"net": spec}, "data": {"images": copy.deepcopy(present)}}
@@ -119,14 +121,14 @@ def test_options_without_effect_on_learning_may_change(resumed):
 def test_unchanged_runs_have_no_differences(resumed):
     assert resumed() == []
     assert resumed("output_dir=/elsewhere", "resume=x", "resume_anyway=true") == []
-    assert resumed(test=Pictures(50)) == []  # other test images change nothing that is learnt
+    assert resumed(test=ConstantImages(50)) == []  # test images do not affect learning
 
 
 LEARNT_FROM = {
     "seed=1": "seed: 0 → 1",
     "data.batch_size=2": "data.batch_size: 4 → 2",
     "data.samples_per_epoch=4": "data.samples_per_epoch: 8 → 4",
-    "data.cache=memory": "data.cache: none → memory",  # its epochs are all the same
+    "data.cache=memory": "data.cache: none → memory",  # all epochs are equal
     "virtual.preset=table": "virtual.preset: quickstart → table",
     "++virtual.scene.lighting.tint=0.5": "virtual.scene.lighting.tint: not set → 0.5",
     "data.masking.probability=0.1": "data.masking.probability: 0.5 → 0.1",
@@ -154,7 +156,7 @@ def test_learning_options_change_only_with_resume_anyway(resumed):
 
 @pytest.mark.parametrize("split", ["train", "val"])
 def test_changed_images_with_equal_options_are_rejected(split, resumed):
-    changed: dict[str, Any] = {split: Pictures(50)}
+    changed: dict[str, Any] = {split: ConstantImages(50)}
     with pytest.raises(UserError, match=rf"{split} images: as trained on → changed \(pixels of"):
         resumed(**changed)
     assert len(resumed("resume_anyway=true", **changed)) == 1

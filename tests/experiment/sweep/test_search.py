@@ -98,7 +98,7 @@ def test_a_repeated_command_continues_and_names_the_best_trial(call_fast, tmp_pa
         assert trial.number == int(number)
         assert trial.params["optimizer.lr"] == pytest.approx(float(lr), rel=1e-3)
     drawn = {trial.params["optimizer.lr"] for trial in result}
-    assert len(drawn) == 3  # the second command did not draw the first one's again
+    assert len(drawn) == 3  # the second command drew new values
     best = max(result, key=lambda trial: trial.value or 0)
     assert f"best trial {best.number}, objective {best.value:.4f}: optimizer.lr=" in out
     assert "study s: 3 complete" in out
