@@ -55,7 +55,7 @@ def calibration_errors(seed: int, num_images: int) -> Iterator[list[float]]:
         near = rng.uniform(0.3, 0.5) * focal / 850
         middle = np.append(near * rng.uniform(-0.2, 0.2, 2), near)
         T_cam_board = make_transform(turn, middle - turn @ BOARD.points.mean(axis=0))
-        view = BOARD.find(draw_view(BOARD, T_cam_board, camera, rng), f"{number}.png")
+        view = BOARD.detect(draw_view(BOARD, T_cam_board, camera, rng), f"{number}.png")
         if view is not None:
             flanges.append(Y @ invert_transform(T_cam_board) @ invert_transform(X))
             views.append(view)

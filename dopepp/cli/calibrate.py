@@ -5,21 +5,21 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, cast
 
 import typer
 from typer import Argument, Option
 
 from dopepp.cli.common import report_errors
-from dopepp.core.errors import Interruption, UserError, interruptible
+from dopepp.core.errors import Interruption, UserError, check_choice, interruptible
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from dopepp.drawing.pictures import RGBImage, Size
     from dopepp.geometry.camera import Transform
-    from dopepp.robot.calibration.board import Board, BoardPose, Sighting
-    from dopepp.robot.calibration.hand_eye import HandEye
+    from dopepp.robot.calibration.board import Board, BoardDetection, BoardPose
+    from dopepp.robot.calibration.hand_eye import HandEye, Mount
     from dopepp.robot.calibration.lens import LensCalibration
     from dopepp.robot.calibration.quality import CalibrationQuality
     from dopepp.robot.calibration.records import PoseFormat
@@ -29,16 +29,18 @@ if TYPE_CHECKING:
 BOARD: Final = "charuco:8x11:20:15, chess:7x10:25 or circles:4x11:40 (columns × rows, mm)."
 
 Out = Annotated[Path, Option(help="YAML file to write.")]
-Force = Annotated[bool, Option("--force", help="Also write a doubtful calibration, with a mark.")]
+Force = Annotated[
+    bool, Option("--force", help="Write even a doubtful calibration, marked as not trusted.")
+]
 BoardSpec = Annotated[str, Option("--board", help=BOARD)]
-Pictures = Annotated[Path, Argument(help="Folder with images of the board.")]
+Images = Annotated[Path, Argument(help="Folder with images of the board.")]
 Poses = Annotated[
     Path, Argument(help="CSV, JSON or YAML: x y z and a quaternion, rotation vector or angles.")
 ]
 Unit = Annotated[str, Option(help="Unit of positions: m, mm, cm or inch.")]
 Angles = Annotated[str, Option(help="Unit of rx ry rz and roll pitch yaw: rad or deg.")]
 Quaternion = Annotated[str, Option(help="Order of a quaternion: wxyz or xyzw.")]
-Direction = Annotated[str, Option(help="flange-to-base (usual) or base-to-flange.")]
+Direction = Annotated[str, Option(help="Poses are flange-to-base (usual) or base-to-flange.")]
 
 app = typer.Typer(
     no_args_is_help=True, help="Calibrate cameras, a tool, a bench, or the camera on the robot."
@@ -80,10 +82,10 @@ def camera(
         check_target(out, (".yaml", ".yml"))
         target = parse_board(board)
         if Path(source).is_dir() and not (Path(source) / "metadata.yaml").exists():
-            sightings, size = _folder_sightings(Path(source), target)
+            detections, size = _detect_in_folder(Path(source), target)
         else:
-            sightings, size = _stream_sightings(source, target)
-        calibration = calibrate_lens(sightings, size)
+            detections, size = _detect_in_stream(source, target)
+        calibration = calibrate_lens(detections, size)
         _show_lens(calibration)
         check_trust(calibration.findings, force)
         write_camera(out, calibration.camera, not calibration.findings)
@@ -132,7 +134,7 @@ def bench(
     board: Annotated[str | None, Option(help=BOARD)] = None,
     camera: Annotated[Path | None, Option(help="With --board: camera file.")] = None,
     hand_eye: Annotated[Path | None, Option(help="With --board: hand-eye file.")] = None,
-    poses: Annotated[Path | None, Option(help="With a camera on the flange: poses.")] = None,
+    poses: Annotated[Path | None, Option(help="With a camera on the flange: robot poses.")] = None,
     unit: Unit = "m",
     angles: Angles = "rad",
     quaternion: Quaternion = "wxyz",
@@ -144,12 +146,8 @@ def bench(
     From touched points, the origin is the first point, x points to the second and z upwards. From
     a board, origin and x are the board's, and z points out of the board.
     """
-    from dopepp.robot.calibration.records import (
-        check_unit,
-        read_points,
-        transform_record,
-        write_calibration,
-    )
+    from dopepp.geometry.transform_file import transform_record
+    from dopepp.robot.calibration.records import read_points, write_calibration
     from dopepp.robot.calibration.tool import find_bench
 
     with report_errors():
@@ -161,7 +159,7 @@ def bench(
             fix = "describe the board, e.g. --board charuco:8x11:20:15"
             raise UserError(problem, "a CSV, or images with --board", fix)
         else:
-            result = find_bench(read_points(source, check_unit(unit)))
+            result = find_bench(read_points(source, unit))
             names = [f"point {number}" for number in range(1, len(result.residuals) + 1)]
         for name, residual in zip(names, result.residuals, strict=True):
             typer.echo(f"{name}: {1000 * residual:+.2f} mm off the plane")
@@ -172,7 +170,7 @@ def bench(
 
 @app.command()
 def handeye(
-    images: Pictures,
+    images: Images,
     poses: Poses,
     board: BoardSpec,
     camera: Annotated[Path, Option(help="Camera file.")],
@@ -186,24 +184,20 @@ def handeye(
 ) -> None:
     """Calibrate the camera's pose on the robot from images of a board and the robot's poses."""
     from dopepp.core.files import check_target
-    from dopepp.geometry.camera_file import read_camera
-    from dopepp.robot.calibration.board import board_pose, parse_board
-    from dopepp.robot.calibration.hand_eye import calibrate_hand_eye, check_mount
+    from dopepp.robot.calibration.hand_eye import MOUNTS, calibrate_hand_eye
     from dopepp.robot.calibration.quality import assess, check_poses
     from dopepp.robot.calibration.records import match_images, read_robot_poses, write_calibration
 
     with report_errors():
         check_target(out, (".yaml", ".yml"))
-        checked_mount = check_mount(mount)
+        check_choice("--mount", mount, MOUNTS)
+        checked_mount = cast("Mount", mount)
         pose_format = _pose_format(unit, angles, quaternion, direction)
-        robot, names = read_robot_poses(poses), _image_names(images)
-        pairs = match_images(robot, names)
-        sightings, size = _folder_sightings(images, parse_board(board))
-        lens = read_camera(camera).for_picture(size)
-        rows = {names[picture]: row for row, picture in pairs}
-        boards = [board_pose(seen, lens) for seen in sightings if seen.name in rows]
-        chosen = [rows[seen.name] for seen in boards]
-        flanges = check_poses(robot, chosen, pose_format, boards, checked_mount)
+        robot = read_robot_poses(poses)
+        rows = match_images(robot, _image_names(images))
+        boards = [pose for pose in _board_poses(images, board, camera) if pose.name in rows]
+        used_rows = [rows[pose.name] for pose in boards]
+        flanges = check_poses(robot, used_rows, pose_format, boards, checked_mount)
         calibration = calibrate_hand_eye(flanges, boards, checked_mount)
         quality = assess(flanges, boards, calibration)
         _show_hand_eye(boards, calibration, quality)
@@ -237,8 +231,9 @@ def rig(
 
     from dopepp.core.files import check_target
     from dopepp.geometry.camera_file import read_camera
+    from dopepp.geometry.transform_file import read_transform
     from dopepp.robot.calibration.board import parse_board
-    from dopepp.robot.calibration.records import read_transform, write_calibration
+    from dopepp.robot.calibration.records import write_calibration
     from dopepp.robot.calibration.rig import calibrate_rig
 
     with report_errors():
@@ -247,8 +242,8 @@ def rig(
         T_base_first = np.eye(4) if hand_eye is None else read_transform(hand_eye, "T_base_cam")
         boards, cameras = {}, {}
         for images in sorted(path for path in folder.glob("*") if path.is_dir()):
-            sightings, size = _folder_sightings(images, target)
-            boards[images.name] = {sighting.name: sighting for sighting in sightings}
+            detections, size = _detect_in_folder(images, target)
+            boards[images.name] = {detection.name: detection for detection in detections}
             lens = read_camera(images.with_name(f"{images.name}.yaml"))
             cameras[images.name] = lens.for_picture(size)
         calibration = calibrate_rig(boards, cameras)
@@ -260,17 +255,13 @@ def rig(
 
 def _pose_format(unit: str, angles: str, quaternion: str, direction: str) -> PoseFormat:
     """Check the options that describe a file of robot poses, and combine them."""
-    from dopepp.robot.calibration.records import PoseFormat, check_unit
+    from dopepp.robot.calibration.records import UNITS, PoseFormat
 
-    for name, value, allowed in (
-        ("--angles", angles, ("rad", "deg")),
-        ("--quaternion", quaternion, ("wxyz", "xyzw")),
-        ("--direction", direction, ("flange-to-base", "base-to-flange")),
-    ):
-        if value not in allowed:
-            fix = f"pass {' or '.join(f'{name} {choice}' for choice in allowed)}"
-            raise UserError(f"{name} {value}", " or ".join(allowed), fix)
-    return PoseFormat(check_unit(unit), angles == "deg", quaternion, direction == "base-to-flange")
+    check_choice("--unit", unit, UNITS)
+    check_choice("--angles", angles, ("rad", "deg"))
+    check_choice("--quaternion", quaternion, ("wxyz", "xyzw"))
+    check_choice("--direction", direction, ("flange-to-base", "base-to-flange"))
+    return PoseFormat(unit, angles == "deg", quaternion, direction == "base-to-flange")
 
 
 def _image_names(folder: Path) -> list[str]:
@@ -290,31 +281,40 @@ def _image_names(folder: Path) -> list[str]:
     return names
 
 
-def _folder_sightings(folder: Path, board: Board) -> tuple[list[Sighting], Size]:
-    """Find the board in a folder's images, which must have one size."""
+def _board_poses(folder: Path, spec: str, camera: Path) -> list[BoardPose]:
+    """Estimate the board's poses in a folder's images, taken by one camera."""
+    from dopepp.geometry.camera_file import read_camera
+    from dopepp.robot.calibration.board import board_pose, parse_board
+
+    detections, size = _detect_in_folder(folder, parse_board(spec))
+    lens = read_camera(camera).for_picture(size)
+    return [board_pose(detection, lens) for detection in detections]
+
+
+def _detect_in_folder(folder: Path, board: Board) -> tuple[list[BoardDetection], Size]:
+    """Detect the board in a folder's images, which must have one size."""
     from dopepp.drawing.pictures import read_photo
 
-    sightings: list[Sighting] = []
+    detections: list[BoardDetection] = []
     first_size, names = None, _image_names(folder)
     for name in names:
-        picture = read_photo(folder / name)
-        size = (picture.shape[1], picture.shape[0])
+        image = read_photo(folder / name)
+        size = (image.shape[1], image.shape[0])
         first_size = first_size or size
         if size != first_size:
             problem = f"{folder / name} of {size[0]}×{size[1]} pixels among images of "
             problem += f"{first_size[0]}×{first_size[1]}"
             fix = "delete the images of the other size"
             raise UserError(problem, "images of one size", fix)
-        sighting = _find_board(board, picture, name, quiet=False)
-        if sighting is not None:
-            sightings.append(sighting)
-    return _check_sightings(sightings, first_size, f"{folder}", len(names))
+        if detection := _detect_board(board, image, name, reports_missing=True):
+            detections.append(detection)
+    return _check_detections(detections, first_size, f"{folder}", len(names))
 
 
-def _stream_sightings(source: str, board: Board) -> tuple[list[Sighting], Size]:
-    """Find distinct views of the board in a video or a camera stream.
+def _detect_in_stream(source: str, board: Board) -> tuple[list[BoardDetection], Size]:
+    """Collect distinct views of the board from a video or a camera stream.
 
-    Stops at the end of the stream, on Ctrl-C, or when there are enough views.
+    The collection ends with the stream, on Ctrl-C, or with enough views.
     """
     from dopepp.inference.frames import open_sources
     from dopepp.robot.calibration.lens import CHECKS_PER_S, Views
@@ -330,40 +330,42 @@ def _stream_sightings(source: str, board: Board) -> tuple[list[Sighting], Size]:
                     views, first_size = Views(size[0]), size
                 count += 1
                 name = Path(frame.name).name if opened.rate is None else f"frame {frame.number}"
-                is_usable = size == first_size
-                sighting = _find_board(board, frame.image, name, True) if is_usable else None
-                if sighting is not None and views.offer(sighting):
-                    typer.echo(f"{name}: view {len(views.kept)}", err=True)
+                if size == first_size:
+                    detection = _detect_board(board, frame.image, name)
+                    if detection is not None and views.add(detection):
+                        typer.echo(f"{name}: view {len(views.kept)}", err=True)
                 if views.is_full:
                     break
-    sightings = _check_sightings(views.kept, first_size, source, count)
+    detections = _check_detections(views.kept, first_size, source, count)
     typer.echo(f"{len(views.kept)} distinct views in {count} images", err=True)
-    return sightings
+    return detections
 
 
-def _find_board(board: Board, picture: RGBImage, name: str, quiet: bool) -> Sighting | None:
-    """Find the board in an image; report a missing (unless quiet) or second board."""
+def _detect_board(
+    board: Board, image: RGBImage, name: str, reports_missing: bool = False
+) -> BoardDetection | None:
+    """Detect the board in an image; report an image with two boards, or optionally without any."""
     try:
-        sighting = board.find(picture, name)
+        detection = board.detect(image, name)
     except UserError as error:
         typer.echo(f"{name}: skipped, {error}", err=True)
         return None
-    if sighting is None and not quiet:
+    if detection is None and reports_missing:
         typer.echo(f"{name}: no board", err=True)
-    return sighting
+    return detection
 
 
-def _check_sightings(
-    sightings: list[Sighting], size: Size | None, source: str, count: int
-) -> tuple[list[Sighting], Size]:
+def _check_detections(
+    detections: list[BoardDetection], size: Size | None, source: str, count: int
+) -> tuple[list[BoardDetection], Size]:
     """Return the detected boards and the images' size; reject images without any board."""
-    if not sightings or size is None:
+    if not detections or size is None:
         raise UserError(
             f"{source}: no board in any of {count} images",
             "images of the board described by --board",
             "compare --board with the board: kind, numbers of columns and rows, dictionary",
         )
-    return sightings, size
+    return detections, size
 
 
 def _bench_from_board(
@@ -376,9 +378,9 @@ def _bench_from_board(
 ) -> tuple[Bench, list[str]]:
     """Calibrate the bench from images of a board; return the bench and the images' names."""
     from dopepp.core.yaml import read_yaml
-    from dopepp.geometry.camera_file import read_camera
-    from dopepp.robot.calibration.board import board_pose, parse_board
-    from dopepp.robot.calibration.records import match_images, read_robot_poses, read_transform
+    from dopepp.geometry.transform_file import read_transform
+    from dopepp.robot.calibration.board import parse_board
+    from dopepp.robot.calibration.records import match_images, read_robot_poses
     from dopepp.robot.calibration.tool import bench_of_board
 
     if camera is None or hand_eye is None:
@@ -394,17 +396,14 @@ def _bench_from_board(
         fix = "add --poses FILE with the robot's poses" if on_flange else "leave out --poses"
         raise UserError(problem, "--poses if, and only if, the camera is on the flange", fix)
     T_mount_cam = read_transform(hand_eye, "T_flange_cam" if on_flange else "T_base_cam")
-    board = parse_board(spec)
-    sightings, size = _folder_sightings(folder, board)
-    lens = read_camera(camera).for_picture(size)
-    boards = {seen.name: board_pose(seen, lens).T_cam_board for seen in sightings}
+    boards = {pose.name: pose.T_cam_board for pose in _board_poses(folder, spec, camera)}
     T_base_cam = dict.fromkeys(boards, T_mount_cam)
     if poses is not None:
-        robot, names = read_robot_poses(poses), _image_names(folder)
-        flanges, pairs = robot.transforms(pose_format), match_images(robot, names)
-        T_base_cam = {names[picture]: flanges[row] @ T_mount_cam for row, picture in pairs}
+        robot = read_robot_poses(poses)
+        flanges, rows = robot.transforms(pose_format), match_images(robot, _image_names(folder))
+        T_base_cam = {name: flanges[row] @ T_mount_cam for name, row in rows.items()}
     used = [name for name in boards if name in T_base_cam]
-    bench = bench_of_board([T_base_cam[name] @ boards[name] for name in used], board)
+    bench = bench_of_board([T_base_cam[name] @ boards[name] for name in used], parse_board(spec))
     if record.get("trusted") is not True:
         bench = replace(bench, findings=(*bench.findings, f"{hand_eye} is not trusted"))
     return bench, used
@@ -460,14 +459,14 @@ def _show_rig(calibration: Rig) -> None:
     for moment in calibration.outliers:
         typer.echo(f"{moment}: rejected, because it contradicts the other images")
     for number, name in enumerate(calibration.names):
-        seen = f"{name}: {calibration.shared[number]} images with another camera, "
-        seen += f"{calibration.errors_px[number]:.3f} px"
+        line = f"{name}: {calibration.shared[number]} images with another camera, "
+        line += f"{calibration.errors_px[number]:.3f} px"
         if number:
             distance_mm = 1000 * hypot(*calibration.T_world_cam[number][:3, 3])
             shift, rotation = calibration.deviations[number]
-            seen += f", {distance_mm:.1f} mm from {calibration.names[0]}, standard deviations "
-            seen += f"{1000 * shift:.2f} mm and {degrees(rotation):.3f}°"
-        typer.echo(seen)
+            line += f", {distance_mm:.1f} mm from {calibration.names[0]}, standard deviations "
+            line += f"{1000 * shift:.2f} mm and {degrees(rotation):.3f}°"
+        typer.echo(line)
 
 
 def _rig_record(
@@ -477,7 +476,7 @@ def _rig_record(
     from math import degrees
     from os.path import relpath
 
-    from dopepp.robot.calibration.records import transform_record
+    from dopepp.geometry.transform_file import transform_record
 
     shift, rotation = calibration.deviations.max(axis=0)
     views = {
@@ -494,7 +493,7 @@ def _rig_record(
 
 def _hand_eye_record(calibration: HandEye, quality: CalibrationQuality) -> dict[str, object]:
     """Return the content of the hand-eye file: both transforms with their covariance."""
-    from dopepp.robot.calibration.records import transform_record
+    from dopepp.geometry.transform_file import transform_record
 
     mount, other = ("flange", "base") if calibration.mount == "hand" else ("base", "flange")
     return {

@@ -75,7 +75,7 @@ WorkingDistance = Annotated[
 
 Tilt = Annotated[
     float | None,
-    Option(help="Largest angle of that part's z axis to the camera, degrees (default: 180)."),
+    Option(help="Largest angle between this part's z axis and the camera, degrees (default: 180)."),
 ]
 
 Device = Annotated[str, Option(help="PyTorch device, e.g. cpu or cuda.")]
@@ -119,8 +119,8 @@ def load_estimator(
         return PoseEstimator.load(model, device, max_ms=max_ms, scale_error=scale_error)
     distances = None
     if working_distance is not None:
-        option, fix = "--working-distance", "write e.g. --working-distance 0.3,0.5"
-        distances = two_numbers(option, working_distance, "NEAR,FAR in metres", fix)
+        allowed = "NEAR,FAR in metres"
+        distances = two_numbers("--working-distance", working_distance, allowed, "0.3,0.5")
     return PoseEstimator.from_mesh(
         model,
         unit,
@@ -131,15 +131,16 @@ def load_estimator(
     )
 
 
-def two_numbers(option: str, text: str, allowed: str, fix: str) -> tuple[float, float]:
+def two_numbers(option: str, text: str, allowed: str, example: str) -> tuple[float, float]:
     """Read two numbers with a comma between them.
 
     Raises:
-        UserError: The text has another form; ``allowed`` and ``fix`` are parts of the message.
+        UserError: The text has another form; the message contains ``allowed`` and the example.
     """
     try:
         first, second = map(float, text.split(","))
     except ValueError:
+        fix = f"write e.g. {option} {example}"
         raise UserError(f"{option} {text}", allowed, fix) from None
     return first, second
 

@@ -13,10 +13,10 @@ from dopepp.cli.common import Unit, report_errors, resumable
 
 
 class RenderCommand(TyperCommand):
-    """Lists the presets in its help, and rejects lists after ``--negatives``."""
+    """The ``render`` command: its help lists the presets; ``--negatives`` takes a single part."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Reject names after the value of ``--negatives``, which would become targets."""
+        """Reject further names after ``--negatives PART``, which would become targets."""
         if args and not args[0].startswith("-"):  # the targets come first
             for option, value, word in zip(args, args[1:], args[2:], strict=False):
                 if option == "--negatives" and not word.startswith("-"):
@@ -27,7 +27,7 @@ class RenderCommand(TyperCommand):
         return super().parse_args(ctx, args)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write the help, with the names of all presets, which are read only for this purpose."""
+        """Write the help with the names of all presets, which no other command reads."""
         from dopepp.virtual.presets import PRESETS
 
         (preset,) = (parameter for parameter in self.params if parameter.name == "preset")
@@ -54,7 +54,7 @@ def render(
         str | None, Option(help="With --camera: NEAREST,FARTHEST part in metres.")
     ] = None,
     views: Annotated[
-        int, Option(help="Cameras of each scene, in a folder with their poses (bop only).")
+        int, Option(help="Cameras of each scene, which is a folder with their poses (bop only).")
     ] = 1,
     workers: Annotated[int | None, Option(help="Processes (default: all cores).")] = None,
     seed: Annotated[int, Option(help="Random seed.")] = 0,

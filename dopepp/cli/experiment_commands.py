@@ -72,7 +72,9 @@ def export(
     out: Annotated[
         Path | None, Option(help="File or OpenVINO folder (default: next to the checkpoint).")
     ] = None,
-    images: Annotated[int, Option(min=20, max=10_000, help="Number of renders.")] = 100,
+    images: Annotated[
+        int, Option(min=20, max=10_000, help="Number of rendered scenes for int8 and ADD-0.1d.")
+    ] = 100,
 ) -> None:
     """Export a checkpoint for ONNX Runtime or OpenVINO, and verify it against PyTorch.
 

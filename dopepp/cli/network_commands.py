@@ -36,7 +36,7 @@ from dopepp.core.errors import UserError
 if TYPE_CHECKING:
     from dopepp.inference.benchmark import Timing
 
-NUM_SCENES: Final = 10  # number of rendered images that the benchmark cycles through
+NUM_SCENES: Final = 10  # number of rendered images of a benchmark, used in turn
 SIZE: Final = (640, 480)  # width and height of rendered images
 
 
@@ -146,7 +146,7 @@ def doctor(
             )
         K = None if intrinsics is None else camera_matrix(*intrinsics)
         lens = Lens(choose_camera(K, camera, Images([image])), K_size, crop)
-        picture = read_photo(image)
+        pixels = read_photo(image)
         from dopepp.inference.diagnosis import Case, Diagnosis, diagnose
         from dopepp.parts.catalogue import with_meshes
 
@@ -156,7 +156,7 @@ def doctor(
         try:
             case = Case(
                 estimator,
-                *lens.undistort(picture),
+                *lens.undistort(pixels),
                 solid_parts,
                 distance,
                 crop is not None,
@@ -175,9 +175,8 @@ def doctor(
 
 
 def _pixel(text: str) -> tuple[float, float]:
-    """Read a pixel ``u,v``."""
-    fix = "pass column and row of the part's centre, e.g. --at 412,230"
-    return two_numbers("--at", text, "u,v in pixels", fix)
+    """Read column and row of a part's centre, ``u,v``."""
+    return two_numbers("--at", text, "u,v in pixels", "412,230")
 
 
 def serve(

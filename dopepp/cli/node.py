@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 import typer
 from typer import Argument, Option
@@ -27,21 +27,18 @@ from dopepp.cli.common import (
 )
 from dopepp.core.errors import UserError, require
 
-if TYPE_CHECKING:
-    from dopepp.inference.pose_result import PoseResult
-
 LINES: Final = ("--json", "--udp")
 
 TOPIC: Final = "/camera/image_raw"
 
 PACKAGES: Final = {"--ros2": ("rclpy", "ros2"), "--bag": ("rosbags", "bags")}
-"""Package that a transport needs, and the extra that installs it."""
+"""Package and extra that a transport needs."""
 
 
 def node(
     model: Model,
     source: Annotated[
-        list[str] | None, Argument(help="With --json or --udp: as in `dopepp predict`.")
+        list[str] | None, Argument(help="With --json or --udp: sources as in `dopepp predict`.")
     ] = None,
     ros2: Annotated[bool, Option("--ros2", help="Run as a ROS 2 node.")] = False,
     bag: Annotated[Path | None, Option(help="Recording to process; with --out.")] = None,
@@ -53,7 +50,9 @@ def node(
     params: Annotated[Path | None, Option(help="With --ros2: YAML of parameters.")] = None,
     intrinsics: Intrinsics = None,
     camera: Annotated[Path | None, Option(help="Camera file, for camera_info.")] = None,
-    frame: Annotated[str | None, Option(help="Optical frame (default: the images').")] = None,
+    frame: Annotated[
+        str | None, Option(help="Optical frame of the camera (default: the images' frame).")
+    ] = None,
     conf: Conf = None,
     refine: Region = None,
     max_ms: MaxMs = None,
@@ -105,19 +104,17 @@ def node(
         if transport in LINES:
             send_lines(worker, zip(sources, cameras, strict=True), udp)
         elif bag is not None and out is not None:
-            answers = process_bag(worker, bag, out, topic, name)
-            counts = [answer and _counts(answer.result) for answer in answers]
-            processed = [count for count in counts if count is not None]
-            poses, weaker = map(sum, zip((0, 0), *processed, strict=True))
-            skipped = len(counts) - len(processed)
+            poses = weaker = processed = skipped = 0
+            for answer in process_bag(worker, bag, out, topic, name):
+                if answer is None:
+                    skipped += 1
+                else:
+                    processed += 1
+                    poses += len(answer.result.detections)
+                    weaker += answer.result.num_weaker
             note = f", {skipped} skipped" if skipped else ""
             note += f"; {weaker} weaker candidates" if weaker else ""
-            typer.echo(f"{out}: {poses} poses in {len(processed)} images{note}")
-
-
-def _counts(result: PoseResult) -> tuple[int, int]:
-    """Return the number of poses and of weaker candidates."""
-    return len(result.detections), result.num_weaker
+            typer.echo(f"{out}: {poses} poses in {processed} images{note}")
 
 
 def _check_transport(

@@ -72,7 +72,7 @@ class Outputs:
 
 
 class OverlayFolder:
-    """A folder with an image for each input image, and a video for each video or camera."""
+    """Writes an image for each input image, and a video for each video or camera, to a folder."""
 
     def __init__(self, folder: Path, stride: int = 1) -> None:
         check_target(folder / "picture.png")
@@ -124,7 +124,7 @@ class OverlayFolder:
 
 
 class JsonLines:
-    """A file with a line of JSON for each image, with or without detections."""
+    """Writes a file with a line of JSON for each image, with or without detections."""
 
     def __init__(self, path: Path) -> None:
         check_target(path)
@@ -155,10 +155,10 @@ class JsonLines:
 
 
 class BopCsv:
-    """A BOP challenge file: a scene for each source, an image for each image.
+    """Writes poses in the format of the BOP challenge; each source is a scene.
 
-    Objects are numbered from 1 in the checkpoint's order. If all names look like BOP's files
-    (``obj_000005``), their numbers are used.
+    Objects are numbered from 1 in the checkpoint's order, or as in their names if all names have
+    the form ``obj_000005``.
     """
 
     def __init__(self, path: Path) -> None:

@@ -70,7 +70,9 @@ def predict(
     ] = None,
     max_ms: MaxMs = None,
     scale_error: ScaleError = None,
-    depth: Annotated[Path | None, Option(help="Aligned 16-bit PNG, 0 = unknown.")] = None,
+    depth: Annotated[
+        Path | None, Option(help="Depth aligned with the image: 16-bit PNG, 0 = unknown.")
+    ] = None,
     depth_scale: Annotated[float, Option(help="Metres per unit of --depth.")] = 0.001,
     views: Annotated[
         Path | None,
@@ -101,23 +103,26 @@ def predict(
     gc.disable()  # all imported objects stay alive; collecting them would slow down the start
     with resumable("the written files are complete"):
         from dopepp.cli.outputs import Outputs
-        from dopepp.cli.predict_scene import predict_scene, refuse_options
+        from dopepp.cli.predict_scene import predict_scene
         from dopepp.geometry.camera import camera_matrix
         from dopepp.inference.frames import open_sources
         from dopepp.inference.frames.source import choose_camera, given_camera
 
         terms = () if refine is None else tuple(refine.split(","))
-        _check_options(terms, depth, track, verify, distance or roi)
-        terms = ("region",) if track or views else terms
+        if ("depth" in terms) != (depth is not None):
+            raise UserError(
+                "--depth without --refine depth" if depth else "--refine depth without --depth",
+                "both options or neither",
+                "add --refine depth" if depth else "add --depth FILE",
+            )
+        excluded: dict[str, object] = {"--verify": verify, "--depth": depth, "--roi": roi}
+        if track:
+            _exclude("--track", {**excluded, "--distance": distance})
         if views is not None:
-            unused: dict[str, object] = {
-                "--track": track,
-                "--depth": depth,
-                "--verify": verify,
-                "--csv": csv,
-            }
-            unused |= {"--roi": roi, "--crop": crop, "--K-size": K_size, "--topic": topic}
-            refuse_options({**unused, "--rerun": rerun, "--show": show, "--stride": stride != 1})
+            excluded |= {"--track": track, "--csv": csv, "--rerun": rerun, "--show": show}
+            excluded |= {"--crop": crop, "--K-size": K_size, "--topic": topic}
+            _exclude("--views", {**excluded, "--stride": stride != 1})
+        terms = ("region",) if track or views else terms
         outputs = _file_outputs(save, json_file, csv, stride)
         sources = open_sources(source, topic)
         K = None if intrinsics is None else camera_matrix(*intrinsics)
@@ -159,24 +164,20 @@ def predict(
                 session.run(opened, its_camera, written)
 
 
-def _check_options(
-    refine: Sequence[str], depth: Path | None, track: bool, verify: bool, where: object
-) -> None:
-    """Check for options that exclude each other.
+def _exclude(option: str, others: dict[str, object]) -> None:
+    """Reject options that cannot be combined with an option.
+
+    Args:
+        option: Name of the given option.
+        others: Values of the excluded options by name; a false value means that the option is not
+            given.
 
     Raises:
-        UserError: Two options exclude each other.
+        UserError: One of the excluded options is given.
     """
-    if ("depth" in refine) != (depth is not None):
-        raise UserError(
-            "--depth without --refine depth" if depth else "--refine depth without --depth",
-            "both options or neither",
-            "add --refine depth" if depth else "add --depth FILE",
-        )
-    if track and (verify or depth is not None or where):
-        problem = "--track with --verify, --depth, --distance or --roi"
-        fix = "leave out --track, or these options"
-        raise UserError(problem, "--track without these options", fix)
+    if given := ", ".join(name for name, value in others.items() if value):
+        fix = f"leave out {option}, or {given}"
+        raise UserError(f"{option} with {given}", f"{option} without these options", fix)
 
 
 def _file_outputs(

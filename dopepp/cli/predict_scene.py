@@ -18,20 +18,6 @@ if TYPE_CHECKING:
     from dopepp.inference.network_input import Distances
 
 
-def refuse_options(options: dict[str, object]) -> None:
-    """Refuse options of ``dopepp predict`` that cannot be combined with ``--views``.
-
-    Args:
-        options: Values of these options by name; a false value means that the option is not given.
-
-    Raises:
-        UserError: One of the options is given.
-    """
-    if given := [name for name, value in options.items() if value]:
-        problem = f"--views with {', '.join(given)}"
-        raise UserError(problem, "--views without these options", f"leave out {', '.join(given)}")
-
-
 def predict_scene(
     estimator: PoseEstimator,
     sources: Sequence[FrameSource],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
@@ -79,6 +79,17 @@ def require(package: str, choice: str, extra: str) -> ModuleSpec:
             f"pip install 'dopepp[{extra}]', or leave out {choice}",
         )
     return spec
+
+
+def check_choice(option: str, value: str, allowed: Iterable[str]) -> None:
+    """Check the value of a command-line option, e.g. ``--unit``, against the allowed values.
+
+    Raises:
+        UserError: The value is not allowed.
+    """
+    if value not in allowed:
+        fix = f"pass {option} with one of these values"
+        raise UserError(f"{option} {value}", ", ".join(allowed), fix)
 
 
 def system_failure(error: OSError, path: Path) -> str:

@@ -24,10 +24,10 @@ MAX_THRESHOLD: Final = 0.1
 """Largest threshold of accuracy-threshold curves, metres (paper Fig. 4)."""
 
 _NUM_STEPS: Final = 200
-"""Steps of a curve: 0.5 mm each up to 0.1 m."""
+"""Number of steps of a curve, 0.5 mm each up to 0.1 m."""
 
 _SMOOTHING: Final = 50
-"""Longer lines are drawn pale, below their moving average over 1/50 of the points."""
+"""Lines with more points are drawn pale, with their moving average over 1/50 of the points."""
 
 
 def accuracy_curve(
@@ -39,7 +39,7 @@ def accuracy_curve(
     """
     thresholds = np.linspace(0.0, MAX_THRESHOLD, _NUM_STEPS + 1)
     errors = np.asarray(errors, np.float64)
-    # NaN sorts last, behind infinity; searchsorted on the left counts what is strictly below.
+    # NaN sorts last, behind infinity; searchsorted on the left counts errors strictly below.
     below = np.searchsorted(np.sort(errors), thresholds, side="left")
     return thresholds, below / max(len(errors), 1)
 
@@ -78,7 +78,7 @@ def save_accuracy_curves(
     The CSV has a column ``threshold_m`` and, for each method, a column with the share in [0, 1].
     """
     path = Path(path)
-    columns = {"threshold_m": np.linspace(0.0, MAX_THRESHOLD, _NUM_STEPS + 1)}
+    columns = {"threshold_m": accuracy_curve(np.zeros(0))[0]}
     columns |= {name: accuracy_curve(errors)[1] for name, errors in curves.items()}
     rows = [
         {name: f"{value:.6g}" for name, value in zip(columns, values, strict=True)}
@@ -110,7 +110,7 @@ def figure_image(figure: Figure) -> RGBImage:
 def _area(errors: Float[np.ndarray, "n"]) -> float:
     """Return the area under the accuracy-threshold curve up to MAX_THRESHOLD, in [0, 1].
 
-    ``metrics.auc`` cannot be imported here, because it is in a higher layer.
+    ``metrics.auc`` belongs to a higher layer, which this module cannot import.
     """
     if len(errors) == 0:
         return 0.0
@@ -196,9 +196,9 @@ class PlotLine:
 def lines_figure(
     lines: Sequence[PlotLine], x_label: str, y_label: str, log_y: bool = False
 ) -> Figure:
-    """Draw lines; several runs as their mean within a band from the lowest to the highest.
+    """Draw the mean of each line's runs, within a band from the lowest to the highest run.
 
-    ``log_y`` selects a logarithmic axis, if all values are positive.
+    ``log_y`` selects a logarithmic axis if all values are positive.
     """
     figure, axes = figure_with_axes(x_label, y_label)
     for line in lines:
@@ -210,7 +210,9 @@ def lines_figure(
         if len(mean) > _SMOOTHING and len(line.values) == 1:
             axes.plot(line.x, mean, color=line.colour, alpha=0.2)
         style = ("--" if line.dashed else "-") + marker
-        axes.plot(line.x, smoothed(mean), style, color=line.colour, label=line.name, markersize=3)
+        axes.plot(
+            line.x, moving_average(mean), style, color=line.colour, label=line.name, markersize=3
+        )
     positive = [(line.values[np.isfinite(line.values)] > 0).all() for line in lines]
     if log_y and lines and all(positive):
         axes.set_yscale("log")
@@ -219,11 +221,11 @@ def lines_figure(
     return figure
 
 
-def smoothed(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Return the moving average of a long line; windows are cut off at the ends."""
+def moving_average(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Return the moving average over 1/50 of the points; windows are shorter at the ends."""
     width = max(1, len(values) // _SMOOTHING)
     if width == 1:
         return values
     window = np.ones(width)
-    counted = np.convolve(np.ones(len(values)), window, mode="same")
-    return np.asarray(np.convolve(values, window, mode="same") / counted)
+    counts = np.convolve(np.ones(len(values)), window, mode="same")
+    return np.asarray(np.convolve(values, window, mode="same") / counts)

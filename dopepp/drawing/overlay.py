@@ -1,8 +1,8 @@
-"""Wireframes of cuboids, lines and text on an image, for people to judge poses.
+"""Wireframes of cuboids, lines and text on an image, for the visual inspection of poses.
 
-A cuboid's +z face is bright and thick, with an arrow head that points to +y. Every orientation of a
-cube therefore looks different, unless that face is seen edge-on. Text uses matplotlib's font,
-because cv2's fonts are limited to ASCII.
+A cuboid's +z face is bright and thick, with an arrow head that points to +y. Two orientations of a
+cube therefore never look equal, unless that face is seen edge-on. Text uses matplotlib's font,
+because the fonts of cv2 are limited to ASCII.
 """
 
 from __future__ import annotations
@@ -35,11 +35,9 @@ BLUE: Final[Colour] = (70, 165, 255)
 WHITE: Final[Colour] = (255, 255, 255)
 """Captions."""
 
-MIN_WIDTH_PX: Final = 640
-"""Narrower images are enlarged before drawing, for readable lines and legends."""
+MIN_WIDTH_PX: Final = 640  # narrower images are enlarged, for readable lines and legends
 
-_FRACTION_BITS: Final = 4
-"""cv2's sub-pixel coordinates are integers, here in 1/16 pixel."""
+_FRACTION_BITS: Final = 4  # sub-pixel coordinates of cv2 are integers, here in 1/16 pixel
 
 _FRONT: Final = frozenset(np.flatnonzero(CORNER_SIGNS[:, 2] > 0).tolist())
 _FRONT_BOTTOM: Final = tuple(np.flatnonzero((CORNER_SIGNS[:, 1:] == [-1, 1]).all(axis=1)).tolist())
@@ -68,12 +66,12 @@ def overlay(
     """
     factor = max(1, -(-min_width_px // image.shape[1]))
     canvas = enlarge(image, factor)
-    # Lines keep a width of a pixel on a sheet with tiles of half the width.
+    # On a sheet with tiles of half this width, lines are still a pixel wide.
     thickness = max(1, canvas.shape[1] // 320)
     for wireframe in wireframes:
         points = resize_points(wireframe.keypoints, factor, factor)
         canvas = draw_wireframe(canvas, points, wireframe.colour, thickness)
-    labels = {frame.label: frame.colour for frame in wireframes if frame.label}
+    labels = {cuboid.label: cuboid.colour for cuboid in wireframes if cuboid.label}
     size = max(12, canvas.shape[0] // 22)
     for line, (label, colour) in enumerate(labels.items()):
         draw_text(canvas, label, (size // 2, size // 2 + line * int(1.4 * size)), size, colour)
@@ -141,7 +139,7 @@ def draw_line(
 def _clip(
     start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"], width: int, height: int, margin: int
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]] | None:
-    """Clip a segment to the image and a margin (Liang–Barsky); cv2 overflows far outside."""
+    """Clip a segment to image and margin (Liang–Barsky), because cv2 overflows far outside."""
     if not (np.isfinite(start).all() and np.isfinite(end).all()):
         return None
     direction = end - start

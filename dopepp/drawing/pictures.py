@@ -1,9 +1,9 @@
 """Image and video files: strict decoding of images, and crash-safe writing of videos.
 
-All photos, textures, frames, depth images and masks are decoded here, completely or not at all.
-Pillow, unlike OpenCV, rejects truncated files and reports the size before decoding; the checksums
-of a PNG and the end of a JPEG are checked here. To accept a further format of plain pixels, name it
-in :data:`FORMATS`.
+This module decodes all photos, textures, frames, depth images and masks, completely or not at all.
+Pillow, unlike OpenCV, rejects truncated files and reports the size before decoding. The checksums
+of a PNG and the end of a JPEG are checked here. To accept a further format of plain pixels, add its
+name to :data:`FORMATS`.
 """
 
 from __future__ import annotations
@@ -59,13 +59,13 @@ MAX_BYTES: Final = 256_000_000
 """Largest file: the pixels that :data:`MAX_SIDE` allows, without compression."""
 
 DARKEST: Final = 16
-"""Largest value (of 255) of 16-bit pixels with no more than 12 significant bits."""
+"""Smallest maximum (of 255) of a 16-bit image; 12 significant bits stay below."""
 
 MIN_FREE: Final = 16_000_000
 """Free bytes on the disk below which writing stops, so that the file can still be completed."""
 
 USUAL_RATE: Final = 25.0
-"""Frames per second if a file or a camera does not state the rate."""
+"""Frames per second of a file or camera that does not state its rate."""
 
 LONGEST_GAP_S: Final = 2.0
 """Longest time for which an image is repeated if the next is late, seconds."""
@@ -87,7 +87,7 @@ def read_picture(path: Path, longest_px: int | None = None) -> RGBImage:
         ValueError: The file is missing, damaged or not an image, or exceeds :data:`MAX_SIDE`.
     """
     try:
-        with _opened(read_limited(path, MAX_BYTES), FORMATS) as image:
+        with _open(read_limited(path, MAX_BYTES), FORMATS) as image:
             if max(image.size) > MAX_SIDE:
                 raise ValueError(f"{image.width}×{image.height} pixels")
             scale = 1.0 if longest_px is None else longest_px / max(image.size)
@@ -107,7 +107,7 @@ def whole_image(content: bytes, formats: tuple[str, ...] = FORMATS) -> Image.Ima
         ValueError: The content has another format, is damaged, or exceeds :data:`MAX_PIXELS`.
     """
     try:
-        image = _opened(content, formats)
+        image = _open(content, formats)
         if image.width * image.height > MAX_PIXELS:
             raise ValueError(f"{image.width}×{image.height} pixels")
         image.load()
@@ -150,7 +150,7 @@ def read_image(path: Path) -> NDArray[Any]:
         ) from error
     if _is_deep_colour(content):
         # Pillow would silently drop the lower half of the bits.
-        fix = f"convert it: magick {path.name} -depth 8 picture.png"
+        fix = f"convert it: magick {path.name} -depth 8 image.png"
         raise UserError(f"image {path} of 16-bit colours", "8 bits per channel", fix)
     if image.mode.startswith("I"):
         return np.asarray(image, np.uint16)
@@ -169,7 +169,7 @@ def read_rgb(path: Path) -> RGBImage:
     """
     image = read_image(path)
     if image.dtype != np.uint8:
-        fix = f"convert it: magick {path.name} -depth 8 picture.png"
+        fix = f"convert it: magick {path.name} -depth 8 image.png"
         raise UserError(f"image {path} of type {image.dtype}", "8 bits per channel", fix)
     if image.ndim == 2:
         image = np.repeat(image[..., None], 3, axis=2)
@@ -186,7 +186,7 @@ def read_photo(path: Path) -> RGBImage:
             values do not have 8 or 16 bits, or its 16-bit values are too dark.
     """
     allowed = "an image (PNG, JPEG, TIFF, BMP, WEBP) of 8 or 16 bits a channel"
-    save = f"save it as PNG, e.g. with ImageMagick: magick {path.name} picture.png"
+    save = f"save it as PNG, e.g. with ImageMagick: magick {path.name} image.png"
     content = read_content(path)
     try:
         image = whole_image(content)
@@ -198,20 +198,20 @@ def read_photo(path: Path) -> RGBImage:
     except Exception as error:  # PIL raises many types for damaged files
         raise UserError(f"image {path}: {_reason(error)}", allowed, save) from error
     if is_grey16:
-        picture = np.repeat((np.asarray(image, np.uint16) >> 8)[..., None], 3, 2).astype(np.uint8)
+        pixels = np.repeat((np.asarray(image, np.uint16) >> 8)[..., None], 3, 2).astype(np.uint8)
     else:  # Pillow keeps the upper eight of 16 bits in colours
-        picture = np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
-    if is_deep and picture[..., :3].max() < DARKEST:
-        brightest = picture[..., :3].max() / 255
+        pixels = np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
+    if is_deep and pixels[..., :3].max() < DARKEST:
+        brightest = pixels[..., :3].max() / 255
         raise UserError(
             f"image {path} of 16 bits, whose largest value is {brightest:.1%} of white",
             "values that use all 16 bits, not only 10 or 12 bits",
-            f"stretch it: magick {path.name} -auto-level -depth 8 picture.png",
+            f"stretch it: magick {path.name} -auto-level -depth 8 image.png",
         )
-    return np.ascontiguousarray(picture[..., :3])
+    return np.ascontiguousarray(pixels[..., :3])
 
 
-def _opened(content: bytes, formats: tuple[str, ...]) -> Image.Image:
+def _open(content: bytes, formats: tuple[str, ...]) -> Image.Image:
     """Open an image and check its container, without decoding."""
     damage = "" if content else "an empty file"
     if content.startswith(_PNG):
@@ -284,14 +284,14 @@ class VideoFile(AbstractContextManager["VideoFile"]):
         self._start = 0.0
         self._written = 0
 
-    def write(self, picture: RGBImage, time: float) -> None:
+    def write(self, image: RGBImage, time: float) -> None:
         """Add an image taken at a time in seconds.
 
         Raises:
             RunError: The disk is full, or this OpenCV cannot write MP4.
         """
-        height, width = picture.shape[:2]
-        even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), "edge")
+        height, width = image.shape[:2]
+        even = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), "edge")
         if self._writer is None:
             self._size, self._start = (even.shape[1], even.shape[0]), time
             code = cv2.VideoWriter.fourcc(*"mp4v")

@@ -11,13 +11,12 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.drawing.overlay import Colour, draw_line, draw_text, text_coverage
+from dopepp.drawing.overlay import WHITE, Colour, draw_line, draw_text, text_coverage
 from dopepp.drawing.pictures import DepthMap, Mask, RGBImage
 from dopepp.geometry.cuboid import CENTROID
 
 _CAPTION_PX: Final = 18
-_MIN_CAPTION_PX: Final = 9
-"""Smallest readable line; longer text is cut."""
+_MIN_CAPTION_PX: Final = 9  # smallest readable line; longer text is cut
 
 COLOURS: Final[tuple[Colour, ...]] = (
     (230, 25, 75), (60, 180, 75), (255, 225, 25), (0, 130, 200), (245, 130, 48),
@@ -28,8 +27,7 @@ COLOURS: Final[tuple[Colour, ...]] = (
 AXIS_COLOURS: Final[tuple[Colour, ...]] = ((255, 60, 60), (60, 255, 60), (90, 140, 255))
 """Colours of the axes x (red), y (green) and z (blue)."""
 
-_COVER: Final = 0.65
-"""Opacity of a mask."""
+_MASK_OPACITY: Final = 0.65
 
 
 @dataclass(frozen=True)
@@ -60,8 +58,8 @@ def _draw_tile(tile: Tile, width: int) -> RGBImage:
     height = max(1, round(tile.image.shape[0] * scale))
     # Area averaging suits shrinking; cubic interpolation suits enlarging.
     method = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-    picture = np.asarray(cv2.resize(tile.image, (width, height), interpolation=method), np.uint8)
-    return np.concatenate([picture, text_line(tile.caption, width)]) if tile.caption else picture
+    image = np.asarray(cv2.resize(tile.image, (width, height), interpolation=method), np.uint8)
+    return np.concatenate([image, text_line(tile.caption, width)]) if tile.caption else image
 
 
 def text_line(text: str, width: int) -> RGBImage:
@@ -84,21 +82,21 @@ def grid(images: Sequence[RGBImage], columns: int) -> RGBImage:
     if not images or columns < 1:
         raise ValueError(f"a grid needs images and columns, got {len(images)} and {columns}")
     rows = [images[i : i + columns] for i in range(0, len(images), columns)]
-    width = max(sum(picture.shape[1] for picture in row) for row in rows)
+    width = max(sum(image.shape[1] for image in row) for row in rows)
     bands = []
     for row in rows:
-        band = np.full((max(picture.shape[0] for picture in row), width, 3), 255, np.uint8)
+        band = np.full((max(image.shape[0] for image in row), width, 3), 255, np.uint8)
         left = 0
-        for picture in row:
-            band[: picture.shape[0], left : left + picture.shape[1]] = picture
-            left += picture.shape[1]
+        for image in row:
+            band[: image.shape[0], left : left + image.shape[1]] = image
+            left += image.shape[1]
         bands.append(band)
     return np.concatenate(bands)
 
 
 def message_image(width: int, height: int, text: str) -> RGBImage:
     """Return a grey image with a message; lines beyond its height are cut."""
-    picture = np.full((height, width, 3), 225, np.uint8)
+    image = np.full((height, width, 3), 225, np.uint8)
     size = max(10, int(0.05 * width))
     # On average, a character is half as wide as the line is high.
     per_line = max(10, int((width - 2 * size) / (0.52 * size)))
@@ -106,16 +104,16 @@ def message_image(width: int, height: int, text: str) -> RGBImage:
         top = size + number * (size + size // 4)
         if top + size > height:
             break
-        draw_text(picture, line, (size, top), size, (255, 255, 255))
-    return picture
+        draw_text(image, line, (size, top), size, WHITE)
+    return image
 
 
 def belief_tiles(
     image: RGBImage, beliefs: Float[np.ndarray, "9 map_height map_width"], stride: int, name: str
 ) -> list[Tile]:
-    """Return tiles of the corners' and the centroid's beliefs over an image, with their maxima.
+    """Return a tile of the corners' and a tile of the centroid's beliefs, over an image.
 
-    Tiles are drawn by :func:`heat_picture`; captions begin with ``name``.
+    Captions begin with ``name`` and end with the largest belief.
     """
     maps = {"corners": beliefs[:CENTROID].max(axis=0), "centroid": beliefs[CENTROID]}
     return [
@@ -148,14 +146,14 @@ def mask_panel(image: RGBImage, masks: Sequence[Mask | None]) -> RGBImage:
     for number, mask in enumerate(masks):
         if mask is not None:
             colour = np.array(COLOURS[number % len(COLOURS)])
-            panel[mask] = (1 - _COVER) * grey[mask] + _COVER * colour
+            panel[mask] = (1 - _MASK_OPACITY) * grey[mask] + _MASK_OPACITY * colour
     return np.asarray(np.rint(panel), np.uint8)
 
 
 def depth_panel(depth: DepthMap, shown: Mask) -> tuple[RGBImage, str]:
-    """Colour depth from near (red) to far (blue), unknown depth black, and describe the scale.
+    """Colour depth from near (red) to far (blue), unknown depth black; return image and scale.
 
-    The scale spans the ``shown`` pixels (the objects), because a plane may reach far behind them.
+    The scale spans the ``shown`` pixels (the objects), because a plane may extend far behind them.
     """
     measured = depth > 0
     scale = depth[measured & shown] if (measured & shown).any() else depth[measured]

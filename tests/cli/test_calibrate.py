@@ -1,4 +1,4 @@
-"""The commands as they are typed, on drawn images."""
+"""The calibration commands on rendered images."""
 
 import csv
 import shutil
@@ -13,17 +13,18 @@ from scipy.spatial.transform import Rotation
 from dopepp.core.files import write_png
 from dopepp.geometry.camera import camera_matrix, invert_transform, make_transform
 from dopepp.geometry.camera_file import Camera, read_camera
+from dopepp.geometry.transform_file import read_transform, transform_record
 from dopepp.inference.several_views.view_files import read_camera_poses
 from dopepp.robot.calibration.board import draw_view, parse_board
 from dopepp.robot.calibration.lens import write_camera
-from dopepp.robot.calibration.records import read_transform, transform_record, write_calibration
+from dopepp.robot.calibration.records import write_calibration
 
 BOARD = "charuco:8x6:25:19"
 
 
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory):
-    """A folder with ten images, poses.csv and camera.yaml, and where the camera truly is."""
+    """A folder with ten images, poses.csv and camera.yaml; the true T_flange_cam and camera."""
     folder, rng = tmp_path_factory.mktemp("cell"), np.random.default_rng(0)
     camera = Camera((640, 480), camera_matrix(560, 560, 322, 236), (0.05, -0.1, 0, 0, 0), "true")
     board = parse_board(BOARD)
@@ -45,24 +46,15 @@ def cell(tmp_path_factory):
     return folder, X, camera
 
 
-def test_a_camera_is_calibrated_from_pictures(run, cell, tmp_path):
+def test_a_camera_is_calibrated_from_images(run, cell, tmp_path):
     folder, _, camera = cell
-    done = run(
-        "calibrate",
-        "camera",
-        folder,
-        "--board",
-        BOARD,
-        "--out",
-        tmp_path / "camera.yaml",
-        "--force",
-    )
+    out = tmp_path / "camera.yaml"
+    done = run("calibrate", "camera", folder, "--board", BOARD, "--out", out, "--force")
     assert "reprojection error 0." in done.output
-    K = read_camera(tmp_path / "camera.yaml").K
-    assert np.allclose(K, camera.K, atol=2.5)
+    assert np.allclose(read_camera(out).K, camera.K, atol=2.5)
 
 
-def test_the_hand_eye_is_found_and_its_file_says_what_it_is(run, cell, tmp_path):
+def test_the_hand_eye_transform_is_calibrated_and_written(run, cell, tmp_path):
     folder, X, _ = cell
     out = tmp_path / "hand_eye.yaml"
     words = ("--board", BOARD, "--camera", folder / "camera.yaml", "--mount", "hand", "--out", out)
@@ -76,7 +68,7 @@ def test_the_hand_eye_is_found_and_its_file_says_what_it_is(run, cell, tmp_path)
     assert content["poses_used"] == 10
 
 
-def test_a_calibration_that_is_not_trusted_is_written_by_force_alone(run, cell, tmp_path):
+def test_a_doubtful_calibration_is_written_with_force_only(run, cell, tmp_path):
     folder, _, _ = cell
     with (folder / "poses.csv").open() as file:
         few = file.readlines()[:5]
@@ -94,9 +86,9 @@ def test_a_calibration_that_is_not_trusted_is_written_by_force_alone(run, cell, 
 
 def test_a_tip_and_a_bench_are_written(run, tmp_path):
     rng = np.random.default_rng(0)
-    turns = Rotation.from_euler("xyz", rng.uniform(-0.6, 0.6, (6, 3)))
-    at = np.array([0.4, 0, 0.1]) - turns.apply([0, 0.01, 0.12])
-    rows = np.hstack([1000 * at, turns.as_rotvec(degrees=True)])
+    rotations = Rotation.from_euler("xyz", rng.uniform(-0.6, 0.6, (6, 3)))
+    positions = np.array([0.4, 0, 0.1]) - rotations.apply([0, 0.01, 0.12])
+    rows = np.hstack([1000 * positions, rotations.as_rotvec(degrees=True)])
     np.savetxt(tmp_path / "p.csv", rows, delimiter=",", header="x,y,z,rx,ry,rz", comments="")
     words = ("--unit", "mm", "--angles", "deg", "--out", tmp_path / "tool.yaml")
     run("calibrate", "tcp", tmp_path / "p.csv", *words)
@@ -111,7 +103,7 @@ def test_a_tip_and_a_bench_are_written(run, tmp_path):
 
 @pytest.fixture(scope="module")
 def video(cell):
-    """The cell's images as a video, in which each is in sight for three frames."""
+    """A video that shows each image of the cell for three frames."""
     path = cell[0] / "board.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (640, 480))
     for number in range(10):
@@ -121,41 +113,32 @@ def video(cell):
     return path
 
 
-def test_of_a_video_the_views_that_differ_are_taken(run, cell, video, tmp_path):
+def test_distinct_views_of_a_video_are_used(run, cell, video, tmp_path):
     out = tmp_path / "camera.yaml"
     done = run("calibrate", "camera", video, "--board", BOARD, "--out", out, "--force")
     assert "10 distinct views in 15 images" in done.stderr
     assert read_camera(out).K[0, 0] == pytest.approx(cell[2].K[0, 0], rel=0.02)
 
 
-def test_a_bench_is_found_from_a_board_on_it(run, refused, cell, tmp_path):
-    """The board of the cell lies still: the hand-eye calibration says where."""
+def test_a_bench_is_calibrated_from_a_board_on_it(run, refused, cell, tmp_path):
     folder, X, _ = cell
     hand_eye, out = tmp_path / "hand_eye.yaml", tmp_path / "bench.yaml"
     write_calibration(hand_eye, "hand-eye", {"T_flange_cam": transform_record(X)}, (), False)
     words = ("--board", BOARD, "--camera", folder / "camera.yaml", "--out", out)
-    run(
-        "calibrate",
-        "bench",
-        folder,
-        *words,
-        "--hand-eye",
-        hand_eye,
-        "--poses",
-        folder / "poses.csv",
-    )
+    options = ("--hand-eye", hand_eye, "--poses", folder / "poses.csv")
+    run("calibrate", "bench", folder, *words, *options)
     T = read_transform(out, "T_base_bench")
-    assert np.linalg.norm(T[:3, 3] - [0.5, 0.1, 0.02]) < 0.001  # the board's place, as drawn
-    for more, said in (
+    assert np.linalg.norm(T[:3, 3] - [0.5, 0.1, 0.02]) < 0.001  # the true position of the board
+    for more, message in (
         ((), "--camera and --hand-eye"),
         (("--hand-eye", hand_eye), "without --poses"),
         (("--hand-eye", tmp_path / "none.yaml"), "none.yaml"),
     ):
-        assert said in refused("calibrate", "bench", folder, *words, *more)
+        assert message in refused("calibrate", "bench", folder, *words, *more)
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("board", "chess:8x6:20", "--out", "b.pdf"), "one even and one odd"),
         (("board", "chess:8x5:20", "--out", "b.txt"), ".pdf"),
@@ -169,33 +152,24 @@ def test_a_bench_is_found_from_a_board_on_it(run, refused, cell, tmp_path):
         (("tcp", "none.csv", "--out", "t.yaml", "--angles", "grad"), "--angles grad"),
     ],
 )
-def test_bad_words_are_one_line(refused, tmp_path, monkeypatch, words, said):
+def test_wrong_options_are_one_line(refused, tmp_path, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
-    assert said in refused("calibrate", *words)
+    assert message in refused("calibrate", *words)
 
 
-def test_pictures_without_the_board_are_told(run, cell, tmp_path):
-    done = run(
-        "calibrate",
-        "camera",
-        cell[0],
-        "--board",
-        "chess:9x6:20",
-        "--out",
-        tmp_path / "c.yaml",
-        code=2,
-    )
+def test_images_without_the_board_are_an_error(run, cell, tmp_path):
+    words = ("--board", "chess:9x6:20", "--out", tmp_path / "c.yaml")
+    done = run("calibrate", "camera", cell[0], *words, code=2)
     assert "no board in any of 10 images" in done.output
 
 
 @pytest.fixture(scope="module")
 def rig_folder(tmp_path_factory):
-    """Images of two cameras at five moments, their camera files, and the second's true pose."""
+    """Images and files of two cameras at five moments, and the true T_left_right."""
     folder, rng = tmp_path_factory.mktemp("rig"), np.random.default_rng(1)
     camera = Camera((640, 480), camera_matrix(560, 560, 322, 236), (0.05, -0.1, 0, 0, 0), "true")
     board, names = parse_board(BOARD), ("left", "right")
-    turn = Rotation.from_euler("y", -0.5).as_matrix()
-    T_left_right = make_transform(turn, [0.16, 0.0, 0.04])
+    T_left_right = make_transform(Rotation.from_euler("y", -0.5).as_matrix(), [0.16, 0.0, 0.04])
     for name in names:
         (folder / name).mkdir()
         write_camera(folder / f"{name}.yaml", camera)
@@ -226,7 +200,7 @@ def test_a_rig_is_calibrated_for_several_views(run, rig_folder, tmp_path):
     assert 1e-6 < poses.error[0] < 1e-3
 
 
-def test_a_faulty_rig_is_refused_with_the_name_of_its_camera(run, refused, rig_folder, tmp_path):
+def test_the_error_of_a_faulty_rig_names_the_camera(run, refused, rig_folder, tmp_path):
     folder, _ = rig_folder
     shutil.copytree(folder, tmp_path / "rig")
     words = ("calibrate", "rig", tmp_path / "rig", "--board", BOARD, "--out", tmp_path / "rig.yaml")

@@ -12,7 +12,7 @@ import trimesh
 from dopepp.models.checkpoint import Checkpoint, write_atomic
 from dopepp.models.network import build_network
 from dopepp.parts.catalogue import pivconnector
-from dopepp.virtual.presets import PRESETS
+from dopepp.virtual import PRESETS, Factory
 
 K = ["--K", "100", "100", "31.5", "31.5"]
 RENDER = ["render", "servoholder", "--preset", "quickstart", "--size", "32x24", "--format", "ndds"]
@@ -27,21 +27,21 @@ def checkpoint(tiny_spec, tmp_path):
 
 
 @pytest.fixture
-def picture(tmp_path):
-    path = tmp_path / "picture.png"
+def image_file(tmp_path):
+    path = tmp_path / "image.png"
     cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8))
     return path
 
 
-def test_predict_verifies_and_refines(run, checkpoint, picture, tmp_path):
+def test_predict_verifies_and_refines(run, checkpoint, image_file, tmp_path):
     depth = tmp_path / "depth.png"
     cv2.imwrite(str(depth), np.full((64, 64), 500, np.uint16))
     measured = ("--depth", depth)
     for options in (("depth", *measured), ("region",), ("region,depth", *measured)):
-        done = run("predict", checkpoint, picture, *K, "--verify", "--refine", *options)
+        done = run("predict", checkpoint, image_file, *K, "--verify", "--refine", *options)
         for line in done.stdout.splitlines():
             assert 0 <= json.loads(line)["agreement"] <= 1
-            assert json.loads(line)["kept"]  # noise shows no part
+            assert json.loads(line)["kept"]  # a pose on noise is reported
 
 
 @pytest.mark.parametrize(
@@ -56,15 +56,12 @@ def test_predict_verifies_and_refines(run, checkpoint, picture, tmp_path):
         (["--refine", "depth", "--depth", "missing.png"], "missing.png"),
     ],
 )
-def test_predict_tells_wrong_options(refused, checkpoint, picture, options, message):
-    assert message in refused("predict", checkpoint, picture, *K, *options)
-    assert refused("predict", picture, picture, *K, *options).startswith("got ")
+def test_wrong_options_of_predict_are_one_line(refused, checkpoint, image_file, options, message):
+    assert message in refused("predict", checkpoint, image_file, *K, *options)
+    assert refused("predict", image_file, image_file, *K, *options).startswith("got ")
 
 
-def test_predict_follows_parts_through_a_folder(run, refused, tmp_path):
-    from dopepp.parts.catalogue import pivconnector
-    from dopepp.virtual import PRESETS, Factory
-
+def test_predict_tracks_parts_through_a_folder(run, refused, tmp_path):
     released = Path("pretrained", "pivconnector")
     rendered = Factory([pivconnector()], PRESETS["quickstart"].reframed(640, 480), 2).render(0, 6)
     frames, drawn = tmp_path / "frames", tmp_path / "drawn"
@@ -76,7 +73,7 @@ def test_predict_follows_parts_through_a_folder(run, refused, tmp_path):
     done = run("predict", released, frames, "--K", *camera, "--track", "--save", drawn)
     records = [json.loads(line) for line in done.stdout.splitlines()]
     assert [Path(entry["image"]).name for entry in records] == ["000.png", "001.png", "002.png"]
-    assert {one["identity"] for one in records} == {0}
+    assert {entry["identity"] for entry in records} == {0}
     true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj
     for record in records:
         assert np.linalg.norm(np.array(record["T_cam_obj"])[:3, 3] - true[:3, 3]) < 0.003
@@ -84,14 +81,14 @@ def test_predict_follows_parts_through_a_folder(run, refused, tmp_path):
     assert "without an image" in refused("predict", released, drawn.parent, "--K", *camera)
 
 
-def test_compare_tells_an_unfinished_run(run, refused, tmp_path):
+def test_compare_lists_an_unfinished_run(run, refused, tmp_path):
     (tmp_path / "run" / ".hydra").mkdir(parents=True)
     run("compare", tmp_path / "run", "--out", tmp_path / "out")
     assert "unfinished" in (tmp_path / "out" / "compare.md").read_text()
     assert "missing, which holds no run" in refused("compare", tmp_path / "missing")
 
 
-def test_render_writes_goes_on_and_says_so(run, tmp_path):
+def test_render_continues_an_unfinished_data_set(run, tmp_path):
     arguments = [*RENDER, "--workers", "1", "--out", tmp_path, "-n", "2"]
     done = run(*arguments, "--shard", "1/2")
     assert done.stdout.startswith("1 of 1 images rendered in ")
@@ -141,14 +138,14 @@ def test_render_shows_a_users_camera(run, tmp_path, caplog):
         (["--camera", "/nowhere", "--working-distance", "0.5,1"], "got camera file /nowhere: No"),
     ],
 )
-def test_a_camera_that_cannot_be_used_is_one_line(refused, arguments, message, tmp_path):
+def test_a_wrong_camera_is_one_line(refused, arguments, message, tmp_path):
     (tmp_path / "cam.yaml").write_text(CAMERA)
     given = [text.format(camera=tmp_path / "cam.yaml") for text in arguments]
     line = refused("render", "servoholder", "--out", tmp_path / "out", "-n", "1", *given)
     assert line.startswith(message)
 
 
-def test_render_previews_and_stops(run, tmp_path):
+def test_a_preview_renders_no_data_set(run, tmp_path):
     out = tmp_path / "out"
     done = run(*RENDER, "-n", "5000", "--preview", "--out", out)
     assert done.stdout == f"{out.resolve()}.preview.png\n"
@@ -204,7 +201,7 @@ def test_a_wrong_command_is_one_line_and_code_2(refused, arguments, message):
     assert refused(*arguments).startswith(message)
 
 
-def test_download_tells_where_the_photos_are(run, tmp_path, monkeypatch):
+def test_download_prints_the_folder_of_the_photos(run, tmp_path, monkeypatch):
     photos = tmp_path / "voc2007" / "VOCdevkit" / "VOC2007" / "JPEGImages"
     photos.mkdir(parents=True)
     done = run("download", "voc2007", "--out", tmp_path)
@@ -233,7 +230,7 @@ def test_the_unit_of_a_file_is_guessed_and_a_wrong_one_named(refused, plate, tmp
 
 
 @pytest.mark.slow
-def test_an_inch_file_comes_out_in_its_size_and_checked(run, plate, tmp_path):
+def test_a_mesh_in_inches_is_rendered_at_its_size(run, plate, tmp_path):
     mesh = trimesh.load_mesh(plate)
     inches, out = tmp_path / "plate.stl", tmp_path / "out"
     corners = mesh.vertices.copy()
@@ -264,7 +261,7 @@ SLOW_LAYOUTS = [pytest.param(name, marks=pytest.mark.slow) for name in ("ndds", 
 
 @pytest.mark.parametrize("layout", ["bop", *SLOW_LAYOUTS])
 def test_neither_render_nor_check_imports_torch(layout, command, tmp_path):
-    # One interpreter does everything a worker does, too: workers are other processes.
+    # This interpreter also does the work of the worker processes.
     code = f"""
 import sys
 from typer.testing import CliRunner
@@ -292,14 +289,14 @@ print(sorted({{"torch", "lightning", "torchmetrics", "ray", "webdataset"}} & set
 
 
 @pytest.mark.parametrize("verb", [["predict", "x.ckpt"], ["doctor", "--model", "x.ckpt"]])
-def test_a_missing_camera_is_told_before_pytorch_is_imported(verb, command, tmp_path):
-    picture = tmp_path / "a.png"
-    cv2.imwrite(str(picture), np.zeros((8, 8, 3), np.uint8))
+def test_a_missing_camera_is_an_error_before_pytorch_is_imported(verb, command, tmp_path):
+    image_file = tmp_path / "a.png"
+    cv2.imwrite(str(image_file), np.zeros((8, 8, 3), np.uint8))
     code = f"""
 import sys
 from typer.testing import CliRunner
 from dopepp.cli import app
-done = CliRunner().invoke(app, [{", ".join(map(repr, verb))}, {str(picture)!r}])
+done = CliRunner().invoke(app, [{", ".join(map(repr, verb))}, {str(image_file)!r}])
 print(done.exit_code, {{"torch", "numba", "scipy.spatial"}} & set(sys.modules), done.stderr)
 """
     assert command("-c", code).out.startswith("2 set() got neither --K nor --camera")

@@ -1,4 +1,4 @@
-"""``dopepp doctor`` and ``dopepp serve`` as their users call them."""
+"""The commands ``dopepp doctor`` and ``dopepp serve``."""
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ MODEL = "pretrained/pivconnector"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("patient")
+    folder = tmp_path_factory.mktemp("images")
     rendered = Factory([pivconnector()], PRESETS["quickstart"], 411).render(0, 0)
     cv2.imwrite(str(folder / "good.png"), rendered.image[..., ::-1])
     cv2.imwrite(str(folder / "plain.png"), np.full((128, 128, 3), 90, np.uint8))
@@ -24,31 +24,11 @@ def folder(tmp_path_factory):
     return folder
 
 
-def test_a_good_picture_is_well(run, folder):
-    done = run(
-        "doctor",
-        "--model",
-        MODEL,
-        folder / "good.png",
-        "--camera",
-        folder / "K.txt",
-        "--refine",
-        "region",
-    )
-    lines = done.stdout.splitlines()
-    assert [line.split(":")[0] for line in lines] == [
-        f"ok {subject}"
-        for subject in (
-            "part",
-            "exposure",
-            "sharpness",
-            "camera",
-            "size",
-            "visibility",
-            "elsewhere",
-            "pose",
-        )
-    ]
+def test_a_good_image_passes_all_checks(run, folder):
+    words = (folder / "good.png", "--camera", folder / "K.txt", "--refine", "region")
+    lines = run("doctor", "--model", MODEL, *words).stdout.splitlines()
+    subjects = "part exposure sharpness camera size visibility elsewhere pose"
+    assert [line.split(":")[0] for line in lines] == [f"ok {word}" for word in subjects.split()]
     assert "pivconnector measures 105 × 52 × 7.0 mm" in lines[0]
     assert "of its outline agrees" in lines[-1]
 
@@ -57,14 +37,8 @@ def test_a_good_picture_is_well(run, folder):
     ("options", "line"),
     [
         (["plain.png", "--camera", "K.txt"], "!! visibility: pivconnector is not detected"),
-        (
-            ["good.png", "--camera", "K.txt", "--at", "5,5"],
-            "!! elsewhere: 1 of 1 detections above",
-        ),
-        (
-            ["good.png", "--camera", "K.txt", "--empty"],
-            "!! elsewhere: 1 of 1 detections above",
-        ),
+        (["good.png", "--camera", "K.txt", "--at", "5,5"], "!! elsewhere: 1 of 1 detections"),
+        (["good.png", "--camera", "K.txt", "--empty"], "!! elsewhere: 1 of 1 detections"),
         (["good.png", "--K", "220", "220", "127.5", "127.5"], "!! camera: K with fx=220"),
         (
             ["good.png", "--camera", "K.txt", "--part", "piv.stl", "--unit", "cm"],
@@ -73,12 +47,9 @@ def test_a_good_picture_is_well(run, folder):
         ),
     ],
 )
-def test_what_is_wrong_comes_first(run, folder, options, line):
-    paths = [
-        str(folder / option) if "." in option and option[0].isalpha() else option
-        for option in options
-    ]
-    done = run("doctor", "--model", MODEL, *paths, code=1)
+def test_problems_come_first(run, folder, options, line, monkeypatch):
+    monkeypatch.chdir(folder)
+    done = run("doctor", "--model", MODEL, *options, code=1)
     assert done.stdout.startswith(line)
     assert "; fix: " in done.stdout.splitlines()[0]
 
@@ -94,11 +65,9 @@ def test_what_is_wrong_comes_first(run, folder, options, line):
         (["good.png", "--camera", "K.txt", "--distance", "2", "1"], "distances=(2.0, 1.0)"),
     ],
 )
-def test_wrong_input_is_one_line(refused, folder, options, line):
-    paths = [
-        str(folder / option) if option[-4:] in (".png", ".txt") else option for option in options
-    ]
-    assert line in refused("doctor", "--model", MODEL, *paths)
+def test_wrong_input_is_one_line(refused, folder, options, line, monkeypatch):
+    monkeypatch.chdir(folder)
+    assert line in refused("doctor", "--model", MODEL, *options)
 
 
 def test_a_page_that_cannot_be_served_is_one_line(refused, monkeypatch):

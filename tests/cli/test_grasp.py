@@ -1,4 +1,4 @@
-"""The commands as they are typed: a few grasps, and what is refused in one line."""
+"""The grasp commands: a few grasps, and wrong options."""
 
 import json
 
@@ -50,7 +50,7 @@ def test_other_layouts_end_in_a_report(grasped, tmp_path, layout):
     assert content["layout"] == layout
 
 
-def test_the_arm_takes_a_second_picture_and_states_why(grasped):
+def test_the_arm_takes_a_second_image_and_states_the_reason(grasped):
     content, output = grasped("-n", 1, "--views", 2, "--poses", "network,exact", "--workers", 1)
     first, exact = content["trials"]
     assert first["caught"]
@@ -67,21 +67,17 @@ def test_templates_grip_a_part_without_training(grasped, tmp_path):
     assert "## Table 9: templates" in output
 
 
-def test_proposed_grasps_hold_a_part_of_ones_own(grasped, run, tmp_path):
+def test_proposed_grasps_hold_a_new_part(grasped, run, tmp_path):
     trimesh.creation.box((60, 30, 20)).export(tmp_path / "block.stl")
-    done = run(
-        "grasp", "propose", tmp_path / "block.stl", "--unit", "mm", "--out", tmp_path / "block.yaml"
-    )
-    assert "grasps" in done.output
-    content, _ = grasped(
-        "--part", tmp_path / "block.stl", "--unit", "mm", "--poses", "exact", "-n", 2,
-        "--grasps", tmp_path / "block.yaml", "--rest", "any", "--workers", 1,
-    )  # fmt: skip
+    mesh, grasps = (tmp_path / "block.stl", "--unit", "mm"), tmp_path / "block.yaml"
+    assert "grasps" in run("grasp", "propose", *mesh, "--out", grasps).output
+    options = ("--poses", "exact", "-n", 2, "--grasps", grasps, "--rest", "any", "--workers", 1)
+    content, _ = grasped("--part", *mesh, *options)
     assert content["sources"]["exact poses"]["caught"] == 2
 
 
 @pytest.mark.parametrize(
-    ("words", "named"),
+    ("words", "message"),
     [
         (["--layout", "pile"], "--layout pile"),
         (["--renderer", "blender"], "--renderer blender"),
@@ -97,18 +93,18 @@ def test_proposed_grasps_hold_a_part_of_ones_own(grasped, run, tmp_path):
         (["--grasps", "none.yaml"], "none.yaml"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(refused, tmp_path, words, named):
-    assert named in refused("grasp", "--out", tmp_path, "--workers", 1, *words)
+def test_wrong_options_are_one_line(refused, tmp_path, words, message):
+    assert message in refused("grasp", "--out", tmp_path, "--workers", 1, *words)
 
 
-def test_a_part_without_a_grasp_or_a_network_is_refused(refused, tmp_path):
+def test_a_part_without_a_grasp_or_a_network_is_rejected(refused, tmp_path):
     trimesh.creation.box((60, 30, 20)).export(tmp_path / "block.stl")
     words = ["--part", tmp_path / "block.stl", "--unit", "mm", "--out", tmp_path]
     assert "without a network" in refused("grasp", *words)
     assert "part block without a grasp" in refused("grasp", *words, "--poses", "exact")
 
 
-def test_grasps_that_are_not_reached_are_told(run, tmp_path):
+def test_grasps_out_of_reach_are_an_error(run, tmp_path):
     below = "{point: [0, 0, 0], closing: [0, 1, 0], approach: [0, 0, 1], width: 0.052}"
     (tmp_path / "below.yaml").write_text(f"part: pivconnector\ngrasps: [{below}]\n")
     words = ["--poses", "exact", "-n", 2, "--grasps", tmp_path / "below.yaml", "--workers", 1]
@@ -116,13 +112,13 @@ def test_grasps_that_are_not_reached_are_told(run, tmp_path):
     assert "whose grasps were not reachable in any" in done.output
 
 
-def test_without_the_extra_it_says_which(refused, tmp_path, monkeypatch):
+def test_a_missing_extra_is_named(refused, tmp_path, monkeypatch):
     monkeypatch.setattr("dopepp.core.errors.find_spec", lambda name: None)
     assert "dopepp[robot]" in refused("grasp", "--out", tmp_path)
 
 
 @pytest.mark.parametrize("words", [["--video", "film.mp4"], ["--renderer", "mujoco"]])
-def test_without_a_display_it_says_so_before_the_first_grasp(run, tmp_path, monkeypatch, words):
+def test_missing_opengl_is_an_error_before_the_first_grasp(run, tmp_path, monkeypatch, words):
     def fail(*_):
         raise RuntimeError("no EGL display")
 

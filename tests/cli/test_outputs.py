@@ -1,4 +1,4 @@
-"""What ``dopepp predict`` writes, to the end or until something ends it."""
+"""Files that ``dopepp predict`` writes, also if it is interrupted or fails."""
 
 from __future__ import annotations
 
@@ -18,20 +18,19 @@ import pytest
 from dopepp.data.formats.bop.bop_results import read_results
 from dopepp.inference.frames.media import Video
 from dopepp.parts.catalogue import pivconnector
+from dopepp.virtual import PRESETS, Factory
 
 FRAMES = 5
 
 
 @pytest.fixture(scope="module")
 def rendered():
-    from dopepp.virtual import PRESETS, Factory
-
     return Factory([pivconnector()], PRESETS["quickstart"].reframed(320, 240), 2).render(0, 9)
 
 
 @pytest.fixture(scope="module")
 def files(rendered, tmp_path_factory):
-    """A video of the part standing still, and an image of it and one without it."""
+    """A video and an image of the same part, and an image without a part."""
     folder = tmp_path_factory.mktemp("files")
     writer = cv2.VideoWriter(
         str(folder / "clip.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (320, 240)
@@ -62,7 +61,7 @@ def lines(path: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def test_everything_about_pictures_and_a_video(predict, files, rendered, tmp_path):
+def test_all_outputs_for_images_and_a_video(predict, files, rendered, tmp_path):
     out, poses, csv = tmp_path / "out", tmp_path / "poses.jsonl", tmp_path / "poses.csv"
     sources = (f"{files}/0*", files / "clip.avi")
     done = predict(*sources, "--save", out, "--json", poses, "--csv", csv, "--stride", 2)
@@ -70,8 +69,8 @@ def test_everything_about_pictures_and_a_video(predict, files, rendered, tmp_pat
     assert frames(out / "clip.mp4") == 3
     true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj
     result = lines(poses)
-    assert [one["number"] for one in result] == [7, 0, 2, 4]
-    assert [one["time"] for one in result] == [None, 0, pytest.approx(0.2), pytest.approx(0.4)]
+    assert [entry["number"] for entry in result] == [7, 0, 2, 4]
+    assert [entry["time"] for entry in result] == [None, 0, pytest.approx(0.2), pytest.approx(0.4)]
     for record in result:
         assert "x right, y down, z forward" in record["frame"]
         T = np.array(record["detections"][0]["T_cam_obj"])
@@ -81,13 +80,13 @@ def test_everything_about_pictures_and_a_video(predict, files, rendered, tmp_pat
     for row, entry in zip(rows, result, strict=True):
         np.testing.assert_allclose(row.T_cam_obj, entry["detections"][0]["T_cam_obj"], atol=1e-9)
     assert len(done.stdout.splitlines()) == 4
-    told = done.stderr.splitlines()
-    assert len(told) == 4
-    assert all("speed: pre " in item and item.endswith(" ms") for item in told)
-    assert told[1].startswith("1/3 clip.avi: 1 pose; ")
+    messages = done.stderr.splitlines()
+    assert len(messages) == 4
+    assert all("speed: pre " in item and item.endswith(" ms") for item in messages)
+    assert messages[1].startswith("1/3 clip.avi: 1 pose; ")
 
 
-def test_a_picture_without_the_part_is_a_line_of_its_own(predict, files, tmp_path):
+def test_an_image_without_the_part_has_an_empty_line(predict, files, tmp_path):
     done = predict(
         files / "000009.png", "--json", tmp_path / "poses.jsonl", "--csv", tmp_path / "p.csv"
     )
@@ -104,7 +103,7 @@ def test_a_picture_without_the_part_is_a_line_of_its_own(predict, files, tmp_pat
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_an_interruption_leaves_what_was_written(
+def test_an_interruption_keeps_the_written_files(
     predict, files, tmp_path, monkeypatch, number, code
 ):
     whole = Video.frames
@@ -141,21 +140,21 @@ def test_a_full_disk_is_one_line_and_code_1(predict, files, tmp_path, monkeypatc
     assert not list(tmp_path.rglob("*.partial"))
 
 
-def test_pictures_are_not_overwritten_by_their_overlays(predict, files):
+def test_overlays_do_not_overwrite_their_images(predict, files):
     before = (files / "000007.jpg").read_bytes()
     done = predict(files / "000007.jpg", "--save", files, code=2)
     assert "the folder of" in done.stderr.splitlines()[-1]
     assert (files / "000007.jpg").read_bytes() == before
 
 
-def test_names_that_come_twice_are_both_kept(predict, files, tmp_path):
+def test_equal_names_are_numbered(predict, files, tmp_path):
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "000007.jpg").write_bytes((files / "000007.jpg").read_bytes())
     predict(files / "000007.jpg", tmp_path / "b", "--save", tmp_path / "out")
     assert len(list((tmp_path / "out").iterdir())) == 2
 
 
-def test_a_folder_stops_at_a_damaged_picture_with_what_was_written(predict, files, tmp_path):
+def test_a_damaged_image_stops_a_folder_and_keeps_the_written_files(predict, files, tmp_path):
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "1.jpg").write_bytes((files / "000007.jpg").read_bytes())
     (tmp_path / "in" / "2.jpg").write_bytes((files / "000007.jpg").read_bytes()[:900])
@@ -164,6 +163,6 @@ def test_a_folder_stops_at_a_damaged_picture_with_what_was_written(predict, file
     assert len(lines(tmp_path / "poses.jsonl")) == 1
 
 
-def test_a_camera_that_is_not_there(predict, files):
+def test_a_missing_camera_is_an_error(predict, files):
     done = predict(97, code=2)
     assert done.stderr.startswith("got camera 97, which cannot be opened")

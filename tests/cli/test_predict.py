@@ -1,4 +1,4 @@
-"""``dopepp predict`` as somebody with a camera of their own calls it, with a released network."""
+"""``dopepp predict`` with a released network and several cameras."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ import numpy as np
 import pytest
 import torch
 
+from dopepp.geometry.camera import make_transform
+from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.parts.catalogue import pivconnector
+from dopepp.virtual import PRESETS, Factory, render
+from dopepp.virtual.sensor import capture
 
 RELEASED = "pretrained/pivconnector"
 LENS = np.array([-0.25, 0.1, 0.001, -0.002, 0.0])
@@ -28,45 +32,28 @@ def poses(run):
 
 
 @pytest.fixture(scope="module")
-def rendered():
-    from dopepp.virtual import PRESETS, Factory
-
-    return Factory([pivconnector()], PRESETS["quickstart"].reframed(640, 480), 2).render(0, 9)
-
-
-@pytest.fixture(scope="module")
-def K(rendered):  # noqa: N802
-    return rendered.scene.K
-
-
-@pytest.fixture(scope="module")
-def four(K):
-    return ("--K", *K[[0, 1, 0, 1], [0, 1, 2, 2]])
-
-
-@pytest.fixture(scope="module")
-def folder(rendered, K, tmp_path_factory):
-    """Images of one part, each spoilt or taken in another way, and files of their cameras."""
-    folder = tmp_path_factory.mktemp("pictures")
-    picture = rendered.image[..., ::-1]
+def folder(rendered, tmp_path_factory):
+    """Images of a part with different sizes, depths and lenses, and files of their cameras."""
+    folder = tmp_path_factory.mktemp("images")
+    image, K = rendered.image[..., ::-1], rendered.scene.K
     pixels = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), -1).reshape(-1, 1, 2)
     straight = cv2.undistortPoints(pixels, K, LENS, P=K).reshape(480, 640, 2)
     written = {
-        "whole.png": picture,
-        "deep.png": 257 * picture.astype(np.uint16),
-        "raw.png": 16 * picture.astype(np.uint16),
-        "lens.png": cv2.remap(picture, straight.astype(np.float32), None, cv2.INTER_LINEAR),
-        "half.png": cv2.resize(picture, (320, 240), interpolation=cv2.INTER_AREA),
-        "cut.png": picture[:400, 8:],
-        "grey.png": cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY),
-        "4k.png": cv2.resize(picture, (3840, 2160)),
-        "dot.png": picture[:1, :1],
-        "empty.png": np.full_like(picture, 90),
-        "corner.png": picture[400:, :200],
+        "whole.png": image,
+        "deep.png": 257 * image.astype(np.uint16),
+        "raw.png": 16 * image.astype(np.uint16),
+        "lens.png": cv2.remap(image, straight.astype(np.float32), None, cv2.INTER_LINEAR),
+        "half.png": cv2.resize(image, (320, 240), interpolation=cv2.INTER_AREA),
+        "cut.png": image[:400, 8:],
+        "grey.png": cv2.cvtColor(image, cv2.COLOR_BGR2GRAY),
+        "4k.png": cv2.resize(image, (3840, 2160)),
+        "dot.png": image[:1, :1],
+        "empty.png": np.full_like(image, 90),
+        "corner.png": image[400:, :200],
     }
     for name, content in written.items():
         cv2.imwrite(str(folder / name), content)
-    cv2.imwrite(str(folder / "anim.gif"), picture)
+    cv2.imwrite(str(folder / "anim.gif"), image)
     storage = cv2.FileStorage(str(folder / "lens.yaml"), cv2.FILE_STORAGE_WRITE)
     storage.write("image_width", 640)
     storage.write("image_height", 480)
@@ -81,36 +68,36 @@ def folder(rendered, K, tmp_path_factory):
     return folder
 
 
-def test_a_camera_file_says_what_k_says(poses, folder, four):
-    (expected,) = poses(folder / "whole.png", *four)
+def test_a_camera_file_and_k_give_the_same_pose(poses, folder, intrinsics):
+    (expected,) = poses(folder / "whole.png", *intrinsics)
     for name in ("K.txt", "plain.json"):
         (result,) = poses(folder / "whole.png", "--camera", folder / name)
         np.testing.assert_allclose(result, expected, atol=1e-9)
-    (deep,) = poses(folder / "deep.png", *four)
+    (deep,) = poses(folder / "deep.png", *intrinsics)
     np.testing.assert_allclose(deep, expected, atol=1e-9)
 
 
-def test_resized_and_cut_pictures_give_the_whole_ones_pose(poses, folder, four, rendered):
+def test_resized_and_cropped_images_give_the_same_pose(poses, folder, intrinsics, rendered):
     true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj[:3, 3]
     plain = ("--camera", folder / "plain.json", "--refine", "region")
-    for name, said in (
+    for name, options in (
         ("half.png", ("--K-size", 640, 480)),
         ("cut.png", ("--crop", 8, 0, 632, 400)),
     ):
-        (result,) = poses(folder / name, *plain, *said)
+        (result,) = poses(folder / name, *plain, *options)
         assert np.linalg.norm(result[:3, 3] - true) < 0.001
 
 
-def test_the_lens_counts(poses, folder, rendered, tmp_path):
+def test_the_distortion_of_the_lens_is_corrected(poses, folder, rendered, tmp_path):
     true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj[:3, 3]
-    picture, refine = folder / "lens.png", ("--refine", "region")
+    image, refine = folder / "lens.png", ("--refine", "region")
     lens = ("--camera", folder / "lens.yaml", *refine, "--save", tmp_path)
-    (result,) = poses(picture, *lens)
+    (result,) = poses(image, *lens)
     assert np.linalg.norm(result[:3, 3] - true) < 0.0005
-    without = poses(picture, "--camera", folder / "K.txt", *refine)
+    without = poses(image, "--camera", folder / "K.txt", *refine)
     assert all(np.linalg.norm(item[:3, 3] - true) > 0.001 for item in without)
     drawn = tmp_path / "lens.png"
-    # Drawn on the image as a pinhole sees it, which is the rendered one.
+    # The overlay shows the undistorted image, which equals the rendered image.
     shown = cv2.imread(str(drawn))[200:450, 20:300, ::-1].astype(float)
     assert np.abs(shown - rendered.image[200:450, 20:300]).mean() < 12
 
@@ -130,22 +117,22 @@ def test_the_lens_counts(poses, folder, rendered, tmp_path):
         ("whole.png", ["--K", "100", "100", "63.5", "63.5"], "likely of 128×128"),
         ("whole.png", ["--K", "nan", "100", "319.5", "239.5"], "3×3 pinhole"),
         ("whole.png", ["--K", "0.1", "0.1", "319.5", "239.5"], "field of view of 5° – 150°"),
-        ("anim.gif", ["--camera", "K.txt"], "magick anim.gif picture.png"),
+        ("anim.gif", ["--camera", "K.txt"], "magick anim.gif image.png"),
         ("raw.png", ["--camera", "K.txt"], "magick raw.png -auto-level"),
         ("whole.png", ["--camera", "K.txt", "--device", "nope"], "device nope ("),
     ],
 )
-def test_what_cannot_be_is_one_line(refused, folder, name, options, message, monkeypatch):
+def test_wrong_input_is_one_line(refused, folder, name, options, message, monkeypatch):
     monkeypatch.chdir(folder)
     line = refused("predict", RELEASED, name, *options)
     assert line.startswith("got ")
     assert message in line
 
 
-def test_a_device_that_is_not_there(refused, folder, four):
+def test_a_missing_device_is_one_line(refused, folder, intrinsics):
     if torch.cuda.is_available():
         pytest.skip("this machine has CUDA")
-    line = refused("predict", RELEASED, folder / "whole.png", *four, "--device", "cuda")
+    line = refused("predict", RELEASED, folder / "whole.png", *intrinsics, "--device", "cuda")
     assert "device cuda (" in line
 
 
@@ -158,15 +145,15 @@ def test_a_device_that_is_not_there(refused, folder, four):
         ("--csv", "poses.txt", ".csv"),
     ],
 )
-def test_a_place_for_what_is_written_is_checked_before_the_work(
-    refused, folder, four, option, name, message, tmp_path, monkeypatch
+def test_output_paths_are_checked_before_the_network_is_loaded(
+    refused, folder, intrinsics, option, name, message, tmp_path, monkeypatch
 ):
     def load(*_: object, **__: object) -> None:
         raise AssertionError("the work has begun")
 
     monkeypatch.setattr("dopepp.inference.estimator.PoseEstimator.load", load)
     (tmp_path / "file").touch()
-    words = (folder / "whole.png", *four, option, tmp_path / name)
+    words = (folder / "whole.png", *intrinsics, option, tmp_path / name)
     assert message in refused("predict", RELEASED, *words)
 
 
@@ -182,8 +169,8 @@ def test_a_place_for_what_is_written_is_checked_before_the_work(
         ("whole.png", (277, 208, 319.5, 239.5), False),
     ],
 )
-def test_any_picture_has_an_answer_in_time(run, folder, name, camera, silent):
-    """With refinement: poses, or why there are none; ``silent`` where there is no part."""
+def test_every_image_has_poses_or_a_reason_in_time(run, folder, name, camera, silent):
+    """Refine the poses; ``silent`` means that the image shows no part."""
     start = time.process_time()
     done = run("predict", RELEASED, folder / name, "--K", *camera, "--refine", "region")
     assert time.process_time() - start < 60
@@ -196,19 +183,14 @@ def test_any_picture_has_an_answer_in_time(run, folder, name, camera, silent):
 
 
 def test_several_views_of_a_scene(run, tmp_path):
-    from dopepp.geometry.camera import make_transform
-    from dopepp.geometry.rotation import rotation_vector_to_matrix
-    from dopepp.virtual import PRESETS, Factory, render
-    from dopepp.virtual.sensor import capture
-
     scene = Factory([pivconnector()], PRESETS["quickstart"].reframed(640, 480), 2).scene(0, 9)
     target = scene.objects[scene.targets[0]].T_cam_obj
-    turn = rotation_vector_to_matrix(np.array([0.0, 0.4, 0.0]))
-    T_new_cam = make_transform(turn, target[:3, 3] - turn @ target[:3, 3])
+    rotation = rotation_vector_to_matrix(np.array([0.0, 0.4, 0.0]))
+    T_new_cam = make_transform(rotation, target[:3, 3] - rotation @ target[:3, 3])
     views = {}
     for name, T in (("a.png", np.eye(4)), ("b.png", T_new_cam)):
-        seen = scene.seen_from(T)
-        cv2.imwrite(str(tmp_path / name), capture(render(seen).image, seen.sensor)[..., ::-1])
+        view = scene.seen_from(T)
+        cv2.imwrite(str(tmp_path / name), capture(render(view).image, view.sensor)[..., ::-1])
         views[name] = {"T_world_cam": {"matrix": np.linalg.inv(T).tolist()}}
     np.savetxt(tmp_path / "K.txt", scene.K)
     path = tmp_path / "views.yaml"
@@ -223,7 +205,7 @@ def test_several_views_of_a_scene(run, tmp_path):
     assert json.loads((tmp_path / "scene.json").read_text())["detections"] == [record]
     drawn = sorted(file.name for file in (tmp_path / "out").iterdir())
     assert drawn == ["0_a.png", "1_b.png"]
-    for name in views:  # as from a rig: a folder for each camera
+    for name in views:  # a folder for each camera, as for a rig
         (tmp_path / name[0]).mkdir()
         shutil.copy(tmp_path / name, tmp_path / name[0] / "7.png")
     rig = {"camera": "K.txt", "views": {name[0]: view for name, view in views.items()}}

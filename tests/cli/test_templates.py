@@ -1,4 +1,4 @@
-"""Commands with a mesh in place of a checkpoint."""
+"""Commands with a mesh instead of a checkpoint."""
 
 import json
 
@@ -8,15 +8,9 @@ import pytest
 import trimesh
 
 from dopepp.parts.catalogue import pivconnector
-from dopepp.virtual import PRESETS, Factory
 
 RELEASED = "pretrained/pivconnector"
 RANGE = ("--working-distance", "0.08,0.2")
-
-
-@pytest.fixture(scope="module")
-def rendered():
-    return Factory([pivconnector()], PRESETS["quickstart"].reframed(640, 480), 2).render(0, 9)
 
 
 @pytest.fixture(scope="module")
@@ -46,14 +40,14 @@ def test_predict_draws_and_writes_the_pose_of_a_mesh(run, truth, tmp_path):
     (line,) = map(json.loads, done.stdout.splitlines())
     assert line["object"] == "piv"
     assert np.abs(np.array(line["T_cam_obj"]) - truth).max() < 0.01
-    assert line["score"] > line["probability"] > 0.5  # above a silent level of 0
+    assert line["score"] > line["probability"] > 0.5  # scores have a silent level of 0
     assert line["agreement"] > 0.5
     assert len(list((tmp_path / "out").iterdir())) == 1
     assert json.loads((tmp_path / "p.json").read_text())
     assert (tmp_path / "p.csv").read_text().count("\n") == 2
 
 
-def test_predict_is_silent_on_an_empty_picture_and_searches_once(run, near_truth, truth):
+def test_predict_finds_nothing_in_an_empty_image_and_searches_once(run, near_truth, truth):
     near_truth.truth = []
     done = run("predict", "pivconnector", "empty.png", "--camera", "K.txt", *RANGE, "--refine",
                "region")  # fmt: skip
@@ -61,21 +55,20 @@ def test_predict_is_silent_on_an_empty_picture_and_searches_once(run, near_truth
     assert "nothing found: no pose at these distances passes the verification;" in done.stderr
 
 
-def test_node_doctor_and_benchmark_take_a_mesh(run, truth, rendered):
+def test_node_doctor_and_benchmark_take_a_mesh(run, truth, intrinsics):
     line = run("node", *MESH, "--json").stdout.splitlines()[0]
     assert "piv" in line
     words = ("part.png", "--model", "piv.stl", "--camera", "K.txt", "--unit", "mm", *RANGE)
     lines = run("doctor", *words).stdout.splitlines()
     assert all(line.startswith("ok ") for line in lines), lines
     assert "piv is detected, score" in lines[5]
-    four = ("--K", *rendered.scene.K[[0, 1, 0, 1], [0, 1, 2, 2]])
     table = run(
-        "benchmark", "piv.stl", "--unit", "mm", *RANGE, "--image", "part.png", *four, "-n", 1
+        "benchmark", "piv.stl", "--unit", "mm", *RANGE, "--image", "part.png", *intrinsics, "-n", 1
     )
     assert "piv.stl" in table.stdout
 
 
-def test_doctor_says_that_no_pose_is_verified(run, near_truth, truth):
+def test_doctor_reports_that_no_pose_is_verified(run, near_truth, truth):
     near_truth.truth = []
     words = ("part.png", "--model", "pivconnector", "--camera", "K.txt", *RANGE)
     first = run("doctor", *words, code=1).stdout.splitlines()[0]
@@ -98,19 +91,18 @@ def test_doctor_says_that_no_pose_is_verified(run, near_truth, truth):
     ],
 )
 @pytest.mark.parametrize("command", ["predict", "node", "doctor", "benchmark"])
-def test_wrong_options_are_one_line(refused, truth, rendered, command, words, message):
+def test_wrong_options_are_one_line(refused, truth, intrinsics, command, words, message):
     model, *options = words
-    four = ("--K", *rendered.scene.K[[0, 1, 0, 1], [0, 1, 2, 2]])
     commands = {
-        "predict": (model, "part.png", *four),
-        "node": (model, "part.png", *four, "--json"),
-        "doctor": ("part.png", "--model", model, *four),
-        "benchmark": (model, "--image", "part.png", *four),
+        "predict": (model, "part.png", *intrinsics),
+        "node": (model, "part.png", *intrinsics, "--json"),
+        "doctor": ("part.png", "--model", model, *intrinsics),
+        "benchmark": (model, "--image", "part.png", *intrinsics),
     }
     assert message in refused(command, *commands[command], *options)
 
 
-def test_options_of_one_command_alone(refused, truth):
+def test_wrong_options_of_single_commands_are_one_line(refused, truth):
     line = refused("predict", *MESH, "--part", "piv.stl")
     assert "got --part with the mesh piv.stl" in line
     assert "piv.stl without --image" in refused("benchmark", "piv.stl", *RANGE)

@@ -28,7 +28,7 @@ ERRORS = st.lists(
 
 @given(ERRORS)
 @settings(max_examples=60)
-def test_a_curve_counts_what_is_strictly_below(errors):
+def test_a_curve_counts_errors_strictly_below_a_threshold(errors):
     thresholds, accuracy = accuracy_curve(np.array(errors))
     for threshold, share in zip(thresholds, accuracy, strict=True):
         below = sum(error < threshold for error in errors)
@@ -54,11 +54,11 @@ def test_png_and_csv_hold_the_curves(tmp_path):
     table = np.array(rows[1:], float)
     assert table.shape == (201, 3)
     np.testing.assert_allclose(table[:, 0], np.arange(201) * 0.0005, atol=1e-9)
-    at = {round(row[0], 4): row[1:].tolist() for row in table}
-    assert (at[0.0], at[0.0005], at[0.01]) == ([0, 0], [0, 0.5], [0, 0.5])
-    assert at[0.0105] == [0, 1]
-    assert at[0.02] == [0, 1]  # strictly below
-    assert (at[0.0205], at[0.1]) == ([0.5, 1], [0.5, 1])
+    shares = {round(row[0], 4): row[1:].tolist() for row in table}
+    assert (shares[0.0], shares[0.0005], shares[0.01]) == ([0, 0], [0, 0.5], [0, 0.5])
+    assert shares[0.0105] == [0, 1]
+    assert shares[0.02] == [0, 1]  # strictly below
+    assert (shares[0.0205], shares[0.1]) == ([0.5, 1], [0.5, 1])
     image = cv2.imread(str(tmp_path / "run.1" / "auc_curves.png"))
     assert image.shape[0] > 300
     assert image.std() > 5
@@ -68,7 +68,7 @@ def test_png_and_csv_hold_the_curves(tmp_path):
     ]
 
 
-def test_figures_without_curves_are_drawn_and_pyplot_keeps_none():
+def test_empty_figures_are_drawn_and_pyplot_holds_no_figure():
     for curves in ({}, {"none": np.array([])}, {"a": np.array([0.01])}):
         assert figure_image(accuracy_figure(curves)).ndim == 3
     assert plt.get_fignums() == []
@@ -90,7 +90,7 @@ def test_every_panel_has_a_line_and_an_interval_for_every_method():
     assert [axes.get_title() for axes in figure.axes[:3]] == ["a", "b", "c"]
     assert [text.get_text() for text in first.get_legend().get_texts()] == ["dope", "dopepp"]
     np.testing.assert_allclose(first.get_lines()[0].get_ydata(), [90, 50])
-    # A point on its own has a bar, because its band has no width.
+    # The band of a single point has no width, so the point has a bar.
     (low, high) = second.collections[-1].get_segments()[0][:, 1]
     assert (low, high) == pytest.approx((9, 19))
     assert third.get_legend() is None
@@ -98,7 +98,7 @@ def test_every_panel_has_a_line_and_an_interval_for_every_method():
     assert figure_image(figure).std() > 0
 
 
-def test_ratios_are_evenly_spaced_and_marked_where_they_were_measured():
+def test_ratios_are_evenly_spaced_with_ticks_at_the_measured_values():
     rate = np.array([0.1, 0.9, 0.4])
     lines = {"dopepp": RateCurve(np.array([0.5, 1.0, 2.0]), rate, rate, rate)}
     (axes,) = rates_figure({"a": lines}, "scale", 1, ratio=True).axes

@@ -1,4 +1,4 @@
-"""Wireframes: pixels where they belong, in the asked colour, and nothing where nothing is."""
+"""Wireframes: their lines have the right position and colour, and nothing else is drawn."""
 
 import itertools
 import math
@@ -31,10 +31,10 @@ def keypoints(seed: int = 0, z: float = 0.4) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize("colour", [YELLOW, GREEN, BLUE])
 def test_all_edges_and_the_centroid_are_drawn_in_the_colour(colour):
-    points, given = keypoints(), black()
-    image = draw_wireframe(given, points, colour)
-    overlay(given, [Wireframe(points, colour, "a")])
-    assert not given.any()  # the input is left alone
+    points, image_before = keypoints(), black()
+    image = draw_wireframe(image_before, points, colour)
+    overlay(image_before, [Wireframe(points, colour, "a")])
+    assert not image_before.any()  # the input is unchanged
     direction = np.array(colour) / np.linalg.norm(colour)
     for a, b in EDGES:
         u, v = np.rint((points[a] + points[b]) / 2).astype(int)
@@ -77,7 +77,7 @@ def test_all_24_orientations_of_a_cube_look_different():
         assert (np.abs(a - b).max(axis=2) > 60).sum() > 20
 
 
-def test_edges_with_a_missing_keypoint_are_left_out():
+def test_edges_with_a_missing_keypoint_are_omitted():
     points = keypoints()
     points[0] = math.nan
     image = draw_wireframe(black(), points)
@@ -103,11 +103,11 @@ def test_a_line_between_points_far_outside_crosses_the_image():
 )
 @settings(max_examples=60)
 def test_any_keypoints_on_any_image_are_drawn_without_an_error(points, width, height):
-    frames = [Wireframe(points, BLUE, "a long name")]  # whose legend is cut, not refused
+    frames = [Wireframe(points, BLUE, "a long name")]  # its legend is cut off
     assert overlay(black(width, height), frames, width).shape == (height, width, 3)
 
 
-def test_narrow_images_are_enlarged_and_the_keypoints_follow():
+def test_narrow_images_and_their_keypoints_are_enlarged():
     points = keypoints()
     image = overlay(black(), [Wireframe(points, GREEN)], min_width_px=600)
     assert image.shape == (480, 640, 3)

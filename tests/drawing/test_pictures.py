@@ -14,7 +14,7 @@ def image():
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_reads_what_pillow_reads(tmp_path, image, suffix):
+def test_images_agree_with_pillow(tmp_path, image, suffix):
     path = tmp_path / f"image{suffix}"
     Image.fromarray(image).save(path)
     expected = np.asarray(Image.open(path).convert("RGB"))
@@ -61,8 +61,8 @@ def test_damage_and_other_formats(tmp_path, image):
 
 
 def test_rare_kinds_of_pixels_agree_with_opencv(tmp_path, image):
-    picture, path = Image.fromarray(image), tmp_path / "image.png"
-    for rare in (picture.convert("P"), picture.convert("1"), picture.convert("LA")):
+    original, path = Image.fromarray(image), tmp_path / "image.png"
+    for rare in (original.convert("P"), original.convert("1"), original.convert("LA")):
         rare.save(path)
         expected = cv2.imread(str(path), cv2.IMREAD_COLOR)
         np.testing.assert_array_equal(read_rgb(path), expected[..., ::-1])
@@ -71,7 +71,7 @@ def test_rare_kinds_of_pixels_agree_with_opencv(tmp_path, image):
         read_image(path)
 
 
-def test_a_jpeg_may_go_on_behind_its_end(tmp_path, image):
+def test_a_jpeg_may_have_data_after_its_end_marker(tmp_path, image):
     path = tmp_path / "image.jpg"
     Image.fromarray(image).save(path)
     expected = read_rgb(path)
@@ -80,7 +80,7 @@ def test_a_jpeg_may_go_on_behind_its_end(tmp_path, image):
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_a_photo_is_turned_as_opencv_turns_it(tmp_path, image, orientation):
+def test_the_orientation_of_a_photo_agrees_with_opencv(tmp_path, image, orientation):
     path, exif = tmp_path / "photo.jpg", Image.Exif()
     exif[0x0112] = orientation
     Image.fromarray(image).save(path, exif=exif, quality=95)
@@ -97,30 +97,30 @@ def test_photos_of_8_and_16_bits(tmp_path, image, suffix, channels, kind):
         pytest.skip("Pillow reads no 16-bit colours from TIFF")
     wide = np.dstack([image, image[..., :1]])[..., :channels].astype(kind)
     if kind == np.uint16:
-        wide = 256 * wide + 200  # as a 16-bit value, cut off to what it was
+        wide = 256 * wide + 200  # 16 bits, whose upper eight are the original value
     path = tmp_path / f"photo{suffix}"
     cv2.imwrite(str(path), wide[..., [2, 1, 0, 3][:channels]] if channels > 2 else wide)
     expected = image if channels > 1 else image[..., [0, 0, 0]]
     np.testing.assert_array_equal(read_photo(path), expected)
 
 
-def test_photos_that_are_refused_say_what_to_do(tmp_path, image):
-    def refused(name, fix):
-        with pytest.raises(UserError, match=fix) as caught:
+def test_errors_about_photos_contain_a_fix(tmp_path, image):
+    def check_error(name, fix):
+        with pytest.raises(UserError, match=fix) as error:
             read_photo(tmp_path / name)
-        assert name in str(caught.value)
+        assert name in str(error.value)
 
     for name in ("photo.gif", "several.tiff"):
         pages = [Image.fromarray(image), Image.fromarray(image[::-1])]
         pages[0].save(tmp_path / name, save_all=True, append_images=pages[1:])
-        refused(name, f"fix: save it as PNG, e.g. with ImageMagick: magick {name} picture.png")
+        check_error(name, f"fix: save it as PNG, e.g. with ImageMagick: magick {name} image.png")
     Image.fromarray(image[..., 0].astype(np.float32)).save(tmp_path / "float.tiff")
-    refused("float.tiff", "of mode F")
-    # A sensor's 12 bits in 16: the upper eight of them are next to black.
+    check_error("float.tiff", "of mode F")
+    # 12 significant bits in 16: the upper eight bits are almost black.
     cv2.imwrite(str(tmp_path / "raw.png"), 16 * image[..., 0].astype(np.uint16))
-    refused("raw.png", "-auto-level")
+    check_error("raw.png", "-auto-level")
     cv2.imwrite(str(tmp_path / "colours.png"), 16 * image.astype(np.uint16))
-    refused("colours.png", "-auto-level")
+    check_error("colours.png", "-auto-level")
     (tmp_path / "text.png").write_text("no image")
-    refused("text.png", "save it as PNG")
-    refused("missing.png", "pass the path of an existing file")
+    check_error("text.png", "save it as PNG")
+    check_error("missing.png", "pass the path of an existing file")

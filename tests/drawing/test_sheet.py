@@ -1,4 +1,4 @@
-"""Panels and contact sheets: every image where it belongs, in its colours."""
+"""Panels and contact sheets: positions and colours of their images."""
 
 from dataclasses import replace
 
@@ -41,7 +41,7 @@ def test_losses_that_are_not_positive_are_not_drawn_on_a_logarithm():
     assert curves.lines_figure([], "step", "loss", log_y=True).axes[0].get_legend() is None
 
 
-def test_a_long_line_is_pale_and_smooth_and_what_it_is_compared_with_dashed():
+def test_a_long_line_is_pale_with_its_average_and_a_dashed_line_stays_dashed():
     noisy = np.random.default_rng(0).normal(1, 0.5, (1, 500))
     pale, smooth, other = (
         curves.lines_figure([line(noisy), replace(line(noisy[:, :3]), dashed=True)], "step", "loss")
@@ -57,16 +57,16 @@ def test_a_long_line_is_pale_and_smooth_and_what_it_is_compared_with_dashed():
 @given(num=st.integers(1, 400), slope=st.floats(-3, 3))
 def test_smoothing_keeps_length_level_and_straight_lines(num, slope):
     values = 5 + slope * np.arange(num, dtype=float)
-    result = curves.smoothed(values)
+    result = curves.moving_average(values)
     assert result.shape == values.shape
     margin = num // 50
     inner = slice(margin, num - margin)
-    # An even window lies half a step beside its place.
+    # An even window is half a step off its centre.
     np.testing.assert_allclose(result[inner], values[inner], atol=abs(slope) / 2 + 1e-9)
-    np.testing.assert_allclose(curves.smoothed(np.full(num, 2.5)), 2.5)
+    np.testing.assert_allclose(curves.moving_average(np.full(num, 2.5)), 2.5)
 
 
-def test_pictures_stand_in_rows():
+def test_images_are_arranged_in_rows():
     images = [np.full((2 + i, 3 + i, 3), 10 * i, np.uint8) for i in range(3)]
     rows = sheet.grid(images, 2)
     assert rows.shape == (3 + 4, 3 + 4, 3)
@@ -78,11 +78,11 @@ def test_pictures_stand_in_rows():
             sheet.grid(*wrong)
 
 
-def test_a_message_is_cut_where_the_picture_ends():
-    picture = sheet.message_image(120, 60, "no file anywhere " * 50)
-    assert picture.shape == (60, 120, 3)
-    assert picture.std() > 1
-    assert (sheet.message_image(40, 30, "")[0] == picture[0, :40]).all()
+def test_a_message_is_cut_at_the_bottom_of_the_image():
+    image = sheet.message_image(120, 60, "no file anywhere " * 50)
+    assert image.shape == (60, 120, 3)
+    assert image.std() > 1
+    assert (sheet.message_image(40, 30, "")[0] == image[0, :40]).all()
 
 
 def test_masks_are_painted_in_their_colours_on_the_darkened_image():
@@ -95,7 +95,7 @@ def test_masks_are_painted_in_their_colours_on_the_darkened_image():
         expected = 0.35 * 100 + 0.65 * np.array(colour)
         assert np.abs(panel[mask] - expected).max() <= 1
     assert (sheet.mask_panel(IMAGE, []) == 35).all()
-    masks = [np.ones((30, 40), bool)] * (len(sheet.COLOURS) + 1)  # after the last colour the first
+    masks = [np.ones((30, 40), bool)] * (len(sheet.COLOURS) + 1)  # the colours repeat
     assert (sheet.mask_panel(IMAGE, masks) == sheet.mask_panel(IMAGE, masks[:1])).all()
 
 
@@ -114,7 +114,7 @@ def test_depth_goes_from_red_over_the_objects_range_to_blue():
     assert (panel[5, 20:] == panel[5, 20]).all()
 
 
-def test_depth_without_objects_and_without_anything():
+def test_depth_without_objects_and_unknown_depth():
     nothing = np.zeros((30, 40), bool)
     assert (
         sheet.depth_panel(np.full((30, 40), 1.0), nothing)[1]
@@ -125,19 +125,19 @@ def test_depth_without_objects_and_without_anything():
     assert not panel.any()
 
 
-def test_axes_end_where_they_should():
+def test_axes_have_their_ends_and_colours():
     image = np.zeros((60, 80, 3), np.uint8)
     sheet.draw_axes(image, np.array([[20.0, 30], [70, 30], [20, 5], [20, 55]]), thickness=1)
     for (column, row), colour in zip(
         [(60, 30), (20, 8), (20, 50)], sheet.AXIS_COLOURS, strict=True
     ):
-        # An antialiased line of one pixel keeps nine tenths of its colour at least.
+        # An anti-aliased line of one pixel has at least nine tenths of its colour.
         assert np.abs(image[row, column].astype(int) - colour).max() < 0.1 * 255 + 1
     assert image[30, 75].sum() == 0
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1e12])
-def test_an_axis_that_is_not_seen_is_left_out(bad):
+def test_an_axis_far_outside_is_omitted(bad):
     image = np.zeros((60, 80, 3), np.uint8)
     sheet.draw_axes(image, np.array([[20.0, 30], [bad, bad], [20, 5], [20, 55]]))
     assert image[10, 20].any()
@@ -149,7 +149,7 @@ def plain(colour: tuple[int, int, int], width: int = 40, height: int = 30) -> ND
     return np.full((height, width, 3), colour, np.uint8)
 
 
-def test_tiles_stand_in_reading_order():
+def test_tiles_are_in_reading_order():
     colours = [(10 * i, 100, 50) for i in range(5)]
     sheet = contact_sheet([Tile(plain(c)) for c in colours], columns=2, tile_width=40)
     assert sheet.shape == (3 * 30 + 4 * 6, 2 * 40 + 3 * 6, 3)
@@ -157,10 +157,10 @@ def test_tiles_stand_in_reading_order():
         row, column = divmod(i, 2)
         top, left = 6 + 36 * row, 6 + 46 * column
         assert (sheet[top : top + 30, left : left + 40] == colour).all()
-    assert (sheet[78:108, 52:92] == 255).all()  # the sixth place is empty
+    assert (sheet[78:108, 52:92] == 255).all()  # there is no sixth tile
 
 
-def test_tiles_of_any_size_get_one_width_and_keep_their_shape():
+def test_tiles_have_one_width_and_keep_their_aspect_ratio():
     tiles = [Tile(plain(RED, 10, 20)), Tile(plain(GREY, 400, 100))]
     sheet = contact_sheet(tiles, columns=5, tile_width=100)
     assert sheet.shape == (200 + 12, 2 * 100 + 18, 3)
@@ -170,7 +170,7 @@ def test_tiles_of_any_size_get_one_width_and_keep_their_shape():
 
 
 @pytest.mark.parametrize("caption", ["ADD 3.1 mm", "Δ = 4° · a very long caption " * 9, "$x"])
-def test_a_caption_is_written_below_its_picture(caption):
+def test_a_caption_is_below_its_image(caption):
     sheet = contact_sheet([Tile(plain(RED, 120, 90), caption)], tile_width=120)
     assert sheet.shape == (90 + 18 + 12, 132, 3)
     assert (sheet[6:96, 6:126] == RED).all()
@@ -179,12 +179,12 @@ def test_a_caption_is_written_below_its_picture(caption):
 
 
 @pytest.mark.parametrize("arguments", [([], 2, 10), ([Tile(plain(RED))], 0, 10)])
-def test_an_empty_sheet_is_refused(arguments):
+def test_an_empty_sheet_is_an_error(arguments):
     with pytest.raises(ValueError, match="a grid needs images and columns"):
         contact_sheet(*arguments)
 
 
-def test_text_fits_its_line_and_is_as_wide_as_its_letters():
+def test_text_fits_its_line_and_has_the_width_of_its_letters():
     short, long = text_coverage("i", 20), text_coverage("iiiiiiiiii", 20)
     assert short.shape[0] == 20
     assert 3 * short.shape[1] < long.shape[1]
@@ -194,15 +194,15 @@ def test_text_fits_its_line_and_is_as_wide_as_its_letters():
     assert letters[-1].max() < 0.1
 
 
-def test_a_belief_lies_over_the_pixels_its_cell_covers():
-    image = np.full((90, 150, 3), 90, np.uint8)  # the maps cover its padding, too
+def test_a_belief_covers_the_pixels_of_its_cell():
+    image = np.full((90, 150, 3), 90, np.uint8)  # smaller than the maps, which include padding
     belief = np.zeros((12, 20), np.float32)
     belief[4, 11] = 1
-    picture = heat_picture(image, belief).astype(int)
-    assert picture.shape == image.shape
-    hot = np.argwhere(np.abs(picture - 54).max(axis=2) > 100)  # 54 = the dimmed grey
+    heat = heat_picture(image, belief).astype(int)
+    assert heat.shape == image.shape
+    hot = np.argwhere(np.abs(heat - 54).max(axis=2) > 100)  # 54 = the dimmed grey
     np.testing.assert_allclose(hot.mean(axis=0), [8 * 4 + 3.5, 8 * 11 + 3.5], atol=0.6)
-    assert (picture[:24] == 54).all()
+    assert (heat[:24] == 54).all()
 
 
 def test_beliefs_beyond_their_range_are_clipped():

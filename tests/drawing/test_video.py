@@ -1,4 +1,4 @@
-"""Videos that are written: every image at its time, playable however the writing ends."""
+"""Written videos: images at their times, and complete files after errors."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from dopepp.drawing.pictures import VideoFile
 
 def frames(path) -> list[np.ndarray]:
     capture, result = cv2.VideoCapture(str(path)), []
-    while (one := capture.read())[0]:
-        result.append(one[1][..., ::-1])
+    while (frame := capture.read())[0]:
+        result.append(frame[1][..., ::-1])
     return result
 
 
@@ -23,20 +23,20 @@ def level(number: int, size: tuple[int, int] = (48, 32)) -> np.ndarray:
     return np.full((*size[::-1], 3), 20 * number, np.uint8)
 
 
-def test_pictures_stand_at_their_times(tmp_path):
+def test_images_are_shown_at_their_times(tmp_path):
     with VideoFile(tmp_path / "new" / "clip.mp4", 10) as video:
         for number, time in enumerate((7.0, 7.1, 7.4, 7.41, 99.0)):
             video.write(level(number), time)
         assert not video.path.exists()
     shown = [round(frame.mean() / 20) for frame in frames(video.path)]
-    # The third comes late and stands for what it missed; the fourth has no place of its own; the
-    # last stands for two seconds of the minute and a half before it.
+    # The third image is late and repeated; the fourth falls on an occupied frame; the last is
+    # repeated for two seconds only, although it is a minute and a half late.
     assert shown == [0, 1, 2, 2, 2, *[4] * 20]
     assert [path.name for path in video.path.parent.iterdir()] == ["clip.mp4"]
 
 
 @pytest.mark.parametrize("size", [(47, 31), (48, 31)])
-def test_odd_sides_lose_nothing(tmp_path, size):
+def test_odd_sides_are_complete(tmp_path, size):
     image = level(2, size)
     image[:, -1] = image[-1] = 240
     with VideoFile(tmp_path / "clip.mp4", 10) as video:
@@ -46,7 +46,7 @@ def test_odd_sides_lose_nothing(tmp_path, size):
     assert shown[size[1] - 1 :].mean() > 200
 
 
-def test_it_is_playable_after_an_interruption(tmp_path):
+def test_a_video_is_complete_after_an_interruption(tmp_path):
     def interrupted() -> None:
         with VideoFile(tmp_path / "clip.mp4", 10) as video:
             for number in range(3):
@@ -58,7 +58,7 @@ def test_it_is_playable_after_an_interruption(tmp_path):
     assert len(frames(tmp_path / "clip.mp4")) == 3
 
 
-def test_a_full_disk_ends_it_in_one_line(tmp_path, monkeypatch):
+def test_a_full_disk_is_an_error_and_keeps_the_written_frames(tmp_path, monkeypatch):
     video = VideoFile(tmp_path / "a.mp4", 10)
     video.write(level(0), 0)
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
@@ -68,15 +68,15 @@ def test_a_full_disk_ends_it_in_one_line(tmp_path, monkeypatch):
     assert len(frames(video.path)) == 1
 
 
-def test_a_disk_that_is_full_before_the_first_picture(tmp_path, monkeypatch, capfd):
+def test_a_full_disk_before_the_first_image_leaves_no_file(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
     with pytest.raises(RunError, match="no space left"), VideoFile(tmp_path / "a.mp4", 10) as video:
         video.write(level(0), 0)
     assert list(tmp_path.iterdir()) == []
-    assert capfd.readouterr().err == ""  # OpenCV would say that the file cannot be read
+    assert capfd.readouterr().err == ""  # no message of OpenCV
 
 
-def test_what_did_not_arrive_is_told(tmp_path):
+def test_missing_frames_are_an_error(tmp_path):
     video = VideoFile(tmp_path / "a.mp4", 10)
     for number in range(30):
         video.write(np.random.default_rng(number).integers(0, 256, (48, 64, 3), np.uint8), number)

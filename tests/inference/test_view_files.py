@@ -11,7 +11,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.inference.several_views.view_files import parse_transform, read_camera_poses
+from dopepp.geometry.transform_file import parse_transform
+from dopepp.inference.several_views.view_files import read_camera_poses
 
 TURN = Rotation.from_euler("xyz", [20, -30, 140], degrees=True)
 SHIFT = np.array([0.3, -0.2, 0.7])

@@ -24,20 +24,15 @@ import numpy as np
 from dopepp.core.errors import UserError
 from dopepp.core.files import read_limited
 from dopepp.core.json import read_json
-from dopepp.core.validation import Range, check, short_repr
+from dopepp.core.validation import Range, check
 from dopepp.core.yaml import read_yaml
 from dopepp.geometry.camera import Transform, invert_transform, make_transform
 from dopepp.geometry.camera_file import Camera, camera_of_fields, camera_of_text, read_camera
-from dopepp.geometry.rotation import is_rigid, nearest_rotation, quaternion_to_matrix
+from dopepp.geometry.transform_file import parse_transform, read_transform
 
 FORMATS: Final = (
     "YAML with `views: {a.png: {T_world_cam: …}}`, BOP's scene_camera.json, or COLMAP's images.txt"
 )
-_FORMS: Final = (
-    "matrix: 4×4 numbers; ROS's translation and rotation; or position (metres) with "
-    "quaternion_wxyz or quaternion_xyzw"
-)
-_POSE_FIX: Final = "write the camera's pose in the world, metres"
 MAX_COLMAP_BYTES: Final = 64_000_000
 
 
@@ -98,10 +93,7 @@ def read_camera_poses(path: Path) -> CameraPoses:
     camera, hand_eye, error = (content.get(key) for key in ("camera", "hand_eye", "camera_error"))
     T_flange_cam = None
     if hand_eye is not None:
-        mount = read_yaml(path.parent / str(hand_eye))
-        where = f"{hand_eye}: T_flange_cam"
-        values = mount.get("T_flange_cam") if isinstance(mount, Mapping) else None
-        T_flange_cam = parse_transform(values, where)
+        T_flange_cam = read_transform(path.parent / str(hand_eye), "T_flange_cam")
     pose_name = "T_world_cam" if T_flange_cam is None else "T_base_flange"
     poses = {}
     for name, view in views.items():
@@ -112,43 +104,6 @@ def read_camera_poses(path: Path) -> CameraPoses:
         lens = None if file is None else read_camera(path.parent / str(file))
         poses[str(name)] = CameraPose(T_world_cam, lens)
     return CameraPoses(poses, None if error is None else _error(error, path), str(path))
-
-
-def parse_transform(value: object, where: str) -> Transform:
-    """Parse a rigid transform.
-
-    Args:
-        value: Mapping with ``matrix`` (4×4 numbers); with ROS's ``translation`` {x, y, z} and
-            ``rotation`` {x, y, z, w}; or with ``position`` and either ``quaternion_wxyz`` or
-            ``quaternion_xyzw``. Lengths are metres.
-        where: File and field, for error messages.
-
-    Raises:
-        UserError: The value has none of these forms, or is not a rigid transform.
-    """
-    fields = value if isinstance(value, Mapping) else {}
-    problem = f"{where}={short_repr(value)}"
-    try:
-        if "matrix" in fields:
-            T = np.array(fields["matrix"], np.float64).reshape(4, 4)
-        else:
-            if "rotation" in fields:
-                shift, orientation = fields["translation"], fields["rotation"]
-                position = [shift[axis] for axis in "xyz"]
-                quaternion = [orientation[axis] for axis in "wxyz"]
-            else:
-                position = fields["position"]
-                x_first = fields.get("quaternion_xyzw")
-                quaternion = (
-                    fields["quaternion_wxyz"] if x_first is None else [x_first[3], *x_first[:3]]
-                )
-            R = quaternion_to_matrix(np.array(quaternion, np.float64).reshape(4))
-            T = make_transform(R, np.array(position, np.float64).reshape(3))
-    except (KeyError, IndexError, TypeError, ValueError):
-        raise UserError(problem, _FORMS, _POSE_FIX) from None
-    if not is_rigid(T):
-        raise UserError(problem, "a rigid transform", _POSE_FIX)
-    return make_transform(nearest_rotation(T[:3, :3]), T[:3, 3])
 
 
 def _error(value: object, path: Path) -> tuple[float, float]:

@@ -2,7 +2,7 @@
 
 A board's frame has its origin at the first point, x along the columns, y along the rows and z
 into the board. :func:`draw_view` renders images of a board for simulated calibrations. To add a
-kind of board, extend :meth:`Board.points`, :meth:`Board.drawing` and the ``_find_`` methods.
+kind of board, extend :meth:`Board.points`, :meth:`Board.drawing` and the ``_detect_`` methods.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ Grey = UInt8[np.ndarray, "height width"]
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class BoardDetection:
     """A board detected in an image."""
 
-    name: str  # of the image
+    name: str  # name of the image
     points: Float[np.ndarray, "n 3"]  # detected points in the board's frame, metres
-    pixels: Float[np.ndarray, "n 2"]  # positions of the points in the image
+    pixels: Float[np.ndarray, "n 2"]  # positions of these points in the image
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,8 @@ class BoardPose:
 
     name: str  # name of the image
     T_cam_board: Transform
-    # Covariance of the rotation about the board's origin (radians) and shift (metres), camera axes.
+    # Covariance of the rotation about the board's origin (radians) and translation (metres),
+    # camera axes
     covariance: Float[np.ndarray, "6 6"]
     error_px: float  # RMS reprojection error, pixels
     distance: float  # distance from the camera to the mean of the points, metres
@@ -89,7 +90,7 @@ class Board:
             x, y = x + (row % 2) * self.spacing / 2, y / 2
         return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
 
-    def find(self, image: RGBImage, name: str) -> Sighting | None:
+    def detect(self, image: RGBImage, name: str) -> BoardDetection | None:
         """Detect the board in an RGB image.
 
         Returns:
@@ -99,10 +100,12 @@ class Board:
             UserError: Two ChArUco boards of the same kind are visible.
         """
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        indices, pixels = getattr(self, f"_find_{self.kind}")(grey)
+        indices, pixels = getattr(self, f"_detect_{self.kind}")(grey)
         if len(indices) < MIN_POINTS:
             return None
-        return Sighting(name, self.points[indices], np.asarray(pixels, np.float64).reshape(-1, 2))
+        return BoardDetection(
+            name, self.points[indices], np.asarray(pixels, np.float64).reshape(-1, 2)
+        )
 
     @property
     def first_px(self) -> float:
@@ -130,7 +133,7 @@ class Board:
         return page
 
     def write(self, path: Path) -> str:
-        """Write the board for printing (PDF or PNG) and return its size as text."""
+        """Write the board for printing (PDF or PNG); return its size with a hint for printing."""
         check_target(path, (".pdf", ".png"))
         page, content, dpi = self.drawing(), io.BytesIO(), PX_PER_MM * 25.4
         if path.suffix.lower() == ".pdf":
@@ -152,7 +155,7 @@ class Board:
         """OpenCV's detector of this ChArUco board."""
         return cv2.aruco.CharucoDetector(self._charuco)
 
-    def _find_charuco(self, grey: Grey) -> tuple[Any, Any]:
+    def _detect_charuco(self, grey: Grey) -> tuple[Any, Any]:
         """Return indices and pixels of the visible ChArUco corners."""
         pixels, indices, _, markers = self._detector.detectBoard(grey)
         if markers is not None and len(np.unique(markers)) < len(markers):
@@ -161,7 +164,7 @@ class Board:
             raise UserError(problem, "one visible board", fix)
         return ([], []) if indices is None else (np.ravel(indices), pixels)
 
-    def _find_chess(self, grey: Grey) -> tuple[Any, Any]:
+    def _detect_chess(self, grey: Grey) -> tuple[Any, Any]:
         """Return indices and pixels of the chessboard's corners, from the frame's origin."""
         is_found, pixels = cv2.findChessboardCornersSB(grey, (self.columns, self.rows), None)
         if not is_found:
@@ -175,7 +178,7 @@ class Board:
         )
         return np.arange(len(pixels)), pixels if first < second else pixels[::-1]
 
-    def _find_circles(self, grey: Grey) -> tuple[Any, Any]:
+    def _detect_circles(self, grey: Grey) -> tuple[Any, Any]:
         """Return indices and pixels of the grid's circles."""
         size, layout = (self.columns, self.rows), cv2.CALIB_CB_ASYMMETRIC_GRID
         is_found, pixels = cv2.findCirclesGrid(grey, size, None, layout)
@@ -194,8 +197,8 @@ def parse_board(text: str) -> Board:
         UserError: The description cannot be parsed, or the board is impossible.
     """
     try:
-        board = _parsed(text)
-        allowed = _allowed_instead(board)
+        board = _parse(text)
+        allowed = _violated_rule(board)
     except ValueError:
         allowed = SPELLING
     if allowed:
@@ -204,8 +207,8 @@ def parse_board(text: str) -> Board:
     return board
 
 
-def _parsed(text: str) -> Board:
-    """Parse a board's description; raise ``ValueError`` if that is impossible."""
+def _parse(text: str) -> Board:
+    """Parse a board's description; raise a ``ValueError`` if its form is wrong."""
     kind, _, rest = text.partition(":")
     fields = rest.split(":")
     fewest, most = NUM_FIELDS.get(kind, (0, 0))
@@ -216,8 +219,8 @@ def _parsed(text: str) -> Board:
     return Board(kind, columns, rows, spacing, sum(marker), (*fields[3:], DICTIONARY)[0])
 
 
-def _allowed_instead(board: Board) -> str:
-    """Return the allowed values if the board's dimensions are impossible, or an empty string."""
+def _violated_rule(board: Board) -> str:
+    """Return the rule that the board's dimensions violate, or an empty string."""
     if min(board.columns, board.rows) < 3 or not board.spacing >= 0.001:
         return "at least 3×3, squares of at least 1 mm"
     if max(board.columns, board.rows) * board.spacing * 1000 > LONGEST_MM:
@@ -237,13 +240,13 @@ def _allowed_instead(board: Board) -> str:
     return ""
 
 
-def board_pose(sighting: Sighting, camera: Camera) -> BoardPose:
+def board_pose(detection: BoardDetection, camera: Camera) -> BoardPose:
     """Estimate a board's pose from its points in an image of a calibrated camera.
 
     Raises:
         UserError: The points determine no pose.
     """
-    points, pixels = sighting.points, sighting.pixels
+    points, pixels = detection.points, detection.pixels
     lens = (camera.K, camera.coefficients)
     _, rotations, shifts, _ = cv2.solvePnPGeneric(points, pixels, *lens, flags=cv2.SOLVEPNP_IPPE)
     poses = [
@@ -253,7 +256,7 @@ def board_pose(sighting: Sighting, camera: Camera) -> BoardPose:
     projections = [cv2.projectPoints(points, *pose, *lens)[0][:, 0] for pose in poses]
     errors = [float(np.square(projection - pixels).sum()) for projection in projections]
     if not errors or not np.isfinite(min(errors)):
-        problem = f"{sighting.name}, from which no pose of the board can be estimated"
+        problem = f"{detection.name}, from which no pose of the board can be estimated"
         fix = "delete this image, or take it again with the board facing the camera"
         raise UserError(problem, "a board that faces the camera", fix)
     error = min(errors)
@@ -263,18 +266,18 @@ def board_pose(sighting: Sighting, camera: Camera) -> BoardPose:
     jacobian = _pose_jacobian(points, T, camera)
     covariance = np.linalg.inv(jacobian.T @ jacobian) * noise
     distance = float((T[:3, :3] @ points.mean(axis=0) + T[:3, 3])[2])
-    return BoardPose(sighting.name, T, covariance, float(np.sqrt(error / len(points))), distance)
+    return BoardPose(detection.name, T, covariance, float(np.sqrt(error / len(points))), distance)
 
 
 def _pose_jacobian(
     points: Float[np.ndarray, "n 3"], T: Transform, camera: Camera
 ) -> Float[np.ndarray, "m 6"]:
-    """Return the pixels' derivative by a rotation about the origin and a shift, camera axes."""
+    """Return the derivative of the pixels by a rotation about the origin and a translation."""
     columns = []
     for step in np.diag([1e-5] * 3 + [1e-6] * 3):
         sides = []
         for delta in (-step, step):
-            moved = displaced(T[None], delta[None])[0]
+            moved = displace(T[None], delta[None])[0]
             rotation = cv2.Rodrigues(moved[:3, :3])[0]
             lens = (camera.K, camera.coefficients)
             sides.append(cv2.projectPoints(points, rotation, moved[:3, 3], *lens)[0])
@@ -282,7 +285,7 @@ def _pose_jacobian(
     return np.stack(columns, axis=1)
 
 
-def displaced(T: Transforms, step: Float[np.ndarray, "poses 6"]) -> Transforms:
+def displace(T: Transforms, step: Float[np.ndarray, "poses 6"]) -> Transforms:
     """Rotate poses about their own origins and translate them."""
     moved = T.copy()
     moved[:, :3, :3] = Rotation.from_rotvec(step[:, :3]).as_matrix() @ T[:, :3, :3]

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, cast
+from typing import Final, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -29,9 +29,10 @@ from scipy.spatial.transform import Rotation
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import Transform, invert_transform, make_transform
 from dopepp.geometry.rotation import nearest_rotation
-from dopepp.robot.calibration.board import BoardPose, Transforms, displaced
+from dopepp.robot.calibration.board import BoardPose, Transforms, displace
 
 Mount = Literal["hand", "bench"]
+MOUNTS: Final[tuple[Mount, Mount]] = ("hand", "bench")
 
 Covariances = Float[np.ndarray, "poses 6 6"]
 Residuals = Float[np.ndarray, "poses 6"]  # rotations (radians), translations (metres), camera axes
@@ -56,24 +57,12 @@ class HandEye:
     mount: Mount  # `hand` (the camera is on the flange) or `bench`
     T_mount_cam: Transform  # T_flange_cam, or T_base_cam of a camera on the bench
     T_other_board: Transform  # T_base_board, or T_flange_board
-    # Covariance of the camera's rotation about its origin (radians) and shift (metres)
+    # Covariance of the camera's rotation about its origin (radians) and translation (metres)
     covariance: Float[np.ndarray, "6 6"]
     rotation_errors: Float[np.ndarray, "poses"]  # rotation error of every pose, radians
     shifts: Float[np.ndarray, "poses"]  # translation error, metres
     inliers: Bool[np.ndarray, "poses"]  # poses that were not rejected
     robot_noise: tuple[float, float]  # estimated error of the robot, radians and metres
-
-
-def check_mount(mount: str) -> Mount:
-    """Return a valid mount.
-
-    Raises:
-        UserError: The mount is invalid.
-    """
-    if mount not in ("hand", "bench"):
-        fix = "pass --mount hand for a camera on the robot, --mount bench for a fixed camera"
-        raise UserError(f"--mount {mount}", "hand or bench", fix)
-    return cast("Mount", mount)
 
 
 def calibrate_hand_eye(
@@ -90,14 +79,14 @@ def calibrate_hand_eye(
             f"at least {MIN_POSES}, better 15",
             "record more poses, rotated by 30° or more about different axes",
         )
-    M, B, B_cov = equations(T_base_flange, boards, mount)
+    M, B, B_cov = robot_world_equations(T_base_flange, boards, mount)
     starts = [solve(M, B) for solve in (park, shah)]
     costs = [np.median(np.linalg.norm(_residuals(M, B, *start), axis=1)) for start in starts]
     X, Y = starts[int(np.argmin(costs))]
     inliers = np.ones(len(M), bool)
     robot = np.array(ROBOT_NOISE)
     for _ in range(4):
-        X, Y, covariance = refined(M[inliers], B[inliers], B_cov[inliers], X, Y, robot)
+        X, Y, covariance = refine(M[inliers], B[inliers], B_cov[inliers], X, Y, robot)
         robot = _robot_noise(_residuals(M, B, X, Y)[inliers], B_cov[inliers])
         distances = _distances(M, B, B_cov, X, Y, robot)
         scale = max(1.0, float(np.median(distances[inliers])) / MEDIAN_CHI2)
@@ -106,18 +95,18 @@ def calibrate_hand_eye(
             inliers = distances <= np.sort(distances)[MIN_POSES - 1]
     residuals = _residuals(M, B, X, Y)
     rotation_errors, shifts = (np.linalg.norm(residuals[:, k : k + 3], axis=1) for k in (0, 3))
-    noise = (float(robot[0]), float(robot[1]))
-    return HandEye(mount, X, Y, covariance, rotation_errors, shifts, inliers, noise)
+    robot_noise = (float(robot[0]), float(robot[1]))
+    return HandEye(mount, X, Y, covariance, rotation_errors, shifts, inliers, robot_noise)
 
 
-def equations(
+def robot_world_equations(
     T_base_flange: Transforms, boards: Sequence[BoardPose], mount: Mount
 ) -> tuple[Transforms, Transforms, Covariances]:
     """Return M and B of M_i X B_i = Y, and the covariances of B."""
     M = np.asarray(T_base_flange, np.float64)
     B = np.stack([board.T_cam_board for board in boards])
     covariances = np.stack([board.covariance for board in boards])
-    return (M if mount == "hand" else inverted(M)), B, covariances
+    return (M if mount == "hand" else invert_transforms(M)), B, covariances
 
 
 def park(M: Transforms, B: Transforms) -> tuple[Transform, Transform]:
@@ -125,7 +114,7 @@ def park(M: Transforms, B: Transforms) -> tuple[Transform, Transform]:
 
     The rotation vectors α = R_X β are aligned over all pairs. Translations follow linearly.
     """
-    P, Q = pairs(M, B)
+    P, Q = relative_motions(M, B)
     alpha, beta = (Rotation.from_matrix(T[:, :3, :3]).as_rotvec() for T in (P, Q))
     R = nearest_rotation(alpha.T @ beta)
     system = (P[:, :3, :3] - np.eye(3)).reshape(-1, 3)
@@ -142,7 +131,7 @@ def shah(M: Transforms, B: Transforms) -> tuple[Transform, Transform]:
     vec(R_Y) = (R_C ⊗ R_M) vec(R_X) with C = B⁻¹, so both rotations are the leading singular
     vectors of the sum over all poses. Translations follow linearly.
     """
-    C = inverted(B)
+    C = invert_transforms(B)
     kronecker = np.einsum("nij,nkl->ikjl", C[:, :3, :3], M[:, :3, :3]).reshape(9, 9)
     left, _, right = np.linalg.svd(kronecker)
     matrices = (vector.reshape(3, 3).T for vector in (left[:, 0], right[0]))  # up to their signs
@@ -153,19 +142,19 @@ def shah(M: Transforms, B: Transforms) -> tuple[Transform, Transform]:
     return make_transform(R_X, shifts[:3]), make_transform(R_Y, shifts[3:])
 
 
-def pairs(M: Transforms, B: Transforms) -> tuple[Transforms, Transforms]:
+def relative_motions(M: Transforms, B: Transforms) -> tuple[Transforms, Transforms]:
     """Return the motions M_j⁻¹ M_i of the robot and B_j B_i⁻¹ of the board, i < j."""
     i, j = np.triu_indices(len(M), 1)
-    return inverted(M)[j] @ M[i], B[j] @ inverted(B)[i]
+    return invert_transforms(M)[j] @ M[i], B[j] @ invert_transforms(B)[i]
 
 
-def refined(
+def refine(
     M: Transforms, B: Transforms, B_cov: Covariances, X: Transform, Y: Transform, robot: Noise
 ) -> tuple[Transform, Transform, Float[np.ndarray, "6 6"]]:
     """Refine X and Y by robust least squares.
 
     Args:
-        M: Transforms of the robot, as in :func:`equations`.
+        M: Transforms of the robot, as in :func:`robot_world_equations`.
         B: Transforms of the board.
         B_cov: Covariances of B.
         X: Initial pose of the camera.
@@ -178,12 +167,12 @@ def refined(
     whitening = np.linalg.inv(np.linalg.cholesky(_covariances(M, X, Y, B_cov, robot)))
 
     def residuals(step: Float[np.ndarray, "12"]) -> Float[np.ndarray, "numbers"]:
-        moved = displaced(np.stack([X, Y]), step.reshape(2, 6))
+        moved = displace(np.stack([X, Y]), step.reshape(2, 6))
         return np.asarray((whitening @ _residuals(M, B, *moved)[..., None]).ravel())
 
     scale = np.tile(np.repeat([1e-3, 1e-3], 3), 2)
     solution = least_squares(residuals, np.zeros(12), x_scale=scale, loss="soft_l1", f_scale=3.0)
-    X, Y = displaced(np.stack([X, Y]), solution.x.reshape(2, 6))
+    X, Y = displace(np.stack([X, Y]), solution.x.reshape(2, 6))
     jacobian = np.asarray(solution.jac)
     covariance = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14)[:6, :6]
     to_cam = np.kron(np.eye(2), X[:3, :3])
@@ -191,15 +180,8 @@ def refined(
 
 
 def _residuals(M: Transforms, B: Transforms, X: Transform, Y: Transform) -> Residuals:
-    """Return each pose's errors of rotation (about the board's origin) and translation.
-
-    Args:
-        M: Poses of the flange, as in the equations M X B = Y.
-        B: Poses of the board in the camera.
-        X: Pose of the camera.
-        Y: Pose of the board.
-    """
-    expected = invert_transform(X) @ inverted(M) @ Y
+    """Return each pose's error of M X B = Y: rotation about the board's origin and translation."""
+    expected = invert_transform(X) @ invert_transforms(M) @ Y
     rotvec = Rotation.from_matrix(B[:, :3, :3] @ expected[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
     return np.concatenate([rotvec, B[:, :3, 3] - expected[:, :3, 3]], axis=1)
 
@@ -207,13 +189,13 @@ def _residuals(M: Transforms, B: Transforms, X: Transform, Y: Transform) -> Resi
 def _covariances(
     M: Transforms, X: Transform, Y: Transform, B_cov: Covariances, robot: Noise
 ) -> Covariances:
-    """Return the covariances of the residuals: the sum of image and robot covariances."""
-    # Jacobian of the board's pose, in camera axes, with respect to a small rotation (about the
-    # origin of the camera's mount) and translation of the robot's pose.
+    """Return the covariances of the residuals: the sums of image and robot covariances."""
+    # Derivative of the board's pose, in camera axes, by a small rotation (about the origin of the
+    # camera's mount) and translation of the robot's pose.
     to_cam = X[:3, :3].T
     jacobian = np.zeros((len(M), 6, 6))
     jacobian[:, :3, :3] = jacobian[:, 3:, 3:] = to_cam
-    jacobian[:, 3:, :3] = -to_cam @ _cross((inverted(M) @ Y)[:, :3, 3])
+    jacobian[:, 3:, :3] = -to_cam @ _cross((invert_transforms(M) @ Y)[:, :3, 3])
     variances = np.diag(np.repeat(robot**2, 3))
     return np.asarray(B_cov + jacobian @ variances @ jacobian.transpose(0, 2, 1))
 
@@ -237,7 +219,7 @@ def _distances(
     return np.asarray((residuals * whole).sum(axis=1))
 
 
-def inverted(T: Transforms) -> Transforms:
+def invert_transforms(T: Transforms) -> Transforms:
     """Return the inverse of every rigid transform."""
     R = T[:, :3, :3].transpose(0, 2, 1)
     inverse = np.tile(np.eye(4), (len(T), 1, 1))

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ from dopepp.core.errors import UserError
 from dopepp.core.files import check_target, write_file
 from dopepp.drawing.pictures import Size
 from dopepp.geometry.camera_file import Camera
-from dopepp.robot.calibration.board import MIN_POINTS, Sighting
+from dopepp.robot.calibration.board import MIN_POINTS, BoardDetection
 
 MIN_VIEWS: Final = 6  # views of a reliable calibration; three views determine K
 CELLS: Final = (8, 6)  # columns and rows of the grid that measures the coverage
@@ -33,46 +33,46 @@ MIN_SHIFT: Final = 0.04
 """Mean shift of the points between two distinct views, as a share of the image's width."""
 
 MAX_VIEWS: Final = 60
-CHECKS_PER_S: Final = 5.0  # searched frames of a video, per second
+CHECKS_PER_S: Final = 5.0  # frames of a video in which the board is searched, per second
 
 
 class Views:
-    """Keeps distinct views of a board; of similar views, keeps the view with the least motion.
+    """Keeps distinct views of a board, and of similar views the view with the least motion.
 
-    In a video, sharp frames of pauses therefore replace frames with motion blur.
+    In a video, sharp frames from pauses therefore replace frames with motion blur.
 
     Args:
         width: Width of the images, pixels.
     """
 
     def __init__(self, width: int) -> None:
-        self.kept: list[Sighting] = []
+        self.kept: list[BoardDetection] = []
         self._limit = MIN_SHIFT * width
         self._motions: list[float] = []
-        self._last: Sighting | None = None
+        self._last: BoardDetection | None = None
 
-    def offer(self, sighting: Sighting) -> bool:
-        """Add the next sighting; return whether it is a new view."""
-        motion = np.inf if self._last is None else _shift(self._last, sighting)
-        self._last = sighting
-        shifts = [_shift(view, sighting) for view in self.kept]
+    def add(self, detection: BoardDetection) -> bool:
+        """Process the next detection; return whether its view is new."""
+        motion = np.inf if self._last is None else _shift(self._last, detection)
+        self._last = detection
+        shifts = [_shift(view, detection) for view in self.kept]
         nearest = int(np.argmin(shifts)) if shifts else 0
         if not shifts or shifts[nearest] > self._limit:
-            self.kept.append(sighting)
+            self.kept.append(detection)
             self._motions.append(motion)
             return True
         if motion < self._motions[nearest]:
-            self.kept[nearest], self._motions[nearest] = sighting, motion
+            self.kept[nearest], self._motions[nearest] = detection, motion
         return False
 
     @property
     def is_full(self) -> bool:
-        """Whether more views would only cost time."""
+        """Whether further views would not improve a calibration noticeably."""
         return len(self.kept) >= MAX_VIEWS
 
 
-def _shift(first: Sighting, second: Sighting) -> float:
-    """Return the mean distance between common points, pixels; infinite for too few points."""
+def _shift(first: BoardDetection, second: BoardDetection) -> float:
+    """Return the mean shift of the common points, pixels; infinite for too few points."""
     is_same = (first.points[:, None] == second.points[None]).all(axis=2)
     rows, columns = np.nonzero(is_same)
     if len(rows) < MIN_POINTS:
@@ -90,55 +90,70 @@ class LensCalibration:
     errors_px: Float[np.ndarray, "views"]  # RMS reprojection error of each view, pixels
     outliers: tuple[str, ...]  # names of views rejected for large errors
     coverage: float  # share of the image's cells (8×6) with points
-    covered: Bool[np.ndarray, "rows columns"]  # cells of the image that contain board points
+    covered: Bool[np.ndarray, "rows columns"]  # cells of the image with points
     deviations: Float[np.ndarray, "4"]  # standard deviations of fx, fy, cx, cy, pixels
     findings: tuple[str, ...]  # reasons not to trust the calibration, with remedies
 
 
-def calibrate_lens(sightings: Sequence[Sighting], size: Size) -> LensCalibration:
+def calibrate_lens(detections: Sequence[BoardDetection], size: Size) -> LensCalibration:
     """Calibrate a camera from views of a board.
 
     Views with far larger errors than the others are rejected, in a single pass.
 
     Args:
-        sightings: The board's points in the images.
+        detections: The board's points in the images.
         size: Width and height of the images, pixels.
 
     Raises:
         UserError: There are fewer than three views, or the views determine no camera.
     """
-    if len(sightings) < 3:
+    if len(detections) < 3:
         raise UserError(
-            f"{len(sightings)} images with the board",
+            f"{len(detections)} images with the board",
             f"at least 3, better {MIN_VIEWS} or more",
             "take more images, with the board tilted by 20 to 40° in all directions and moved "
             "into the corners of the image",
         )
-    views = list(sightings)
-    lens = _solve(views, size)
-    limit = max(MIN_OUTLIER_PX, OUTLIER * float(np.median(lens.errors_px)))
-    is_kept = lens.errors_px <= limit
-    outliers: list[str] = []
-    if not is_kept.all() and is_kept.sum() >= 3:
-        outliers = [view.name for view, keep in zip(views, is_kept, strict=True) if not keep]
-        views = [view for view, keep in zip(views, is_kept, strict=True) if keep]
-        lens = _solve(views, size)
-    pixels = np.concatenate([view.pixels for view in views])
+    calibration = _calibrate(detections, size)
+    errors_px = calibration.errors_px
+    is_kept = errors_px <= max(MIN_OUTLIER_PX, OUTLIER * float(np.median(errors_px)))
+    if is_kept.all() or is_kept.sum() < 3:
+        return calibration
+    views = [view for view, keep in zip(detections, is_kept, strict=True) if keep]
+    outliers = (view.name for view, keep in zip(detections, is_kept, strict=True) if not keep)
+    return replace(_calibrate(views, size), outliers=tuple(outliers))
+
+
+def _calibrate(views: Sequence[BoardDetection], size: Size) -> LensCalibration:
+    """Calibrate the camera with OpenCV from all views, without rejection."""
+    points = [view.points.astype(np.float32) for view in views]
+    pixels = [view.pixels.astype(np.float32) for view in views]
+    try:
+        error_px, K, lens, rotations, _, deviations, _, errors_px = cv2.calibrateCameraExtended(
+            points, pixels, size, None, None
+        )
+    except cv2.error as reason:
+        problem = f"{len(views)} views of the board, which do not determine a camera ({reason.err})"
+        allowed = "views tilted by 20 to 40° in several directions"
+        raise UserError(problem, allowed, "take more images of the tilted board") from reason
+    normals = np.array([cv2.Rodrigues(rotation)[0][:, 2] for rotation in rotations])
+    tilt = float(np.linalg.norm(normals[:, :2].std(axis=0)))
     columns, rows = (
         np.linspace(-0.5, side - 0.5, count + 1) for side, count in zip(size, CELLS, strict=True)
     )
-    covered = np.histogram2d(pixels[:, 1], pixels[:, 0], bins=(rows, columns))[0] > 0
+    x, y = np.concatenate([view.pixels for view in views]).T
+    covered = np.histogram2d(y, x, bins=(rows, columns))[0] > 0
     coverage = float(covered.mean())
     return LensCalibration(
-        Camera(size, lens.K, tuple(lens.distortion.tolist()), "calibration"),
-        lens.error_px,
+        Camera(size, np.asarray(K), tuple(np.ravel(lens)[:5].tolist()), "calibration"),
+        float(error_px),
         tuple(view.name for view in views),
-        lens.errors_px,
-        tuple(outliers),
+        np.ravel(errors_px),
+        (),
         coverage,
         covered,
-        lens.deviations,
-        _findings(len(views), coverage, lens.tilt, lens.error_px),
+        np.ravel(deviations)[:4],
+        _findings(len(views), coverage, tilt, float(error_px)),
     )
 
 
@@ -166,33 +181,6 @@ def _matrix(values: Float[np.ndarray, "rows columns"]) -> dict[str, object]:
     """Return a matrix in the layout of OpenCV's and ROS's YAML files."""
     rows, columns = values.shape
     return {"rows": rows, "cols": columns, "data": np.float64(values).ravel().tolist()}
-
-
-class _Solution(NamedTuple):
-    error_px: float
-    K: Float[np.ndarray, "3 3"]
-    distortion: Float[np.ndarray, "5"]
-    deviations: Float[np.ndarray, "4"]  # standard deviations of fx, fy, cx, cy, pixels
-    errors_px: Float[np.ndarray, "views"]
-    tilt: float  # standard deviation of the boards' normals
-
-
-def _solve(views: Sequence[Sighting], size: Size) -> _Solution:
-    """Calibrate the camera with OpenCV from all views."""
-    points = [view.points.astype(np.float32) for view in views]
-    pixels = [view.pixels.astype(np.float32) for view in views]
-    try:
-        error, K, lens, rotations, _, deviations, _, errors = cv2.calibrateCameraExtended(
-            points, pixels, size, None, None
-        )
-    except cv2.error as reason:
-        problem = f"{len(views)} views of the board, which do not determine a camera ({reason.err})"
-        allowed = "views tilted by 20 to 40° in several directions"
-        raise UserError(problem, allowed, "take more images of the tilted board") from reason
-    normals = np.array([cv2.Rodrigues(rotation)[0][:, 2] for rotation in rotations])
-    tilt = float(np.linalg.norm(normals[:, :2].std(axis=0)))
-    distortion, deviations = np.ravel(lens)[:5], np.ravel(deviations)[:4]
-    return _Solution(float(error), np.asarray(K), distortion, deviations, np.ravel(errors), tilt)
 
 
 def _findings(num_views: int, coverage: float, tilt: float, error_px: float) -> tuple[str, ...]:

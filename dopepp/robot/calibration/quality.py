@@ -1,7 +1,7 @@
 """Checks of robot poses before a hand-eye calibration, and the quality of its result.
 
-A motion rotates robot and camera by equal angles, for any mount of the camera. Therefore, images
-and poses can be compared under every pose convention before the calibration.
+A motion rotates robot and camera by equal angles, for any mount of the camera. Therefore, poses of
+the robot can be compared with images before the calibration, under every pose convention.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from dopepp.core.errors import UserError
 from dopepp.geometry.rotation import Vector, nearest_rotation
 from dopepp.robot.calibration.board import BoardPose, Transforms
 from dopepp.robot.calibration.hand_eye import (
+    MOUNTS,
     HandEye,
     Mount,
-    equations,
-    inverted,
-    pairs,
-    refined,
+    invert_transforms,
+    refine,
+    relative_motions,
+    robot_world_equations,
 )
 from dopepp.robot.calibration.records import UNITS, PoseFormat, RobotPoses
 from dopepp.robot.calibration.tool import axis_name
@@ -33,7 +34,6 @@ MAX_ROTATION_ERROR: Final = np.radians(1.5)
 """Largest median rotation error over pairs under the correct convention."""
 MAX_SHIFT_ERROR: Final = 0.01
 """Largest median translation error over pairs under the correct convention, metres."""
-MOUNTS: Final[tuple[Mount, Mount]] = ("hand", "bench")
 SCALE: Final = 1.03  # largest negligible factor between robot's and camera's lengths
 MIN_POSES: Final = 8
 
@@ -46,7 +46,7 @@ MIN_USED: Final = 0.7  # share of poses that agree with each other
 
 
 @dataclass(frozen=True)
-class Consistency:
+class MotionAgreement:
     """Agreement between the motions of robot and board."""
 
     rotation: float  # median rotation error over pairs, radians
@@ -59,20 +59,22 @@ class Consistency:
         return self.rotation < MAX_ROTATION_ERROR and self.shift < MAX_SHIFT_ERROR
 
     @property
-    def is_right(self) -> bool:
+    def is_consistent(self) -> bool:
         """Whether a single mount explains all motions."""
         return self.is_rigid and 1 / SCALE < self.scale < SCALE
 
 
-def consistency(T_base_flange: Transforms, B: Transforms, mount: Mount) -> Consistency:
+def compare_motions(T_base_flange: Transforms, B: Transforms, mount: Mount) -> MotionAgreement:
     """Compare the motions of robot and board.
 
     Args:
         T_base_flange: Poses that the robot reports.
-        B: Poses of the board in the camera, as in :func:`.hand_eye.equations`.
+        B: Poses of the board in the camera, as in :func:`.hand_eye.robot_world_equations`.
         mount: Whether the camera is on the robot's hand or on the bench.
     """
-    P, Q = pairs(T_base_flange if mount == "hand" else inverted(T_base_flange), B)
+    P, Q = relative_motions(
+        T_base_flange if mount == "hand" else invert_transforms(T_base_flange), B
+    )
     alpha, beta = (Rotation.from_matrix(T[:, :3, :3]).as_rotvec() for T in (P, Q))
     used = np.minimum(np.linalg.norm(alpha, axis=1), np.linalg.norm(beta, axis=1)) < 3.0
     if used.sum() < 3:
@@ -92,7 +94,7 @@ def consistency(T_base_flange: Transforms, B: Transforms, mount: Mount) -> Consi
         solution = np.linalg.lstsq(weighted, (target * root).ravel(), rcond=None)[0]
         errors = np.linalg.norm(system @ solution - target, axis=1)
         weights = _robust_weights(errors)
-    return Consistency(rotation, float(np.median(errors)), float(solution[3]))
+    return MotionAgreement(rotation, float(np.median(errors)), float(solution[3]))
 
 
 def _robust_weights(errors: Float[np.ndarray, "pairs"]) -> Float[np.ndarray, "pairs"]:
@@ -126,24 +128,22 @@ def check_poses(
     B = np.stack([board.T_cam_board for board in boards])
     flanges = poses.transforms(pose_format)[list(chosen)]
     _check_motion(B, "board, seen by the camera,", poses.source)
-    agreement = consistency(flanges, B, mount)
-    if agreement.is_right:
+    agreement = compare_motions(flanges, B, mount)
+    if agreement.is_consistent:
         return flanges
     if agreement.is_rigid:
         raise _scale_error(agreement.scale, pose_format.unit, poses.source)
     for other, advice in _other_formats(poses, pose_format):
         for other_mount in MOUNTS if mount == "hand" else MOUNTS[::-1]:
-            fit = consistency(poses.transforms(other)[list(chosen)], B, other_mount)
+            fit = compare_motions(poses.transforms(other)[list(chosen)], B, other_mount)
             if fit.is_rigid and abs(fit.scale) > 1e-6:
                 raise _format_error(poses.source, advice, other_mount == mount, fit.scale, other)
     _check_motion(flanges, "robot", poses.source)
     if len(chosen) > 5:
-        for which, rows, seen in (
-            ("next", flanges[:-1], B[1:]),
-            ("previous", flanges[1:], B[:-1]),
-        ):
-            if consistency(rows, seen, mount).is_right:
-                problem = f"{poses.source}: the poses fit the {which} image"
+        shifted = ("next", flanges[:-1], B[1:]), ("previous", flanges[1:], B[:-1])
+        for neighbour, shifted_flanges, shifted_boards in shifted:
+            if compare_motions(shifted_flanges, shifted_boards, mount).is_consistent:
+                problem = f"{poses.source}: the poses fit the {neighbour} image"
                 fix = "shift the list of poses by one, or name each pose's image in a column `name`"
                 raise UserError(problem, "poses in the order of the images", fix)
     raise UserError(
@@ -157,16 +157,7 @@ def check_poses(
 
 
 def _check_motion(T: Transforms, body: str, source: str) -> None:
-    """Check that the recorded poses differ enough in orientation for a calibration.
-
-    Args:
-        T: Recorded poses of one body.
-        body: Name of the body, for the message.
-        source: Name of the recording, for the message.
-
-    Raises:
-        UserError: The largest rotation between two poses is below ``MIN_ROTATION``.
-    """
+    """Check that a body rotates by at least :data:`MIN_ROTATION` between two of its poses."""
     i, j = np.triu_indices(len(T), 1)
     relative = T[i, :3, :3] @ T[j, :3, :3].transpose(0, 2, 1)
     largest = Rotation.from_matrix(relative).magnitude().max(initial=0.0)
@@ -193,7 +184,7 @@ def _other_formats(poses: RobotPoses, pose_format: PoseFormat) -> Iterator[tuple
 def _format_error(
     source: str, advice: str, same_mount: bool, scale: float, pose_format: PoseFormat
 ) -> UserError:
-    """Return the error for poses that fit under other conventions."""
+    """Return the error for robot poses that fit the images under other conventions."""
     changes = [advice] if advice else []
     if not same_mount:
         changes.append(
@@ -211,13 +202,7 @@ def _format_error(
 
 
 def _scale_error(scale: float, unit: str, source: str) -> UserError:
-    """Return the error for robot motions that agree with the camera's except for their lengths.
-
-    Args:
-        scale: Factor that corrects the robot's lengths.
-        unit: Unit in which the robot's positions were read.
-        source: File of the poses, for the message.
-    """
+    """Return the error for robot positions, read in a unit, that are wrong by a factor."""
     factor, right = 1 / scale, _unit_of(scale, unit)
     if right is not None:
         problem = f"{source} in {unit}, which makes the robot's motions {factor:.4g} times too long"
@@ -244,7 +229,8 @@ class CalibrationQuality:
 
     shift: float  # expected error of positions at the board's distance (1 σ), metres
     rotation: float  # expected error of the rotation (1 σ), radians
-    leave_one_out: Float[np.ndarray, "poses"]  # change of the camera without each pose, metres
+    # Distance by which the camera moves if the calibration omits a pose, for each pose, metres
+    leave_one_out: Float[np.ndarray, "poses"]
     diversity: Vector  # RMS rotation over pairs about the main axes, radians, descending
     weakest: Vector  # least certain direction of the camera's position, in the mount's frame
     next_pose: str  # the most useful pose to add
@@ -255,8 +241,8 @@ def assess(
     T_base_flange: Transforms, boards: Sequence[BoardPose], calibration: HandEye
 ) -> CalibrationQuality:
     """Assess a hand-eye calibration from its result and its inputs."""
-    M, B, seen = equations(T_base_flange, boards, calibration.mount)
-    alpha = Rotation.from_matrix(pairs(M, B)[0][:, :3, :3]).as_rotvec()
+    M, B, B_cov = robot_world_equations(T_base_flange, boards, calibration.mount)
+    alpha = Rotation.from_matrix(relative_motions(M, B)[0][:, :3, :3]).as_rotvec()
     diversity = np.linalg.svd(alpha, compute_uv=False) / np.sqrt(len(alpha))
     distance = float(np.median([board.distance for board in boards]))
     shift, rotation = expected_error(calibration.covariance, distance)
@@ -283,7 +269,7 @@ def assess(
     for index in indices.tolist():
         rest = indices[indices != index]
         noise = np.array(calibration.robot_noise)
-        without, _, _ = refined(M[rest], B[rest], seen[rest], X, Y, noise)
+        without, _, _ = refine(M[rest], B[rest], B_cov[rest], X, Y, noise)
         changes[index] = np.linalg.norm(without[:3, 3] - X[:3, 3])
     reasons = tuple(text for text, applies in findings.items() if applies)
     return CalibrationQuality(shift, rotation, changes, diversity, weakest, next_pose, reasons)

@@ -1,4 +1,4 @@
-"""Files of a calibration: reading robot poses and writing results.
+"""Files of a calibration: robot poses and touched points as input, YAML files as results.
 
 Poses of a robot's flange are read from CSV, JSON or YAML, one record per pose. A record has x, y, z
 and a rotation: qw, qx, qy, qz; or rx, ry, rz (rotation vector); or roll, pitch, yaw (about the
@@ -21,11 +21,10 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import check_target, write_file
+from dopepp.core.files import check_target, read_limited, write_file
 from dopepp.core.json import read_json
 from dopepp.core.yaml import read_yaml
 from dopepp.geometry.camera import Transform
-from dopepp.geometry.rotation import is_rotation, matrix_to_quaternion
 
 UNITS: Final = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "inch": 0.0254}
 
@@ -58,7 +57,7 @@ class PoseFormat:
 
 @dataclass(frozen=True, eq=False)
 class RobotPoses:
-    """The poses of a file, in the file's conventions."""
+    """Poses of a file in the file's own conventions."""
 
     names: tuple[str, ...]  # file name of each image, empty if the record has none
     positions: Float[np.ndarray, "poses 3"]  # x, y, z
@@ -134,37 +133,21 @@ def read_points(path: Path, unit: str) -> Float[np.ndarray, "points 3"]:
     return _numbers(_read_csv(path), ("x", "y", "z"), path).reshape(-1, 3) * UNITS[unit]
 
 
-def check_unit(unit: str) -> str:
-    """Return a valid unit.
-
-    Raises:
-        UserError: The unit is unknown.
-    """
-    if unit not in UNITS:
-        raise UserError(f"--unit {unit}", ", ".join(UNITS), "pass the unit, e.g. --unit mm")
-    return unit
-
-
 def _read_csv(path: Path) -> list[Record]:
     """Read the rows of a CSV file with a header."""
     try:
-        with path.open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
-        text = content.decode("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        problem = f"{path}: {error!s:.200}"
+        text = read_limited(path, MAX_BYTES).decode("utf-8-sig")
+    except (OSError, ValueError) as error:
         fix = "pass the path of a CSV file in UTF-8"
-        raise UserError(problem, "a readable CSV file", fix) from error
-    if len(content) > MAX_BYTES:
-        problem = f"{path} of more than {MAX_BYTES / 1e6:g} MB"
-        raise UserError(problem, FORMAT, "pass a file of poses only")
+        allowed = f"a readable CSV file of at most {MAX_BYTES / 1e6:g} MB"
+        raise UserError(f"{path}: {error!s:.200}", allowed, fix) from error
     separator = ";" if text.partition("\n")[0].count(";") >= 3 else ","
     rows = csv.DictReader(io.StringIO(text), delimiter=separator)
     return [{str(key).strip().lower(): value for key, value in row.items()} for row in rows]
 
 
 def _records(content: object, path: Path) -> list[Record]:
-    """Return the records of a list, or of a mapping from images' names."""
+    """Return the records of a list, or of a mapping from names of images to records."""
     if isinstance(content, Mapping):
         content = [
             {"name": name, **record} if isinstance(record, Mapping) else record
@@ -210,20 +193,17 @@ def _matrix(record: Record, row: int, path: Path) -> Transform:
     return T
 
 
-def match_images(poses: RobotPoses, images: Sequence[str]) -> list[tuple[int, int]]:
-    """Pair poses with images: by name if the poses have names, otherwise in order.
-
-    Returns:
-        Pairs of indices (pose, image).
+def match_images(poses: RobotPoses, images: Sequence[str]) -> dict[str, int]:
+    """Return the index of the pose of each image: by name if the poses have names, else in order.
 
     Raises:
         UserError: A named image is missing, or there are no names and the numbers of poses and
             images differ.
     """
     if any(poses.names):
-        indices = {name: index for index, name in enumerate(images)}
-        indices |= {name.rpartition(".")[0]: index for index, name in enumerate(images)}
-        missing = [name for name in poses.names if name not in indices]
+        full_names = {name: name for name in images}
+        full_names |= {name.rpartition(".")[0]: name for name in images}
+        missing = [name for name in poses.names if name not in full_names]
         if missing:
             raise UserError(
                 f"{poses.source}: {len(missing)} poses without an image, the first "
@@ -231,12 +211,12 @@ def match_images(poses: RobotPoses, images: Sequence[str]) -> list[tuple[int, in
                 f"names such as {images[0] if images else '…'!r}",
                 "write the names of the images' files, or pass the folder with these images",
             )
-        return [(row, indices[name]) for row, name in enumerate(poses.names)]
+        return {full_names[name]: row for row, name in enumerate(poses.names)}
     if len(poses.names) != len(images):
         problem = f"{len(poses.names)} poses and {len(images)} images"
         fix = "add a column `name` with the image of every pose"
         raise UserError(problem, "one pose for every image", fix)
-    return [(index, index) for index in range(len(images))]
+    return {name: row for row, name in enumerate(images)}
 
 
 def write_calibration(
@@ -273,31 +253,3 @@ def check_trust(findings: Sequence[str], force: bool) -> None:
         problem = f"a calibration that is not trustworthy: {'; '.join(findings)}"
         fix = "measure again as advised, or add --force to write it anyway"
         raise UserError(problem, "a calibration without findings", fix)
-
-
-def read_transform(path: Path, name: str) -> Transform:
-    """Read a transform from a calibration file, e.g. ``T_flange_cam``.
-
-    Raises:
-        UserError: The file cannot be read, or has no rigid transform of this name.
-    """
-    content = read_yaml(path)
-    values = content.get(name) if isinstance(content, Mapping) else None
-    try:
-        T = np.array(values["matrix"] if isinstance(values, Mapping) else None, np.float64)
-    except (KeyError, TypeError, ValueError):
-        T = np.zeros(0)
-    if T.shape != (4, 4) or not is_rotation(T[:3, :3], 1e-6) or not np.isfinite(T).all():
-        allowed = f"{name}: {{matrix: 4×4 numbers of a rigid transform}}"
-        fix = "pass a file written by `dopepp calibrate`"
-        raise UserError(f"{path} without {name}", allowed, fix)
-    return T
-
-
-def transform_record(T: Transform) -> dict[str, object]:
-    """Return a transform as matrix, position (metres) and quaternion (w, x, y, z)."""
-    return {
-        "matrix": T.tolist(),
-        "position": T[:3, 3].tolist(),
-        "quaternion_wxyz": matrix_to_quaternion(T[:3, :3]).tolist(),
-    }

@@ -1,7 +1,7 @@
-"""Calibration of a rig: the poses of several fixed cameras that look at one moving board.
+"""Calibration of a rig: the poses of several fixed cameras, from images of one moving board.
 
-Images of one name show the board at the same moment. The poses of cameras and boards are refined
-together on all points (bundle adjustment). The world is the frame of the first camera.
+Images of one name show the board at the same moment. A bundle adjustment refines the poses of
+cameras and boards together, on all points. The world is the frame of the first camera.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from dopepp.geometry.camera import Transform, invert_transform, transform
 from dopepp.geometry.camera_file import Camera
 from dopepp.robot.calibration.board import (
     PIXEL_NOISE,
+    BoardDetection,
     BoardPose,
-    Sighting,
     Transforms,
     board_pose,
-    displaced,
+    displace,
 )
 from dopepp.robot.calibration.lens import MAX_ERROR_PX, MIN_OUTLIER_PX, OUTLIER
 
 MIN_CAMERAS, MAX_CAMERAS = 2, 8
-MIN_SHARED: Final = 5  # moments at which a camera of a reliable rig sees the board with another
+MIN_SHARED: Final = 5  # moments at which each camera of a reliable rig shares the board
 SOFT_PX: Final = 1.0  # error from which a point loses weight, pixels
 START_PX: Final = 5.0  # smallest error of a moment that is rejected before refinement, pixels
 MAX_STEPS: Final = 30  # a solution takes about ten
 
-Boards = Mapping[str, Mapping[str, Sighting]]
-"""Sightings of the board by camera and moment, the name of an image."""
+Boards = Mapping[str, Mapping[str, BoardDetection]]
+"""Detections of the board by camera and moment; a moment is the name of its images."""
 
 BoardPoses = Mapping[str, Mapping[str, BoardPose]]  # by camera and moment
 
@@ -48,11 +48,12 @@ class Rig:
 
     names: tuple[str, ...]  # of the cameras; the first is the world's frame
     T_world_cam: Transforms
-    # Covariance of each camera's rotation about its centre (radians) and shift (metres), world axes
+    # Covariance of each camera's rotation about its centre (radians) and translation (metres),
+    # world axes
     covariances: Float[np.ndarray, "cameras 6 6"]
     errors_px: Float[np.ndarray, "cameras"]  # RMS reprojection error of each camera, pixels
-    shared: tuple[int, ...]  # moments at which each camera sees the board with another camera
-    outliers: tuple[str, ...]  # moments that contradict the others
+    shared: tuple[int, ...]  # number of moments at which each camera and another see the board
+    outliers: tuple[str, ...]  # rejected moments, which contradict the others
     findings: tuple[str, ...]  # reasons not to trust the rig, with remedies
 
     @property
@@ -67,7 +68,7 @@ def calibrate_rig(boards: Boards, cameras: Mapping[str, Camera]) -> Rig:
     """Estimate the poses of cameras from images of a board that they see together.
 
     Args:
-        boards: Sightings of the board by each camera.
+        boards: Detections of the board by each camera.
         cameras: Calibrated camera of the same names.
 
     Raises:
@@ -78,12 +79,12 @@ def calibrate_rig(boards: Boards, cameras: Mapping[str, Camera]) -> Rig:
     if not MIN_CAMERAS <= len(names) <= MAX_CAMERAS:
         allowed = f"{MIN_CAMERAS} to {MAX_CAMERAS} cameras"
         raise UserError(f"a rig of {len(names)} cameras", allowed, "pass a folder for each camera")
-    counts = Counter(moment for sightings in boards.values() for moment in sightings)
+    counts = Counter(moment for detections in boards.values() for moment in detections)
     shared = {moment for moment, count in counts.items() if count > 1}
     poses = {
         name: {
-            moment: board_pose(sighting, cameras[name])
-            for moment, sighting in boards[name].items()
+            moment: board_pose(detection, cameras[name])
+            for moment, detection in boards[name].items()
             if moment in shared
         }
         for name in names
@@ -94,8 +95,8 @@ def calibrate_rig(boards: Boards, cameras: Mapping[str, Camera]) -> Rig:
         outliers += worst
         if worst:
             poses = {
-                name: {moment: pose for moment, pose in seen.items() if moment not in worst}
-                for name, seen in poses.items()
+                name: {moment: pose for moment, pose in own.items() if moment not in worst}
+                for name, own in poses.items()
             }
             adjustment = _Adjustment(boards, cameras, poses)
         if worst or limit_px == START_PX:
@@ -104,7 +105,7 @@ def calibrate_rig(boards: Boards, cameras: Mapping[str, Camera]) -> Rig:
     errors_px = adjustment.camera_errors_px()
     findings = [
         f"{name} sees the board with another camera {count} times: take at least {MIN_SHARED} "
-        "pictures"
+        "images"
         for name, count in zip(names, counts_shared, strict=True)
         if count < MIN_SHARED
     ]
@@ -118,7 +119,7 @@ def calibrate_rig(boards: Boards, cameras: Mapping[str, Camera]) -> Rig:
     return Rig(names, *solution, errors_px, counts_shared, tuple(outliers), tuple(findings))
 
 
-def _linked(poses: BoardPoses) -> dict[str, Transform]:
+def _link_cameras(poses: BoardPoses) -> dict[str, Transform]:
     """Return T_world_cam of every camera, linked to the first by moments that two cameras share.
 
     Raises:
@@ -165,42 +166,43 @@ class _Adjustment:
     """
 
     def __init__(self, boards: Boards, cameras: Mapping[str, Camera], poses: BoardPoses) -> None:
-        start = _linked(poses)
-        moments = sorted({moment for seen in poses.values() for moment in seen})
-        views = [(name, moment) for name, seen in poses.items() for moment in seen]
+        start = _link_cameras(poses)
+        views = [(name, moment) for name, own in poses.items() for moment in own]
+        moments = sorted({moment for _, moment in views})
         names = list(start)
         self._moments, self._num_cameras = moments, len(names)
         self._views = [(names.index(name), moments.index(moment)) for name, moment in views]
         self._cameras = [cameras[name] for name in names]
         self._sightings = [boards[name][moment] for name, moment in views]
-        placed = []
+        T_world_boards = []
         for moment in moments:
+            # The most certain pose of the board is its initial pose.
             spreads = [
                 (float(np.trace(poses[name][moment].covariance)), name)
                 for name in names
                 if moment in poses[name]
             ]
             name = min(spreads)[1]
-            placed.append(start[name] @ poses[name][moment].T_cam_board)
-        self._transforms = np.stack([*start.values(), *placed])
+            T_world_boards.append(start[name] @ poses[name][moment].T_cam_board)
+        self._transforms = np.stack([*start.values(), *T_world_boards])
         self._errors = self._residuals(self._transforms)
 
     def solve(self) -> None:
         """Refine all poses, and estimate the covariances of the cameras."""
         start = self._transforms
         num_unknowns = 6 * (len(start) - 1)
-        ends = np.cumsum([0, *(2 * len(sighting.points) for sighting in self._sightings)])
+        ends = np.cumsum([0, *(2 * len(detection.points) for detection in self._sightings)])
         sparsity = lil_matrix((ends[-1], num_unknowns), dtype=np.int8)
         for number, (camera, moment) in enumerate(self._views):
             for unknown in (camera - 1, self._num_cameras - 1 + moment):
                 if unknown >= 0:
                     sparsity[ends[number] : ends[number + 1], 6 * unknown : 6 * unknown + 6] = 1
 
-        def placed(step: Float[np.ndarray, "numbers"]) -> Transforms:
-            return np.concatenate([start[:1], displaced(start[1:], step.reshape(-1, 6))])
+        def move(step: Float[np.ndarray, "numbers"]) -> Transforms:
+            return np.concatenate([start[:1], displace(start[1:], step.reshape(-1, 6))])
 
         def errors(step: Float[np.ndarray, "numbers"]) -> Float[np.ndarray, "numbers"]:
-            return np.concatenate(self._residuals(placed(step))).ravel()
+            return np.concatenate(self._residuals(move(step))).ravel()
 
         solution = least_squares(
             errors,
@@ -211,7 +213,7 @@ class _Adjustment:
             loss="soft_l1",
             f_scale=SOFT_PX,
         )
-        self._transforms = placed(solution.x)
+        self._transforms = move(solution.x)
         self.T_world_cam = self._transforms[: self._num_cameras]
         self._errors = self._residuals(self._transforms)
         squares = sum(float(np.square(error).sum()) for error in self._errors)
@@ -228,14 +230,14 @@ class _Adjustment:
     def _residuals(self, transforms: Transforms) -> list[Float[np.ndarray, "points 2"]]:
         """Return the reprojection errors of every view, pixels."""
         errors = []
-        for (camera, moment), sighting in zip(self._views, self._sightings, strict=True):
+        for (camera, moment), detection in zip(self._views, self._sightings, strict=True):
             T_world_board = transforms[self._num_cameras + moment]
             points = transform(
-                invert_transform(transforms[camera]) @ T_world_board, sighting.points
+                invert_transform(transforms[camera]) @ T_world_board, detection.points
             )
             lens = self._cameras[camera]
             given = points, np.zeros(3), np.zeros(3), lens.K, lens.coefficients
-            errors.append(cv2.projectPoints(*given)[0][:, 0] - sighting.pixels)
+            errors.append(cv2.projectPoints(*given)[0][:, 0] - detection.pixels)
         return errors
 
     def outliers(self, limit_px: float) -> list[str]:

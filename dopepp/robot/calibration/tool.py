@@ -27,7 +27,7 @@ class Tip:
     """A tool's tip."""
 
     position: Vector  # in the flange's frame, metres
-    residuals: Float[np.ndarray, "poses"]  # distance of every pose's tip from the point, metres
+    residuals: Float[np.ndarray, "poses"]  # distance of the tip from the point, metres
     deviations: Vector  # standard deviations of the position along the flange's axes, metres
     findings: tuple[str, ...]  # reasons not to trust the tip, with remedies
 
@@ -80,8 +80,7 @@ def find_tip(T_base_flange: Float[np.ndarray, "poses 4 4"]) -> Tip:
 class Bench:
     """The plane of a bench with a frame on it."""
 
-    # z points away from the plane, towards the robot. Origin: the first point; x: to the second.
-    T_base_bench: Transform
+    T_base_bench: Transform  # z is the normal; from points: origin first, x to the second point
     residuals: Float[np.ndarray, "points"]  # signed distances from the plane, metres
     findings: tuple[str, ...]  # reasons not to trust the plane, with remedies
 

@@ -97,7 +97,7 @@ class Cell:
         return state
 
     def put(self, state: Any, number: int, T_base_obj: Transform) -> None:
-        """Place an object at rest."""
+        """Place the solid of this number at rest."""
         joint = self.model.joint(f"solid{number}")
         position, velocity = int(joint.qposadr[0]), int(joint.dofadr[0])
         state.qpos[position : position + 3] = T_base_obj[:3, 3]
@@ -105,7 +105,7 @@ class Cell:
         state.qvel[velocity : velocity + 6] = 0.0
 
     def pose(self, state: Any, number: int) -> Transform:
-        """Return the pose of an object, T_base_obj."""
+        """Return T_base_obj of the solid of this number."""
         body = self.model.body(f"solid{number}").id
         return make_transform(state.xmat[body].reshape(3, 3), state.xpos[body])
 

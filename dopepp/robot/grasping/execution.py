@@ -56,7 +56,7 @@ class Execution:
         self.outcome = Outcome()
 
     def stand(self, joints: Joints) -> None:
-        """Place the arm at rest at the joints that its controller reads, with open fingers."""
+        """Set the arm to rest at joints that its controller reads, with open fingers."""
         state = self._state
         state.qpos[:JOINTS] = state.ctrl[:JOINTS] = joints + self._zero
         state.qvel[: JOINTS + 8] = 0.0
@@ -81,7 +81,7 @@ class Execution:
             self._command = (1 - share) * self._gripper.command(plan.opening) + share * CLOSED
             self._advance(grasp_joints, np.zeros(JOINTS))
         self._rest(grasp_joints)
-        for joints in chain(_timed(plan.lift), _shaken(plan.lift[-1])):
+        for joints in chain(_sample_path(plan.lift), _sample_shake(plan.lift[-1])):
             self._advance(*joints)
         self._rest(plan.lift[-1])
         rises = self._heights() - heights_before
@@ -91,7 +91,7 @@ class Execution:
 
     def move(self, path: Path) -> None:
         """Move the arm along a path, from rest to rest."""
-        for joints in _timed(path):
+        for joints in _sample_path(path):
             self._advance(*joints)
             self.outcome.collided |= self._is_hit()
 
@@ -101,12 +101,12 @@ class Execution:
         return np.array([cell.pose(state, number)[2, 3] for number in range(cell.count)])
 
     def _rest(self, joints: Joints) -> None:
-        """Hold the arm at the given joint angles, radians, for a short pause."""
+        """Hold the arm at joints, radians, for a short pause."""
         for _ in range(round(PAUSE_S / STEP)):
             self._advance(joints, np.zeros(JOINTS))
 
     def _advance(self, joints: Joints, speeds: Joints) -> None:
-        """Command joints and speeds for one simulation step, and record frames for films."""
+        """Command joints and speeds for one simulation step, and record the state for films."""
         state = self._state
         state.ctrl[:JOINTS] = joints + self._zero + LAG_S * speeds
         state.ctrl[JOINTS] = self._command
@@ -117,7 +117,7 @@ class Execution:
             self.outcome.states.append(state.qpos.copy())
 
     def _is_hit(self) -> bool:
-        """Return whether the robot presses against an obstacle."""
+        """Return whether the robot presses on an obstacle with more than :data:`HIT_FORCE`."""
         state, force = self._state, np.zeros(6)
         pairs = self._cell.groups[state.contact.geom]
         for number in np.flatnonzero((pairs == 0).sum(axis=1) == 1):
@@ -127,7 +127,7 @@ class Execution:
         return False
 
 
-def _timed(path: Path) -> Iterator[tuple[Joints, Joints]]:
+def _sample_path(path: Path) -> Iterator[tuple[Joints, Joints]]:
     """Yield joints and their speeds at every simulation step, from rest to rest."""
     lengths = np.abs(np.diff(path, axis=0)).max(axis=1)
     distances = np.concatenate([[0.0], np.cumsum(lengths)])
@@ -139,7 +139,7 @@ def _timed(path: Path) -> Iterator[tuple[Joints, Joints]]:
     yield from zip(joints, speeds, strict=True)
 
 
-def _shaken(joints: Joints) -> Iterator[tuple[Joints, Joints]]:
+def _sample_shake(joints: Joints) -> Iterator[tuple[Joints, Joints]]:
     """Yield joints and their speeds while the wrist oscillates."""
     times = np.arange(0, SHAKE_S, STEP)
     fade = np.sin(np.pi * times / SHAKE_S) ** 0.5

@@ -121,7 +121,7 @@ def write_rerun(path: Path, trials: Trials, scene: TrialScene, attempt: Attempt)
         recording.save(partial)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         image = draw_estimate(trials, scene, attempt)
-        recording.log("picture", rr.Image(image), static=True)
+        recording.log("image", rr.Image(image), static=True)
         model = Cell([item.solid for item in scene.placed], "all", T_flange_cam=MOUNT).model
         state = mujoco.MjData(model)
         bodies = _log_shapes(recording, model)

@@ -1,7 +1,7 @@
-"""The grasp experiment: trials distributed to processes, and its report.
+"""The grasp experiment: runs trials in several processes and reports them.
 
-Every trial depends only on the seed. The report has a JSON, a CSV and a Markdown file with Table 9,
-the failures and a curve.
+Every trial depends only on the seed. The report consists of a JSON, a CSV and a Markdown file with
+Table 9 and the failures, and a curve.
 """
 
 from __future__ import annotations
@@ -9,16 +9,16 @@ from __future__ import annotations
 import json
 import pickle
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import lru_cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from dopepp.core.errors import RunError, UserError
+from dopepp.core.errors import RunError, UserError, check_choice
 from dopepp.core.files import check_target, write_csv, write_file, write_image
 from dopepp.core.pool import LostWorkerError, ProcessPool, available_cores
 from dopepp.core.validation import Range, check
@@ -66,15 +66,8 @@ def parse_sources(text: str) -> tuple[PoseSource, ...]:
     """
     names = dict.fromkeys(name.strip() for name in text.split(","))
     for name in names:
-        _check_choice("--poses", name, SOURCES)
+        check_choice("--poses", name, SOURCES)
     return tuple(source for name in names for source in SOURCES[name])
-
-
-def _check_choice(option: str, value: str, allowed: Iterable[str]) -> None:
-    """Check the value of an option against the allowed names."""
-    if value not in allowed:
-        fix = f"pass {option} with one of these names"
-        raise UserError(f"{option} {value}", ", ".join(allowed), fix)
 
 
 def check_task(task: GraspTask, poses: str, count: int) -> GraspTask:
@@ -83,9 +76,9 @@ def check_task(task: GraspTask, poses: str, count: int) -> GraspTask:
     Raises:
         UserError: An option has an invalid value, or the part has no network or no grasp.
     """
-    _check_choice("--layout", task.layout, LAYOUTS)
-    _check_choice("--renderer", task.renderer, RENDERERS)
-    _check_choice("--rest", task.rest, ("front", "any"))
+    check_choice("--layout", task.layout, LAYOUTS)
+    check_choice("--renderer", task.renderer, RENDERERS)
+    check_choice("--rest", task.rest, ("front", "any"))
     check("-n", count, int, Range(1, MAX_TRIALS))
     check("--views", task.views, int, Range(1, 2))
     check("--yaw", task.yaw_deg, float, Range(0, 180, "degrees"))
@@ -122,7 +115,7 @@ def make_experiment(
         folder: Target folder.
         video: Film of the first trial, .mp4 or .jpg.
         rerun: Rerun recording of the first trial.
-        report_progress: Receives a line after every 50 trials.
+        report_progress: Receives a line of text after every 50 trials.
 
     Returns:
         The tables in Markdown.
@@ -180,7 +173,7 @@ def run_trials(task: GraspTask, count: int, workers: int) -> Iterator[Record]:
         RunError: A process died.
         UserError: A trial cannot run the task.
     """
-    run = _TrialRunner(task)
+    run = partial(_run_trial, task)
     if workers == 1:
         for number in range(count):
             yield from run(number)
@@ -193,20 +186,17 @@ def run_trials(task: GraspTask, count: int, workers: int) -> Iterator[Record]:
                 raise RunError(str(error)) from error
 
 
-class _TrialRunner:
-    """Runs a trial with every source of the task; picklable."""
+def _run_trial(task: GraspTask, number: int) -> list[Record]:
+    """Run a trial with every source of the task."""
+    trials = _task_trials(task)
+    scene = trials.scene(number)
+    return [trials.attempt(scene, source).record for source in task.sources]
 
-    def __init__(self, task: GraspTask) -> None:
-        self._task = task
 
-    @cached_property
-    def _trials(self) -> Trials:
-        """The trials of the task, set up on first use in this process."""
-        return Trials(self._task)
-
-    def __call__(self, number: int) -> list[Record]:
-        scene = self._trials.scene(number)
-        return [self._trials.attempt(scene, source).record for source in self._task.sources]
+@lru_cache(maxsize=1)
+def _task_trials(task: GraspTask) -> Trials:
+    """Set up the trials of a task, once in each process."""
+    return Trials(task)
 
 
 @dataclass(frozen=True)
@@ -236,7 +226,7 @@ def count_records(records: Sequence[Record]) -> Counts:
 
 
 def by_source(records: Sequence[Record]) -> dict[str, list[Record]]:
-    """Group records by the source of poses, each group sorted by trial."""
+    """Group records by their source of poses, and sort each group by trial."""
     groups: dict[str, list[Record]] = {}
     for record in sorted(records, key=lambda record: record.number):
         groups.setdefault(record.source, []).append(record)
@@ -244,7 +234,7 @@ def by_source(records: Sequence[Record]) -> dict[str, list[Record]]:
 
 
 def table_9(records: Sequence[Record]) -> list[str]:
-    """Return the trials of a source in the layout of the paper's Table 9, in Markdown."""
+    """Return the Markdown lines of a source's trials in the layout of the paper's Table 9."""
     lines = [
         "| grasps | recognised | caught | paper: recognised | caught |",
         "| --- | ---: | ---: | ---: | ---: |",
@@ -265,7 +255,7 @@ def table_9(records: Sequence[Record]) -> list[str]:
 
 
 def sources_table(records: Sequence[Record]) -> list[str]:
-    """Return a table with a row for every source of poses, in Markdown."""
+    """Return the Markdown lines of a table with a row for every source of poses."""
     lines = [
         "| poses | trials | recognised (ADD-0.1d) | caught | median error at the arm "
         f"| {' | '.join(FAILURES)} |",
@@ -318,7 +308,7 @@ def write_report(folder: Path, records: Sequence[Record], facts: Mapping[str, An
 
 
 def curve(records: Sequence[Record]) -> Any:
-    """Plot the share of caught parts over the error of exact poses."""
+    """Plot the share of caught parts against the error of exact poses."""
     from dopepp.drawing.curves import RateCurve, rates_figure
 
     points = []

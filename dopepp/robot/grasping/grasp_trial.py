@@ -1,6 +1,6 @@
-"""A trial: an image of the bench, a pose, a motion of the arm, and the outcome.
+"""A trial: an image of the bench, an estimated pose, a motion of the arm, and its outcome.
 
-A task and the records of its trials are plain values, so that they can be sent to processes.
+A task and the records of its trials are plain values that can be pickled for worker processes.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from dopepp.parts.catalogue import load_part
 from dopepp.robot.grasping.cell import HOME, TRAY, Cell
 from dopepp.robot.grasping.execution import Execution, Outcome
 from dopepp.robot.grasping.grasps import find_grasps
-from dopepp.robot.grasping.planner import Arm, Joints, Planner, laid_flat, measure_gripper
+from dopepp.robot.grasping.planner import Arm, Joints, Planner, align_with_bench, measure_gripper
 from dopepp.robot.grasping.rehearsal import (
     MOUNT,
     CalibratedRobot,
     TrueRobot,
     calibrate,
+    downward_view,
     draw_robot,
-    looking_at,
 )
-from dopepp.robot.grasping.viewpoint import ViewpointPlanner
+from dopepp.robot.grasping.viewpoint import choose_viewpoint
 from dopepp.robot.grasping.workbench import (
     Layout,
     MujocoView,
@@ -69,7 +69,7 @@ RECOGNISED: Final = 0.1  # largest ADD of a recognised part, as a share of its d
 
 @dataclass(frozen=True)
 class PoseSource:
-    """Source of the poses by which parts are grasped."""
+    """Source of the poses from which grasps are planned."""
 
     kind: str = "network"  # `network`, `templates`, `exact` (the simulation's) or `random`
     matrices: str = "calibrated"  # `calibrated` or `true` camera matrices for the network's poses
@@ -117,11 +117,11 @@ class Record:
     add_mm: float  # ADD, millimetres
     error_mm: float  # position error of the part's origin, millimetres
     error_deg: float  # rotation error of the pose, degrees
-    caught: bool  # whether the part was held after lifting and shaking
+    caught: bool  # whether the gripper held the part after lifting and shaking
     failure: str  # one of `FAILURES`, or empty
     hand_eye_mm: float  # error of the hand-eye calibration at the part's distance
     hand_eye_deg: float  # rotation error of the hand-eye calibration, degrees
-    second_view: str = ""  # where the camera took a second image, and why
+    second_view: str = ""  # where the camera took a second image, and the reason
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +130,7 @@ class SceneObservation:
 
     poses: list[Transform]  # T_base_obj of the parts, the highest first
     joints: Joints  # joints of the arm at the last image, radians
-    second_view: str = ""  # as of :class:`Record`
+    second_view: str = ""  # as in :class:`Record`
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +158,7 @@ class TrialScene:
 
 @dataclass(eq=False)
 class Attempt:
-    """A record, and the motion that led to it."""
+    """The record and the motion of a trial with one source of poses."""
 
     record: Record
     outcome: Outcome = field(default_factory=Outcome)
@@ -193,7 +193,7 @@ class Trials:
 
     @cached_property
     def templates(self) -> PoseEstimator:
-        """Estimator that detects the part with templates of its mesh, without training."""
+        """Estimator that detects the part by templates of its mesh, without training."""
         from dopepp.inference.estimator import PoseEstimator
 
         near, far = self.distance
@@ -246,12 +246,12 @@ class Trials:
         return TrialScene(number, cell, placed, state, poses, robot, calibrated, *camera)
 
     def attempt(self, scene: TrialScene, source: PoseSource) -> Attempt:
-        """Grasp a part of a scene by the poses of a source."""
+        """Grasp a part of a scene, using the poses of a source."""
         observation = self._observe(scene, source)
         if not observation.poses:
             return Attempt(self._record(scene, source, observation, None, None))
         bench, hull = scene.calibrated.knowledge.T_base_bench, self.layout.body.hull
-        flat = [laid_flat(pose, hull, bench) for pose in observation.poses][:MAX_OBSTACLES]
+        flat = [align_with_bench(pose, hull, bench) for pose in observation.poses][:MAX_OBSTACLES]
         planner, estimate, outcome = self._planner(scene), observation.poses[0], None
         for number, target in enumerate(flat):
             others = [*flat[:number], *flat[number + 1 :]]
@@ -266,23 +266,18 @@ class Trials:
         record = self._record(scene, source, observation, estimate, outcome)
         return Attempt(record, outcome or Outcome(), estimate)
 
-    def _viewpoints(self, scene: TrialScene) -> ViewpointPlanner:
-        """Return the planner of the camera's second view."""
-        robot = scene.calibrated
-        return ViewpointPlanner(self.arm, self._planner(scene), robot.knowledge, robot.camera)
-
     def _planner(self, scene: TrialScene) -> Planner:
         """Return the planner of grasps among the parts of a scene."""
         count = 1 if self.task.layout == "single" else MAX_OBSTACLES
         return Planner(self.arm, self.gripper, self._parts_cell(count), scene.calibrated.knowledge)
 
     def _observe(self, scene: TrialScene, source: PoseSource) -> SceneObservation:
-        """Return the poses of parts for the controller, from one image or two."""
+        """Return the poses of parts as the controller estimates them, from one image or two."""
         rng = np.random.default_rng([self.task.seed, scene.number, 2])
         if source.kind == "random":
             return SceneObservation([self.layout.draw_pose(rng)], scene.joints)
         if source.kind == "exact":
-            poses = [_perturbed(pose, source.error, rng) for pose in scene.targets]
+            poses = [_perturb(pose, source.error, rng) for pose in scene.targets]
             return SceneObservation(poses, scene.joints)
         estimator = self.templates if source.kind == "templates" else self.estimator
         lens, T_base_cam = scene.calibrated.camera, self._camera_pose(scene, source, scene.joints)
@@ -296,7 +291,7 @@ class Trials:
         assert estimator.refiner is not None
         mesh = estimator.refiner.mesh(self.part.name)
         assert mesh is not None
-        view = self._viewpoints(scene).choose(scene.joints, likely, mesh)
+        view = choose_viewpoint(self._planner(scene), lens.K, scene.joints, likely, mesh)
         joints, reason = (scene.joints, "none in reach") if view is None else view
         if view is not None:
             image = scene.photograph(self._true_camera_pose(scene.robot, joints), rng)
@@ -362,12 +357,12 @@ class Trials:
         )
 
     def _aim_camera(self, robot: TrueRobot, rng: Generator) -> tuple[Joints, Transform]:
-        """Draw joints from which the camera sees the tray; return joints and T_base_cam."""
+        """Draw joints at which the camera sees the tray; return joints and T_base_cam."""
         for _ in range(20):
             point = TRAY + np.array([*rng.uniform(-0.01, 0.01, 2), 0.0])
             distance = rng.uniform(*self.distance)
             tilt, roll = rng.uniform(-TILT, TILT, 2), rng.uniform(-0.2, 0.2)
-            flange = looking_at(point, distance, tilt, roll) @ invert_transform(MOUNT)
+            flange = downward_view(point, distance, tilt, roll) @ invert_transform(MOUNT)
             joints = self.arm.joints(flange, HOME)
             if joints is not None:
                 return joints, self._true_camera_pose(robot, joints)
@@ -384,7 +379,7 @@ def _height(T_base_obj: Transform) -> float:
     return float(T_base_obj[2, 3])
 
 
-def _perturbed(pose: Transform, error: tuple[float, float], rng: Generator) -> Transform:
+def _perturb(pose: Transform, error: tuple[float, float], rng: Generator) -> Transform:
     """Return a pose with an error in millimetres and degrees."""
     direction, axis = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
     R = Rotation.from_rotvec(np.radians(error[1]) * axis).as_matrix()

@@ -47,7 +47,7 @@ INSERTIONS: Final = (0.009, 0.003)
 """Distances of the pads' ends beyond a grasp's point, metres: half a pad, or less above an
 obstacle."""
 
-ABOVE_BENCH: Final = 0.001  # distance of the pads' ends from the bench, metres
+ABOVE_BENCH: Final = 0.001  # smallest distance of the pads' ends from the bench, metres
 PAIRS: Final = 1500  # sampled points for the search of pairs
 FACES: Final = 8  # number of the most common resting faces
 TRIED: Final = 100  # pairs tested on every face
@@ -80,7 +80,7 @@ FIX: Final = "correct the file, or create a new file with `dopepp grasp propose`
 
 @dataclass(frozen=True, eq=False)
 class Grasp:
-    """A two-finger grasp of a part; see the module."""
+    """A two-finger grasp of a part, with the fields described in the module."""
 
     point: Vector
     closing: Vector
@@ -146,12 +146,12 @@ def read_grasps(path: Path, part: Part) -> tuple[Grasp, ...]:
         problem = f"{path}, part {part.name} with {len(content.grasps)} grasps"
         raise UserError(problem, f"1 to {MAX_GRASPS} grasps", FIX)
     return tuple(
-        _checked(record, f"{path}.grasps[{number}]", part)
+        _check_grasp(record, f"{path}.grasps[{number}]", part)
         for number, record in enumerate(content.grasps)
     )
 
 
-def _checked(record: _GraspRecord, name: str, part: Part) -> Grasp:
+def _check_grasp(record: _GraspRecord, name: str, part: Part) -> Grasp:
     """Return the grasp of a file's record after checking its position and directions."""
     point, closing, approach = map(np.array, (record.point, record.closing, record.approach))
     lower, upper = part.cuboid.min(axis=0) - 0.01, part.cuboid.max(axis=0) + 0.01
@@ -172,15 +172,15 @@ def write_grasps(path: Path, part: Part, grasps: Sequence[Grasp]) -> None:
     lines = [f"part: {part.name}", "grasps:"]
     for grasp in grasps:
         vectors = ", ".join(
-            f"{name}: [{', '.join(map(_written, getattr(grasp, name)))}]"
+            f"{name}: [{', '.join(map(_format_number, getattr(grasp, name)))}]"
             for name in ("point", "closing", "approach")
         )
-        lines.append(f"- {{{vectors}, width: {_written(grasp.width)}}}")
+        lines.append(f"- {{{vectors}, width: {_format_number(grasp.width)}}}")
     write_file(path, ("\n".join(lines) + "\n").encode())
 
 
-def _written(value: float) -> str:
-    """Return a number with up to five decimals. YAML reads a number with an exponent as text."""
+def _format_number(value: float) -> str:
+    """Format a number with up to five decimals, because YAML reads an exponent as text."""
     number = round(value, 5) + 0.0  # −0 becomes 0
     return f"{number:.5f}".rstrip("0").rstrip(".")
 
@@ -204,7 +204,7 @@ def propose_grasps(part: Part, count: int, seed: int = 0) -> tuple[Grasp, ...]:
     rng = np.random.default_rng(seed)
     normals, shares = body.hull.rests
     pairs = list(_pairs(part.mesh, rng))
-    surface = _sampled(part.mesh, SAMPLES, rng)
+    surface = _sample_surface(part.mesh, SAMPLES, rng)
     faces = np.argsort(-shares, kind="stable")[:FACES]
     each = math.ceil(count / len(faces))
     grasps: list[Grasp] = []
@@ -219,7 +219,7 @@ def propose_grasps(part: Part, count: int, seed: int = 0) -> tuple[Grasp, ...]:
             for grasp in _from_above(middle, closing, width, up)
             if (score := _score(grasp, up, bottom, surface, body.hull.centre, part.diameter)) > 0
         ]
-        grasps += _distinct(scored, each)
+        grasps += _select_distinct(scored, each)
     if not grasps:
         raise UserError(
             f"part {part.name}, on which no grasp was found",
@@ -230,7 +230,9 @@ def propose_grasps(part: Part, count: int, seed: int = 0) -> tuple[Grasp, ...]:
     return tuple(grasps[:count])
 
 
-def _sampled(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[Points, Points, float]:
+def _sample_surface(
+    mesh: Mesh, count: int, rng: np.random.Generator
+) -> tuple[Points, Points, float]:
     """Return random points of the surface, their normals, and the area per point, m²."""
     a, b, c = mesh.vertices[mesh.faces].swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
@@ -244,7 +246,7 @@ def _sampled(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[Points, 
 
 def _pairs(mesh: Mesh, rng: np.random.Generator) -> Iterator[tuple[Vector, Vector, float]]:
     """Yield midpoints, closing directions and widths of antipodal pairs."""
-    points, normals, _ = _sampled(mesh, PAIRS, rng)
+    points, normals, _ = _sample_surface(mesh, PAIRS, rng)
     a, b, c = mesh.vertices[mesh.faces].swapaxes(0, 1)
     flat = np.cross(b - a, c - a)
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
@@ -320,10 +322,10 @@ def _score(
     return max(0.01, min(min(patches) / ENOUGH, 1.0) - lever - 0.5 * (1 - steep))
 
 
-def _distinct(scored: list[tuple[float, Grasp]], count: int) -> list[Grasp]:
-    """Return at most ``count`` (score, grasp) pairs' grasps, best first, without near-duplicates.
+def _select_distinct(scored: list[tuple[float, Grasp]], count: int) -> list[Grasp]:
+    """Return at most ``count`` grasps of (score, grasp) pairs, the best first.
 
-    A grasp is left out if a better grasp is within ``APART`` of its position and directions.
+    A grasp is omitted if a better grasp is within :data:`APART` of its position and directions.
     """
     distance, cosine = APART[0], math.cos(APART[1])
     distinct: list[Grasp] = []

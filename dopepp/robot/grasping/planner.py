@@ -42,7 +42,7 @@ PENETRATION: Final = 1e-4  # minimum penetration of a collision, metres
 
 
 class Arm:
-    """An arm's kinematics, without errors."""
+    """Kinematics of the arm's model, without the errors of a real arm."""
 
     def __init__(self) -> None:
         self._cell = Cell(gripper=False)
@@ -107,7 +107,7 @@ class Gripper:
         return float(np.interp(-width, -self.widths, self.reaches))
 
     def fingers(self, width: float) -> Float[np.ndarray, "8"]:
-        """Return the positions of the fingers' joints that open the pads to a width, metres."""
+        """Return the finger joints that open the pads to a width, metres."""
         command = self.command(width)
         return np.array([np.interp(command, COMMANDS, joint) for joint in self.joints.T])
 
@@ -143,18 +143,18 @@ class ControllerParameters:
 class Plan:
     """A motion: waypoints of the joints, radians."""
 
-    approach: Path  # to above the part
-    descent: Path  # straight to it
+    approach: Path  # from the start to above the part
+    descent: Path  # straight down to the part
     lift: Path  # straight up
     opening: float  # distance between the fingers before they close, metres
     grasp: Grasp  # the part's grasp that the motion executes
 
 
-def laid_flat(T_base_obj: Transform, hull: Hull, T_base_bench: Transform) -> Transform:
-    """Align the estimated pose of a part with the bench.
+def align_with_bench(T_base_obj: Transform, hull: Hull, T_base_bench: Transform) -> Transform:
+    """Lay the estimated pose of a part flat on the bench.
 
-    An image from above determines tilt and height poorly; the bench determines both well. A
-    part whose height differs by more than :data:`LOW` leans on an obstacle, so its pose is kept.
+    An image from above determines tilt and height poorly; the bench determines both well. A part
+    whose height differs by more than :data:`LOW` leans on an obstacle, so its pose is unchanged.
 
     Args:
         T_base_obj: The estimated pose.
@@ -184,13 +184,13 @@ class Planner:
         arm: The arm's kinematics.
         gripper: The gripper's kinematics.
         cell: A model with the largest possible number of parts.
-        knowledge: Calibrated parameters.
+        knowledge: Calibrated parameters of the controller.
     """
 
     def __init__(
         self, arm: Arm, gripper: Gripper, cell: Cell, knowledge: ControllerParameters
     ) -> None:
-        self._arm, self._gripper, self._cell, self._knowledge = arm, gripper, cell, knowledge
+        self.arm, self._gripper, self._cell, self.knowledge = arm, gripper, cell, knowledge
         self._state = cell.data()
         model = cell.model
         self._hand = np.array(["gripper/" in model.body(body).name for body in model.geom_bodyid])
@@ -222,14 +222,14 @@ class Planner:
         return self._is_free(np.stack([start, end]), self._gripper.widest)
 
     def _place(self, poses: Sequence[Transform]) -> None:
-        """Place parts in the model, and the other parts out of the way."""
+        """Place the model's parts at these poses, and its surplus parts out of the way."""
         for number in range(self._cell.count):
             pose = make_transform(np.eye(3), np.array([2.0, number, 0.5]))
             self._cell.put(self._state, number, poses[number] if number < len(poses) else pose)
 
     def _tools(self, T_base_obj: Transform, grasp: Grasp) -> Iterator[Transform]:
         """Yield poses of the closed pads' ends, T_base_tool, that grip the part."""
-        up = self._knowledge.T_base_bench[:3, 2]
+        up = self.knowledge.T_base_bench[:3, 2]
         half_width, half_pad = grasp.width / 2 + 2 * PAD_HALF[0], PAD_HALF[1]
         signs = [[-1, -1, 0], [-1, 1, 0], [1, -1, 0], [1, 1, 0]]
         ends = np.array(signs) * [half_width, half_pad, 0.0]
@@ -238,7 +238,7 @@ class Planner:
             steep = -float(T[:3, 2] @ up)
             if steep < np.cos(STEEPEST):
                 continue
-            points = ends @ T[:3, :3].T + T[:3, 3] - self._knowledge.T_base_bench[:3, 3]
+            points = ends @ T[:3, :3].T + T[:3, 3] - self.knowledge.T_base_bench[:3, 3]
             room = (float((points @ up).min()) - ABOVE_BENCH) / steep
             if room >= 0:
                 for depth in sorted({min(room, depth) for depth in INSERTIONS}, reverse=True):
@@ -246,12 +246,12 @@ class Planner:
 
     def _motion(self, T_base_tool: Transform, grasp: Grasp, start: Joints) -> Plan | None:
         """Return a collision-free motion to a pose of the finger pads' ends, or None."""
-        tip = self._knowledge.tip.copy()
+        tip = self.knowledge.tip.copy()
         tip[2] += self._gripper.reach(grasp.width) - self._gripper.reach(0.0)
         T_base_flange = T_base_tool @ make_transform(np.eye(3), -tip)
         before = T_base_flange.copy()
         before[:3, 3] -= RETREAT * T_base_flange[:3, 2]
-        first = self._arm.joints(before, start)
+        first = self.arm.joints(before, start)
         if first is None:
             return None
         descent = self._line(first, before, T_base_flange)
@@ -261,7 +261,7 @@ class Planner:
         if not self._is_free(approach, grasp.opening):
             return None
         above = T_base_flange.copy()
-        above[:3, 3] += LIFT * self._knowledge.T_base_bench[:3, 2]
+        above[:3, 3] += LIFT * self.knowledge.T_base_bench[:3, 2]
         lift = self._line(descent[-1], T_base_flange, above)
         return None if lift is None else Plan(approach, descent, lift, grasp.opening, grasp)
 
@@ -271,19 +271,14 @@ class Planner:
         for share in np.linspace(0, 1, 7)[1:]:
             between = T_to.copy()
             between[:3, 3] = (1 - share) * T_from[:3, 3] + share * T_to[:3, 3]
-            joints = self._arm.joints(between, path[-1])
+            joints = self.arm.joints(between, path[-1])
             if joints is None:
                 return None
             path.append(joints)
         return np.stack(path)
 
     def _is_free(self, path: Path, opening: float) -> bool:
-        """Return whether the arm does not collide on a path.
-
-        Args:
-            path: Joint positions, connected by straight lines.
-            opening: Distance between the pads, metres.
-        """
+        """Return whether a path of straight lines, with the pads opened, is free of collisions."""
         for here, there in pairwise(path):
             count = max(2, round(CHECKS * float(np.abs(there - here).max())))
             for share in np.linspace(0, 1, count):

@@ -40,7 +40,7 @@ FOCAL: Final = SIZE[0] / 2 / np.tan(np.radians(30.0))  # 60° across, as in the 
 TRUE_K: Final[CameraMatrix] = camera_matrix(FOCAL, FOCAL, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
 
 MOUNT: Final = make_transform(np.eye(3), np.array([0.0, 0.09, 0.11]))
-"""Nominal T_flange_cam: beside the fingers, which stay out of view, with z along the tool."""
+"""Nominal T_flange_cam: beside the fingers, which are not in view, with z along the tool."""
 
 BRACKET: Final = (np.radians(1.0), 0.003)
 """Standard deviations of the bracket's error about and along each axis, radians and metres."""
@@ -95,7 +95,7 @@ FlangePair = tuple[Transform, Transform]
 
 
 def _move(robot: TrueRobot, arm: Arm, goal: Transform) -> FlangePair | None:
-    """Move the flange to a pose; return None if it is out of reach."""
+    """Move the flange to a pose; return None if the pose is out of reach."""
     joints = arm.joints(goal)
     return None if joints is None else (arm.flange(joints), arm.flange(joints - robot.zero))
 
@@ -141,26 +141,26 @@ def _calibrate_camera(robot: TrueRobot, arm: Arm, rng: Generator) -> tuple[Camer
     def draw() -> FlangePair | None:
         point = TRAY + np.array([*rng.uniform(-0.03, 0.03, 2), 0.0])
         distance, tilt = rng.uniform(0.2, 0.32), rng.uniform(-0.6, 0.6, 2)
-        T_base_cam = looking_at(point, distance, tilt, rng.uniform(-1.0, 1.0))
+        T_base_cam = downward_view(point, distance, tilt, rng.uniform(-1.0, 1.0))
         return _move(robot, arm, T_base_cam @ invert_transform(robot.T_flange_cam))
 
-    sightings, flanges = [], []
+    detections, flanges = [], []
     for number, (flange, read) in enumerate(_draw_reachable(draw, VIEWS)):
         T_cam_board = invert_transform(flange @ robot.T_flange_cam) @ T_base_board
         image = draw_view(board, T_cam_board, true_camera, rng)
-        sighting = board.find(image, f"{number}")
-        if sighting is not None:
-            sightings.append(sighting)
+        detection = board.detect(image, f"{number}")
+        if detection is not None:
+            detections.append(detection)
             flanges.append(read)
-    camera = calibrate_lens(sightings, SIZE).camera
-    boards = [board_pose(sighting, camera) for sighting in sightings]
+    camera = calibrate_lens(detections, SIZE).camera
+    boards = [board_pose(detection, camera) for detection in detections]
     return camera, calibrate_hand_eye(np.stack(flanges), boards, "hand").T_mount_cam
 
 
-def looking_at(
+def downward_view(
     point: Vector, distance: float, tilt: Float[np.ndarray, "2"], roll: float
 ) -> Transform:
-    """Return T_base_cam of a camera that looks down at a point.
+    """Return T_base_cam of a camera above a point, with the point on its optical axis.
 
     Args:
         point: The point in the base's frame, metres.

@@ -1,8 +1,8 @@
 """The second view of a grasp: where the arm moves its camera after the first image.
 
 Candidates lie on rings around the part at the first camera's distance. The arm must reach them
-without a collision. Of these, the best is the one whose image is expected to reduce the error of
-the part's pose most.
+without a collision. The chosen candidate is the one from which an image is expected to reduce the
+error of the part's pose most.
 """
 
 from __future__ import annotations
@@ -13,94 +13,87 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import Transform, invert_transform, transform
-from dopepp.geometry.camera_file import Camera
+from dopepp.geometry.camera import CameraMatrix, Transform, invert_transform, transform
 from dopepp.geometry.rotation import Vector
 from dopepp.inference.refinement.outline import OutlineMesh
 from dopepp.inference.several_views.next_view import next_best_view
 from dopepp.inference.several_views.views_result import WorldDetection
 from dopepp.robot.grasping.cell import TRAY
-from dopepp.robot.grasping.planner import Arm, ControllerParameters, Joints, Planner
-from dopepp.robot.grasping.rehearsal import SIZE, looking_at
+from dopepp.robot.grasping.planner import Joints, Planner
+from dopepp.robot.grasping.rehearsal import SIZE, downward_view
 
 TILTS: Final = np.radians([15.0, 25.0, 35.0])  # of the camera from straight down, radians
 NUM_AZIMUTHS: Final = 8  # candidates on each ring
 
 
 class Viewpoint(NamedTuple):
-    """Joints at which the camera takes the second image, and why."""
+    """Joints at which the camera takes the second image, and the reason for this choice."""
 
     joints: Joints  # as the controller reads them
     reason: str
 
 
-class ViewpointPlanner:
-    """Chooses the camera's second view.
+def choose_viewpoint(
+    planner: Planner,
+    K: CameraMatrix,
+    start: Joints,
+    parts: Sequence[WorldDetection],
+    mesh: OutlineMesh,
+) -> Viewpoint | None:
+    """Return the best second view of the first part; without a part, any other view of the tray.
 
     Args:
-        arm: The arm's kinematics.
         planner: Checks motions of the hand for collisions.
-        knowledge: Calibrated parameters.
-        camera: Calibrated camera.
+        K: Calibrated camera matrix.
+        start: Joints at the first image.
+        parts: Parts in the first image, T_base_obj; the first is to be grasped.
+        mesh: Mesh of the part.
+
+    Returns:
+        The view, or None if the arm reaches no view that shows the part.
     """
-
-    def __init__(
-        self, arm: Arm, planner: Planner, knowledge: ControllerParameters, camera: Camera
-    ) -> None:
-        self._arm, self._planner, self._knowledge, self._camera = arm, planner, knowledge, camera
-
-    def choose(
-        self, start: Joints, parts: Sequence[WorldDetection], mesh: OutlineMesh
-    ) -> Viewpoint | None:
-        """Return the best view of the first part; without a part, any other view of the tray.
-
-        Args:
-            start: Joints at the first image.
-            parts: Parts that the first image shows, T_base_obj; the first is to be grasped.
-            mesh: Mesh of the part.
-
-        Returns:
-            The view, or None if the arm reaches no view that shows the part.
-        """
-        T_base_cam = self._camera_pose(start)
-        middle = mesh.vertices.mean(axis=0)
-        point = transform(parts[0].T_world_obj, middle) if parts else TRAY
-        distance = float(np.linalg.norm(point - T_base_cam[:3, 3]))
-        poses = [part.T_world_obj for part in parts]
-        reached = [
-            joints
-            for joints in self._candidates(point, distance, start)
-            if self._planner.can_move(poses, start, joints)
-        ]
-        cameras = [self._camera_pose(joints) for joints in reached]
-        number, reason = 0, "shows the tray from another side"
-        if parts:
-            part, bench = parts[0], self._knowledge.T_base_bench
-            given = part.T_world_obj, part.covariance, cameras, self._camera.K, SIZE, bench
-            try:
-                best = next_best_view(mesh, *given)
-            except UserError:  # no candidate shows the whole part
-                return None
-            number, reason = best.number, best.reason
-        if not reached:
+    T_base_cam = _camera_pose(planner, start)
+    middle = mesh.vertices.mean(axis=0)
+    point = transform(parts[0].T_world_obj, middle) if parts else TRAY
+    distance = float(np.linalg.norm(point - T_base_cam[:3, 3]))
+    poses = [part.T_world_obj for part in parts]
+    reached = [
+        joints
+        for joints in _candidates(planner, point, distance, start)
+        if planner.can_move(poses, start, joints)
+    ]
+    cameras = [_camera_pose(planner, joints) for joints in reached]
+    number, reason = 0, "shows the tray from another side"
+    if parts:
+        part, bench = parts[0], planner.knowledge.T_base_bench
+        given = part.T_world_obj, part.covariance, cameras, K, SIZE, bench
+        try:
+            best = next_best_view(mesh, *given)
+        except UserError:  # no candidate shows the whole part
             return None
-        cosine = float(T_base_cam[:3, 2] @ cameras[number][:3, 2])
-        angle = np.degrees(np.arccos(min(1.0, cosine)))
-        reason = f"{angle:.0f}° from the first, {reason}; best of {len(reached)} in reach"
-        return Viewpoint(reached[number], reason)
+        number, reason = best.number, best.reason
+    if not reached:
+        return None
+    cosine = float(T_base_cam[:3, 2] @ cameras[number][:3, 2])
+    angle = np.degrees(np.arccos(min(1.0, cosine)))
+    reason = f"{angle:.0f}° from the first, {reason}; best of {len(reached)} in reach"
+    return Viewpoint(reached[number], reason)
 
-    def _camera_pose(self, joints: Joints) -> Transform:
-        """Return the controller's T_base_cam at the given joint angles, radians."""
-        return np.asarray(self._arm.flange(joints) @ self._knowledge.T_flange_cam)
 
-    def _candidates(self, point: Vector, distance: float, start: Joints) -> Iterator[Joints]:
-        """Yield the joints at candidates in reach."""
-        T_cam_flange = invert_transform(self._knowledge.T_flange_cam)
-        azimuths = np.linspace(0.0, 2 * np.pi, NUM_AZIMUTHS, endpoint=False)
-        for tilt in TILTS:
-            for azimuth in azimuths:
-                tilts = tilt * np.array([np.cos(azimuth), np.sin(azimuth)])
-                T_base_cam = looking_at(point, distance, tilts, 0.0)
-                joints = self._arm.joints(T_base_cam @ T_cam_flange, start)
-                if joints is not None:
-                    yield joints
+def _camera_pose(planner: Planner, joints: Joints) -> Transform:
+    """Return the controller's T_base_cam at the given joint angles, radians."""
+    return np.asarray(planner.arm.flange(joints) @ planner.knowledge.T_flange_cam)
+
+
+def _candidates(
+    planner: Planner, point: Vector, distance: float, start: Joints
+) -> Iterator[Joints]:
+    """Yield the joints at the candidates in reach."""
+    T_cam_flange = invert_transform(planner.knowledge.T_flange_cam)
+    for tilt in TILTS:
+        for azimuth in np.linspace(0.0, 2 * np.pi, NUM_AZIMUTHS, endpoint=False):
+            tilts = tilt * np.array([np.cos(azimuth), np.sin(azimuth)])
+            T_base_cam = downward_view(point, distance, tilts, 0.0)
+            joints = planner.arm.joints(T_base_cam @ T_cam_flange, start)
+            if joints is not None:
+                yield joints

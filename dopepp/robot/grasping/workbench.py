@@ -92,10 +92,12 @@ class Layout:
 
     def draw_pose(self, rng: Generator) -> Transform:
         """Draw the pose of a single part in the tray."""
-        return self._placed(rng, SPREAD, DROP_HEIGHT, 0.0).T_base_obj
+        return self._draw_part(rng, SPREAD, DROP_HEIGHT, 0.0).T_base_obj
 
-    def _placed(self, rng: Generator, spread: float, height: float, tilt_deg: float) -> PlacedSolid:
-        """Draw a pose of the part within ``spread`` of the tray's centre, at a height, metres."""
+    def _draw_part(
+        self, rng: Generator, spread: float, height: float, tilt_deg: float
+    ) -> PlacedSolid:
+        """Draw the part's pose at a height, within ``spread`` of the tray's centre, both metres."""
         up = np.array([0.0, 0.0, 1.0])
         if self._rest == "any":
             normals, shares = self.body.hull.rests
@@ -115,10 +117,10 @@ class Layout:
 
     def single(self, rng: Generator) -> list[PlacedSolid]:
         """Place a single part."""
-        return [self._placed(rng, SPREAD, DROP_HEIGHT, 0.0)]
+        return [self._draw_part(rng, SPREAD, DROP_HEIGHT, 0.0)]
 
     def distractors(self, rng: Generator) -> list[PlacedSolid]:
-        """Place a part among distractors that do not touch the part."""
+        """Place a part among distractors that do not touch it."""
         solids = self.single(rng)
         occupied = [(solids[0].T_base_obj[:3, 3], self.part.diameter / 2)]
         shapes = distractor_shapes()
@@ -141,7 +143,7 @@ class Layout:
         """Drop parts onto each other."""
         count = int(rng.integers(HEAP[0], HEAP[1] + 1))
         heights = [0.002 + 0.02 * index for index in range(count)]
-        return [self._placed(rng, HEAP_SPREAD, height, HEAP_TILT) for height in heights]
+        return [self._draw_part(rng, HEAP_SPREAD, height, HEAP_TILT) for height in heights]
 
 
 def _standing(body: Body, position: np.ndarray, rng: Generator) -> PlacedSolid:
@@ -198,8 +200,8 @@ class RasterView:
             objects.append(SceneObject(body.surface, T_cam_base @ pose, material, body.part))
         T_cam_table = table_pose(T_base_cam)
         lights, ambient = STYLE.lighting.draw(rng, T_cam_table[:3, 3], T_cam_table[:3, 2])
-        picture = Table().draw_image(rng, self._backgrounds, TRUE_K, SIZE, T_cam_table)
-        background = picture.seen(TRUE_K, SIZE, T_cam_table)
+        table_image = Table().draw_image(rng, self._backgrounds, TRUE_K, SIZE, T_cam_table)
+        background = table_image.seen(TRUE_K, SIZE, T_cam_table)
         plane = plane_of(T_cam_table)
         scene = Scene(TRUE_K, background, tuple(objects), lights, ambient, plane)
         return partial(self._take, scene, T_base_cam)
@@ -208,9 +210,9 @@ class RasterView:
         self, scene: Scene, T_base_first: Transform, T_base_cam: Transform, rng: Generator
     ) -> RGBImage:
         """Render the arranged scene from a camera pose, with the sensor's effects."""
-        seen = scene.seen_from(invert_transform(T_base_cam) @ T_base_first)
-        seen = seen if self._shadows else replace(seen, plane=None)
-        return capture(self._render(seen).image, self._sensors.draw(rng))
+        scene = scene.seen_from(invert_transform(T_base_cam) @ T_base_first)
+        scene = scene if self._shadows else replace(scene, plane=None)
+        return capture(self._render(scene).image, self._sensors.draw(rng))
 
 
 class MujocoView:
@@ -238,18 +240,18 @@ class MujocoView:
         model, state = self._cell.model, self._state
         for number, pose in enumerate(poses):
             self._cell.put(state, number, pose)
-        # OpenGL's cameras look along −z with y upwards.
+        # The frame of an OpenGL camera has z backwards and y upwards.
         model.cam_pos[:] = T_base_cam[:3, 3]
         model.cam_quat[:] = matrix_to_quaternion(T_base_cam[:3, :3] @ np.diag([1.0, -1.0, -1.0]))
         state.qpos[:JOINTS] = UPRIGHT
         mujoco.mj_forward(model, state)
         self._renderer.update_scene(state, camera=CAMERA)
-        picture: RGBImage = np.ascontiguousarray(self._renderer.render())
-        return capture(picture, self._sensors.draw(rng))
+        image: RGBImage = np.ascontiguousarray(self._renderer.render())
+        return capture(image, self._sensors.draw(rng))
 
 
 def table_pose(T_base_cam: Transform) -> Transform:
-    """Return T_cam_table: the bench's plane, with its origin on the camera's optical axis."""
+    """Return T_cam_table, a frame in the bench's plane with its origin on the optical axis."""
     ahead = T_base_cam[:3, 2]
     origin = T_base_cam[:3, 3] - T_base_cam[2, 3] / ahead[2] * ahead
     return np.asarray(invert_transform(T_base_cam) @ make_transform(np.eye(3), origin))

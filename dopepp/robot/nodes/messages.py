@@ -63,7 +63,7 @@ class Message:
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """A part's triangles for markers. The object is reused, so that converted points are cached."""
+    """A part's triangles for markers, whose conversion to points is cached."""
 
     corners: Float[np.ndarray, "points 3"]
 
@@ -139,7 +139,7 @@ class AnswerFormatter:
         detections = []
         for name, detection in self._frames(answer):
             cuboid, centre = self._cuboids[detection.object], detection.T_cam_obj.copy()
-            centre[:3, 3] += centre[:3, :3] @ cuboid[-1]  # the box's, not the part's origin
+            centre[:3, 3] += centre[:3, :3] @ cuboid[-1]  # the box centre, not the part's origin
             box = {"center": _pose(centre), "size": _xyz(np.ptp(cuboid, axis=0))}
             results = [_hypothesis(detection)]
             detections.append({"header": header, "results": results, "bbox": box, "id": name})
@@ -217,7 +217,7 @@ def _xyz(values: Float[np.ndarray, "3"]) -> Fields:
 
 
 def _triangles(part: Part) -> Triangles:
-    """Return a part's simplified mesh; no triangles without a mesh."""
+    """Return a part's simplified mesh, which is empty if the part has no mesh."""
     if part.mesh is None:
         return Triangles(np.zeros((0, 3)))
     vertices, faces = part.mesh.vertices, part.mesh.faces

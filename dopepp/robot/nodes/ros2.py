@@ -36,15 +36,11 @@ from dopepp.robot.nodes.messages import (
 )
 from dopepp.robot.nodes.worker import Stamp, Worker
 
-QUEUE_IN: Final = 5
-"""Shorter input queues lose images on a busy machine; longer queues start with old images."""
-
+QUEUE_IN: Final = 5  # a shorter queue loses images on a busy machine; a longer one delays them
 QUEUE_OUT: Final = 10
 WAIT_S: Final = 0.2  # seconds between two checks whether the node should stop
-PATIENCE_S: Final = 5.0  # seconds to wait for the end of an image when the node stops
-CHECKPOINTS: Final = -1.0
-"""Value of the parameter ``confidence`` that selects the checkpoint's threshold."""
-
+PATIENCE_S: Final = 5.0  # seconds to wait for the last image when the node stops
+CHECKPOINTS: Final = -1.0  # parameter ``confidence`` that selects the checkpoint's threshold
 RECENT: Final = 100  # number of images over which rates and latencies are reported
 
 logger = logging.getLogger(__name__)
@@ -168,8 +164,8 @@ class _Node:
         ]
 
     def _take_info(self, message: Any) -> None:
-        """Store the newest ``camera_info``."""
-        self._info = message  # valid until the next message
+        """Store the newest ``camera_info``, which is valid until the next message."""
+        self._info = message
 
     def _take_image(self, message: Any) -> None:
         """Pass an image with the newest ``camera_info`` to the worker's thread."""
@@ -191,7 +187,7 @@ class _Node:
         if self.slot.received:
             return
         self._silent_s += 1
-        if self._is_reliable and self._offers_less():
+        if self._is_reliable and self._is_best_effort():
             self._is_reliable = False
             logger.warning("%s is published best effort: images may be lost", self._topic)
             self._subscribe()
@@ -216,13 +212,13 @@ class _Node:
             problem = problem or f"no image on {self._topic}"
         return diagnosis(stamp, self._name, problem, values)
 
-    def _offers_less(self) -> bool:
+    def _is_best_effort(self) -> bool:
         """Return whether a publisher of the images offers best-effort delivery only."""
         from rclpy.qos import ReliabilityPolicy
 
         offers = self.handle.get_publishers_info_by_topic(self._topic)
-        lesser = ReliabilityPolicy.BEST_EFFORT
-        return any(offer.qos_profile.reliability == lesser for offer in offers)
+        best_effort = ReliabilityPolicy.BEST_EFFORT
+        return any(offer.qos_profile.reliability == best_effort for offer in offers)
 
     def _publish(self, message: Message) -> None:
         """Publish a message if its topic is advertised."""
@@ -260,7 +256,7 @@ def _ros_errors(source: str) -> Iterator[None]:
 
 
 class Slot(Generic[Item]):
-    """Passes images to a thread; a new image replaces an image that is still waiting.
+    """Passes images to a worker thread; a new image replaces an image that is still waiting.
 
     Args:
         handle: Processes an image in the thread. An exception ends the thread and is raised again

@@ -1,7 +1,7 @@
 """The node without ROS: lines of JSON on stdout or over UDP, and processing of recordings.
 
-A processed recording is an ``.mcap`` of ROS 2 with the node's topics and the images' stamps; a
-viewer opens it together with the original recording (extra ``bags``).
+The output for a recording is an ``.mcap`` of ROS 2 with the node's topics at the images' stamps. A
+viewer can open both recordings together. Recordings need the extra ``bags``.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Worker: processes the images of a node, for any transport.
 
-An invalid image or camera does not stop the node. The worker warns once, with a remedy, and
-continues with the next image.
+An invalid image or camera does not stop the node. The worker warns once about each kind of problem
+and continues with the next image.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from dopepp.inference.frames.ros import CameraInfo, decode_image, is_rectified
 from dopepp.inference.pose_result import PoseResult, elapsed_by_step, make_shape
 from dopepp.inference.tracker import PoseTracker
 
-PATIENCE: Final = 5
-"""Number of consecutive images without ``camera_info`` before the warning."""
+PATIENCE: Final = 5  # consecutive images without ``camera_info`` before the warning
 
 OPTICAL: Final = "optical"  # part of the name of a frame whose z axis points forward (REP 103)
 
@@ -66,9 +65,9 @@ class Answer:
 
     @property
     def numbers(self) -> list[int]:
-        """The number n of each pose, for its frame ``<object>_<n>``.
+        """Number n of each pose, for its TF frame ``<object>_<n>``.
 
-        Tracked parts have the identity of the track; other detections of an object are numbered by
+        The number is the identity of a track; other detections of an object are numbered by
         descending score.
         """
         if self.result.identities is not None:
@@ -149,7 +148,7 @@ class Worker:
             image = decode_image(message)
         except Exception as error:  # a message of any sender may cause any error
             fix = "configure the driver to send rgb8, bgr8 or JPEG"
-            self._reject("picture", f"an image of {topic}: {error!s:.300}; fix: {fix}")
+            self._reject("image", f"an image of {topic}: {error!s:.300}; fix: {fix}")
             return None
         try:
             lens = None if info is None else CameraInfo.from_message(info)
@@ -226,20 +225,20 @@ class Worker:
         """Return the frame of the poses; warn if the frame is not an optical frame."""
         if self._frame_id is not None:
             return self._frame_id
-        images = f"images on {topic} are in frame {frame_id!r:.80}"
-        fix = "name the camera's optical frame: --frame camera_optical_frame"
+        problem = ""
         if OPTICAL not in frame_id:
-            problem = (
-                f"{images}, which is not named as an optical frame; a pose's frame has x right, "
-            )
-            self._warn("frame", f"{problem}y down and z forward; {fix}")
+            problem = "which is not named as an optical frame; "
+            problem += "a pose's frame has x right, y down and z forward"
         elif info is not None and info.frame_id not in ("", frame_id):
-            problem = f"{images}, their camera_info in {info.frame_id!r:.80}; the images' frame"
-            self._warn("frame", f"{problem} is used; {fix}")
+            problem = f"their camera_info in {info.frame_id!r:.80}; the images' frame is used"
+        if problem:
+            images = f"images on {topic} are in frame {frame_id!r:.80}"
+            fix = "name the camera's optical frame: --frame camera_optical_frame"
+            self._warn("frame", f"{images}, {problem}; {fix}")
         return frame_id
 
     def _check_time(self, stamp: Stamp, topic: str) -> None:
-        """Warn about missing or decreasing stamps; after a decrease, restart the tracking."""
+        """Warn about missing or decreasing stamps; restart the tracking after a decrease."""
         last, self._last = self._last, stamp
         if stamp == Stamp(0, 0):
             problem = f"images on {topic} without a stamp, which TF needs: "
@@ -255,7 +254,7 @@ class Worker:
                 self._tracker = PoseTracker(self._estimator(True))
 
     def _reject(self, kind: str, problem: str) -> None:
-        """Record why an image is not processed, and warn."""
+        """Store the reason why an image is not processed, and warn."""
         self.problem = problem
         self._warn(kind, problem)
 

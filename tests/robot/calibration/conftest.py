@@ -1,4 +1,4 @@
-"""A robot, a camera and a board, with what they would report."""
+"""A simulated robot with a camera and a board, and the data that it reports."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,22 +10,22 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.geometry.camera import camera_matrix, invert_transform, make_transform
 from dopepp.geometry.camera_file import Camera
-from dopepp.robot.calibration.board import Sighting, parse_board
+from dopepp.robot.calibration.board import BoardDetection, parse_board
 
 
 @dataclass
 class Cell:
-    """What is true, and what robot and camera say."""
+    """True poses and camera of a calibration, and the reported poses and detections."""
 
     camera: Camera
     T_mount_cam: np.ndarray
     T_other_board: np.ndarray
     T_base_flange: np.ndarray
-    sightings: list[Sighting]
+    detections: list[BoardDetection]
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, roll: float) -> np.ndarray:
-    """Return T_world_cam of a camera that looks at a point."""
+    """Return T_world_cam of a camera with a point on its optical axis."""
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross(z, [0.3, 1.0, 0.1])
     x /= np.linalg.norm(x)
@@ -36,7 +36,7 @@ def look_at(eye: np.ndarray, target: np.ndarray, roll: float) -> np.ndarray:
 def make_cell(
     seed: int = 0, num: int = 20, mount: str = "hand", noise: float = 1.0, tilt: float = 0.25
 ) -> Cell:
-    """Draw a calibration: noise 1 is 0.15 px, 0.3 mm and 0.03°."""
+    """Draw a calibration; a noise of 1 is 0.15 px, 0.3 mm and 0.03°."""
     rng = np.random.default_rng(seed)
     board = parse_board("charuco:9x7:25:18")
     lens = (0.05, -0.1, 0.001, -0.001, 0.0)
@@ -44,22 +44,28 @@ def make_cell(
     X = make_transform(Rotation.random(rng=rng).as_matrix(), rng.uniform(-0.1, 0.1, 3))
     Y = make_transform(Rotation.random(rng=rng).as_matrix(), rng.uniform(-0.5, 0.5, 3))
     middle = board.points.mean(axis=0)
-    robot, sightings = [], []
+    robot, detections = [], []
     for number in range(num):
         side = np.append(rng.uniform(-tilt, tilt, 2), 0)
         eye = middle + np.array([0, 0, -1]) * rng.uniform(0.35, 0.6) + side
         T_board_cam = look_at(eye, middle + 0.02 * rng.normal(size=3), rng.uniform(-0.8, 0.8))
-        seen = invert_transform(T_board_cam)
+        T_cam_board = invert_transform(T_board_cam)
         pixels = cv2.projectPoints(
-            board.points, cv2.Rodrigues(seen[:3, :3])[0], seen[:3, 3], camera.K, camera.coefficients
+            board.points,
+            cv2.Rodrigues(T_cam_board[:3, :3])[0],
+            T_cam_board[:3, 3],
+            camera.K,
+            camera.coefficients,
         )[0][:, 0]
         M = Y @ T_board_cam @ invert_transform(X)
         M = M if mount == "hand" else invert_transform(M)
-        turn = Rotation.from_rotvec(noise * np.radians(0.03) * rng.normal(size=3)).as_matrix()
-        robot.append(make_transform(M[:3, :3] @ turn, M[:3, 3] + noise * 3e-4 * rng.normal(size=3)))
+        rotation = Rotation.from_rotvec(noise * np.radians(0.03) * rng.normal(size=3)).as_matrix()
+        robot.append(
+            make_transform(M[:3, :3] @ rotation, M[:3, 3] + noise * 3e-4 * rng.normal(size=3))
+        )
         pixels = pixels + 0.15 * noise * rng.normal(size=pixels.shape)
-        sightings.append(Sighting(f"{number:02d}.png", board.points, pixels))
-    return Cell(camera, X, Y, np.array(robot), sightings)
+        detections.append(BoardDetection(f"{number:02d}.png", board.points, pixels))
+    return Cell(camera, X, Y, np.array(robot), detections)
 
 
 @pytest.fixture(scope="session")

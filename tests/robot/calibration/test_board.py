@@ -18,32 +18,34 @@ from dopepp.robot.calibration.board import draw_view, parse_board
 BOARDS = ["charuco:8x6:20:15", "charuco:7x5:24.5:18:4X4_50", "chess:8x5:20", "circles:4x9:30"]
 
 
-@pytest.mark.parametrize("what", BOARDS)
+@pytest.mark.parametrize("spec", BOARDS)
 @pytest.mark.parametrize("roll", [0.3, 2.0, -2.6])
-def test_points_are_found_where_the_camera_has_them(what, roll, looking_at):
-    board, rng = parse_board(what), np.random.default_rng(0)
+def test_points_are_detected_where_the_camera_projects_them(spec, roll, looking_at):
+    board, rng = parse_board(spec), np.random.default_rng(0)
     camera = Camera((800, 600), camera_matrix(700, 700, 395, 310), (), "a camera")
     middle = board.points.mean(axis=0)
     T = invert_transform(looking_at(middle + np.array([0.08, -0.05, -0.3]), middle, roll))
-    seen = board.find(draw_view(board, T, camera, rng), "picture")
-    assert seen is not None
-    assert len(seen.points) > 0.8 * len(board.points)
-    errors = np.linalg.norm(project(transform(T, seen.points), camera.K) - seen.pixels, axis=1)
+    detection = board.detect(draw_view(board, T, camera, rng), "image")
+    assert detection is not None
+    assert len(detection.points) > 0.8 * len(board.points)
+    errors = np.linalg.norm(
+        project(transform(T, detection.points), camera.K) - detection.pixels, axis=1
+    )
     assert errors.max() < 0.4
     assert np.sqrt((errors**2).mean()) < 0.15
 
 
-def test_an_empty_picture_shows_no_board():
+def test_no_board_is_detected_in_an_empty_image():
     empty = np.full((240, 320, 3), 128, np.uint8)
-    assert all(parse_board(what).find(empty, "empty") is None for what in BOARDS)
+    assert all(parse_board(spec).detect(empty, "empty") is None for spec in BOARDS)
 
 
-@pytest.mark.parametrize("what", BOARDS)
-def test_a_printed_board_has_its_true_size(what, tmp_path):
-    board = parse_board(what)
-    said = board.write(tmp_path / "board.pdf")
+@pytest.mark.parametrize("spec", BOARDS)
+def test_a_printed_board_has_its_true_size(spec, tmp_path):
+    board = parse_board(spec)
+    size = board.write(tmp_path / "board.pdf")
     board.write(tmp_path / "board.png")
-    width, height = (float(group) for group in re.match(r"([\d.]+) × ([\d.]+) mm", said).groups())
+    width, height = (float(group) for group in re.match(r"([\d.]+) × ([\d.]+) mm", size).groups())
     box = re.search(rb"/MediaBox \[([^\]]*)\]", (tmp_path / "board.pdf").read_bytes())[1].split()
     assert np.allclose(
         [float(item) for item in box], [0, 0, width / 25.4 * 72, height / 25.4 * 72], atol=0.05
@@ -54,7 +56,7 @@ def test_a_printed_board_has_its_true_size(what, tmp_path):
         )
 
 
-def test_squares_of_a_printed_charuco_board_are_as_long_as_said():
+def test_squares_of_a_printed_charuco_board_have_the_stated_length():
     board = parse_board("charuco:8x6:20:15")
     page = board.drawing()
     assert page.shape == (6 * 200 + 200, 8 * 200 + 200)
@@ -64,7 +66,7 @@ def test_squares_of_a_printed_charuco_board_are_as_long_as_said():
 
 
 @pytest.mark.parametrize(
-    ("what", "said"),
+    ("spec", "message"),
     [
         ("", "charuco:COLUMNS"),
         ("charuco:8x6:20", "charuco:COLUMNS"),
@@ -80,12 +82,12 @@ def test_squares_of_a_printed_charuco_board_are_as_long_as_said():
         ("rings:8x5:20", "charuco:COLUMNS"),
     ],
 )
-def test_a_board_that_is_none_is_refused(what, said):
-    with pytest.raises(UserError, match=re.escape(said)):
-        parse_board(what)
+def test_an_impossible_board_is_rejected(spec, message):
+    with pytest.raises(UserError, match=re.escape(message)):
+        parse_board(spec)
 
 
-def test_two_boards_of_one_kind_are_refused():
+def test_two_boards_of_one_kind_are_rejected():
     board, rng = parse_board("charuco:8x6:25:19"), np.random.default_rng(0)
     camera = Camera((960, 480), camera_matrix(560, 560, 480, 240), (), "true")
     left, right = (
@@ -94,6 +96,6 @@ def test_two_boards_of_one_kind_are_refused():
     )
     both = left.copy()
     both[:, 480:] = right[:, 480:]
-    assert board.find(left, "one") is not None
+    assert board.detect(left, "one") is not None
     with pytest.raises(UserError, match="two boards"):
-        board.find(both, "two")
+        board.detect(both, "two")

@@ -9,41 +9,41 @@ from scipy.spatial.transform import Rotation
 from dopepp.core.errors import UserError
 from dopepp.robot.calibration.records import PoseFormat, match_images, read_robot_poses
 
-TURN = Rotation.from_euler("xyz", [0.3, -0.5, 1.2])
-AT = [0.4, -0.1, 0.3]
+ROTATION = Rotation.from_euler("xyz", [0.3, -0.5, 1.2])
+POSITION = [0.4, -0.1, 0.3]
 
 
 def record():
-    return {"name": "a.png", "x": AT[0], "y": AT[1], "z": AT[2]}
+    return {"name": "a.png", "x": POSITION[0], "y": POSITION[1], "z": POSITION[2]}
 
 
 RECORDS = [
-    dict(zip(("qw", "qx", "qy", "qz"), TURN.as_quat(scalar_first=True).tolist(), strict=True)),
-    dict(zip(("rx", "ry", "rz"), TURN.as_rotvec().tolist(), strict=True)),
-    dict(zip(("roll", "pitch", "yaw"), TURN.as_euler("xyz").tolist(), strict=True)),
+    dict(zip(("qw", "qx", "qy", "qz"), ROTATION.as_quat(scalar_first=True).tolist(), strict=True)),
+    dict(zip(("rx", "ry", "rz"), ROTATION.as_rotvec().tolist(), strict=True)),
+    dict(zip(("roll", "pitch", "yaw"), ROTATION.as_euler("xyz").tolist(), strict=True)),
 ]
 
 
 @pytest.mark.parametrize("rotation", RECORDS)
 @pytest.mark.parametrize("suffix", [".csv", ".json", ".yaml"])
 def test_a_pose_is_the_same_in_every_format(tmp_path, rotation, suffix):
-    path, whole = tmp_path / f"poses{suffix}", {**record(), **rotation}
+    path, fields = tmp_path / f"poses{suffix}", {**record(), **rotation}
     if suffix == ".csv":
-        text = ";".join(whole) + "\n" + ";".join(map(str, whole.values())) + "\n"
+        text = ";".join(fields) + "\n" + ";".join(map(str, fields.values())) + "\n"
     else:
-        text = (json.dumps if suffix == ".json" else yaml.safe_dump)([whole])
+        text = (json.dumps if suffix == ".json" else yaml.safe_dump)([fields])
     path.write_text(text)
     poses = read_robot_poses(path)
     T = poses.transforms(PoseFormat())[0]
     assert poses.names == ("a.png",)
-    assert np.allclose(T[:3, :3], TURN.as_matrix())
-    assert np.allclose(T[:3, 3], AT)
+    assert np.allclose(T[:3, :3], ROTATION.as_matrix())
+    assert np.allclose(T[:3, 3], POSITION)
     assert np.allclose(poses.transforms(PoseFormat(inverted=True))[0] @ T, np.eye(4))
 
 
-def test_a_matrix_stands_for_both(tmp_path):
+def test_a_matrix_replaces_position_and_rotation(tmp_path):
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = TURN.as_matrix(), AT
+    T[:3, :3], T[:3, 3] = ROTATION.as_matrix(), POSITION
     (tmp_path / "poses.json").write_text(json.dumps({"a.png": {"matrix": T.tolist()}}))
     poses = read_robot_poses(tmp_path / "poses.json")
     assert poses.names == ("a.png",)
@@ -51,7 +51,7 @@ def test_a_matrix_stands_for_both(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "said"),
+    ("name", "text", "message"),
     [
         ("p.txt", "", "a .csv, .json or .yaml file"),
         ("p.csv", "", "without a pose"),
@@ -66,20 +66,23 @@ def test_a_matrix_stands_for_both(tmp_path):
         ("p.yaml", "!!python/object/apply:os.system ['true']", "anchors and tags"),
     ],
 )
-def test_a_file_that_is_none_is_refused_in_one_line(tmp_path, name, text, said):
+def test_an_invalid_file_is_rejected_in_one_line(tmp_path, name, text, message):
     (tmp_path / name).write_text(text)
-    with pytest.raises(UserError, match=re.escape(said)) as caught:
+    with pytest.raises(UserError, match=re.escape(message)) as error:
         read_robot_poses(tmp_path / name)
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(error.value)
 
 
-def test_poses_go_with_their_pictures(tmp_path):
+def test_poses_are_paired_with_their_images(tmp_path):
     path = tmp_path / "p.csv"
     path.write_text("image,x,y,z,rx,ry,rz\nb,1,2,3,0,0,0\na,1,2,3,0,0,0\n")
-    assert match_images(read_robot_poses(path), ["a.png", "b.png", "c.png"]) == [(0, 1), (1, 0)]
+    assert match_images(read_robot_poses(path), ["a.png", "b.png", "c.png"]) == {
+        "b.png": 0,
+        "a.png": 1,
+    }
     with pytest.raises(UserError, match="the first 'b'"):
         match_images(read_robot_poses(path), ["a.png"])
     path.write_text("x,y,z,rx,ry,rz\n1,2,3,0,0,0\n")
-    assert match_images(read_robot_poses(path), ["a.png"]) == [(0, 0)]
+    assert match_images(read_robot_poses(path), ["a.png"]) == {"a.png": 0}
     with pytest.raises(UserError, match="1 poses and 2 images"):
         match_images(read_robot_poses(path), ["a.png", "b.png"])

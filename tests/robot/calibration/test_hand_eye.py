@@ -5,33 +5,33 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.robot.calibration.board import board_pose
-from dopepp.robot.calibration.hand_eye import calibrate_hand_eye, equations, park, shah
+from dopepp.robot.calibration.hand_eye import calibrate_hand_eye, park, robot_world_equations, shah
 
 
 def boards_of(cell):
-    return [board_pose(sighting, cell.camera) for sighting in cell.sightings]
+    return [board_pose(detection, cell.camera) for detection in cell.detections]
 
 
-def apart(T, other):
+def difference(T, other):
     """Return the angle in degrees and the distance in millimetres between two poses."""
-    turn = Rotation.from_matrix(T[:3, :3].T @ other[:3, :3]).magnitude()
-    return np.degrees(turn), 1000 * np.linalg.norm(T[:3, 3] - other[:3, 3])
+    angle = Rotation.from_matrix(T[:3, :3].T @ other[:3, :3]).magnitude()
+    return np.degrees(angle), 1000 * np.linalg.norm(T[:3, 3] - other[:3, 3])
 
 
 @pytest.mark.parametrize("mount", ["hand", "bench"])
 @pytest.mark.parametrize("solve", [park, shah])
 def test_closed_forms_are_exact_without_noise(cell, mount, solve):
     given = cell(4, mount=mount, noise=0)
-    M, B, _ = equations(given.T_base_flange, boards_of(given), mount)
+    M, B, _ = robot_world_equations(given.T_base_flange, boards_of(given), mount)
     X, Y = solve(M, B)
-    assert max(apart(X, given.T_mount_cam)) < 1e-3
-    assert max(apart(Y, given.T_other_board)) < 1e-3
+    assert max(difference(X, given.T_mount_cam)) < 1e-3
+    assert max(difference(Y, given.T_other_board)) < 1e-3
 
 
-@pytest.mark.skipif(not hasattr(cv2, "calibrateHandEye"), reason="this OpenCV lacks it")
-def test_park_is_that_of_opencv(cell):
+@pytest.mark.skipif(not hasattr(cv2, "calibrateHandEye"), reason="not in this OpenCV")
+def test_park_agrees_with_opencv(cell):
     given = cell(4)
-    M, B, _ = equations(given.T_base_flange, boards_of(given), "hand")
+    M, B, _ = robot_world_equations(given.T_base_flange, boards_of(given), "hand")
     R, t = cv2.calibrateHandEye(
         M[:, :3, :3], M[:, :3, 3], B[:, :3, :3], B[:, :3, 3], method=cv2.CALIB_HAND_EYE_PARK
     )
@@ -41,13 +41,13 @@ def test_park_is_that_of_opencv(cell):
 
 
 @pytest.mark.parametrize("mount", ["hand", "bench"])
-def test_the_camera_is_found_within_a_millimetre_and_its_covariance(cell, mount):
+def test_the_error_of_the_camera_is_below_a_millimetre_and_fits_its_covariance(cell, mount):
     squares = []
     for seed in range(8):
         given = cell(seed, mount=mount)
         result = calibrate_hand_eye(given.T_base_flange, boards_of(given), mount)
-        turn, shift = apart(given.T_mount_cam, result.T_mount_cam)
-        assert turn < 0.1
+        angle, shift = difference(given.T_mount_cam, result.T_mount_cam)
+        assert angle < 0.1
         assert shift < 1.0
         R = given.T_mount_cam[:3, :3]
         error = np.concatenate([
@@ -58,7 +58,7 @@ def test_the_camera_is_found_within_a_millimetre_and_its_covariance(cell, mount)
     assert 0.4 < np.mean(squares) < 2.5
 
 
-def test_poses_that_contradict_the_others_are_left_out(cell):
+def test_poses_that_contradict_the_others_are_rejected(cell):
     given = cell(5)
     given.T_base_flange[3, :3, 3] += [0.02, 0, 0]
     given.T_base_flange[11, :3, :3] = (
@@ -66,21 +66,23 @@ def test_poses_that_contradict_the_others_are_left_out(cell):
     )
     result = calibrate_hand_eye(given.T_base_flange, boards_of(given), "hand")
     assert set(np.flatnonzero(~result.inliers)) == {3, 11}
-    assert apart(given.T_mount_cam, result.T_mount_cam)[1] < 1.0
+    assert difference(given.T_mount_cam, result.T_mount_cam)[1] < 1.0
 
 
-def test_joint_refinement_is_better_than_its_start(cell):
+def test_joint_refinement_improves_its_initial_values(cell):
     closed, joint = [], []
     for seed in range(10):
         given = cell(seed)
         boards = boards_of(given)
-        M, B, _ = equations(given.T_base_flange, boards, "hand")
-        closed.append(apart(given.T_mount_cam, park(M, B)[0]))
-        joint.append(apart(given.T_mount_cam, calibrate_hand_eye(M, boards, "hand").T_mount_cam))
+        M, B, _ = robot_world_equations(given.T_base_flange, boards, "hand")
+        closed.append(difference(given.T_mount_cam, park(M, B)[0]))
+        joint.append(
+            difference(given.T_mount_cam, calibrate_hand_eye(M, boards, "hand").T_mount_cam)
+        )
     assert (np.median(joint, axis=0) < np.median(closed, axis=0)).all()
 
 
-def test_two_poses_are_refused(cell):
+def test_two_poses_are_rejected(cell):
     given = cell(0, num=2)
     with pytest.raises(UserError, match="at least 3"):
         calibrate_hand_eye(given.T_base_flange, boards_of(given), "hand")

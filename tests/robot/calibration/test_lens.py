@@ -6,30 +6,30 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera_file import read_camera
-from dopepp.robot.calibration.board import Sighting, parse_board
+from dopepp.robot.calibration.board import BoardDetection, parse_board
 from dopepp.robot.calibration.lens import MAX_VIEWS, Views, calibrate_lens, write_camera
 
 
 @pytest.fixture(scope="module")
 def views(cell):
-    """Views with the board near and far, out to the image's corners."""
+    """The camera, and views of a board that reach the corners of the image."""
     result = cell(3, num=4)
     camera, rng = result.camera, np.random.default_rng(1)
     board = parse_board("charuco:9x7:25:18")
-    sightings = []
+    detections = []
     for number in range(16):
-        turn = rng.uniform(-0.6, 0.6, 3)
+        rotation = rng.uniform(-0.6, 0.6, 3)
         shift = np.array([-0.11 + rng.uniform(-0.12, 0.12), -0.09 + rng.uniform(-0.1, 0.1), 0.33])
-        pixels = cv2.projectPoints(board.points, turn, shift, camera.K, camera.coefficients)[0]
+        pixels = cv2.projectPoints(board.points, rotation, shift, camera.K, camera.coefficients)[0]
         pixels = pixels[:, 0] + 0.1 * rng.normal(size=(len(board.points), 2))
         inside = ((pixels > 0) & (pixels < np.array(camera.size) - 1)).all(axis=1)
-        sightings.append(Sighting(f"{number}.png", board.points[inside], pixels[inside]))
-    return camera, sightings
+        detections.append(BoardDetection(f"{number}.png", board.points[inside], pixels[inside]))
+    return camera, detections
 
 
-def test_the_lens_is_found_within_its_deviations(views):
-    camera, sightings = views
-    result = calibrate_lens(sightings, camera.size)
+def test_the_errors_of_the_lens_fit_its_deviations(views):
+    camera, detections = views
+    result = calibrate_lens(detections, camera.size)
     K, true = result.camera.K, camera.K
     errors = np.array([K[0, 0] - true[0, 0], K[1, 1] - true[1, 1], *(K[:2, 2] - true[:2, 2])])
     assert (np.abs(errors) < 4 * result.deviations).all()
@@ -40,8 +40,8 @@ def test_the_lens_is_found_within_its_deviations(views):
 
 
 def test_the_file_is_read_by_every_camera_option(views, tmp_path):
-    camera, sightings = views
-    result = calibrate_lens(sightings, camera.size).camera
+    camera, detections = views
+    result = calibrate_lens(detections, camera.size).camera
     write_camera(tmp_path / "camera.yaml", result)
     again = read_camera(tmp_path / "camera.yaml")
     assert again.size == result.size
@@ -49,22 +49,23 @@ def test_the_file_is_read_by_every_camera_option(views, tmp_path):
     assert again.distortion == result.distortion
 
 
-def test_a_view_that_contradicts_the_others_is_named_and_left_out(views):
-    camera, sightings = views
+def test_a_view_that_contradicts_the_others_is_rejected_by_name(views):
+    camera, detections = views
     rng = np.random.default_rng(2)
     bent = replace(
-        sightings[5], pixels=sightings[5].pixels + 6 * rng.normal(size=sightings[5].pixels.shape)
+        detections[5], pixels=detections[5].pixels + 6 * rng.normal(size=detections[5].pixels.shape)
     )
-    result = calibrate_lens([*sightings[:5], bent, *sightings[6:]], camera.size)
+    result = calibrate_lens([*detections[:5], bent, *detections[6:]], camera.size)
     assert result.outliers == ("5.png",)
     assert abs(result.camera.K[0, 0] - camera.K[0, 0]) < 1.5
 
 
-def test_views_in_the_middle_alone_are_not_trusted(views):
-    camera, sightings = views
+def test_views_in_the_middle_only_are_not_trusted(views):
+    camera, detections = views
     wide = tuple(3 * side for side in camera.size)
     middle = [
-        replace(sighting, pixels=sighting.pixels + np.array(camera.size)) for sighting in sightings
+        replace(detection, pixels=detection.pixels + np.array(camera.size))
+        for detection in detections
     ]
     assert any("cover" in finding for finding in calibrate_lens(middle, wide).findings)
 
@@ -73,7 +74,7 @@ def test_parallel_views_are_not_trusted(views):
     camera, _ = views
     board = parse_board("charuco:9x7:25:18")
     parallel = [
-        Sighting(str(k), board.points, cv2.projectPoints(
+        BoardDetection(str(k), board.points, cv2.projectPoints(
             board.points, np.array([0.01 * k, 0, 0.2 * k]), np.array([0.03 * k - 0.2, -0.1, 0.4]),
             camera.K, camera.coefficients)[0][:, 0])
         for k in range(8)
@@ -81,7 +82,7 @@ def test_parallel_views_are_not_trusted(views):
     assert any("parallel" in finding for finding in calibrate_lens(parallel, camera.size).findings)
 
 
-def test_two_views_are_refused(views):
+def test_two_views_are_rejected(views):
     with pytest.raises(UserError, match="at least 3"):
         calibrate_lens(views[1][:2], views[0].size)
 
@@ -90,35 +91,37 @@ POINTS = parse_board("charuco:8x6:25:19").points
 
 
 def at(x, name, points=POINTS):
-    return Sighting(name, points, 1000 * points[:, :2] + [x, 0])
+    return BoardDetection(name, points, 1000 * points[:, :2] + [x, 0])
 
 
-def test_frames_that_add_nothing_give_way_to_stiller_ones():
+def test_of_similar_frames_the_frame_with_the_least_motion_is_kept():
     views = Views(1000)
-    # It comes, rests at 100, leaves, rests at 300: steps of 30, 10, 2, 30 … pixels.
+    # The board arrives, rests at 100, leaves and rests at 300: steps of 30, 10, 2, 30 … pixels.
     places = [60, 90, 100, 102, 130, 200, 260, 290, 300, 300, 310]
-    new = [views.offer(at(x, str(x))) for x in places]
+    new = [views.add(at(x, str(x))) for x in places]
     assert new == [True] + 4 * [False] + [True, True] + 4 * [False]
     assert [view.name for view in views.kept] == ["102", "200", "300"]
 
 
 def test_other_corners_of_the_board_are_another_view():
     views = Views(1000)
-    assert views.offer(at(0, "left", POINTS[:15]))
-    assert views.offer(at(0, "right", POINTS[15:]))
-    assert not views.offer(at(0, "left again", POINTS[:15]))
+    assert views.add(at(0, "left", POINTS[:15]))
+    assert views.add(at(0, "right", POINTS[15:]))
+    assert not views.add(at(0, "left again", POINTS[:15]))
 
 
-def test_there_are_never_too_many():
+def test_the_number_of_views_is_limited():
     views = Views(1000)
     for number in range(MAX_VIEWS):
         assert not views.is_full
-        views.offer(at(50 * number, str(number)))
+        views.add(at(50 * number, str(number)))
     assert views.is_full
 
 
-def test_turned_boards_differ():
+def test_a_rotated_board_is_another_view():
     views = Views(1000)
-    turned = Sighting("turned", POINTS, 1000 * POINTS[:, :2] @ np.array([[0.0, 1], [-1, 0]]))
-    assert views.offer(at(0, "straight"))
-    assert views.offer(turned)
+    rotated = BoardDetection(
+        "rotated", POINTS, 1000 * POINTS[:, :2] @ np.array([[0.0, 1], [-1, 0]])
+    )
+    assert views.add(at(0, "straight"))
+    assert views.add(rotated)

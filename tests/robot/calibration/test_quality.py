@@ -1,4 +1,4 @@
-"""Twenty ways in which robot poses are wrong, each recognised; what a calibration is worth."""
+"""Faults of robot poses, each recognised, and the quality of a hand-eye calibration."""
 
 import csv
 import re
@@ -31,15 +31,15 @@ def write(path, T, kind="quaternion", unit=1.0, degrees=False, xyzw=False):
     return path
 
 
-def judge(given, path, reading, mount):
-    boards = [board_pose(one, given.camera) for one in given.sightings]
+def check(given, path, pose_format, mount):
+    boards = [board_pose(detection, given.camera) for detection in given.detections]
     poses = read_robot_poses(path)
-    return check_poses(poses, range(len(boards)), reading, boards, mount)
+    return check_poses(poses, range(len(boards)), pose_format, boards, mount)
 
 
 @pytest.mark.parametrize("mount", ["hand", "bench"])
 @pytest.mark.parametrize(
-    ("how", "reading"),
+    ("style", "pose_format"),
     [
         ({}, PoseFormat()),
         ({"kind": "rotvec"}, PoseFormat()),
@@ -48,14 +48,15 @@ def judge(given, path, reading, mount):
         ({"xyzw": True}, PoseFormat(order="xyzw")),
     ],
 )
-def test_poses_that_are_read_as_they_are_meant_pass(cell, tmp_path, mount, how, reading):
+def test_poses_under_the_right_convention_pass(cell, tmp_path, mount, style, pose_format):
     given = cell(1, mount=mount)
-    found = judge(given, write(tmp_path / "poses.csv", given.T_base_flange, **how), reading, mount)
-    assert np.allclose(found, given.T_base_flange, atol=1e-9)
+    path = write(tmp_path / "poses.csv", given.T_base_flange, **style)
+    flanges = check(given, path, pose_format, mount)
+    assert np.allclose(flanges, given.T_base_flange, atol=1e-9)
 
 
 FAULTS = [
-    # what is written, how it is read, mounting said, what the message says
+    # style of the file, convention under which it is read, mount, message
     ({"unit": 1e-3}, PoseFormat(), "hand", "--unit mm"),
     ({"unit": 1e-2}, PoseFormat(), "bench", "--unit cm"),
     ({"unit": 0.0254}, PoseFormat("mm"), "hand", "--unit inch"),
@@ -73,28 +74,26 @@ FAULTS = [
 ]
 
 
-@pytest.mark.parametrize(("how", "reading", "mount", "said"), FAULTS)
-def test_poses_that_are_read_wrongly_are_recognised(cell, tmp_path, how, reading, mount, said):
+@pytest.mark.parametrize(("style", "pose_format", "mount", "message"), FAULTS)
+def test_a_wrong_convention_is_recognised(cell, tmp_path, style, pose_format, mount, message):
     given = cell(2, mount=mount)
-    path = write(tmp_path / "poses.csv", given.T_base_flange, **how)
-    with pytest.raises(UserError, match=re.escape(said)):
-        judge(given, path, reading, mount)
-
-
-def same(given):
-    pass
+    path = write(tmp_path / "poses.csv", given.T_base_flange, **style)
+    with pytest.raises(UserError, match=re.escape(message)):
+        check(given, path, pose_format, mount)
 
 
 def on_a_larger_board(given):
-    given.sightings = [replace(one, points=one.points * 0.8) for one in given.sightings]
+    given.detections = [
+        replace(detection, points=detection.points * 0.8) for detection in given.detections
+    ]
 
 
 def standing_still(given):
     given.T_base_flange[:] = given.T_base_flange[0]
 
 
-def one_picture(given):
-    given.sightings = given.sightings[:1] * 20
+def one_image(given):
+    given.detections = given.detections[:1] * 20
 
 
 def one_late(given):
@@ -106,69 +105,67 @@ def one_early(given):
 
 
 @pytest.mark.parametrize(
-    ("spoil", "mount", "said"),
+    ("change", "mount", "message"),
     [
-        (same, "bench", "camera on the other mount"),
+        (lambda _: None, "bench", "camera on the other mount"),
         (on_a_larger_board, "hand", r"squares \(they may be 1\.2\d+ times"),
         (standing_still, "hand", "the robot rotates by 0"),
-        (one_picture, "hand", "the board, seen by the camera, rotates by 0"),
+        (one_image, "hand", "the board, seen by the camera, rotates by 0"),
         (one_late, "hand", "poses fit the"),
         (one_early, "hand", "poses fit the"),
     ],
 )
-def test_poses_that_are_not_those_of_the_pictures_are_recognised(
-    cell, tmp_path, spoil, mount, said
-):
+def test_poses_that_contradict_the_images_are_recognised(cell, tmp_path, change, mount, message):
     given = cell(2)
-    spoil(given)
+    change(given)
     path = write(tmp_path / "poses.csv", given.T_base_flange)
-    with pytest.raises(UserError, match=said):
-        judge(given, path, PoseFormat(), mount)
+    with pytest.raises(UserError, match=message):
+        check(given, path, PoseFormat(), mount)
 
 
-def test_poses_of_another_day_are_refused(cell, tmp_path):
+def test_poses_of_another_calibration_are_rejected(cell, tmp_path):
     path = write(tmp_path / "poses.csv", cell(9).T_base_flange)
     with pytest.raises(UserError, match="medians over"):
-        judge(cell(2), path, PoseFormat(), "hand")
+        check(cell(2), path, PoseFormat(), "hand")
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_good_poses_with_two_outliers_raise_no_alarm(cell, tmp_path, seed):
+def test_good_poses_with_two_outliers_pass(cell, tmp_path, seed):
     given = cell(seed)
     given.T_base_flange[:2, :3, 3] += 0.03
-    judge(given, write(tmp_path / "poses.csv", given.T_base_flange), PoseFormat(), "hand")
+    check(given, write(tmp_path / "poses.csv", given.T_base_flange), PoseFormat(), "hand")
 
 
-def test_an_explanation_names_the_pose_that_matters_and_trusts_a_good_calibration(cell):
+def test_leave_one_out_finds_the_pose_with_the_largest_influence(cell):
     given = cell(6)
-    boards = [board_pose(one, given.camera) for one in given.sightings]
-    found = calibrate_hand_eye(given.T_base_flange, boards, "hand")
-    worth = assess(given.T_base_flange, boards, found)
-    assert not worth.findings
-    assert worth.shift < 0.001
-    one = int(worth.leave_one_out.argmax())
-    rest = [k for k in range(len(boards)) if k != one]
+    boards = [board_pose(detection, given.camera) for detection in given.detections]
+    calibration = calibrate_hand_eye(given.T_base_flange, boards, "hand")
+    quality = assess(given.T_base_flange, boards, calibration)
+    assert not quality.findings
+    assert quality.shift < 0.001
+    worst = int(quality.leave_one_out.argmax())
+    rest = [k for k in range(len(boards)) if k != worst]
     without = calibrate_hand_eye(given.T_base_flange[rest], [boards[k] for k in rest], "hand")
-    moved = np.linalg.norm(without.T_mount_cam[:3, 3] - found.T_mount_cam[:3, 3])
-    assert worth.leave_one_out[one] == pytest.approx(moved, rel=0.5)
+    moved = np.linalg.norm(without.T_mount_cam[:3, 3] - calibration.T_mount_cam[:3, 3])
+    assert quality.leave_one_out[worst] == pytest.approx(moved, rel=0.5)
 
 
-def test_turns_about_one_axis_are_not_trusted(cell):
-    given = cell(7, tilt=0.01)  # straight from above, turned about the optical axis only
-    boards = [board_pose(one, given.camera) for one in given.sightings]
-    found = calibrate_hand_eye(given.T_base_flange, boards, "hand")
-    worth = assess(given.T_base_flange, boards, found)
-    assert any("nearly parallel axes only" in one for one in worth.findings)
+def test_rotations_about_a_single_axis_are_not_trusted(cell):
+    given = cell(7, tilt=0.01)  # from straight above, rotated about the optical axis only
+    boards = [board_pose(detection, given.camera) for detection in given.detections]
+    calibration = calibrate_hand_eye(given.T_base_flange, boards, "hand")
+    quality = assess(given.T_base_flange, boards, calibration)
+    assert any("nearly parallel axes only" in finding for finding in quality.findings)
     optical = given.T_mount_cam[:3, 2]
-    assert abs(worth.weakest @ optical) > 0.9
+    assert abs(quality.weakest @ optical) > 0.9
 
 
-def test_expected_error_is_that_of_drawn_calibrations():
+def test_the_expected_error_agrees_with_drawn_calibrations():
     rng = np.random.default_rng(0)
     root = 1e-3 * rng.normal(size=(6, 6))
     steps = rng.normal(size=(20000, 6)) @ root.T
     point = np.array([0, 0, 0.5])
     moved = np.cross(steps[:, :3], point) + steps[:, 3:]
-    shift, turn = expected_error(root @ root.T, 0.5)
+    shift, rotation = expected_error(root @ root.T, 0.5)
     assert shift == pytest.approx(np.sqrt((moved**2).sum(axis=1).mean()), rel=0.03)
-    assert turn == pytest.approx(np.sqrt((steps[:, :3] ** 2).sum(axis=1).mean()), rel=0.03)
+    assert rotation == pytest.approx(np.sqrt((steps[:, :3] ** 2).sum(axis=1).mean()), rel=0.03)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import camera_matrix, invert_transform, make_transform
 from dopepp.geometry.camera_file import Camera
-from dopepp.robot.calibration.board import Sighting, parse_board
+from dopepp.robot.calibration.board import BoardDetection, parse_board
 from dopepp.robot.calibration.rig import calibrate_rig
 from tests.robot.calibration.conftest import look_at
 
@@ -29,32 +29,32 @@ POSES = {
 }
 
 
-def rig_pictures(seed=0, moments=8, names=tuple(POSES)):
-    """Return the sightings of a board at random poses, in the cameras' images."""
+def draw_detections(seed=0, moments=8, names=tuple(POSES)):
+    """Return the detections of a board at random poses, in the cameras' images."""
     rng = np.random.default_rng(seed)
     boards = {name: {} for name in names}
     for moment in range(moments):
-        turn = Rotation.from_rotvec(rng.uniform(-0.4, 0.4, 3)).as_matrix()
-        position = CENTRE + rng.uniform(-0.05, 0.05, 3) - turn @ BOARD.points.mean(axis=0)
-        T_world_board = make_transform(turn, position)
+        rotation = Rotation.from_rotvec(rng.uniform(-0.4, 0.4, 3)).as_matrix()
+        position = CENTRE + rng.uniform(-0.05, 0.05, 3) - rotation @ BOARD.points.mean(axis=0)
+        T_world_board = make_transform(rotation, position)
         for name in names:
             T, lens = invert_transform(POSES[name]) @ T_world_board, LENSES[name]
-            turning, shift = cv2.Rodrigues(T[:3, :3])[0], T[:3, 3]
-            given = turning, shift, lens.K, lens.coefficients
-            pixels = cv2.projectPoints(BOARD.points, *given)[0][:, 0]
+            rotation_vector, shift = cv2.Rodrigues(T[:3, :3])[0], T[:3, 3]
+            parameters = rotation_vector, shift, lens.K, lens.coefficients
+            pixels = cv2.projectPoints(BOARD.points, *parameters)[0][:, 0]
             pixels = pixels + rng.normal(0, NOISE, pixels.shape)
-            boards[name][f"{moment}.png"] = Sighting(f"{moment}.png", BOARD.points, pixels)
+            boards[name][f"{moment}.png"] = BoardDetection(f"{moment}.png", BOARD.points, pixels)
     return boards
 
 
 def step(T, true):
     """Return the rotation about the camera's centre and the shift between two poses."""
-    turn = Rotation.from_matrix(T[:3, :3] @ true[:3, :3].T).as_rotvec()
-    return np.concatenate([turn, T[:3, 3] - true[:3, 3]])
+    rotation = Rotation.from_matrix(T[:3, :3] @ true[:3, :3].T).as_rotvec()
+    return np.concatenate([rotation, T[:3, 3] - true[:3, 3]])
 
 
-def test_cameras_are_where_they_truly_are():
-    rig = calibrate_rig(rig_pictures(), LENSES)
+def test_the_poses_of_the_cameras_are_estimated():
+    rig = calibrate_rig(draw_detections(), LENSES)
     assert rig.names == tuple(POSES)
     assert (rig.outliers, rig.findings, rig.shared) == ((), (), (8, 8, 8))
     np.testing.assert_array_equal(rig.T_world_cam[0], np.eye(4))
@@ -67,7 +67,7 @@ def test_cameras_are_where_they_truly_are():
 def test_stated_deviations_are_those_of_repeated_calibrations():
     squares = []
     for seed in range(8):
-        rig = calibrate_rig(rig_pictures(seed, moments=5), LENSES)
+        rig = calibrate_rig(draw_detections(seed, moments=5), LENSES)
         for number, true in list(enumerate(POSES.values()))[1:]:
             error = step(rig.T_world_cam[number], true)
             squares.append(error @ np.linalg.solve(rig.covariances[number], error) / 6)
@@ -76,43 +76,43 @@ def test_stated_deviations_are_those_of_repeated_calibrations():
 
 
 def test_a_camera_is_linked_through_another():
-    boards = rig_pictures(moments=12)
+    boards = draw_detections(moments=12)
     boards["left"] = dict(list(boards["left"].items())[:6])
     boards["top"] = dict(list(boards["top"].items())[6:])  # never together with the left camera
     rig = calibrate_rig(boards, LENSES)
     assert rig.shared == (6, 12, 6)
     assert np.linalg.norm(rig.T_world_cam[2][:3, 3] - POSES["top"][:3, 3]) < 1e-3
-    direct = calibrate_rig(rig_pictures(moments=6), LENSES)
+    direct = calibrate_rig(draw_detections(moments=6), LENSES)
     assert rig.deviations[2, 0] > 1.2 * direct.deviations[2, 0]
 
 
 def test_a_camera_that_never_shares_the_board_is_named():
-    boards = rig_pictures()
+    boards = draw_detections()
     boards["top"] = {f"other {name}": seen for name, seen in boards["top"].items()}
     with pytest.raises(UserError, match="top without an image of the board together with left"):
         calibrate_rig(boards, LENSES)
 
 
-def test_a_board_that_moved_between_the_pictures_of_a_moment_is_left_out():
-    boards = rig_pictures()
+def test_a_moment_with_a_moved_board_is_rejected():
+    boards = draw_detections()
     boards["right"]["3.png"] = boards["right"]["4.png"]
     rig = calibrate_rig(boards, LENSES)
     assert rig.outliers == ("3.png",)
     assert np.linalg.norm(rig.T_world_cam[1][:3, 3] - POSES["right"][:3, 3]) < 1e-3
 
 
-def test_pictures_of_other_moments_and_few_pictures_are_findings():
-    boards = rig_pictures()
+def test_images_of_other_moments_and_few_images_are_findings():
+    boards = draw_detections()
     names = list(boards["right"])
     boards["right"] = dict(zip(names, np.roll(list(boards["right"].values()), 1), strict=True))
     assert "same moment" in calibrate_rig(boards, LENSES).findings[-1]
-    few = calibrate_rig(rig_pictures(moments=3, names=("left", "top")), LENSES)
+    few = calibrate_rig(draw_detections(moments=3, names=("left", "top")), LENSES)
     assert [finding.split()[0] for finding in few.findings] == ["left", "top"]
 
 
 def test_a_wrong_focal_length_is_a_finding():
     wrong = LENSES | {"right": replace(LENSES["right"], K=camera_matrix(1400, 1400, 640, 360))}
-    assert "right" in calibrate_rig(rig_pictures(), wrong).findings[0]
+    assert "right" in calibrate_rig(draw_detections(), wrong).findings[0]
 
 
 @pytest.mark.parametrize("count", [1, 9])

@@ -27,7 +27,7 @@ def test_the_tip_is_exact_without_noise(seed, num):
     assert np.allclose(tip.position, TIP, atol=1e-9)
 
 
-def test_the_tip_is_found_within_its_deviations():
+def test_the_error_of_the_tip_fits_its_deviations():
     squares = []
     for seed in range(40):
         tilts = Rotation.from_euler("xyz", np.random.default_rng(seed).uniform(-0.7, 0.7, (8, 3)))
@@ -38,12 +38,12 @@ def test_the_tip_is_found_within_its_deviations():
     assert 0.6 < np.mean(squares) < 1.7
 
 
-def test_turns_about_one_axis_leave_it_open():
+def test_rotations_about_one_axis_do_not_determine_the_tip():
     tip = find_tip(touching(Rotation.from_rotvec(np.outer(np.linspace(0, 2, 6), [0, 0, 1])), 1e-4))
     assert "z axis" in tip.findings[0]
 
 
-def test_a_touch_beside_the_point_is_named():
+def test_a_touch_beside_the_point_is_a_finding():
     poses = touching(
         Rotation.from_euler("xyz", np.random.default_rng(1).uniform(-0.7, 0.7, (9, 3)))
     )
@@ -51,12 +51,12 @@ def test_a_touch_beside_the_point_is_named():
     assert any("pose 5" in finding for finding in find_tip(poses).findings)
 
 
-def test_three_touches_are_refused():
+def test_three_touches_are_rejected():
     with pytest.raises(UserError, match="at least 4"):
         find_tip(touching(Rotation.random(3, rng=np.random.default_rng(0))))
 
 
-def test_a_bench_is_found_with_its_frame():
+def test_a_bench_is_estimated_with_its_frame():
     rng = np.random.default_rng(0)
     T = make_transform(
         Rotation.from_euler("xyz", [3, -4, 60], degrees=True).as_matrix(), [0.5, 0.1, -0.02]
@@ -70,29 +70,29 @@ def test_a_bench_is_found_with_its_frame():
 
 
 @pytest.mark.parametrize(
-    ("points", "said"),
+    ("points", "message"),
     [(np.zeros((2, 3)), "at least 3"), (np.outer(np.arange(4), [1.0, 2, 0]), "along a line")],
 )
-def test_points_that_are_no_plane_are_refused(points, said):
-    with pytest.raises(UserError, match=said):
+def test_points_that_determine_no_plane_are_rejected(points, message):
+    with pytest.raises(UserError, match=message):
         find_bench(points)
 
 
-def test_a_point_off_the_plane_is_named():
+def test_a_point_off_the_plane_is_a_finding():
     points = np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0], [0.3, 0.3, 0], [0.15, 0.15, 0.02]])
     assert any("point 5" in finding for finding in find_bench(points).findings)
 
 
-def test_a_bench_is_found_under_a_board():
+def test_a_bench_is_estimated_from_a_board():
     board, rng = parse_board("charuco:8x6:25:19"), np.random.default_rng(0)
     T = make_transform(Rotation.from_euler("xyz", [184, 3, 40], degrees=True).as_matrix(), PIVOT)
-    seen = [make_transform(T[:3, :3], T[:3, 3] + 2e-4 * rng.normal(size=3)) for _ in range(5)]
-    result = bench_of_board(seen, board)
+    poses = [make_transform(T[:3, :3], T[:3, 3] + 2e-4 * rng.normal(size=3)) for _ in range(5)]
+    result = bench_of_board(poses, board)
     assert not result.findings
-    # The board's z goes into the bench.
+    # The z axis of the board points into the bench.
     flipped = make_transform(T[:3, :3] @ np.diag([1.0, -1, -1]), T[:3, 3])
     assert np.allclose(result.T_base_bench, flipped, atol=5e-4)
     assert np.abs(result.residuals).max() < 1e-3
-    seen[3] = make_transform(T[:3, :3], T[:3, 3] + [0, 0, 0.01])
-    assert any("image 4" in finding for finding in bench_of_board(seen, board).findings)
-    assert "cannot be verified" in bench_of_board(seen[:1], board).findings[0]
+    poses[3] = make_transform(T[:3, :3], T[:3, 3] + [0, 0, 0.01])
+    assert any("image 4" in finding for finding in bench_of_board(poses, board).findings)
+    assert "cannot be verified" in bench_of_board(poses[:1], board).findings[0]

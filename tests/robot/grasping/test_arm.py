@@ -1,4 +1,4 @@
-"""Kinematics beside Denavit and Hartenberg's, and the gripper beside its data sheet."""
+"""Kinematics against Denavit and Hartenberg's, and the gripper against its data sheet."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from dopepp.geometry.camera import make_transform
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.robot.grasping.cell import HOME, TRAY
 
-# a, d and α of a UR5e as Menagerie's model has it, metres and radians.
+# a, d and α of Menagerie's model of a UR5e, metres and radians.
 DH = (
     (0.0, 0.163, np.pi / 2), (-0.425, 0.0, 0.0), (-0.392, 0.0, 0.0),
     (0.0, 0.134, np.pi / 2), (0.0, 0.1, -np.pi / 2), (0.0, 0.1, 0.0),
@@ -30,7 +30,7 @@ def denavit_hartenberg(joints):
 
 @settings(max_examples=30)
 @given(angles)
-def test_the_flange_is_where_the_closed_form_has_it(arm, joints):
+def test_the_flange_agrees_with_the_closed_form(arm, joints):
     ours, theirs = arm.flange(np.array(joints)), denavit_hartenberg(joints)
     np.testing.assert_allclose(ours[:3, 3], theirs[:3, 3], atol=2e-4)
     np.testing.assert_allclose(ours[:3, 2], theirs[:3, 2], atol=1e-3)
@@ -38,10 +38,10 @@ def test_the_flange_is_where_the_closed_form_has_it(arm, joints):
 
 @settings(max_examples=30)
 @given(st.tuples(*[st.floats(-0.1, 0.1)] * 2, st.floats(0.18, 0.4), st.floats(-1.5, 1.5)))
-def test_joints_take_the_flange_to_a_pose_over_the_tray(arm, place):
-    x, y, z, yaw = place
-    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
-    goal = make_transform(turn @ np.diag([1.0, -1.0, -1.0]), TRAY + np.array([x, y, z]))
+def test_inverse_kinematics_reaches_poses_over_the_tray(arm, position):
+    x, y, z, yaw = position
+    rotation = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    goal = make_transform(rotation @ np.diag([1.0, -1.0, -1.0]), TRAY + np.array([x, y, z]))
     joints = arm.joints(goal, HOME)
     assert joints is not None
     reached = arm.flange(joints)
@@ -49,13 +49,13 @@ def test_joints_take_the_flange_to_a_pose_over_the_tray(arm, place):
     assert rotation_angle(reached[:3, :3].T @ goal[:3, :3]) < 2e-3
 
 
-@pytest.mark.parametrize("place", [[1.5, 0.0, 0.3], [0.0, 0.0, 3.0]])
-def test_a_pose_out_of_reach_has_no_joints(arm, straight_down, place):
-    straight_down[:3, 3] = place
+@pytest.mark.parametrize("position", [[1.5, 0.0, 0.3], [0.0, 0.0, 3.0]])
+def test_a_pose_out_of_reach_has_no_joints(arm, straight_down, position):
+    straight_down[:3, 3] = position
     assert arm.joints(straight_down) is None
 
 
-def test_the_gripper_opens_as_its_data_sheet_says(gripper):
+def test_the_gripper_agrees_with_its_data_sheet(gripper):
     assert gripper.widest == pytest.approx(0.085, abs=0.001)
     assert abs(gripper.widths[-1]) < 0.001
     assert (np.diff(gripper.widths) < 0).all()

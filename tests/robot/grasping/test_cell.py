@@ -1,4 +1,4 @@
-"""The cell: convex pieces that fill a part, poses that are put and read, layouts, images."""
+"""The cell: convex pieces of a part, poses of solids, layouts and images."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ from dopepp.geometry.camera import (
 from dopepp.parts.catalogue import BUILTIN, load_part
 from dopepp.parts.convex import convex_pieces
 from dopepp.robot.grasping.cell import TRAY, Cell, Solid
-from dopepp.robot.grasping.rehearsal import SIZE, TRUE_K, looking_at
+from dopepp.robot.grasping.rehearsal import SIZE, TRUE_K, downward_view
 from dopepp.robot.grasping.workbench import HEAP, LAYOUTS, SPREAD, Layout, RasterView
 
 
@@ -39,11 +39,11 @@ def test_a_part_without_a_mesh_has_no_pieces(part):
         convex_pieces(replace(part, mesh=None))
 
 
-def test_a_thing_is_where_it_was_put(part):
+def test_a_solid_has_the_pose_at_which_it_was_placed(part):
     cell = Cell([Solid(convex_pieces(part))] * 2)
     state = cell.data()
-    turn = Rotation.random(rng=np.random.default_rng(0)).as_matrix()
-    T = make_transform(turn, np.array([0.1, 0.2, 0.3]))
+    rotation = Rotation.random(rng=np.random.default_rng(0)).as_matrix()
+    T = make_transform(rotation, np.array([0.1, 0.2, 0.3]))
     cell.put(state, 1, T)
     mujoco.mj_forward(cell.model, state)
     np.testing.assert_allclose(cell.pose(state, 1), T, atol=1e-9)
@@ -51,7 +51,7 @@ def test_a_thing_is_where_it_was_put(part):
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_layouts_lie_on_the_bench_and_repeat_with_their_seed(part, name):
+def test_layouts_lie_on_the_bench_and_depend_on_the_seed_alone(part, name):
     layout = Layout(part, name, yaw_deg=180.0, rest="any")
     for seed in range(5):
         lying, again = (layout.draw(np.random.default_rng(seed)) for _ in range(2))
@@ -73,11 +73,11 @@ def test_distractors_keep_clear_of_the_part(part):
         middle = (first.T_base_obj @ [*part.cuboid[-1], 1.0])[:2]
         assert np.linalg.norm(middle - TRAY[:2]) <= SPREAD + 1e-9
         for item in others:
-            apart = np.linalg.norm(item.T_base_obj[:2, 3] - first.T_base_obj[:2, 3])
-            assert apart > part.diameter / 2
+            distance = np.linalg.norm(item.T_base_obj[:2, 3] - first.T_base_obj[:2, 3])
+            assert distance > part.diameter / 2
 
 
-def test_a_part_that_lies_on_its_front_looks_up_and_turns_within_its_yaw(part):
+def test_the_front_of_a_part_points_up_and_its_yaw_is_limited(part):
     layout = Layout(part, "single", yaw_deg=20.0, rest="front")
     for seed in range(20):
         T = layout.draw_pose(np.random.default_rng(seed))
@@ -86,7 +86,7 @@ def test_a_part_that_lies_on_its_front_looks_up_and_turns_within_its_yaw(part):
 
 
 @pytest.mark.parametrize("shadows", [False, True])
-def test_a_picture_shows_the_part_and_repeats_with_its_seed(trials, scene, shadows):
+def test_an_image_shows_the_part_and_depends_on_the_seed_alone(trials, scene, shadows):
     view, bodies = RasterView(shadows), [item.body for item in scene.placed]
 
     def take(poses):
@@ -103,10 +103,10 @@ def test_a_picture_shows_the_part_and_repeats_with_its_seed(trials, scene, shado
 
 
 @pytest.mark.parametrize("shadows", [False, True])
-def test_a_second_camera_shows_the_part_at_its_place(trials, scene, shadows):
+def test_a_second_camera_shows_the_part_at_its_projection(trials, scene, shadows):
     view, bodies = RasterView(shadows), [item.body for item in scene.placed]
     middle = transform(scene.poses[0], trials.part.cuboid[-1])
-    T_base_cam = looking_at(
+    T_base_cam = downward_view(
         middle + np.array([0.03, 0.02, 0.0]), 0.2, np.radians([20.0, -15.0]), 0.3
     )
     away = [make_transform(np.eye(3), [5.0, 5.0, 0.0])]

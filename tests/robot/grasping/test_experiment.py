@@ -1,4 +1,4 @@
-"""Trials are shared out, and the report counts them as Table 9 does."""
+"""Trials run in several processes, and the report counts them as Table 9 does."""
 
 import csv
 import json
@@ -29,14 +29,16 @@ def record(number, *, recognised=True, caught=True, failure="", source="network"
 
 @pytest.fixture
 def records():
-    """As many as the paper's first 50 and a few more, out of order."""
-    made = [record(k) for k in range(47)]
-    made += [record(k, caught=False, failure="slipped") for k in (47, 48)]
-    made.append(record(49, recognised=False, caught=False, failure="not seen"))
-    made += [record(k, caught=k != 52, failure="no plan" if k == 52 else "") for k in range(50, 54)]
-    made += [record(k, source="exact poses") for k in range(54)]
-    made += [record(k, source="exact poses, off", off=3.0, caught=k < 27) for k in range(54)]
-    return made[::-1]
+    """Records like the paper's first 50 and a few more, in reverse order."""
+    records = [record(k) for k in range(47)]
+    records += [record(k, caught=False, failure="slipped") for k in (47, 48)]
+    records.append(record(49, recognised=False, caught=False, failure="not seen"))
+    records += [
+        record(k, caught=k != 52, failure="no plan" if k == 52 else "") for k in range(50, 54)
+    ]
+    records += [record(k, source="exact poses") for k in range(54)]
+    records += [record(k, source="exact poses, off", off=3.0, caught=k < 27) for k in range(54)]
+    return records[::-1]
 
 
 def test_recognised_and_caught_are_counted_per_50(records):
@@ -71,7 +73,7 @@ TASK = GraspTask(sources=(PoseSource("exact"),))
 
 
 @pytest.mark.slow
-def test_two_processes_make_the_trials_of_one(trials):
+def test_two_processes_and_one_process_run_equal_trials(trials):
     source = TASK.sources[0]
     expected = [trials.attempt(trials.scene(number), source).record for number in (0, 1)]
     records = sorted(run_trials(TASK, 2, workers=2), key=lambda record: record.number)
@@ -92,7 +94,7 @@ def test_a_lost_process_ends_the_experiment_in_one_line(monkeypatch):
         list(run_trials(TASK, 2, workers=2))
 
 
-def test_sources_are_named_once_each_and_a_curve_is_many():
+def test_equal_sources_are_used_once_and_a_curve_is_many_sources():
     assert parse_sources("exact, exact,random") == (PoseSource("exact"), PoseSource("random"))
     names = [source.name for source in parse_sources("curve")]
     assert names[0] == "exact poses, off by 1 mm and 1°"
@@ -101,6 +103,6 @@ def test_sources_are_named_once_each_and_a_curve_is_many():
         parse_sources("exact,truth")
 
 
-def test_a_network_is_dropped_where_no_source_needs_it():
+def test_a_network_is_omitted_if_no_source_needs_it():
     assert check_task(replace(TASK, network="net.ckpt"), "exact", 1).network is None
     assert check_task(replace(TASK, network="net.ckpt"), "network,exact", 1).network == "net.ckpt"

@@ -1,4 +1,4 @@
-"""Proposed grasps lie on opposite walls, come from above and leave the fingers room."""
+"""Proposed grasps lie on opposite walls, within the gripper's opening."""
 
 import numpy as np
 import pytest
@@ -32,14 +32,14 @@ def test_both_contacts_lie_on_the_surface_of_a_ring():
     for grasp in propose_grasps(part_of(solid), 16):
         contacts = grasp.point + np.outer((-0.5, 0.5), grasp.width * grasp.closing)
         radius, height = np.hypot(*contacts[:, :2].T), np.abs(contacts[:, 2])
-        # Of each, its distance from the two cylinders and from the two flat sides.
+        # Distance of each contact from the two cylinders and from the two flat sides.
         away = np.abs([radius - inner, radius - outer, height - 0.01]).min(axis=0)
         assert away.max() < 1e-4
         assert (height < 0.0101).all()
         assert ((radius > inner - 1e-4) & (radius < outer + 1e-4)).all()
 
 
-def test_it_is_the_same_for_the_same_seed():
+def test_equal_seeds_propose_equal_grasps():
     part = part_of(trimesh.creation.box((0.06, 0.03, 0.02)))
     first, second = (propose_grasps(part, 6, seed=3) for _ in range(2))
     assert [grasp.point.tolist() for grasp in first] == [grasp.point.tolist() for grasp in second]
@@ -50,6 +50,6 @@ def test_it_is_the_same_for_the_same_seed():
     [trimesh.creation.box((0.2, 0.2, 0.2)), trimesh.creation.icosphere(radius=0.06)],
     ids=["wide box", "wide ball"],
 )
-def test_what_is_wider_than_the_gripper_has_no_grasp(solid):
+def test_a_part_wider_than_the_gripper_has_no_grasp(solid):
     with pytest.raises(UserError, match="on which no grasp was found"):
         propose_grasps(part_of(solid), 5)

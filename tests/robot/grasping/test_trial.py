@@ -1,4 +1,4 @@
-"""Trials: plans keep clear of what is believed, physics decides, and seeds repeat them."""
+"""Trials: plans avoid estimated parts, the simulation decides, and equal seeds repeat a trial."""
 
 from copy import copy
 from dataclasses import replace
@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.geometry.camera import make_transform
 from dopepp.robot.grasping.cell import HOME, STEP, TRAY
-from dopepp.robot.grasping.execution import SPEED, Execution, _timed
+from dopepp.robot.grasping.execution import SPEED, Execution, _sample_path
 from dopepp.robot.grasping.grasp_trial import PoseSource, SceneObservation, Trials
 from dopepp.robot.grasping.grasps import Grasp
-from dopepp.robot.grasping.planner import laid_flat
+from dopepp.robot.grasping.planner import align_with_bench
 
 
 @pytest.fixture
@@ -26,13 +26,13 @@ def test_a_part_at_a_known_pose_is_caught(trials, scene):
     assert attempt.record.caught
     assert attempt.record.recognised
     assert (attempt.record.failure, attempt.record.add_mm) == ("", 0)
-    # It hangs in the air at the end, and lay on the bench before.
+    # At the end, the part hangs above its initial position on the bench.
     states = attempt.outcome.states
     assert states[-1][-5] > states[0][-5] + 0.1
 
 
-def test_a_part_that_is_elsewhere_is_not_caught(trials, scene, monkeypatch):
-    aside = [one @ make_transform(np.eye(3), [0.0, 0.05, 0.0]) for one in scene.targets]
+def test_a_part_at_another_pose_is_not_caught(trials, scene, monkeypatch):
+    aside = [pose @ make_transform(np.eye(3), [0.0, 0.05, 0.0]) for pose in scene.targets]
     monkeypatch.setattr(trials, "_observe", lambda *_: SceneObservation(aside, scene.joints))
     record = trials.attempt(scene, PoseSource("exact")).record
     assert not record.caught
@@ -40,26 +40,26 @@ def test_a_part_that_is_elsewhere_is_not_caught(trials, scene, monkeypatch):
     assert (record.failure, record.error_mm) == ("wrong pose", pytest.approx(50))
 
 
-def test_nothing_seen_is_a_failure_of_its_own(trials, scene, monkeypatch):
+def test_no_estimated_pose_is_the_failure_not_seen(trials, scene, monkeypatch):
     monkeypatch.setattr(trials, "_observe", lambda *_: SceneObservation([], scene.joints))
     record = trials.attempt(scene, PoseSource("exact")).record
     assert (record.seen, record.caught, record.failure) == (False, False, "not seen")
 
 
-def test_one_seed_makes_one_trial(trials, scene):
-    trials.scene(1)  # what came between does not matter
+def test_a_trial_depends_on_the_seed_alone(trials, scene):
+    trials.scene(1)  # another trial in between has no effect
     again = trials.scene(0)
     np.testing.assert_array_equal(again.image, scene.image)
     np.testing.assert_array_equal(again.T_base_cam, scene.T_base_cam)
-    first, second = (trials.attempt(one, PoseSource("exact")).outcome for one in (scene, again))
+    first, second = (trials.attempt(each, PoseSource("exact")).outcome for each in (scene, again))
     np.testing.assert_array_equal(first.states[-1], second.states[-1])
 
 
-def test_the_planner_comes_from_above_and_lifts(trials, scene, planner):
+def test_a_plan_descends_from_above_and_lifts(trials, scene, planner):
     plan = planner.plan(scene.targets, trials.grasps, scene.joints)
     assert plan is not None
-    flanges = [trials.arm.flange(one) for one in (*plan.descent, plan.lift[-1])]
-    heights = [one[2, 3] for one in flanges]
+    flanges = [trials.arm.flange(joints) for joints in (*plan.descent, plan.lift[-1])]
+    heights = [flange[2, 3] for flange in flanges]
     assert heights[0] - heights[-2] == pytest.approx(0.06, abs=0.001)
     assert heights[-1] - heights[-2] == pytest.approx(0.12, abs=0.001)
     ends = heights[-2] - trials.gripper.reach(plan.grasp.width)
@@ -67,18 +67,18 @@ def test_the_planner_comes_from_above_and_lifts(trials, scene, planner):
 
 
 @pytest.mark.parametrize(
-    ("shift", "turn"),
+    ("shift", "rotation"),
     [((1.2, 0, 0), np.eye(3)), ((0, 0, -0.02), np.eye(3)), ((0, 0, 0), np.diag([1.0, -1, -1]))],
     ids=["out of reach", "inside the bench", "from below only"],
 )
-def test_there_is_no_plan(trials, scene, planner, shift, turn):
-    pose = make_transform(turn, TRAY + np.array([0, 0, 0.0035]) + np.array(shift))
-    front = [one for one in trials.grasps if one.approach[2] < -0.9]
+def test_there_is_no_plan(trials, scene, planner, shift, rotation):
+    pose = make_transform(rotation, TRAY + np.array([0, 0, 0.0035]) + np.array(shift))
+    front = [grasp for grasp in trials.grasps if grasp.approach[2] < -0.9]
     assert planner.plan([pose], front, scene.joints) is None
 
 
 @pytest.mark.parametrize(
-    ("tilt_deg", "rise", "is_laid"),
+    ("tilt_deg", "rise", "is_aligned"),
     [
         (0, 0, True),
         (3, 0.002, True),
@@ -88,21 +88,21 @@ def test_there_is_no_plan(trials, scene, planner, shift, turn):
         (1, 0.02, False),
     ],
 )
-def test_a_part_that_seems_to_lie_on_the_bench_is_laid_on_it(trials, tilt_deg, rise, is_laid):
+def test_a_pose_close_to_the_bench_is_aligned_with_it(trials, tilt_deg, rise, is_aligned):
     bench = make_transform(np.eye(3), np.array([0.3, 0.1, 0.02]))
     flat = make_transform(np.eye(3), np.array([0.0, 0.5, 0.0235]))
     tilt = Rotation.from_euler("x", tilt_deg, degrees=True).as_matrix()
-    seen = make_transform(tilt, flat[:3, 3] + np.array([0.0, 0.0, rise]))
-    laid = laid_flat(seen, trials.layout.body.hull, bench)
-    if is_laid:
-        np.testing.assert_allclose(laid[:3, 2], [0, 0, 1], atol=1e-9)
-        assert laid[2, 3] == pytest.approx(0.0235, abs=1e-9)
-        assert np.linalg.norm(laid[:2, 3] - flat[:2, 3]) < 0.001
+    estimate = make_transform(tilt, flat[:3, 3] + np.array([0.0, 0.0, rise]))
+    aligned = align_with_bench(estimate, trials.layout.body.hull, bench)
+    if is_aligned:
+        np.testing.assert_allclose(aligned[:3, 2], [0, 0, 1], atol=1e-9)
+        assert aligned[2, 3] == pytest.approx(0.0235, abs=1e-9)
+        assert np.linalg.norm(aligned[:2, 3] - flat[:2, 3]) < 0.001
     else:
-        np.testing.assert_array_equal(laid, seen)
+        np.testing.assert_array_equal(aligned, estimate)
 
 
-def test_a_plan_keeps_clear_of_another_part(trials, part):
+def test_a_plan_avoids_another_part(trials, part):
     knowledge = trials.robot(0)[1].knowledge
     scene = SimpleNamespace(calibrated=SimpleNamespace(knowledge=knowledge))
     crowded = Trials(replace(trials.task, layout="heap"))
@@ -114,11 +114,11 @@ def test_a_plan_keeps_clear_of_another_part(trials, part):
     assert planner.plan([lower, over], across, HOME) is None
 
 
-def test_a_motion_goes_from_rest_to_rest_through_its_waypoints(scene):
+def test_a_motion_passes_its_waypoints_from_rest_to_rest(scene):
     path = np.stack(
         [scene.joints, scene.joints + 0.3, scene.joints + np.array([0.5, 0, 0, 0, 0, 0.1])]
     )
-    joints, speeds = (np.array(values) for values in zip(*_timed(path), strict=True))
+    joints, speeds = (np.array(values) for values in zip(*_sample_path(path), strict=True))
     np.testing.assert_allclose(joints[-1], path[-1], atol=1e-9)
     assert np.abs(joints - path[1]).max(axis=1).min() < 0.01
     assert np.abs(speeds[[0, -1]]).max() < 0.05

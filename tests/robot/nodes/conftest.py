@@ -1,4 +1,4 @@
-"""Images of a part as a camera's driver sends them, as messages and as a recording."""
+"""Rendered images of a part, as messages of a camera's driver and as a recording."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,7 @@ from dopepp.core.files import write_png
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.parts.catalogue import pivconnector
 from dopepp.virtual import PRESETS, Factory
+from tests.cli.conftest import refused, run  # noqa: F401
 
 FRAME = "camera_optical_frame"
 TOPIC = "/camera/image_raw"
@@ -19,8 +20,8 @@ LENS = [-0.05, 0.01, 0.001, -0.001, 0.0]
 
 
 @dataclass
-class Seen:
-    """Images of one camera, and a folder with the same."""
+class CameraImages:
+    """Images of a camera, its matrix, and a folder with the same images."""
 
     images: list[np.ndarray]
     K: np.ndarray
@@ -33,13 +34,13 @@ def estimator():
 
 
 @pytest.fixture(scope="session")
-def seen(tmp_path_factory):
+def camera(tmp_path_factory):
     factory = Factory([pivconnector()], PRESETS["quickstart"].reframed(320, 240), 2)
     rendered = [factory.render(0, number) for number in (9, 10, 11)]
-    folder = tmp_path_factory.mktemp("pictures")
-    for number, first in enumerate(rendered):
-        write_png(folder / f"{number}.png", first.image)
-    return Seen([item.image for item in rendered], rendered[0].scene.K, folder)
+    folder = tmp_path_factory.mktemp("images")
+    for number, item in enumerate(rendered):
+        write_png(folder / f"{number}.png", item.image)
+    return CameraImages([item.image for item in rendered], rendered[0].scene.K, folder)
 
 
 def header(second: float, frame_id: str = FRAME) -> SimpleNamespace:
@@ -47,11 +48,11 @@ def header(second: float, frame_id: str = FRAME) -> SimpleNamespace:
     return SimpleNamespace(stamp=stamp, frame_id=frame_id)
 
 
-def image_message(picture: np.ndarray, second: float, frame_id: str = FRAME) -> SimpleNamespace:
-    height, width = picture.shape[:2]
+def image_message(image: np.ndarray, second: float, frame_id: str = FRAME) -> SimpleNamespace:
+    height, width = image.shape[:2]
     return SimpleNamespace(
         header=header(second, frame_id), height=height, width=width, encoding="rgb8",
-        is_bigendian=0, step=3 * width, data=picture.tobytes(),
+        is_bigendian=0, step=3 * width, data=image.tobytes(),
     )  # fmt: skip
 
 
@@ -72,24 +73,25 @@ def messages():
 
 
 @pytest.fixture(scope="session")
-def recording(seen, tmp_path_factory):
-    """Return a recording of ROS 2 whose first ``camera_info`` comes after the first image."""
+def recording(camera, tmp_path_factory):
+    """Return a recording of ROS 2 whose first ``camera_info`` follows the first image."""
     rosbag2 = pytest.importorskip("rosbags.rosbag2")
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
 
     def native(kind: str, message: Any) -> Any:
-        def made(name: str, value: Any) -> Any:
-            values = {
-                field: made(node[1], getattr(value, field)) if node[0].name == "NAME"
-                else np.frombuffer(one, np.uint8) if isinstance(one := getattr(value, field), bytes)
-                else np.array(one, np.float64) if isinstance(one, list) else one
-                for field, node in store.fielddefs[name][1]
-            }  # fmt: skip
-            return store.types[name](**values)
-
-        return made(kind, message)
+        fields = {}
+        for name, node in store.fielddefs[kind][1]:
+            value = getattr(message, name)
+            if node[0].name == "NAME":
+                value = native(node[1], value)
+            elif isinstance(value, bytes):
+                value = np.frombuffer(value, np.uint8)
+            elif isinstance(value, list):
+                value = np.array(value, np.float64)
+            fields[name] = value
+        return store.types[kind](**fields)
 
     folder = tmp_path_factory.mktemp("bag") / "run"
     plugin = rosbag2.StoragePlugin.MCAP
@@ -98,14 +100,13 @@ def recording(seen, tmp_path_factory):
             TOPIC: "sensor_msgs/msg/Image",
             "/camera/camera_info": "sensor_msgs/msg/CameraInfo",
         }
-        ways = {
-            first: writer.add_connection(first, kind, typestore=store)
-            for first, kind in kinds.items()
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=store)
+            for topic, kind in kinds.items()
         }
-        for number, picture in enumerate(seen.pictures, 1):
-            info = info_message(seen.K, (320, 240))
-            for topic, left in ((TOPIC, image_message(picture, number)), (None, info)):
-                topic = topic or "/camera/camera_info"
-                content = store.serialize_cdr(native(kinds[topic], left), kinds[topic])
-                writer.write(ways[topic], number * 10**9, content)
+        for number, image in enumerate(camera.images, 1):
+            info = info_message(camera.K, (320, 240))
+            for topic, message in zip(kinds, (image_message(image, number), info), strict=True):
+                content = store.serialize_cdr(native(kinds[topic], message), kinds[topic])
+                writer.write(connections[topic], number * 10**9, content)
     return next(folder.glob("*.mcap"))

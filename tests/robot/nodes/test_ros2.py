@@ -1,4 +1,4 @@
-"""The node of ROS 2: messages filled by their own types, a camera in another process; its slot."""
+"""The ROS 2 node: native messages, parameters, best-effort cameras and the slot of images."""
 
 from __future__ import annotations
 
@@ -17,19 +17,21 @@ from dopepp.robot.nodes.worker import Stamp, Worker, WorkerSettings
 ROOT = Path(__file__).parents[3]
 
 
-def test_messages_are_filled_by_their_own_types():
+def test_messages_are_converted_to_native_messages():
     pytest.importorskip("rclpy", reason="needs the extra ros2")
 
     message = diagnosis(Stamp(3, 4), "dope", "oh", {"rate": "30"})
-    told = native(message.kind, message.fields)
-    assert (told.header.stamp.sec, told.status[0].level) == (3, b"\x01")
-    assert told.status[0].values[0].value == "30"
+    filled = native(message.kind, message.fields)
+    assert (filled.header.stamp.sec, filled.status[0].level) == (3, b"\x01")
+    assert filled.status[0].values[0].value == "30"
     image = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
-    filled = native("sensor_msgs/Image", image_fields(image, {}))
-    np.testing.assert_array_equal(np.frombuffer(filled.data, np.uint8).reshape(2, 4, 3), image)
+    native_image = native("sensor_msgs/Image", image_fields(image, {}))
+    np.testing.assert_array_equal(
+        np.frombuffer(native_image.data, np.uint8).reshape(2, 4, 3), image
+    )
 
 
-def test_parameters_change_while_it_runs(estimator, tmp_path):
+def test_parameters_change_while_the_node_runs(estimator, tmp_path):
     rclpy = pytest.importorskip("rclpy", reason="needs the extra ros2")
     from rclpy.parameter import Parameter
 
@@ -40,9 +42,9 @@ def test_parameters_change_while_it_runs(estimator, tmp_path):
         worker = Worker(estimator)
         node = _Node(worker, "/camera/image_raw", "dope_of_a_test")
         assert worker.settings == WorkerSettings(confidence=0.25)
-        for value, taken in ((0.75, True), (7.0, False)):
+        for value, is_accepted in ((0.75, True), (7.0, False)):
             (result,) = node.handle.set_parameters([Parameter("confidence", value=value)])
-            assert result.successful == taken
+            assert result.successful == is_accepted
         assert "a number from 0 to 1" in result.reason
         assert worker.settings == WorkerSettings(confidence=0.75)
         node.handle.set_parameters([Parameter("confidence", value=-1.0)])
@@ -52,19 +54,17 @@ def test_parameters_change_while_it_runs(estimator, tmp_path):
         rclpy.try_shutdown()
 
 
-def test_a_camera_that_offers_less_is_heard(estimator, seen, caplog):
+def test_images_of_a_best_effort_camera_arrive(estimator, camera, caplog):
     rclpy = pytest.importorskip("rclpy", reason="needs the extra ros2")
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.qos import qos_profile_sensor_data
 
     rclpy.init()
     try:
-        node, camera = (
-            _Node(Worker(estimator), "/best", "dope_of_a_test"),
-            rclpy.create_node("camera"),
-        )
-        image = native("sensor_msgs/Image", image_fields(seen.pictures[0], {}))
-        publisher = camera.create_publisher(type(image), "/best", qos_profile_sensor_data)
+        node = _Node(Worker(estimator), "/best", "dope_of_a_test")
+        driver = rclpy.create_node("camera")
+        image = native("sensor_msgs/Image", image_fields(camera.images[0], {}))
+        publisher = driver.create_publisher(type(image), "/best", qos_profile_sensor_data)
         executor = SingleThreadedExecutor()
         executor.add_node(node.handle)
         for _ in range(100):
@@ -80,7 +80,7 @@ def test_a_camera_that_offers_less_is_heard(estimator, seen, caplog):
 
 
 @pytest.mark.slow
-def test_no_picture_is_lost_between_two_processes_and_a_killed_node_starts_again():
+def test_no_image_is_lost_between_processes_and_a_killed_node_restarts():
     pytest.importorskip("rclpy", reason="needs the extra ros2")
     command = [sys.executable, str(ROOT / "benchmarks" / "node.py"), "--rate", "10"]
     done = subprocess.run(
@@ -96,12 +96,12 @@ def test_no_picture_is_lost_between_two_processes_and_a_killed_node_starts_again
     assert "exit code 143" in done.stdout
 
 
-def test_whoever_is_slow_gets_the_newest():
+def test_a_slow_handler_receives_the_newest_item():
     begun, go_on, done = threading.Event(), threading.Event(), threading.Event()
-    taken = []
+    handled = []
 
     def handle(item):
-        taken.append(item)
+        handled.append(item)
         begun.set()
         go_on.wait(10)
         if item == 9:
@@ -115,11 +115,11 @@ def test_whoever_is_slow_gets_the_newest():
     go_on.set()
     assert done.wait(10)
     slot.stop()
-    assert taken == [0, 9]
+    assert handled == [0, 9]
     assert (slot.received, slot.replaced) == (10, 8)
 
 
-def test_what_its_thread_raises_is_raised():
+def test_an_exception_of_the_thread_is_raised_again():
     slot = Slot(lambda item: 1 / item)
     slot.put(0)
     slot._thread.join(10)
@@ -128,11 +128,11 @@ def test_what_its_thread_raises_is_raised():
             call()
 
 
-def test_pace_tells_rate_and_latency():
+def test_pace_measures_rate_and_latency():
     seconds = iter(range(100))
     pace = Pace(lambda: next(seconds) / 10)
     assert pace.values() == {"answered": "0"}
     for latency in (0.01, 0.02, 0.03):
         pace.count(latency)
-    told = pace.values()
-    assert (told["rate (1/s)"], told["latency, median (ms)"]) == ("10.0", "20.0")
+    values = pace.values()
+    assert (values["rate (1/s)"], values["latency, median (ms)"]) == ("10.0", "20.0")

@@ -1,4 +1,4 @@
-"""Launch files, parameters and layouts of the package name what there is."""
+"""The shipped launch file, parameters and viewer layouts use existing topics and options."""
 
 import runpy
 import sys
@@ -15,7 +15,7 @@ from dopepp.robot.nodes.worker import WorkerSettings
 SHARE = Path(__file__).parents[3] / "dopepp" / "robot" / "nodes" / "share"
 
 
-def test_what_is_shipped_names_what_there_is(estimator):
+def test_shipped_layouts_and_parameters_name_existing_topics_and_settings(estimator):
     topics = {f"/dope/{topic}" for topic, _ in AnswerFormatter(estimator.solid_parts).topics()}
     topics.add(DIAGNOSTICS[0])
     for name in ("dope.rviz", "dope.foxglove.json"):
@@ -27,25 +27,25 @@ def test_what_is_shipped_names_what_there_is(estimator):
     WorkerSettings(**parameters["ros__parameters"])
 
 
-def test_the_launch_file_starts_the_command_with_options_it_has(monkeypatch):
-    """Of ``launch``, which is no wheel, what the file uses."""
-    seen = []
-    made = {
+def test_the_launch_file_uses_existing_options(monkeypatch):
+    """Replace ``launch``, which is not on PyPI, by a minimal substitute."""
+    words_started = []
+    substitutes = {
         "launch": {"LaunchDescription": list},
         "launch.actions": {
             "DeclareLaunchArgument": lambda name, **_: name,
-            "ExecuteProcess": lambda cmd, **_: seen.extend(cmd),
+            "ExecuteProcess": lambda cmd, **_: words_started.extend(cmd),
         },
         "launch.substitutions": {"LaunchConfiguration": lambda name: f"<{name}>"},
     }
-    for name, content in made.items():
+    for name, content in substitutes.items():
         monkeypatch.setitem(sys.modules, name, SimpleNamespace(**content))
     declared = runpy.run_path(str(SHARE / "dope_launch.py"))["generate_launch_description"]()
-    assert seen[:4] == ["dopepp", "node", "<model>", "--ros2"]
+    assert words_started[:4] == ["dopepp", "node", "<model>", "--ros2"]
     assert {f"<{item}>" for item in declared[:-1]} == {
-        element for element in seen if element[0] == "<"
+        element for element in words_started if element[0] == "<"
     }
-    assert {one for one in seen if one.startswith("--")} <= options()
+    assert {word for word in words_started if word.startswith("--")} <= options()
 
 
 def options():
