@@ -3,9 +3,9 @@
 A pool receives the pickled function once and yields each item with its future when it is done. An
 exception or a lost process affects its own item only.
 
-``concurrent.futures.ProcessPoolExecutor`` and loky lose all items in progress when one process
-dies, do not report its exit code, and leave processes behind when their parent is killed. Here,
-each thread of a ``ThreadPoolExecutor`` has one process behind a pipe.
+When one process dies, ``concurrent.futures.ProcessPoolExecutor`` and loky lose all items in
+progress and do not report the exit code. When their parent is killed, their processes continue.
+Here, each thread of a ``ThreadPoolExecutor`` has one process behind a pipe.
 
 To add an engine, write a :class:`Pool`.
 """

@@ -1,8 +1,8 @@
 """Perspective-n-point: estimate a pose from up to nine keypoints and K, or explain the failure.
 
 OpenCV supplies the closed-form start (SQPnP). This module adds covariances of the points, robust
-weights, the covariance of the pose, a mirrored start for thin plates, and checks that no returned
-pose is NaN, behind the camera or implausibly far away.
+weights, the covariance of the pose and a mirrored start for thin plates. No returned pose is NaN,
+behind the camera or implausibly far away.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The last checkpoint of a run, from which the run can be resumed exactly.
 
-A run that was interrupted anywhere and resumed ends with the weights, best checkpoint and metrics
-of an uninterrupted run, if its arithmetic is deterministic (as on CPUs). See
-``docs/explanation/reliability.md``. Ctrl-C and SIGTERM take effect between two steps.
+A resumed run ends with the weights, best checkpoint and metrics of an uninterrupted run, if its
+arithmetic is deterministic (as on CPUs). See ``docs/explanation/reliability.md``. Ctrl-C and
+SIGTERM take effect between two steps.
 
 Lightning's ``ModelCheckpoint`` keeps the best checkpoint only. It saves inside a batch or a
 validation, or at the end of an epoch, where Lightning's counters cause replayed or skipped batches.

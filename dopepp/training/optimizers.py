@@ -109,9 +109,9 @@ class AveragedWeights(WeightAveraging):
     The ``state_dict`` of a checkpoint is the average; training continues with the weights under
     :data:`TRAINED`.
 
-    Lightning's ``EMAWeightAveraging`` is not sufficient: checkpoints of a validation swap both sets
-    of weights, training ends with the average and cannot be resumed exactly, 16-bit weights are
-    averaged in 16 bits, and the decay has no ramp.
+    Lightning's ``EMAWeightAveraging`` is not sufficient. Its checkpoints of a validation swap both
+    sets of weights. Its training ends with the average and cannot be resumed exactly. It averages
+    16-bit weights in 16 bits, and its decay has no ramp.
     """
 
     def __init__(self, decay: float) -> None:

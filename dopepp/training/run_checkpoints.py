@@ -51,9 +51,9 @@ class SavingFailedError(RunError):
 class AtomicCheckpointIO(TorchCheckpointIO):
     """Saves Lightning's checkpoints atomically and loads them without running code.
 
-    A checkpoint that cannot be written (disk full, server unavailable) is kept in memory and
-    written before the next checkpoint, so that no file refers to a missing file. A newer version of
-    the same file replaces the kept version.
+    A checkpoint that cannot be written (disk full, server unavailable) is kept in memory until the
+    next checkpoint. It is written first, so that no file refers to a missing file. A newer version
+    of the same file replaces the kept version.
 
     Args:
         prepare: Called before each writing; if it raises ``OSError``, nothing is written.

@@ -22,7 +22,7 @@ PLAIN = st.recursive(
 
 @settings(max_examples=60)
 @given(PLAIN, st.booleans(), st.sampled_from([None, 1]))
-def test_reads_what_json_writes(value, ascii_only, indent):
+def test_parses_like_the_json_module(value, ascii_only, indent):
     text = json.dumps(value, ensure_ascii=ascii_only, indent=indent)
     text = text.encode("utf-8", "surrogatepass").decode("utf-8", "replace")
     assert parse_json(text, "here") == json.loads(text)

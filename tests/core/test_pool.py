@@ -132,7 +132,7 @@ def test_an_item_that_takes_too_long_is_killed_when_the_pool_is_stopped(monkeypa
 
 
 @posix
-def test_processes_end_with_a_parent_that_is_killed(tmp_path):
+def test_processes_end_after_their_parent_is_killed(tmp_path):
     code = """
 import pickle
 from dopepp.core.pool import ProcessPool

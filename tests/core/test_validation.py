@@ -33,7 +33,7 @@ class Outer:
     many: tuple[Inner, ...] = ()
 
 
-def test_plain_values_become_typed():
+def test_plain_values_are_converted():
     given = {"number": 1, "path": "x/y", "inner": {"share": 1}, "either": [1, 2.5], "many": [{}]}
     outer = parse(Outer, given)
     assert outer == Outer(
@@ -87,7 +87,7 @@ PAIR = tuple[float, float]
         ((0, 0.5), PAIR, Span(0, 1), (0.0, 0.5)),
     ],
 )
-def test_an_argument_becomes_typed(value, kind, limits, typed):
+def test_an_argument_is_converted(value, kind, limits, typed):
     checked = check("name", value, kind, limits)
     assert (checked, type(checked)) == (typed, type(typed))
 

@@ -176,7 +176,7 @@ NUMBERS = st.floats(-1e6, 1e6).map(lambda number: 0.0 if abs(number) < 1e-300 el
     ),
     st.booleans(),
 )
-def test_reads_what_opencv_writes_to_the_last_bit(tmp_path, suffix, four, lens, is_column):
+def test_files_of_opencv_are_read_exactly(tmp_path, suffix, four, lens, is_column):
     path, matrix = tmp_path / f"camera.{suffix}", camera_matrix(*four)
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     storage.write("calibration_time", "Thu: 4 # of January")
@@ -249,7 +249,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_bad_file_is_one_line(name, tmp_path):
+def test_a_bad_file_gives_one_line(name, tmp_path):
     text, message = BAD[name]
     path = tmp_path / "camera.yaml"
     path.write_bytes(text.encode("latin-1" if name == "an image" else "utf-8"))

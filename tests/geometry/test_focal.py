@@ -15,7 +15,7 @@ K = camera_matrix(500.0, 500.0, 319.5, 239.5)
 
 
 def fit(cuboid, tilt_deg, factor, noise_px=0.0, seed=0):
-    """Fit the focal length of keypoints that a lens ``factor`` times as long as K's has imaged."""
+    """Fit a focal length, which is ``factor`` times that of the assumed camera matrix."""
     rng = np.random.default_rng(seed)
     turn = Rotation.from_euler("zyx", [rng.uniform(-180, 180), tilt_deg, tilt_deg / 2], True)
     pixels = project_keypoints(cuboid, make_transform(turn.as_matrix(), [0.01, -0.01, 0.2]), K)

@@ -36,7 +36,7 @@ CUBOIDS = {
 
 
 def look_at(cuboid: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A random pose with the cuboid's centre in view, 2.5 to 5 of its sizes away."""
+    """Return a random pose, with the cuboid's centre in view at 2.5 to 5 times its size."""
     rotation = random_rotation(rng)
     size = float(np.linalg.norm(cuboid[0] - cuboid[6]))
     centre = size * rng.uniform([-0.5, -0.5, 2.5], [0.5, 0.5, 5.0])
@@ -44,7 +44,7 @@ def look_at(cuboid: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def add(T: np.ndarray | None, truth: np.ndarray, cuboid: np.ndarray) -> float:
-    """Mean corner distance in units of the diameter; infinite without a pose."""
+    """Return the mean corner distance in diameters; infinite without a pose."""
     if T is None:
         return np.inf
     error = np.linalg.norm(transform(T, cuboid) - transform(truth, cuboid), axis=1).mean()
@@ -105,7 +105,7 @@ def test_some_points_are_enough(count):
         check(result, cuboid)
         assert not result.inliers[missing].any()
         good += add(result.T_cam_obj, truth, cuboid) < 1e-3
-    # Four points may lie in one plane or leave several solutions open.
+    # Four points may lie in a plane or have several solutions.
     assert good >= (20 if count == 4 else 29)
 
 
@@ -244,7 +244,7 @@ NUMBERS = st.one_of(st.floats(), st.floats(-2, 2), st.sampled_from(SPECIAL))
 
 @settings(max_examples=300)
 @given(st.lists(st.lists(NUMBERS, min_size=6, max_size=6), max_size=9))
-def test_garbage_never_breaks_it(rows):
+def test_any_numbers_give_a_valid_result(rows):
     table = np.array(rows, float).reshape(-1, 6)
     check(solve_pnp(table[:, :3], table[:, 3:5], K, isotropic(table[:, 5])), table[:, :3])
 
@@ -279,7 +279,7 @@ def test_lengths_must_match_and_the_camera_be_a_pinhole():
             solve_pnp(cuboid, cuboid[:, :2], bad)
 
 
-def test_the_mirrored_start_saves_plates_from_the_wrong_tilt():
+def test_the_mirrored_start_avoids_the_wrong_tilt_of_plates():
     """Two tilts have almost the same image: the cost must decide, not the start."""
     cuboid, rng = CUBOIDS["plate"], np.random.default_rng(9)
     for _ in range(40):
@@ -294,14 +294,14 @@ def test_the_mirrored_start_saves_plates_from_the_wrong_tilt():
 
 
 def covariances(rng: np.random.Generator, n: int) -> np.ndarray:
-    """Ellipses of 0.5 to 4 px, turned any way."""
+    """Return random covariances with standard deviations of 0.5 to 4 px."""
     angle, sigma = rng.uniform(0, np.pi, n), rng.uniform(0.5, 4, (n, 2))
     axes = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     return np.einsum("ijn,nj,kjn->nik", axes, sigma**2, axes)
 
 
 @pytest.mark.parametrize("name", ["box", "box off its origin", "plate"])
-def test_the_covariance_is_that_of_the_poses(name):
+def test_the_covariance_matches_the_scatter_of_poses(name):
     """The poses of many noisy observations scatter like their estimated covariances."""
     rng = np.random.default_rng(5)
     cuboid = CUBOIDS[name]

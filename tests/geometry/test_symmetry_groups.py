@@ -14,7 +14,7 @@ def perturbed(rotation: np.ndarray, degrees: float, rng: np.random.Generator) ->
 
 
 def is_group(elements: np.ndarray) -> bool:
-    """Brute force: every product is an element, to rounding."""
+    """Return whether every product is an element, up to rounding."""
     products = (elements[:, None] @ elements[None]).reshape(-1, 1, 9)
     return bool(np.abs(products - elements.reshape(1, -1, 9)).max(axis=2).min(axis=1).max() < 1e-9)
 
@@ -44,12 +44,12 @@ def test_exact_generators_stay_exact():
     assert is_group(group)
 
 
-def test_rotations_of_no_small_group_are_refused():
+def test_rotations_of_an_infinite_group_are_refused():
     odd = Rotation.from_euler("zx", [[40, 10], [75, 50]], degrees=True).as_matrix()
     assert exact_group(odd) is None
 
 
-def test_an_axis_that_is_stated_twice_counts_once():
+def test_a_repeated_axis_counts_once():
     once = symmetry_group(None, [((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))], 0.05)
     twice = symmetry_group(
         None, [((0.0, 0.0, 1.0), (1.0, 0.0, 0.0)), ((0.0, 0.0, -2.0), (1.0, 0.0, 3.0))], 0.05
@@ -71,7 +71,7 @@ def test_a_ball_has_rotations_all_over_and_a_bounded_number_of_them():
 
 
 def test_group_of_a_can():
-    """A can: any turn about its axis, and upside down. The axis misses the origin."""
+    """A can has any rotation about its axis, which misses the origin, and a half turn."""
     axis_point = np.array([0.02, -0.01, 0.0])
     upside_down = np.eye(4)
     upside_down[:3, :3] = np.diag([1.0, -1.0, -1.0])

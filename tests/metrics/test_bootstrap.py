@@ -21,7 +21,7 @@ Z = norm.ppf(0.975)
 
 
 def difference(*arguments: Any, **options: Any) -> Difference:
-    """Return a difference that exists."""
+    """Return a difference that is defined."""
     result = paired_difference(*arguments, **options)
     assert result is not None
     return result
@@ -68,8 +68,8 @@ def test_seeds_and_instances_add_their_variances():
 
 
 @pytest.mark.parametrize("num_seeds", [2, 3, 5])
-def test_few_seeds_are_not_believed_too_much(num_seeds):
-    """Intervals hold the true difference, where training noise outweighs the rest."""
+def test_intervals_of_few_seeds_are_wide_enough(num_seeds):
+    """Intervals contain the true difference when training noise dominates."""
     rng, hits = np.random.default_rng(8), 0
     for trial in range(150):
         noise = rng.normal(0, 0.1, (2, num_seeds))[:, :, None]
@@ -84,7 +84,7 @@ def test_few_seeds_are_not_believed_too_much(num_seeds):
     seed=st.integers(0, 10_000), num=st.integers(1, 30), seeds=st.integers(1, 3),
     name=st.sampled_from(["mean", "median"]), same=st.booleans(),
 )  # fmt: skip
-def test_the_methods_change_places_and_the_interval_its_sign(seed, num, seeds, name, same):
+def test_exchanging_the_methods_negates_the_interval(seed, num, seeds, name, same):
     rng = np.random.default_rng(seed)
     mine, other = rng.integers(0, 4, (2, seeds, num)).astype(float)
     options = {"same_seeds": True, "num_resamples": 200, "seed": seed}
@@ -109,23 +109,23 @@ def test_the_median_is_of_the_finite_numbers(values):
     np.testing.assert_allclose(result, [expected, expected], rtol=1e-12)
 
 
-def test_a_median_over_misses_does_not_exist():
+def test_a_median_over_misses_is_undefined():
     hit, missed = np.full((1, 9), 5.0), np.full((1, 9), np.inf)
     assert paired_difference([hit], [missed], "median") is None
-    # Nor that of the whole, where one of several seeds has found nothing.
+    # The overall median is undefined if one seed has no finite number.
     half = np.concatenate([hit, missed])
     assert paired_difference([half], [np.concatenate([hit, hit])], "median") is None
 
 
-def test_resamples_without_a_hit_are_left_out():
+def test_resamples_without_finite_numbers_are_ignored():
     mine = np.array([[3.0, np.inf, np.inf, np.inf]])
     result = difference([mine], [np.full((1, 4), 5.0)], "median", num_resamples=500)
     assert (result.value, result.low, result.high) == (-2, -2, -2)
-    assert result.within_noise  # all of four instances: not enough
+    assert result.within_noise  # four differing instances are too few
 
 
 @pytest.mark.parametrize("num", [1, 5, 6])
-def test_fewer_than_six_differing_instances_prove_nothing(num):
+def test_fewer_than_six_differing_instances_are_not_significant(num):
     other = np.zeros((1, 50))
     mine = other.copy()
     mine[0, :num] = 1
@@ -143,7 +143,7 @@ def test_the_fewest_differing_instances_follow_from_the_sign_test():
         assert 2 * 0.5**fewest <= 1 - confidence + 1e-12 < 2 * 0.5 ** (fewest - 1) + 1e-12
 
 
-def test_several_objects_count_alike():
+def test_objects_have_equal_weights():
     rng = np.random.default_rng(1)
     a, b = rng.random((2, 2, 30)), rng.random((2, 2, 300))
     result = difference([a[0], b[0]], [a[1], b[1]])
@@ -193,7 +193,7 @@ def test_values_that_cannot_be_paired_are_a_user_error(mine, baseline, message):
     seeds=st.integers(2, 6),
 )
 def test_the_estimated_number_of_seeds_makes_a_difference_significant(gain, spread, noise, seeds):
-    """Of a known spread over seeds and images, the interval with so many just leaves out 0."""
+    """With this number of seeds, the interval for known spreads just excludes 0."""
     rng = np.random.default_rng(4)
     over_seeds, over_images = rng.normal(size=seeds), rng.normal(size=50)
     over_seeds = spread * (over_seeds - over_seeds.mean()) / over_seeds.std(ddof=1)
@@ -213,7 +213,7 @@ def test_the_estimated_number_of_seeds_makes_a_difference_significant(gain, spre
         assert asked == seeds + 1 or reach(asked - 1) >= gain * (1 - 1e-9)
 
 
-def test_too_few_images_are_not_made_up_for_by_seeds():
+def test_seeds_cannot_replace_images():
     mine, other = np.zeros((3, 10)), np.zeros((3, 10))
     mine[:, 0] = 1
     assert seeds_needed([mine], [other]) == np.inf

@@ -139,7 +139,7 @@ def test_rotation_error_equals_scipy(angle, axis, seed):
     base = Rotation.random(random_state=seed)
     turned = Rotation.from_rotvec(angle * axis) * base
     matrices = (torch.from_numpy(item.as_matrix())[None] for item in (turned, base))
-    # 1e-13 degrees is the rounding of the matrices themselves.
+    # 1e-13 degrees is the rounding error of the matrices.
     magnitude = np.degrees((turned * base.inv()).magnitude())
     assert rotation_error_deg(*matrices).item() == pytest.approx(magnitude, rel=REL, abs=1e-13)
 
@@ -152,11 +152,11 @@ def test_rotation_error_equals_scipy(angle, axis, seed):
     is_near=st.booleans(),
 )
 def test_mssd_and_mspd_are_their_formulas(seed, count, turning, is_near):
-    """Also where most symmetries are left out early, because others are surely nearer."""
+    """Also if most symmetries are rejected early."""
     axes = [(turning, (0.01, 0.0, 0.0))] if turning else []
     group = symmetry_group(HALF_TURN[None], axes, 0.2)
     R_est, t_est, R_gt, t_gt = (tensor.numpy() for tensor in poses(4, seed))
-    if is_near:  # true up to a symmetry and a little: many symmetries come close to the best
+    if is_near:  # nearly true up to a symmetry, so that many symmetries are almost the best
         some = group[np.random.default_rng(seed).integers(len(group), size=4)]
         R_est, t_est = R_gt @ some[:, :3, :3], t_gt + (R_gt @ some[:, :3, 3:])[..., 0] + 1e-4
     t_gt[3, 2] = 0.0  # some of its points are behind the camera
@@ -185,7 +185,7 @@ def test_mspd_ignores_the_last_row_of_k():
     assert_array_equal(mspd(*pose, odd), mspd(*pose, K))
 
 
-def test_symmetries_are_taken_as_they_are():
+def test_no_identity_is_added_to_the_symmetries():
     R, t = torch.eye(3).double()[None], torch.tensor([[0.0, 0.0, 1.0]])
     only_half_turn = torch.from_numpy(HALF_TURN[None])
     assert float(mssd(R, t, R, t, cloud(9), only_half_turn)[0]) > 0.01
@@ -195,7 +195,7 @@ def test_symmetries_are_taken_as_they_are():
             mssd(R, t, R, t, cloud(9), wrong)
 
 
-def test_a_point_behind_the_camera_is_a_miss_in_pixels_alone():
+def test_a_point_behind_the_camera_is_a_miss_only_in_pixels():
     R, t, _, _ = poses(2, 7)
     behind = t * torch.tensor([[1.0, 1, 1], [1, 1, -1]])
     for error in IN_PIXELS.values():

@@ -194,12 +194,12 @@ def test_levels_of_regions_are_those_of_chi_squared(distances):
     np.testing.assert_allclose(levels, expected, rtol=1e-12, atol=1e-14)
 
 
-def test_coverage_of_right_and_of_too_small_covariances():
+def test_coverage_of_correct_and_of_too_small_covariances():
     rng = np.random.default_rng(0)
     distances = torch.from_numpy(np.linalg.norm(rng.normal(size=(20_000, 6)), axis=1))
     for level in (0.1, 0.5, 0.9, 0.99):
         assert coverage(distances, level) == pytest.approx(level, abs=0.01)
-        # Deviations that are half of the true ones: twice the distance.
+        # Half of the true deviations give twice the distance.
         expected = chi2.cdf(chi2.ppf(level, 6) / 4, 6)
         assert coverage(2 * distances, level) == pytest.approx(expected, abs=0.01)
     assert coverage(torch.tensor([0.0, math.inf, math.nan, math.inf])) == 0.25

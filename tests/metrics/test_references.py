@@ -59,16 +59,16 @@ def test_a_test_set_of_one_orientation_is_solved_by_a_constant():
     assert rows[CHANCE_ALL].add_01d < 0.05  # type: ignore[operator]
 
 
-def test_two_orientations_are_half_known_to_the_best_constant():
+def test_the_best_constant_solves_one_of_two_orientations():
     angles = np.array([0.0] * 30 + [np.pi / 2] * 10)
     T = poses(Rotation.from_rotvec(angles[:, None] * np.array([0, 0, 1.0])))
     rows = reference_rows(plate(), T)
     assert rows[BEST_CONSTANT].add_01d == 0.75
-    # Another pose of the set is the same: (30·29 + 10·9) of 40·39 ordered pairs.
+    # Of 40·39 ordered pairs, 30·29 + 10·9 have the same pose.
     assert rows[CHANCE_RANGE].add_01d == pytest.approx(960 / 1560)
 
 
-def test_the_mean_orientation_is_tried_too():
+def test_the_mean_orientation_is_a_candidate():
     # ADD of a turn by a about z is 2·sin(a/2)·mean radius (2.9 cm): ±20° is right from 0° only.
     angles = np.radians([-20.0] * 5 + [20.0] * 5)
     T = poses(Rotation.from_rotvec(angles[:, None] * np.array([0, 0, 1.0])))
@@ -95,8 +95,8 @@ def test_without_instances_and_with_a_single_one():
     assert (rows[CHANCE_RANGE].num_instances, rows[BEST_CONSTANT].add_01d) == (1, 1.0)
 
 
-def test_symmetries_hold_wherever_the_origin_lies():
-    """A half turn about the dumbbell's own centre, which the origin is far from."""
+def test_symmetries_do_not_depend_on_the_origin():
+    """A half turn about the dumbbell's centre, which is far from the origin."""
     centre = np.array([1.0, 1.0, 1.0])
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     half_turn[:3, 3] = centre - half_turn[:3, :3] @ centre

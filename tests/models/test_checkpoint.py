@@ -92,7 +92,7 @@ def test_a_spec_with_lists_survives_a_round_trip(checkpoint, small_fast_spec, tm
 
 
 def test_a_training_checkpoint_is_read_by_its_two_keys(checkpoint, tmp_path):
-    """What Lightning and a LightningModule add beside the network is left alone."""
+    """Entries of Lightning and weights outside the network are ignored."""
     content = checkpoint.to_file()
     content["state_dict"]["loss.weight"] = torch.zeros(3)
     content.update(epoch=3, optimizer_states=[{"state": {0: {"step": torch.tensor(4.0)}}}])
@@ -132,7 +132,7 @@ def test_pretrained_weights_path_is_neither_written_nor_read(make_spec, part, tm
 @pytest.mark.parametrize(
     "content", [b"", b"hello", b"PK\x03\x04", bytes(range(256)) * 40, 0.5, 0.99]
 )
-def test_a_file_that_is_no_torch_file_or_was_cut_short(saved, content):
+def test_files_that_are_damaged_or_no_torch_files_are_refused(saved, content):
     whole = saved.read_bytes()
     cut = whole[: int(len(whole) * content)] if isinstance(content, float) else content
     saved.write_bytes(cut)
@@ -143,7 +143,7 @@ def test_a_file_that_is_no_torch_file_or_was_cut_short(saved, content):
         read(saved)
 
 
-def test_a_file_over_the_limit(saved, monkeypatch):
+def test_a_file_over_the_limit_is_refused(saved, monkeypatch):
     monkeypatch.setattr(storage, "MAX_BYTES", 1000)
     with pytest.raises(UserError, match="at most 1000 bytes"):
         read(saved)
@@ -204,9 +204,7 @@ def test_an_inconsistent_file_is_refused_in_one_line(saved, edit, message):
 
 
 @pytest.mark.parametrize("failing", ["replace", "fsync", "save"])
-def test_a_failed_write_leaves_the_old_file_and_nothing_else(
-    checkpoint, saved, monkeypatch, failing
-):
+def test_a_failed_write_keeps_only_the_old_file(checkpoint, saved, monkeypatch, failing):
     before = saved.read_bytes()
 
     def fail(*_: object) -> None:
@@ -229,7 +227,7 @@ def released(checkpoint, tmp_path):
 
 
 def test_a_released_file_is_the_network_in_half_precision_without_local_paths(released, checkpoint):
-    with safe_open(released, "pt") as file:  # by the library itself
+    with safe_open(released, "pt") as file:  # with the library
         dtypes = {file.get_tensor(name).dtype for name in file.keys()}  # noqa: SIM118
     assert dtypes <= {torch.float16, torch.int64}
     network, loaded = load_network(released)

@@ -51,7 +51,7 @@ def test_mse_is_the_sum_over_stages_of_both_errors():
 @given(st.integers(0, 1000), st.floats(0, 15), st.floats(0, 15), st.floats(-8, 0), st.booleans())
 @settings(max_examples=30)
 def test_terms_are_the_poisson_divergence(seed, x, y, level, second):
-    """Σ e^z − g·z − g + g·log g over the cells, in float64, is where + count, in Gaussians."""
+    """The sum of Σ e^z − g·z − g + g·log g over the cells, in Gaussians, is where + count."""
     generator = torch.Generator().manual_seed(seed)
     target = gaussian(x, y)
     if second:
@@ -93,7 +93,7 @@ def test_gradients_stay_bounded_for_wild_logits(value):
     assert logits.grad.sum((2, 3)).abs().max() < 10 / 9 * math.e**2
 
 
-def test_leaves_the_plateau_within_a_few_steps():
+def test_training_leaves_the_plateau_within_a_few_steps():
     belief, field = targets()
     start = torch.full((1, 9, 16, 16), find_activation("exp").initial_logit)
     logits = start.clone().requires_grad_()

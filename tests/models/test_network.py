@@ -83,7 +83,7 @@ def test_every_scale_of_a_multi_scale_stage_has_its_own_maps(make_spec, stages):
         coarse = belief[:, :, ::factor, ::factor]
         repeated = coarse.repeat_interleave(factor, 2).repeat_interleave(factor, 3)
         torch.testing.assert_close(belief, repeated)
-    # The loss of the coarsest maps alone reaches no convolution of the fusion.
+    # The loss of the coarsest maps does not reach the fusion.
     outputs[0][0].sum().backward()
     branch = network.head.belief_branches[0]
     assert all(parameter.grad is None for parameter in network.head.field_branches.parameters())
@@ -282,7 +282,7 @@ def test_most_of_dopes_compute_is_in_its_stages(make_spec):
     assert num_parameters == 50_267_350
     lighter = build_network(make_spec("DSC", "Identity", "Cascade", "identity"))
     _, backbone_swapped = network_cost(lighter, (416, 416))
-    # The design: 69 % in the stages. Six stages of parameters, each used once per 52×52 cell.
+    # 69 % of the compute is in the stages, whose parameters are used once per 52×52 cell.
     stages = sum(p.numel() for p in network.head.parameters() if p.ndim == 4) * 52 * 52 / 1e9
     assert stages / gmacs == pytest.approx(0.69, abs=0.01)
     assert backbone_swapped < gmacs

@@ -67,7 +67,7 @@ def test_a_rebound_name_is_refused(monkeypatch):
 
 
 class Tiny(backbones.Backbone):
-    """A user's own backbone."""
+    """A backbone of a user."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -80,7 +80,7 @@ class Tiny(backbones.Backbone):
 
 @pytest.fixture
 def tiny_module(monkeypatch):
-    """Make this file's Tiny importable the way a user's installed package is."""
+    """Make Tiny importable like a class of an installed package."""
     module = type(sys)("somebodys_package")
     monkeypatch.setattr(Tiny, "__module__", "somebodys_package")
     module.Tiny, module.Stolen, module.run = Tiny, subprocess.Popen, subprocess.run

@@ -70,7 +70,7 @@ def test_metrics_images_and_throughput(validate, make_system, make_datamodule, t
     caplog.set_level(logging.INFO)
     system, data = make_system(system_class=Displaced), make_datamodule()
     recorder = validate(system, data)
-    # The logged figures are PoseMetrics' on the same poses and the samples' own ground truth.
+    # The logged values equal PoseMetrics on the same poses and the samples' ground truth.
     metrics = PoseMetrics(system.parts)
     for index, detections in enumerate(recorder.detections):
         item = data.val_item(0, index)

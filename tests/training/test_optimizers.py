@@ -33,7 +33,7 @@ def test_a_matrix_of_zeros_takes_no_step():
     assert not orthogonalise(torch.zeros(3, 5)).any()
 
 
-def test_a_step_is_as_large_as_that_of_adamw():
+def test_a_step_has_the_size_of_adamws():
     torch.manual_seed(0)
     shape, rate = (16, 8, 3, 3), 0.01
     parameters = [nn.Parameter(torch.zeros(shape))]

@@ -15,8 +15,8 @@ def one_cycle(optimizer: torch.optim.Optimizer, num_steps: int) -> OneCycleLR:
 
 
 @pytest.mark.parametrize("schedule", [one_cycle, CosineAnnealingLR])
-def test_a_longer_run_is_scheduled_anew(schedule, make_system, make_noise, make_trainer, tmp_path):
-    """A schedule that had ended neither fails nor stays at a learning rate of zero."""
+def test_a_longer_run_has_a_new_schedule(schedule, make_system, make_noise, make_trainer, tmp_path):
+    """An ended schedule continues, without an error and without a rate of zero."""
 
     class Watched(PoseSystem):
         rates: list[float]
@@ -38,6 +38,6 @@ def test_a_longer_run_is_scheduled_anew(schedule, make_system, make_noise, make_
     run("part", 1)
     resumed = run("part", 2, tmp_path / "part" / "checkpoints" / "last.ckpt")
     # The step after the restart still has the rate that the checkpoint's optimiser had, unless the
-    # schedule can say it in closed form.
+    # schedule has a closed form.
     skipped = 1 if schedule is one_cycle else 0
     assert resumed[skipped:] == pytest.approx(whole[4 + skipped :], rel=1e-6)

@@ -90,7 +90,7 @@ def test_the_first_choice_is_the_best_of_the_whole_group(part):
     poses[:, :3, 3] = (0, 0, 0.3) - poses[:, :3, :3] @ fixed
     result = handling.equivalents(make_batch(poses, part)).keypoints[:, 0, 0].numpy()
     group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous, np.pi / 360)
-    # A round part's axis, +z, is to point up in the image: to −y.
+    # The axis +z of a round part shall point up in the image, to −y.
     reference = FACING if part is PLATE else np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     for T, keypoints in zip(poses, result, strict=True):
         equivalents = T @ group

@@ -300,8 +300,8 @@ def vsd(
 ) -> Float[np.ndarray, "tolerances"]:
     """Return the visible surface discrepancy in [0, 1] for each tolerance (VSD; BOP 2019).
 
-    A pixel that shows the object is wrong if it shows the object at a single pose only, or if the
-    surface's distances from the camera at both poses differ by at least the tolerance.
+    A pixel is wrong if it shows the object at one pose only. It is also wrong if the distances of
+    the surface from the camera at both poses differ by at least the tolerance.
 
     Args:
         depth_est: Rendered depth at the estimated pose, metres along z, 0 outside the object.
