@@ -153,7 +153,7 @@ def partial_path(path: Path) -> Path:
 
 
 def is_abandoned(path: Path, now: float) -> bool:
-    """Return whether a partial file's process has ended; ``now`` is the file system's time, s."""
+    """Return whether a partial file's process has ended at the file system's time ``now``."""
     match = _PARTIAL.fullmatch(path.name)
     if match and match[1] == _machine() and not _is_running(int(match[2])):
         return True

@@ -75,9 +75,9 @@ class BopScores:
 
 
 class Localisation:
-    """Accumulates the errors of a method's poses of parts, image by image.
+    """Accumulates the errors of a method's poses, image by image.
 
-    VSD is computed only with ``draw``, the renderer of a part's depth.
+    VSD needs ``draw``, the renderer of a part's depth.
     """
 
     def __init__(self, parts: Sequence[Part], draw: Draw | None = None) -> None:

@@ -275,10 +275,8 @@ def find(path: Path) -> Path:
     released = released_paths()
     if path.name not in released:
         names = ", ".join(f"{FOLDER}/{name}" for name in released) or "none"
-        problem, allowed = (
-            f"checkpoint {path}, no such file",
-            f"an existing file, or one of {names}",
-        )
+        problem = f"checkpoint {path}, no such file"
+        allowed = f"an existing file, or one of {names}"
         raise UserError(problem, allowed, "use one of these names")
     return released[path.name]
 

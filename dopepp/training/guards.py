@@ -167,7 +167,7 @@ class FiniteSteps(Callback):
 
 
 def _dump_batch(path: Path, batch: Batch, facts: Mapping[str, Any]) -> None:
-    """Write a batch and facts to ``path.pt`` and ``path.png``, or warn that this is impossible."""
+    """Write a batch with facts (``.pt``) and its images (``.png``), or warn on a failure."""
     shown = batch.rows(torch.arange(min(len(batch), _MAX_TILES))).to("cpu")
     images, truths = shown.images.permute(0, 2, 3, 1).numpy(), shown.keypoints.numpy()
     tiles = [

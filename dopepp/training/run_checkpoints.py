@@ -175,7 +175,7 @@ def saved_step(path: Path) -> int | None:
 
 
 def check_free_space(run_dir: Path, weight_bytes: int) -> None:
-    """Check in advance that a run can write its checkpoints of a network's size.
+    """Check in advance that a run can write its checkpoints, for weights of this size.
 
     Raises:
         UserError: The folder is not writable, or has too little free space.

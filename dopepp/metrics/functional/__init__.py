@@ -165,8 +165,8 @@ def match(
 ) -> Int[Tensor, "p"]:
     """Match predictions with instances one-to-one, greedily by descending score.
 
-    Predictions with equal scores keep the input order; NaN scores come last. A match is at most
-    ``max_distance`` wide; a NaN distance never matches.
+    Predictions with equal scores keep the input order; NaN scores come last. Matches have a
+    distance of at most ``max_distance``, metres.
 
     Returns:
         Index of each prediction's instance; −1 if it matches none.
