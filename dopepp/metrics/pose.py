@@ -69,23 +69,19 @@ class PredictedPose(Protocol):
 
 
 class TruePose(Protocol):
-    """Attributes of a ground-truth instance that the accumulator reads."""
+    """Attributes of a ground-truth instance that the accumulator reads.
 
-    @property
-    def label(self) -> str:
-        """Name of the part."""
+    Attributes:
+        label: Name of the part.
+        T_cam_obj: True pose, metres.
+        visible_fraction: Visible share of the full silhouette, in [0, 1].
+        wanted: Whether a list of targets names the instance; None without a list.
+    """
 
-    @property
-    def T_cam_obj(self) -> Transform:  # noqa: N802
-        """True pose, metres."""
-
-    @property
-    def visible_fraction(self) -> float:
-        """Visible share of the full silhouette, in [0, 1]."""
-
-    @property
-    def wanted(self) -> bool | None:
-        """Whether a list of targets names the instance; None without a list."""
+    label: str
+    T_cam_obj: Transform
+    visible_fraction: float
+    wanted: bool | None
 
 
 def matching_radius(part: Part) -> float:
