@@ -174,9 +174,9 @@ def _own_cells(
 ) -> None:
     """Mark the cells of a peak's window that belong to this peak.
 
-    A cell belongs to peak ``i`` if the cell is finite, no other peak is higher there by ``margin``
-    (cells²), and the cell is not part of a clamped plateau. Of Gaussians s·exp(−d²/2σ²), the
-    highest in a cell has the smallest d² − 2σ² log s.
+    A cell belongs to peak ``i`` if the cell is finite, peak ``i`` is the highest there, and the cell
+    is not part of a clamped plateau. Of Gaussians s·exp(−d²/2σ²), the highest in a cell has the
+    smallest d² − 2σ² log s; ``margin`` is the required difference to any other peak, cells².
     """
     side, highest = windows.shape[1], 0
     half = side // 2
@@ -192,16 +192,16 @@ def _own_cells(
         # The difference of the squared distances is linear, so its minimum is at a corner.
         column = cells[i, 0] + (half if position[j, 0] > position[i, 0] else -half)
         row = cells[i, 1] + (half if position[j, 1] > position[i, 1] else -half)
-        mine = (column - position[i, 0]) ** 2 + (row - position[i, 1]) ** 2
-        other = (column - position[j, 0]) ** 2 + (row - position[j, 1]) ** 2
-        if mine - handicap < other - ROUNDING:
+        own_squared = (column - position[i, 0]) ** 2 + (row - position[i, 1]) ** 2
+        other_squared = (column - position[j, 0]) ** 2 + (row - position[j, 1]) ** 2
+        if own_squared - handicap < other_squared - ROUNDING:
             continue
         for y in range(side):
             for x in range(side):
                 column, row = cells[i, 0] + x - half, cells[i, 1] + y - half
-                mine = (column - position[i, 0]) ** 2 + (row - position[i, 1]) ** 2
-                other = (column - position[j, 0]) ** 2 + (row - position[j, 1]) ** 2
-                if mine - handicap >= other:
+                own_squared = (column - position[i, 0]) ** 2 + (row - position[i, 1]) ** 2
+                other_squared = (column - position[j, 0]) ** 2 + (row - position[j, 1]) ** 2
+                if own_squared - handicap >= other_squared:
                     usable[y, x] = False
     if highest >= PLATEAU:
         for y in range(side):
