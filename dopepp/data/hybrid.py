@@ -64,7 +64,6 @@ class HybridSource:
         synthetic_fraction: float = 0.0,
         name: str = "hybrid",
     ) -> None:
-        self._sources = (real, virtual, synthetic)
         if real is None and virtual is None and synthetic is None:
             problem, fix = "a hybrid mix without any source", "set data.root=FOLDER"
             raise UserError(problem, "at least one source", fix)
@@ -82,6 +81,10 @@ class HybridSource:
         else:
             num_synthetic = round((1 - real_fraction) * synthetic_fraction * samples_per_epoch)
         self.counts = (num_real, samples_per_epoch - num_real - num_synthetic, num_synthetic)
+        sources = enumerate((real, virtual, synthetic))
+        self._sources = {
+            role: source for role, source in sources if source is not None and self.counts[role]
+        }
         self.name, self._seed, self._length = name, seed, samples_per_epoch
         self._plan = lru_cache(1)(self._make_plan)
         # An epoch may straddle two cycles of a source; older cycles are not needed again.
@@ -97,19 +100,16 @@ class HybridSource:
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Return item ``index`` of ``epoch`` from the source that the mix has drawn."""
         role, cycle, item = self.locate(index, epoch)
-        source = self._sources[role]
-        assert source is not None  # the plan has no items of a missing source
-        return source.sample(item, cycle)
+        return self._sources[role].sample(item, cycle)
 
     def locate(self, index: int, epoch: int) -> tuple[int, int, int]:
         """Return (role, the source's epoch, the source's index) of an item."""
         roles, ranks = self._plan(epoch)
         role = int(roles[index])
         position = epoch * self.counts[role] + int(ranks[index])
-        source = self._sources[role]
-        assert source is not None
-        cycle, rank = divmod(position, len(source))
-        return role, cycle, int(self._order(role, cycle, len(source))[rank])
+        length = len(self._sources[role])
+        cycle, rank = divmod(position, length)
+        return role, cycle, int(self._order(role, cycle, length)[rank])
 
     def _make_plan(self, epoch: int) -> tuple[Order, Order]:
         """Return each item's source and its rank among that source's items."""
@@ -122,20 +122,17 @@ class HybridSource:
 
     def contains(self, label: str) -> bool:
         """Return whether any source with a share holds this object."""
-        return any(
-            count > 0 and source is not None and source.contains(label)
-            for source, count in zip(self._sources, self.counts, strict=True)
-        )
+        return any(source.contains(label) for source in self._sources.values())
 
     def describe(self) -> list[SourceInfo]:
         """Return the entries of all sources with a share."""
         mix = {"seed": self._seed, "samples_per_epoch": self._length}
         entries = []
-        for role, source, count in zip(_ROLES, self._sources, self.counts, strict=True):
-            if source is None or count == 0:
-                continue
+        for role, source in self._sources.items():
+            count = self.counts[role]
+            share = {**mix, "role": _ROLES[role], "count": count}
             for info in source.describe():
-                identity = {**info.identity, "hybrid": {**mix, "role": role, "count": count}}
+                identity = {**info.identity, "hybrid": share}
                 entries.append(replace(info, identity=identity, num_per_epoch=count))
         return entries
 

@@ -165,9 +165,8 @@ class CachedSource(WrappedSource):
                 problem = f"data.cache=memory for {len(source)} images of {source.name} ({size})"
                 allowed = f"at most half of this machine's {available / 1e9:.1f} GB"
                 settings = "data.input_size or data.samples_per_epoch"
-                raise UserError(
-                    problem, allowed, f"set data.cache=none or disk, or lower {settings}"
-                )
+                fix = f"set data.cache=none or disk, or lower {settings}"
+                raise UserError(problem, allowed, fix)
         else:
             described = [[info.name, info.num_images, info.identity] for info in source.describe()]
             record = {"items": described, "identity": identity, "slot": str(slot.descr)}

@@ -174,7 +174,7 @@ def _own_cells(
 ) -> None:
     """Mark the cells of a peak's window that belong to this peak.
 
-    A cell belongs to peak ``i`` if the cell is finite, peak ``i`` is the highest there, and the cell
+    A cell belongs to peak ``i`` if the cell is finite, the peak is the highest there, and the cell
     is not part of a clamped plateau. Of Gaussians s·exp(−d²/2σ²), the highest in a cell has the
     smallest d² − 2σ² log s; ``margin`` is the required difference to any other peak, cells².
     """
