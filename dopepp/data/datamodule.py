@@ -41,7 +41,7 @@ from dopepp.drawing.pictures import Size
 from dopepp.geometry.camera import Letterbox, focal_length, transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.parts.part import Part
-from dopepp.parts.size import Seen, widest
+from dopepp.parts.size import LearnedRange, enclosing_range
 from dopepp.virtual.backgrounds import Backgrounds
 
 _MAX_MEASURED: Final = 200  # images of a source for measuring the parts' sizes
@@ -146,12 +146,12 @@ class PoseDataModule(LightningDataModule):
             fix = "leave the object out, or add a source that shows it (e.g. renders)"
             raise UserError(problem, "objects with at least one instance in a training source", fix)
 
-    def size_ranges(self, parts: Sequence[Part]) -> dict[str, Seen]:
+    def size_ranges(self, parts: Sequence[Part]) -> dict[str, LearnedRange]:
         """Measure the ranges of size and distance of each part.
 
         Validation images are measured first; training images only for parts that they lack.
         """
-        views: dict[str, list[Seen]] = {part.name: [] for part in parts}
+        views: dict[str, list[LearnedRange]] = {part.name: [] for part in parts}
         for source in (self.val_source, self.train_source):
             missing = [part for part in parts if not views[part.name]]
             for index in range(min(len(source), _MAX_MEASURED) if missing else 0):
@@ -161,8 +161,8 @@ class PoseDataModule(LightningDataModule):
                     if instance.label == part.name:
                         depth = float(transform(instance.T_cam_obj, part.cuboid[CENTROID])[2])
                         pixels = scale * focal_length(sample.K) * part.diameter / depth
-                        views[part.name].append(Seen(pixels, pixels, depth, depth))
-        return {name: widest(sizes) for name, sizes in views.items() if sizes}
+                        views[part.name].append(LearnedRange(pixels, pixels, depth, depth))
+        return {name: enclosing_range(sizes) for name, sizes in views.items() if sizes}
 
     def summary(self) -> list[tuple[str, SourceInfo]]:
         """Return the splits and descriptions of all sources, for the log at the start."""

@@ -72,9 +72,10 @@ class RenderJob:
     def sample(self, index: int) -> Sample:
         """Render an image; consecutive images are the views of a scene."""
         scene, view = divmod(index, self.views)
-        sample = rendered_sample(self.factory.render(0, scene, view=view), "virtual", str(index))
+        rendered = self.factory.render(0, scene, view=view)
+        sample = rendered_sample(rendered, "virtual", str(index))
         if self.views > 1:
-            sample.T_world_cam = invert_transform(self.factory.camera(0, scene, view))
+            sample.T_world_cam = invert_transform(rendered.scene.T_cam_world)
         return sample
 
 

@@ -32,7 +32,7 @@ from dopepp.geometry.camera import (
     project_keypoints,
 )
 from dopepp.geometry.cuboid import Cuboid
-from dopepp.parts.size import Seen
+from dopepp.parts.size import LearnedRange
 
 if TYPE_CHECKING:
     from dopepp.models.checkpoint import Checkpoint
@@ -303,7 +303,7 @@ def merge_scales(scales: Sequence[Sequence[Detection]]) -> list[Detection]:
 
 
 def _depths(
-    seen: Seen, reach: float, size: Size, distances: Distances | None
+    seen: LearnedRange, reach: float, size: Size, distances: Distances | None
 ) -> tuple[float, float]:
     """Return the nearest and farthest depth at which the part is searched, metres.
 
@@ -321,7 +321,7 @@ def _depths(
     return distances
 
 
-def _scales(seen: Seen, reach: float, depths: tuple[float, float]) -> Sequence[float]:
+def _scales(seen: LearnedRange, reach: float, depths: tuple[float, float]) -> Sequence[float]:
     """Return the smallest set of scales at which a part has a trained size at all depths.
 
     ``reach`` is the part's length on the image at a depth of one metre, pixels. At the middle depth

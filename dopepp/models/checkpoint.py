@@ -30,7 +30,7 @@ from dopepp.models.storage import (
     write_safetensors,
 )
 from dopepp.parts.part import Part
-from dopepp.parts.size import Seen
+from dopepp.parts.size import LearnedRange
 
 __all__ = ["Checkpoint", "load_network", "parse_description", "read", "write_atomic"]
 
@@ -82,7 +82,7 @@ class Checkpoint:
     recovery: dict[str, float] = field(default_factory=dict)
     data: dict[str, Any] = field(default_factory=dict)
     data_fingerprint: str = ""
-    seen: dict[str, Seen] = field(default_factory=dict)
+    seen: dict[str, LearnedRange] = field(default_factory=dict)
 
     def to_payload(self) -> dict[str, Any]:
         """Return the description as plain values, for the file's ``dopepp`` key.
@@ -179,7 +179,7 @@ def parse_description(payload: object) -> Checkpoint:
     empty = {name: type(value)() for name, value in kept.items() if isinstance(value, (dict, list))}
     fields = vars(parse(_Header, {**payload, **empty}, fix=_FIX))
     parts = [Part.from_record(record) for record in kept["parts"]]
-    seen = {name: Seen.parse(values) for name, values in fields["seen"].items()}
+    seen = {name: LearnedRange.parse(values) for name, values in fields["seen"].items()}
     kept |= {"spec": architecture(kept["spec"]), "parts": parts, "seen": seen}
     return Checkpoint(**{**fields, **kept}, state_dict={})
 

@@ -1,4 +1,4 @@
-"""Parts by mesh file or by name of a built-in part.
+"""Loading of parts, by mesh file or by name of a built-in part.
 
 The built-in parts are the paper's parts (§2.1): Servoholder, 77×77×7 mm, and PivConnector,
 105×52×7 mm. The shapes are our own: a 4 mm plate with raised features on its front (+z) and
@@ -143,21 +143,15 @@ def with_meshes(
             single = len(names) == len(given) == 1
             name = names[0] if single else text if text in BUILTIN else Path(text).stem
         if name not in names:
-            problem, allowed = (
-                f"--part {text}, which is not in the checkpoint",
-                ", ".join(names),
-            )
-            raise UserError(problem, allowed, "name the part of the file: --part NAME=FILE")
+            problem = f"--part {text}, which is not in the checkpoint"
+            fix = "name the part of the file: --part NAME=FILE"
+            raise UserError(problem, ", ".join(names), fix)
         chosen[name] = path
     return [_with_mesh(part, chosen.get(part.name), unit) for part in parts]
 
 
 def _with_mesh(part: Part, chosen: str | None, unit: str | None) -> Part:
-    """Return a part with the mesh of a chosen file, or unchanged without a chosen file.
-
-    Raises:
-        UserError: The part has no mesh, and none was chosen.
-    """
+    """Return a part with the mesh of a chosen file, or with its own mesh without a file."""
     if chosen is None:
         if part.mesh is not None:
             return part

@@ -1,4 +1,4 @@
-"""Look-alikes: parts that resemble a part and must not be mistaken for it.
+"""Look-alikes: parts that resemble a target but must not be detected.
 
 A uniformly scaled copy is not a look-alike, because one camera cannot distinguish it from the part
 at another distance. To add a look-alike, yield its mesh from ``_meshes``.
@@ -19,14 +19,14 @@ from dopepp.parts.part import Mesh, Part, make_part
 STRETCH: Final = 1.3
 """Factor on the longest side of the stretched copy."""
 
-_CUT_SHARE: Final = 0.25  # share of the surface that the cut removes
-_OWN_MIRROR: Final = 0.015  # largest mean distance of a part that is its own mirror image
+_CUT_SHARE: Final = 0.25  # Share of the surface that the cut removes
+_OWN_MIRROR: Final = 0.015  # Largest mirror distance of a part that equals its mirror image
 
 
 def lookalikes(parts: Sequence[Part]) -> list[Part]:
     """Return look-alikes of parts: mirrored, stretched along the longest side, with an end cut off.
 
-    A part that is its own mirror image has no mirrored copy.
+    A part that equals its mirror image has no mirrored copy.
 
     Args:
         parts: Parts; parts without a mesh are ignored.
@@ -40,14 +40,10 @@ def lookalikes(parts: Sequence[Part]) -> list[Part]:
 
 
 def mirror_distance(mesh: Mesh) -> float:
-    """Return how far a surface is from its mirror image.
+    """Return the smallest mean distance of a reflected surface, diameters of the bounding sphere.
 
-    Reflections at planes through the centroid and the reflection at the centroid itself are
-    searched; a part with another improper symmetry counts as chiral.
-
-    Returns:
-        Smallest mean distance of the reflected surface from the surface, diameters of its bounding
-        sphere.
+    The search covers reflections at planes through the centroid and at the centroid itself; a part
+    with another improper symmetry counts as chiral.
     """
     surface = SurfaceTree(mesh.vertices, mesh.faces)
     centre = surface.areas @ surface.triangles.mean(axis=1) / surface.areas.sum()

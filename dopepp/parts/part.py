@@ -1,6 +1,6 @@
 """A part: a rigid object with its mesh, size, cuboid and symmetries, all in metres.
 
-A record is the plain mapping of a part in a file. Files are not trusted, so
+A record holds a part as plain values in a file. Files are not trusted, so
 :meth:`Part.from_record` checks every field.
 """
 
@@ -42,7 +42,7 @@ SMALLEST_DIAMETER: Final = 0.005
 LARGEST_DIAMETER: Final = 5.0
 """Metres. Other diameters nearly always mean a wrong unit."""
 
-MAX_NAME: Final = 200  # Characters; bounds what a hostile file prints
+MAX_NAME: Final = 200  # Characters; a hostile file prints no more
 MAX_POINTS: Final = 100_000
 MAX_SYMMETRIES: Final = 1000
 """Far more than any real part has; bounds on the memory of a hostile file."""
@@ -50,8 +50,8 @@ MAX_SYMMETRIES: Final = 1000
 MAX_LIGHT_FACES: Final = 4000
 """Triangles of a record's mesh: edges of two pixels on a part of 100 pixels."""
 
-_SAME_SHAPE: Final = 0.001  # largest distance between equal surfaces, diameters
-_FARTHEST: Final = 1e6  # Largest coordinate, metres; its square stays finite
+_SAME_SHAPE: Final = 0.001  # Largest distance between equal surfaces, diameters
+_FARTHEST: Final = 1e6  # Largest coordinate, metres; its square is finite
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Mesh:
         uv: Texture coordinates per vertex, v upwards as in OBJ; None without a texture.
         texture: RGB texture image, first row on top.
         colours: sRGB of each vertex; None with a texture.
-        normals: Normal of each vertex in the file, of any length, not checked.
+        normals: Normal of each vertex as in the file, of any length; may be zero or not finite.
     """
 
     vertices: Vertices
@@ -110,9 +110,9 @@ class Part:
         return bool(self.symmetries_continuous) or (discrete is not None and len(discrete) > 0)
 
     def has_shape_of(self, other: Part) -> bool:
-        """Return whether the surfaces agree, whatever their triangles.
+        """Return whether two surfaces differ by at most 0.1 % of the diameter, for any triangles.
 
-        Surfaces may deviate by 0.1 % of the diameter. Parts without meshes are compared by hash.
+        Parts without meshes are compared by hash.
         """
         if self.mesh_hash == other.mesh_hash or self.mesh is None or other.mesh is None:
             return self.mesh_hash == other.mesh_hash
@@ -230,31 +230,20 @@ class _Record:
 
 
 def _checked_cuboid(rows: Sequence[_Point]) -> Float[np.ndarray, "9 3"]:
-    """Return the cuboid of a record.
-
-    Raises:
-        UserError: The corners do not form an axis-aligned box, or are in another order.
-    """
+    """Return the cuboid of a record, whose corners must form an axis-aligned box in NDDS order."""
     cuboid = np.array(rows, np.float64)
     expected = cuboid_keypoints(cuboid.min(axis=0), cuboid.max(axis=0))
     # Another order of corners would silently give wrong poses; 1e-6 is float32's rounding.
     if not np.abs(cuboid - expected).max() <= 1e-6 * np.ptp(cuboid):
-        problem, allowed = (
-            "part.cuboid that is not an axis-aligned box",
-            "eight corners in NDDS order",
-        )
-        raise UserError(problem, f"{allowed}, then the centre", _FIX)
+        problem = "part.cuboid that is not an axis-aligned box"
+        raise UserError(problem, "eight corners in NDDS order, then the centre", _FIX)
     return cuboid
 
 
 def _checked_transforms(
     matrices: Sequence[Sequence[_Row]] | None,
 ) -> Float[np.ndarray, "symmetries 4 4"] | None:
-    """Return the discrete symmetries of a record.
-
-    Raises:
-        UserError: A matrix is not a rigid transform.
-    """
+    """Return the discrete symmetries of a record, which must be rigid transforms."""
     if matrices is None:
         return None
     transforms = np.array(matrices, np.float64).reshape(-1, 4, 4)
@@ -342,13 +331,11 @@ def _check_diameter(diameter: float, name: str, unit: str) -> None:
         return
     written = diameter / UNITS[unit]
     likely = [u for u, s in UNITS.items() if SMALLEST_DIAMETER <= written * s <= LARGEST_DIAMETER]
-    raise UserError(
-        f"part {name!r} with a diameter of {diameter:.4g} m, its file read with unit={unit}",
-        "a diameter of 5 mm – 5 m",
-        f"state the file's unit: unit={likely[0]}"
-        if likely
-        else "export the part at its real size",
+    problem = f"part {name!r} with a diameter of {diameter:.4g} m, its file read with unit={unit}"
+    fix = (
+        f"state the file's unit: unit={likely[0]}" if likely else "export the part at its real size"
     )
+    raise UserError(problem, "a diameter of 5 mm – 5 m", fix)
 
 
 def check_name(name: object) -> str:

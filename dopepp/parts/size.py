@@ -1,7 +1,4 @@
-"""Sizes of parts, and the range of sizes and distances that a network has learned.
-
-The log describes each mesh, so that a wrong unit or a stray body is visible before training.
-"""
+"""Sizes of parts in words, and the range of sizes and distances that a network has learned."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ from dopepp.geometry.rotation import Vector
 from dopepp.parts.mesh.read import body_extents
 from dopepp.parts.part import Part
 
-_PLAUSIBLE: Final = (0.01, 2.0)  # Diameters that a hand or gripper holds, metres
+_PLAUSIBLE: Final = (0.01, 2.0)  # Diameters of parts that a gripper can hold, metres
 _LISTED: Final = 3  # Most bodies whose sizes the log lists
 
 
@@ -47,7 +44,7 @@ def part_in_words(part: Part) -> str:
     return words
 
 
-class Seen(NamedTuple):
+class LearnedRange(NamedTuple):
     """Range of sizes and distances of a part that a network has learned.
 
     Attributes:
@@ -63,25 +60,23 @@ class Seen(NamedTuple):
     farthest: float
 
     @classmethod
-    def parse(cls, values: object) -> Seen:
-        """Validate the four numbers of a file.
+    def parse(cls, values: object) -> LearnedRange:
+        """Validate the four numbers of a checkpoint.
 
         Raises:
             UserError: The values are not four numbers, or a number is out of range.
         """
         if not isinstance(values, list | tuple) or len(values) != len(cls._fields):
             fix = "use a checkpoint written by train.py"
-            raise UserError(
-                f"the learned range of sizes {values!r:.100}", ", ".join(cls._fields), fix
-            )
-        sizes = check("sizes of a part", values[:2], tuple[float, float], Span(0.1, 1e5, "pixels"))
-        depths = check(
-            "distances of a part", values[2:], tuple[float, float], Span(1e-4, 1e4, "metres")
-        )
+            problem = f"the learned range of sizes {values!r:.100}"
+            raise UserError(problem, ", ".join(cls._fields), fix)
+        pair = tuple[float, float]
+        sizes = check("sizes of a part", values[:2], pair, Span(0.1, 1e5, "pixels"))
+        depths = check("distances of a part", values[2:], pair, Span(1e-4, 1e4, "metres"))
         return cls(*sizes, *depths)
 
 
-def widest(ranges: Sequence[Seen]) -> Seen:
+def enclosing_range(ranges: Sequence[LearnedRange]) -> LearnedRange:
     """Return the smallest range that contains all ranges."""
     smallest, largest, nearest, farthest = zip(*ranges, strict=True)
-    return Seen(min(smallest), max(largest), min(nearest), max(farthest))
+    return LearnedRange(min(smallest), max(largest), min(nearest), max(farthest))

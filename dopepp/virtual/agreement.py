@@ -52,13 +52,13 @@ def _contour(
     item: SceneObject, K: CameraMatrix, size: Size
 ) -> tuple[Float[np.ndarray, "points 4"], float]:
     """Return x, y and normal of contour pixels in the image, and the part's extent, pixels."""
-    seen = project_object(item, K)
-    box = seen.box(size)
+    projected = project_object(item, K)
+    box = projected.box(size)
     if box is None:
         return np.empty((0, 4)), 0.0
     # A frame of one empty pixel, so that the outline is inside the canvas.
     left, top, right, bottom = box[0] - 1, box[1] - 1, box[2] + 1, box[3] + 1
-    inverse_depth, ids = draw_alone(item, seen.hom, (left, top, right, bottom))
+    inverse_depth, ids = draw_alone(item, projected.hom, (left, top, right, bottom))
     edges = _edges(item, np.where(inverse_depth > 0, ids, -1))
     rows, columns = np.nonzero(edges)
     x, y = columns + left, rows + top
@@ -66,8 +66,8 @@ def _contour(
     normals = _normals(edges)[rows, columns]
     points = np.column_stack([x, y, normals])[inside]
     points = points[:: -(-len(points) // MAX_POINTS) or 1]
-    extent = max(seen.extent[2] - seen.extent[0], seen.extent[3] - seen.extent[1])
-    return points, extent
+    left, top, right, bottom = projected.extent
+    return points, max(right - left, bottom - top)
 
 
 def _edges(item: SceneObject, ids: Int[np.ndarray, "height width"]) -> Mask:

@@ -108,12 +108,12 @@ class Preview:
 
         An object that reaches the camera or is far larger than the frame is refused.
         """
-        seen, (width, height) = project_object(item, self._K), self._size
-        left, top, right, bottom = seen.extent
+        projected, (width, height) = project_object(item, self._K), self._size
+        left, top, right, bottom = projected.extent
         if not max(right - left, bottom - top) <= 4 * max(width, height):
             return False
-        box = centres_within(seen.extent)
-        inverse_depth = draw_alone(item, seen.hom, box)[0]
+        box = centres_within(projected.extent)
+        inverse_depth = draw_alone(item, projected.hom, box)[0]
         whole = int(np.count_nonzero(inverse_depth))
         if item.is_target and whole == 0:
             return False
@@ -127,14 +127,14 @@ class Preview:
         in_front = drawn > nearest
         hidden = self._owners[frame][in_front]
         losses = np.bincount(hidden[hidden >= 0], minlength=len(self._visible))
-        left_px = [have - int(loss) for have, loss in zip(self._visible, losses, strict=True)]
+        remaining = [px - int(loss) for px, loss in zip(self._visible, losses, strict=True)]
         drawn_px = int(np.count_nonzero(in_front))
         needed = self._least * whole if item.is_target else 0.0
-        if (np.array([*left_px, drawn_px]) < [*self._needed, needed]).any():
+        if (np.array([*remaining, drawn_px]) < [*self._needed, needed]).any():
             return False
         nearest[in_front] = drawn[in_front]
-        self._owners[frame][in_front] = len(left_px)
-        self._visible = [*left_px, drawn_px]
+        self._owners[frame][in_front] = len(remaining)
+        self._visible = [*remaining, drawn_px]
         self._needed.append(needed)
         return True
 
@@ -188,9 +188,7 @@ def _poses(composition: Composition, body: Body) -> Iterator[Transform]:
 def _place_distractor(composition: Composition, reference: float) -> None:
     """Try up to eight times to add a distractor that neither pierces nor hides a target.
 
-    Args:
-        composition: The scene so far.
-        reference: Depth, in metres, that the preset's range of distractor depths multiplies.
+    The preset's range of distractor depths is multiplied by the depth ``reference``, metres.
     """
     rng, ranges = composition.rng, composition.preset.distractors
     for _ in range(8):

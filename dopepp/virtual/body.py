@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from itertools import product
 from typing import Annotated, Final
 
 import numpy as np
@@ -20,7 +21,7 @@ from scipy.spatial import ConvexHull, QhullError
 from dopepp.core.errors import UserError
 from dopepp.core.validation import Checked, Pair, Share, Span
 from dopepp.geometry.rotation import Vector
-from dopepp.parts.convex import Piece, convex_pieces
+from dopepp.parts.convex import Piece, convex_pieces, hull_faces
 from dopepp.parts.mesh import Vertices
 from dopepp.parts.part import Mesh, Part
 from dopepp.virtual.scene import Triple, triple
@@ -134,11 +135,7 @@ def make_hull(surface: Surface) -> Hull:
     except QhullError:
         # A flat or straight mesh has no volume; "QJ" moves its points slightly to get a hull.
         hull = ConvexHull(used, qhull_options="QJ")
-    # The order of corners makes normals point outwards.
-    a, b, c = hull.points[hull.simplices].swapaxes(0, 1)
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
-    triangles = hull.simplices.copy()
-    triangles[inward] = triangles[inward][:, ::-1]
+    triangles = hull_faces(hull)
     closed = surface.vertices[surface.faces] if surface.closed else hull.points[triangles]
     kept, index = np.unique(triangles, return_inverse=True)
     return Hull(
@@ -286,3 +283,11 @@ def bin_walls() -> Body:
     outer = CrossSection.square((1 + 2 * WALL,) * 2, center=True)
     solid = (outer - CrossSection.square((1.0, 1.0), center=True)).extrude(1.0)
     return Body(make_surface(_mesh_of(solid)))
+
+
+def bin_pieces() -> list[Piece]:
+    """Return the four walls of :func:`bin_walls` as convex pieces."""
+    near, far = 0.5, 0.5 + WALL
+    ends = [((near, far), (-far, far)), ((-far, -near), (-far, far))]
+    ends += [((-near, near), (near, far)), ((-near, near), (-far, -near))]
+    return [np.array(list(product(x, y, (0.0, 1.0)))) for x, y in ends]

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.random import Generator
 
 from dopepp.core.errors import UserError, require
 from dopepp.geometry.camera import Transform, make_transform, orbited_camera, transform
@@ -95,8 +96,9 @@ class Factory:
             epoch: Epoch of the image.
             index: Index of the image within the epoch.
             scale: Magnification of the targets, relative to the preset.
-            view: Number of the camera; 0 is the preset's camera; for other cameras see
-                :meth:`camera`.
+            view: Number of the camera of the static scene; 0 is the preset's camera. Other
+                cameras look at the middle of the targets from :data:`BESIDE_DEG` beside the
+                preset's camera, and from above the table.
 
         Raises:
             UserError: The preset cannot show the part, or the camera would be below the table.
@@ -104,32 +106,11 @@ class Factory:
         scene = self.scene(epoch, index, scale)
         if view:
             sensor = replace(scene.sensor, noise_seed=scene.sensor.noise_seed + view)
-            seen = scene.seen_from(self.camera(epoch, index, view))
+            rng = np.random.default_rng([self.seed, epoch, index, view])
+            seen = scene.seen_from(_draw_camera(scene, rng))
             scene = replace(seen, objects=_in_front(seen.objects), sensor=sensor)
         rendered = self._render(scene)
         return replace(rendered, image=capture(rendered.image, rendered.scene.sensor))
-
-    def camera(self, epoch: int, index: int, view: int) -> Transform:
-        """Return the pose of a further camera of a static scene, T_new_cam; view 0 is the preset's.
-
-        It looks at the middle of the targets from :data:`BESIDE_DEG` beside the preset's camera,
-        and from above the table.
-        """
-        if view == 0:
-            return np.eye(4)
-        scene = self.scene(epoch, index)
-        rng = np.random.default_rng([self.seed, epoch, index, view])
-        angle, first = np.radians(rng.uniform(*BESIDE_DEG)), rng.uniform(0.0, 2 * np.pi)
-        middle = _middle([scene.objects[number] for number in scene.targets])
-        point = np.array([0.0, 0.0, 1.0]) if middle is None else middle
-        cameras = [orbited_camera(point, angle, first + turn) for turn in np.pi / 4 * np.arange(8)]
-        if scene.plane is None:
-            return cameras[0]
-        normal, offset = np.array(scene.plane.normal), scene.plane.offset
-        # The camera's centre is −Rᵀt in the preset's camera.
-        heights = [-float(normal @ (T[:3, :3].T @ T[:3, 3])) - offset for T in cameras]
-        high = [T for T, height in zip(cameras, heights, strict=True) if height > -offset / 2]
-        return high[0] if high else cameras[int(np.argmax(heights))]
 
     def scene(self, epoch: int, index: int, scale: float = 1.0) -> Scene:
         """Return the scene of an image without rendering it.
@@ -166,14 +147,14 @@ class Factory:
                 T_cam_table = arrange_heap(composition, preset.table, pile, targets, drawing)
             shift = approach(composition.objects, scale)
             lights, ambient = preset.lighting.draw(rng, T_cam_table[:3, 3], T_cam_table[:3, 2])
-            picture = preset.table.draw_image(rng, backgrounds, K, size, T_cam_table)
+            table_image = preset.table.draw_image(rng, backgrounds, K, size, T_cam_table)
             T_cam_table = _moved(T_cam_table, shift)
             plane = plane_of(T_cam_table)
             if plane.offset >= 0:
                 problem = f"scale {scale:g} of a scene whose parts reach higher than the camera"
                 allowed = "a scale at which the camera is above the table"
                 raise UserError(problem, allowed, "set a larger scale")
-            background = picture.seen(K, size, T_cam_table)
+            background = table_image.project(K, size, T_cam_table)
         if targets and not any(item.is_target for item in composition.objects):
             part = targets[0].part
             assert part is not None
@@ -202,6 +183,21 @@ def approach(objects: Sequence[SceneObject], scale: float) -> Vector:
     """
     middle = _middle(objects)
     return np.zeros(3) if middle is None or scale == 1 else np.asarray((1 / scale - 1) * middle)
+
+
+def _draw_camera(scene: Scene, rng: Generator) -> Transform:
+    """Draw the pose of a further camera of a static scene, T_new_cam."""
+    angle, first = np.radians(rng.uniform(*BESIDE_DEG)), rng.uniform(0.0, 2 * np.pi)
+    middle = _middle(scene.objects)
+    point = np.array([0.0, 0.0, 1.0]) if middle is None else middle
+    cameras = [orbited_camera(point, angle, first + turn) for turn in np.pi / 4 * np.arange(8)]
+    if scene.plane is None:
+        return cameras[0]
+    normal, offset = np.array(scene.plane.normal), scene.plane.offset
+    # The camera's centre is −Rᵀt in the preset's camera.
+    heights = [-float(normal @ (T[:3, :3].T @ T[:3, 3])) - offset for T in cameras]
+    high = [T for T, height in zip(cameras, heights, strict=True) if height > -offset / 2]
+    return high[0] if high else cameras[int(np.argmax(heights))]
 
 
 def _middle(objects: Sequence[SceneObject]) -> Vector | None:
@@ -233,11 +229,7 @@ def code_hash() -> str:
 
 
 def _all_negatives(parts: Sequence[Part], given: Sequence[Part]) -> tuple[Part, ...]:
-    """Return the given negatives and the built-in parts that are neither targets nor given.
-
-    Raises:
-        UserError: A negative has the name or the mesh of a target.
-    """
+    """Return the given negatives and the built-in parts that are neither targets nor given."""
     names, hashes = {part.name for part in parts}, {part.mesh_hash for part in parts}
     for part in given:
         if part.name in names or part.mesh_hash in hashes:

@@ -7,20 +7,18 @@ turns and shifts the heap and draws its own view, materials and light.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import product
 from typing import Final
 
 import numpy as np
 from jaxtyping import Float
 from numpy.random import Generator
-from scipy.spatial.distance import pdist
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import Transform, make_transform, project, transform
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
-from dopepp.parts.convex import Piece
+from dopepp.parts.mesh import largest_distance
 from dopepp.virtual.arrangement import Composition
-from dopepp.virtual.body import WALL, Body, bin_walls
+from dopepp.virtual.body import Body, bin_pieces, bin_walls
 from dopepp.virtual.presets.table import Pile, Table
 from dopepp.virtual.scene import NEAR, SceneObject
 from dopepp.virtual.tabletop import draw_view
@@ -53,9 +51,12 @@ def arrange_heap(
         UserError: The objects do not come to rest.
     """
     preset, rng = composition.preset, composition.rng
-    diameter = max((_diameter(body) for body in targets), default=0.3 * table.distance[0])
-    bodies = list(targets)
-    negatives = [body for body in composition.negatives if _diameter(body) < _LARGEST * diameter]
+    hulls = (body.surface.hull for body in targets)
+    diameter = max(map(largest_distance, hulls), default=0.3 * table.distance[0])
+    bodies, limit = list(targets), _LARGEST * diameter
+    negatives = [
+        body for body in composition.negatives if largest_distance(body.surface.hull) < limit
+    ]
     low, high = preset.distractors.number
     for _ in range(int(drawing.integers(low, high + 1))):
         bodies.append(preset.distractors.draw(drawing, _IMAGE_WIDTH * diameter, negatives))
@@ -92,11 +93,7 @@ def arrange_heap(
 def _drop(
     bodies: Sequence[Body], pile: Pile, diameter: float, rng: Generator
 ) -> tuple[Sequence[Transform], Sides | None]:
-    """Return the bodies' poses at rest, and the sides of their bin, if any.
-
-    Raises:
-        UserError: The bodies do not come to rest in any trial.
-    """
+    """Return the bodies' poses at rest, and the sides of their bin, if any."""
     from dopepp.virtual.physics import settle  # needs the extra
 
     if not bodies:
@@ -109,7 +106,7 @@ def _drop(
         sides = np.array([room * stretch, room / stretch, height])
         has_bin = rng.random() < pile.bin_share
         starts = _layers(bodies, sides, diameter, rng)
-        walls = [sides * wall for wall in _walls()] if has_bin else []
+        walls = [sides * piece for piece in bin_pieces()] if has_bin else []
         poses = settle([body.pieces for body in bodies], starts, walls, diameter)
         if poses is not None:
             return list(poses), sides if has_bin else None
@@ -143,16 +140,3 @@ def _layers(
         top = max(top, float(position[2] + upper[2]))
         poses.append(make_transform(rotation, position))
     return np.stack(poses)
-
-
-def _diameter(body: Body) -> float:
-    """Return the largest distance between two points of a body, metres."""
-    return float(pdist(body.surface.hull).max())
-
-
-def _walls() -> list[Piece]:
-    """Return the four walls of a bin of inner width, depth and height 1, without a floor."""
-    near, far = 0.5, 0.5 + WALL
-    ends = [((near, far), (-far, far)), ((-far, -near), (-far, far))]
-    ends += [((-near, near), (near, far)), ((-near, near), (-far, -near))]
-    return [np.array(list(product(x, y, (0.0, 1.0)))) for x, y in ends]

@@ -57,7 +57,8 @@ _FLOOR, _HULL, _PIECES = 1, 2, 4  # collision groups
 def add_hull(spec: Any, body: Any, name: str, vertices: Piece) -> Any:
     """Add a convex hull to a body, and return the geom; geoms of one name share a mesh."""
     if spec.mesh(name) is None:
-        spec.add_mesh(name=name, uservert=vertices.ravel(), userface=hull_faces(vertices).ravel())
+        faces = hull_faces(ConvexHull(vertices))
+        spec.add_mesh(name=name, uservert=vertices.ravel(), userface=faces.ravel())
     return body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
 
 
@@ -105,14 +106,7 @@ def settle(
 def _simulate(
     solids: Sequence[tuple[Piece, ...]], starts: Poses, walls: Sequence[Piece], diameter: float
 ) -> Poses | None:
-    """Simulate the fall of solids; return their poses at rest, or None if they keep moving.
-
-    Args:
-        solids: Convex pieces of each solid.
-        starts: Initial pose of each solid, metres.
-        walls: Convex pieces that do not move.
-        diameter: Diameter of the largest solid, metres; the simulation is scaled by it.
-    """
+    """Simulate the fall of solids; return their poses at rest, or None if they keep moving."""
     scale = _SIZE / diameter
     model = _model(solids, walls, scale)
     state = mujoco.MjData(model)

@@ -13,6 +13,7 @@ from jaxtyping import Float, Float32, Int16
 from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
 from dopepp.geometry.cuboid import NUM_KEYPOINTS
+from dopepp.geometry.rotation import Vector
 from dopepp.parts.part import Part
 from dopepp.virtual.sensor import Sensor
 from dopepp.virtual.surface import Surface
@@ -110,6 +111,10 @@ class Plane:
     normal: Triple
     offset: float
 
+    def inverse_depth_row(self, K: CameraMatrix) -> Vector:
+        """Return (a, b, c) with 1/z = a u + b v + c on the plane, 1/m; positive if in front."""
+        return np.asarray(np.linalg.solve(K.T, np.array(self.normal, np.float64)) / self.offset)
+
 
 @dataclass(frozen=True, eq=False)
 class SceneObject:
@@ -137,7 +142,12 @@ class SceneObject:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Objects, lights, background and camera of one image."""
+    """Objects, lights, background and camera of one image.
+
+    Attributes:
+        T_cam_world: Pose of the camera of :meth:`seen_from`; the world frame is the camera that the
+            preset has drawn.
+    """
 
     K: CameraMatrix
     background: RGBImage
@@ -146,6 +156,7 @@ class Scene:
     ambient: Ambient = field(default_factory=Ambient)
     plane: Plane | None = None
     sensor: Sensor = field(default_factory=Sensor)
+    T_cam_world: Transform = field(default_factory=lambda: np.eye(4))
 
     @property
     def size(self) -> tuple[int, int]:
@@ -172,20 +183,22 @@ class Scene:
             normal = R @ plane.normal
             homography = R + np.outer(shift, plane.normal) / plane.offset
             plane = Plane(triple(normal), plane.offset + float(normal @ shift))
-        homography, border = self.K @ homography @ np.linalg.inv(self.K), cv2.BORDER_REFLECT_101
+        homography = self.K @ homography @ np.linalg.inv(self.K)
+        background = cv2.warpPerspective(
+            self.background, homography, self.size, borderMode=cv2.BORDER_REFLECT_101
+        )
+        objects = (replace(item, T_cam_obj=T_new_cam @ item.T_cam_obj) for item in self.objects)
+        lights = (
+            replace(light, position=triple(R @ light.position + shift)) for light in self.lights
+        )
         return replace(
             self,
-            background=cv2.warpPerspective(
-                self.background, homography, self.size, borderMode=border
-            ),
-            objects=tuple(
-                replace(item, T_cam_obj=T_new_cam @ item.T_cam_obj) for item in self.objects
-            ),
-            lights=tuple(
-                replace(light, position=triple(R @ light.position + shift)) for light in self.lights
-            ),
+            background=background,
+            objects=tuple(objects),
+            lights=tuple(lights),
             ambient=replace(self.ambient, up=triple(R @ self.ambient.up)),
             plane=plane,
+            T_cam_world=T_new_cam @ self.T_cam_world,
         )
 
     def keypoints(self, index: int) -> Float[np.ndarray, "9 2"]:

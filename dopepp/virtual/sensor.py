@@ -199,10 +199,9 @@ def _shuffle(values: Array) -> None:
 def _add_noise(
     image: Array, read: np.float32, shot: np.float32, table: Array, seed: int, noisy: Array
 ) -> None:
-    """Add read and shot noise, with normal values from a table.
+    """Add read noise (variance in squared grey levels) and shot noise (variance per grey level).
 
-    ``image`` and ``noisy`` are flat uint8. ``read`` is a variance in squared grey levels, and
-    ``shot`` a variance per grey level. The table has a power of two plus ``_NOISE_RUN`` values.
+    ``image`` and ``noisy`` are flat uint8. The table has a power of two plus ``_NOISE_RUN`` values.
     """
     count, mask = image.shape[0], np.uint32(table.shape[0] - _NOISE_RUN - 1)
     start = _mixed(np.uint32(seed) ^ np.uint32(0x9E3779B9))

@@ -1,4 +1,4 @@
-"""Objects on a table: side by side on the plane, or dropped onto a heap.
+"""Objects on a table: side by side on the plane, or lowered onto a heap.
 
 The table frame has its origin on the plane and z upwards. A height map on a square grid holds the
 objects so far. A new object is lowered until its underside meets the map in some cell. Objects keep
@@ -21,7 +21,7 @@ from dopepp.geometry.rotation import RotationMatrix, rotation_vector_to_matrix
 from dopepp.parts.mesh import Faces
 from dopepp.virtual.arrangement import Composition
 from dopepp.virtual.body import Body
-from dopepp.virtual.presets.table import Table, inverse_depth_row, plane_of
+from dopepp.virtual.presets.table import Table, plane_of
 from dopepp.virtual.surface import Surface
 from dopepp.virtual.triangles import CENTRE_SAMPLE, rasterise
 
@@ -44,21 +44,21 @@ def arrange_on_table(composition: Composition, table: Table, targets: Sequence[B
     # Draw another view if no target fits into the image.
     for _ in range(8):
         composition.clear()
-        setting = _Setting(composition, table, targets)
+        scene = _TableScene(composition, table, targets)
         for body in targets:
-            if not setting.place(body) and not composition.objects:
+            if not scene.place(body) and not composition.objects:
                 break
         if composition.objects or not targets:
             break
     low, high = composition.preset.distractors.number
     for _ in range(int(rng.integers(low, high + 1))):
-        setting.place(composition.draw_distractor(float(setting.T_cam_table[2, 3])))
-    return setting.T_cam_table
+        scene.place(composition.draw_distractor(float(scene.T_cam_table[2, 3])))
+    return scene.T_cam_table
 
 
 @dataclass(frozen=True, eq=False)
-class _Lying:
-    """A resting pose, with the heights of lowest point and centre of mass above the plane."""
+class _RestingPose:
+    """A resting pose; ``height`` (lowest point) and ``centre`` (of mass) are above the plane."""
 
     T_table_obj: Transform
     footprint: Footprint
@@ -67,8 +67,8 @@ class _Lying:
     centre: float
 
 
-class _Setting:
-    """A view of the table and the objects on it."""
+class _TableScene:
+    """A view of the table, and the height map of the objects on it."""
 
     def __init__(self, composition: Composition, table: Table, targets: Sequence[Body]) -> None:
         self.composition, self.table, self.rng = composition, table, composition.rng
@@ -80,28 +80,28 @@ class _Setting:
         reach = self._radius + 2 * diameter if table.heaped else 2 * distance
         # A cell is a hundredth of the largest target; at most 512 cells lie to either side.
         self._map = HeightMap(max(0.01 * diameter, reach / 512), reach)
-        self._inverse_depth = inverse_depth_row(plane_of(self.T_cam_table), composition.K)
+        self._inverse_depth = plane_of(self.T_cam_table).inverse_depth_row(composition.K)
 
     def place(self, body: Body) -> bool:
         """Lay a body down; return whether it fits."""
         material = self.composition.draw_material(body)
         for _ in range(6):  # random orientations, until the body fits
-            for lying in self._candidates(body):
-                T_cam_obj = self.T_cam_table @ lying.T_table_obj
+            for pose in self._candidates(body):
+                T_cam_obj = self.T_cam_table @ pose.T_table_obj
                 if self.composition.add(body, T_cam_obj, material):
-                    self._map.put(lying.footprint, lying.cell, lying.height)
+                    self._map.put(pose.footprint, pose.cell, pose.height)
                     return True
         return False
 
-    def _candidates(self, body: Body) -> Iterable[_Lying]:
+    def _candidates(self, body: Body) -> Iterable[_RestingPose]:
         """Draw resting poses of a body; on a heap, the lowest first."""
         if not self.table.heaped:
             return self._resting_poses(body)
         # Objects slide down: prefer the lowest pose of two orientations.
-        several = [lying for _ in range(2) for lying in self._resting_poses(body)]
-        return sorted(several, key=lambda lying: lying.centre)
+        several = [pose for _ in range(2) for pose in self._resting_poses(body)]
+        return sorted(several, key=lambda pose: pose.centre)
 
-    def _resting_poses(self, body: Body) -> Iterator[_Lying]:
+    def _resting_poses(self, body: Body) -> Iterator[_RestingPose]:
         """Turn a body at random and yield resting poses."""
         rotation, lowest = self.table.draw_turning(self.rng, body.hull)
         footprint = self._map.footprint(body.surface, rotation, lowest)
@@ -119,7 +119,7 @@ class _Setting:
                 continue
             origin = np.array([cell[0] * side, cell[1] * side, height - lowest])
             centre = origin[2] + float(rotation[2] @ body.hull.centre)
-            yield _Lying(make_transform(rotation, origin), footprint, cell, height, centre)
+            yield _RestingPose(make_transform(rotation, origin), footprint, cell, height, centre)
 
     def _draw_point(self) -> tuple[float, float] | None:
         """Draw a point of the table, metres: in the heap's circle, or under a random pixel."""
@@ -239,19 +239,9 @@ class HeightMap:
 def _greatest(
     x: Column, y: Column, values: Column, surface: Surface, faces: Faces, corner: Cell, shape: Shape
 ) -> Float32[np.ndarray, "rows columns"]:
-    """Draw triangles into a height map with the greatest value at every cell.
+    """Return 1 + the greatest value (in [0, 1] per vertex) at cell centres; 0 outside the object.
 
-    Args:
-        x: Column of each vertex.
-        y: Row of each vertex.
-        values: Value of each vertex, in [0, 1].
-        surface: The surface, which may be closed.
-        faces: Vertices of each triangle to draw.
-        corner: (column, row) of the map's first cell.
-        shape: Number of rows and columns.
-
-    Returns:
-        1 + the greatest value at every cell's centre; 0 outside the object.
+    ``x`` and ``y`` are columns and rows of the vertices; ``corner`` is the map's first cell.
     """
     # The rasteriser keeps the greatest 1/z and interpolates it linearly over the image. A vertex at
     # column x and row y with z = 1/(1 + value) therefore maps any linear value in [0, 1].

@@ -1,6 +1,6 @@
 """Compiled rasterisation of triangles: the nearest triangle and inverse depth of every sample.
 
-Baking, arranging, rendering and shadow maps share these functions, which are independent of scenes.
+Baking, arranging, rendering and shadow maps share these functions.
 
 Visibility uses homogeneous edge functions (Olano and Greer, "Triangle scan conversion using 2D
 homogeneous coordinates", 1997): with the projected vertices ``p = K x_cam`` of a triangle,
@@ -38,15 +38,7 @@ _pool = threading.local()
 
 @compiled()
 def project_vertices(vertices: Array, T_cam_obj: Array, K: Array, cam: Array, hom: Array) -> None:
-    """Transform vertices to the camera frame, and project them.
-
-    Args:
-        vertices: Vertices in the object frame, metres.
-        T_cam_obj: Pose of the object.
-        K: Camera matrix, pixels.
-        cam: Filled with the vertices in the camera frame, metres.
-        hom: Filled with the homogeneous pixels ``K x_cam``.
-    """
+    """Fill ``cam`` with vertices in the camera frame, and ``hom`` with the pixels ``K x_cam``."""
     for i in range(vertices.shape[0]):
         x, y, z = vertices[i, 0], vertices[i, 1], vertices[i, 2]
         for r in range(3):
@@ -199,15 +191,9 @@ def rasterise(
 
 @compiled(inline="always")
 def edge_functions(hom: Array, a: int, b: int, c: int) -> EdgeFunctions:
-    """Return the three edge functions of a triangle, as coefficients of (x, y, 1).
+    """Return the edge functions of the triangle of vertices a, b, c, as coefficients of (x, y, 1).
 
     An edge function at a pixel is the weight of the opposite corner, up to a common factor.
-
-    Args:
-        hom: Homogeneous pixels of the vertices.
-        a: First corner.
-        b: Second corner.
-        c: Third corner.
     """
     ax, ay, aw = hom[a, 0], hom[a, 1], hom[a, 2]
     bx, by, bw = hom[b, 0], hom[b, 1], hom[b, 2]
@@ -221,18 +207,10 @@ def edge_functions(hom: Array, a: int, b: int, c: int) -> EdgeFunctions:
 
 @compiled(fastmath=True)
 def open_share(u: Scalar, v: Scalar, inverse: Scalar, inverse_depth: Array) -> Scalar:
-    """Return which share of the four shadow-map texels around a point leaves the point lit.
+    """Return the share of light in [0, 1] that reaches a point at column u, row v of a shadow map.
 
-    This is percentage-closer filtering: the comparisons are interpolated, not the depths.
-
-    Args:
-        u: Column in the shadow map, texels.
-        v: Row in the shadow map, texels.
-        inverse: Inverse depth of the point, as seen from the light.
-        inverse_depth: Shadow map, (rows, columns, 1).
-
-    Returns:
-        Share from 0 (in shadow) to 1 (lit); 1 for points outside the map.
+    ``inverse`` is the point's inverse depth from the light. The comparisons with the four texels
+    are interpolated, not the depths (percentage-closer filtering). Points outside the map are lit.
     """
     rows, columns = inverse_depth.shape[0], inverse_depth.shape[1]
     if not (_ZERO <= u < np.float32(columns - 1) and _ZERO <= v < np.float32(rows - 1)):
@@ -249,15 +227,7 @@ def open_share(u: Scalar, v: Scalar, inverse: Scalar, inverse_depth: Array) -> S
 
 @compiled(fastmath=True)
 def lit_share(x: Scalar, y: Scalar, z: Scalar, inverse_depth: Array, P: Array) -> Scalar:
-    """Return the share of the light that reaches a point, interpolated in a shadow map (float32).
-
-    Args:
-        x: Coordinate of the point, metres, like y and z.
-        y: Coordinate of the point.
-        z: Coordinate of the point.
-        inverse_depth: Shadow map, 1/m, shape (height, width, 1).
-        P: Projection to homogeneous pixels of the map and depth, shape (3, 4).
-    """
+    """Return the share of light that reaches a point; ``P`` (3, 4) projects into the shadow map."""
     depth = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3]
     if depth <= _ZERO:
         return _ONE

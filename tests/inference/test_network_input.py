@@ -26,10 +26,10 @@ from dopepp.inference.network_input import (
     undistort_depth,
 )
 from dopepp.parts.catalogue import load_part
-from dopepp.parts.size import Seen
+from dopepp.parts.size import LearnedRange
 from dopepp.virtual import PRESETS, Factory, render
 
-SEEN = Seen(48.0, 98.0, 0.12, 0.25)
+SEEN = LearnedRange(48.0, 98.0, 0.12, 0.25)
 
 
 def picture(width, height):

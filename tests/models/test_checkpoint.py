@@ -22,7 +22,7 @@ from dopepp.models.checkpoint import (
 )
 from dopepp.models.network import build_network
 from dopepp.parts.part import Mesh, make_part
-from dopepp.parts.size import Seen
+from dopepp.parts.size import LearnedRange
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def checkpoint(small_spec, part):
             "virtual": {"backgrounds": "photos/2024", "preset": "wide"},
         },
         data_fingerprint="abc",
-        seen={"bracket": Seen(40.0, 90.0, 0.2, 0.5)},
+        seen={"bracket": LearnedRange(40.0, 90.0, 0.2, 0.5)},
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ def without_mesh(name: str, mesh_hash: str = "") -> Part:
     return replace(servoholder(), name=name, mesh=None, mesh_hash=mesh_hash)
 
 
-def test_a_given_mesh_is_taken_and_compared(caplog):
+def test_a_given_mesh_is_used_and_compared(caplog):
     mesh_hash = servoholder().mesh_hash
     parts = [servoholder(), without_mesh("other", mesh_hash)]
     with caplog.at_level(logging.WARNING):
@@ -25,7 +25,7 @@ def test_a_given_mesh_is_taken_and_compared(caplog):
     assert "the checkpoint was not trained on this mesh" in caplog.text
 
 
-def test_a_checkpoints_own_mesh_is_taken_unless_another_is_given():
+def test_the_checkpoints_mesh_is_used_unless_another_is_given():
     part = replace(servoholder(), name="bracket")
     assert with_meshes([part])[0].mesh is part.mesh
     assert with_meshes([part], ["pivconnector"])[0].mesh is pivconnector().mesh

@@ -36,7 +36,7 @@ def test_points_alone_make_a_part_without_mesh():
     np.testing.assert_allclose(part.cuboid[8], [0.015, 0.02, 0.05])
 
 
-def test_hash_tells_meshes_apart():
+def test_different_meshes_have_different_hashes():
     mesh = box((0.1, 0.1, 0.1))
     moved = Mesh(np.nextafter(mesh.vertices, 1), mesh.faces)
     turned = Mesh(mesh.vertices, mesh.faces[:, [1, 2, 0]])
@@ -73,7 +73,7 @@ def test_a_name_must_be_printable(name):
         make_part(name, box((0.1, 0.1, 0.1)))
 
 
-def test_a_shape_is_the_same_whatever_its_triangles():
+def test_shapes_are_compared_independently_of_their_triangles():
     solid = trimesh.creation.box((0.1, 0.06, 0.02))
     part, finer, other, thin = (
         make_part("box", Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int32)))

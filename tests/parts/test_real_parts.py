@@ -17,7 +17,7 @@ TEXTURED = (
 )
 
 
-def test_somebody_elses_stl_parts_load_as_they_are(shared_data):
+def test_stl_parts_agree_with_trimesh(shared_data):
     paths = sorted(p for p in (shared_data / "parts").rglob("*") if p.suffix.lower() == ".stl")
     assert len(paths) == 6
     for path in paths:
@@ -84,7 +84,7 @@ def test_an_unknown_object_lists_the_known_ones(copied_root):
             ycb_part(copied_root, name)
 
 
-def test_a_folder_that_is_no_ycb_video_is_refused(tmp_path):
+def test_a_folder_without_ycb_models_is_refused(tmp_path):
     for root in (tmp_path, tmp_path / "gone"):
         with pytest.raises(UserError, match=r"no models/NAME/points\.xyz; .*data\.root"):
             ycb_part(root, "009_gelatin_box")

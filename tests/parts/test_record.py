@@ -39,7 +39,7 @@ SCALED = np.eye(4) * 2
 
 
 @pytest.mark.parametrize("part", [servoholder(), symmetric_part()], ids=lambda p: p.name)
-def test_a_record_survives_json_without_loss(part):
+def test_a_record_is_unchanged_by_json(part):
     again = Part.from_record(json.loads(json.dumps(part.to_record())))
     np.testing.assert_allclose(again.mesh.vertices[again.mesh.faces],
                                part.mesh.vertices[part.mesh.faces], atol=0.6e-7)  # fmt: skip
@@ -55,12 +55,12 @@ def test_a_record_survives_json_without_loss(part):
     assert again.to_record() == part.to_record()
 
 
-def test_a_record_holds_few_triangles_and_says_how_far_they_are_off():
+def test_a_record_holds_few_triangles_and_their_deviation():
     sphere = trimesh.creation.icosphere(6, 0.05)  # 81,920 triangles
     light, deviation = make_part("ball", Mesh(sphere.vertices, sphere.faces)).light_mesh
     assert 2000 < len(light.faces) <= MAX_LIGHT_FACES
-    told = trimesh.Trimesh(light.vertices, light.faces)
-    points, _ = trimesh.sample.sample_surface(told, 300_000, seed=0)
+    solid = trimesh.Trimesh(light.vertices, light.faces)
+    points, _ = trimesh.sample.sample_surface(solid, 300_000, seed=0)
     away = KDTree(points).query(sphere.vertices)[0].max()
     assert away - 0.0005 < deviation < 1.05 * away
     assert deviation < 0.001
@@ -135,7 +135,7 @@ def test_a_bad_field_is_named(field, value, message):
           for field in RECORD),
     ],
 )  # fmt: skip
-def test_another_thing_is_no_record_and_no_field_may_be_missing(record, message):
+def test_other_values_and_missing_fields_are_refused(record, message):
     with pytest.raises(UserError, match=message):
         Part.from_record(record)
 

@@ -1,4 +1,4 @@
-"""Sizes of parts: in the log, and as a network has seen them."""
+"""Sizes of parts in the log, and the range that a network has learned."""
 
 import logging
 import math
@@ -12,7 +12,7 @@ from trimesh.exchange.stl import export_stl
 from dopepp.core.errors import UserError
 from dopepp.parts import load_part, servoholder
 from dopepp.parts.mesh.read import body_extents
-from dopepp.parts.size import Seen, part_in_words, size_in_words, widest
+from dopepp.parts.size import LearnedRange, enclosing_range, part_in_words, size_in_words
 
 
 def box(*extents: float, at: tuple[float, float, float] = (0, 0, 0)) -> trimesh.Trimesh:
@@ -65,21 +65,17 @@ def written(tmp_path):
     [
         ("mm", logging.INFO, "bracket: 62 × 40 × 31 mm, read in mm"),
         ("cm", logging.INFO, "bracket: 620 × 400 × 310 mm, read in cm"),
-        (
-            "inch",
-            logging.WARNING,
-            "bracket: 1575 × 1016 × 787 mm, read in inch (unlikely: most parts measure 0.01 – 2 m; "
-            "is the unit right?)",
-        ),
+        ("inch", logging.WARNING, "bracket: 1575 × 1016 × 787 mm, read in inch (unlikely: most "
+         "parts measure 0.01 – 2 m; is the unit right?)"),
     ],
-)
-def test_the_log_says_the_size_and_the_unit_taken(unit, level, words, written, caplog):
+)  # fmt: skip
+def test_the_log_states_size_and_unit(unit, level, words, written, caplog):
     with caplog.at_level(logging.INFO):
         load_part(written(BRACKET), unit)
     assert (caplog.records[-1].levelno, caplog.records[-1].getMessage()) == (level, words)
 
 
-@pytest.mark.parametrize(("side", "unit"), [(40, "inch"), (100, "cm"), (0.3, "cm")])
+@pytest.mark.parametrize(("side", "unit"), [(100, "cm"), (0.3, "cm")])
 def test_an_unlikely_size_is_a_warning(side, unit, written, caplog):
     with caplog.at_level(logging.WARNING):
         load_part(written(box(2 * side, side, side)), unit)
@@ -87,7 +83,7 @@ def test_an_unlikely_size_is_a_warning(side, unit, written, caplog):
     assert "is the unit right?" in record.getMessage()
 
 
-def test_several_bodies_are_said_once(written, caplog):
+def test_several_bodies_are_logged_once(written, caplog):
     with caplog.at_level(logging.INFO):
         load_part(written(BRACKET, box(5, 5, 8, at=(100, 0, 0))), "mm")
     lines = [record.getMessage() for record in caplog.records if "bodies" in record.getMessage()]
@@ -100,7 +96,7 @@ def test_several_bodies_are_said_once(written, caplog):
     assert "; 5 bodies (the largest 14 × 10 × 10 mm), which" in words
 
 
-def test_a_built_in_part_and_a_checkpoints_have_no_unit():
+def test_parts_without_a_file_have_no_unit():
     assert part_in_words(servoholder()) == "servoholder: 77 × 77 × 7.0 mm"
     assert part_in_words(replace(servoholder(), mesh=None)) == "servoholder: 77 × 77 × 7.0 mm"
     assert size_in_words(np.array([0.0031, 0.2, 0.04])) == "200 × 40 × 3.1 mm"
@@ -111,10 +107,11 @@ def test_a_built_in_part_and_a_checkpoints_have_no_unit():
     [None, 4, [1, 2, 3], [9.0, 2.0, 0.1, 0.2], [1, 2, 0.2, 0.1], [1, 2, 0, 1], [1, "2", 0.1, 0.2],
      [1, math.nan, 0.1, 0.2], [1, 2, 0.1, math.inf], [True, 2, 0.1, 0.2]],
 )  # fmt: skip
-def test_what_cannot_be_is_refused(record):
+def test_an_invalid_range_is_refused(record):
     with pytest.raises(UserError):
-        Seen.parse(record)
+        LearnedRange.parse(record)
 
 
-def test_the_widest_range_holds_all():
-    assert widest([Seen(30, 40, 0.2, 0.3), Seen(10, 35, 0.25, 0.9)]) == Seen(10, 40, 0.2, 0.9)
+def test_the_enclosing_range_contains_all_ranges():
+    ranges = [LearnedRange(30, 40, 0.2, 0.3), LearnedRange(10, 35, 0.25, 0.9)]
+    assert enclosing_range(ranges) == LearnedRange(10, 40, 0.2, 0.9)

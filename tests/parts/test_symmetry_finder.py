@@ -1,4 +1,4 @@
-"""Shapes whose groups are known, however they lie and however they are cut into triangles."""
+"""Shapes with known symmetry groups, in any pose and with any triangles."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ SHAPES = {
 }
 
 SLOW = ("cube", "sphere", "triangular prism", "square prism", "hexagonal prism")
-"""Shapes with many axes, which take long: only as the finder has it hardest, moved and recut."""
+"""Shapes with many axes, which take long, and are tested moved and recut only."""
 
 
 def as_mesh(shape: trimesh.Trimesh) -> Mesh:
@@ -110,6 +110,6 @@ def test_a_larger_tolerance_overlooks_a_smaller_hole():
 
 
 @pytest.mark.parametrize("tolerance", [0.0, -1.0, 0.5, float("nan")])
-def test_a_tolerance_without_meaning_is_refused(tolerance):
+def test_a_tolerance_out_of_range_is_refused(tolerance):
     with pytest.raises(UserError, match=r"tolerance of .*0\.0001 – 0\.1 diameters"):
         find_symmetries(as_mesh(box((1, 1, 1))), tolerance)

@@ -11,7 +11,7 @@ from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import PRESETS
 
 
-def test_falls_with_the_error_of_the_pose():
+def test_agreement_falls_with_the_error_of_the_pose():
     factory = Factory([servoholder()], PRESETS["table"].resized(320, 240), 3)
     errors, values, right = [], [], []
     for index in range(4):
@@ -32,7 +32,7 @@ def test_falls_with_the_error_of_the_pose():
     assert all(0 <= value <= 1 for value in values)
 
 
-def test_nothing_agrees_with_an_empty_image_or_outside_it():
+def test_agreement_is_zero_in_an_empty_image_and_outside_the_image():
     item = Factory([servoholder()], PRESETS["paper"], 0).scene(0, 0).objects[0]
     K = PRESETS["paper"].K
     grey = np.full((480, 640, 3), 90, np.uint8)

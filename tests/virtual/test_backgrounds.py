@@ -42,7 +42,7 @@ def test_a_choice_by_name(tmp_path):
             find_backgrounds(folder)
 
 
-def test_bundled_photos_come_without_a_network(monkeypatch):
+def test_bundled_photos_need_no_download(monkeypatch):
     pytest.importorskip("skimage")
     backgrounds = find_backgrounds("skimage")
     assert isinstance(backgrounds, PhotoBackgrounds)
@@ -73,7 +73,7 @@ def test_a_deep_tree_is_opened_without_decoding(tmp_path):
     ]  # fmt: skip
 
 
-def test_the_identity_knows_names_and_sizes_but_not_the_place(tmp_path):
+def test_the_identity_depends_on_names_and_sizes_but_not_on_the_folder(tmp_path):
     write_photos(tmp_path / "a", 3)
     write_photos(tmp_path / "b", 3)
     first, again = (PhotoBackgrounds(tmp_path / name).identity() for name in "ab")
@@ -102,7 +102,7 @@ def test_half_a_photo_is_damaged(tmp_path, suffix):
     assert "\n" not in str(caught.value)
 
 
-def test_one_bad_photo_of_many_is_replaced_whatever_came_before(tmp_path, caplog):
+def test_one_damaged_photo_of_many_is_replaced_independently_of_earlier_draws(tmp_path, caplog):
     write_photos(tmp_path, 200)
     bad = tmp_path / "0100.jpg"
     bad.write_bytes(bad.read_bytes()[:200])
@@ -132,7 +132,7 @@ def test_damage_is_capped(tmp_path, count, allowed):
         draw(backgrounds, 0)
 
 
-def test_large_photos_are_reduced_as_opencv_would(tmp_path):
+def test_large_photos_are_reduced_like_opencv(tmp_path):
     noise = np.random.default_rng(0).integers(0, 256, (1200, 1600, 3), np.uint8)
     photo = cv2.GaussianBlur(noise, (0, 0), 20)
     Image.fromarray(photo).save(tmp_path / "a.png")
@@ -167,7 +167,7 @@ def test_memory_for_photos_is_bounded(tmp_path, monkeypatch):
 
 
 def test_crops_lie_inside_of_their_photo(tmp_path):
-    # Colours ramp over the photo, so a crop's corners tell where it was taken.
+    # Colours ramp over the photo, so a crop's corners show its position.
     x, y = np.meshgrid(np.linspace(0, 200, 300), np.linspace(0, 200, 200))
     Image.fromarray(np.stack([x, y, 0 * x], axis=2).astype(np.uint8)).save(tmp_path / "a.png")
     backgrounds = PhotoBackgrounds(tmp_path)
@@ -184,7 +184,7 @@ def test_crops_lie_inside_of_their_photo(tmp_path):
 
 
 @pytest.mark.parametrize("size", [(640, 480), (97, 301), (33, 20), (7, 5), (1, 1)])
-def test_procedural_pictures_depend_on_the_generator_only(size):
+def test_procedural_images_depend_on_the_generator_only(size):
     first, other = ProceduralBackgrounds(), ProceduralBackgrounds()
     images = [first.draw(np.random.default_rng(seed), *size) for seed in range(8)]
     for seed in reversed(range(8)):
@@ -193,7 +193,7 @@ def test_procedural_pictures_depend_on_the_generator_only(size):
         np.testing.assert_array_equal(again, images[seed])
 
 
-def test_procedural_pictures_have_detail_at_every_size():
+def test_procedural_images_have_detail_at_every_size():
     backgrounds = ProceduralBackgrounds()
     for size in ((320, 240), (128, 128)):
         images = [backgrounds.draw(np.random.default_rng(seed), *size) for seed in range(60)]
@@ -247,14 +247,14 @@ def test_a_small_piece_of_a_large_photo_is_that_photo_reduced(tmp_path, monkeypa
     assert max(fast) < 4 < max(slow)
 
 
-def test_clutter_covers_more_the_more_there_is_and_never_all():
+def test_more_pieces_cover_more_of_the_image():
     few, many = ([covered(number, seed) for seed in range(40)] for number in (5, 40))
     assert 0.02 < np.mean(few) < np.mean(many) < 0.9
     assert covered(0, 1) == 0
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 200), (200, 3), (640, 480)])
-def test_clutter_depends_on_the_generator_only_and_leaves_what_is_behind(size):
+def test_clutter_depends_on_the_generator_only_and_keeps_uncovered_pixels(size):
     behind = ProceduralBackgrounds()
     clutter = ClutteredBackgrounds(behind, (30, 30))
     for seed in range(4):
@@ -274,7 +274,7 @@ def test_clutter_has_edges_between_the_pixels(monkeypatch):
         image = clutter.draw(np.random.default_rng(seed), 128, 128)[..., 0]
         inside, between = image == 255, (image > 77) & (image < 255)
         assert inside.any()
-        # Fewer than two pixels wide, all along the outlines.
+        # Outlines are blended over fewer than two pixels.
         rim = cv2.dilate(inside.astype(np.uint8), np.ones((3, 3))) - inside
         assert 0.3 * rim.sum() < between.sum() < 3 * rim.sum()
 
@@ -304,7 +304,7 @@ def test_a_backgrounds_contrast_is_changed_about_its_mean():
             np.testing.assert_allclose(image, expected, atol=0.51)
 
 
-def test_a_preset_without_clutter_draws_as_if_there_were_none():
+def test_a_clutter_of_zero_changes_nothing():
     def render(clutter):
         preset = preset_of("quickstart", {"clutter": clutter})
         return Factory([pivconnector()], preset, 3).render(0, 0)

@@ -1,4 +1,4 @@
-"""Stable faces: closed forms, trimesh, and shapes that can only lie one way."""
+"""Stable faces against closed forms and trimesh."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from dopepp.virtual.body import Body, make_hull
 from dopepp.virtual.surface import make_surface
 
 
-def test_a_box_rests_on_six_faces_as_often_as_its_centre_sees_them(surface_of):
+def test_a_box_rests_on_six_faces_by_their_solid_angles(surface_of):
     sides = np.array([0.10, 0.06, 0.02])
     normals, shares = make_hull(surface_of(trimesh.creation.box(sides))).rests
     assert len(normals) == 6
@@ -22,18 +22,18 @@ def test_a_box_rests_on_six_faces_as_often_as_its_centre_sees_them(surface_of):
         assert share == pytest.approx(angle / (4 * np.pi), rel=1e-9)
 
 
-def test_the_stable_faces_are_trimeshs():
+def test_stable_faces_agree_with_trimesh():
     mesh = pivconnector().mesh
     hull = make_hull(make_surface(mesh))
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
     np.testing.assert_allclose(hull.centre, solid.center_mass, atol=1e-9)
     poses, chances = solid.compute_stable_poses(threshold=0.01)
-    theirs = -poses[:, 2, :3]  # what points down
+    theirs = -poses[:, 2, :3]  # the direction that points down
     normals, shares = hull.rests
     for direction, chance in zip(theirs, chances, strict=True):
         nearest = int((normals @ direction).argmax())
         assert normals[nearest] @ direction > 0.9999
-        # They also count what rolls over onto the face.
+        # trimesh also counts bodies that roll over onto the face.
         assert shares[nearest] == pytest.approx(chance, abs=0.1)
     assert shares.sum() == pytest.approx(1.0)
 
@@ -68,7 +68,7 @@ def test_a_flat_sheet_lies_on_either_side(sheet):
     assert {round(z) for z in normals[:, 2]} == {-1, 1}
 
 
-def test_a_stretched_hull_is_the_stretched_bodys_hull():
+def test_a_stretched_hull_equals_the_hull_of_the_stretched_body():
     mesh = pivconnector().mesh
     body, scale = Body(make_surface(mesh)), np.array([0.5, 1.2, 3.0])
     stretched = body.stretched(scale)

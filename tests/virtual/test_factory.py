@@ -68,7 +68,7 @@ def test_same_bytes_in_another_process_and_order(name):
     assert len(set(expected)) == len(items)
 
 
-def test_the_sensor_takes_the_renderers_picture():
+def test_the_sensor_processes_the_rendered_image():
     noisy = Sensors(noise_probability=1.0, blur_probability=1.0, jpeg_probability=1.0)
     factory = make_factory(preset=replace(PRESETS["quickstart"], sensors=noisy))
     ideal, taken = render(factory.scene(0, 3)), factory.render(0, 3)
@@ -101,7 +101,7 @@ def with_distractors(**changes: float) -> Preset:
     return replace(PRESETS["ycb"], distractors=Distractors((3, 3), **changes))
 
 
-def test_other_parts_stand_among_the_distractors():
+def test_other_built_in_parts_are_among_the_distractors():
     factory = Factory([pivconnector()], with_distractors(lookalike_share=0.5), 0)
     assert [part.name for part in factory.negatives] == ["servoholder"]
     radii, others = lookalikes(factory)

@@ -106,7 +106,7 @@ def test_objects_lie_inside_a_bin(box_part):
             assert z.min() > -0.01 * DIAMETER
 
 
-def test_a_heap_repeats_from_its_seed_with_and_without_its_cache(box_part, heaps, cache):
+def test_a_heap_is_the_same_with_and_without_cache(box_part, heaps, cache):
     assert list((cache / "dopepp" / "piles").glob("*.npy"))
     cached = Factory([box_part], small(), 1).scene(0, 0)
     for path in (cache / "dopepp" / "piles").glob("*.npy"):
@@ -181,7 +181,7 @@ def test_both_renderers_draw_a_heap(heaps):
     np.testing.assert_allclose(traced.visible_fractions, fractions, atol=0.05)
 
 
-def test_a_missing_extra_is_one_clear_line(box_part, monkeypatch):
+def test_a_missing_extra_is_named_in_one_line(box_part, monkeypatch):
     monkeypatch.setattr(dopepp.core.errors, "find_spec", lambda name: None)
     with pytest.raises(
         UserError, match=r"without the package mujoco.*pip install 'dopepp\[robot\]'"
@@ -189,7 +189,7 @@ def test_a_missing_extra_is_one_clear_line(box_part, monkeypatch):
         Factory([box_part], small(), 0)
 
 
-def test_visibility_is_not_chosen_in_a_heap():
+def test_a_heap_refuses_visibility_options():
     for change in (
         {"min_visible_fraction": 0.3},
         {"centroid_inside": True},

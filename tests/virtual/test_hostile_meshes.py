@@ -1,4 +1,4 @@
-"""Meshes and places that nobody should send: compiled code must neither crash nor take for ever."""
+"""Degenerate meshes and poses, on which compiled code must neither crash nor hang."""
 
 from dataclasses import replace
 
@@ -86,7 +86,7 @@ def test_nothing_but_faces_without_area(scene_of):
         assert check(scene_of(SceneObject(surface, pose))).visible_fractions[0] == 0
 
 
-def test_a_hub_of_many_faces_takes_no_square_of_time(scene_of):
+def test_the_time_for_a_hub_is_not_quadratic_in_its_faces(scene_of):
     # All pairs of these faces would take minutes.
     count = 50_000
     angle = np.linspace(0, 2 * np.pi, count, endpoint=False)

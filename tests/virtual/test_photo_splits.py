@@ -46,7 +46,7 @@ def test_splits_are_disjoint_and_complete(tmp_path, count, expected):
     assert not photos.is_divided
 
 
-def test_names_and_folders_do_not_decide(tmp_path):
+def test_splits_do_not_depend_on_names_and_folders(tmp_path):
     photos = write_numbers(tmp_path / "a", range(20))
     splits = contents(photos)
     (tmp_path / "b" / "deeper").mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""The same scenes from nearer and farther, against projections and rigid motions in closed form."""
+"""Scenes at other scales, against projections and rigid motions in closed form."""
 
 from functools import cache
 
@@ -51,7 +51,7 @@ def centre(item: SceneObject) -> np.ndarray:
 
 
 @pytest.mark.parametrize("scale", [0.25, *SCALES])
-def test_a_part_keeps_its_place_and_its_distance_is_divided(scale):
+def test_a_scale_divides_the_distance_and_keeps_the_pixel(scale):
     for scene, near in zip(scenes("wide", 1), scenes("wide", scale), strict=True):
         (index,), (there,) = scene.targets, near.targets
         item = scene.objects[index]
@@ -92,7 +92,7 @@ def test_only_the_camera_moves(name, scale):
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_the_picture_on_a_table_stays_where_it_lies(scale):
+def test_the_image_on_a_table_does_not_move(scale):
     rng, differences = np.random.default_rng(0), []
     for scene, near in zip(scenes("table", 1), scenes("table", scale), strict=True):
         pixels = np.rint(rng.uniform(0, 1, (200, 2)) * (np.array(scene.size) - 1)).astype(int)
@@ -111,7 +111,7 @@ def test_the_picture_on_a_table_stays_where_it_lies(scale):
 
 
 @pytest.mark.parametrize("name", ["paper", "table"])
-def test_once_as_large_is_the_image_itself(name):
+def test_a_scale_of_one_changes_nothing(name):
     usual, same = factory(name).render(0, 0), factory(name).render(0, 0, 1.0)
     for field in ("image", "depth", "instances", "visible_fractions"):
         assert getattr(usual, field).tobytes() == getattr(same, field).tobytes()
@@ -125,7 +125,7 @@ def test_without_a_part_the_camera_stays():
     np.testing.assert_array_equal(approach(distractors, 3.0), np.zeros(3))
 
 
-def test_what_the_camera_reaches_is_no_longer_in_the_scene():
+def test_objects_that_the_camera_has_passed_are_removed():
     assert len(factory("paper").scene(0, 0).targets) == 1
     rendered = factory("paper").render(0, 0, 15.0)
     assert rendered.scene.objects == ()

@@ -1,4 +1,4 @@
-"""The sensor: each step against SciPy, Pillow or a closed form; all of it pure."""
+"""The sensor: each step against SciPy, Pillow or a closed form."""
 
 import io
 
@@ -23,13 +23,13 @@ from dopepp.virtual.sensor import (
 
 
 @pytest.fixture(scope="module")
-def picture():
+def image():
     noise = np.random.default_rng(0).integers(0, 256, (60, 90, 3), np.uint8)
     return cv2.GaussianBlur(noise, (9, 9), 2)
 
 
-def test_a_zero_sensor_changes_nothing(picture):
-    assert capture(picture, Sensor()) is picture
+def test_the_default_sensor_changes_nothing(image):
+    assert capture(image, Sensor()) is image
 
 
 @settings(max_examples=40)
@@ -70,22 +70,22 @@ def test_exposure_multiplies_the_light(exposure):
 
 
 @pytest.mark.parametrize("sigma", [0.3, 1.0, 2.5])
-def test_defocus_is_scipys_gaussian(picture, sigma):
+def test_defocus_equals_scipys_gaussian(image, sigma):
     expected = scipy.ndimage.gaussian_filter(
-        picture.astype(float), (sigma, sigma, 0), mode="mirror", truncate=4
+        image.astype(float), (sigma, sigma, 0), mode="mirror", truncate=4
     )
-    assert np.abs(defocus(picture, sigma) - expected).max() < 2.5
-    assert np.abs(defocus(picture, sigma) - expected).mean() < 0.4
+    assert np.abs(defocus(image, sigma) - expected).max() < 2.5
+    assert np.abs(defocus(image, sigma) - expected).mean() < 0.4
 
 
 @pytest.mark.parametrize("motion", [(7.0, 0.0), (0.0, -4.5), (3.0, 2.0), (0.3, 0.1), (-6.0, 9.0)])
-def test_motion_blur_is_the_mean_of_shifted_pictures(picture, motion):
+def test_motion_blur_is_the_mean_of_shifted_images(image, motion):
     shifts = [
-        scipy.ndimage.shift(picture.astype(float), (t * motion[1], t * motion[0], 0), order=1,
+        scipy.ndimage.shift(image.astype(float), (t * motion[1], t * motion[0], 0), order=1,
                             mode="mirror")
         for t in np.linspace(-0.5, 0.5, 401)
     ]  # fmt: skip
-    blurred = motion_blur(picture, motion)
+    blurred = motion_blur(image, motion)
     assert np.abs(blurred - np.mean(shifts, axis=0)).max() < 2.0
 
 
@@ -113,15 +113,15 @@ def test_noise_is_independent_of_place_channel_and_seed():
         assert abs(np.corrcoef(a.reshape(-1), b.reshape(-1))[0, 1]) < 0.015
 
 
-def test_jpeg_is_pillows(picture):
+def test_jpeg_equals_pillows(image):
     for quality in (30, 90):
         stream = io.BytesIO()
-        Image.fromarray(picture).save(stream, "jpeg", quality=quality, subsampling=2)
+        Image.fromarray(image).save(stream, "jpeg", quality=quality, subsampling=2)
         stream.seek(0)
         theirs = np.asarray(Image.open(stream)).astype(int)
-        ours = compress(picture, quality).astype(int)
+        ours = compress(image, quality).astype(int)
         assert np.abs(ours - theirs).mean() < 1.0
-        assert np.abs(ours - picture).mean() > 0.3
+        assert np.abs(ours - image).mean() > 0.3
 
 
 def test_drawn_sensors_keep_to_their_ranges():
@@ -139,7 +139,7 @@ def test_drawn_sensors_keep_to_their_ranges():
     assert len({s.noise_seed for s in drawn}) > 1990
 
 
-def test_everything_off_is_the_zero_sensor():
+def test_probabilities_of_zero_give_the_default_sensor():
     steps = ("exposure", "blur", "motion", "noise", "jpeg")
     off = Sensors(**{f"{step}_probability": 0 for step in steps})
     drawn = off.draw(np.random.default_rng(1))

@@ -56,7 +56,7 @@ def heaps(parts):
     return [factory.scene(0, index) for index in range(NUM_SCENES)]
 
 
-def test_everything_on_a_table_touches_it_and_nothing_is_below(tables):
+def test_objects_on_a_table_touch_the_plane(tables):
     for scene in tables:
         for item in scene.objects:
             assert -1e-9 <= heights(scene, item).min() <= CONTACT
@@ -64,7 +64,7 @@ def test_everything_on_a_table_touches_it_and_nothing_is_below(tables):
     assert {len(scene.objects) - len(scene.targets) for scene in tables} >= {1, 4, 7}
 
 
-def test_what_does_not_lean_rests_on_a_face(parts):
+def test_objects_rest_on_a_face_or_lean_on_an_edge(parts):
     factory = Factory(parts, small("table", table={"tilted_share": 0.0}), 1, Constant())
     leaning = Factory(parts, small("table", table={"tilted_share": 1.0}), 1, Constant())
     for index in range(8):
@@ -107,7 +107,7 @@ def test_objects_do_not_pierce_each_other(name, most, tables, heaps):
     assert max(shares) < most
 
 
-def test_the_cameras_place_keeps_to_its_ranges(tables):
+def test_camera_poses_are_within_their_ranges(tables):
     distances, elevations = [], []
     for scene in tables:
         normal = np.array(scene.plane.normal)
@@ -121,7 +121,7 @@ def test_the_cameras_place_keeps_to_its_ranges(tables):
     assert 30 - 1e-9 <= min(elevations) < 45 < 70 < max(elevations) <= 85 + 1e-9
 
 
-def test_the_background_is_a_picture_that_lies_on_the_plane(parts):
+def test_the_background_image_lies_on_the_plane(parts):
     wide = {"picture_width": (8.0, 8.0), "elevation_deg": (45.0, 85.0)}
     preset = replace(preset_of("table", {"table": wide}), width=256, height=256)
     factory = Factory(parts, preset, 4, Ramp())
@@ -143,7 +143,7 @@ def test_the_background_is_a_picture_that_lies_on_the_plane(parts):
                                    atol=0.05 * similarity[0, 0])  # fmt: skip
 
 
-def test_beyond_the_horizon_is_another_picture(parts):
+def test_another_image_is_shown_beyond_the_horizon(parts):
     preset = small("table", table={"elevation_deg": (12.0, 12.0), "roll_deg": 0.0})
     background = Factory(parts, preset, 4, Constant()).scene(0, 0).background
     assert len(np.unique(background)) == 2
@@ -167,7 +167,7 @@ def test_an_image_without_targets_has_its_distractors(parts):
 
 
 @pytest.mark.parametrize("name", ["table", "bin"])
-def test_somebody_elses_parts_lie_well(name, request):
+def test_parts_from_files_lie_on_the_table(name, request):
     shared = request.getfixturevalue("shared_data")
     path = sorted((shared / "parts" / "so_arm100").glob("*.stl"))[0]
     theirs = [
@@ -183,7 +183,7 @@ def test_somebody_elses_parts_lie_well(name, request):
         assert name == "bin" or max(lowest) <= CONTACT
 
 
-def test_a_dropped_box_lands_on_what_is_there(surface_of):
+def test_a_dropped_box_lands_on_earlier_objects(surface_of):
     surface = surface_of(trimesh.creation.box((0.04, 0.02, 0.03)))
     table = HeightMap(0.001, 0.1)
     footprint = table.footprint(surface, np.eye(3), -0.015)
@@ -201,7 +201,7 @@ def test_a_dropped_box_lands_on_what_is_there(surface_of):
     assert table.height(lying, (0, 0)) == pytest.approx(0.06, abs=1e-6)
 
 
-def test_a_slope_is_met_where_it_is_highest(surface_of):
+def test_a_block_rests_on_the_highest_point_of_a_slope(surface_of):
     profile, ends = ((-0.05, 0.0), (0.05, 0.0), (0.05, 0.05)), (-0.05, 0.05)
     wedge = trimesh.convex.convex_hull(np.array([[x, y, z] for x, z in profile for y in ends]))
     table = HeightMap(0.001, 0.1)

@@ -34,7 +34,7 @@ from dopepp.models.network import LOSSES, PoseNetwork, build_network
 from dopepp.models.registry import TARGET, Registry
 from dopepp.models.start import FITS, start_from_checkpoint, start_from_parts
 from dopepp.parts.part import Part
-from dopepp.parts.size import Seen
+from dopepp.parts.size import LearnedRange
 from dopepp.recovery.detection import RecoveryOptions
 from dopepp.training.loggers import MetricsTable
 from dopepp.training.optimizers import AveragedWeights
@@ -108,7 +108,7 @@ def build_system(
     parts: list[Part],
     fingerprint: str,
     images: Mapping[str, Any] | None = None,
-    seen: Mapping[str, Seen] | None = None,
+    seen: Mapping[str, LearnedRange] | None = None,
 ) -> PoseSystem:
     """Build network, loss and optimiser; ``images`` describes the data in the checkpoint."""
     network, description = build_untrained(config, parts)

@@ -17,7 +17,7 @@ from dopepp.geometry.cuboid import CENTROID, NUM_KEYPOINTS
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.network_input import letterboxes
 from dopepp.parts.part import Part
-from dopepp.parts.size import Seen
+from dopepp.parts.size import LearnedRange
 from dopepp.recovery.detection import Detection
 
 NEARER, FARTHER = 2.0, 4.0  # factors on the expected distances for a further search
@@ -118,7 +118,7 @@ class Case:
         return parts[self.detection.object] if self.detection else self.estimator.parts[0]
 
     @property
-    def seen(self) -> Seen | None:
+    def seen(self) -> LearnedRange | None:
         """Sizes and distances of the part in training, if known."""
         if not self.estimator.has_network:
             return None

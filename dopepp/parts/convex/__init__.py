@@ -52,10 +52,9 @@ def convex_pieces(part: Part) -> tuple[Piece, ...]:
     return _read_pieces(cache_folder() / "solids" / name)
 
 
-def hull_faces(piece: Piece) -> Int[np.ndarray, "faces 3"]:
-    """Return the triangles of a convex piece's hull with outward normals."""
-    hull = ConvexHull(piece)
-    a, b, c = piece[hull.simplices].swapaxes(0, 1)
+def hull_faces(hull: ConvexHull) -> Int[np.ndarray, "faces 3"]:
+    """Return the triangles of a convex hull with outward normals."""
+    a, b, c = hull.points[hull.simplices].swapaxes(0, 1)
     is_inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
     faces = hull.simplices.astype(np.int32)
     faces[is_inward] = faces[is_inward][:, ::-1]

@@ -64,12 +64,6 @@ def sample_surface(
 ) -> Points:
     """Draw random points uniformly over the area of a mesh.
 
-    Args:
-        vertices: Vertices.
-        faces: Vertices of each triangle.
-        num_points: Number of points.
-        seed: Random seed.
-
     Raises:
         ValueError: The triangles have no area.
     """

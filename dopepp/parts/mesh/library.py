@@ -154,15 +154,15 @@ def read_glb(path: Path) -> RawMesh:
     primitives = [p for mesh in header.get("meshes", ()) for p in mesh["primitives"]]
     _check(header, primitives, len(binary))
     drawn = [p for p in primitives if p.get("mode", _TRIANGLES) >= _TRIANGLES]
-    images = {_picture(header, primitive) for primitive in drawn}
+    images = {_image_number(header, primitive) for primitive in drawn}
     if len(images) > 1:
         problem = f"mesh {path} with faces of {len(images)} textures"
         fix = "bake them into one texture, or remove them"
         raise UserError(problem, "one texture for all faces, or none", fix)
-    picture = next(iter(images), None)
+    number = next(iter(images), None)
     texture = None
-    if picture is not None:
-        view = header["bufferViews"][header["images"][picture]["bufferView"]]
+    if number is not None:
+        view = header["bufferViews"][header["images"][number]["bufferView"]]
         start = view.get("byteOffset", 0)
         try:
             image = whole_image(binary[start : start + view["byteLength"]])
@@ -225,8 +225,8 @@ def _check(header: dict[str, Any], primitives: list[dict[str, Any]], num_bytes: 
         raise ValueError("a node with two parents")
 
 
-def _picture(header: dict[str, Any], primitive: dict[str, Any]) -> int | None:
-    """Return the index of a primitive's colour texture, or None."""
+def _image_number(header: dict[str, Any], primitive: dict[str, Any]) -> int | None:
+    """Return the number of the image of a primitive's colour texture, or None."""
     material = header["materials"][primitive["material"]] if "material" in primitive else {}
     info = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
     if info is None:

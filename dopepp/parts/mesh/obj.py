@@ -125,11 +125,7 @@ def _index(word: str, count: int) -> int:
 
 
 def _texture(obj: ObjFile, path: Path) -> RGBImage | None:
-    """Read the texture of the used materials; None without a texture.
-
-    Raises:
-        UserError: A material is undefined, or the faces use several textures.
-    """
+    """Read the texture of the used materials; None without a texture."""
     if not obj.libraries:
         return None
     maps: dict[str | None, str | None] = {None: None}
@@ -151,11 +147,7 @@ def _texture(obj: ObjFile, path: Path) -> RGBImage | None:
 
 
 def _colour_maps(path: Path) -> dict[str | None, str | None]:
-    """Return the file name of the colour map, or None, for each material of an MTL file.
-
-    Raises:
-        UserError: The file is too large, or a colour map has options.
-    """
+    """Return the file name of the colour map, or None, for each material of an MTL file."""
     if (size := path.stat().st_size) > MAX_MATERIAL_BYTES:
         allowed = f"up to {MAX_MATERIAL_BYTES / 1e6:.0f} MB"
         fix = "delete the materials that the mesh does not use"
@@ -182,18 +174,13 @@ def _text(path: Path) -> str:
 
 
 def companion_path(mesh_path: Path, name: str, statement: str) -> Path:
-    """Return the path of a file that a mesh file names.
-
-    Args:
-        mesh_path: The mesh file.
-        name: Name of the other file.
-        statement: Keyword before the name, for messages.
+    """Return the path of the file ``name`` that a mesh file refers to in a ``statement``.
 
     Raises:
         UserError: The file is missing or outside the mesh's folder.
     """
     folder = mesh_path.parent.resolve()
-    written = PureWindowsPath(name)  # splits at / and at \, and knows C:
+    written = PureWindowsPath(name)  # splits at / and at \, and recognises C:
     path = (folder / written.as_posix()).resolve()
     problem = f"{mesh_path} whose {statement} {name!r}"
     if written.anchor or not path.is_relative_to(folder):
@@ -240,9 +227,7 @@ def read_off(path: Path) -> RawMesh:
     polygons = [[int(word) for word in row[: int(row[0]) + 1]] for row in rows[num_vertices:]]
     for number, (count, *corners) in enumerate(polygons):
         if len(corners) != count:
-            raise ValueError(
-                f"face {number} with {len(corners)} instead of {count} corners in its line"
-            )
+            raise ValueError(f"face {number} with {len(corners)} instead of {count} corners")
     counts = np.array([count for count, *_ in polygons], np.int64)
     row_of_corners = np.array([i for _, *corners in polygons for i in corners], np.int64)
     return RawMesh(vertices, row_of_corners[fans(vertices, row_of_corners, counts)])

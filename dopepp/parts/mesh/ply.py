@@ -112,10 +112,7 @@ def _vectors(vertex: Table, names: Sequence[str]) -> NDArray[np.float64] | None:
 
 
 def _colours(vertex: Table, elements: Sequence[Element]) -> NDArray[np.uint8] | None:
-    """Return the vertices' colours, 0 – 255, or None.
-
-    A uniform grey counts as no colour, because programs write it by default.
-    """
+    """Return the vertices' colours, 0 – 255; None also for a uniform grey, programs' default."""
     values = _vectors(vertex, COLOURS)
     if values is None or not len(values):
         return None
@@ -178,20 +175,9 @@ def _doubles(text: bytes) -> bytes:
 
 
 def _read_table(body: bytes, start: int, element: Element) -> tuple[Table, int]:
-    """Read all rows of an element (e.g. of the vertices).
+    """Read all rows of an element from byte ``start``; also return the end of the last row.
 
     The rows are read at once if all have lists of equal length, otherwise one after the other.
-
-    Args:
-        body: Data of the file, after its header.
-        start: Offset of the first row in ``body``, bytes.
-        element: Name, number of rows and columns of the element.
-
-    Returns:
-        The columns by name, and the offset of the byte after the last row.
-
-    Raises:
-        ValueError: The data end too early, or there are too many rows with uneven lists.
     """
     name, num_rows, columns = element
     too_short = ValueError(f"less data than {num_rows} rows of element {name}")

@@ -65,27 +65,15 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
 
 
 def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
-    """Return a mesh in metres and the unit of its file.
-
-    Args:
-        path: Mesh file; see :func:`read_mesh`.
-        unit: mm, cm, m or inch, or None; see :func:`read_mesh`.
-
-    Returns:
-        The mesh, and the unit from which it was converted.
-
-    Raises:
-        UserError: The file or the unit is invalid; see :func:`read_mesh`.
-    """
+    """Like :func:`read_mesh`, but return also the unit from which the mesh was converted."""
     path = Path(path)
     if unit is not None and unit not in UNITS:
         fix = "set the unit in which the file was exported, e.g. unit=mm"
         raise UserError(f"unit={unit!r} for {path}", ", ".join(UNITS), fix)
     reader = READERS.get(path.suffix.lower())
     if reader is None:
-        suffixes = ", ".join(READERS)
         fix = "export the mesh in one of these formats, e.g. as STL"
-        raise UserError(f"mesh {path}", f"files ending in {suffixes}", fix)
+        raise UserError(f"mesh {path}", f"files ending in {', '.join(READERS)}", fix)
     try:
         is_file = path.is_file()
     except OSError:  # e.g. a name that is too long
@@ -108,9 +96,8 @@ def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
     if unit is None and raw.unit is None:
         logger.warning("%s states no unit: assuming %s (override with unit=…)", path, ASSUMED_UNIT)
     elif raw.unit not in (None, applied):
-        logger.warning(
-            "%s is in %s by its format, but read in %s as requested", path, raw.unit, applied
-        )
+        message = "%s is in %s by its format, but read in %s as requested"
+        logger.warning(message, path, raw.unit, applied)
     return mesh, applied
 
 
@@ -130,12 +117,9 @@ def ycb_part(root: str | Path, name: str) -> Part:
     models = Path(root) / "models"
     names = sorted(path.parent.name for path in models.glob("*/points.xyz"))
     if not names:
-        problem, allowed = f"{root}, which has no models/NAME/points.xyz", "the root of YCB-Video"
-        raise UserError(
-            problem,
-            allowed,
-            "set data.root to the root of YCB-Video, or unpack YCB_Video_Models into it",
-        )
+        problem = f"{root}, which has no models/NAME/points.xyz"
+        fix = "set data.root to the root of YCB-Video, or unpack YCB_Video_Models into it"
+        raise UserError(problem, "the root of YCB-Video", fix)
     if name not in names:
         fix = "set data.objects to one or more of these names"
         raise UserError(f"unknown object {name!r}", ", ".join(names), fix)
@@ -145,11 +129,7 @@ def ycb_part(root: str | Path, name: str) -> Part:
 
 
 def _read_points(path: Path) -> Points:
-    """Read a file of points.
-
-    Raises:
-        UserError: The file is missing or too large, or is not a table of three columns.
-    """
+    """Read a file of points, a table of three columns."""
     allowed = "lines of three finite numbers"
     try:
         if path.stat().st_size > MAX_POINTS_BYTES:
@@ -184,7 +164,7 @@ def _checked(path: Path, raw: RawMesh) -> Mesh:
         logger.info("%s: dropped %d triangles without area", path, (~proper).sum())
     used, index = np.unique(faces[proper], return_inverse=True)
     vertices, faces = vertices[used], index.reshape(-1, 3)
-    topology = find_topology(vertices, faces)
+    topology = find_topology(weld(vertices, faces)[1])
     if not topology.is_closed:
         message = "%s is not watertight: %d open edges, %d edges of more than two triangles"
         logger.info(message, path, topology.num_open, topology.num_crowded)
@@ -215,7 +195,7 @@ class Topology:
     Attributes:
         num_open: Number of edges of a single triangle (rims of holes).
         num_crowded: Number of edges of more than two triangles.
-        neighbours: Pairs of triangles at all other edges.
+        neighbours: Pairs of triangles that share another edge.
         opposed: Whether the triangles of each pair face opposite ways.
     """
 
@@ -230,12 +210,11 @@ class Topology:
         return self.num_open == self.num_crowded == 0
 
 
-def find_topology(vertices: Vertices, faces: Faces) -> Topology:
-    """Find the edges of triangles, none of which may have an area of 0."""
-    positions, corners = weld(vertices, faces)
+def find_topology(corners: Faces) -> Topology:
+    """Find the edges of triangles with three different corners; one position has one number."""
     start, end = corners.reshape(-1), corners[:, [1, 2, 0]].reshape(-1)
     # Both directions of an edge have the same number, which fits into an int64.
-    edges = np.minimum(start, end) * len(positions) + np.maximum(start, end)
+    edges = np.minimum(start, end) * (np.int64(corners.max(initial=0)) + 1) + np.maximum(start, end)
     order = np.argsort(edges, kind="stable")
     first = np.flatnonzero(np.diff(edges[order], prepend=-1))
     uses = np.diff(first, append=len(edges))

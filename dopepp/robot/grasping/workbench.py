@@ -201,7 +201,7 @@ class RasterView:
         T_cam_table = table_pose(T_base_cam)
         lights, ambient = STYLE.lighting.draw(rng, T_cam_table[:3, 3], T_cam_table[:3, 2])
         table_image = Table().draw_image(rng, self._backgrounds, TRUE_K, SIZE, T_cam_table)
-        background = table_image.seen(TRUE_K, SIZE, T_cam_table)
+        background = table_image.project(TRUE_K, SIZE, T_cam_table)
         plane = plane_of(T_cam_table)
         scene = Scene(TRUE_K, background, tuple(objects), lights, ambient, plane)
         return partial(self._take, scene, T_base_cam)

@@ -152,17 +152,10 @@ class PhotoBackgrounds:
         Raises:
             UserError: Too many photos are damaged.
         """
-        while True:
+        photo = None
+        while photo is None:
             path = self.paths[number % len(self.paths)]
-            number += 1
-            if path in self.bad:
-                continue
-            try:
-                photo = read_picture(path)
-            except ValueError as error:
-                self._quarantine(path, str(error))
-                continue
-            break
+            photo, number = self._read(path), number + 1
         (rows, columns), (width, height) = photo.shape[:2], size
         scale = share * min(columns / width, rows / height)
         crop_width, crop_height = round(width * scale), round(height * scale)
@@ -181,12 +174,8 @@ class PhotoBackgrounds:
         if path in self._photos:
             self._photos.move_to_end(path)
             return self._photos[path]
-        if path in self.bad:
-            return None
-        try:
-            photo = read_picture(path, _LONGEST_PHOTO_PX)
-        except ValueError as error:
-            self._quarantine(path, str(error))
+        photo = self._read(path, _LONGEST_PHOTO_PX)
+        if photo is None:
             return None
         sizes = _halvings(photo)
         self._photos[path] = sizes
@@ -196,13 +185,14 @@ class PhotoBackgrounds:
             self._kept_bytes -= sum(size.nbytes for size in oldest)
         return sizes
 
-    def _quarantine(self, path: Path, damage: str) -> None:
-        """Record a damaged photo.
-
-        Raises:
-            UserError: Too many photos are damaged.
-        """
-        self.bad[path] = damage
+    def _read(self, path: Path, longest: int | None = None) -> RGBImage | None:
+        """Read a photo, or log that it is damaged; raise if too many photos are damaged."""
+        if path in self.bad:
+            return None
+        try:
+            return read_picture(path, longest)
+        except ValueError as error:
+            self.bad[path] = str(error)
         most = min(10, int(0.01 * len(self.paths)))
         if len(self.bad) > most:
             listed = "; ".join(f"{bad}: {reason}" for bad, reason in self.bad.items())
@@ -212,7 +202,8 @@ class PhotoBackgrounds:
                 "delete these files, or copy them again",
             )
         text = "skipping the damaged background photo %s: %s (%d of at most %d)"
-        logger.warning(text, path, damage, len(self.bad), most)
+        logger.warning(text, path, self.bad[path], len(self.bad), most)
+        return None
 
 
 def _halvings(photo: RGBImage) -> list[RGBImage]:

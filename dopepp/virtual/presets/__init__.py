@@ -206,10 +206,8 @@ def written_out(name: str, changes: object = None) -> tuple[str, object]:
     fields: Any = read_yaml(path)
     base = fields.pop("base", None) if isinstance(fields, dict) else None
     if base not in _NAMES:
-        problem, allowed = f"{path} with base={short_repr(base)}", ", ".join(_NAMES)
-        raise UserError(
-            problem, allowed, "set base to the name of the preset that the file changes"
-        )
+        fix = "set base to the name of the preset that the file changes"
+        raise UserError(f"{path} with base={short_repr(base)}", ", ".join(_NAMES), fix)
     return base, _merged({"name": path.stem, **fields}, changes or {})
 
 

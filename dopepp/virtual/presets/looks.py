@@ -128,7 +128,7 @@ class Materials(Checked):
 
 
 def _grey(rng: Generator, brightness: float) -> Triple:
-    """Draw a nearly grey colour of a brightness."""
+    """Draw a nearly grey colour."""
     return triple(np.clip(brightness * (1 + rng.uniform(-_GREY_CAST, _GREY_CAST, 3)), 0.0, 1.0))
 
 

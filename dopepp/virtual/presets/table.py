@@ -13,7 +13,7 @@ from numpy.random import Generator
 from dopepp.core.validation import Checked, Pair, Range, Share, Span
 from dopepp.drawing.pictures import Mask, RGBImage, Size
 from dopepp.geometry.camera import CameraMatrix, Transform, make_transform
-from dopepp.geometry.rotation import Vector, rotation_to_z, rotation_vector_to_matrix
+from dopepp.geometry.rotation import rotation_to_z, rotation_vector_to_matrix
 from dopepp.virtual.backgrounds import Backgrounds
 from dopepp.virtual.body import Hull
 from dopepp.virtual.presets.placement import Angle, looking_down
@@ -108,44 +108,42 @@ class Table(Checked):
         K: CameraMatrix,
         size: Size,
         T_cam_table: Transform,
-    ) -> TablePicture:
+    ) -> TableImage:
         """Draw the plane's image and, if the plane's end is in view, the surroundings."""
         width, height = size
-        picture = backgrounds.draw(rng, width, height)
+        image = backgrounds.draw(rng, width, height)
         metres = rng.uniform(*self.picture_width) * T_cam_table[2, 3]
         middle = rng.uniform(0.35, 0.65, 2) * size  # pixel at the table's origin
         angle, scale = rng.uniform(0, 2 * np.pi), width / metres
         cosine, sine = scale * np.cos(angle), scale * np.sin(angle)
-        picture_table = np.array([[cosine, -sine, middle[0]], [sine, cosine, middle[1]], [0, 0, 1]])
+        image_table = np.array([[cosine, -sine, middle[0]], [sine, cosine, middle[1]], [0, 0, 1]])
         end = 8 * float(T_cam_table[2, 3])
         in_view = _beyond(end, K, size, T_cam_table) is not None
         surroundings = backgrounds.draw(rng, width, height) if in_view else None
-        return TablePicture(picture, picture_table, end, surroundings)
+        return TableImage(image, image_table, end, surroundings)
 
 
 @dataclass(frozen=True, eq=False)
-class TablePicture:
+class TableImage:
     """The image of the plane, and the surroundings beyond the plane's end.
 
     Attributes:
-        picture_table: Homography from (x, y) in the table frame, metres, to the image's pixels.
+        image_table: Homography from (x, y) in the table frame, metres, to the image's pixels.
         end: Depth at which the plane ends, metres.
         surroundings: Camera image beyond the end; None if the end is out of view.
     """
 
-    picture: RGBImage
-    picture_table: Float[np.ndarray, "3 3"]
+    image: RGBImage
+    image_table: Float[np.ndarray, "3 3"]
     end: float
     surroundings: RGBImage | None
 
-    def seen(self, K: CameraMatrix, size: Size, T_cam_table: Transform) -> RGBImage:
+    def project(self, K: CameraMatrix, size: Size, T_cam_table: Transform) -> RGBImage:
         """Return the camera image of the empty plane."""
         # A point (x, y, 0) of the plane projects to K [r1 r2 t] (x, y, 1).
-        picture_image = self.picture_table @ np.linalg.inv(K @ T_cam_table[:3, [0, 1, 3]])
+        image_camera = self.image_table @ np.linalg.inv(K @ T_cam_table[:3, [0, 1, 3]])
         flags, border = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, cv2.BORDER_REFLECT_101
-        image = cv2.warpPerspective(
-            self.picture, picture_image, size, flags=flags, borderMode=border
-        )
+        image = cv2.warpPerspective(self.image, image_camera, size, flags=flags, borderMode=border)
         beyond = _beyond(self.end, K, size, T_cam_table)
         if beyond is None or self.surroundings is None:
             return np.asarray(image)
@@ -157,18 +155,10 @@ def plane_of(T_cam_table: Transform) -> Plane:
     return Plane(triple(T_cam_table[:3, 2]), float(T_cam_table[:3, 2] @ T_cam_table[:3, 3]))
 
 
-def inverse_depth_row(plane: Plane, K: CameraMatrix) -> Vector:
-    """Return the row vector that maps a homogeneous pixel to the plane's inverse depth, 1/m.
-
-    A ray r (with z = 1) meets the plane at depth offset/(normal · r).
-    """
-    return np.asarray(np.array(plane.normal) @ np.linalg.inv(K) / plane.offset)
-
-
 def _beyond(end: float, K: CameraMatrix, size: Size, T_cam_table: Transform) -> Mask | None:
     """Return the mask of pixels beyond the plane's end, or None if the mask is empty."""
     width, height = size
-    slope = inverse_depth_row(plane_of(T_cam_table), K)
+    slope = plane_of(T_cam_table).inverse_depth_row(K)
     across, down = slope[0] * np.arange(width), slope[1] * np.arange(height) + slope[2]
     if across.min() + down.min() >= 1 / end:
         return None

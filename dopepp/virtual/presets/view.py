@@ -1,4 +1,4 @@
-"""A working camera: the scale and windows of training images, from lens, distances and parts.
+"""A working camera: the scale and the windows of training images for a lens, distances and parts.
 
 The network's input is scaled down until parts have sizes in pixels that networks learn well.
 Training uses windows, because a part covers a small share of a large image.
@@ -34,9 +34,7 @@ _WIDE_RATIO: Final = 3.5
 _ROOM: Final = 1.3  # ratio of a window's shorter side to the diameter of the largest part
 _MULTIPLE: Final = 32  # both sides of a window are multiples of this number, pixels
 _MAX_BLUR: Final = 10.0  # largest factor on the blur in large images
-_BEYOND: Final = (
-    1.25  # ratio of a part's largest depth on a table to the depth of the table's origin
-)
+_BEYOND: Final = 1.25  # ratio of a part's largest depth to the depth of the table's origin
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""The renderers by name, imported on demand.
+"""Renderers by name, imported on demand.
 
 To add a renderer, write a module with ``render(scene) -> Rendered`` and add it to
 :data:`RENDERERS`, or add an entry point ``dopepp.renderers`` (:mod:`dopepp.core.extensions`).

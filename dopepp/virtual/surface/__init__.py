@@ -8,13 +8,12 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.core.errors import UserError
 from dopepp.geometry.rotation import Vector
-from dopepp.parts.mesh import Faces, Points, Vertices
+from dopepp.parts.mesh import Faces, Points, Vertices, connected
+from dopepp.parts.mesh.read import find_topology
 from dopepp.parts.part import Mesh
 from dopepp.virtual.sensor import SRGB_TO_LINEAR
 from dopepp.virtual.surface.occlusion import OpenSky, bake_open_sky, spread_directions
@@ -158,14 +157,10 @@ def _merge_vertices(vertices: Vertices) -> Int[np.ndarray, "vertices"]:
 
 
 def _is_closed(merged: Faces, triangles: Corners) -> bool:
-    """Return whether every directed edge has exactly one opposite and the volume is positive."""
+    """Return whether every edge has two faces of one orientation, and the volume is positive."""
     collapsed = (merged == merged[:, [1, 2, 0]]).any(axis=1)
-    start, end = merged[~collapsed], merged[~collapsed][:, [1, 2, 0]]
-    count = int(merged.max()) + 1
-    forward = np.sort((start * count + end).reshape(-1))
-    if len(forward) == 0 or (forward[1:] == forward[:-1]).any():
-        return False
-    if not np.array_equal(forward, np.sort((end * count + start).reshape(-1))):
+    topology = find_topology(merged[~collapsed])
+    if collapsed.all() or not topology.is_closed or topology.opposed.any():
         return False
     a, b, c = (triangles - triangles.reshape(-1, 3).mean(axis=0)).transpose(1, 0, 2)
     return bool(np.einsum("ij,ij->", a, np.cross(b, c)) > 0)
@@ -176,11 +171,7 @@ def _corner_normals(
 ) -> Corners:
     """Return angle-weighted corner normals (Thürmer and Wüthrich 1998) with creases.
 
-    Args:
-        merged: Merged vertex of every corner.
-        doubled: Cross product of two edges of every face.
-        length: Length of ``doubled``, twice the area of a face.
-        edges: Edges of every face.
+    ``doubled`` is the cross product of two edges of every face, and ``length`` its length.
     """
     face_normals = doubled / np.maximum(length, 1e-300)[:, None]
     unit = edges / np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), 1e-300)
@@ -216,13 +207,8 @@ def _average_normals(
 ) -> None:
     """Average normals at every corner over the faces around its vertex that meet without a crease.
 
-    Args:
-        face_normals: Unit normals; zero for degenerate faces.
-        weights: Angle of each corner, shape (F, 3).
-        offsets: Index of each vertex's first entry in ``corners``.
-        corners: Numbers 3·face + k of all corners, sorted by vertex.
-        cosine: Cosine of the crease angle.
-        out: Filled with the normals of the corners.
+    Vertex v has the corners from ``offsets[v]`` to ``offsets[v + 1]`` of ``corners``, numbered
+    3·face + k. Normals of degenerate faces are zero. ``cosine`` belongs to the crease angle.
     """
     for vertex in range(offsets.shape[0] - 1):
         for p in range(offsets[vertex], offsets[vertex + 1]):
@@ -252,10 +238,7 @@ def _smooth_patches(
 ) -> Int[np.ndarray, "faces"]:
     """Number the smooth patches: faces connected by edges without a crease share a number.
 
-    Args:
-        corners: Vertices of every face; vertices with different attributes must be distinct.
-        normals: Normals of the corners, which are equal across a smooth edge.
-        usable: Faces that may connect other faces.
+    Normals of corners are equal across a smooth edge. Only ``usable`` faces connect other faces.
     """
     count = int(corners.max()) + 1
     start, end = corners, corners[:, [1, 2, 0]]
@@ -267,6 +250,4 @@ def _smooth_patches(
     products = normals[first][:, :, None] * normals[second][:, None]
     agree = products.sum(axis=-1, dtype=np.float64) > 0.999
     smooth = usable[first] & usable[second] & (agree | ~meet).all(axis=(1, 2))
-    edges = (np.ones(int(smooth.sum()), bool), (first[smooth], second[smooth]))
-    joined = coo_array(edges, shape=(len(corners), len(corners)))
-    return np.asarray(connected_components(joined, directed=False)[1], np.int32)
+    return connected(first[smooth], second[smooth], len(corners))[1].astype(np.int32)

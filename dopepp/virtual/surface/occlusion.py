@@ -55,15 +55,9 @@ _BAKED: Final[dict[bytes, OpenSky]] = {}
 def bake_open_sky(
     vertices: Vertices, faces: Faces, normals: Float[np.ndarray, "faces 3 3"], closed: bool
 ) -> OpenSky:
-    """Return the open sky of a mesh; the time grows with the number of triangles.
+    """Return the open sky of a mesh from its corner normals; a closed mesh has no back sides.
 
     Results are cached, because a run prepares its parts again for every data set.
-
-    Args:
-        vertices: Positions.
-        faces: Triangles.
-        normals: Unit normals of the corners.
-        closed: Whether the mesh is closed, so that back sides are skipped.
     """
     digest = hashlib.sha256(str((vertices.shape, closed)).encode())
     for array in (vertices, faces, normals):
@@ -78,14 +72,7 @@ def bake_open_sky(
 
 
 def _bake_mesh(vertices: Array, faces: Array, normals: Array, closed: bool) -> OpenSky:
-    """Render depth maps of a mesh from all directions, and look up its points.
-
-    Args:
-        vertices: Positions, shape (V, 3).
-        faces: Triangles, shape (F, 3).
-        normals: Unit normals of the triangles' corners, shape (F, 3, 3).
-        closed: Whether the mesh is closed, so that back sides are skipped.
-    """
+    """Render depth maps of a mesh from all directions, and look up its points."""
     corners = vertices[faces]
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
@@ -108,13 +95,7 @@ def _bake_mesh(vertices: Array, faces: Array, normals: Array, closed: bool) -> O
 
 
 def _is_convex(corners: Array, flat: Array, closed: bool) -> bool:
-    """Return whether all corners lie behind every face's plane, or on it for an open mesh.
-
-    Args:
-        corners: Corners of the triangles, shape (F, 3, 3).
-        flat: Unit normals of the triangles, shape (F, 3).
-        closed: Whether the mesh is closed.
-    """
+    """Return whether all corners lie behind every face's plane, or on it for an open mesh."""
     points = corners.reshape(-1, 3)
     slack = 1e-4 * float(np.ptp(points, axis=0).max())
     heights = points @ flat.T - (corners[:, 0] * flat).sum(axis=1)
@@ -124,12 +105,7 @@ def _is_convex(corners: Array, flat: Array, closed: bool) -> bool:
 def _grids(corners: Array, size: float) -> tuple[Array, Array, int]:
     """Choose every triangle's steps so that the points are few and evenly spaced.
 
-    Args:
-        corners: Corners of the triangles, shape (F, 3, 3).
-        size: Diameter of the mesh.
-
-    Returns:
-        Steps along each triangle's sides, the index of its first point, and the number of points.
+    Also return the index of each triangle's first point, and the number of points.
     """
     longest = np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=2).max(axis=1)
     spacing, most = _FINEST * size, 3 * len(corners) + 40_000
@@ -185,18 +161,10 @@ def _bake(
     grid: _Points,
     sums: Array,
 ) -> None:
-    """Sum the cosines of directions over each point's hemisphere; each direction has a depth map.
+    """Sum the cosines of directions over each point's hemisphere, with a depth map per direction.
 
-    Args:
-        vertices: Vertices of the mesh.
-        faces: Vertices of each triangle.
-        closed: Whether the mesh is closed.
-        centre: Centre of a sphere around the mesh.
-        radius: Radius of this sphere.
-        directions: Unit vectors, evenly spread.
-        samples: Offset of the sample in a pixel.
-        grid: Points on the triangles.
-        sums: Filled with four rows per point: unblocked front, all front, unblocked back, all back.
+    ``centre`` and ``radius`` are a sphere around the mesh. The rows of ``sums`` are the unblocked
+    and all directions of the front, then of the back.
     """
     points, upright, ground, flat = grid
     side = _MAP_SIDE
@@ -255,15 +223,10 @@ def _bake(
 def look_up_sky(
     face: Array, share: Array, steps: Array, firsts: Array, values: Array, out: Array
 ) -> None:
-    """Interpolate the open sky at an object's fragments.
+    """Fill ``out`` with the open sky at an object's fragments.
 
-    Args:
-        face: Triangle of each fragment (:class:`Fragments`).
-        share: Corner weights of each fragment.
-        steps: As in :class:`OpenSky`.
-        firsts: As in :class:`OpenSky`.
-        values: As in :class:`OpenSky`.
-        out: Filled with the open share of each fragment.
+    ``face`` and ``share`` are fields of :class:`Fragments`; ``steps``, ``firsts`` and ``values``
+    are fields of :class:`OpenSky`.
     """
     for p in range(face.shape[0]):
         f, side = (face[p], 0) if face[p] >= 0 else (~face[p], 1)

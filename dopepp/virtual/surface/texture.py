@@ -53,9 +53,8 @@ def make_texture(image: RGBImage, uv: Float[np.ndarray, "vertices 2"], faces: Fa
         shapes.append((max(shapes[-1][0] // 2, 1), max(shapes[-1][1] // 2, 1)))
     sizes = [rows * columns for rows, columns in shapes]
     firsts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
-    texture = Texture(
-        np.empty((sum(sizes), 3), np.uint8), np.column_stack([firsts, shapes]).astype(np.int64)
-    )
+    levels = np.column_stack([firsts, shapes]).astype(np.int64)
+    texture = Texture(np.empty((sum(sizes), 3), np.uint8), levels)
     texture.image()[:] = image
     shares = [_used_texels(uv, faces, shapes[0])]
     for level in range(1, len(shapes)):
@@ -94,13 +93,8 @@ def _halve(
 ) -> None:
     """Average the used texels of a level under every texel of the next, coarser level.
 
-    Args:
-        source: Texels, sRGB, (rows, columns, 3).
-        share: Used share of each texel.
-        decode: Table from sRGB to linear light.
-        encode: Table from linear light to sRGB.
-        out: Filled with the texels of the next level.
-        out_share: Filled with the used share of the texels.
+    ``share`` and ``out_share`` are the used shares of the texels; ``decode`` and ``encode`` are the
+    tables between sRGB codes and linear light.
     """
     rows, columns = source.shape[:2]
     height, width = rows / out.shape[0], columns / out.shape[1]
@@ -128,16 +122,9 @@ def _halve(
 def _bilinear(
     texels: Array, first: int, rows: int, columns: int, decode: Array, u: float, v: float
 ) -> tuple[float, float, float]:
-    """Sample a repeating texture level in linear light; v points up, row 0 is the top.
+    """Sample a repeating level in linear light; v points up, and row 0 is the top.
 
-    Args:
-        texels: Texels of all levels, (n, 3).
-        first: Index of the level's first texel.
-        rows: Number of rows of the level.
-        columns: Number of columns of the level.
-        decode: Table from sRGB to linear light.
-        u: Horizontal texture coordinate.
-        v: Vertical texture coordinate.
+    ``first`` is the level's first texel in ``texels`` (n, 3), and ``decode`` the table from sRGB.
     """
     x = (u - math.floor(u)) * columns - 0.5
     y = (1.0 - (v - math.floor(v))) * rows - 0.5
@@ -169,7 +156,7 @@ def sample_texture(
         hom: Homogeneous pixels of the vertices.
         faces: Triangles.
         uv: Texture coordinates of the vertices.
-        texture: Texels and levels of a :class:`Texture`, and the linear light of every code.
+        texture: Texels and levels of a :class:`Texture`, and the table from sRGB codes.
         out: Filled with linear RGB, shape (3, n).
     """
     face, share, x, y = points

@@ -83,7 +83,7 @@ def test_further_cameras_are_above_the_table(preset):
     factory = Factory([pivconnector()], PRESETS[preset].resized(64, 48), 0)
     for index in range(6):
         first, second = factory.render(0, index).scene, factory.render(0, index, view=1).scene
-        T_new_cam = factory.camera(0, index, 1)
+        T_new_cam = second.T_cam_world
         numbers = [scene.targets[0] for scene in (first, second)]
         poses = [
             scene.objects[n].T_cam_obj for scene, n in zip((first, second), numbers, strict=True)

@@ -66,7 +66,7 @@ def test_a_ball_stays_a_ball_that_faces_outwards():
     size=st.sampled_from([0.02, 0.5, 3.0]),
     flat=st.booleans(),
 )
-def test_any_triangles_are_taken(seed, num_faces, size, flat):
+def test_any_triangles_are_decimated(seed, num_faces, size, flat):
     rng = np.random.default_rng(seed)
     corners = rng.random((num_faces, 1, 3)) + size * rng.random((num_faces, 3, 3))
     if flat:
@@ -124,7 +124,7 @@ def test_the_part_is_measured_before_it_is_decimated(monkeypatch, caplog):
     np.testing.assert_array_equal(fewer.points, whole.points)
 
 
-def test_specks_that_no_triangle_can_stand_for_are_refused():
+def test_tiny_separate_triangles_are_refused():
     # Far more separate specks than the limit, each inside of a cell of any grid that is tried.
     grid = np.stack(np.meshgrid(*[np.arange(6.0)] * 3), axis=-1).reshape(-1, 1, 3) + 0.45
     specks = grid + 1e-6 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])

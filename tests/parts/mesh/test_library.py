@@ -1,4 +1,4 @@
-"""STL, GLB and 3MF files through trimesh, and what it makes of files that are not left to it."""
+"""STL, GLB and 3MF files read by trimesh, and files that trimesh reads wrongly."""
 
 import io
 import json
@@ -43,10 +43,10 @@ OFF = "OFF\n8 6 0\n" + "".join(f"{x} {y} {z}\n" for x, y, z in BOX.vertices.toli
 OFF += "".join(f"4 {' '.join(map(str, face))}\n" for face in QUADS)
 TEXT_PLY = export_ply(BOX, encoding="ascii")
 PENTAGON_AND_TRIANGLE = [*QUADS[:2], [0, 4, 5, 1, 0], [2, 3, 7]]
-"""As long together as two quads."""
+"""The last two faces have as many bytes as two quads."""
 
 WRONG: dict[str, tuple[str | bytes, int, int | str]] = {
-    # A file, the triangles that trimesh finds in it (-1: refused), and ours or why not.
+    # A file, trimesh's number of triangles (-1: refused), and our number or error message.
     "cut.ply": (TEXT_PLY[: TEXT_PLY.rindex(b"\n3 ")], 11, "less data|buffer is smaller"),
     "count.ply": (TEXT_PLY.replace(b"\n3 7", b"\n2 7"), 12, "fewer than 3|bytes more"),
     "fraction.ply": (TEXT_PLY.replace(b"3 1 3 0", b"3 1 3 0.5"), 12, "not an integer"),
@@ -67,8 +67,8 @@ WRONG: dict[str, tuple[str | bytes, int, int | str]] = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_trimesh_makes_of_it(write, refused, name):
-    """Where one of these fails, trimesh has learned it and a check or a reader here can go."""
+def test_files_that_trimesh_reads_wrongly(write, refused, name):
+    """If a case fails, trimesh has been corrected, and our check or reader can be removed."""
     content, theirs, ours = WRONG[name]
     path = write(name, content)
     try:
@@ -83,7 +83,7 @@ def test_what_trimesh_makes_of_it(write, refused, name):
 
 
 def test_trimesh_puts_the_triangles_of_quads_in_another_order(write):
-    """A mesh's hash, which checkpoints and render caches know it by, depends on the order."""
+    """The order changes a mesh's hash, which identifies it in checkpoints and render caches."""
     path = write("a.ply", ply_faces(*QUADS))
     theirs, ours = trimesh.load_mesh(path, process=False).faces, read_mesh(path, "mm").faces
     assert ours[:2].tolist() == [[0, 1, 3], [0, 3, 2]]
@@ -91,7 +91,7 @@ def test_trimesh_puts_the_triangles_of_quads_in_another_order(write):
 
 
 @pytest.mark.parametrize("count", [0, 1, 11, 13, 10**9, 2**32 - 1])
-def test_a_binary_stl_that_lies_about_its_triangles(refused, count):
+def test_a_binary_stl_with_a_wrong_count_is_refused(refused, count):
     binary = export_stl(BOX)
     lie = binary[:80] + struct.pack("<I", count) + binary[84:]
     refused("a.stl", lie, rf"684 bytes, but the header states {count} triangles")
@@ -102,7 +102,7 @@ def test_a_binary_stl_may_begin_like_text(write):
     assert len(read_mesh(path, "mm").faces) == 12
 
 
-def test_a_text_stl_may_be_laid_out_in_any_way(write):
+def test_layouts_of_text_stl_files(write):
     text = export_stl_ascii(BOX)
     for number, (num_faces, dialect) in enumerate([
         (12, text.upper()),
@@ -115,7 +115,7 @@ def test_a_text_stl_may_be_laid_out_in_any_way(write):
 
 
 @pytest.mark.parametrize(("old", "new"), [("-5", "nan"), ("vertex", "vertex x")])
-def test_a_text_stl_of_no_numbers_is_refused(refused, old, new):
+def test_a_text_stl_without_numbers_is_refused(refused, old, new):
     refused("m.stl", export_stl_ascii(BOX).replace(old, new, 1), "m.stl with")
 
 
@@ -164,7 +164,7 @@ def ordered(points: np.ndarray) -> np.ndarray:
     return np.asarray(points[np.lexsort(np.round(points, 4).T)])
 
 
-def test_a_glb_file_is_in_metres_and_another_unit_is_said(write, caplog):
+def test_a_glb_file_is_in_metres_and_another_unit_is_logged(write, caplog):
     small = BOX.copy()
     small.apply_scale(0.001)
     path = write("box.glb", exported(small, "glb"))
@@ -178,7 +178,7 @@ def test_a_glb_file_is_in_metres_and_another_unit_is_said(write, caplog):
         load_part(write("large.glb", exported(BOX, "glb")))
 
 
-def test_a_glb_scene_is_one_mesh_where_its_nodes_are(write, volume):
+def test_the_nodes_of_a_glb_scene_are_merged_into_one_mesh(write, volume):
     scene = trimesh.Scene()
     scene.add_geometry(BOX, transform=TURN)
     scene.add_geometry(BOX, transform=np.diag([1, 1, -2, 1]))
@@ -203,7 +203,7 @@ def test_a_glb_file_has_one_hash(write):
     assert len({load_part(path, "mm").mesh_hash for _ in range(5)}) == 1
 
 
-def test_a_glb_texture_lies_as_that_of_an_obj_file(tmp_path, write):
+def test_glb_and_obj_textures_have_the_same_coordinates(tmp_path, write):
     square = textured_square()
     loaded = read_mesh(write("a.glb", exported(square, "glb")))
     np.testing.assert_array_equal(loaded.texture, square.visual.material.baseColorTexture)
@@ -252,10 +252,10 @@ GLB_CASES: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
 
 
 @pytest.mark.parametrize("name", GLB_CASES)
-def test_what_trimesh_passes_over_in_a_glb_file_is_refused(write, refused, name):
+def test_glb_features_that_trimesh_ignores_are_refused(write, refused, name):
     edit, message = GLB_CASES[name]
     content = edited(exported(textured_square(), "glb"), edit)
-    trimesh.load_scene(write("a.glb", content))  # without a word
+    trimesh.load_scene(write("a.glb", content))  # without an error
     refused("a.glb", content, message)
 
 
@@ -289,7 +289,7 @@ def test_a_3mf_file_states_its_unit(write, unit, caplog, volume):
         assert f"is in {UNITS_3MF[unit]} by its format, but read in inch" in caplog.text
 
 
-def test_a_3mf_file_in_no_unit_is_in_millimetres_and_in_feet_is_refused(write):
+def test_a_3mf_file_without_a_unit_is_in_millimetres_and_feet_are_refused(write):
     content = exported(BOX, "3mf")
     bare = repacked(content, lambda model: model.replace(b'unit="millimeter"', b""))
     loaded = read_mesh(write("bare.3mf", bare))
@@ -299,7 +299,7 @@ def test_a_3mf_file_in_no_unit_is_in_millimetres_and_in_feet_is_refused(write):
         read_mesh(write("feet.3mf", feet))
 
 
-def test_a_3mf_build_is_one_mesh_where_it_puts_its_objects(write, volume):
+def test_the_objects_of_a_3mf_build_are_merged_into_one_mesh(write, volume):
     def transform(x):
         return f'transform="1 0 0 0 0 1 0 -1 0 {x} 0 7"'
 

@@ -16,7 +16,7 @@ from dopepp.parts.mesh import SurfaceTree, face_areas, largest_distance, sample_
     rank=st.integers(1, 3),
     far=st.sampled_from([0.0, 10.0]),
 )
-def test_largest_distance_is_the_largest_of_all_pairs(num_points, seed, rank, far):
+def test_largest_distance_agrees_with_all_pairs(num_points, seed, rank, far):
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(num_points, rank)) @ rng.normal(size=(rank, 3)) + far
     assert largest_distance(points) == pytest.approx(pdist(points).max(), rel=1e-9)
@@ -62,7 +62,7 @@ def test_largest_distance_of_rounded_sets_without_all_pairs(shape):
     assert exact * (1 - 9e-4) < largest_distance(points) <= exact * (1 + 1e-12)
 
 
-def test_largest_distance_of_many_points_in_a_plane_but_one():
+def test_largest_distance_of_one_point_outside_a_plane():
     x, y = np.meshgrid(np.linspace(0, 1, 100), np.linspace(0, 1, 100))
     points = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
     points[1] = [0.5, 0.5, 3]
@@ -138,7 +138,7 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_distances_are_those_to_all_triangles(name):
+def test_distances_agree_with_all_triangles(name):
     mesh = SHAPES[name]
     surface = SurfaceTree(np.asarray(mesh.vertices), np.asarray(mesh.faces))
     points = np.random.default_rng(1).uniform(-0.7, 0.7, (500, 3)) * mesh.extents

@@ -30,7 +30,7 @@ def test_dialects(write):
     np.testing.assert_allclose(np.ptp(loaded.vertices, axis=0), [0.01, 0.01, 0])
 
 
-def test_a_concave_polygon_whose_fan_fills_it_is_taken(write):
+def test_a_concave_polygon_that_its_fan_fills_is_accepted(write):
     text = "v 0 0 0\nv 2 0 0\nv 0.5 0.5 0\nv 0 2 0\nf 1 2 3 4\n"  # the fan starts at 0 0 0
     loaded = read_mesh(write("m.obj", text), "m")
     assert trimesh.Trimesh(loaded.vertices, loaded.faces, process=False).area == pytest.approx(1.0)
@@ -120,12 +120,12 @@ def test_a_bad_texture_is_refused(tmp_path, refused, materials, message):
         ("other.mtl", "uses the material 'm'; allowed: materials of other.mtl"),
     ],
 )
-def test_a_material_file_must_be_there_with_the_material(write, refused, library, message):
+def test_a_missing_material_file_or_material_is_named(write, refused, library, message):
     write("other.mtl", "newmtl other\nmap_Kd t.png\n")
     refused("m.obj", TEXTURED.replace("a.mtl", library), message)
 
 
-def test_materials_without_a_texture_are_fine(write):
+def test_materials_without_a_texture_are_accepted(write):
     write("a.mtl", "newmtl m\nKd 1 0 0\nnewmtl other\nmap_Kd gone.png\n")
     loaded = read_mesh(write("m.obj", TEXTURED), "mm")
     assert loaded.texture is loaded.uv is None

@@ -1,4 +1,4 @@
-"""PLY and OFF files: dialects, headers and lists that lie, and polygons cut into fans."""
+"""PLY and OFF files: dialects, wrong counts in headers and lists, and polygons cut into fans."""
 
 import struct
 from collections.abc import Sequence
@@ -80,13 +80,13 @@ def test_every_dialect_gives_the_box(write, form, faces, extra, types, volume):
 
 @pytest.mark.parametrize("newline", ["\r\n", "\r"])
 @pytest.mark.parametrize("form", FORMATS)
-def test_line_ends_of_every_system(write, form, newline):
+def test_line_ends_of_all_systems(write, form, newline):
     assert len(read_mesh(write("a.ply", ply(form, MIXED, newline=newline)), "mm").faces) == 12
 
 
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("names", [("s", "t"), ("u", "v"), ("texture_u", "texture_v")])
-def test_a_texture_and_its_coordinates_by_any_name(tmp_path, write, form, names):
+def test_texture_coordinates_of_all_names(tmp_path, write, form, names):
     pixels = np.random.default_rng(0).integers(0, 256, (4, 4, 3), np.uint8)
     Image.fromarray(pixels).save(tmp_path / "t.png")
     columns = [("float", names[0], np.arange(8) / 8), ("float", names[1], [0.25] * 8)]
@@ -120,7 +120,7 @@ def test_agrees_with_trimesh(tmp_path, encoding):
         ({"count": 2}, "face 0 with fewer than 3|bytes more"),
     ],
 )
-def test_a_header_or_a_list_that_lies_is_refused(refused, form, options, message):
+def test_a_wrong_count_in_a_header_or_list_is_refused(refused, form, options, message):
     refused("a.ply", ply(form, TRIANGLES, **options), message)
 
 
@@ -167,7 +167,7 @@ def off(faces: list[list[int]], vertices: np.ndarray = BOX.vertices) -> str:
     return f"OFF\n{len(vertices)} {len(faces)} 0\n" + "\n".join(rows) + "\n"
 
 
-def test_fans_lie_around_first_corners():
+def test_fans_start_at_first_corners():
     triangles = fans(ROUND, np.arange(12), np.array([3, 5, 4]))
     assert triangles.tolist() == [
         [0, 1, 2], [3, 4, 5], [3, 5, 6], [3, 6, 7], [8, 9, 10], [8, 10, 11]
@@ -177,12 +177,12 @@ def test_fans_lie_around_first_corners():
 
 
 @pytest.mark.parametrize("other", [DART, SQUARE[[0, 2, 1, 3]]], ids=["dart", "bow tie"])
-def test_a_fan_over_a_dent_is_folded(other):
+def test_a_fan_outside_its_polygon_is_refused(other):
     corners, counts = np.arange(8), np.array([4, 4])
     assert len(fans(np.vstack([SQUARE, SQUARE]), corners, counts)) == 4
     with pytest.raises(FoldedPolygonError, match="not convex, face 1"):
         fans(np.vstack([SQUARE, other]), corners, counts)
-    # A face of a vertex that is not there is not judged.
+    # A face with a missing vertex is not checked here.
     assert len(fans(np.vstack([SQUARE, other]), corners + 1, counts)) == 4
 
 
@@ -251,12 +251,12 @@ def test_vertices_keep_colours_and_normals(form, kind, scale, write):
 @pytest.mark.parametrize(
     ("kind", "shade", "expected"),
     [
-        ("uchar", (102, 102, 102), None),  # one grey everywhere is nobody's choice
+        ("uchar", (102, 102, 102), None),  # programs write a uniform grey by default
         ("uchar", (230, 175, 40), [230, 175, 40]),
         ("float", (1 + 1e-4, -1e-4, 0.5), [255, 0, 128]),  # rounded beyond its range
     ],
 )
-def test_one_grey_everywhere_is_no_colour_and_rounding_is_none(kind, shade, expected, write):
+def test_a_uniform_grey_is_no_colour_and_rounding_errors_are_clipped(kind, shade, expected, write):
     content = coloured("ascii", kind, np.tile(shade, (8, 1)))
     colours = read_mesh(write("box.ply", content), "mm").colours
     assert (None if colours is None else colours[3].tolist()) == expected
@@ -265,7 +265,7 @@ def test_one_grey_everywhere_is_no_colour_and_rounding_is_none(kind, shade, expe
 @pytest.mark.parametrize(
     ("kind", "shade", "most"), [("uchar", 256, "255"), ("float", 1.5, "1"), ("float", -0.1, "1")]
 )
-def test_what_is_no_colour_is_refused(kind, shade, most, refused):
+def test_a_colour_out_of_range_is_refused(kind, shade, most, refused):
     values = np.where(np.arange(24).reshape(8, 3) == 16, shade, 0)
     content = coloured("ascii", kind, values)
     refused("box.ply", content, f"a vertex colour that is not from 0 to {most}")

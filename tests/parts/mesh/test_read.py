@@ -1,4 +1,4 @@
-"""What holds for every format: units, refusals, bounds, and what is done to a mesh once read."""
+"""All mesh formats: units, refused files, limits on size, and repairs of the mesh."""
 
 import logging
 import os
@@ -48,7 +48,7 @@ def test_every_format_and_unit_gives_the_same_box(write, name, unit, metres, vol
 
 
 @pytest.mark.parametrize("name", UNSTATED)
-def test_millimetres_are_assumed_and_said(write, name, caplog):
+def test_millimetres_are_assumed_with_a_warning(write, name, caplog):
     path = write(name, FILES[name])
     with caplog.at_level(logging.WARNING):
         stated = read_mesh(path, "mm")
@@ -60,7 +60,7 @@ def test_millimetres_are_assumed_and_said(write, name, caplog):
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_file_cut_anywhere_is_never_half_a_mesh(refused, name):
+def test_a_truncated_file_is_refused(refused, name):
     content = FILES[name].rstrip(b"\n")
     for length in [0, *np.linspace(1, len(content) - 2, 25).astype(int)]:
         lines = content[:length].split(b"\n")
@@ -87,13 +87,13 @@ def test_a_file_cut_anywhere_is_never_half_a_mesh(refused, name):
         ],
     ],
 )
-def test_another_format_under_a_suffix_is_refused(refused, name, content):
+def test_a_file_of_another_format_is_refused(refused, name, content):
     refused(name, content, name)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("name", ["a.stl", "text.stl", "a.ply", "text.ply", "a.obj"])
-def test_a_coordinate_that_is_no_number_is_named(refused, name, value):
+def test_a_coordinate_that_is_not_finite_is_named(refused, name, value):
     box = BOX.copy()
     # Value 7 of the box is its third vertex's y.
     box.vertices = np.where(np.arange(24).reshape(8, 3) == 7, value, box.vertices)
@@ -117,7 +117,7 @@ def test_a_coordinate_that_is_no_number_is_named(refused, name, value):
     refused(name, content, rf"{name} with .*{place}")
 
 
-def test_a_path_or_unit_that_cannot_be_is_refused(tmp_path, write):
+def test_a_wrong_path_or_unit_is_refused(tmp_path, write):
     path = write("box.stl", FILES["binary.stl"])
     with pytest.raises(
         UserError, match=r"box\.step; allowed: files ending in \.stl, \.obj, \.ply, \.glb, "

@@ -8,15 +8,20 @@ from hypothesis import strategies as st
 from trimesh.exchange.stl import export_stl
 
 from dopepp.parts import read_mesh, servoholder
-from dopepp.parts.mesh.read import find_topology, flip_faces, misoriented_faces
+from dopepp.parts.mesh import weld
+from dopepp.parts.mesh.read import Topology, find_topology, flip_faces, misoriented_faces
 
 
 def arrays(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
     return np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
 
 
+def topology_of(vertices: np.ndarray, faces: np.ndarray) -> Topology:
+    return find_topology(weld(vertices, faces)[1])
+
+
 def repaired(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    topology = find_topology(vertices, faces)
+    topology = topology_of(vertices, faces)
     return flip_faces(faces, misoriented_faces(vertices, faces, topology))
 
 
@@ -28,18 +33,18 @@ def cyclic(faces: np.ndarray) -> set[tuple[int, ...]]:
 def test_edges_agree_with_trimesh():
     mesh = trimesh.creation.icosphere(subdivisions=2)
     vertices, faces = arrays(mesh)
-    assert find_topology(vertices, faces).is_closed
+    assert topology_of(vertices, faces).is_closed
     cut = faces[np.random.default_rng(0).random(len(faces)) < 0.9]
-    topology = find_topology(vertices, cut)
+    topology = topology_of(vertices, cut)
     open_edges = trimesh.Trimesh(vertices, cut, process=False)
     unique = trimesh.grouping.group_rows(open_edges.edges_sorted, require_count=1)
     assert topology.num_open == len(unique) > 0
     assert topology.num_crowded == 0
     tip = np.vstack([vertices, [[9.0, 9.0, 9.0]]])
     fin = np.vstack([faces, [[faces[0, 0], faces[0, 1], len(vertices)]]])
-    assert (find_topology(tip, fin).num_crowded, find_topology(tip, fin).num_open) == (1, 2)
+    assert (topology_of(tip, fin).num_crowded, topology_of(tip, fin).num_open) == (1, 2)
     soup = mesh.triangles.reshape(-1, 3)  # corners at one position are one
-    assert find_topology(soup, np.arange(len(soup)).reshape(-1, 3)).is_closed
+    assert topology_of(soup, np.arange(len(soup)).reshape(-1, 3)).is_closed
 
 
 @settings(max_examples=40)
@@ -58,7 +63,7 @@ def test_an_open_surface_follows_its_majority():
     bowl = faces[vertices[faces].mean(axis=1)[:, 2] < 0.3]
     wrong = np.arange(len(bowl)) % 5 == 0
     assert cyclic(repaired(vertices, flip_faces(bowl, wrong))) == cyclic(bowl)
-    inwards = flip_faces(bowl, ~wrong)  # nothing tells the inside of a bowl from its outside
+    inwards = flip_faces(bowl, ~wrong)  # a bowl has no inside
     assert cyclic(repaired(vertices, inwards)) == cyclic(bowl[:, ::-1])
 
 
@@ -72,7 +77,7 @@ def test_every_body_is_repaired_by_itself_and_a_cavity_stays():
     assert cyclic(repaired(vertices, mixed)) == cyclic(faces)
 
 
-def test_one_body_of_several_that_faces_inwards_is_turned():
+def test_one_body_of_several_that_faces_inwards_is_flipped():
     ball = trimesh.creation.icosphere(2, 1.0)
     beside = trimesh.creation.box((0.5, 0.5, 0.5))
     beside.apply_translation((2, 0, 0))
@@ -82,7 +87,7 @@ def test_one_body_of_several_that_faces_inwards_is_turned():
     assert cyclic(repaired(vertices, faces)) == cyclic(faces)
 
 
-def test_a_moebius_strip_is_left_alone():
+def test_a_moebius_strip_is_unchanged():
     around = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     rims = []
     for side in (-0.2, 0.2):
@@ -96,14 +101,12 @@ def test_a_moebius_strip_is_left_alone():
         c, d = ((i + 1) % 24, (i + 1) % 24 + 24) if i < 23 else (24, 0)
         faces += [[a, b, c], [b, d, c]]
     strip = np.array(faces)
-    assert find_topology(vertices, strip).opposed.any()
+    assert topology_of(vertices, strip).opposed.any()
     np.testing.assert_array_equal(repaired(vertices, strip), strip)
 
 
-@pytest.mark.parametrize(
-    ("share", "message"), [(0.1, "flipped [0-9]+ triangles"), (1.0, "turned over 320 tri")]
-)
-def test_a_file_that_faces_the_wrong_way_is_repaired(tmp_path, share, message, caplog, volume):
+@pytest.mark.parametrize("share", [0.1, 1.0])
+def test_a_file_that_faces_the_wrong_way_is_repaired(tmp_path, share, caplog, volume):
     ball = trimesh.creation.icosphere(subdivisions=2, radius=20)
     ball.faces = flip_faces(ball.faces, np.random.default_rng(0).random(len(ball.faces)) < share)
     (tmp_path / "a.stl").write_bytes(export_stl(ball))
@@ -126,7 +129,7 @@ def test_holes_are_counted_in_one_line(tmp_path, caplog):
     assert len(loaded.faces) == 319
 
 
-def test_bodies_that_pass_through_each_other_are_taken(tmp_path, caplog):
+def test_intersecting_bodies_are_accepted(tmp_path, caplog):
     boxes = [trimesh.creation.box((20, 20, 20)), trimesh.creation.box((10, 10, 40))]
     (tmp_path / "a.stl").write_bytes(export_stl(trimesh.util.concatenate(boxes)))
     with caplog.at_level(logging.INFO):
@@ -135,6 +138,6 @@ def test_bodies_that_pass_through_each_other_are_taken(tmp_path, caplog):
     np.testing.assert_allclose(np.ptp(loaded.vertices, axis=0), [0.02, 0.02, 0.04])
 
 
-def test_a_good_part_is_not_touched():
+def test_a_consistent_mesh_is_unchanged():
     mesh = servoholder().mesh
     np.testing.assert_array_equal(repaired(mesh.vertices, mesh.faces), mesh.faces)

@@ -111,7 +111,7 @@ def test_textured_surfaces_keep_their_colours(sheet):
     assert np.abs(np.corrcoef(colours.T) - np.eye(3)).max() < 0.1
 
 
-def test_only_what_has_colours_is_stained(sheet, box_surface):
+def test_only_coloured_surfaces_have_texture_noise(sheet, box_surface):
     materials = Materials(texture_noise=(1.0, 3.0))
     coloured = make_surface(sheet(0.1, np.full((4, 4, 3), 99, np.uint8)))
     rng = np.random.default_rng(0)

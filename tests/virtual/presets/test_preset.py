@@ -1,4 +1,4 @@
-"""Presets: ranges that hold over random scenes, cameras that follow the size, plain changes."""
+"""Presets: ranges of random scenes, cameras of other image sizes, changes by plain values."""
 
 from dataclasses import replace
 
@@ -71,7 +71,7 @@ def test_quickstart_poses_and_lights(quickstart_scenes):
             assert light.reach > 0
 
 
-def test_what_the_camera_does_not_see_of_the_papers_box_skews_no_place_across_nor_rotation(parts):
+def test_the_limited_view_skews_neither_lateral_positions_nor_rotations(parts):
     preset = PRESETS["paper"]
     factory = Factory(parts, preset.resized(80, 60), seed=90125)
     drawn = [factory.scene(0, index) for index in range(600)]
@@ -91,7 +91,7 @@ def test_what_the_camera_does_not_see_of_the_papers_box_skews_no_place_across_no
     assert z.mean() == pytest.approx(0.219, abs=0.005)
 
 
-def test_a_place_that_no_depth_suits_is_given_up(sized_box):
+def test_a_lateral_position_outside_the_view_is_drawn_again(sized_box):
     preset = replace(PRESETS["paper"].resized(80, 60), placement=OffsetPlacement(lateral=0.25))
     factory = Factory([sized_box("large", 3)], preset, seed=0)
     places = np.array([factory.scene(0, n).objects[0].T_cam_obj[:3, 3] for n in range(20)])
@@ -123,7 +123,7 @@ def test_resized_draws_the_same_poses(box_part):
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
 @pytest.mark.parametrize("size", [(416, 416), (1280, 720), (720, 1280), (320, 240), (100, 333)])
-def test_another_shape_keeps_pixels_square_and_the_view_along_the_shorter_side(name, size):
+def test_reframing_keeps_square_pixels_and_the_view_along_the_shorter_side(name, size):
     preset = PRESETS[name]
     sized = preset.reframed(*size)
     assert (sized.width, sized.height) == size
@@ -139,7 +139,7 @@ def test_another_shape_keeps_pixels_square_and_the_view_along_the_shorter_side(n
 
 @pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
 @pytest.mark.parametrize("factor", [0.25, 3 / 8, 2.0])
-def test_the_same_shape_is_the_same_camera_to_the_last_bit(preset, factor):
+def test_reframing_to_the_same_aspect_ratio_equals_resizing(preset, factor):
     size = round(factor * preset.width), round(factor * preset.height)
     resized = preset.resized(*size)
     assert preset.reframed(*size) == resized
@@ -147,7 +147,7 @@ def test_the_same_shape_is_the_same_camera_to_the_last_bit(preset, factor):
     assert resized.sensors.read_noise == preset.sensors.read_noise
 
 
-def test_windows_lie_in_the_picture_all_over_it():
+def test_windows_cover_the_image():
     preset = replace(PRESETS["ycb"], window=(224, 160))
     rng = np.random.default_rng(3)
     corners = []
@@ -165,7 +165,7 @@ def test_windows_lie_in_the_picture_all_over_it():
     assert 0.06 < shares.min() < shares.max() < 0.2
 
 
-def test_a_window_larger_than_the_picture_has_it_in_its_middle():
+def test_a_window_larger_than_the_image_is_centred_on_it():
     K, size = replace(PRESETS["quickstart"], window=(160, 96)).draw_camera(np.random.default_rng(0))
     assert size == (160, 96)
     assert K[0, 2] == PRESETS["quickstart"].K[0, 2] + 16
@@ -179,7 +179,7 @@ def test_a_window_larger_than_the_picture_has_it_in_its_middle():
     nearest=st.floats(0.5, 2.0),
     width=st.integers(200, 800),
 )
-def test_parts_at_work_stand_at_their_distance_and_fit(seed, origin, nearest, width):
+def test_working_placement_keeps_the_distance_and_fits_the_image(seed, origin, nearest, width):
     rng = np.random.default_rng(seed)
     hull = rng.uniform(-0.05, 0.05, (30, 3)) + origin  # wherever the file has its origin
     K = np.array([[width, 0, 0.4 * width], [0, 1.1 * width, 100], [0, 0, 1]])
@@ -302,7 +302,7 @@ def test_nested_fields_change_and_the_others_stay():
     assert preset_of("table", {}) == original
 
 
-def test_groups_come_and_go():
+def test_groups_are_added_and_removed():
     assert preset_of("paper", {"table": {}}).table == Table()
     assert preset_of("paper", {"table": {"roll_deg": 5}}).table == Table(roll_deg=5.0)
     assert preset_of("bin", {"table": None}).table is None
@@ -355,7 +355,7 @@ def test_another_kind_starts_from_its_defaults():
     assert kept == FacingTurning(in_plane_deg=45.0, tilt_deg=5.0)
 
 
-def test_a_file_of_ones_own_builds_on_a_shipped_preset(tmp_path):
+def test_a_preset_file_changes_a_shipped_preset(tmp_path):
     path = tmp_path / "shelf.yaml"
     path.write_text("base: table\ntable: {roll_deg: 3.0}\nwidth: 320\n")
     preset = preset_of(str(path), {"width": 256})
@@ -385,7 +385,7 @@ PLAIN = st.recursive(
     ),
     value=PLAIN,
 )
-def test_any_plain_value_is_taken_or_refused(field, value):
+def test_any_plain_value_is_accepted_or_refused(field, value):
     try:
         preset = preset_of("paper", {field: value})
     except UserError:

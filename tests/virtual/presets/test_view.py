@@ -1,4 +1,4 @@
-"""A camera at work: sizes in pixels, what they cost, and what is refused with what would do."""
+"""Working cameras: sizes in pixels, scales and windows, and advice in error messages."""
 
 import logging
 import math
@@ -41,7 +41,7 @@ def test_a_part_has_the_pixels_of_the_pinhole():
     diameter=st.floats(0.02, 0.2),
     portrait=st.booleans(),
 )
-def test_what_is_chosen_shows_parts_as_networks_learn_them(near, ratio, diameter, portrait):
+def test_chosen_scales_and_windows_suit_the_network(near, ratio, diameter, portrait):
     first, parts = view(near, near * ratio), [part(diameter)]
     if portrait:
         first = replace(first, size=(720, 1280), K=camera_matrix(FOCAL, FOCAL, 350.0, 650.0))
@@ -71,7 +71,7 @@ def test_a_given_window_limits_the_scale():
     assert view().sizes_px(parts, small)[1] <= 64 / 1.29
 
 
-def test_what_is_advised_will_do():
+def test_the_advised_distances_are_accepted():
     parts = [part(0.1)]
     large = r"from 0.1 m, where bracket \(100 mm across\) has 931 pixels .*1280×720.*"
     large += r"start working_distance at 0\.13$"
@@ -102,7 +102,7 @@ def test_wrong_distances_are_refused(distance, message):
         view(distance=distance)
 
 
-def test_a_camera_must_say_how_large_its_pictures_are(tmp_path, caplog):
+def test_a_camera_file_must_state_the_image_size(tmp_path, caplog):
     path, size = tmp_path / "cam.yaml", "image_width: 640\nimage_height: 480\n"
     rest = "camera_matrix: {rows: 3, cols: 3, data: [600, 0, 320, 0, 610, 240, 0, 0, 1]}\n"
     lens = "distortion_coefficients: {rows: 1, cols: 5, data: [0.1, 0, 0, 0, 0]}\n"
@@ -121,7 +121,7 @@ def test_a_camera_must_say_how_large_its_pictures_are(tmp_path, caplog):
         view(size=(640, 360))
 
 
-def test_it_is_said_in_words():
+def test_the_description_states_sizes_and_warnings():
     lines = view().in_words([part(0.1)], 0.4, (224, 128))
     assert lines == [
         "cam.yaml: 1280×720 pixels, 69° × 42°, parts at 0.4 – 0.7 m",
@@ -135,7 +135,7 @@ def test_it_is_said_in_words():
 
 
 @pytest.mark.parametrize("name", ["wide", "table", "quickstart"])
-def test_scenes_show_the_parts_at_work(name):
+def test_scenes_show_parts_within_the_working_distance(name):
     parts, first = [servoholder()], view()
     scale = first.scale_for(parts)
     window = first.window_for(parts, scale)
@@ -162,7 +162,7 @@ def test_scenes_show_the_parts_at_work(name):
                     assert (pixels < scene.size).all()
 
 
-def test_a_window_shows_what_the_whole_picture_has_there():
+def test_a_window_is_a_crop_of_the_scaled_image():
     """The window's K is that of the camera's image, scaled and moved by whole pixels."""
     item = view()
     scene = Factory([servoholder()], item.window(PRESETS["wide"], 0.4, (224, 128)), 1).scene(0, 0)

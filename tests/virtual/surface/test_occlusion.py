@@ -95,7 +95,7 @@ def test_beside_a_long_wall_half_the_sky_is_hidden(bracket):
             pytest.fail("no face under the point")
 
 
-def test_convex_and_flat_surfaces_are_open(sheet):
+def test_convex_and_flat_surfaces_have_an_open_sky(sheet):
     for solid in (Manifold.cube((1, 0.7, 0.5)), Manifold.sphere(0.5, 24), Manifold.sphere(0.5, 80)):
         surface = made(solid)
         assert surface.sky.values[0].min() > 0.9

@@ -1,4 +1,4 @@
-"""Meshes made ready: creases, closedness, and meshes that nobody can render."""
+"""Prepared surfaces: creases, closedness, and meshes that cannot be rendered."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def test_cad_edges_stay_sharp_and_cylinders_are_smooth(surface_of):
     np.testing.assert_allclose(np.abs(surface.normals[~side][:, 2]), 1, atol=1e-6)
 
 
-def test_split_vertices_are_closed_and_smooth_again():
+def test_split_vertices_are_merged_into_a_closed_smooth_surface():
     # STL gives every triangle vertices of its own.
     ball = trimesh.creation.icosphere(2, 0.05)
     soup = np.asarray(ball.triangles).reshape(-1, 3)
@@ -84,14 +84,14 @@ def test_faces_without_area_change_nothing(sheet):
     np.testing.assert_array_equal(surface.normals[:2], make_surface(mesh).normals)
 
 
-def test_a_files_normals_count_where_they_can_be_the_surfaces():
-    # Eight corners of a box: their normals, averaged over three sides, are nobody's.
+def test_a_files_normals_are_used_where_they_fit_the_surface():
+    # The vertex normals of a box are averaged over three sides, so they fit none.
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     mesh = Mesh(box.vertices, box.faces.astype(np.int32))
     given = replace(mesh, normals=np.asarray(box.vertex_normals))
     np.testing.assert_array_equal(make_surface(given).normals, make_surface(mesh).normals)
     ball = trimesh.creation.icosphere(3, 0.05)
-    normals = ball.vertices * 1000.0  # of any length; one unknown, one zero
+    normals = ball.vertices * 1000.0  # of any length; one is not finite, one is zero
     normals[0], normals[1] = np.nan, 0
     surface = make_surface(Mesh(ball.vertices, ball.faces.astype(np.int32), normals=normals))
     exact = ball.vertices[ball.faces] / 0.05

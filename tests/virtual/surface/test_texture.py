@@ -55,7 +55,7 @@ def test_a_fine_checker_matches_supersampling(scene_of, sheet, angle, distance):
 
 
 def test_unused_texels_leave_no_seams(scene_of, sheet):
-    # Only the left half of the texture is used; the rest is of a colour that nobody should see.
+    # Only the left half of the texture is used; the rest must not be visible.
     texture = np.full((128, 128, 3), (120, 120, 120), np.uint8)
     texture[:, 64:] = (255, 0, 255)
     mesh = sheet(SIDE, texture)

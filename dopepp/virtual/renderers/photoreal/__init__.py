@@ -96,9 +96,8 @@ def _start() -> int:
     library = _chosen_library()
     if library is not None and os.environ.get(LIBRARY_SETTING) != str(library):
         if "drjit" in sys.modules:
-            _log.warning(
-                "Dr.Jit was imported before dopepp chose its libLLVM: rendering with scalar_rgb"
-            )
+            message = "Dr.Jit was imported before dopepp chose its libLLVM: rendering with %s"
+            _log.warning(message, "scalar_rgb")
             library = None
         else:
             os.environ[LIBRARY_SETTING] = str(library)
@@ -153,10 +152,8 @@ def is_usable(library: Path) -> bool:
     cached = cache_folder() / f"libllvm_{hashlib.sha256(key.encode()).hexdigest()[:16]}"
     with suppress(OSError, ValueError, KeyError):  # not tried yet, or the file is damaged
         return {"works": True, "fails": False}[cached.read_text("utf-8")]
-    command, environment = (
-        [sys.executable, "-c", _TRIAL],
-        {**os.environ, LIBRARY_SETTING: str(library)},
-    )
+    command = [sys.executable, "-c", _TRIAL]
+    environment = {**os.environ, LIBRARY_SETTING: str(library)}
     try:
         trial = subprocess.run(
             command, env=environment, capture_output=True, text=True, timeout=60.0
@@ -170,7 +167,6 @@ def is_usable(library: Path) -> bool:
         cached.parent.mkdir(parents=True, exist_ok=True)
         cached.write_text("works" if usable else "fails", "utf-8")
     except OSError as error:
-        _log.warning(
-            "%s cannot be written, so the next process tests libLLVM again: %s", cached, error
-        )
+        message = "%s cannot be written, so the next process tests libLLVM again: %s"
+        _log.warning(message, cached, error)
     return usable

@@ -237,15 +237,15 @@ class Film:
         }
 
     def resampled(
-        self, picture: Float32[np.ndarray, "film_height film_width 4"]
+        self, image: Float32[np.ndarray, "film_height film_width 4"]
     ) -> Float32[np.ndarray, "height width 4"]:
         """Return the film's image in the window's pixels."""
         left, top, right, bottom = self.window
         if np.array_equal(self.film_from_window, np.eye(2, 3)):
-            return picture
+            return image
         size, flags = (right - left, bottom - top), cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
         options = {"flags": flags, "borderMode": cv2.BORDER_REPLICATE}
-        resampled = cv2.warpAffine(picture, self.film_from_window, size, **options)
+        resampled = cv2.warpAffine(image, self.film_from_window, size, **options)
         return np.asarray(np.maximum(resampled, np.float32(0)))
 
 

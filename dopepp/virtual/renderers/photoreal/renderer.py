@@ -7,10 +7,8 @@ A matt disc represents the supporting plane, whose image is the background. The 
 divided by its radiance without objects, multiplies the background (shadows, reflected light).
 
 A scene renders to the same bytes on the same machine for any number of threads. Workers must be
-spawned, or forked before the first image. The package lists the environment variables.
-
-This module needs the extra ``photoreal``. It calls pyoidn's C interface directly, because the
-pyoidn package imports torch if installed, which costs seconds and memory.
+spawned, or forked before the first image. The module needs the extra ``photoreal``, and calls
+pyoidn's C interface directly, because the pyoidn package imports torch if installed.
 """
 
 from __future__ import annotations
@@ -89,9 +87,9 @@ def render(scene: Scene) -> Rendered:
             tracer.paint_on_table(window, depth, image)
         if window is not None:
             area = _slices(window)
-            seen, numbers = tracer.cast(window)
-            nearer = (numbers >= 0) & ((depth[area] == 0) | (seen < depth[area]))
-            depth[area] = np.where(nearer, seen, depth[area])
+            distance, numbers = tracer.cast(window)
+            nearer = (numbers >= 0) & ((depth[area] == 0) | (distance < depth[area]))
+            depth[area] = np.where(nearer, distance, depth[area])
             instances[area] = np.where(nearer, numbers, -1)
             if scene.plane is None:
                 film = make_film(scene.K, window)
@@ -172,14 +170,7 @@ class Tracer:
     def _measure(
         self, world: dict[str, Any], film: Film, integrator: dict[str, Any], samples: int
     ) -> Float32[np.ndarray, "film_height film_width channels"]:
-        """Return an integrator's output for every pixel of a film.
-
-        Args:
-            world: Mitsuba's description of the scene.
-            film: Pixels to render.
-            integrator: Mitsuba's description of the integrator.
-            samples: Samples per pixel.
-        """
+        """Return an integrator's output for every pixel of a film."""
         whole = {**world, "sensor": film.sensor(self._mi, samples), "integrator": integrator}
         # Parallel loading would order objects randomly and recompile for every order.
         loaded = self._mi.load_dict(whole, parallel=False)
@@ -220,10 +211,10 @@ class TableTop:
 
     def window(self, objects: Box | None) -> Box | None:
         """Return the part of the image with the disc and the objects, or None."""
-        seen = self._away < 1
+        shown = self._away < 1
         if objects is not None:
-            seen[_slices(objects)] = True
-        rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+            shown[_slices(objects)] = True
+        rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
         if not len(rows):
             return None
         return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
@@ -262,24 +253,19 @@ class TableTop:
 
     def _estimated_albedo(self) -> Vector:
         """Return the albedo at which the disc is as bright as its image, within limits."""
-        seen = self._away < 1
-        if not seen.any():
+        disc = self._away < 1
+        if not disc.any():
             return np.full(3, np.mean(_ALBEDO))
-        shown = SRGB_TO_LINEAR[self._scene.background[seen]].mean(axis=0)
-        light = np.maximum(self._light[seen].mean(axis=0), _MIN_LIGHT)
+        shown = SRGB_TO_LINEAR[self._scene.background[disc]].mean(axis=0)
+        light = np.maximum(self._light[disc].mean(axis=0), _MIN_LIGHT)
         return np.asarray(np.clip(shown / light, *_ALBEDO))
 
 
 def split_light(light: Colours, alpha: Depth, unshadowed: Colours) -> tuple[Colours, Colours]:
-    """Split radiance into the radiance of the objects and of the disc.
+    """Split radiance into the objects' radiance and the share of light that remains on the disc.
 
-    Args:
-        light: Radiance of objects and disc together.
-        alpha: Coverage of each pixel by objects.
-        unshadowed: Radiance of the disc without objects, 0 outside the disc.
-
-    Returns:
-        Radiance of the objects, and the share of the light that remains on the disc.
+    ``alpha`` is the coverage by objects; ``unshadowed`` is the radiance of the disc without
+    objects, 0 outside the disc.
     """
     is_disc = (alpha <= 0) & (unshadowed.min(axis=-1) > _MIN_LIGHT)
     light_share = np.where(is_disc[..., None], light / np.maximum(unshadowed, _MIN_LIGHT), 1.0)
@@ -293,11 +279,11 @@ def split_light(light: Colours, alpha: Depth, unshadowed: Colours) -> tuple[Colo
     return np.where(alpha[..., None] > 0, np.maximum(objects, 0), 0).astype(np.float32), light_share
 
 
-def shadowed(picture: RGBImage, light_share: Colours) -> RGBImage:
+def shadowed(image: RGBImage, light_share: Colours) -> RGBImage:
     """Multiply an image's linear light by the shares ``light_share`` in shadows."""
-    steps = np.minimum(SRGB_TO_LINEAR[picture] * light_share * CODE_STEPS + 0.5, CODE_STEPS)
+    steps = np.minimum(SRGB_TO_LINEAR[image] * light_share * CODE_STEPS + 0.5, CODE_STEPS)
     changed = (LINEAR_TO_SRGB[steps.astype(np.int32)] + 0.5).astype(np.uint8)
-    return np.where(light_share == 1.0, picture, changed)
+    return np.where(light_share == 1.0, image, changed)
 
 
 def denoise(colour: Colours, albedo: Colours, normal: Colours) -> Colours:

@@ -17,7 +17,7 @@ from dopepp.virtual.renderers.raster.plane import darken_plane
 from dopepp.virtual.renderers.raster.shading import shade_object
 from dopepp.virtual.renderers.raster.visibility import (
     Box,
-    Projected,
+    Projection,
     Samples,
     backdrop,
     box_around,
@@ -43,19 +43,19 @@ _MAX_PX: Final = 1_000_000  # a whole silhouette in a larger box is counted at a
 def render(scene: Scene) -> Rendered:
     """Render a scene with 2×2 anti-aliasing; return the background of a scene without objects."""
     image, depth, instances = backdrop(scene)
-    projected = [project_object(item, scene.K) for item in scene.objects]
-    window = box_around(seen.box(scene.size) for seen in projected) or (0, 0, 0, 0)
-    lights = shadow_maps(scene, projected) if scene.objects else []
-    samples = draw_samples(scene, projected, window, PIXEL_SAMPLES)
+    projections = [project_object(item, scene.K) for item in scene.objects]
+    window = box_around(projection.box(scene.size) for projection in projections) or (0, 0, 0, 0)
+    lights = shadow_maps(scene, projections) if scene.objects else []
+    samples = draw_samples(scene, projections, window, PIXEL_SAMPLES)
     if scene.plane is not None:
         darken_plane(scene, scene.plane, lights, samples, image)
     colour = scratch("colour", (*samples.ids.shape[:2], 3), np.float32)
     colour.fill(0.0)
     firsts = first_ids(scene)
-    for item, seen, first in zip(scene.objects, projected, firsts, strict=True):
-        shade_object(item, seen, scene, lights, samples, int(first), colour)
+    for item, projection, first in zip(scene.objects, projections, firsts, strict=True):
+        shade_object(item, projection, scene, lights, samples, int(first), colour)
     _composite(samples, colour, firsts, image, depth, instances)
-    return Rendered(image, depth, instances, _fractions(scene, projected, instances), scene)
+    return Rendered(image, depth, instances, _fractions(scene, projections, instances), scene)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,48 +75,48 @@ class Silhouette:
 
 def silhouette(item: SceneObject, K: Array, size: Size) -> Silhouette:
     """Return an object's whole silhouette, for formats that store it (BOP's ``mask``)."""
-    seen = project_object(item, K)
-    mask = draw_alone(item, seen.hom, (0, 0, *size))[0] > 0
-    left, _, right, _ = seen.extent
+    projection = project_object(item, K)
+    mask = draw_alone(item, projection.hom, (0, 0, *size))[0] > 0
+    left, _, right, _ = projection.extent
     if left > right:
         return Silhouette(mask, 0.0, None)
     if not math.isfinite(left):
         return Silhouette(mask, math.inf, (0, 0, *size))
-    whole = float(mask.sum()) if seen.inside(size) else _whole_px(item, seen, K)
-    return Silhouette(mask, whole, centres_within(seen.extent))
+    whole = float(mask.sum()) if projection.inside(size) else _whole_px(item, projection, K)
+    return Silhouette(mask, whole, centres_within(projection.extent))
 
 
 def visible_fractions(scene: Scene) -> Float[np.ndarray, "objects"]:
     """Return each object's visible fraction as a render reports it, without computing colours."""
-    projected = [project_object(item, scene.K) for item in scene.objects]
-    samples = draw_samples(scene, projected, (0, 0, *scene.size), CENTRE_SAMPLE)
+    projections = [project_object(item, scene.K) for item in scene.objects]
+    samples = draw_samples(scene, projections, (0, 0, *scene.size), CENTRE_SAMPLE)
     owners = np.searchsorted(first_ids(scene), samples.ids[..., 0], side="right") - 1
-    return _fractions(scene, projected, owners.astype(np.int16))
+    return _fractions(scene, projections, owners.astype(np.int16))
 
 
 def _fractions(
-    scene: Scene, projected: Sequence[Projected], instances: Int16[np.ndarray, "height width"]
+    scene: Scene, projections: Sequence[Projection], instances: Int16[np.ndarray, "height width"]
 ) -> Float[np.ndarray, "objects"]:
     """Divide every object's visible pixels by the pixels of its whole silhouette."""
-    visible = np.bincount(instances.reshape(-1) + 1, minlength=len(projected) + 1)[1:]
-    fractions = np.zeros(len(projected))
+    visible = np.bincount(instances.reshape(-1) + 1, minlength=len(projections) + 1)[1:]
+    fractions = np.zeros(len(projections))
     for index in np.flatnonzero(visible).tolist():
-        item, seen = scene.objects[index], projected[index]
-        if seen.inside(scene.size):
+        item, projection = scene.objects[index], projections[index]
+        if projection.inside(scene.size):
             # Pixels can be hidden only where another object may be in front.
-            left, top, right, bottom = _rivals(scene, projected, index) or (0, 0, 0, 0)
-            covered = draw_alone(item, seen.hom, (left, top, right, bottom))[0] > 0
+            left, top, right, bottom = _rivals(scene, projections, index) or (0, 0, 0, 0)
+            covered = draw_alone(item, projection.hom, (left, top, right, bottom))[0] > 0
             hidden = int((covered & (instances[top:bottom, left:right] != index)).sum())
             fractions[index] = visible[index] / (visible[index] + hidden)
         else:
-            whole = _whole_px(item, seen, scene.K)
+            whole = _whole_px(item, projection, scene.K)
             fractions[index] = min(visible[index] / whole, 1.0) if whole else 1.0
     return fractions
 
 
-def _rivals(scene: Scene, projected: Sequence[Projected], index: int) -> Box | None:
+def _rivals(scene: Scene, projections: Sequence[Projection], index: int) -> Box | None:
     """Return the box in which other objects or the plane may hide an object, or None."""
-    item, whole = scene.objects[index], projected[index].box(scene.size)
+    item, whole = scene.objects[index], projections[index].box(scene.size)
     if whole is None:
         return None
     if scene.plane is not None:
@@ -127,8 +127,8 @@ def _rivals(scene: Scene, projected: Sequence[Projected], index: int) -> Box | N
     # An object hides nothing if its nearest point lies behind the farthest point of this object.
     depths = [_depths(other) for other in scene.objects]
     boxes = []
-    for number, seen in enumerate(projected):
-        box = seen.box(scene.size) if depths[number][0] < depths[index][1] else None
+    for number, projection in enumerate(projections):
+        box = projection.box(scene.size) if depths[number][0] < depths[index][1] else None
         if number != index and box is not None:
             left, top = max(whole[0], box[0]), max(whole[1], box[1])
             right, bottom = min(whole[2], box[2]), min(whole[3], box[3])
@@ -145,15 +145,15 @@ def _depths(item: SceneObject) -> tuple[float, float]:
     return least - slack, most + slack
 
 
-def _whole_px(item: SceneObject, seen: Projected, K: Array) -> float:
+def _whole_px(item: SceneObject, projection: Projection, K: Array) -> float:
     """Count the pixel centres of an unoccluded object on an unbounded canvas."""
-    left, top, right, bottom = seen.extent
+    left, top, right, bottom = projection.extent
     if not math.isfinite(left):
         return math.inf  # the object surrounds the camera
-    hom, scale, extent = seen.hom, 1.0, seen.extent
+    hom, scale, extent = projection.hom, 1.0, projection.extent
     if (right - left + 2) * (bottom - top + 2) > _MAX_PX:
         scale = math.sqrt(_MAX_PX / ((right - left + 2) * (bottom - top + 2)))
-        hom = seen.cam @ resize_camera(K, scale, scale).T
+        hom = projection.cam @ resize_camera(K, scale, scale).T
         extent = bounds(hom, NEAR)
     return float(np.count_nonzero(draw_alone(item, hom, centres_within(extent))[0])) / scale**2
 
@@ -162,16 +162,7 @@ def _whole_px(item: SceneObject, seen: Projected, K: Array) -> float:
 def _composite(
     samples: Samples, colour: Array, first_ids: Array, image: Array, depth: Array, instances: Array
 ) -> None:
-    """Composite a window of samples over the background, and read labels at the centre samples.
-
-    Args:
-        samples: The window's sample buffers.
-        colour: Sum of the covered samples' sRGB values.
-        first_ids: Number of each object's first triangle, ascending.
-        image: Updated in place.
-        depth: Updated in place.
-        instances: Updated in place.
-    """
+    """Composite the sums of samples' sRGB values over the image, and write depth and instances."""
     origin, inverse_depth, ids = samples
     height, width, num_samples = ids.shape
     centre = num_samples - 1

@@ -12,12 +12,12 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.virtual.renderers.raster.visibility import Box, Projected, Samples
+from dopepp.virtual.renderers.raster.visibility import Box, Projection, Samples
 from dopepp.virtual.scene import Scene, SceneObject
 from dopepp.virtual.triangles import NUM_COLOUR_SAMPLES, PIXEL_SAMPLES, edge_functions, scratch
 
 _DEPTH_GAP: Final = 0.01  # samples of a patch whose depths differ by more hide one another
-Mesh = tuple[Array, Array, Array]
+Mesh = tuple[Array, Array, Array]  # vertices, faces and corner normals
 
 _ALL_BUT_FIRST: Final = 0b1110  # bits of the samples to skip when all of a pixel are alike
 
@@ -65,13 +65,13 @@ _GROUP_TYPES: Final = {
 
 
 def gather_fragments(
-    item: SceneObject, projected: Projected, scene: Scene, samples: Samples, first_id: int
+    item: SceneObject, projection: Projection, scene: Scene, samples: Samples, first_id: int
 ) -> Fragments | None:
     """Collect an object's fragments; None if it has none. The next call overwrites the arrays.
 
     ``first_id`` is the number of the object's first triangle; the albedo and alpha are not set.
     """
-    box = projected.box(scene.size)
+    box = projection.box(scene.size)
     if box is None:
         return None
     (x, y), surface = samples.origin, item.surface
@@ -89,7 +89,7 @@ def gather_fragments(
     )
     rotation = np.ascontiguousarray(item.T_cam_obj[:3, :3], np.float64)
     mesh = (surface.vertices, surface.faces, surface.normals)
-    _interpolate(fragments, projected.hom, mesh, rotation, np.linalg.inv(scene.K))
+    _interpolate(fragments, projection.hom, mesh, rotation, np.linalg.inv(scene.K))
     return fragments
 
 
@@ -102,18 +102,9 @@ def _group(
     offsets: Array,
     groups: tuple[Array, ...],
 ) -> int:
-    """Group the samples of every pixel by smooth patch.
+    """Group the samples of every pixel by smooth patch, and return the number of groups.
 
-    Args:
-        window: Part of the image: left, top, right, bottom.
-        samples: Sample buffers of the window.
-        first_id: Number of the object's first triangle.
-        patches: Smooth patch of each triangle.
-        offsets: Offset of each sample in a pixel.
-        groups: Filled with pixel, weight, triangle, x, y and inverse depth of each group.
-
-    Returns:
-        The number of groups.
+    ``groups`` is filled with pixel, weight, triangle, x, y and inverse depth of each group.
     """
     origin, inverse_depth, ids = samples
     pixel, weight, triangle, x, y, depth = groups
@@ -169,14 +160,7 @@ def _interpolate(
 ) -> None:
     """Write the corner weights, position, normal and bulge of every fragment.
 
-    Triangles that are seen from behind are marked by the bitwise complement of their number.
-
-    Args:
-        fragments: Fragments of an object, updated in place.
-        hom: Homogeneous pixels of the vertices.
-        mesh: Vertices, faces and corner normals.
-        rotation: Rotation from the object to the camera frame.
-        inverse_K: Inverse camera matrix.
+    A triangle seen from behind is marked by the bitwise complement of its number.
     """
     vertices, faces, normals = mesh
     triangle, share = fragments.face, fragments.share

@@ -1,12 +1,11 @@
 """Shadows of objects on the image of a supporting plane.
 
 The background shows the plane in full light and is multiplied by the share of light (sky and lamps)
-that objects leave. Homographies map the plane to each shadow map and to the grid of its sky, so
-both are warped into the image.
+that objects leave. Homographies warp each shadow map and the grid of the sky into the image.
 
-Points on the objects' surfaces hide the sky in 32 cosine-distributed directions: each point
-sets one bit per direction in a cell of the plane, and the share of bits is the hidden share of the
-sky. This gives the soft contact shadow of an object.
+Points on the objects' surfaces hide the sky in 32 cosine-distributed directions. Each point sets
+one bit per direction in a cell of the plane. The share of bits is the hidden share of the sky and
+gives soft contact shadows.
 """
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ from dopepp.virtual.renderers.raster.visibility import (
     Samples,
     ShadowMap,
     ambient_row,
-    inverse_depth_of,
 )
 from dopepp.virtual.scene import NEAR, Plane, Scene, SceneObject
 from dopepp.virtual.sensor import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
@@ -73,7 +71,7 @@ def darken_plane(
     box = _shadowed_box(scene, frame, grid, hidden.shape, lights)
     if box is None:
         return
-    inverse = inverse_depth_of(plane, scene.K)
+    inverse = plane.inverse_depth_row(scene.K)
     # A pixel (u, v, 1) shows the plane's point K⁻¹ (u, v, 1) / (inverse · (u, v, 1)).
     to_point = np.vstack([np.linalg.inv(scene.K), inverse])
     to_cells = np.array([[1, 0, -grid[0]], [0, 1, -grid[1]], [0, 0, grid[2]]])
@@ -222,14 +220,10 @@ def hidden_sky(
 
 @compiled()
 def _splat(points: Array, reach: float, slopes: Array, grid: Array, bits: Array) -> None:
-    """Mark the cells of a grid on the plane that points of an object shade.
+    """Set a bit per direction of light in the cells that points (x, y, height) shade.
 
-    Args:
-        points: Points relative to the plane: two coordinates in it and the height, metres.
-        reach: Half-width of a point's shadow, cells.
-        slopes: Horizontal displacement of a shadow per height, by direction of light.
-        grid: Two coordinates of the first cell, and the side of a cell, metres.
-        bits: Updated bit set of shading directions in each cell.
+    ``reach`` is the half-width of a point's shadow in cells, and ``slopes`` the displacement of the
+    shadow per height, by direction.
     """
     rows, columns = bits.shape
     for p in range(points.shape[0]):
@@ -256,16 +250,10 @@ def _darken(
     samples: Samples,
     image: Array,
 ) -> None:
-    """Multiply the image by the remaining share of the plane's light.
+    """Multiply the image in place by the share of the plane's light that remains.
 
-    Args:
-        corner: First pixel of ``shades``.
-        lit: The plane and its lights.
-        shades: Hidden shares of the sky and of every light, shape (1 + lights, h, w).
-        decode: Table from sRGB codes to linear light.
-        encode: Table from linear light to sRGB codes.
-        samples: The window's sample buffers.
-        image: Updated in place.
+    ``shades`` (1 + lights, h, w) are the hidden shares of the sky and of every light from the pixel
+    ``corner`` on; ``decode`` and ``encode`` are the tables between sRGB codes and linear light.
     """
     origin, _, ids = samples
     to_point, width = lit.to_point, shades.shape[2]
@@ -301,16 +289,7 @@ def _is_full(ids: Array, j: int, i: int) -> bool:
 def _light_row(
     corner: tuple[int, int], j: int, lit: _LitPlane, shades: Array, total: Array, lost: Array
 ) -> None:
-    """Sum the light on one row of the plane's pixels, and the part of it that objects block.
-
-    Args:
-        corner: (column, row) of the area's first pixel.
-        j: Row in the area.
-        lit: The plane and its lights.
-        shades: Share of the sky, then of each light, that objects block at each pixel.
-        total: Filled with the light of each channel and pixel.
-        lost: Filled with the blocked light of each channel and pixel.
-    """
+    """Fill ``total`` with the light on row j of ``shades``, and ``lost`` with the blocked light."""
     to_point, normal, sky, lights, P = lit
     fv = np.float32(corner[1] + j)
     px, py = to_point[0, 1] * fv + to_point[0, 2], to_point[1, 1] * fv + to_point[1, 2]

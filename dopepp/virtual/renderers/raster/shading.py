@@ -1,13 +1,12 @@
 """Shading: the light that an object's visible fragments send to the camera.
 
-Each pass works on all fragments of an object: colour (``surface.texture``, noise), normals
-(grooves), the open sky (``surface.occlusion``), and each light with its shadow map. Arrays are
-float32. π is left out of every term: a white diffuse surface under intensity 1 has radiance 1.
+Each pass works on all fragments of an object: colour, grooves, the open sky, and each light with
+its shadow map. Arrays are float32. π is left out of every term: a white diffuse surface under
+intensity 1 has radiance 1.
 
-Grooves are the layer lines of a print or the marks of brushed metal: a sine of the distance
-along an axis, mixed with noise for irregular grooves. Averaged over a pixel of w grooves, a sine
-keeps sinc(w) of its amplitude. The lost slope variance is added to the roughness (as in Olano and
-Baker, "LEAN mapping", 2010), so grooves never alias and a distant print keeps its broad highlight.
+Grooves (layer lines of a print, brushed metal) are a sine of the distance along an axis, mixed with
+noise. Averaged over a pixel of w grooves, a sine keeps sinc(w) of its amplitude. The lost slope
+variance is added to the roughness (Olano and Baker, "LEAN mapping", 2010), so grooves never alias.
 
 To add a material effect, write a pass and call it in :func:`shade_object`.
 """
@@ -22,7 +21,7 @@ import numpy as np
 
 from dopepp.core.compiled import Array, Scalar, compiled
 from dopepp.virtual.renderers.raster.fragments import Fragments, gather_fragments
-from dopepp.virtual.renderers.raster.visibility import Projected, Samples, ShadowMap, ambient_row
+from dopepp.virtual.renderers.raster.visibility import Projection, Samples, ShadowMap, ambient_row
 from dopepp.virtual.scene import NOISE_LIMITS, Scene, SceneObject
 from dopepp.virtual.sensor import CODE_STEPS, SRGB_TO_LINEAR, TONE_CURVE, TONE_LIMIT
 from dopepp.virtual.surface.occlusion import look_up_sky
@@ -42,29 +41,22 @@ _NOISE: Final = np.random.default_rng(0).integers(-127, 128, (_SIDE, _SIDE, _SID
 
 def shade_object(
     item: SceneObject,
-    projected: Projected,
+    projection: Projection,
     scene: Scene,
     lights: Sequence[ShadowMap],
     samples: Samples,
     first_id: int,
     colour: Array,
 ) -> None:
-    """Add the light that an object reflects to the pixels that show it.
+    """Add an object's samples to ``colour``, the sum of sRGB values per pixel (height, width, 3).
 
-    Args:
-        item: The object.
-        projected: Its projected triangles.
-        scene: The scene.
-        lights: The lights with their shadow maps.
-        samples: Triangle number of each sample of the pixels.
-        first_id: Number of the object's first triangle.
-        colour: Sum of sRGB values per pixel, float32 (height, width, 3), updated in place.
+    ``first_id`` is the number of the object's first triangle in the samples.
     """
-    fragments = gather_fragments(item, projected, scene, samples, first_id)
+    fragments = gather_fragments(item, projection, scene, samples, first_id)
     if fragments is None:
         return
     material, sky, count = item.material, item.surface.sky, len(fragments.pixel)
-    _set_albedo(item, projected, scene, fragments)
+    _set_albedo(item, projection, scene, fragments)
     # A highlight under a point light may be narrower than any pixel.
     fragments.alpha.fill(max(material.roughness**2, 0.002))
     if (grooves := material.grooves) is not None:
@@ -85,7 +77,7 @@ def shade_object(
 
 
 def _set_albedo(
-    item: SceneObject, projected: Projected, scene: Scene, fragments: Fragments
+    item: SceneObject, projection: Projection, scene: Scene, fragments: Fragments
 ) -> None:
     """Set the albedo to the surface's colour times the material's, with its noise."""
     surface, material, albedo = item.surface, item.material, fragments.albedo
@@ -93,7 +85,7 @@ def _set_albedo(
     if surface.texture is not None:
         texture = (surface.texture.texels, surface.texture.levels, SRGB_TO_LINEAR)
         points = (face, share, fragments.x, fragments.y)
-        sample_texture(points, projected.hom, surface.faces, surface.uv, texture, albedo)
+        sample_texture(points, projection.hom, surface.faces, surface.uv, texture, albedo)
     elif len(surface.colours):
         _blend_colours(face, share, surface.faces, surface.colours, albedo)
     else:
@@ -155,13 +147,8 @@ def _tilt_normals(
 ) -> None:
     """Tilt the normals of grooved points, or widen their alpha where grooves are fine.
 
-    Args:
-        noise: :data:`_NOISE`.
-        fragments: Fragments of the object, updated in place.
-        axis: Unit vector across the grooves, camera frame.
-        origin: Coordinate of the object's origin along ``axis``, metres.
-        focal: (fx, fy), pixels.
-        profile: Pitch, slope and irregularity of the grooves.
+    ``axis`` is the unit vector across the grooves, camera frame; ``origin`` is the coordinate of
+    the object's origin along it, metres; ``profile`` is pitch, slope and irregularity.
     """
     position, normal, alpha = fragments.position, fragments.normal, fragments.alpha
     ax, ay, az = axis

@@ -16,8 +16,8 @@ from jaxtyping import Float32, Int16
 from dopepp.core.compiled import Array, Scalar, compiled
 from dopepp.drawing.pictures import RGBImage, Size
 from dopepp.geometry.camera import make_transform, transform
-from dopepp.geometry.rotation import Vector, rotation_to_z
-from dopepp.virtual.scene import NEAR, Ambient, Light, Plane, Scene, SceneObject
+from dopepp.geometry.rotation import rotation_to_z
+from dopepp.virtual.scene import NEAR, Ambient, Light, Scene, SceneObject
 from dopepp.virtual.triangles import (
     CENTRE_SAMPLE,
     PIXEL_SAMPLES,
@@ -35,15 +35,13 @@ Extent = tuple[float, float, float, float]
 """Smallest and largest pixel coordinates (left, top, right, bottom)."""
 
 _REACH: Final = float(np.abs(PIXEL_SAMPLES).max())
-_LARGEST_TANGENT: Final = (
-    3.0  # largest tangent off the axis of a light among the objects; points beyond are lit
-)
+_LARGEST_TANGENT: Final = 3.0  # largest half-width of a shadow map; points outside are lit
 _ZERO, _ONE = np.float32(0), np.float32(1)  # literals would turn the arithmetic into float64
 
 
 @dataclass(frozen=True, eq=False)
-class Projected:
-    """An object's projected vertices.
+class Projection:
+    """The projected vertices of an object.
 
     Attributes:
         cam: Camera frame, metres, shape (V, 3).
@@ -71,11 +69,11 @@ class Projected:
         return 0 <= left <= right <= size[0] - 1 and 0 <= top <= bottom <= size[1] - 1
 
 
-def project_object(item: SceneObject, K: Array) -> Projected:
+def project_object(item: SceneObject, K: Array) -> Projection:
     """Project an object's vertices."""
     cam, hom = np.empty_like(item.surface.vertices), np.empty_like(item.surface.vertices)
     project_vertices(item.surface.vertices, item.T_cam_obj, K, cam, hom)
-    return Projected(cam, hom, bounds(hom, NEAR))
+    return Projection(cam, hom, bounds(hom, NEAR))
 
 
 def centres_within(extent: Extent) -> Box:
@@ -108,7 +106,7 @@ class Samples(NamedTuple):
 
 
 def draw_samples(
-    scene: Scene, projected: Sequence[Projected], window: Box, offsets: Array
+    scene: Scene, projections: Sequence[Projection], window: Box, offsets: Array
 ) -> Samples:
     """Draw a scene's plane and objects; the buffers are reused for the next scene.
 
@@ -122,12 +120,14 @@ def draw_samples(
     if scene.plane is None:
         inverse_depth.fill(0.0)
     else:
-        inverse = inverse_depth_of(scene.plane, scene.K)
+        inverse = scene.plane.inverse_depth_row(scene.K)
         _clear_to_plane(inverse, (left, top), offsets, NEAR, inverse_depth)
     samples = Samples((left, top), inverse_depth, ids)
-    for item, seen, first in zip(scene.objects, projected, first_ids(scene), strict=True):
+    for item, projection, first in zip(scene.objects, projections, first_ids(scene), strict=True):
         faces, closed = item.surface.faces, item.surface.closed
-        rasterise(seen.hom, faces, closed, NEAR, (left, top), offsets, inverse_depth, ids, first)
+        rasterise(
+            projection.hom, faces, closed, NEAR, (left, top), offsets, inverse_depth, ids, first
+        )
     return samples
 
 
@@ -159,13 +159,8 @@ def backdrop(
     """Return image, depth and instances of a scene without its objects."""
     depth = np.zeros(scene.background.shape[:2], np.float32)
     if scene.plane is not None:
-        _plane_depth(inverse_depth_of(scene.plane, scene.K), NEAR, depth)
+        _plane_depth(scene.plane.inverse_depth_row(scene.K), NEAR, depth)
     return scene.background.copy(), depth, np.full(depth.shape, -1, np.int16)
-
-
-def inverse_depth_of(plane: Plane, K: Array) -> Vector:
-    """Return (a, b, c) with 1/z = a u + b v + c on the plane; positive in front of the camera."""
-    return np.asarray(np.linalg.solve(K.T, np.array(plane.normal, np.float64)) / plane.offset)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,27 +187,27 @@ class ShadowMap:
         Beyond √2 texels, a plane cannot shadow itself at any slope; the bulge keeps a smooth ball
         of few flat triangles from shadowing itself where its normals still face the light.
         """
-        projected = scratch("projected", position.shape, np.float32)
-        lit = scratch("lit", projected.shape[1:], np.float32)
+        points = scratch("projected", position.shape, np.float32)
+        lit = scratch("lit", points.shape[1:], np.float32)
         lift = np.float32(1.5 * self.texel)
-        _project_points(position, normal, bulge, self.light, self.P, lift, projected)
-        _compare(projected, self.inverse_depth, lit)
+        _project_points(position, normal, bulge, self.light, self.P, lift, points)
+        _compare(points, self.inverse_depth, lit)
         return lit
 
 
-def shadow_maps(scene: Scene, projected: Sequence[Projected]) -> list[ShadowMap]:
+def shadow_maps(scene: Scene, projections: Sequence[Projection]) -> list[ShadowMap]:
     """Return the shadow map of every light of a scene with objects."""
-    boxes = [box for seen in projected if (box := seen.box(scene.size)) is not None]
+    boxes = [box for projection in projections if (box := projection.box(scene.size)) is not None]
     extent = max((max(box[2] - box[0], box[3] - box[1]) for box in boxes), default=0)
     # A texel per pixel of the objects' image; for all lights but the first, half as many.
     return [
-        shadow_map(light, scene.objects, projected, extent * (0.5 if number else 1.0))
+        shadow_map(light, scene.objects, projections, extent * (0.5 if number else 1.0))
         for number, light in enumerate(scene.lights)
     ]
 
 
 def shadow_map(
-    light: Light, objects: Sequence[SceneObject], projected: Sequence[Projected], texels: float
+    light: Light, objects: Sequence[SceneObject], projections: Sequence[Projection], texels: float
 ) -> ShadowMap:
     """Rasterise objects from a light; the map's longer side has about ``texels``."""
     points = np.concatenate([transform(item.T_cam_obj, item.surface.hull) for item in objects])
@@ -234,9 +229,9 @@ def shadow_map(
     K = np.array([[focal, 0, 2 - focal * low[0]], [0, focal, 2 - focal * low[1]], [0, 0, 1.0]])
     inverse_depth = np.zeros((height, width, 1), np.float32)
     ids = np.empty(inverse_depth.shape, np.int32)
-    for item, seen in zip(objects, projected, strict=True):
-        cam, hom = np.empty_like(seen.cam), np.empty_like(seen.cam)
-        project_vertices(seen.cam, T_light_cam, K, cam, hom)
+    for item, projection in zip(objects, projections, strict=True):
+        cam, hom = np.empty_like(projection.cam), np.empty_like(projection.cam)
+        project_vertices(projection.cam, T_light_cam, K, cam, hom)
         surface = item.surface
         rasterise(
             hom, surface.faces, surface.closed, NEAR, (0, 0), CENTRE_SAMPLE, inverse_depth, ids, 0
@@ -256,17 +251,10 @@ def ambient_row(ambient: Ambient) -> Array:
 def _project_points(
     position: Array, normal: Array, bulge: Array, light: Array, P: Array, lift: Scalar, out: Array
 ) -> None:
-    """Project surface points into a light's shadow map.
+    """Project surface points into a light's shadow map: u, v and inverse depth into ``out`` (3, n).
 
-    Args:
-        position: Points in the camera frame, (3, n), metres.
-        normal: Unit normals, (3, n).
-        bulge: Height of the smooth surface above each point's triangle, metres.
-        light: Position of the light, camera frame, metres.
-        P: Projection of the light, 3×4.
-        lift: Distance by which points are lifted along their normals, per depth from the light.
-        out: Filled with u, v and inverse depth in the map, (3, n). The inverse depth is −1 for
-            points that face away from the light.
+    Points are lifted along their normals by ``bulge`` metres and by ``lift`` per depth from the
+    light. The inverse depth is −1 for points that face away from the light.
     """
     x0, y0, z0 = light[0], light[1], light[2]
     a, b, c, d = P[0, 0], P[0, 1], P[0, 2], P[0, 3]
@@ -285,16 +273,10 @@ def _project_points(
 
 
 @compiled(fastmath=True)
-def _compare(projected: Array, inverse_depth: Array, lit: Array) -> None:
-    """Write the lit share of projected points, by comparison with the shadow map.
-
-    Args:
-        projected: u, v and inverse depth of each point, (3, n).
-        inverse_depth: Shadow map.
-        lit: Filled with the lit share of each point, from 0 to 1.
-    """
+def _compare(points: Array, inverse_depth: Array, lit: Array) -> None:
+    """Write the lit share, in [0, 1], of the points of :func:`_project_points`."""
     for p in range(lit.shape[0]):
-        u, v, inverse = projected[0, p], projected[1, p], projected[2, p]
+        u, v, inverse = points[0, p], points[1, p], points[2, p]
         lit[p] = open_share(u, v, inverse, inverse_depth) if inverse > _ZERO else _ZERO
 
 
@@ -302,15 +284,7 @@ def _compare(projected: Array, inverse_depth: Array, lit: Array) -> None:
 def _clear_to_plane(
     inverse: Array, origin: tuple[int, int], samples: Array, near: float, inverse_depth: Array
 ) -> None:
-    """Fill a sample buffer with the plane's inverse depth; 0 where the plane is not seen.
-
-    Args:
-        inverse: Coefficients (a, b, c) of the plane's inverse depth a u + b v + c, 1/metres.
-        origin: Column and row of the buffer's first pixel.
-        samples: Offsets of the samples from the pixel's centre, shape (S, 2).
-        near: Smallest depth that is drawn, metres.
-        inverse_depth: The buffer, shape (height, width, S).
-    """
+    """Fill a sample buffer with the plane's inverse depth; 0 where the plane is not visible."""
     height, width, num_samples = inverse_depth.shape
     row = inverse_depth.reshape(height, width * num_samples)
     steps = np.empty(width * num_samples, np.float32)

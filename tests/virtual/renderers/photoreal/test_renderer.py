@@ -1,4 +1,4 @@
-"""Path-traced images: labels as the rasteriser's, light that is plausible."""
+"""Path-traced images: the rasteriser's labels, and plausible light."""
 
 import importlib
 import pickle
@@ -40,10 +40,10 @@ def on_table(scene: Scene) -> Scene:
     return replace(scene, plane=Plane((0.0, 0.0, -1.0), -0.5))
 
 
-def assert_same_labels(found: Rendered, expected: Rendered) -> None:
-    assert (np.abs(found.depth - expected.depth) < 1e-3).mean() >= 0.99
-    assert (found.instances == expected.instances).mean() >= 0.99
-    np.testing.assert_array_equal(found.visible_fractions, expected.visible_fractions)
+def assert_same_labels(result: Rendered, expected: Rendered) -> None:
+    assert (np.abs(result.depth - expected.depth) < 1e-3).mean() >= 0.99
+    assert (result.instances == expected.instances).mean() >= 0.99
+    np.testing.assert_array_equal(result.visible_fractions, expected.visible_fractions)
 
 
 @pytest.mark.parametrize(("preset", "seed"), [("paper", 1), ("paper", 2), ("table", 3), ("bin", 5)])
@@ -89,7 +89,7 @@ def test_a_textured_model_shows_its_texture(photoreal, ycb_root, scene_of):
     assert_same_labels(result, expected)
     covered = expected.instances == 0
     for channel in range(3):
-        first, other = (picture.image[covered][:, channel] for picture in (expected, result))
+        first, other = (rendered.image[covered][:, channel] for rendered in (expected, result))
         assert np.corrcoef(first, other)[0, 1] > 0.9
 
 
@@ -99,7 +99,7 @@ def test_no_light_at_all_is_black_and_finite(photoreal, box_part, scene_of):
     result = photoreal(scene)
     inside = result.instances == 0
     assert (np.percentile(result.image[inside], 90) == 0).all()
-    # Without light there is nothing that an object could keep from the table.
+    # Without light, objects cast no shadow on the table.
     np.testing.assert_array_equal(result.image[:4], scene.background[:4])
 
 
@@ -129,7 +129,7 @@ def test_a_shadow_falls_away_from_its_lamp(photoreal, box_part, scene_of):
     assert right == pytest.approx(expected.image[row, columns[-1] + 4].mean(), abs=15)
 
 
-def test_a_red_neighbour_is_seen_in_a_mirror(photoreal, box_part, scene_of):
+def test_a_mirror_reflects_a_red_neighbour(photoreal, box_part, scene_of):
     mirror = Material(metallic=1.0, roughness=0.05, colour=(0.9, 0.9, 0.9))
     red = Material(colour=(0.9, 0.02, 0.02))
     plate = lying(box_part, 0.1, material=mirror)
@@ -140,10 +140,10 @@ def test_a_red_neighbour_is_seen_in_a_mirror(photoreal, box_part, scene_of):
     turned[:3, 3] = 0.0, -0.042, 0.36
     scene = scene_of(plate, replace(wall, T_cam_obj=turned))
     both, alone = photoreal(scene), photoreal(replace(scene, objects=(plate,)))
-    seen = (both.instances == 0) & (alone.instances == 0)
+    plate_px = (both.instances == 0) & (alone.instances == 0)
 
-    def redness(picture):
-        values = picture.image[seen].astype(float)
+    def redness(rendered):
+        values = rendered.image[plate_px].astype(float)
         return float((values[:, 0] - values[:, 1]).max())
 
     assert redness(both) > redness(alone) + 30
@@ -174,9 +174,9 @@ def test_a_scene_gives_the_same_bytes(photoreal, box_part, scene_of):
 
 def test_an_empty_scene_is_its_background(photoreal, scene_of):
     scene = scene_of()
-    for found in (photoreal(scene), photoreal(on_table(scene))):
-        np.testing.assert_array_equal(found.image, scene.background)
-        assert (found.instances == -1).all()
+    for result in (photoreal(scene), photoreal(on_table(scene))):
+        np.testing.assert_array_equal(result.image, scene.background)
+        assert (result.instances == -1).all()
 
 
 @pytest.mark.parametrize("package", ["mitsuba", "pyoidn"])
@@ -190,7 +190,7 @@ def test_the_missing_extra_is_named(monkeypatch, package):
         find_renderer("photoreal")
 
 
-def test_vertex_colours_are_the_rasterisers(photoreal, scene_of):
+def test_vertex_colours_agree_with_the_rasteriser(photoreal, scene_of):
     ball = trimesh.creation.icosphere(3, 0.06)
     shades = np.clip(128 + 2000 * ball.vertices, 0, 255).astype(np.uint8)
     mesh = Mesh(ball.vertices, ball.faces.astype(np.int32), colours=shades)
@@ -204,5 +204,5 @@ def test_vertex_colours_are_the_rasterisers(photoreal, scene_of):
     apart = expected.image[covered].astype(int) - result.image[covered]
     assert np.abs(np.median(apart, axis=0)).max() < 8
     for channel in range(3):
-        first, other = (picture.image[covered][:, channel] for picture in (expected, result))
+        first, other = (rendered.image[covered][:, channel] for rendered in (expected, result))
         assert np.corrcoef(first, other)[0, 1] > 0.95

@@ -1,4 +1,4 @@
-"""The choice of Mitsuba's variant: a libLLVM that kills its process must not kill the user's."""
+"""The choice of Mitsuba's variant: a libLLVM that crashes must not crash the user's process."""
 
 import os
 import subprocess
@@ -45,7 +45,7 @@ def library(tmp_path, monkeypatch):
 
 
 def stand_in(monkeypatch: pytest.MonkeyPatch, code: str) -> list[list[str]]:
-    """Let other code than the trial run in its process; return the list of commands so far."""
+    """Run other code in place of the trial; return the list of commands so far."""
     commands: list[list[str]] = []
     run = subprocess.run
 
@@ -65,22 +65,22 @@ def test_a_library_that_ends_the_process_is_not_usable(library, monkeypatch, cod
     assert not variant.is_usable(library)
 
 
-def test_the_outcome_is_remembered_until_the_library_changes(library, monkeypatch, tmp_path):
+def test_the_outcome_is_cached_until_the_library_changes(library, monkeypatch, tmp_path):
     commands = stand_in(monkeypatch, "print('mean', 0.5)")
     assert [variant.is_usable(library) for _ in range(2)] == [True, True]
     assert len(commands) == 1
-    (memory,) = (tmp_path / "cache" / "dopepp").iterdir()
+    (cached,) = (tmp_path / "cache" / "dopepp").iterdir()
     for count, damage in enumerate((b"", b"wor", b"\xff" * 1000), start=2):
-        memory.write_bytes(damage)  # a damaged memory is written anew
+        cached.write_bytes(damage)  # a damaged file is written again
         assert variant.is_usable(library)
         assert len(commands) == count
-        assert memory.read_text() == "works"
+        assert cached.read_text() == "works"
     os.utime(library, (1, 1))
     assert variant.is_usable(library)
     assert len(commands) == 5
 
 
-def test_a_trial_without_an_end_is_made_again_later(library, monkeypatch):
+def test_a_trial_that_times_out_is_repeated_later(library, monkeypatch):
     def hang(command, timeout, **_):
         raise subprocess.TimeoutExpired(command, timeout)
 
@@ -122,7 +122,7 @@ def test_the_newest_library_comes_first(library, monkeypatch, tmp_path):
         ("cuda_ad_rgb", ["DOPEPP_MITSUBA_VARIANT='cuda_ad_rgb'", "llvm_ad_rgb, scalar_rgb"]),
     ],
 )
-def test_a_real_process_survives_a_library_that_is_none(library, setting, answers):
+def test_a_process_survives_an_invalid_library(library, setting, answers):
     wish = {} if setting is None else {variant.VARIANT_SETTING: setting}
     done = subprocess.run(
         [sys.executable, "-c", _RENDER], capture_output=True, text=True, check=False, timeout=120,

@@ -1,4 +1,4 @@
-"""The supporting plane: depth, what it hides, and the shadows on its image."""
+"""The supporting plane: depth, hidden objects, and the shadows on its image."""
 
 from dataclasses import replace
 
@@ -71,7 +71,7 @@ def test_depth_is_right_around_objects(scene_of):
     assert rendered.visible_fractions[0] == 1.0
 
 
-def test_what_is_below_is_hidden_and_counts(scene_of):
+def test_parts_below_the_plane_are_hidden_and_reduce_the_visible_fraction(scene_of):
     # A box sunk in by half of its height, one below the plane and a whole one.
     sunk = box_at(-0.1, 0, -0.05, (0.05, 0.05, 0.1))
     below = box_at(0.1, 0, -0.2, (0.05, 0.05, 0.1))
@@ -109,7 +109,7 @@ def test_a_shadow_lies_where_the_light_is_blocked(scene_of, which):
         assert brightness(rendered, inner) < 15
 
 
-def test_a_lamp_adds_to_what_is_left(scene_of):
+def test_light_of_unblocked_lamps_remains(scene_of):
     # Two equal lamps at equal distances, one blocked, no sky: half of the light is left.
     item = box_at(0, 0, 0.10, (0.06, 0.06, 0.01))
     lamps = [Light(tuple(on_plane(x, 0, 0.4)), (0.5, 0.5, 0.5), 0.5) for x in (-0.4, 0.4)]
@@ -137,7 +137,7 @@ def test_contact_darkens_the_sky_more_the_nearer(scene_of):
     assert light[0] < light[1] < light[2]
 
 
-def test_far_from_objects_the_picture_is_untouched(scene_of):
+def test_the_image_is_unchanged_far_from_objects(scene_of):
     item = box_at(0, 0, 0, (0.02, 0.02, 0.02))
     scene = scene_of(item, lights=(Light(tuple(on_plane(0, 0, 1.0))),), **IMAGE)
     rendered = drawn(scene)

@@ -118,7 +118,7 @@ def test_inconsistent_winding_renders_the_same_silhouette_and_shading(
     assert np.percentile(difference, 99) <= 2
 
 
-def test_nearer_object_wins_whatever_the_order(scene_of, box_surface):
+def test_the_nearer_object_is_visible_in_any_order(scene_of, box_surface):
     near, far = at(box_surface, 0, 0, 0.2), at(box_surface, 0.02, 0, 0.3)
     first, second = render(scene_of(near, far)), render(scene_of(far, near))
     np.testing.assert_array_equal(first.depth, second.depth)
@@ -176,7 +176,7 @@ def test_an_open_mesh_shows_both_sides(tmp_path, scene_of, caplog):
 
 
 @pytest.mark.parametrize("inside_out", [False, True])
-def test_bodies_through_each_other_show_their_outside(tmp_path, scene_of, inside_out):
+def test_intersecting_bodies_show_their_outside(tmp_path, scene_of, inside_out):
     slab, pin = trimesh.creation.box((100, 100, 20)), trimesh.creation.box((30, 30, 80))
     if inside_out:
         pin.invert()
@@ -234,7 +234,7 @@ def without_casters(*arguments: object) -> ShadowMap:
 @pytest.mark.parametrize(
     "body", [trimesh.creation.icosphere(1, 0.05), trimesh.creation.cylinder(0.03, 0.1, sections=16)]
 )
-def test_a_smooth_body_of_few_triangles_has_no_shadow_on_it(
+def test_a_smooth_body_of_few_triangles_does_not_shadow_itself(
     scene_of, surface_of, monkeypatch, body, inside_out
 ):
     body = body.copy()
