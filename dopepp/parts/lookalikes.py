@@ -73,10 +73,10 @@ def _meshes(mesh: Mesh) -> Iterator[tuple[str, Mesh]]:
     if mirror_distance(mesh) > _OWN_MIRROR:
         mirrored = mesh.vertices * (-1.0, 1.0, 1.0)
         # A reflection turns triangles inside out.
-        yield "mirrored", _changed(mesh, mirrored, mesh.faces[:, ::-1])
+        yield "mirrored", _replace_triangles(mesh, mirrored, mesh.faces[:, ::-1])
     longest = int((high - low).argmax())
     stretch = np.where(np.arange(3) == longest, STRETCH, 1.0)
-    yield "stretched", _changed(mesh, mesh.vertices * stretch, mesh.faces)
+    yield "stretched", _replace_triangles(mesh, mesh.vertices * stretch, mesh.faces)
     # Vertices beyond the plane move into it, so the surface stays closed and keeps its colours.
     points = SurfaceTree(mesh.vertices, mesh.faces).spread(2000, seed=0)[0]
     normal = np.where(
@@ -85,9 +85,9 @@ def _meshes(mesh: Mesh) -> Iterator[tuple[str, Mesh]]:
     normal /= np.linalg.norm(normal)
     offset = np.quantile(points @ normal, 1 - _CUT_SHARE)
     beyond = np.maximum(mesh.vertices @ normal - offset, 0.0)
-    yield "cut", _changed(mesh, mesh.vertices - beyond[:, None] * normal, mesh.faces)
+    yield "cut", _replace_triangles(mesh, mesh.vertices - beyond[:, None] * normal, mesh.faces)
 
 
-def _changed(mesh: Mesh, vertices: Vertices, faces: Faces) -> Mesh:
+def _replace_triangles(mesh: Mesh, vertices: Vertices, faces: Faces) -> Mesh:
     """Return a mesh with other vertices and faces, and with computed normals."""
     return replace(mesh, vertices=vertices, faces=np.ascontiguousarray(faces), normals=None)

@@ -181,13 +181,13 @@ class Part:
             deviation = values.mesh.deviation
         return cls(
             name=check_name(values.name),
-            cuboid=_checked_cuboid(values.cuboid),
+            cuboid=_parse_cuboid(values.cuboid),
             diameter=values.diameter,
             points=np.array(values.points, np.float64),
             mesh=mesh,
             mesh_deviation=deviation,
             mesh_hash=values.mesh_hash,
-            symmetries_discrete=_checked_transforms(values.symmetries_discrete),
+            symmetries_discrete=_parse_transforms(values.symmetries_discrete),
             symmetries_continuous=tuple(values.symmetries_continuous),
         )
 
@@ -229,7 +229,7 @@ class _Record:
     symmetries_continuous: Annotated[list[tuple[_Point, _Point]], Field(max_length=MAX_SYMMETRIES)]
 
 
-def _checked_cuboid(rows: Sequence[_Point]) -> Float[np.ndarray, "9 3"]:
+def _parse_cuboid(rows: Sequence[_Point]) -> Float[np.ndarray, "9 3"]:
     """Return the cuboid of a record, whose corners must form an axis-aligned box in NDDS order."""
     cuboid = np.array(rows, np.float64)
     expected = cuboid_keypoints(cuboid.min(axis=0), cuboid.max(axis=0))
@@ -240,7 +240,7 @@ def _checked_cuboid(rows: Sequence[_Point]) -> Float[np.ndarray, "9 3"]:
     return cuboid
 
 
-def _checked_transforms(
+def _parse_transforms(
     matrices: Sequence[Sequence[_Row]] | None,
 ) -> Float[np.ndarray, "symmetries 4 4"] | None:
     """Return the discrete symmetries of a record, which must be rigid transforms."""

@@ -70,9 +70,9 @@ class LearnedRange(NamedTuple):
             fix = "use a checkpoint written by train.py"
             problem = f"the learned range of sizes {values!r:.100}"
             raise UserError(problem, ", ".join(cls._fields), fix)
-        pair = tuple[float, float]
-        sizes = check("sizes of a part", values[:2], pair, Span(0.1, 1e5, "pixels"))
-        depths = check("distances of a part", values[2:], pair, Span(1e-4, 1e4, "metres"))
+        pixels, metres = Span(0.1, 1e5, "pixels"), Span(1e-4, 1e4, "metres")
+        sizes = check("sizes of a part", values[:2], tuple[float, float], pixels)
+        depths = check("distances of a part", values[2:], tuple[float, float], metres)
         return cls(*sizes, *depths)
 
 

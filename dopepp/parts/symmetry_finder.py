@@ -26,8 +26,8 @@ from dopepp.parts.mesh import Points, SurfaceTree, half_sphere, largest_distance
 from dopepp.parts.part import Mesh
 
 _ROUGH: Final = 0.06  # Mean distance that excludes a symmetry within 2.6° of the axis, diameters
-_GIVE: Final = 0.02
-"""Distance above which a point's loss is linear, diameters (Huber): a feature may lack a
+_HUBER_WIDTH: Final = 0.02
+"""Distance above which the loss of a point is linear (Huber), diameters: a feature may lack a
 counterpart."""
 
 TOLERANCE: Final = 0.01  # Largest distance from the surface, diameters
@@ -117,12 +117,12 @@ class _Shape:
         self, rotations: Float[np.ndarray, "rotations 3 3"]
     ) -> Float[np.ndarray, "rotations 4 4"]:
         """Return rotations about the centre as transforms of the part, metres."""
-        return _clean(rotations_about(self.centre, rotations))
+        return _round(rotations_about(self.centre, rotations))
 
     def axis(self, axis: Vector) -> ContinuousSymmetry:
         """Return an axis through the centre and its point nearest the origin."""
         offset = self.centre - (self.centre @ axis) * axis
-        return tuple(_clean(axis).tolist()), tuple(_clean(offset).tolist())
+        return tuple(_round(axis).tolist()), tuple(_round(offset).tolist())
 
 
 def _search(shape: _Shape) -> tuple[Vector | None, list[RotationMatrix]]:
@@ -190,11 +190,11 @@ class Candidates:
             if taken and np.abs(np.array(taken) @ axis).max() > np.cos(np.radians(8.0)):
                 continue
             taken.append(axis)
-            yield self._refined(axis, order, special=number < len(self._special))
+            yield self._refine(axis, order, special=number < len(self._special))
             if len(taken) == 24:  # the icosahedron has the most, 15
                 return
 
-    def _refined(self, axis: Vector, order: int, special: bool) -> Vector:
+    def _refine(self, axis: Vector, order: int, special: bool) -> Vector:
         """Refine an axis so that the rotated surface coincides best with the surface."""
         rotation = axis_rotation(axis, 2 * np.pi / order)
         for _ in range(12):
@@ -215,7 +215,7 @@ class Candidates:
         moved = self._probes @ rotation.T
         closest, normals = self._surface.nearest(moved)
         offsets = ((closest - moved) * normals).sum(axis=1)
-        weight = np.minimum(1.0, _GIVE / np.maximum(np.abs(offsets), _GIVE))
+        weight = np.minimum(1.0, _HUBER_WIDTH / np.maximum(np.abs(offsets), _HUBER_WIDTH))
         lever = np.cross(moved, normals)
         # Damping prevents steps that slide the surface along itself.
         normal_matrix = (lever * weight[:, None]).T @ lever + 1e-4 * np.eye(3)
@@ -283,6 +283,6 @@ def _subset(points: Points) -> Float[np.ndarray, "subset 3"]:
     return points[:: -(-len(points) // _NUM_PROBES)]
 
 
-def _clean(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+def _round(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     """Round to 12 decimals, and replace −0 by 0."""
     return np.asarray(np.round(values, 12) + 0.0)

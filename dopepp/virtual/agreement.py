@@ -66,8 +66,8 @@ def _contour(
     normals = _normals(edges)[rows, columns]
     points = np.column_stack([x, y, normals])[inside]
     points = points[:: -(-len(points) // MAX_POINTS) or 1]
-    left, top, right, bottom = projected.extent
-    return points, max(right - left, bottom - top)
+    x0, y0, x1, y1 = projected.extent
+    return points, max(x1 - x0, y1 - y0)
 
 
 def _edges(item: SceneObject, ids: Int[np.ndarray, "height width"]) -> Mask:

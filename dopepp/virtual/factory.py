@@ -79,7 +79,7 @@ class Factory:
         if seed < 0:
             raise UserError(f"seed {seed}", "an integer >= 0", "set a seed such as 0")
         self.parts, self.preset, self.seed = tuple(parts), preset, seed
-        self.negatives = _all_negatives(parts, negatives)
+        self.negatives = _collect_negatives(parts, negatives)
         self.backgrounds = ProceduralBackgrounds() if backgrounds is None else backgrounds
         self.renderer, self._render = renderer, find_renderer(renderer)
         self._targets = [make_body(part, is_target=True) for part in parts]
@@ -148,7 +148,7 @@ class Factory:
             shift = approach(composition.objects, scale)
             lights, ambient = preset.lighting.draw(rng, T_cam_table[:3, 3], T_cam_table[:3, 2])
             table_image = preset.table.draw_image(rng, backgrounds, K, size, T_cam_table)
-            T_cam_table = _moved(T_cam_table, shift)
+            T_cam_table = _shift(T_cam_table, shift)
             plane = plane_of(T_cam_table)
             if plane.offset >= 0:
                 problem = f"scale {scale:g} of a scene whose parts reach higher than the camera"
@@ -165,7 +165,7 @@ class Factory:
                 "set the unit of the mesh file, or the preset's distances or field of view",
             )
         objects = [
-            replace(item, T_cam_obj=_moved(item.T_cam_obj, shift)) for item in composition.objects
+            replace(item, T_cam_obj=_shift(item.T_cam_obj, shift)) for item in composition.objects
         ]
         # ``reach`` stays, so the lamps light the scene as before.
         lights = tuple(
@@ -213,7 +213,7 @@ def _in_front(objects: Sequence[SceneObject]) -> tuple[SceneObject, ...]:
     return tuple(item for item, hull in zip(objects, hulls, strict=True) if hull[:, 2].min() > NEAR)
 
 
-def _moved(T_cam: Transform, shift: Vector) -> Transform:
+def _shift(T_cam: Transform, shift: Vector) -> Transform:
     """Return a pose shifted by a vector."""
     return make_transform(T_cam[:3, :3], T_cam[:3, 3] + shift)
 
@@ -228,7 +228,7 @@ def code_hash() -> str:
     return digest.hexdigest()
 
 
-def _all_negatives(parts: Sequence[Part], given: Sequence[Part]) -> tuple[Part, ...]:
+def _collect_negatives(parts: Sequence[Part], given: Sequence[Part]) -> tuple[Part, ...]:
     """Return the given negatives and the built-in parts that are neither targets nor given."""
     names, hashes = {part.name for part in parts}, {part.mesh_hash for part in parts}
     for part in given:

@@ -48,7 +48,7 @@ _MAX_DRAG: Final = 300.0  # reached by doubling in every window once solids have
 _WINDOW: Final = 0.1  # duration over which the motion is measured, seconds
 _REST: Final = 0.01  # largest motion of a vertex at rest in a window, diameters; a fall is 0.03
 _LANDED: Final = 0.1  # largest motion in a window once solids have landed, diameters
-_LONGEST: Final = 1.0  # a pile that moves longer at most drag is rejected, seconds
+_LONGEST: Final = 1.0  # a pile that moves longer at the largest drag is rejected, seconds
 _MAX_WINDOWS: Final = 300  # a tower of 100 solids falls for 17 seconds
 _FRICTION: Final = (0.4, 0.005, 0.0001)  # sliding, torsional and rolling
 _FLOOR, _HULL, _PIECES = 1, 2, 4  # collision groups
@@ -114,7 +114,7 @@ def _simulate(
         row[:3], row[3:] = scale * pose[:3, 3], matrix_to_quaternion(pose[:3, :3])
     ends = [scale * _hull(solid) for solid in solids]
     # Positions of all vertices are compared after every window of simulated time.
-    positions, drag = _moved(starts, ends), _DRAG
+    positions, drag = _vertex_positions(starts, ends), _DRAG
     windows_left = round(_LONGEST / _WINDOW)
     for _ in range(_MAX_WINDOWS):
         inertia = model.body_inertia[1:].max(axis=1)
@@ -124,7 +124,7 @@ def _simulate(
         mujoco.mj_forward(model, state)
         frames = zip(state.xmat[1:], state.xpos[1:], strict=True)
         poses = np.stack([make_transform(R.reshape(3, 3), position) for R, position in frames])
-        moved = _moved(poses, ends)
+        moved = _vertex_positions(poses, ends)
         motion = np.linalg.norm(moved - positions, axis=1).max()
         overlap = -state.contact.dist.min(initial=0.0)
         if motion < _REST * _SIZE and overlap < MAX_OVERLAP * _SIZE:
@@ -139,7 +139,7 @@ def _simulate(
     return None
 
 
-def _moved(poses: Poses, vertices: Sequence[Piece]) -> Float[np.ndarray, "vertices 3"]:
+def _vertex_positions(poses: Poses, vertices: Sequence[Piece]) -> Float[np.ndarray, "vertices 3"]:
     """Return the vertices of all solids at their poses."""
     pairs = zip(poses, vertices, strict=True)
     return np.concatenate([transform(pose, solid) for pose, solid in pairs])

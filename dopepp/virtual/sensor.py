@@ -191,7 +191,7 @@ def _normal_values() -> Float32[np.ndarray, "values"]:
 def _shuffle(values: Array) -> None:
     """Shuffle in place (Fisher and Yates) by the hash, in the same order on every platform."""
     for i in range(values.shape[0] - 1, 0, -1):
-        k = _mixed(np.uint32(i)) % np.uint32(i + 1)
+        k = _mix_bits(np.uint32(i)) % np.uint32(i + 1)
         values[i], values[k] = values[k], values[i]
 
 
@@ -204,10 +204,10 @@ def _add_noise(
     ``image`` and ``noisy`` are flat uint8. The table has a power of two plus ``_NOISE_RUN`` values.
     """
     count, mask = image.shape[0], np.uint32(table.shape[0] - _NOISE_RUN - 1)
-    start = _mixed(np.uint32(seed) ^ np.uint32(0x9E3779B9))
+    start = _mix_bits(np.uint32(seed) ^ np.uint32(0x9E3779B9))
     least, most, half = np.float32(0), np.float32(255), np.float32(0.5)
     for run in range((count + _NOISE_RUN - 1) // _NOISE_RUN):
-        h = _mixed(np.uint32(np.uint32(run) + start))
+        h = _mix_bits(np.uint32(np.uint32(run) + start))
         first, last = run * _NOISE_RUN, min((run + 1) * _NOISE_RUN, count)
         sign = np.float32(1) if h & np.uint32(1) else np.float32(-1)
         normal = table[np.int64((h >> np.uint32(8)) & mask) :]
@@ -218,7 +218,7 @@ def _add_noise(
 
 
 @compiled(inline="always")
-def _mixed(h: np.uint32) -> np.uint32:
+def _mix_bits(h: np.uint32) -> np.uint32:
     """Mix 32 bits by xor-shifts and odd multipliers (a bijection)."""
     h = np.uint32(h ^ (h >> np.uint32(16)))
     h = np.uint32(h * np.uint32(0x7FEB352D))

@@ -1,7 +1,7 @@
 """Objects on a table: side by side on the plane, or lowered onto a heap.
 
 The table frame has its origin on the plane and z upwards. A height map on a square grid holds the
-objects so far. A new object is lowered until its underside meets the map in some cell. Objects keep
+placed objects. A new object is lowered until its underside meets the map in some cell. Objects keep
 their orientation (without physics) and overlap by at most the height change within a cell.
 """
 

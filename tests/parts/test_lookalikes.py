@@ -69,9 +69,8 @@ def test_a_chiral_part_has_a_mirrored_copy():
     assert volumes[1] == pytest.approx(volumes[0])
     assert volumes[2] == pytest.approx(STRETCH * volumes[0])
     assert 0.4 * volumes[0] < volumes[3] < 0.95 * volumes[0]
-    assert np.ptp(stretched.cuboid, axis=0) == pytest.approx(
-        np.ptp(part.cuboid, axis=0) * (STRETCH, 1, 1)
-    )
+    sides = np.ptp(part.cuboid, axis=0) * (STRETCH, 1, 1)
+    assert np.ptp(stretched.cuboid, axis=0) == pytest.approx(sides)
     assert mirrored.diameter == pytest.approx(part.diameter)
     assert len({each.mesh_hash for each in (part, mirrored, stretched, cut)}) == 4
 

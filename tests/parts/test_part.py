@@ -75,14 +75,11 @@ def test_a_name_must_be_printable(name):
 
 def test_shapes_are_compared_independently_of_their_triangles():
     solid = trimesh.creation.box((0.1, 0.06, 0.02))
+    thinner = trimesh.creation.box((0.1, 0.06, 0.019))
+    solids = (solid, solid.subdivide(), solid.copy().apply_scale(1.005), thinner)
     part, finer, other, thin = (
         make_part("box", Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int32)))
-        for mesh in (
-            solid,
-            solid.subdivide(),
-            solid.copy().apply_scale(1.005),
-            trimesh.creation.box((0.1, 0.06, 0.019)),
-        )
+        for mesh in solids
     )
     assert part.mesh_hash != finer.mesh_hash
     assert part.has_shape_of(finer)

@@ -60,27 +60,23 @@ def written(tmp_path):
     return write
 
 
+UNLIKELY = " (unlikely: most parts measure 0.01 – 2 m; is the unit right?)"
+
+
 @pytest.mark.parametrize(
-    ("unit", "level", "words"),
+    ("mesh", "unit", "level", "words"),
     [
-        ("mm", logging.INFO, "bracket: 62 × 40 × 31 mm, read in mm"),
-        ("cm", logging.INFO, "bracket: 620 × 400 × 310 mm, read in cm"),
-        ("inch", logging.WARNING, "bracket: 1575 × 1016 × 787 mm, read in inch (unlikely: most "
-         "parts measure 0.01 – 2 m; is the unit right?)"),
+        (BRACKET, "mm", logging.INFO, "62 × 40 × 31 mm, read in mm"),
+        (BRACKET, "cm", logging.INFO, "620 × 400 × 310 mm, read in cm"),
+        (BRACKET, "inch", logging.WARNING, "1575 × 1016 × 787 mm, read in inch" + UNLIKELY),
+        (box(0.6, 0.3, 0.3), "cm", logging.WARNING, "6.0 × 3.0 × 3.0 mm, read in cm" + UNLIKELY),
     ],
-)  # fmt: skip
-def test_the_log_states_size_and_unit(unit, level, words, written, caplog):
+)
+def test_the_log_states_size_and_unit(mesh, unit, level, words, written, caplog):
     with caplog.at_level(logging.INFO):
-        load_part(written(BRACKET), unit)
-    assert (caplog.records[-1].levelno, caplog.records[-1].getMessage()) == (level, words)
-
-
-@pytest.mark.parametrize(("side", "unit"), [(100, "cm"), (0.3, "cm")])
-def test_an_unlikely_size_is_a_warning(side, unit, written, caplog):
-    with caplog.at_level(logging.WARNING):
-        load_part(written(box(2 * side, side, side)), unit)
-    (record,) = [entry for entry in caplog.records if entry.levelno == logging.WARNING]
-    assert "is the unit right?" in record.getMessage()
+        load_part(written(mesh), unit)
+    record = caplog.records[-1]
+    assert (record.levelno, record.getMessage()) == (level, f"bracket: {words}")
 
 
 def test_several_bodies_are_logged_once(written, caplog):

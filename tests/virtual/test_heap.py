@@ -94,10 +94,8 @@ def test_objects_lie_inside_a_bin(box_part):
     table = {"pile": {"bin_share": 1.0, "wall_height": [1.0, 1.0], "room": [2.5, 2.5]}}
     scene = Factory([box_part], small(table=table), 2).scene(0, 0)
     (walls,) = (item for item in scene.objects if not item.is_target)
-    T_bin_cam, (width, depth, height) = (
-        invert_transform(walls.T_cam_obj),
-        np.ptp(walls.surface.vertices, axis=0),
-    )
+    T_bin_cam = invert_transform(walls.T_cam_obj)
+    width, depth, height = np.ptp(walls.surface.vertices, axis=0)
     assert height == pytest.approx(DIAMETER)
     for item in scene.objects:
         if item.is_target:
@@ -120,9 +118,8 @@ def test_a_heap_is_the_same_with_and_without_cache(box_part, heaps, cache):
 def test_a_damaged_cache_is_named(box_part, cache):
     factory = Factory([box_part], small(), 5)
     factory.scene(0, 0)
-    newest = max(
-        (cache / "dopepp" / "piles").glob("*.npy"), key=lambda path: path.stat().st_mtime_ns
-    )
+    files = (cache / "dopepp" / "piles").glob("*.npy")
+    newest = max(files, key=lambda path: path.stat().st_mtime_ns)
     newest.write_bytes(newest.read_bytes()[:200])
     with pytest.raises(UserError, match="delete this file"):
         factory.scene(0, 0)
@@ -183,17 +180,13 @@ def test_both_renderers_draw_a_heap(heaps):
 
 def test_a_missing_extra_is_named_in_one_line(box_part, monkeypatch):
     monkeypatch.setattr(dopepp.core.errors, "find_spec", lambda name: None)
-    with pytest.raises(
-        UserError, match=r"without the package mujoco.*pip install 'dopepp\[robot\]'"
-    ):
+    message = r"without the package mujoco.*pip install 'dopepp\[robot\]'"
+    with pytest.raises(UserError, match=message):
         Factory([box_part], small(), 0)
 
 
 def test_a_heap_refuses_visibility_options():
-    for change in (
-        {"min_visible_fraction": 0.3},
-        {"centroid_inside": True},
-        {"depths": (0.1, 1.0)},
-    ):
+    changes = {"min_visible_fraction": 0.3, "centroid_inside": True, "depths": (0.1, 1.0)}
+    for change in ({field: value} for field, value in changes.items()):
         with pytest.raises(UserError, match="physics decides what is visible"):
             preset_of("heap", change)

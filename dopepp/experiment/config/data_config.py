@@ -16,7 +16,7 @@ from dopepp.core.validation import STRICT, Range, parse, short_repr
 from dopepp.data.rendered import MAX_ITEMS, Split
 from dopepp.drawing.pictures import Size
 from dopepp.geometry.camera import CameraMatrix, camera_matrix
-from dopepp.virtual.presets import Preset, preset_of, written_out
+from dopepp.virtual.presets import Preset, preset_of, resolve_base
 from dopepp.virtual.presets.view import View, read_lens
 
 Node = Mapping[str, Any]
@@ -338,7 +338,7 @@ def with_files(virtual: object) -> object:
     if isinstance(virtual.get("camera"), str):
         written["camera"] = vars(LensConfig.of(*read_lens(virtual["camera"])))
     if isinstance(virtual.get("preset"), str):
-        preset, scene = written_out(virtual["preset"], virtual.get("scene"))
+        preset, scene = resolve_base(virtual["preset"], virtual.get("scene"))
         written |= {"preset": preset, "scene": scene}
     return written
 

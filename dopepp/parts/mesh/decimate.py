@@ -68,7 +68,7 @@ def _cluster(
     best_cells, best_kept = np.zeros(len(vertices), np.int64), np.zeros(0, np.int64)
     for _ in range(12):
         cells = _cells(vertices, side)
-        remaining = _surviving(cells[faces])
+        remaining = _select_triangles(cells[faces])
         if len(best_kept) < len(remaining) <= max_faces:
             best_cells, best_kept = cells, remaining
         if _WELL_USED * max_faces <= len(remaining) <= max_faces:
@@ -91,7 +91,7 @@ def _cells(vertices: Vertices, side: float) -> Int[np.ndarray, " vertices"]:
     return np.asarray(np.unique(keys, return_inverse=True)[1].reshape(-1), np.int64)
 
 
-def _surviving(corners: Faces) -> Int[np.ndarray, " kept"]:
+def _select_triangles(corners: Faces) -> Int[np.ndarray, " kept"]:
     """Return the first triangle for every triple of cells and orientation."""
     a, b, c = corners.T
     candidates = np.flatnonzero((a != b) & (b != c) & (c != a))

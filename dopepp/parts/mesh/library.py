@@ -273,7 +273,7 @@ def read_scene(data: bytes, kind: str) -> tuple[RawMesh, int]:
         num_triangles += len(mesh.faces)
         if num_triangles > MAX_TRIANGLES:
             raise ValueError(f"over {MAX_TRIANGLES} triangles")
-        vertices.append(_moved(np.asarray(mesh.vertices), transform))
+        vertices.append(_transform_vertices(np.asarray(mesh.vertices), transform))
         faces.append(np.asarray(mesh.faces) + start)
         uvs.append(getattr(mesh.visual, "uv", None))
         start += len(mesh.vertices)
@@ -284,7 +284,7 @@ def read_scene(data: bytes, kind: str) -> tuple[RawMesh, int]:
     return RawMesh(np.concatenate(vertices), np.concatenate(faces), uv, unit=unit), len(uvs)
 
 
-def _moved(vertices: Vertices, transform: Transform) -> Vertices:
+def _transform_vertices(vertices: Vertices, transform: Transform) -> Vertices:
     """Apply a transform to vertices, with equal results on every processor."""
     if (transform == np.eye(4)).all():
         return vertices  # a product would spread infinite coordinates as NaN

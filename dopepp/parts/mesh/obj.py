@@ -259,7 +259,7 @@ def fans(
     triangles = np.stack([first, first + number + 1, first + number + 2], axis=1)
     faces = corners[triangles]
     if (counts > 3).any() and 0 <= faces.min() <= faces.max() < len(vertices):
-        folded = _folded(vertices, faces, polygons)
+        folded = _find_folded(vertices, faces, polygons)
         if folded.any():
             raise FoldedPolygonError(int(polygons[folded.argmax()]))
     return triangles
@@ -273,7 +273,7 @@ class FoldedPolygonError(ValueError):
         self.number = number
 
 
-def _folded(
+def _find_folded(
     vertices: Vertices, faces: Faces, polygons: Int[np.ndarray, " faces"]
 ) -> Bool[np.ndarray, " faces"]:
     """Return which triangles face opposite to their polygon, or belong to one of total area 0."""

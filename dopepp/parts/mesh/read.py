@@ -83,16 +83,16 @@ def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
         raise UserError(f"mesh {path}, no such file", "a mesh file", fix)
     if (size := path.stat().st_size) > MAX_BYTES:
         fix = "reduce its triangles, or write it as a binary file"
-        raise _damaged(path, f"{size / 1e6:.0f} MB", fix)
+        raise _damage_error(path, f"{size / 1e6:.0f} MB", fix)
     try:
         raw = reader(path)
     except UserError:
         raise
     except Exception as error:  # parsers raise anything for a damaged file
         kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
-        raise _damaged(path, f"{kind}{error}") from error
+        raise _damage_error(path, f"{kind}{error}") from error
     applied = unit or raw.unit or ASSUMED_UNIT
-    mesh = _checked(path, raw._replace(vertices=UNITS[applied] * raw.vertices))
+    mesh = _clean_mesh(path, raw._replace(vertices=UNITS[applied] * raw.vertices))
     if unit is None and raw.unit is None:
         logger.warning("%s states no unit: assuming %s (override with unit=…)", path, ASSUMED_UNIT)
     elif raw.unit not in (None, applied):
@@ -144,22 +144,22 @@ def _read_points(path: Path) -> Points:
     return np.asarray(points, np.float64)
 
 
-def _checked(path: Path, raw: RawMesh) -> Mesh:
+def _clean_mesh(path: Path, raw: RawMesh) -> Mesh:
     """Check a mesh, drop flat triangles and unused vertices, and orient the triangles."""
     vertices, faces, uv, texture, *_ = raw
     if not len(vertices) or not len(faces):
-        raise _damaged(path, f"{len(vertices)} vertices and {len(faces)} faces")
+        raise _damage_error(path, f"{len(vertices)} vertices and {len(faces)} faces")
     for values in (vertices, uv):
         if values is not None and not np.isfinite(values).all():
             bad = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
-            raise _damaged(path, f"a coordinate that is not a finite number, vertex {bad + 1}")
+            raise _damage_error(path, f"a coordinate that is not a finite number, vertex {bad + 1}")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise _damaged(path, f"a face index outside of its {len(vertices)} vertices")
+        raise _damage_error(path, f"a face index outside of its {len(vertices)} vertices")
     # A triangle of a millionth of the mesh's size has no meaningful normal.
     smallest = 1e-12 * np.square(np.ptp(vertices, axis=0)).sum()
     proper = face_areas(vertices, faces) > smallest
     if not proper.any():
-        raise _damaged(path, f"{len(faces)} faces, none with an area")
+        raise _damage_error(path, f"{len(faces)} faces, none with an area")
     if not proper.all():
         logger.info("%s: dropped %d triangles without area", path, (~proper).sum())
     used, index = np.unique(faces[proper], return_inverse=True)
@@ -181,7 +181,7 @@ def _checked(path: Path, raw: RawMesh) -> Mesh:
     )
 
 
-def _damaged(path: Path, problem: str, fix: str = "export the mesh again") -> UserError:
+def _damage_error(path: Path, problem: str, fix: str = "export the mesh again") -> UserError:
     """Return the error for a mesh file that is damaged or too large."""
     content = "triangles, finite coordinates and colours of their range"
     allowed = f"a complete mesh with {content}, under {MAX_BYTES / 1e6:.0f} MB"
@@ -239,11 +239,11 @@ def misoriented_faces(
     """
     inverted = np.zeros(len(faces), bool)
     if topology.opposed.any():
-        inverted = _minority(face_areas(vertices, faces), topology)
+        inverted = _find_minority(face_areas(vertices, faces), topology)
     if topology.is_closed:
         if _signed_volumes(vertices, flip_faces(faces, inverted)).sum() < 0:
             inverted = ~inverted
-        inverted ^= _inverted_bodies(vertices, flip_faces(faces, inverted), topology)
+        inverted ^= _find_inverted_bodies(vertices, flip_faces(faces, inverted), topology)
     return inverted
 
 
@@ -252,7 +252,9 @@ def flip_faces(faces: Faces, inverted: Bool[np.ndarray, " faces"]) -> Faces:
     return np.where(inverted[:, None], faces[:, ::-1], faces)
 
 
-def _minority(areas: Float[np.ndarray, " faces"], topology: Topology) -> Bool[np.ndarray, " faces"]:
+def _find_minority(
+    areas: Float[np.ndarray, " faces"], topology: Topology
+) -> Bool[np.ndarray, " faces"]:
     """Return the triangles that face against most of their connected surface."""
     # Each triangle is two nodes of a graph, as it is and flipped, and links join nodes that face
     # the same way. An orientable surface has two components, one per orientation, and triangle f is
@@ -270,16 +272,16 @@ def _minority(areas: Float[np.ndarray, " faces"], topology: Topology) -> Bool[np
     return np.asarray(flip_is_better | tied)
 
 
-def _inverted_bodies(
+def _find_inverted_bodies(
     vertices: Vertices, faces: Faces, topology: Topology
 ) -> Bool[np.ndarray, " faces"]:
     """Return the triangles of closed bodies that face inwards and lie in no other body's box."""
     first_face, second_face = topology.neighbours.T
     count, bodies = connected(first_face, second_face, len(faces))
     volumes = np.bincount(bodies, _signed_volumes(vertices, faces), minlength=count)
-    lower, upper = _boxes(vertices[faces].reshape(-1, 3), np.repeat(bodies, 3), count)
+    lower, upper = _bounding_boxes(vertices[faces].reshape(-1, 3), np.repeat(bodies, 3), count)
     inwards = volumes < 0
-    return np.asarray((inwards & ~_enclosed(lower, upper, np.flatnonzero(inwards)))[bodies])
+    return np.asarray((inwards & ~_find_enclosed(lower, upper, np.flatnonzero(inwards)))[bodies])
 
 
 def body_extents(vertices: Vertices, faces: Faces) -> list[Float[np.ndarray, "3"]]:
@@ -293,17 +295,17 @@ def body_extents(vertices: Vertices, faces: Faces) -> list[Float[np.ndarray, "3"
     count, of_vertex = connected(start, end, len(positions))
     if count == 1:
         return [np.ptp(positions, axis=0)]
-    lower, upper = _boxes(positions, of_vertex, count)
+    lower, upper = _bounding_boxes(positions, of_vertex, count)
     bodies = of_vertex[corners[:, 0]]
     # Measured from the body's own centre, an open surface has a meaningful sign too.
     a, b, c = (positions[corners] - ((lower + upper) / 2)[bodies][:, None]).swapaxes(0, 1)
     volumes = np.bincount(bodies, np.einsum("ij,ij->i", a, np.cross(b, c)), minlength=count)
-    is_body = ~_enclosed(lower, upper, np.flatnonzero(volumes < 0)[:MANY_CAVITIES])
+    is_body = ~_find_enclosed(lower, upper, np.flatnonzero(volumes < 0)[:MANY_CAVITIES])
     extents = (upper - lower)[is_body]
     return list(extents[np.argsort(-extents.prod(axis=1), kind="stable")])
 
 
-def _boxes(
+def _bounding_boxes(
     points: Points, bodies: Int[np.ndarray, " points"], count: int
 ) -> tuple[Float[np.ndarray, "bodies 3"], Float[np.ndarray, "bodies 3"]]:
     """Return the lower and upper corners of the box of each body."""
@@ -313,7 +315,7 @@ def _boxes(
     return lower, upper
 
 
-def _enclosed(
+def _find_enclosed(
     lower: Float[np.ndarray, "bodies 3"],
     upper: Float[np.ndarray, "bodies 3"],
     candidates: Int[np.ndarray, " candidates"],

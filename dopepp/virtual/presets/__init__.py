@@ -186,11 +186,11 @@ def preset_of(name: str, changes: object = None, where: str = "") -> Preset:
     Raises:
         UserError: A preset or field is unknown, or a value has the wrong type or range.
     """
-    base, changes = written_out(name, changes)
-    return parse(Preset, _merged({"name": base, **_shipped(base)}, changes), where)
+    base, changes = resolve_base(name, changes)
+    return parse(Preset, _merge({"name": base, **_read_shipped(base)}, changes), where)
 
 
-def written_out(name: str, changes: object = None) -> tuple[str, object]:
+def resolve_base(name: str, changes: object = None) -> tuple[str, object]:
     """Return the shipped base preset of ``name``, and the file's and caller's changes to it.
 
     Raises:
@@ -208,21 +208,21 @@ def written_out(name: str, changes: object = None) -> tuple[str, object]:
     if base not in _NAMES:
         fix = "set base to the name of the preset that the file changes"
         raise UserError(f"{path} with base={short_repr(base)}", ", ".join(_NAMES), fix)
-    return base, _merged({"name": path.stem, **fields}, changes or {})
+    return base, _merge({"name": path.stem, **fields}, changes or {})
 
 
-def _shipped(name: str) -> Any:
+def _read_shipped(name: str) -> Any:
     """Return the fields of a shipped preset, including the fields of its base."""
     fields: Any = read_yaml(_FOLDER / f"{name}.yaml")
     base = fields.pop("base", None)
-    return fields if base is None else _merged(_shipped(base), fields)
+    return fields if base is None else _merge(_read_shipped(base), fields)
 
 
-def _merged(values: Any, changes: Any) -> Any:
+def _merge(values: Any, changes: Any) -> Any:
     """Change fields of nested mappings; a group of another kind replaces the whole group."""
     if not isinstance(values, dict) or not isinstance(changes, dict):
         return changes
     if changes.get("kind", values.get("kind")) != values.get("kind"):
         return changes
-    changed = {key: _merged(values.get(key), value) for key, value in changes.items()}
+    changed = {key: _merge(values.get(key), value) for key, value in changes.items()}
     return {**values, **changed}

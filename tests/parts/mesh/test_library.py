@@ -276,10 +276,9 @@ def test_a_glb_file_without_its_data_is_cut_short(refused):
 @pytest.mark.parametrize("unit", UNITS_3MF)
 def test_a_3mf_file_states_its_unit(write, unit, caplog, volume):
     metres = {"millimeter": 1e-3, "centimeter": 1e-2, "meter": 1, "inch": 0.0254}[unit]
-    content = repacked(
-        exported(BOX, "3mf"), lambda model: model.replace(b"millimeter", unit.encode())
-    )
-    path = write("box.3mf", content)
+    box = exported(BOX, "3mf")
+    stated = repacked(box, lambda model: model.replace(b"millimeter", unit.encode()))
+    path = write("box.3mf", stated)
     loaded = read_mesh(path)
     np.testing.assert_allclose(np.ptp(loaded.vertices, axis=0), metres * np.array([10, 20, 30]))
     assert volume(loaded) == pytest.approx(6000 * metres**3)
@@ -318,16 +317,10 @@ def test_the_objects_of_a_3mf_build_are_merged_into_one_mesh(write, volume):
     assert volume(loaded) == pytest.approx(3 * 6e-6)
     # A 3MF row is a column of ours: a quarter turn about x, then a shift.
     T = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 7], [0, 0, 0, 1.0]])
-    places = []
-    for matrix in (
-        np.eye(4),
-        T + 100 * np.eye(4, k=3),
-        (T + 100 * np.eye(4, k=3)) @ (T + 40 * np.eye(4, k=3)),
-    ):
-        places.append(trimesh.transform_points(BOX.vertices, matrix))
-    np.testing.assert_allclose(
-        ordered(1000 * loaded.vertices), ordered(np.concatenate(places)), atol=1e-9
-    )
+    first, second = T + 100 * np.eye(4, k=3), T + 40 * np.eye(4, k=3)
+    matrices = (np.eye(4), first, first @ second)
+    expected = np.concatenate([trimesh.transform_points(BOX.vertices, M) for M in matrices])
+    np.testing.assert_allclose(ordered(1000 * loaded.vertices), ordered(expected), atol=1e-9)
 
 
 def test_a_3mf_model_that_ends_too_early_is_refused(refused):

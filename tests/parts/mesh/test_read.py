@@ -119,9 +119,8 @@ def test_a_coordinate_that_is_not_finite_is_named(refused, name, value):
 
 def test_a_wrong_path_or_unit_is_refused(tmp_path, write):
     path = write("box.stl", FILES["binary.stl"])
-    with pytest.raises(
-        UserError, match=r"box\.step; allowed: files ending in \.stl, \.obj, \.ply, \.glb, "
-    ):
+    suffixes = r"files ending in \.stl, \.obj, \.ply, \.glb, "
+    with pytest.raises(UserError, match=rf"box\.step; allowed: {suffixes}"):
         read_mesh(tmp_path / "box.step")
     with pytest.raises(UserError, match=r"unit='feet' .*; allowed: mm, cm, m, inch"):
         read_mesh(path, "feet")
@@ -210,9 +209,8 @@ def write_torus(path: Path, sections: int) -> None:
     across = np.roll(up, -1, axis=1)
     halves = ((grid, right, across), (grid, across, up))
     triangles = np.concatenate([np.stack(half, axis=2).reshape(-1, 9) for half in halves])
-    records = np.zeros(
-        len(triangles), [("normal", "<f4", 3), ("corners", "<f4", 9), ("end", "<u2")]
-    )
+    fields = [("normal", "<f4", 3), ("corners", "<f4", 9), ("end", "<u2")]
+    records = np.zeros(len(triangles), fields)
     records["corners"] = triangles
     path.write_bytes(bytes(80) + struct.pack("<I", len(records)) + records.tobytes())
 

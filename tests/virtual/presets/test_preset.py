@@ -13,7 +13,7 @@ from dopepp.geometry.camera import project, resize_camera, transform
 from dopepp.geometry.rotation import is_rotation, random_rotation
 from dopepp.parts.part import Part
 from dopepp.virtual import PRESETS, Distractors, Factory, Preset, Scene, Table, visible_fractions
-from dopepp.virtual.presets import preset_of, written_out
+from dopepp.virtual.presets import preset_of, resolve_base
 from dopepp.virtual.presets.placement import (
     DistancePlacement,
     FacingTurning,
@@ -49,9 +49,8 @@ def angles(rotation: np.ndarray) -> tuple[float, float]:
 
 
 def test_quickstart_poses_and_lights(quickstart_scenes):
-    in_plane, tilt = zip(
-        *(angles(s.objects[0].T_cam_obj[:3, :3]) for s in quickstart_scenes), strict=True
-    )
+    rotations = (scene.objects[0].T_cam_obj[:3, :3] for scene in quickstart_scenes)
+    in_plane, tilt = zip(*map(angles, rotations), strict=True)
     assert 42 < np.abs(in_plane).max() <= 45 + 1e-6
     assert 37 < max(tilt) <= 40 + 1e-6
     assert {s.objects[0].label for s in quickstart_scenes} == {"servoholder", "pivconnector"}
@@ -361,7 +360,7 @@ def test_a_preset_file_changes_a_shipped_preset(tmp_path):
     preset = preset_of(str(path), {"width": 256})
     table = replace(PRESETS["table"].table, roll_deg=3.0)
     assert preset == replace(PRESETS["table"], name="shelf", width=256, table=table)
-    base, changes = written_out(str(path), {"width": 256})
+    base, changes = resolve_base(str(path), {"width": 256})
     assert (base, preset_of(base, changes)) == ("table", preset)
     for text in ("base: shelf", "- 1", "width: 64"):
         path.write_text(text)

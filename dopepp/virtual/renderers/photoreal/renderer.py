@@ -94,7 +94,7 @@ def render(scene: Scene) -> Rendered:
             if scene.plane is None:
                 film = make_film(scene.K, window)
                 traced = film.resampled(tracer.trace(tracer.world, film))
-                image[area] = _over(traced[..., :3], traced[..., 3], image[area])
+                image[area] = _composite(traced[..., :3], traced[..., 3], image[area])
     return Rendered(image, depth, instances, fractions, scene)
 
 
@@ -164,8 +164,8 @@ class Tracer:
         traced = film.resampled(traced)
         alpha = np.clip(traced[..., 3], 0.0, 1.0)
         light, light_share = split_light(traced[..., :3], alpha, table.unshadowed(area))
-        image[area] = shadowed(image[area], table.faded(light_share, area))
-        image[area] = _over(light, alpha, image[area])
+        image[area] = darken(image[area], table.fade(light_share, area))
+        image[area] = _composite(light, alpha, image[area])
 
     def _measure(
         self, world: dict[str, Any], film: Film, integrator: dict[str, Any], samples: int
@@ -177,7 +177,7 @@ class Tracer:
         return np.array(self._mi.render(loaded, seed=self._seed), np.float32)
 
 
-def _over(light: Colours, alpha: Depth, behind: RGBImage) -> RGBImage:
+def _composite(light: Colours, alpha: Depth, behind: RGBImage) -> RGBImage:
     """Composite light over an image in linear light; ``alpha`` is the coverage."""
     alpha = np.clip(alpha, 0.0, 1.0)[..., None]
     total = light + (1 - alpha) * _RADIANCE_OF_CODE[behind]
@@ -231,7 +231,7 @@ class TableTop:
         """Return the disc's radiance without objects; 0 outside the disc."""
         return np.asarray(self.albedo * self._light[area])
 
-    def faded(self, light_share: Colours, area: Area) -> Colours:
+    def fade(self, light_share: Colours, area: Area) -> Colours:
         """Return the shares of light, faded to 1 towards the disc's rim."""
         share = np.clip((1 - self._away[area]) / (1 - 0.6), 0.0, 1.0)[..., None]
         # Smoothstep: no visible line at either end of the fading.
@@ -279,7 +279,7 @@ def split_light(light: Colours, alpha: Depth, unshadowed: Colours) -> tuple[Colo
     return np.where(alpha[..., None] > 0, np.maximum(objects, 0), 0).astype(np.float32), light_share
 
 
-def shadowed(image: RGBImage, light_share: Colours) -> RGBImage:
+def darken(image: RGBImage, light_share: Colours) -> RGBImage:
     """Multiply an image's linear light by the shares ``light_share`` in shadows."""
     steps = np.minimum(SRGB_TO_LINEAR[image] * light_share * CODE_STEPS + 0.5, CODE_STEPS)
     changed = (LINEAR_TO_SRGB[steps.astype(np.int32)] + 0.5).astype(np.uint8)

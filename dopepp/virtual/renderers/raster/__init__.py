@@ -82,7 +82,7 @@ def silhouette(item: SceneObject, K: Array, size: Size) -> Silhouette:
         return Silhouette(mask, 0.0, None)
     if not math.isfinite(left):
         return Silhouette(mask, math.inf, (0, 0, *size))
-    whole = float(mask.sum()) if projection.inside(size) else _whole_px(item, projection, K)
+    whole = float(mask.sum()) if projection.inside(size) else _count_whole_px(item, projection, K)
     return Silhouette(mask, whole, centres_within(projection.extent))
 
 
@@ -104,17 +104,17 @@ def _fractions(
         item, projection = scene.objects[index], projections[index]
         if projection.inside(scene.size):
             # Pixels can be hidden only where another object may be in front.
-            left, top, right, bottom = _rivals(scene, projections, index) or (0, 0, 0, 0)
+            left, top, right, bottom = _occluder_box(scene, projections, index) or (0, 0, 0, 0)
             covered = draw_alone(item, projection.hom, (left, top, right, bottom))[0] > 0
             hidden = int((covered & (instances[top:bottom, left:right] != index)).sum())
             fractions[index] = visible[index] / (visible[index] + hidden)
         else:
-            whole = _whole_px(item, projection, scene.K)
+            whole = _count_whole_px(item, projection, scene.K)
             fractions[index] = min(visible[index] / whole, 1.0) if whole else 1.0
     return fractions
 
 
-def _rivals(scene: Scene, projections: Sequence[Projection], index: int) -> Box | None:
+def _occluder_box(scene: Scene, projections: Sequence[Projection], index: int) -> Box | None:
     """Return the box in which other objects or the plane may hide an object, or None."""
     item, whole = scene.objects[index], projections[index].box(scene.size)
     if whole is None:
@@ -145,7 +145,7 @@ def _depths(item: SceneObject) -> tuple[float, float]:
     return least - slack, most + slack
 
 
-def _whole_px(item: SceneObject, projection: Projection, K: Array) -> float:
+def _count_whole_px(item: SceneObject, projection: Projection, K: Array) -> float:
     """Count the pixel centres of an unoccluded object on an unbounded canvas."""
     left, top, right, bottom = projection.extent
     if not math.isfinite(left):

@@ -79,7 +79,7 @@ def darken_plane(
     shades = scratch("shades", (1 + len(lights), box[3] - box[1], box[2] - box[0]), np.float32)
     _warp(hidden, to_cells @ to_plane, box, shades[0])
     for shadow, shade in zip(lights, shades[1:], strict=True):
-        cast, margin = _cast(plane, shadow)
+        cast, margin = _soft_shadow(plane, shadow)
         to_map = np.array([[1, 0, margin], [0, 1, margin], [0, 0, 1]]) @ shadow.P
         _warp(cast, to_map @ to_point, box, shade)
     ambient = ambient_row(scene.ambient)
@@ -94,7 +94,9 @@ def darken_plane(
     _darken(box[:2], lit, shades, SRGB_TO_LINEAR, LINEAR_TO_SRGB, samples, image)
 
 
-def _cast(plane: Plane, shadow: ShadowMap) -> tuple[Float32[np.ndarray, "rows columns"], int]:
+def _soft_shadow(
+    plane: Plane, shadow: ShadowMap
+) -> tuple[Float32[np.ndarray, "rows columns"], int]:
     """Return the shadow of every texel with its penumbra, and the margin added for it, texels."""
     P = shadow.P.astype(np.float64)
     # The plane's 1/depth is linear in the map as well: n · x = offset with x = M⁻¹ (depth (u, v, 1)

@@ -121,10 +121,7 @@ def test_a_shadow_falls_away_from_its_lamp(photoreal, box_part, scene_of):
     result, expected = photoreal(scene), render(scene)
     columns = np.flatnonzero((result.instances == 0).any(axis=0))
     row = scene.size[1] // 2
-    left, right = (
-        result.image[row, columns[0] - 4].mean(),
-        result.image[row, columns[-1] + 4].mean(),
-    )
+    left, right = result.image[row, [columns[0] - 4, columns[-1] + 4]].mean(axis=1)
     assert right < 45 < left
     assert right == pytest.approx(expected.image[row, columns[-1] + 4].mean(), abs=15)
 

@@ -129,15 +129,13 @@ def test_the_nearer_object_is_visible_in_any_order(scene_of, box_surface):
 
 
 def test_vertices_bound_the_mask(scene_of, box_part, box_surface):
-    pose = make_transform(
-        rotation_vector_to_matrix(np.array([0.9, -0.4, 0.3])), np.array([0, 0, 0.25])
-    )
+    turn = rotation_vector_to_matrix(np.array([0.9, -0.4, 0.3]))
+    pose = make_transform(turn, np.array([0, 0, 0.25]))
     scene = scene_of(SceneObject(box_surface, pose, part=box_part))
     rows, columns = np.nonzero(render(scene).instances == 0)
     keypoints = scene.keypoints(0)[:8]
-    np.testing.assert_allclose(
-        keypoints, project(transform(pose, box_part.cuboid[:8]), scene.K), atol=1e-9
-    )
+    expected = project(transform(pose, box_part.cuboid[:8]), scene.K)
+    np.testing.assert_allclose(keypoints, expected, atol=1e-9)
     # A pixel belongs to the mask when its centre is inside: the outermost one is < 1 px inside.
     low, high = keypoints.min(axis=0), keypoints.max(axis=0)
     inside = np.array([columns.min(), rows.min()]) - low, high - (columns.max(), rows.max())
