@@ -23,7 +23,13 @@ from dopepp.geometry.rotation import RotationMatrix, Vector
 from dopepp.inference.network_input import Depth
 from dopepp.inference.refinement.depth import DepthEvidence
 from dopepp.inference.refinement.part_surface import SurfacePoints
-from dopepp.inference.refinement.region import RegionRefiner, necessary_rounds, search_distance
+from dopepp.inference.refinement.region import (
+    MAX_REPEATS,
+    RegionRefiner,
+    has_converged,
+    necessary_rounds,
+    search_distance,
+)
 from dopepp.inference.refinement.region.round import OutlineAgreement, Round
 from dopepp.inference.refinement.solver import (
     NormalEquations,
@@ -161,14 +167,16 @@ def refine_views(
     end = Solution(start.T_cam_obj, prior.information)
     num_stages = max((len(search.rounds) for search in searches), default=0)
     terms: list[Term] = []
-    for stages_left in range(num_stages, 0, -1):
+    for stages_left in (*range(num_stages, 0, -1), *[1] * MAX_REPEATS):
         searches = [search for search in searches if search.learn(end.T_cam_obj, stages_left)]
         terms = [term for search in searches for term in search.terms(stages_left)]
         steps = max((search.round(stages_left).stage.steps for search in searches), default=0)
         solution = descend(end.T_cam_obj, prior, terms, steps)
         if solution is None or not terms:
             raise UndecidedError("the part's outline left the image")
-        end = solution
+        end, before = solution, end.T_cam_obj
+        if stages_left == 1 and has_converged(end, before):
+            break
     agreements: list[OutlineAgreement | None] = [None] * len(views)
     for search in searches:
         agreements[search.number] = search.agreement(end.T_cam_obj)

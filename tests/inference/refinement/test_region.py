@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,7 +27,15 @@ from dopepp.inference.refinement.outline import (
     posed,
 )
 from dopepp.inference.refinement.refiner import NUM_QUADRUPLES, poses_of_four
-from dopepp.inference.refinement.region import FINE, FOLLOWED, FOUND, SURE, RegionRefiner
+from dopepp.inference.refinement.region import (
+    CONVERGED,
+    FINE,
+    FOLLOWED,
+    FOUND,
+    MAX_REPEATS,
+    SURE,
+    RegionRefiner,
+)
 from dopepp.inference.refinement.region.round import Round
 from dopepp.inference.refinement.region.shared_errors import (
     OFFSET_PX,
@@ -445,6 +454,30 @@ def test_tight_prior_needs_the_last_round_only(refiner: RegionRefiner) -> None:
     assert learned == [FINE.longest_px]
     assert not refined.reason
     assert max(off(refined.T_cam_obj)) < 0.3 < max(off(start))
+
+
+def test_the_last_round_is_repeated_until_it_converges(
+    refiner: RegionRefiner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learned: list[int] = []
+    learn = Round.learn
+
+    def recorded(stage: Round, *rest: Any) -> None:
+        learned.append(stage.stage.longest_px)
+        learn(stage, *rest)
+
+    monkeypatch.setattr(Round, "learn", recorded)
+    image = picture(pivconnector())
+    refined = refiner.refine(image, K, started(1), np.diag(DEVIATIONS**2))
+    repeats = learned.count(FINE.longest_px) - 1
+    assert 1 <= repeats < MAX_REPEATS  # on an image without noise, the search converges early
+    assert refined.covariance is not None
+    # The next repetition hardly moves the pose.
+    monkeypatch.setattr("dopepp.inference.refinement.region.CONVERGED", 0.0)
+    further = refiner.refine(image, K, started(1), np.diag(DEVIATIONS**2))
+    assert learned.count(FINE.longest_px) == repeats + MAX_REPEATS + 2
+    prior = Prior(refined.T_cam_obj, np.linalg.inv(refined.covariance))
+    assert prior.squared_distance(further.T_cam_obj) < CONVERGED**2
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -4,7 +4,7 @@
 2. Colours and edges along the normals of the outline show where the part ends
    (:mod:`~dopepp.inference.refinement.region.shifts`).
 3. A few Gauss–Newton steps follow, from coarse to fine, with the given pose and its covariance as
-   prior.
+   prior. The last round is repeated until it converges.
 4. If the image does not agree with the result, the descent is repeated from other starts with a
    weaker prior, and the result that agrees best is returned. The covariance of a network's pose can
    be too small, for instance if the part is occluded.
@@ -76,6 +76,9 @@ of the outline's extent."""
 
 ENOUGH: Final = 0.6
 """Share of the search distance (1.5 standard deviations) that makes coarser rounds unnecessary."""
+
+MAX_REPEATS: Final = 3  # repetitions of the last round, until it converges
+CONVERGED: Final = 0.4  # standard deviations that a converged round moves the pose at most
 
 Starts = Callable[[], Sequence[Transform]]
 """Returns further start poses; called only if the search is extended."""
@@ -303,8 +306,19 @@ def _refine(rounds: Sequence[Round], start: Transform, prior: Prior, reach: floa
     Raises:
         UndecidedError: The result is not accepted.
     """
-    end = _descend(rounds, start, prior, reach)
-    return end, rounds[-1].check(end, prior, reach, prior.information)
+    end, last = _descend(rounds, start, prior, reach), rounds[-1]
+    for _ in range(MAX_REPEATS if reach > EDGE_PX else 0):
+        before = end.T_cam_obj
+        # Each time, the colours are learned at a better pose, and the search distance is shortest.
+        end = _descend([last], before, prior, EDGE_PX)
+        if has_converged(end, before):
+            break
+    return end, last.check(end, prior, reach, prior.information)
+
+
+def has_converged(end: Solution, before: Transform) -> bool:
+    """Return whether a round has moved the pose by less than ``CONVERGED`` deviations."""
+    return Prior(before, end.information).squared_distance(end.T_cam_obj) < CONVERGED**2
 
 
 def _descend(rounds: Sequence[Round], start: Transform, prior: Prior, reach: float) -> Solution:
