@@ -1,8 +1,8 @@
 """The outline of a mesh at a pose: its silhouette, and points on the silhouette's border.
 
-The mask of a closed mesh is the union of the triangles that face the camera. Their common border
-winds around a pixel as often as they cover it, so only the few edges on this border are filled, row
-by row. In an open mesh, every triangle is filled.
+The border of the triangles that face the camera winds around a pixel as often as they cover it, so
+only the few edges on this border are filled, row by row. They cover the whole silhouette of a
+closed mesh. In an open mesh, the triangles that face away are filled in the same way.
 
 An edge can belong to the outline if exactly one of its triangles faces the camera, or if it has one
 triangle only. The filled mask shows which of these edges do: the part ends there. Other edges have
@@ -49,7 +49,16 @@ class OutlineMesh:
     sides: Int[np.ndarray, "edges 2"]
     # 1 if both triangles run along the edge in the same direction, else 0
     opposed: UInt8[np.ndarray, "edges"]
-    is_closed: bool  # whether the mesh is closed: front triangles hide all others
+    # 1 if the edge has exactly two triangles, which are oriented alike, else 0
+    paired: UInt8[np.ndarray, "edges"]
+    # Edge of every triangle at the edges that are not paired, in the triangle's direction
+    loose_edges: Int[np.ndarray, "loose 2"]
+    loose_sides: Int[np.ndarray, "loose"]  # triangle of each loose edge
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the triangles that face the camera hide all others."""
+        return not len(self.loose_sides)
 
 
 def make_outline_mesh(vertices: Vertices, faces: Faces) -> OutlineMesh:
@@ -77,8 +86,11 @@ def make_outline_mesh(vertices: Vertices, faces: Faces) -> OutlineMesh:
     opposed = (start[left] == start[right]) & (uses > 1)
     edges = np.stack([start[left], end[left]], axis=1)
     sides = np.stack([left // 3, np.where(uses > 1, right // 3, -1)], axis=1)
-    is_closed = bool((uses == 2).all() and not opposed.any())
-    return OutlineMesh(vertices, faces, planes, edges, sides, opposed.astype(np.uint8), is_closed)
+    paired = (uses == 2) & ~opposed
+    loose = order[np.repeat(~paired, uses)]
+    loose_edges = np.stack([start[loose], end[loose]], axis=1)
+    kinds = opposed.astype(np.uint8), paired.astype(np.uint8)
+    return OutlineMesh(vertices, faces, planes, edges, sides, *kinds, loose_edges, loose // 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,12 +117,11 @@ def filled_mask(
 ) -> UInt8[np.ndarray, "height width"]:
     """Return a mask of (width, height): 1 if the mesh covers the pixel's centre, else 0."""
     width, height = size
-    mask = np.zeros((height, width), np.uint8)
-    if mesh.is_closed:
-        winding = np.zeros((height, width + 1), np.int32)
-        _wind(posed_mesh.pixels, mesh.edges, mesh.sides, posed_mesh.front, winding, mask)
-    else:
-        _fill(posed_mesh.pixels, mesh.faces, mask)
+    mask = np.empty((height, width), np.uint8)
+    winding = np.zeros((1 if mesh.is_closed else 2, height, width + 1), np.int32)
+    pixels, front = posed_mesh.pixels, posed_mesh.front
+    pairs = mesh.edges, mesh.sides, mesh.paired
+    _wind(pixels, front, *pairs, mesh.loose_edges, mesh.loose_sides, winding, mask)
     return mask
 
 
@@ -194,69 +205,70 @@ def _pose(
 
 
 @compiled()
-def _fill(pixels: Array, faces: Array, mask: Array) -> None:
-    """Set the pixels whose centres lie in a triangle, row by row."""
-    height, width = mask.shape
-    left, right = np.empty(height), np.empty(height)
-    for f in range(len(faces)):
-        top, bottom = height, -1
-        for c in range(3):
-            y = pixels[faces[f, c], 1]
-            top, bottom = min(top, max(0.0, math.ceil(y))), max(bottom, math.floor(y))
-        first, last = int(top), int(min(bottom, height - 1.0))
-        for v in range(first, last + 1):
-            left[v], right[v] = math.inf, -math.inf
-        for c in range(3):
-            i, j = faces[f, c], faces[f, (c + 1) % 3]
-            if pixels[i, 1] > pixels[j, 1]:
-                i, j = j, i
-            y, rise = pixels[i, 1], pixels[j, 1] - pixels[i, 1]
-            slope = (pixels[j, 0] - pixels[i, 0]) / rise if rise > 0.0 else 0.0
-            low, high = max(0.0, math.ceil(y)), min(height - 1.0, math.floor(pixels[j, 1]))
-            for v in range(int(low), int(high) + 1):
-                x = pixels[i, 0] + slope * (v - y)
-                left[v], right[v] = min(left[v], x), max(right[v], x)
-        for v in range(first, last + 1):
-            # Rounding must not open gaps between triangles.
-            start, end = max(0.0, math.ceil(left[v] - 1e-9)), min(width - 1.0, right[v] + 1e-9)
-            if end >= start:
-                mask[v, int(start) : int(end) + 1] = 1
-
-
-@compiled()
 def _wind(
-    pixels: Array, edges: Array, sides: Array, front: Array, winding: Array, mask: Array
+    pixels: Array,
+    front: Array,
+    edges: Array,
+    sides: Array,
+    paired: Array,
+    loose_edges: Array,
+    loose_sides: Array,
+    winding: Array,
+    mask: Array,
 ) -> None:
-    """Set the pixels that the border of the triangles facing the camera winds around.
+    """Set the pixels that the borders of front and back triangles wind around.
 
     Args:
         pixels: Projected vertices.
-        edges: Vertices of each edge.
-        sides: The two triangles of each edge.
         front: Whether each triangle faces the camera.
-        winding: Zeros, one column wider than the mask; filled with the winding number's changes.
-        mask: Filled with 1 inside the border and 0 outside.
+        edges: Vertices of each edge, in the direction of its first triangle.
+        sides: The two triangles of each edge.
+        paired: 1 for edges with exactly two triangles, which are oriented alike.
+        loose_edges: Vertices of each loose edge, in the direction of its triangle.
+        loose_sides: Triangle of each loose edge.
+        winding: Zeros; filled with the winding number's changes along each row, for the triangles
+            that face the camera and, in an open mesh, for those that face away.
+        mask: Filled with 1 inside the borders and 0 outside.
     """
     height, width = mask.shape
     for e in range(len(edges)):
-        is_front = front[sides[e, 0]]
-        if is_front == front[sides[e, 1]]:
+        first, second = sides[e, 0], sides[e, 1]
+        if not paired[e] or front[first] == front[second]:
             continue
-        # An edge has the direction of its first triangle, and opposes its second one.
-        i, j = (edges[e, 0], edges[e, 1]) if is_front else (edges[e, 1], edges[e, 0])
-        way = 1
-        if pixels[i, 1] > pixels[j, 1]:
-            i, j, way = j, i, -1
-        y, rise = pixels[i, 1], pixels[j, 1] - pixels[i, 1]
-        low, high = max(0.0, math.ceil(y)), min(height - 1.0, math.ceil(pixels[j, 1]) - 1.0)
-        for v in range(int(low), int(high) + 1):
-            x = pixels[i, 0] + (pixels[j, 0] - pixels[i, 0]) / rise * (v - y)
-            winding[v, int(min(max(0.0, math.ceil(x)), width))] += way
+        i, j = edges[e, 0], edges[e, 1]
+        if not front[first]:
+            i, j = j, i
+        for side in range(len(winding)):  # both triangles have this edge, in opposite directions
+            _cross_rows(pixels, i, j, winding[side])
+    for e in range(len(loose_edges)):
+        i, j = loose_edges[e, 0], loose_edges[e, 1]
+        if front[loose_sides[e]]:
+            _cross_rows(pixels, i, j, winding[0])
+        else:
+            _cross_rows(pixels, j, i, winding[1])
     for v in range(height):
-        count = 0
         for u in range(width):
-            count += winding[v, u]
-            mask[v, u] = count != 0
+            mask[v, u] = 0
+        for side in range(len(winding)):
+            count = 0
+            for u in range(width):
+                count += winding[side, v, u]
+                if count != 0:
+                    mask[v, u] = 1
+
+
+@compiled()
+def _cross_rows(pixels: Array, i: int, j: int, winding: Array) -> None:
+    """Add an edge to the winding number's changes in the rows that it crosses."""
+    height, width = winding.shape[0], winding.shape[1] - 1
+    way = 1
+    if pixels[i, 1] > pixels[j, 1]:
+        i, j, way = j, i, -1
+    y, rise = pixels[i, 1], pixels[j, 1] - pixels[i, 1]
+    low, high = max(0.0, math.ceil(y)), min(height - 1.0, math.ceil(pixels[j, 1]) - 1.0)
+    for v in range(int(low), int(high) + 1):
+        x = pixels[i, 0] + (pixels[j, 0] - pixels[i, 0]) / rise * (v - y)
+        winding[v, int(min(max(0.0, math.ceil(x)), width))] += way
 
 
 @compiled()
