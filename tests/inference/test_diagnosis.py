@@ -102,8 +102,8 @@ def test_absent_or_covered_part_is_not_visible(estimator, factory, empty):
         T = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj
         points = project_keypoints(PART.cuboid, T, K).clip(0, 127)
         (left, top), (right, bottom) = points.min(0).astype(int), points.max(0).astype(int)
-        place = np.s_[top:bottom, left + (right - left) // 3 : right]
-        image[place] = without.image[place]
+        covered_region = np.s_[top:bottom, left + (right - left) // 3 : right]
+        image[covered_region] = without.image[covered_region]
         covered[first(estimator, image, K)] += 1
     assert missing["visibility"] >= 3, missing
     assert covered["visibility"] + covered["pose"] >= 3, covered

@@ -93,8 +93,8 @@ class Oracle(PoseEstimator):
 
 def test_estimator_has_the_parts_and_options_of_its_checkpoint(estimator, parts):
     assert [part.name for part in estimator.parts] == ["bracket", "plate"]
-    for ours, theirs in zip(estimator.parts, parts, strict=True):
-        assert_allclose(ours.cuboid, theirs.cuboid)
+    for loaded, expected in zip(estimator.parts, parts, strict=True):
+        assert_allclose(loaded.cuboid, expected.cuboid)
     assert not estimator.network.training
     assert (estimator.recovery.peak_threshold, estimator.recovery.max_peaks) == (0.03, 8)
     assert estimator.recovery.sigma == 1.5
@@ -119,10 +119,10 @@ def test_images_of_any_size(estimator, size):
 
 
 def test_network_input_is_the_letterboxed_image(estimator):
-    picture = image(640, 480)
-    padded = resize_and_pad(picture, Letterbox.fit((640, 480), (416, 416)), 32)
+    pixels = image(640, 480)
+    padded = resize_and_pad(pixels, Letterbox.fit((640, 480), (416, 416)), 32)
     assert padded.shape == (320, 416, 3)
-    expected = cv2.resize(picture, (416, 312), interpolation=cv2.INTER_AREA)
+    expected = cv2.resize(pixels, (416, 312), interpolation=cv2.INTER_AREA)
     assert_array_equal(padded[:312], expected)
     assert not padded[312:].any()
     belief, field = estimator.maps(padded)
@@ -149,32 +149,36 @@ def test_poses_and_pixels_refer_to_the_given_image(checkpoint_path, size):
         for detection in detections:
             index = ["bracket", "plate"].index(detection.object)
             part = oracle.parts[index]
-            there, here = (transform(T, part.cuboid) for T in (truth[index], detection.T_cam_obj))
-            assert np.linalg.norm(there - here, axis=1).mean() < 0.1 * part.diameter
+            true_points, points = (
+                transform(T, part.cuboid) for T in (truth[index], detection.T_cam_obj)
+            )
+            assert np.linalg.norm(true_points - points, axis=1).mean() < 0.1 * part.diameter
             pixels = project_keypoints(part.cuboid, truth[index], K)
             assert_allclose(detection.keypoints, pixels, atol=0.005 * width)
-            seen = ~np.isnan(detection.peaks).any(1)
-            assert seen.sum() >= 5
-            assert_allclose(detection.peaks[seen], pixels[seen], atol=0.002 * width)
+            measured = ~np.isnan(detection.peaks).any(1)
+            assert measured.sum() >= 5
+            assert_allclose(detection.peaks[measured], pixels[measured], atol=0.002 * width)
             assert detection.reprojection_error_px < 0.003 * width
 
 
 def test_distorted_images_are_undistorted_first(estimator, monkeypatch):
-    seen: list[np.ndarray] = []
+    inputs: list[np.ndarray] = []
     original = PoseEstimator.maps
 
     def spy(self: PoseEstimator, pixels: np.ndarray) -> module.Maps:
-        seen.append(pixels)
+        inputs.append(pixels)
         return original(self, pixels)
 
     monkeypatch.setattr(PoseEstimator, "maps", spy)
-    picture, distortion = cv2.blur(image(640, 480), (9, 9)), [-0.3, 0.1, 0.001, -0.002, 0.01]
-    estimator.predict(picture, K_VGA, np.array(distortion))
-    by_hand = cv2.undistort(picture, K_VGA, np.array(distortion))
-    assert_array_equal(seen[0], resize_and_pad(by_hand, Letterbox.fit((640, 480), (416, 416)), 32))
-    estimator.predict(picture, K_VGA, np.zeros((1, 4)))
-    estimator.predict(picture, K_VGA)
-    assert_array_equal(seen[1], seen[2])
+    pixels, distortion = cv2.blur(image(640, 480), (9, 9)), [-0.3, 0.1, 0.001, -0.002, 0.01]
+    estimator.predict(pixels, K_VGA, np.array(distortion))
+    by_hand = cv2.undistort(pixels, K_VGA, np.array(distortion))
+    assert_array_equal(
+        inputs[0], resize_and_pad(by_hand, Letterbox.fit((640, 480), (416, 416)), 32)
+    )
+    estimator.predict(pixels, K_VGA, np.zeros((1, 4)))
+    estimator.predict(pixels, K_VGA)
+    assert_array_equal(inputs[1], inputs[2])
 
 
 def test_array_views_and_lists_are_accepted(estimator):
@@ -248,7 +252,7 @@ def parts_path(save):
     return save([servoholder(), pivconnector()])
 
 
-def seen(path, refine, nearer=0.012, **options):
+def oracle_and_render(path, refine, nearer=0.012, **options):
     """Return an oracle with a distance error (``nearer``, metres) and a render of the part."""
     from dopepp.virtual import Scene, SceneObject, make_surface, render
 
@@ -267,7 +271,7 @@ def error(pose):
 
 
 def test_depth_image_refines_the_distance(parts_path):
-    estimator, rendered = seen(parts_path, "depth")
+    estimator, rendered = oracle_and_render(parts_path, "depth")
     detection = estimator.predict(rendered.image, K_VGA, depth=rendered.depth)[0]
     alone = estimator.candidates(rendered.image, K_VGA)[0]
     assert error(detection.T_cam_obj) < 0.002 < 0.009 < error(alone.T_cam_obj)
@@ -278,7 +282,7 @@ def test_depth_image_refines_the_distance(parts_path):
 
 
 def test_region_refines_on_the_image(parts_path):
-    estimator, rendered = seen(parts_path, "region", nearer=0.0)
+    estimator, rendered = oracle_and_render(parts_path, "region", nearer=0.0)
     detection = estimator.predict(rendered.image, K_VGA)[0]
     turned = rotation_vector_to_matrix(np.array([0.04, 0.04, -0.03])) @ TRUE[:3, :3]
     off = make_transform(turned, TRUE[:3, 3] + (0.001, 0.002, 0.002))
@@ -304,7 +308,7 @@ def test_region_refines_on_the_image(parts_path):
 
 
 def test_refinement_stops_at_the_time_limit(parts_path):
-    estimator, rendered = seen(parts_path, "region", max_ms=0.0)
+    estimator, rendered = oracle_and_render(parts_path, "region", max_ms=0.0)
     assert estimator.predict(rendered.image, K_VGA)[0].kept == "max_ms=0 was spent"
 
 
@@ -316,7 +320,7 @@ def test_scale_error_is_a_share(parts_path):
 
 
 def test_error_about_a_missing_mesh_names_the_option(parts_path):
-    estimator, _ = seen(parts_path, None)
+    estimator, _ = oracle_and_render(parts_path, None)
     bare = replace(
         estimator.checkpoint, parts=[replace(part, mesh=None) for part in estimator.parts]
     )
@@ -327,20 +331,20 @@ def test_error_about_a_missing_mesh_names_the_option(parts_path):
 
 
 def test_candidates_below_the_threshold_are_not_detections(checkpoint_path):
-    estimator, picture = Oracle.load(checkpoint_path), image(640, 480)
-    places = [(-0.2, -0.1, 0.7), (0.2, -0.1, 0.8), (-0.2, 0.15, 0.9), (0.2, 0.15, 1.0)]
-    poses = [(0, make_transform(TRUE[:3, :3], np.array(place))) for place in places]
+    estimator, pixels = Oracle.load(checkpoint_path), image(640, 480)
+    positions = [(-0.2, -0.1, 0.7), (0.2, -0.1, 0.8), (-0.2, 0.15, 0.9), (0.2, 0.15, 1.0)]
+    poses = [(0, make_transform(TRUE[:3, :3], np.array(position))) for position in positions]
     estimator.show((640, 480), K_VGA, poses)
-    candidates = estimator.reporting(0.0).predict(picture, K_VGA)
+    candidates = estimator.reporting(0.0).predict(pixels, K_VGA)
     scores = [candidate.score for candidate in candidates]
     assert sorted(set(scores), reverse=True) == scores
     assert len(scores) == 4
     strict = estimator.reporting(scores[1])
     assert strict.min_score == scores[1]
-    assert [detection.score for detection in strict.predict(picture, K_VGA)] == scores[:2]
-    assert [candidate.score for candidate in strict.candidates(picture, K_VGA)] == scores
+    assert [detection.score for detection in strict.predict(pixels, K_VGA)] == scores[:2]
+    assert [candidate.score for candidate in strict.candidates(pixels, K_VGA)] == scores
     assert strict.split(candidates) == (candidates[:2], scores[2:])
-    rejected = [reason.best for reason in strict.explain(picture, K_VGA) if reason.kind == "score"]
+    rejected = [reason.best for reason in strict.explain(pixels, K_VGA) if reason.kind == "score"]
     assert sorted(rejected, reverse=True) == scores[2:]
     assert estimator.reporting(None) is estimator
     with pytest.raises(UserError, match=r"min_score=1.1"):
@@ -348,10 +352,10 @@ def test_candidates_below_the_threshold_are_not_detections(checkpoint_path):
 
 
 def test_refined_poses_have_a_separate_threshold(parts_path):
-    estimator, rendered = seen(parts_path, "region", nearer=0.0)
+    estimator, rendered = oracle_and_render(parts_path, "region", nearer=0.0)
     estimator.recovery = replace(estimator.recovery, min_score=0.2, refined_min_score=0.6)
     assert estimator.min_score == 0.6
-    unrefined, _ = seen(parts_path, None, nearer=0.0)
+    unrefined, _ = oracle_and_render(parts_path, None, nearer=0.0)
     unrefined.recovery = estimator.recovery
     assert unrefined.min_score == 0.2
     (candidate,) = estimator.candidates(rendered.image, K_VGA)

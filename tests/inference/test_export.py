@@ -72,20 +72,27 @@ def exported(request, original, tmp_path_factory):
     return written(original, request.param, tmp_path_factory.mktemp("exported"))
 
 
-def pictures(*shape: int) -> torch.Tensor:
+def random_images(*shape: int) -> torch.Tensor:
     return torch.from_numpy(np.random.default_rng(0).integers(0, 256, shape, np.uint8))
 
 
 def test_export_has_the_same_maps_for_any_batch_and_size(exported, original):
-    theirs, ours = PoseEstimator.load(exported), PoseEstimator.load(original)
-    assert theirs.network.size_multiple == ours.network.size_multiple
+    exported_estimator, original_estimator = (
+        PoseEstimator.load(exported),
+        PoseEstimator.load(original),
+    )
+    assert exported_estimator.network.size_multiple == original_estimator.network.size_multiple
     for shape in ((1, 3, 96, 128), (1, 3, 32, 32), (3, 3, 160, 64)):
-        images = pictures(*shape)
+        images = random_images(*shape)
         with torch.inference_mode():
-            pairs = zip(theirs.network.maps(images), ours.network.maps(images), strict=True)
+            pairs = zip(
+                exported_estimator.network.maps(images),
+                original_estimator.network.maps(images),
+                strict=True,
+            )
         for first, other in pairs:
             assert other.std() > 0.01
-            # A random network's field is up to 20 long, a trained one's 1.
+            # Vectors of a random network are up to 20 long, those of a trained network 1.
             size = max(1.0, float(other.abs().max()))
             torch.testing.assert_close(first / size, other / size, atol=1e-4, rtol=0)
 
@@ -94,11 +101,18 @@ def test_renamed_export_is_the_same_estimator(exported, original, tmp_path):
     ending = "".join(exported.suffixes)
     moved = tmp_path / f"renamed{ending}"
     (shutil.copytree if exported.is_dir() else shutil.copy)(exported, moved)
-    theirs, ours = (PoseEstimator.load(item, refine="region") for item in (moved, original))
-    assert replace(theirs.checkpoint, state_dict={}).to_payload() == ours.checkpoint.to_payload()
-    assert theirs.recovery == ours.recovery
-    image = pictures(96, 128, 3).numpy()
-    detections, expected = (estimator.predict(image, K) for estimator in (theirs, ours))
+    exported_estimator, original_estimator = (
+        PoseEstimator.load(item, refine="region") for item in (moved, original)
+    )
+    assert (
+        replace(exported_estimator.checkpoint, state_dict={}).to_payload()
+        == original_estimator.checkpoint.to_payload()
+    )
+    assert exported_estimator.recovery == original_estimator.recovery
+    image = random_images(96, 128, 3).numpy()
+    detections, expected = (
+        estimator.predict(image, K) for estimator in (exported_estimator, original_estimator)
+    )
     assert len(detections) == len(expected)
     for detection, other in zip(detections, expected, strict=True):
         assert_allclose(detection.T_cam_obj, other.T_cam_obj, atol=1e-4)
@@ -110,7 +124,7 @@ def test_half_precision_halves_the_file(original, tmp_path):
     whole, half = (written(original, "onnx", tmp_path / item, item) for item in ("fp32", "fp16"))
     described = len(half.read_bytes()) - 2 * len(whole.read_bytes())
     assert described < 0
-    images = pictures(1, 3, 96, 128)
+    images = random_images(1, 3, 96, 128)
     belief, _ = PoseEstimator.load(half).network.maps(images)
     with torch.inference_mode():
         expected, _ = PoseEstimator.load(original).network.maps(images)

@@ -32,19 +32,19 @@ from dopepp.virtual import PRESETS, Factory, render
 SEEN = LearnedRange(48.0, 98.0, 0.12, 0.25)
 
 
-def picture(width, height):
+def blank_image(width, height):
     return np.zeros((height, width, 3), np.uint8)
 
 
 def checkpoint(diameter=0.1, seen=SEEN, **others):
     parts = [SimpleNamespace(name="part", diameter=diameter)]
-    known = {} if seen is None else {"part": seen}
-    return SimpleNamespace(parts=parts, input_size=(128, 128), seen=known, **others)
+    sizes = {} if seen is None else {"part": seen}
+    return SimpleNamespace(parts=parts, input_size=(128, 128), seen=sizes, **others)
 
 
-def boxes(size, focal, distances=None, **what):
+def boxes(size, focal, distances=None, **options):
     K = camera_matrix(focal, focal, size[0] / 2, size[1] / 2)
-    return letterboxes(checkpoint(**what), K, picture(*size), distances)
+    return letterboxes(checkpoint(**options), K, blank_image(*size), distances)
 
 
 def test_training_camera_uses_the_training_size():
@@ -57,8 +57,8 @@ def test_training_camera_uses_the_training_size():
 @pytest.mark.parametrize("size", [(640, 480), (1920, 1080), (1080, 1920), (2592, 1944)])
 def test_camera_with_more_pixels_shows_the_part_at_the_trained_size(size):
     focal = 120.0 * min(size) / 128
-    whole, box = boxes(size, focal)
-    assert whole == Letterbox.fit(size, (128, 128))
+    training, box = boxes(size, focal)
+    assert training == Letterbox.fit(size, (128, 128))
     assert min(box.width, box.height) == pytest.approx(128, rel=0.03)
     assert box.width / box.height == pytest.approx(size[0] / size[1], rel=0.02)
 
@@ -126,7 +126,7 @@ def scenes(estimator):
     return [factory.scene(0, index) for index in range(12)]
 
 
-def through(scene, size):
+def with_image_size(scene, size):
     """Return a scene for a camera of another image size and the same angle of the shorter side."""
     scale = min(size) / 128
     K = resize_camera(scene.K, scale, scale)
@@ -149,27 +149,27 @@ def num_right(estimator, scenes):
 def test_other_cameras_detect_as_many_parts_as_the_training_camera(estimator, scenes, size):
     usual = num_right(estimator, scenes)
     assert usual >= 5
-    assert num_right(estimator, [through(scene, size) for scene in scenes]) >= usual - 2
+    assert num_right(estimator, [with_image_size(scene, size) for scene in scenes]) >= usual - 2
 
 
 def test_farther_part_is_detected_with_a_farther_range(estimator, scenes):
-    scene = through(scenes[0], (1280, 720))
+    scene = with_image_size(scenes[0], (1280, 720))
     true = scene.objects[scene.targets[0]].T_cam_obj
     image, K = render(scene).image, scene.K
     # With three times the focal length, the same image shows a part three times as far away.
     K = K * np.array([[3.0], [3.0], [1.0]])
     K[:2, 2] = scene.K[:2, 2]
 
-    def found(distances=None):
+    def is_detected(distances=None):
         depths = [
             detection.T_cam_obj[2, 3]
             for detection in estimator.predict(image, K, distances=distances)
         ]
         return bool(depths) and abs(depths[0] / (3 * true[2, 3]) - 1) < 0.15
 
-    assert not found((0.1, 0.15))
-    assert found((0.4, 0.8))
-    assert found("any")
+    assert not is_detected((0.1, 0.15))
+    assert is_detected((0.4, 0.8))
+    assert is_detected("any")
 
 
 def test_region_is_processed_like_a_separate_image(estimator, scenes):
@@ -191,7 +191,7 @@ def test_region_is_processed_like_a_separate_image(estimator, scenes):
 @pytest.mark.parametrize("roi", [(-1, 0, 10, 10), (0, 0, 200, 10), (5, 5, 0, 10)])
 def test_region_outside_the_image_is_rejected(estimator, roi):
     with pytest.raises(UserError, match="roi"):
-        estimator.predict(picture(128, 128), camera_matrix(110, 110, 63.5, 63.5), roi=roi)
+        estimator.predict(blank_image(128, 128), camera_matrix(110, 110, 63.5, 63.5), roi=roi)
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,10 @@ def opened() -> Iterator[tuple[object, list[str]]]:
         page = browser.new_page()
         page.set_default_timeout(120_000)  # beside other work
         inside = (address, "data:", "blob:")
-        page.on("request", lambda one: one.url.startswith(inside) or elsewhere.append(one.url))
+        page.on(
+            "request",
+            lambda request: request.url.startswith(inside) or elsewhere.append(request.url),
+        )
         page.goto(address)
         page.get_by_role("button", name=FIND).wait_for()
         yield page, elsewhere
@@ -70,16 +73,16 @@ def page(opened):
     assert not elsewhere
 
 
-def upload(page, place, path):
+def upload(page, field, path):
     """Upload a file to an input field of the page."""
-    area = page.locator(place)
+    area = page.locator(field)
     if area.get_by_label("Clear").count():
         area.get_by_label("Clear").click()
     area.locator("input[type=file]").set_input_files(path)
     area.get_by_text(path.name.split(".")[0]).first.wait_for()
 
 
-def said(page):
+def message_of(page):
     """Click on the button that finds poses; return the new message."""
     line = page.locator(".said")
     before = line.inner_text()
@@ -92,7 +95,7 @@ def test_image_yields_an_overlay_and_the_json_of_predict(page, files, tmp_path):
     upload(page, "#image", files / "part.png")
     page.get_by_label("camera file", exact=True).check()
     upload(page, "#camera", files / "K.txt")
-    assert said(page) == "1 pose"
+    assert message_of(page) == "1 pose"
     shown = page.locator("#poses img")
     shown.wait_for()
     source = shown.get_attribute("src")
@@ -126,7 +129,7 @@ def test_errors_are_shown_in_a_sentence(page, files, name, view, line):
     upload(page, "#image", files / name)
     page.get_by_label("field of view", exact=True).check()
     page.get_by_label("Degrees across").fill(view)
-    assert said(page).startswith(line)
+    assert message_of(page).startswith(line)
     assert page.locator("#poses img").count() == (name == "empty.png")
 
 
@@ -135,7 +138,7 @@ def test_camera_of_another_image_size_is_reported(page, files):
     page.get_by_label("K", exact=True).check()
     for name in ("fx", "fy", "cx", "cy"):
         page.get_by_label(name, exact=True).fill("100")
-    assert "likely of 201×201 (--K-size)" in said(page)
+    assert "likely of 201×201 (--K-size)" in message_of(page)
 
 
 def test_used_port_is_reported(page):

@@ -40,17 +40,15 @@ def result(*poses: np.ndarray, size: tuple[int, int] = (640, 480), **fields: obj
     return PoseResult(image, K, result, speed, **given)
 
 
-@pytest.mark.parametrize("image", range(4))
-def test_silhouette_is_the_renderers_mask(image):
+@pytest.mark.parametrize("index", range(4))
+def test_silhouette_is_the_renderers_mask(index):
     from dopepp.virtual import PRESETS, Factory
 
-    rendered = Factory([PART], PRESETS["quickstart"].reframed(320, 240), 5).render(0, image)
+    rendered = Factory([PART], PRESETS["quickstart"].reframed(320, 240), 5).render(0, index)
     target = rendered.scene.targets[0]
-    T, picture = rendered.scene.objects[target].T_cam_obj, np.zeros_like(rendered.image)
-    mask = np.zeros(picture.shape[:2], np.uint8)
-    cv2.drawContours(
-        mask, silhouette_contours(SHAPES[PART.name], T, rendered.scene.K, picture), -1, 1, -1
-    )
+    T, mask = rendered.scene.objects[target].T_cam_obj, np.zeros((240, 320), np.uint8)
+    contours = silhouette_contours(SHAPES[PART.name], T, rendered.scene.K, rendered.image)
+    cv2.drawContours(mask, contours, -1, 1, -1)
     truth = rendered.instances == target
     assert (mask.astype(bool) & truth).sum() / (mask.astype(bool) | truth).sum() > 0.97
 
@@ -117,15 +115,15 @@ def test_weaker_candidates_are_counted_in_every_output():
 
 
 def test_json_states_frame_and_null_for_nan():
-    whole = json.loads(result(pose(), pose(0.1), time=0.4, number=7, identities=[3, 5]).to_json())
-    assert (whole["image"], whole["number"], whole["time"], whole["frame"]) == (
+    content = json.loads(result(pose(), pose(0.1), time=0.4, number=7, identities=[3, 5]).to_json())
+    assert (content["image"], content["number"], content["time"], content["frame"]) == (
         "a.png", 7, 0.4, FRAME,
     )  # fmt: skip
-    np.testing.assert_allclose(whole["K"], K)
-    assert whole["speed_ms"] == {"pre": 1.0, "network": 2.0, "decode": 3.0, "refine": 0.0}
-    assert [record["identity"] for record in whole["detections"]] == [3, 5]
-    np.testing.assert_allclose(whole["detections"][1]["T_cam_obj"], pose(0.1))
-    assert np.shape(whole["detections"][0]["covariance"]) == (6, 6)
+    np.testing.assert_allclose(content["K"], K)
+    assert content["speed_ms"] == {"pre": 1.0, "network": 2.0, "decode": 3.0, "refine": 0.0}
+    assert [record["identity"] for record in content["detections"]] == [3, 5]
+    np.testing.assert_allclose(content["detections"][1]["T_cam_obj"], pose(0.1))
+    assert np.shape(content["detections"][0]["covariance"]) == (6, 6)
     behind = json.loads(result(pose(z=-0.3)).to_json())["detections"][0]
     assert behind["keypoints"][0] == [None, None]
     assert json.loads(result().to_json())["detections"] == []

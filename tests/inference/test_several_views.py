@@ -50,8 +50,8 @@ def views(scene, true):
     poses = [np.eye(4), beside(true, (0.0, 1.0, 0.0)), beside(true, (1.0, 0.0, 0.0))]
     images = []
     for T_new_cam in poses:
-        seen = scene.seen_from(T_new_cam)
-        images.append(capture(render(seen).image, seen.sensor))
+        shown = scene.seen_from(T_new_cam)
+        images.append(capture(render(shown).image, shown.sensor))
     return images, [invert_transform(T) for T in poses]
 
 
@@ -161,8 +161,8 @@ def test_moved_part_is_not_averaged(estimator, scene, views, true):
     shift = np.eye(4)
     shift[:3, 3] = 0.0, 0.02, 0.01
     objects = [replace(item, T_cam_obj=shift @ item.T_cam_obj) for item in scene.objects]
-    seen = replace(scene, objects=tuple(objects)).seen_from(invert_transform(poses[1]))
-    images = [images[0], capture(render(seen).image, seen.sensor)]
+    shown = replace(scene, objects=tuple(objects)).seen_from(invert_transform(poses[1]))
+    images = [images[0], capture(render(shown).image, shown.sensor)]
     result = predicted(estimator, scene, views, images=images)
     assert result.detections == []
     assert "the part was moved between the images" in result.findings[0]

@@ -57,7 +57,7 @@ def test_stream_of_an_image_equals_predict(estimator, rendered, K, tmp_path):
 def test_parts_are_tracked_through_a_video(estimator, clip, K):
     results = list(estimator.stream(clip, K, track=True))
     assert [frame.time for frame in results] == pytest.approx([0, 0.1, 0.2, 0.3])
-    assert [list(one.identities) for one in results] == [[0]] * 4
+    assert [list(result.identities) for result in results] == [[0]] * 4
     moved = [result.detections[0].keypoints[-1, 0] for result in results]
     assert 1 < moved[-1] - moved[0] < 4  # of three pixels; a tracker's first steps are careful
     assert [item.number for item in estimator.stream(clip, K, stride=3)] == [0, 3]

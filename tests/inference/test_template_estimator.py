@@ -75,7 +75,7 @@ def test_template_estimator_tracks_and_streams(near_truth, estimator, rendered, 
         (track,) = tracker.track(rendered.image, rendered.scene.K)
         identities.add(track.identity)
     assert (len(identities), len(estimator.detectors[0].asked)) == (1, 1)
-    path = tmp_path / "picture.png"
+    path = tmp_path / "image.png"
     cv2.imwrite(str(path), rendered.image[..., ::-1])
     (result,) = estimator.stream(path, rendered.scene.K)
     assert [it.object for it in result.detections] == ["pivconnector"]
@@ -93,13 +93,13 @@ def test_options_reach_the_part_and_the_detector(near_truth, tmp_path):
     corners = [f"{x} {y} {z}" for x in (0, 40) for y in (0, 30) for z in (0, 20)]
     quads = ["0 1 3 2", "4 6 7 5", "0 4 5 1", "2 3 7 6", "0 2 6 4", "1 5 7 3"]
     path.write_text("\n".join(["OFF", "8 6 0", *corners, *(f"4 {quad}" for quad in quads)]))
-    made = PoseEstimator.from_mesh(path, "mm", (0.2, 0.3), tilt_deg=40, name="block")
-    (part,) = made.parts
+    estimator = PoseEstimator.from_mesh(path, "mm", (0.2, 0.3), tilt_deg=40, name="block")
+    (part,) = estimator.parts
     assert (part.name, part.unit) == ("block", "mm")
     assert part.diameter == pytest.approx(np.linalg.norm([0.04, 0.03, 0.02]))
     assert len(part.symmetries_discrete) == 3  # half turns of a box
-    assert made.detectors[0].tilt_deg == 40
-    assert made.detectors[0].working_distance == (0.2, 0.3)
+    assert estimator.detectors[0].tilt_deg == 40
+    assert estimator.detectors[0].working_distance == (0.2, 0.3)
     plain = PoseEstimator.from_mesh(path, "mm", (0.2, 0.3), symmetries=None)
     assert plain.parts[0].symmetries_discrete is None
 

@@ -51,9 +51,9 @@ def rendered(detector):
     """Return a render of the part, its camera matrix and its pose."""
     fields = {"width": 320, "height": 240, "distractors": {"number": [0, 0]}}
     fields["placement"] = {"kind": "distance", "nearest": 0.2, "farthest": 0.3}
-    picture = Factory([detector.part], preset_of("wide", fields, "scene"), 3).render(0, 0)
-    scene = picture.scene
-    return picture.image, scene.K, scene.objects[scene.targets[0]].T_cam_obj
+    rendered = Factory([detector.part], preset_of("wide", fields, "scene"), 3).render(0, 0)
+    scene = rendered.scene
+    return rendered.image, scene.K, scene.objects[scene.targets[0]].T_cam_obj
 
 
 def distance_of(part: Part, T, T_true) -> float:
@@ -217,10 +217,10 @@ def test_a_match_becomes_the_pose_at_its_pixel_size_and_turn(detector):
     centre += detector.part.mesh.vertices.max(axis=0) / 2
     rotations = view_rotations(180.0)[drawings]
     for T, pixel, size, turn, R in zip(transforms, pixels, sizes, turns, rotations, strict=True):
-        seen = transform(T, centre[None])
-        np.testing.assert_allclose(project(seen, K)[0], pixel)
-        np.testing.assert_allclose(seen[0, 2], 300 * detector.part.diameter / size)
-        ray = seen[0] / np.linalg.norm(seen)
+        centre_in_camera = transform(T, centre[None])
+        np.testing.assert_allclose(project(centre_in_camera, K)[0], pixel)
+        np.testing.assert_allclose(centre_in_camera[0, 2], 300 * detector.part.diameter / size)
+        ray = centre_in_camera[0] / np.linalg.norm(centre_in_camera)
         axis = np.cross([0, 0, 1], ray)
         to_ray = Rotation.from_rotvec(axis / np.linalg.norm(axis) * np.arccos(ray[2]))
         expected = to_ray * Rotation.from_euler("z", turn) * Rotation.from_matrix(R)

@@ -41,8 +41,8 @@ class Stage:
         self.agreement = self.network_agreement = 0.95
         self.min_score = 0.5
 
-    def put(self, name, part, place, turn=(0.0, 0.0, 0.0)):
-        pose = make_transform(rotation_vector_to_matrix(np.array(turn)), np.array(place))
+    def put(self, name, part, position, turn=(0.0, 0.0, 0.0)):
+        pose = make_transform(rotation_vector_to_matrix(np.array(turn)), np.array(position))
         self.actors[name] = part.name, pose
 
     def split(self, candidates):
@@ -58,7 +58,7 @@ class Stage:
         ]
 
     def _detection(self, part, pose):
-        cuboid = next(one.cuboid for one in self.parts if one.name == part)
+        cuboid = next(item.cuboid for item in self.parts if item.name == part)
         keypoints = project_keypoints(cuboid, pose, K)
         return Detection(part, 0.9, 0.8, pose, keypoints, keypoints, 0.5, np.eye(6) * 1e-6)
 
@@ -66,16 +66,16 @@ class Stage:
         self.refinements += len(given)
         return [self._refined(item) for item in given]
 
-    def _refined(self, one):
+    def _refined(self, start):
         for name, (part, pose) in self.actors.items():
-            if part != one.object or name in self.hidden:
+            if part != start.object or name in self.hidden:
                 continue
-            deviation = np.sqrt(np.diag(one.covariance))
-            turn = rotation_angle(pose[:3, :3] @ one.T_cam_obj[:3, :3].T)
-            shift = np.linalg.norm(pose[:3, 3] - one.T_cam_obj[:3, 3])
+            deviation = np.sqrt(np.diag(start.covariance))
+            turn = rotation_angle(pose[:3, :3] @ start.T_cam_obj[:3, :3].T)
+            shift = np.linalg.norm(pose[:3, 3] - start.T_cam_obj[:3, 3])
             if turn <= 3 * deviation[0] and shift <= 3 * deviation[3]:
                 return replace(self._detection(part, pose), agreement=self.agreement)
-        return replace(one, kept="nothing there")
+        return replace(start, kept="nothing there")
 
 
 @pytest.fixture
@@ -163,21 +163,23 @@ def test_lost_part_is_forgotten(stage):
         assert track.detection.object == "servoholder"
     assert stage.looks == FORGOTTEN + 2
     stage.hidden = set()
-    assert [one.identity for one in tracker.track(IMAGE, K)] == [1]
+    assert [track.identity for track in tracker.track(IMAGE, K)] == [1]
 
 
 def test_equal_parts_keep_their_identities_when_one_reappears(stage):
     tracker = PoseTracker(stage, detect_every=5)
     stage.put("left", pivconnector(), (-0.1, 0.0, 0.4))
     stage.put("right", pivconnector(), (0.1, 0.0, 0.4))
-    places = {track.identity: track.detection.T_cam_obj[0, 3] for track in tracker.track(IMAGE, K)}
+    positions = {
+        track.identity: track.detection.T_cam_obj[0, 3] for track in tracker.track(IMAGE, K)
+    }
     stage.hidden = {"left"}
-    seen = [tracker.track(IMAGE, K) for _ in range(4)][-1]
-    assert [item.detection.T_cam_obj[0, 3] for item in seen] == [0.1]
+    tracks = [tracker.track(IMAGE, K) for _ in range(4)][-1]
+    assert [item.detection.T_cam_obj[0, 3] for item in tracks] == [0.1]
     stage.hidden = set()
     stage.put("third", pivconnector(), (0.0, 0.1, 0.4))
-    again = {one.identity: one.detection.T_cam_obj[0, 3] for one in tracker.track(IMAGE, K)}
-    assert again == {**places, 2: 0.0}
+    again = {track.identity: track.detection.T_cam_obj[0, 3] for track in tracker.track(IMAGE, K)}
+    assert again == {**positions, 2: 0.0}
 
 
 def test_sudden_motion_is_tracked_without_the_network(stage, tracker):
@@ -214,8 +216,8 @@ def test_track_moves_only_to_a_detection_that_agrees_better(stage, tracker):
         (track,) = tracker.track(IMAGE, K)
     assert track.detection.T_cam_obj[1, 3] == pytest.approx(0.0, abs=1e-9)
     beside = replace(beside, agreement=0.9)
-    places = [tracker.track(IMAGE, K)[0].detection.T_cam_obj[1, 3] for _ in range(OFTEN + 1)]
-    assert max(places) == pytest.approx(0.03)
+    heights = [tracker.track(IMAGE, K)[0].detection.T_cam_obj[1, 3] for _ in range(OFTEN + 1)]
+    assert max(heights) == pytest.approx(0.03)
 
 
 def test_doubtful_part_continues_its_motion(stage):
@@ -229,9 +231,9 @@ def test_doubtful_part_continues_its_motion(stage):
     stage.put("a", pivconnector(), (0.047, 0.006, 0.3))
     for number in range(1, PATIENCE + 1):
         (track,) = tracker.track(IMAGE, K)
-        place = track.detection.T_cam_obj[:3, 3]
-        assert 0.045 < place[0] < 0.045 + 0.005 * number
-        assert place[1] == 0.0
+        position = track.detection.T_cam_obj[:3, 3]
+        assert 0.045 < position[0] < 0.045 + 0.005 * number
+        assert position[1] == 0.0
         # The network searches the region around the predicted part.
         x, y, width, height = stage.roi
         for corner in track.detection.keypoints:
@@ -265,9 +267,9 @@ NOISE = np.repeat([math.radians(0.5), 0.0005], 3)
 
 def filtered(motion: Motion, T: np.ndarray) -> Motion:
     """Update a prediction by a pose measured with NOISE, as refinement fuses the two."""
-    prior, own = np.linalg.inv(motion.pose_covariance), np.diag(1 / NOISE**2)
-    covariance = np.linalg.inv(prior + own)
-    step = covariance @ own @ step_between(motion.T_cam_obj, T)
+    prior, measured = np.linalg.inv(motion.pose_covariance), np.diag(1 / NOISE**2)
+    covariance = np.linalg.inv(prior + measured)
+    step = covariance @ measured @ step_between(motion.T_cam_obj, T)
     return motion.update(move_pose(motion.T_cam_obj, step), covariance)
 
 

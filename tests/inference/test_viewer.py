@@ -51,9 +51,9 @@ def test_recording_contains_every_entity(estimator, result, tmp_path):
 
 
 def test_beliefs_peak_where_the_part_is(estimator, result):
-    (picture,) = belief_images(estimator, result).values()
-    hottest = np.array(np.unravel_index(picture.sum(axis=2).argmax(), picture.shape[:2]))[::-1]
-    scale = np.array(result.image.shape[1::-1]) / picture.shape[1::-1]
+    (colours,) = belief_images(estimator, result).values()
+    hottest = np.array(np.unravel_index(colours.sum(axis=2).argmax(), colours.shape[:2]))[::-1]
+    scale = np.array(result.image.shape[1::-1]) / colours.shape[1::-1]
     nearest = np.abs((hottest + 0.5) * scale - result.detections[0].keypoints).sum(axis=1).min()
     assert nearest < 2 * scale.max()
 

@@ -63,7 +63,7 @@ def scene():
 
 
 @pytest.fixture(scope="module")
-def picture(scene):
+def photo(scene):
     return render(scene).image
 
 
@@ -73,9 +73,9 @@ def estimator():
 
 
 @pytest.fixture(scope="module")
-def whole(estimator, scene, picture):
+def whole_pose(estimator, scene, photo):
     """The pose on the whole image."""
-    (detection,) = estimator.predict(picture, scene.K)
+    (detection,) = estimator.predict(photo, scene.K)
     assert not detection.kept
     return detection.T_cam_obj
 
@@ -87,46 +87,46 @@ def whole(estimator, scene, picture):
 @example(View(turns=1))
 @example(View(lens=True))
 @example(View(scale=1 / 3, lens=True, flipped=True))
-def test_pose_is_the_same_in_every_view(estimator, scene, picture, whole, view):
-    keypoints = project_keypoints(pivconnector().cuboid, whole, scene.K)
-    seen, K = made(view, picture, scene.K, keypoints)
-    assert view is not VGA or seen.shape == (480, 640, 3)
-    detections = estimator.predict(seen, K, LENS if view.lens else None, cropped=True)
+def test_pose_is_the_same_in_every_view(estimator, scene, photo, whole_pose, view):
+    keypoints = project_keypoints(pivconnector().cuboid, whole_pose, scene.K)
+    image, K = transform_image(view, photo, scene.K, keypoints)
+    assert view is not VGA or image.shape == (480, 640, 3)
+    detections = estimator.predict(image, K, LENS if view.lens else None, cropped=True)
     assert detections, "nothing found"
     back = np.eye(4)
     back[:3, :3] = quarter_turn(-view.turns)
     T = back @ detections[0].T_cam_obj
-    assert 1000 * np.linalg.norm(T[:3, 3] - whole[:3, 3]) < MOST_MM
-    assert math.degrees(rotation_angle(T[:3, :3] @ whole[:3, :3].T)) < MOST_DEG
+    assert 1000 * np.linalg.norm(T[:3, 3] - whole_pose[:3, 3]) < MOST_MM
+    assert math.degrees(rotation_angle(T[:3, :3] @ whole_pose[:3, :3].T)) < MOST_DEG
 
 
-def made(
-    view: View, picture: RGBImage, K: CameraMatrix, keypoints: np.ndarray
+def transform_image(
+    view: View, image: RGBImage, K: CameraMatrix, keypoints: np.ndarray
 ) -> tuple[RGBImage, CameraMatrix]:
     """Return the image of a view and its K, by formulas independent of the package."""
-    limit = np.array(picture.shape[1::-1])
+    limit = np.array(image.shape[1::-1])
     lower, upper = keypoints.min(0) - AROUND_PX, keypoints.max(0) + AROUND_PX
     left, top = np.clip(np.minimum(view.cut[:2] * limit, lower), 0, limit).astype(int)
     right, bottom = np.clip(limit - np.minimum(view.cut[2:] * limit, limit - upper), 0, limit)
     right, bottom = math.ceil(right), math.ceil(bottom)
-    picture = picture[top:bottom, left:right]
+    image = image[top:bottom, left:right]
     (width, height), K = (right - left, bottom - top), K - [[0, 0, left], [0, 0, top], [0, 0, 0]]
     columns, rows = round(view.scale * width), round(view.scale * height)
-    picture = cv2.resize(picture, (columns, rows), interpolation=cv2.INTER_AREA)
+    image = cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA)
     # Pixel corners, at halves, stay corners.
     corner = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
     K = np.linalg.inv(corner) @ np.diag([columns / width, rows / height, 1]) @ corner @ K
     for _ in range(view.turns):
         # Anticlockwise, (u, v) goes to (v, columns − 1 − u).
-        columns = picture.shape[1]
+        columns = image.shape[1]
         turned = np.array([[0, 1, 0], [-1, 0, columns - 1], [0, 0, 1.0]])
         K = turned @ K @ quarter_turn(-1)
-        picture = np.rot90(picture)
+        image = np.rot90(image)
     if view.lens:
-        picture = distorted(picture, K)
+        image = distort(image, K)
     if view.flipped:
-        picture = np.ascontiguousarray(picture[..., ::-1])[..., ::-1]
-    return picture, K
+        image = np.ascontiguousarray(image[..., ::-1])[..., ::-1]
+    return image, K
 
 
 def quarter_turn(turns: int) -> np.ndarray:
@@ -135,10 +135,10 @@ def quarter_turn(turns: int) -> np.ndarray:
     return np.linalg.matrix_power(once, turns % 4)
 
 
-def distorted(picture: RGBImage, K: CameraMatrix) -> RGBImage:
+def distort(image: RGBImage, K: CameraMatrix) -> RGBImage:
     """Return an image distorted by LENS: sample each pixel at its undistorted position."""
-    rows, columns = picture.shape[:2]
+    rows, columns = image.shape[:2]
     pixels = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).reshape(-1, 1, 2)
     straight = cv2.undistortPoints(pixels.astype(np.float64), K, LENS, P=K)
     at = straight.reshape(rows, columns, 2).astype(np.float32)
-    return cv2.remap(np.ascontiguousarray(picture), at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+    return cv2.remap(np.ascontiguousarray(image), at[..., 0], at[..., 1], cv2.INTER_LINEAR)

@@ -26,10 +26,10 @@ def peaks(
 ) -> ObjectPeaks:
     """Return peaks at known positions, (8, n, 2); NaN for missing peaks."""
     centroid = np.array(centroids, float).reshape(-1, 2)
-    there = np.isfinite(corners[..., 0])
+    is_present = np.isfinite(corners[..., 0])
     return ObjectPeaks(
         corners,
-        np.where(there, score, 0.0),
+        np.where(is_present, score, 0.0),
         np.tile(np.eye(2), (*corners.shape[:2], 1, 1)),
         toward,
         centroid,
@@ -45,8 +45,8 @@ def one_corner(position: object, toward: object, centroids: object, score: objec
     return peaks(corners, vectors, centroids, score)
 
 
-def group(found: ObjectPeaks, max_angle: float = WIDE, coincident_px: float = 8.0):
-    return associate(found, direction_evidence(found, max_angle, coincident_px))
+def group(peaks: ObjectPeaks, max_angle: float = WIDE, coincident_px: float = 8.0):
+    return associate(peaks, direction_evidence(peaks, max_angle, coincident_px))
 
 
 def crowd(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -164,8 +164,8 @@ def test_wide_peaks_have_less_weight(box, K, pose):
             for covariance in (honest, np.tile(9.0 * np.eye(2), (9, 1, 1)))
         ]
         errors.append([error(solve_group(group, box, K).T_cam_obj, truth, box) for group in groups])
-    told, untold = np.median(errors, axis=0)
-    assert told < 0.5 * untold
+    true_error, equal_error = np.median(errors, axis=0)
+    assert true_error < 0.5 * equal_error
 
 
 def test_peaks_narrower_than_their_errors_yield_poses(box, K, pose):

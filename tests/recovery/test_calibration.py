@@ -34,8 +34,10 @@ T = make_transform(rotation_vector_to_matrix(np.array([0.3, -0.2, 1.0])), np.arr
 
 
 def detection(**changes: object) -> Detection:
-    seen, covariance = project(transform(T, CUBOID), K), np.diag([1e-4] * 3 + [1e-6] * 3)
-    return replace(Detection("box", 0.5, 0.5, T, seen, seen.copy(), 1.0, covariance), **changes)
+    keypoints, covariance = project(transform(T, CUBOID), K), np.diag([1e-4] * 3 + [1e-6] * 3)
+    return replace(
+        Detection("box", 0.5, 0.5, T, keypoints, keypoints.copy(), 1.0, covariance), **changes
+    )
 
 
 def test_without_fitted_weights_the_score_is_the_mean_belief():
@@ -132,11 +134,11 @@ def test_refined_factor_applies_to_poses_refined_on_the_image():
     refined = detection(agreement=0.9, probability=0.8)
     kept, by_depth_alone = detection(probability=0.7, kept="occluded"), detection()
     options = RecoveryOptions(refined_covariance_factor=0.25)
-    found = recalibrate([refined, kept, by_depth_alone], options)
-    factors = [item.covariance[0, 0] / refined.covariance[0, 0] for item in found]
+    calibrated = recalibrate([refined, kept, by_depth_alone], options)
+    factors = [item.covariance[0, 0] / refined.covariance[0, 0] for item in calibrated]
     assert factors == [0.25, 1.0, 1.0]
     before = recalibrate([refined, kept, by_depth_alone], RecoveryOptions())
-    assert [item.score for item in found] == [item.score for item in before]
+    assert [item.score for item in calibrated] == [item.score for item in before]
     with_depth = recalibrate([refined], options, by_depth=True)[0]
     assert np.array_equal(with_depth.covariance, refined.covariance)
 
@@ -220,9 +222,11 @@ def test_the_fit_is_the_maximum_of_the_likelihood():
     correct = rng.random(400) < score(features, truth)
 
     def loss(weights: np.ndarray) -> float:
-        said = features @ weights
+        log_odds = features @ weights
         return float(
-            np.logaddexp(0, said).sum() - said[correct].sum() + 0.05 * (weights[1:] ** 2).sum()
+            np.logaddexp(0, log_odds).sum()
+            - log_odds[correct].sum()
+            + 0.05 * (weights[1:] ** 2).sum()
         )
 
     fitted = fit_weights(features, correct)

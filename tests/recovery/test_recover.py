@@ -120,10 +120,10 @@ def test_batch_equals_its_single_images(make_scene, box, plate, pose):
     maps = [scene.maps() for scene in scenes]
     belief, field = (torch.stack(kind) for kind in zip(*maps, strict=True))
     batch = recover_batch(belief, field, scenes[0].cuboids, np.stack(cameras))
-    for scene, found, (one_belief, one_field) in zip(scenes, batch, maps, strict=True):
-        alone = recover(one_belief, one_field, scene.cuboids, scene.K)
-        assert len(found) == len(alone) == 2
-        for detection, other in zip(found, alone, strict=True):
+    for scene, detections, (single_belief, single_field) in zip(scenes, batch, maps, strict=True):
+        alone = recover(single_belief, single_field, scene.cuboids, scene.K)
+        assert len(detections) == len(alone) == 2
+        for detection, other in zip(detections, alone, strict=True):
             assert detection.object == other.object
             assert detection.score == pytest.approx(other.score, abs=1e-6)
             assert_allclose(detection.T_cam_obj, other.T_cam_obj, atol=1e-5)
@@ -247,18 +247,18 @@ def test_peaks_at_the_border_are_less_certain():
     covariance = np.tile(np.diag([2.0, 3.0]), (1, 9, 6, 1, 1))
     score = np.ones((1, 9, 6))
     peaks = Peaks(position, score, covariance, np.zeros((1, 9, 6, 2)))
-    own = select_peaks(peaks, 0, 0, 0.05, (10, 6), 8.0)
-    added = own.covariance_px[0] - covariance[0, 0]
+    selected = select_peaks(peaks, 0, 0, 0.05, (10, 6), 8.0)
+    added = selected.covariance_px[0] - covariance[0, 0]
     assert_array_equal(added[:2], 0.0)
     assert_array_equal(added[2:], np.tile((8.0 * BORDER_DEVIATION) ** 2 * np.eye(2), (4, 1, 1)))
-    assert own.area_px == 80 * 48
+    assert selected.area_px == 80 * 48
 
 
 def test_shifted_corners_at_the_border_have_less_weight(plate, pose):
     """Peaks of a network in the outermost cells are shifted inward by half a cell."""
     rng, K, size = np.random.default_rng(11), camera_matrix(153, 153, 63.5, 63.5), 128
-    ours, plain = [], []
-    while len(ours) < 30:
+    weighted, unweighted_errors = [], []
+    while len(weighted) < 30:
         T = pose(rng, *rng.uniform(-0.02, 0.02, 2), 0.16)
         points = project_keypoints(plate, T, K)
         inward = np.minimum(points + 0.5, size - 0.5 - points)
@@ -273,6 +273,6 @@ def test_shifted_corners_at_the_border_have_less_weight(plate, pose):
         (detection,) = recover(belief[0], field[0], plate[None], K)
         unweighted = solve_pnp(plate, points, K).T_cam_obj
         assert unweighted is not None
-        for errors, estimate in ((ours, detection.T_cam_obj), (plain, unweighted)):
+        for errors, estimate in ((weighted, detection.T_cam_obj), (unweighted_errors, unweighted)):
             errors.append(np.linalg.norm(transform(estimate, plate) - transform(T, plate), axis=1))
-    assert np.mean(ours) < 0.6 * np.mean(plain)
+    assert np.mean(weighted) < 0.6 * np.mean(unweighted_errors)

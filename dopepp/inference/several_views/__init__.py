@@ -13,7 +13,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -67,13 +66,11 @@ def predict_views(
     error = CAMERA_ERROR if camera_error is None else camera_error
     views = _posed_images(images, cameras, T_world_cam, depths, error, names)
     observations, speeds = _search(estimator, views, distances)
-    start = time.perf_counter()
     geometries = {part.name: PartGeometry.of(part) for part in estimator.solid_parts}
     associated = partial(associate, geometries=geometries)
     slope, least = estimator.recovery.refined_verification, estimator.min_score
     joint = JointEstimator(refiner, views, names, geometries, slope)
     parts = [part.detection for part in joint.parts(associated(observations))]
-    joint_ms = 1000 * (time.perf_counter() - start)
     strong = [[item for item in view if item.detection.score >= least] for view in observations]
     passed, findings = contradictions(
         [part for part in parts if part.score >= least], strong, views, names, associated
@@ -88,7 +85,7 @@ def predict_views(
         shown = [item.detection for item in evidence if item.status == "supports"]
         result = PoseResult(view.image, view.K, shown, speed, names[number], number, shapes=shapes)
         results.append(result)
-    return ViewsResult(passed, findings, results, weaker, joint_ms)
+    return ViewsResult(passed, findings, results, weaker)
 
 
 def _posed_images(

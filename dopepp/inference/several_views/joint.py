@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
 
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID
@@ -198,7 +197,8 @@ class JointEstimator:
         if observation is not None and original.kept:
             is_shown |= geometry.separation(pose, observation.pose) <= CONSISTENT
         status: Status = "supports" if is_shown else "hidden"
-        if not _is_inside(detection.keypoints[CENTROID], view):
+        centre = detection.keypoints[CENTROID]
+        if not ((centre >= 0) & (centre < view.image.shape[1::-1])).all():
             status = "outside"
         return ViewEvidence(self._names[number], status, probability, detection)
 
@@ -250,9 +250,3 @@ def _is_duplicate(part: JointPart, better: JointPart) -> bool:
 def _probability(odds: float) -> float:
     """Convert log odds to a probability."""
     return 1.0 / (1.0 + math.exp(-odds))
-
-
-def _is_inside(pixel: Float[np.ndarray, "2"], view: PosedImage) -> bool:
-    """Return whether a view's image contains a pixel."""
-    height, width = view.image.shape[:2]
-    return bool((pixel >= 0).all() and pixel[0] < width and pixel[1] < height)

@@ -90,7 +90,6 @@ class ViewsResult:
     views: Sequence[PoseResult]  # result of each view, with the detections that it supports
     # Detections below the threshold or rejected by a contradiction, best score first
     weaker: Sequence[WorldDetection] = ()
-    joint_ms: float = 0.0  # time of association, joint refinement and verification, milliseconds
 
     @property
     def summary(self) -> str:

@@ -54,7 +54,7 @@ class Recording:
         encode = self._store.serialize_ros1 if self._is_ros1 else self._store.serialize_cdr
         self._writer.write(self._topics[topic], second * 10**9, encode(message, name))
 
-    def picture(self, topic: str, encoding: str, data: np.ndarray, second: int = 1) -> None:
+    def image(self, topic: str, encoding: str, data: np.ndarray, second: int = 1) -> None:
         rows = np.pad(data.reshape(len(data), -1), ((0, 0), (0, 3)))  # rows may be padded
         self.write(
             topic, "Image", second, height=data.shape[0], width=data.shape[1], encoding=encoding,
@@ -77,20 +77,20 @@ def test_recording_has_images_times_and_camera(kind, tmp_path):
         bag.camera("/cam/camera_info")
         bag.camera("/other/camera_info", width=640)
         for second in (1, 2, 3):
-            bag.picture("/cam/image_raw", "bgr8", IMAGE[..., ::-1] // second, second)
+            bag.image("/cam/image_raw", "bgr8", IMAGE[..., ::-1] // second, second)
     paths = [bag.path] if kind == "bag" else [bag.path, next(bag.path.glob("run*.*3")
              if kind == "sqlite3" else bag.path.glob("*.mcap"))]  # fmt: skip
     for path in paths:
         (source,) = open_sources([path])
         frames = list(source.frames())
-        assert [one.time for one in frames] == [1.5, 2.5, 3.5]
+        assert [frame.time for frame in frames] == [1.5, 2.5, 3.5]
         for second, frame in enumerate(frames, 1):
             np.testing.assert_array_equal(frame.image, IMAGE // second)
         assert (source.count, source.rate) == (3, pytest.approx(1, abs=1e-6))
         assert source.camera.size == (64, 48)
         np.testing.assert_allclose(source.camera.K.ravel(), K)
         assert source.camera.distortion == pytest.approx(tuple(LENS))
-        assert [one.number for one in source.frames(stride=2)] == [0, 2]
+        assert [frame.number for frame in source.frames(stride=2)] == [0, 2]
 
 
 @pytest.mark.parametrize("encoding", ["rgb8", "rgba8", "bgra8", "mono8", "8UC3", "bayer_rggb8",
@@ -108,7 +108,7 @@ def test_every_encoding_is_converted_to_rgb(encoding, tmp_path):
             tolerance = 0.0 if encoding == "png" else 6.0
         else:
             data, expected, tolerance = coded_as(encoding, smooth)
-            bag.picture("/cam/image_raw", encoding, data)
+            bag.image("/cam/image_raw", encoding, data)
     (source,) = open_sources([bag.path])
     (frame,) = source.frames()
     assert np.abs(frame.image.astype(float) - expected).mean() <= tolerance
@@ -139,39 +139,39 @@ def coded_as(encoding: str, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray, fl
 def test_rectified_images_have_the_camera_of_p(tmp_path):
     with Recording("mcap", tmp_path) as bag:
         bag.camera("/cam/camera_info")
-        bag.picture("/cam/image_rect_color", "rgb8", IMAGE)
+        bag.image("/cam/image_rect_color", "rgb8", IMAGE)
     (source,) = open_sources([bag.path])
     assert (source.camera.K[0, 0], source.camera.distortion) == (500, ())
 
 
 def test_choice_among_several_topics_is_required(tmp_path):
     with Recording("bag", tmp_path) as bag:
-        bag.picture("/left/image_raw", "rgb8", IMAGE)
-        bag.picture("/right/image_raw", "rgb8", IMAGE // 2)
+        bag.image("/left/image_raw", "rgb8", IMAGE)
+        bag.image("/right/image_raw", "rgb8", IMAGE // 2)
         bag.camera("/right/camera_info")
     (source,) = open_sources([bag.path], "/right/image_raw")
     np.testing.assert_array_equal(next(source.frames()).image, IMAGE // 2)
     assert source.camera is not None
     (left,) = open_sources([bag.path], "/left/image_raw")
     assert left.camera is None  # the other's would be a guess
-    for topic, said in ((None, "on 2 topics"), ("/nowhere", "without images on /nowhere")):
-        with pytest.raises(UserError, match=said) as raised:
+    for topic, message in ((None, "on 2 topics"), ("/nowhere", "without images on /nowhere")):
+        with pytest.raises(UserError, match=message) as raised:
             open_sources([bag.path], topic)
         assert "/left/image_raw, /right/image_raw" in str(raised.value)
 
 
 def test_damaged_recordings_are_reported_in_one_line(tmp_path):
     with Recording("mcap", tmp_path) as bag:
-        bag.picture("/cam/image_raw", "mono16", IMAGE[..., :2])
-        bag.picture("/odd/image_raw", "rgb8", IMAGE)
+        bag.image("/cam/image_raw", "mono16", IMAGE[..., :2])
+        bag.image("/odd/image_raw", "rgb8", IMAGE)
         bag.camera("/cam/camera_info", distortion_model="equidistant")
     (source,) = open_sources([bag.path], "/cam/image_raw")
     with pytest.raises(UserError, match="encoding 'mono16'"):
         list(source.frames())
     with pytest.raises(UserError, match="equidistant"):
         _ = source.camera
-    whole = next(bag.path.glob("*.mcap")).read_bytes()
-    contents = {"a.mcap": b"", "b.mcap": b"\x89MCAP0\r\n" * 30, "c.mcap": whole[:300],
+    recording = next(bag.path.glob("*.mcap")).read_bytes()
+    contents = {"a.mcap": b"", "b.mcap": b"\x89MCAP0\r\n" * 30, "c.mcap": recording[:300],
                 "d.bag": b"#ROSBAG V2.0\n", "e.db3": b"SQLite format 3\0" * 9}  # fmt: skip
     for name, content in contents.items():
         (tmp_path / name).write_bytes(content)

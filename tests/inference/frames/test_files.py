@@ -37,7 +37,7 @@ def clip(tmp_path):
 
 def levels(*given: object, stride: int = 1) -> list[int]:
     frames = [frame for source in open_sources(given) for frame in source.frames(stride)]
-    return [round(float(one.image.mean()) / 20) for one in frames]
+    return [round(float(frame.image.mean()) / 20) for frame in frames]
 
 
 def test_folder_pattern_and_list_of_files_are_one_sequence(folder):
@@ -49,7 +49,7 @@ def test_folder_pattern_and_list_of_files_are_one_sequence(folder):
     assert [Path(frame.name).name for frame in source.frames()] == [
         "frame0.png", "frame2.png", "frame10.png",
     ]  # fmt: skip
-    assert [one.number for one in source.frames()] == [0, 1, 2]
+    assert [frame.number for frame in source.frames()] == [0, 1, 2]
     assert (source.count, source.rate) == (3, None)
 
 
@@ -66,7 +66,7 @@ def test_video_has_frame_numbers_and_times(clip):
     assert levels(clip) == list(range(12))
     frames = list(source.frames(stride=5))
     assert [frame.number for frame in frames] == [0, 5, 10]
-    assert [one.time for one in frames] == pytest.approx([0, 0.5, 1])
+    assert [frame.time for frame in frames] == pytest.approx([0, 0.5, 1])
     assert levels(clip, stride=5) == [0, 5, 10]
 
 
@@ -97,7 +97,7 @@ def test_images_of_any_mode_are_converted_to_rgb(tmp_path, mode):
         image = image.quantize(200)
     else:
         image = image.convert(mode)
-    path = tmp_path / ("picture.tif" if mode in ("CMYK", "I;16") else "picture.png")
+    path = tmp_path / ("image.tif" if mode in ("CMYK", "I;16") else "image.png")
     image.save(path)
     (source,) = open_sources([path])
     (frame,) = source.frames()
@@ -106,10 +106,10 @@ def test_images_of_any_mode_are_converted_to_rgb(tmp_path, mode):
 
 
 def test_exif_orientation_is_applied(tmp_path):
-    picture = Image.fromarray(grey(0, (64, 48)))
+    image = Image.fromarray(grey(0, (64, 48)))
     exif = Image.Exif()
     exif[274] = 6
-    picture.save(tmp_path / "turned.jpg", exif=exif)
+    image.save(tmp_path / "turned.jpg", exif=exif)
     (source,) = open_sources([tmp_path / "turned.jpg"])
     (frame,) = source.frames()
     assert frame.image.shape == (64, 48, 3)
@@ -140,7 +140,7 @@ def test_unreadable_sources_are_reported_in_one_line(
         levels(name)
     assert message in str(raised.value)
     assert "secret" not in str(raised.value)
-    assert capfd.readouterr().err == ""  # neither OpenCV nor FFmpeg says anything of its own
+    assert capfd.readouterr().err == ""  # neither OpenCV nor FFmpeg prints a message
 
 
 def test_truncated_video_yields_its_frames(tmp_path, caplog, capfd):

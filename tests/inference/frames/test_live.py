@@ -112,10 +112,10 @@ class Dead(Camera):
 
 
 @pytest.mark.parametrize("hangs", [False, True])
-@pytest.mark.parametrize(("alive", "said"), [(0, "since it was opened"), (1, "no image for")])
-def test_camera_without_further_frames_is_an_error(hangs, alive, said):
+@pytest.mark.parametrize(("alive", "message"), [(0, "since it was opened"), (1, "no image for")])
+def test_camera_without_further_frames_is_an_error(hangs, alive, message):
     source = Live(3, lambda _: Dead(alive, hangs), first_s=0.2, stalled_s=0.2)
-    with pytest.raises(RunError, match=said) as raised:
+    with pytest.raises(RunError, match=message) as raised:
         list(source.frames())
     assert str(raised.value).startswith("camera 3: no image for 0.2 s")
 
