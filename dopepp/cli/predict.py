@@ -262,7 +262,11 @@ class _Session:
         return result, format_reasons(reason)
 
     def _records(self, result: PoseResult) -> list[dict[str, object]]:
-        """Return the detections as plain values; with ``--verify``, with their agreement."""
+        """Return the detections as plain values.
+
+        With ``--verify``, ``agreement`` states how well the part's outline and creases agree with
+        the image, in [0, 1].
+        """
         records = result.records()
         if self._verified is None:
             return records

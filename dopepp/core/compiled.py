@@ -37,21 +37,21 @@ def compiled(**options: Any) -> Callable[[Function], Function]:
 
 
 _warm_ups: Final[list[str]] = []
-"""Functions that a second process calls when this process starts to compile."""
+"""Functions (``module:function``) that are called in other processes at the first compilation."""
 
 
 def compile_in_background(function: str) -> None:
-    """Register ``module:function``, which a second process calls to compile loops of a later job.
+    """Register a function (``module:function``) whose call compiles loops that are needed later.
 
-    The second process starts when this process has to compile, as on a new machine. Both processes
-    use the same cache, so that two cores share the compilation.
+    When this process compiles for the first time, as on a new machine, it starts a process for each
+    registered function. All processes use the same cache, so several cores share the compilation.
     """
     if function not in _warm_ups:
         _warm_ups.append(function)
 
 
 class _Compilation(event.Listener):  # type: ignore[misc]  # numba has no types
-    """Shares the first compilation with a second process, and logs the reason for the delay.
+    """Shares the first compilation with other processes, and logs the reason for the delay.
 
     Garbage collection is paused, because it would take a quarter of the time without effect.
     """
@@ -59,7 +59,7 @@ class _Compilation(event.Listener):  # type: ignore[misc]  # numba has no types
     is_first, depth, collects = True, 0, False
 
     def on_start(self, event: event.Event) -> None:
-        """Pause garbage collection; at the first compilation, start the second process."""
+        """Pause garbage collection; at the first compilation, start the other processes."""
         if self.depth == 0:
             self.collects = gc.isenabled()
             gc.disable()
@@ -78,7 +78,7 @@ class _Compilation(event.Listener):  # type: ignore[misc]  # numba has no types
 
 
 def _call_in_process(module: str, function: str) -> None:
-    """Call a function in a second process, if one can be started."""
+    """Call a function in a new process, if the process can be started."""
     code = f"import sys; sys.path[:] = {sys.path!r}; from {module} import {function} as f; f()"
     with contextlib.suppress(OSError):
         null = subprocess.DEVNULL

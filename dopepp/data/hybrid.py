@@ -140,7 +140,7 @@ class HybridSource:
 class WindowedSource(WrappedSource):
     """Windows of another source's scaled images that contain the centre of an object.
 
-    Networks that train on windows of renders need windows of photographs as well. Each epoch draws
+    Networks that train on windows of renders need windows of photographs too. Each epoch samples
     object and window again, uniformly among the windows that contain the object's centre, or among
     all windows without an object. Smaller images are padded, as for prediction.
 

@@ -63,7 +63,7 @@ class RenderJob:
     record: Mapping[str, Any]  # the settings as plain values; equal records give equal bytes
 
     def writer(self, root: Path) -> Writer:
-        """Return a new writer into a folder."""
+        """Return a writer of images in the job's layout to the data set in ``root``."""
         writer = _find_writer(self.layout)(root, self.factory.parts)
         if self.views > 1:
             writer.chunk_size = self.views  # a folder for each static scene

@@ -198,7 +198,7 @@ class RenderTasks:
 
     @cached_property
     def _writer(self) -> Writer:
-        """This process's writer into the data set."""
+        """Writer of this process for the images of the data set."""
         cv2.setNumThreads(1)
         os.environ.setdefault(THREADS_SETTING, "1")
         if not is_claimed(self._root):

@@ -72,7 +72,7 @@ def _refuse_used_folder(arguments: Sequence[str]) -> None:
         return
     from dopepp.experiment.results.folder import VERSIONS_FILE
 
-    # Further processes of a run receive the folder of the first process.
+    # Processes of higher rank receive the folder that rank 0 has created.
     if Path(folder, VERSIONS_FILE).is_file() and program.is_first_process():
         raise UserError(
             f"hydra.run.dir={folder}, which holds a run",

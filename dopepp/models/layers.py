@@ -86,7 +86,7 @@ def double(maps: Features) -> Float[Tensor, "batch channels 2*height 2*width"]:
 
 
 def initialise(module: nn.Module) -> None:
-    """Draw convolution and linear weights from He's normal distribution; set biases to 0.
+    """Sample convolution and linear weights from He's normal distribution; set biases to 0.
 
     The variance 2 / fan_in (He et al. 2015, Eq. 10) preserves the scale of activations in networks
     without batch norm that are as deep as DOPE's cascade. Weights on ``meta`` are skipped, because

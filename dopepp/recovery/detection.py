@@ -79,10 +79,10 @@ class Detection:
         covariance: Covariance of a small rotation about the object's origin (rotation vector in
             the camera frame, radians) and a small translation (camera frame, metres).
         kept: Why the refinement kept the network's pose; empty otherwise.
-        agreement: Share of the image's evidence about the refined outline that agrees with it, in
-            [0, 1]; None without refinement.
-        support: Share of the refined outline that has agreeing evidence, in [0, 1]; an occluded
-            outline has none. None without refinement.
+        agreement: Share of the image's information about the outline that agrees with the refined
+            outline, in [0, 1]; None without refinement.
+        support: Share of the refined outline at which image information agrees, in [0, 1]; occluded
+            points have no information. None without refinement.
         probability: Probability that ADD(-S) is below a tenth of the diameter, from the image at
             the refined pose (:mod:`dopepp.inference.refinement.verification`); None without
             refinement by region.

@@ -227,7 +227,7 @@ class EmptyMaps(Callback):
         self._sizes.append(extent.amax(dim=-1) / system.geometry.stride)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Count validations without belief peaks above the thresholds; warn after ``patience``."""
+        """Warn after ``patience`` consecutive validations without peaks above the thresholds."""
         assert isinstance(pl_module, PoseSystem)
         if trainer.world_size > 1:
             torch.distributed.all_reduce(self._highest, torch.distributed.ReduceOp.MAX)

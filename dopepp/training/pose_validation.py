@@ -1,9 +1,9 @@
 """Pose metrics, early stopping and contact sheets of validations.
 
-Poses are recovered from the maps and compared by the same accumulator as in evaluations. To log
-another metric, add a field of :class:`~dopepp.metrics.row.PoseRow` and its name in :data:`LOGGED`.
-To draw another sheet of the first validation images, add a subclass of :class:`ValidationSheet`
-with a ``name`` and :meth:`~ValidationSheet.tiles`, a line in
+Poses are recovered from the maps, and ``PoseMetrics`` accumulates their errors as in evaluations.
+To log another metric, add a field of :class:`~dopepp.metrics.row.PoseRow` and its name in
+:data:`LOGGED`. To draw another sheet of the first validation images, add a subclass of
+:class:`ValidationSheet` with a ``name`` and :meth:`~ValidationSheet.tiles`, a line in
 ``dopepp/experiment/assembly/build_system.py`` and an entry in ``conf/callbacks``.
 """
 
@@ -54,12 +54,12 @@ class PoseMetricsCallback(Callback):
     metrics: PoseMetrics
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Create an accumulator for the system's parts."""
+        """Create the pose metrics of the system's parts."""
         assert isinstance(pl_module, PoseSystem)
         self.metrics = PoseMetrics(pl_module.parts)
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Reset the accumulator, on the device that gathers across processes."""
+        """Reset the pose metrics, on the device that gathers them across processes."""
         self.metrics.to(pl_module.device).reset()
 
     def on_validation_batch_end(  # type: ignore[override]

@@ -81,7 +81,7 @@ class RefinedProgress(Callback):
     def _measure_and_report(self, trainer: Trainer, system: PoseSystem) -> bool:
         """Measure, log, print and draw; return whether the goal is reached."""
         estimator = self._estimator(system)
-        # Only the first process measures, so nothing is gathered.
+        # Only rank 0 measures, so metrics are not gathered across processes.
         metrics = PoseMetrics(system.parts, sync_on_compute=False)
         share, count, precision = self._measure(estimator, metrics, 0, NUM_IMAGES)
         if self.stop_at is not None and share >= self.stop_at:

@@ -31,7 +31,7 @@ from dopepp.virtual.renderers.raster.visibility import centres_within, draw_alon
 from dopepp.virtual.scene import NEAR, Material, SceneObject
 
 _REDRAWS: Final = 25
-"""Redraws of a position before the orientation is drawn again; some orientations never fit."""
+"""Positions to sample before a new orientation is sampled; some orientations never fit."""
 
 
 class Composition:
@@ -50,7 +50,7 @@ class Composition:
         self._preview = Preview(self.K, self.size, self.preset.min_visible_fraction)
 
     def draw_material(self, body: Body) -> Material:
-        """Draw a body's material; all instances of a part may share it."""
+        """Sample a body's material; all instances of a part may share it."""
         if body.part is None or not self._alike:
             return self.preset.materials.draw(self.rng, body.surface)
         name = body.part.name
@@ -59,7 +59,7 @@ class Composition:
         return self._materials[name]
 
     def draw_distractor(self, depth: float) -> Body:
-        """Draw a distractor for a depth in metres."""
+        """Sample a distractor for a depth in metres."""
         width_at_depth = self.size[0] * depth / float(self.K[0, 0])
         return self.preset.distractors.draw(self.rng, width_at_depth, self.negatives)
 
@@ -144,8 +144,8 @@ def arrange_floating(
 ) -> float:
     """Place targets and distractors, and return the targets' mean depth, metres.
 
-    If the first target does not fit, no target is placed. Without targets, the depth is drawn for
-    the body ``reference_body``.
+    If the first target does not fit, no target is placed. Without targets, the depth is sampled
+    for the body ``reference_body``.
     """
     for body in targets:
         material = composition.draw_material(body)
@@ -165,7 +165,7 @@ def arrange_floating(
 
 
 def _draw_pose(composition: Composition, body: Body) -> Transform:
-    """Draw a body's orientation and position from the preset."""
+    """Sample a body's orientation and position from the preset."""
     preset, rng = composition.preset, composition.rng
     rotation = preset.turning.draw(rng)
     turned = body.surface.hull @ rotation.T

@@ -214,7 +214,7 @@ class Distractors(Checked):
     lookalike_scale: Annotated[Pair, Span(0.01, 100.0, "factor")] = (0.7, 1.3)
 
     def draw(self, rng: Generator, width_at_depth: float, negatives: Sequence[Body]) -> Body:
-        """Draw a distractor for a depth at which the image spans ``width_at_depth`` metres."""
+        """Sample a distractor for a depth at which the image spans ``width_at_depth`` metres."""
         if rng.random() < self.lookalike_share and negatives:
             negative = negatives[int(rng.integers(len(negatives)))]
             return negative.stretched(np.full(3, rng.uniform(*self.lookalike_scale)))

@@ -186,7 +186,7 @@ def approach(objects: Sequence[SceneObject], scale: float) -> Vector:
 
 
 def _draw_camera(scene: Scene, rng: Generator) -> Transform:
-    """Draw the pose of a further camera of a static scene, T_new_cam."""
+    """Sample the pose of a further camera of a static scene, T_new_cam."""
     angle, first = np.radians(rng.uniform(*BESIDE_DEG)), rng.uniform(0.0, 2 * np.pi)
     middle = _middle(scene.objects)
     point = np.array([0.0, 0.0, 1.0]) if middle is None else middle

@@ -1,7 +1,8 @@
 """Heaps: objects that physics has dropped into a bin or onto the open table.
 
-A heap is drawn from its number, simulated once and cached (``physics``). Every image of a heap
-turns and shifts the heap and draws its own view, materials and light.
+A heap's objects are sampled with the heap's number as seed, simulated once and cached
+(``physics``). Each image of a heap turns and shifts the heap, and samples its own view, materials
+and light.
 """
 
 from __future__ import annotations

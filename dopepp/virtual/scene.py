@@ -146,7 +146,7 @@ class Scene:
 
     Attributes:
         T_cam_world: Pose of the camera of :meth:`seen_from`; the world frame is the camera that the
-            preset has drawn.
+            preset has sampled.
     """
 
     K: CameraMatrix

@@ -85,12 +85,12 @@ class Sensors(Checked):
         return replace(self, blur_px=blur, motion_px=motion)
 
     def draw(self, rng: Generator) -> Sensor:
-        """Draw a sensor's settings."""
+        """Sample a sensor's settings."""
         steps = ("exposure", "blur", "motion", "noise", "jpeg")
         on = rng.random(5) < [getattr(self, f"{step}_probability") for step in steps]
         direction, length = rng.uniform(0, 2 * np.pi), rng.uniform(*self.motion_px)
         motion = (float(length * np.cos(direction)), float(length * np.sin(direction)))
-        # All numbers are drawn, used or not, so that a probability changes no other effect.
+        # All numbers are sampled, used or not, so that a probability changes no other effect.
         exposure, blur = rng.uniform(*self.exposure_ev), rng.uniform(*self.blur_px)
         read, shot = rng.uniform(*self.read_noise), rng.uniform(*self.shot_noise)
         quality = int(rng.integers(self.jpeg_quality[0], self.jpeg_quality[1] + 1))

@@ -41,7 +41,7 @@ def arrange_on_table(composition: Composition, table: Table, targets: Sequence[B
         T_cam_table (plane z = 0, z up).
     """
     rng = composition.rng
-    # Draw another view if no target fits into the image.
+    # Sample another view if no target fits into the image.
     for _ in range(8):
         composition.clear()
         scene = _TableScene(composition, table, targets)
@@ -94,7 +94,7 @@ class _TableScene:
         return False
 
     def _candidates(self, body: Body) -> Iterable[_RestingPose]:
-        """Draw resting poses of a body; on a heap, the lowest first."""
+        """Sample resting poses of a body; on a heap, the lowest first."""
         if not self.table.heaped:
             return self._resting_poses(body)
         # Objects slide down: prefer the lowest pose of two orientations.
@@ -122,7 +122,7 @@ class _TableScene:
             yield _RestingPose(make_transform(rotation, origin), footprint, cell, height, centre)
 
     def _draw_point(self) -> tuple[float, float] | None:
-        """Draw a point of the table, metres: in the heap's circle, or under a random pixel."""
+        """Sample a point of the table, metres: in the heap's circle, or under a random pixel."""
         rng = self.rng
         if self.table.heaped:
             # The root makes the points uniform over the circle's area.
@@ -139,7 +139,7 @@ class _TableScene:
 
 
 def draw_view(table: Table, composition: Composition) -> Transform:
-    """Draw T_cam_table; the middle of the image or window shows the table's origin."""
+    """Sample T_cam_table; the middle of the image or window shows the table's origin."""
     T_cam_table = table.draw_view(composition.rng)
     if composition.preset.window is None:
         return T_cam_table

@@ -31,7 +31,7 @@ MAX_DRAWS: Final = 8  # Largest number of crops to draw from an image.
 
 
 class BackgroundCrops:
-    """Draws crops of an image that show no object.
+    """Samples crops of an image that show no object.
 
     Args:
         image: RGB, without padding, as padding is not background.
@@ -52,7 +52,7 @@ class BackgroundCrops:
         self._integral = cv2.integral(occupied.astype(np.uint8))
 
     def draw(self, size: Size, rng: Generator) -> RGBImage | None:
-        """Return a crop of (height, width), or None if no draw has contrast."""
+        """Return a random crop of (height, width), or None if no sampled crop has contrast."""
         windows = np.flatnonzero(self._is_free(size).ravel())
         for _ in range(self.max_draws if len(windows) else 0):
             crop = self._crop(int(rng.choice(windows)), size)
@@ -185,7 +185,7 @@ class RandomMask(Checked):
         return replace(sample, image=image, instances=instances)
 
     def _patch(self, object_mask: Mask, rng: Generator) -> tuple[slice, slice] | None:
-        """Draw a patch inside the object's box; None if the box is too small."""
+        """Sample a patch inside the object's box; None if the box is too small."""
         slices = []
         limits = self.max_height, self.max_width
         for side, limit in zip(mask_slices(object_mask), limits, strict=True):
@@ -201,7 +201,11 @@ class RandomMask(Checked):
     def _crop(
         self, crops: BackgroundCrops, size: Size, rng: Generator, other: Backgrounds
     ) -> RGBImage | None:
-        """Draw a crop from the image's background, else from another image."""
+        """Return a random crop of the image's background.
+
+        If no part of the background is suitable, the crop is from ``other``. The result is None if
+        the sampled crops of ``other`` have no contrast either.
+        """
         crop = crops.largest(size, rng)
         if crop is not None:
             return crop

@@ -141,7 +141,7 @@ class _Cover:
         return self.order <= min(int(last), _NEVER - 1)
 
     def _draw_crop(self, crops: BackgroundCrops, rng: Generator) -> RGBImage | None:
-        """Draw a crop of random size, reduced to fit the background, or None."""
+        """Sample a crop of random size, reduced to fit the background, or None."""
         extent = self._visible.shape
         if min(extent) < MIN_PATCH_PX:
             return None
@@ -151,7 +151,7 @@ class _Cover:
         return crops.largest((height, width), rng)
 
     def _add_patch(self, crop: RGBImage, pixel: Int[np.ndarray, "2"], rng: Generator) -> None:
-        """Draw a crop below earlier crops, at a random position that covers ``pixel``."""
+        """Insert a crop below earlier crops, at a random position that covers ``pixel``."""
         slices = []
         for position, length, extent in zip(pixel, crop.shape, self.order.shape, strict=False):
             first, last = max(0, position - length + 1), min(position, extent - length)

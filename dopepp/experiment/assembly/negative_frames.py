@@ -50,7 +50,7 @@ FRAME: Final[Size] = (640, 480)
 _MAX_DISTRACTORS: Final = 12  # per frame; limits the rendering time
 _LOOKALIKES_SHOWN: Final = (1, 3)  # smallest and largest number per frame
 _MARGIN: Final = 0.3  # border without look-alikes, share of the frame, if there is no camera
-_NUM_POSES: Final = 64  # number of drawn poses per part for measuring the preset's distances
+_NUM_POSES: Final = 64  # number of sampled poses per part for measuring the preset's distances
 
 
 def negative_frames(

@@ -100,7 +100,10 @@ class Value(NamedTuple):
 
     @property
     def within_noise(self) -> bool:
-        """Whether the difference may be due to chance."""
+        """Whether a difference to the baseline is not significant.
+
+        Too few instances differ, or the 95 % interval contains 0.
+        """
         return self.num_differing < MIN_DIFFERING or self.low <= 0 <= self.high
 
     @property

@@ -66,7 +66,7 @@ class Method(Protocol):
     """Source of poses for the images of a test set.
 
     Attributes:
-        parts: Objects to score, as defined by the test set.
+        parts: Objects to measure, as defined by the test set.
         min_score: Smallest score of a reported candidate.
     """
 
@@ -168,12 +168,13 @@ class FilePose:
 class FileMethod:
     """Poses of another program, read from a BOP challenge CSV.
 
-    Poses of objects that are not measured are ignored. All others are reported.
+    Poses of other objects than ``parts`` are ignored. All poses with a score of at least 0 count
+    as detections.
 
     Args:
         path: CSV file.
-        parts: Objects to score.
-        numbers: BOP number of every object by name.
+        parts: Objects to measure.
+        numbers: BOP's ``obj_id`` of each object, by name.
     """
 
     min_score = 0.0
@@ -188,7 +189,7 @@ class FileMethod:
             self._unused.setdefault((row.scene_id, row.im_id), []).append(row)
 
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
-        """Return the poses of an image and the largest time in its lines."""
+        """Return an image's poses, and the largest time of its lines in seconds or None."""
         rows = self._used.setdefault(image, self._unused.pop(image, []))
         poses = [
             FilePose(part.name, row.score, T, project_keypoints(part.cuboid, T, sample.K))
@@ -199,7 +200,7 @@ class FileMethod:
         return poses, seconds if seconds >= 0 else None
 
     def cost(self, seconds: Sequence[float]) -> Cost:
-        """Return the median of the times in the file."""
+        """Return the median of the images' times in the file."""
         return Cost(ms_per_frame=_median_ms(seconds))
 
     def check_used(self) -> None:
@@ -229,7 +230,7 @@ class FileMethod:
 
 
 def object_numbers(data: DataConfig, parts: Parts) -> dict[str, int]:
-    """Return the BOP number of each object by name.
+    """Return BOP's ``obj_id`` of each object, by name.
 
     Numbers come from ``models_info.json`` for BOP data sets and from the line numbers of
     ``classes.txt`` for YCB-Video. Otherwise parts are numbered from 1.

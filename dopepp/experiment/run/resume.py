@@ -57,6 +57,7 @@ _NOT_LEARNT_FROM: Final = (
 )  # fmt: skip
 """Exceptions from :data:`LEARNT_FROM`: caches, loader processes and the test images."""
 _THIS_CALL: Final = ("resume", "resume_anyway", "output_dir")
+"""Options that resume a run or select its folder, and do not affect the training."""
 _NETWORK: Final = ("model.backbone", "model.attention", "model.head", "model.width")
 _OPTIMIZER: Final = "optimizer._target_"
 
@@ -123,7 +124,7 @@ def check_resume(
 
 
 def config_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[ConfigDifference]:
-    """Return the options in which two configs differ, except options of a single call."""
+    """Return the options in which two configs differ, except the options of :data:`_THIS_CALL`."""
     before, after = dict(flatten(old)), dict(flatten(new))
     return [
         ConfigDifference(key, (str(before.get(key, _ABSENT)), str(after.get(key, _ABSENT))))
@@ -145,7 +146,7 @@ def image_differences(saved: object, present: object) -> list[ConfigDifference]:
 
 
 def trusted_overrides(stored: object, source: Path) -> list[str]:
-    """Return the overrides of a run, without options of a single call.
+    """Return the overrides of a run, except those that resume it or select its folder.
 
     A run folder is not trusted. Hydra's flags and nodes could execute arbitrary code, so they are
     not read from a folder.

@@ -141,7 +141,7 @@ def _train(
         )
     seed_everything(config.seed, verbose=False)
     keep_freed_memory()
-    # Only the first process reports.
+    # Only rank 0 reports.
     display.console.quiet = not is_first_process()
     parts = build_parts(config.data)
     config = fit_to_camera(config, parts)
@@ -179,7 +179,7 @@ def _train(
     _fit(trainer, system, datamodule, resume_from, run_dir)
     raise_if_pruned(trainer)
     if not trainer.is_global_zero:
-        raise SystemExit(0)  # only the first process measures and reports
+        raise SystemExit(0)  # only rank 0 measures and reports
     _print_outcome(trainer, run_dir)
     report = _measure_run(config, parts, run_dir, trainer)
     log_report(trackers, report, run_dir)
@@ -218,7 +218,7 @@ def _fit(
         raise
     except RunError as error:
         if not trainer.is_global_zero and not isinstance(error, ProcessDiedError):
-            raise SystemExit(1) from error  # the first process reports the common reason
+            raise SystemExit(1) from error  # rank 0 reports the common reason
         kept = (run_dir / LAST_CHECKPOINT).is_file()
         advice = f"continue with resume={run_dir}" if kept else "no checkpoint was saved yet"
         raise RunError(f"{error}; {advice}") from error

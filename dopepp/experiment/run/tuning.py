@@ -158,8 +158,8 @@ def tune(
         target: Number of images without objects, and permitted rate of false positives.
 
     Raises:
-        UserError: There are no detections, all of them are correct, all are incorrect, or the
-            covariances differ too much from the errors.
+        UserError: There are no detections, all detections are correct, all are incorrect, or a
+            covariance factor is outside the range of :func:`fit_covariance_factor`.
     """
     old, cache = estimator.recovery, TuningCache()
     estimator = cache.with_cached_maps(estimator)
@@ -288,14 +288,14 @@ class WrongFocalLengths:
 
 
 def fit_refined_factor(estimator: PoseEstimator, parts: Parts, source: SampleSource) -> float:
-    """Fit the covariance factor of refined poses to the errors of correct poses.
+    """Fit the factor on the covariances of refined poses to the errors of correct poses.
 
     Returns:
         The factor, at least :data:`MIN_REFINED_FACTOR`; 1 if there are fewer than
         :data:`MIN_REFINED` correct poses.
 
     Raises:
-        UserError: The covariances differ too much from the errors.
+        UserError: The factor is outside the range of :func:`fit_covariance_factor`.
     """
     matches = matched_poses(estimator, parts, source, only_right=True)
     pairs = [match for match in matches if match[0].agreement is not None]

@@ -132,7 +132,7 @@ class JointRefinement:
     T_world_obj: Transform
     covariance: PoseMatrix  # rotation vector about the object's origin and shift, world axes
     agreements: Sequence[OutlineAgreement | None]  # of each view; None without the outline
-    # Mahalanobis distance of each view's evidence from the other views', per √degree of freedom
+    # Mahalanobis distance per √degree of freedom between each view and all other views
     disagreements: Sequence[float]
 
 
@@ -246,7 +246,7 @@ class _ViewSearch:
 
 
 def _disagreements(end: Solution, prior: Prior, owners: Sequence[int]) -> dict[int, float]:
-    """Return the distance of each view's evidence from the other views and the prior.
+    """Return the Mahalanobis distance of each view from the other views and the prior.
 
     Args:
         end: Pose with the equations of each term.

@@ -1,4 +1,4 @@
-"""Refinement of poses by one solver; ``refine=`` selects the evidence (terms).
+"""Refinement of poses by one solver; ``refine=`` selects the measurement terms.
 
 ``region`` uses the outline on the image, ``depth`` a depth image. With both terms:
 
@@ -104,7 +104,7 @@ class Refiner:
         self._refiners = {part.name: PartRefiner(part, terms, scale_error) for part in parts}
         self._cuboids = {part.name: part.cuboid for part in parts}
         self.verifies = "region" in terms
-        """Whether refined poses are verified, from the same evidence as the term ``region``."""
+        """Whether refined poses are verified, which requires the term ``region``."""
         self.uses_depth = "depth" in terms
         """Whether poses are refined on depth images, if available."""
 

@@ -1,4 +1,4 @@
-"""Solver of a pose: Gauss–Newton steps on a prior and several terms of evidence.
+"""Solver of a pose: Gauss–Newton steps on a prior and several measurement terms.
 
 To add a kind of evidence, write a :class:`Term`.
 """
@@ -39,7 +39,7 @@ MIN_ALONG: Final = 0.15
 
 
 class UndecidedError(Exception):
-    """Reason why the evidence does not determine a pose."""
+    """Reason why the measurements do not determine a pose."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ class Refinement:
     T_cam_obj: Transform
     covariance: PoseMatrix | None = None  # see PnPResult; None if the given pose was kept
     reason: str = ""  # why the given pose was kept; empty if it was refined
-    agreement: float | None = None  # share of the image's evidence that agrees with the outline
-    support: float | None = None  # share of the outline with agreeing evidence
+    agreement: float | None = None  # agreeing share of the image's information
+    support: float | None = None  # share of the outline with agreeing information
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class Solution:
     """Pose and information at the end of a descent."""
 
     T_cam_obj: Transform
-    information: PoseMatrix  # inverse covariance of evidence and prior
+    information: PoseMatrix  # inverse covariance, from the terms and the prior
     # Equations of each term of `descend` at this pose, linearised before the last step
     equations: Sequence[NormalEquations] = ()
 
@@ -80,10 +80,10 @@ class Prior:
         return max(0.0, float(offset @ self.information @ offset))
 
     def draws(self, spread: float, count: int) -> list[Transform]:
-        """Draw poses from a Gaussian around the pose; every call returns the same poses.
+        """Sample poses around the mean; every call returns the same poses.
 
         Args:
-            spread: Factor on the standard deviations.
+            spread: Factor on the standard deviations of the distribution.
             count: Number of poses.
         """
         deviations = spread * np.linalg.cholesky(np.linalg.inv(self.information))
@@ -120,13 +120,13 @@ def make_prior(
 
 
 class Term(Protocol):
-    """Evidence about a pose."""
+    """Term of the cost that :func:`descend` minimises, e.g. from the outline or the depth."""
 
     def __call__(self, pose: Transform, prior: NormalEquations, /) -> NormalEquations | None:
-        """Linearise the evidence at a pose; return None if there is none.
+        """Return the term's normal equations at a pose; None if no measurement is usable.
 
-        ``prior`` contains the prior and all other terms. Earlier terms are linearised in this
-        iteration, later terms in the last one.
+        ``prior`` is the sum of the equations of the prior and of all other terms. Earlier terms
+        were linearised in this iteration, later terms in the previous iteration.
         """
 
 
@@ -136,7 +136,7 @@ def descend(
     """Take Gauss–Newton steps on the prior and the terms from a start pose.
 
     Returns:
-        The solution after at most ``steps`` steps; None if a term has no evidence.
+        The solution after at most ``steps`` steps; None if a term has no usable measurement.
     """
     pose, information = T_cam_obj, prior.information
     step = np.zeros(6)

@@ -54,7 +54,7 @@ EVIDENCE: Final = (
     "spread",  # logarithm of the stated deviation of the part's points over a tenth of the diameter
     "size",  # logarithm of the extent on the image over 100 pixels
 )
-"""Evidence about a pose, in this order."""
+"""Features of a pose and an image, in the order in which the verification model reads them."""
 
 LONGEST_PX: Final = 120  # approximate length of the part on the crop
 SPACING: Final = 80.0  # number of sampled points along the part's extent

@@ -209,7 +209,7 @@ class JointEstimator:
         evidence: Sequence[ViewEvidence],
         disagreement: float = 0.0,
     ) -> JointPart:
-        """Combine the evidence of all views to the probability and score of a part."""
+        """Combine the probabilities of all views into the probability and score of a part."""
         best = max((item.detection for item in observations), key=lambda detection: detection.score)
         single_odds, odds = log_odds(best.probability or 0.0), 0.0
         for item in evidence:

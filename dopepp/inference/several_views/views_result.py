@@ -25,7 +25,7 @@ this position. ``outside``: the pose is outside the image."""
 
 @dataclass(frozen=True, eq=False)
 class ViewEvidence:
-    """Evidence of one view about a part."""
+    """Visibility and probability of a part's pose in one view."""
 
     view: str  # name of the view
     status: Status
@@ -44,10 +44,10 @@ class WorldDetection:
     # Covariance of a rotation vector about the object's origin (radians) and a shift (metres), in
     # world axes; it includes the errors of the camera poses
     covariance: PoseMatrix
-    evidence: Sequence[ViewEvidence]  # evidence of each view
-    # Mahalanobis distance per √degree of freedom: the larger of the largest distance between the
-    # evidence of one view and of all others, and the smallest distance between the joint pose and
-    # the pose of a single view
+    evidence: Sequence[ViewEvidence]  # one entry per view
+    # Mahalanobis distance per √degree of freedom, the larger of two distances: the largest between
+    # the measurements of one view and of all other views, and the smallest between the joint pose
+    # and the pose from a single view
     disagreement: float = 0.0
 
     @property

@@ -62,7 +62,7 @@ def face_areas(vertices: Vertices, faces: Faces) -> Float[np.ndarray, " faces"]:
 def sample_surface(
     vertices: Vertices, faces: Faces, num_points: int = NUM_SURFACE_POINTS, seed: int = SURFACE_SEED
 ) -> Points:
-    """Draw random points uniformly over the area of a mesh.
+    """Sample random points uniformly over the area of a mesh.
 
     Raises:
         ValueError: The triangles have no area.
@@ -79,7 +79,7 @@ def sample_surface(
 def _points_inside(
     triangles: Float[np.ndarray, "triangles 3 3"], rng: Generator
 ) -> Float[np.ndarray, "triangles 3"]:
-    """Draw a point uniformly from each triangle."""
+    """Sample a point uniformly from each triangle."""
     a, b, c = triangles.swapaxes(0, 1)
     # √ makes the density of points independent of the distance from corner a.
     root, along = np.sqrt(rng.random((len(a), 1))), rng.random((len(a), 1))

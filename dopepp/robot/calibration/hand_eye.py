@@ -36,7 +36,7 @@ MOUNTS: Final[tuple[Mount, Mount]] = ("hand", "bench")
 
 Covariances = Float[np.ndarray, "poses 6 6"]
 Residuals = Float[np.ndarray, "poses 6"]  # rotations (radians), translations (metres), camera axes
-Noise = Float[np.ndarray, "2"]  # standard deviations of a robot's rotation and position
+Noise = Float[np.ndarray, "2"]  # standard deviations of a robot's pose: radians, metres
 
 MIN_POSES: Final = 3
 
@@ -189,7 +189,11 @@ def _residuals(M: Transforms, B: Transforms, X: Transform, Y: Transform) -> Resi
 def _covariances(
     M: Transforms, X: Transform, Y: Transform, B_cov: Covariances, robot: Noise
 ) -> Covariances:
-    """Return the covariances of the residuals: the sums of image and robot covariances."""
+    """Return the covariances of :func:`_residuals`, camera axes.
+
+    Each covariance is the sum of the board's covariance ``B_cov`` and of the robot's covariance,
+    which is propagated to the pose of the board.
+    """
     # Derivative of the board's pose, in camera axes, by a small rotation (about the origin of the
     # camera's mount) and translation of the robot's pose.
     to_cam = X[:3, :3].T

@@ -209,7 +209,8 @@ def match_images(poses: RobotPoses, images: Sequence[str]) -> dict[str, int]:
                 f"{poses.source}: {len(missing)} poses without an image, the first "
                 f"{missing[0]!r:.80}",
                 f"names such as {images[0] if images else '…'!r}",
-                "write the names of the images' files, or pass the folder with these images",
+                "set the name of each pose to the file name of its image, or pass the folder with "
+                "these images",
             )
         return {full_names[name]: row for row, name in enumerate(poses.names)}
     if len(poses.names) != len(images):

@@ -216,7 +216,7 @@ class Trials:
         return near + 0.4 * (far - near), near + 0.75 * (far - near)
 
     def _robot(self, block: int) -> tuple[TrueRobot, CalibratedRobot]:
-        """Draw the true robot of a block of trials, and calibrate it."""
+        """Sample the true robot of a block of trials, and calibrate it."""
         rng = np.random.default_rng([self.task.seed, block, 1])
         robot = draw_robot(rng, self.tip)
         return robot, calibrate(robot, self.arm, rng, float(np.mean(self.distance)))
@@ -357,7 +357,7 @@ class Trials:
         )
 
     def _aim_camera(self, robot: TrueRobot, rng: Generator) -> tuple[Joints, Transform]:
-        """Draw joints at which the camera sees the tray; return joints and T_base_cam."""
+        """Sample joints at which the camera sees the tray; return joints and T_base_cam."""
         for _ in range(20):
             point = TRAY + np.array([*rng.uniform(-0.01, 0.01, 2), 0.0])
             distance = rng.uniform(*self.distance)

@@ -72,7 +72,7 @@ class CalibratedRobot:
 
 
 def draw_robot(rng: Generator, tip: Vector) -> TrueRobot:
-    """Draw a robot's errors; ``tip`` is as in :class:`TrueRobot`."""
+    """Sample a robot's errors; ``tip`` is as in :class:`TrueRobot`."""
     angle, shift = (rng.normal(0, spread, 3) for spread in BRACKET)
     error = make_transform(Rotation.from_rotvec(angle).as_matrix(), shift)
     return TrueRobot(rng.normal(0, ZERO, JOINTS), MOUNT @ error, tip)
@@ -101,7 +101,7 @@ def _move(robot: TrueRobot, arm: Arm, goal: Transform) -> FlangePair | None:
 
 
 def _draw_reachable(draw: Callable[[], FlangePair | None], count: int) -> list[FlangePair]:
-    """Draw poses until ``count`` of them are in reach."""
+    """Sample poses and return the first ``count`` poses in reach."""
     drawn = (draw() for _ in range(4 * count))
     pairs = [pair for pair in drawn if pair is not None][:count]
     if len(pairs) < count:

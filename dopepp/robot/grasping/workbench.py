@@ -53,8 +53,8 @@ UPRIGHT: Final = np.radians([90.0, -90.0, 0.0, -90.0, 0.0, 0.0])
 """Joints of an arm that points at the ceiling, outside the image."""
 
 Photographer = Callable[[Transform, Generator], RGBImage]
-"""Takes an image of objects at rest by a camera at T_base_cam; the generator draws the errors of
-the camera's sensor."""
+"""Takes an image of objects at rest by a camera at T_base_cam; the generator samples the errors
+of the camera's sensor."""
 
 _log = logging.getLogger(__name__)
 
@@ -69,14 +69,14 @@ class PlacedSolid:
 
 
 class Layout:
-    """Draws a random arrangement of objects on the bench.
+    """Samples random arrangements of objects on the bench.
 
     Args:
         part: The part to grasp.
         name: One of :data:`LAYOUTS`.
         yaw_deg: Largest rotation of parts about the vertical to either side, degrees. At 0, their x
             axis points to the camera's right.
-        rest: ``front`` lays the part's +z axis upwards; ``any`` draws a resting face.
+        rest: ``front`` lays the part's +z axis upwards; ``any`` selects a random resting face.
     """
 
     def __init__(self, part: Part, name: str, yaw_deg: float, rest: str) -> None:
@@ -86,18 +86,18 @@ class Layout:
         self._yaw, self._rest = np.radians(yaw_deg), rest
 
     def draw(self, rng: Generator) -> list[PlacedSolid]:
-        """Draw the objects and their poses, the parts first."""
+        """Sample the objects and their poses, the parts first."""
         solids: list[PlacedSolid] = getattr(self, self._name)(rng)
         return solids
 
     def draw_pose(self, rng: Generator) -> Transform:
-        """Draw the pose of a single part in the tray."""
+        """Sample the pose of a single part in the tray."""
         return self._draw_part(rng, SPREAD, DROP_HEIGHT, 0.0).T_base_obj
 
     def _draw_part(
         self, rng: Generator, spread: float, height: float, tilt_deg: float
     ) -> PlacedSolid:
-        """Draw the part's pose at a height, within ``spread`` of the tray's centre, both metres."""
+        """Sample a part's pose at ``height`` within ``spread`` of the tray's centre, metres."""
         up = np.array([0.0, 0.0, 1.0])
         if self._rest == "any":
             normals, shares = self.body.hull.rests
@@ -156,7 +156,7 @@ def _standing(body: Body, position: np.ndarray, rng: Generator) -> PlacedSolid:
 
 
 def _draw_in_disc(rng: Generator, radius: float) -> tuple[float, float]:
-    """Draw a point uniformly from a disc around the origin, metres."""
+    """Sample a point uniformly from a disc around the origin, metres."""
     distance, angle = radius * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
     return float(distance * np.cos(angle)), float(distance * np.sin(angle))
 
@@ -182,13 +182,13 @@ class RasterView:
         T_base_cam: Transform,
         rng: Generator,
     ) -> Photographer:
-        """Draw the materials of objects on the bench, the lights and the bench's image.
+        """Sample the materials of objects on the bench, the lights and the bench's image.
 
         Args:
             bodies: Objects on the bench.
             poses: T_base_obj of each object.
             T_base_cam: Pose of the first camera, to which the lights are relative.
-            rng: Draws the scene.
+            rng: Source of all random choices.
         """
         T_cam_base = invert_transform(T_base_cam)
         objects = []
@@ -232,7 +232,7 @@ class MujocoView:
         T_base_cam: Transform,
         rng: Generator,
     ) -> Photographer:
-        """Like :meth:`RasterView.arrange`; nothing is drawn at random."""
+        """Like :meth:`RasterView.arrange`, without random choices."""
         return partial(self._take, poses)
 
     def _take(self, poses: Sequence[Transform], T_base_cam: Transform, rng: Generator) -> RGBImage:

@@ -36,7 +36,7 @@ _SHIPPED: Final = Path(__file__).parent / "photos"
 
 
 class Backgrounds(Protocol):
-    """Draws background images."""
+    """Source of random background images."""
 
     def draw(self, rng: Generator, width: int, height: int) -> RGBImage:
         """Return an RGB image, a pure function of the generator's state."""
@@ -51,7 +51,7 @@ def find_backgrounds(choice: str | Path | None, split: PhotoSplit = "all") -> Ba
     Args:
         choice: None or ``procedural``, the same on every machine; ``skimage`` for the photos in an
             installed scikit-image; or a folder of photos (``./skimage`` for a folder of that name).
-        split: Photos to draw from (:meth:`PhotoBackgrounds.part`).
+        split: Photos to choose from (:meth:`PhotoBackgrounds.part`).
 
     Raises:
         UserError: The folder is missing or contains no photo, or scikit-image is not installed.
@@ -73,7 +73,7 @@ class MixedBackgrounds:
         return [*self.usual.identity(), f"mixed {self.share:g}", *self.other.identity()]
 
     def draw(self, rng: Generator, width: int, height: int) -> RGBImage:
-        """Draw a background from one of the two sources."""
+        """Sample a background from one of the two sources."""
         chosen = self.other if rng.random() < self.share else self.usual
         return chosen.draw(rng, width, height)
 

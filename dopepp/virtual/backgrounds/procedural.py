@@ -30,7 +30,7 @@ class ProceduralBackgrounds:
     """Textures made from noise, gradients, tiles, bricks, wood and scattered shapes."""
 
     def identity(self) -> list[str]:
-        """Return the kind alone: procedural backgrounds are drawn without files."""
+        """Return the kind alone: procedural backgrounds need no files."""
         return ["procedural"]
 
     def draw(self, rng: Generator, width: int, height: int) -> RGBImage:
@@ -178,7 +178,7 @@ _PATTERNS: Final[Sequence[_Pattern]] = (_clouds, _gradient, _checker, _bricks, _
 def _scatter(rng: Generator, image: RGBImage, count: int) -> None:
     """Draw random ellipses, polygons, lines and circles over an image in place."""
     height, width = image.shape[:2]
-    # Draw all numbers at once; single draws would take longer than the shapes.
+    # Sample all numbers at once; single draws would take longer than the shapes.
     for red, green, blue, x, y, size, kind, turn, more in rng.random((count, 9)).tolist():
         colour = (256 * red, 256 * green, 256 * blue)
         centre = (int(x * width), int(y * height))

@@ -112,7 +112,7 @@ class Preset(Checked):
     def draw_camera(self, rng: Generator) -> tuple[CameraMatrix, Size]:
         """Return K and (width, height) of the rendered image or window.
 
-        A window is centred on a uniformly drawn point, then shifted into the image. A window
+        A window is centred on a uniformly sampled point, then shifted into the image. A window
         larger than the image is centred on the image.
         """
         K, size = self.K, (self.width, self.height)

@@ -78,14 +78,14 @@ class Materials(Checked):
     alike_share: Share = 0.5
 
     def draw(self, rng: Generator, surface: Surface) -> Material:
-        """Draw a surface's material."""
+        """Sample a surface's material."""
         pitch = surface.radius * rng.uniform(*self.noise_pitch)
         if surface.is_coloured:
             gain = np.full(3, rng.uniform(*self.texture_gain))
             if self.texture_tint:
                 gain *= 1 + rng.uniform(-self.texture_tint, self.texture_tint, 3)
             roughness, specular = rng.uniform(*self.roughness), rng.uniform(*self.specular)
-            # Draw only if needed, so that the images of other presets do not change.
+            # Sample only if needed, so that the images of other presets do not change.
             noise = rng.uniform(*self.texture_noise) if self.texture_noise[1] else 0.0
             return Material(triple(gain), roughness, specular, noise=noise, noise_pitch=pitch)
         noise = rng.uniform(*self.noise)
@@ -94,7 +94,7 @@ class Materials(Checked):
         return self._dielectric(rng, surface, noise, pitch)
 
     def _metal(self, rng: Generator, noise: float, pitch: float) -> Material:
-        """Draw a bare metal: nearly grey, possibly brushed along one of the object's axes."""
+        """Sample a bare metal: nearly grey, possibly with brush marks across an object axis."""
         colour = _grey(rng, rng.uniform(*self.metal_albedo))
         grooves = None
         if rng.random() < self.brushed_share:
@@ -106,7 +106,7 @@ class Materials(Checked):
         )
 
     def _dielectric(self, rng: Generator, surface: Surface, noise: float, pitch: float) -> Material:
-        """Draw a plastic; a 3D print has layers along its build axis."""
+        """Sample a plastic; a 3D print has layers along its build axis."""
         brightness = rng.uniform(*self.albedo)
         if rng.random() < self.coloured_share:
             srgb = colorsys.hsv_to_rgb(rng.random(), rng.uniform(*self.saturation), 1.0)
@@ -128,14 +128,17 @@ class Materials(Checked):
 
 
 def _grey(rng: Generator, brightness: float) -> Triple:
-    """Draw a nearly grey colour."""
+    """Sample a nearly grey colour."""
     return triple(np.clip(brightness * (1 + rng.uniform(-_GREY_CAST, _GREY_CAST, 3)), 0.0, 1.0))
 
 
 def _grooves(
     rng: Generator, axis: int, pitch: Pair, slope: Pair, irregularity: float = 0.0
 ) -> Grooves:
-    """Draw grooves along an axis, with pitch and slope from their ranges."""
+    """Sample grooves across an object axis (0 to 2); see :class:`~dopepp.virtual.scene.Grooves`.
+
+    The pitch (metres) and the slope are uniform in their ranges.
+    """
     direction = triple(np.eye(3)[axis])
     return Grooves(direction, rng.uniform(*pitch), rng.uniform(*slope), irregularity)
 
@@ -182,7 +185,7 @@ class Lighting(Checked):
     def draw(
         self, rng: Generator, centre: Vector, normal: Vector | None = None
     ) -> tuple[tuple[Light, ...], Ambient]:
-        """Draw the ambient light and point lights around ``centre``, camera frame, metres.
+        """Sample the ambient light and point lights around ``centre``, camera frame, metres.
 
         ``normal`` is the normal of the supporting plane; None without a plane.
         """
@@ -203,7 +206,7 @@ class Lighting(Checked):
         return tuple(lights), Ambient(triple(towards), triple(above), triple(below))
 
     def _colour(self, rng: Generator) -> Vector:
-        """Draw the linear RGB of a lamp of luminance about 1."""
+        """Sample the linear RGB of a lamp of luminance about 1."""
         # Uniform in 1/T, because equal steps of 1/T are equally visible (mired).
         warm, cold = self.temperature_k
         colour = black_body_rgb(1.0 / rng.uniform(1.0 / cold, 1.0 / warm))
@@ -233,7 +236,7 @@ def black_body_rgb(temperature_k: float) -> Vector:
 
 
 def _in_cap(rng: Generator, axis: Vector, angle_deg: float) -> Vector:
-    """Draw a unit vector uniformly over the spherical cap around a unit axis."""
+    """Sample a unit vector uniformly over the spherical cap around a unit axis."""
     cosine = rng.uniform(np.cos(np.radians(angle_deg)), 1.0)
     azimuth, sine = rng.uniform(0, 2 * np.pi), np.sqrt(1 - cosine**2)
     right, across, _ = rotation_to_z(axis)

@@ -41,7 +41,7 @@ class FreeTurning(Checked):
     kind: Literal["free"] = "free"
 
     def draw(self, rng: Generator) -> RotationMatrix:
-        """Draw a rotation from the object to the camera frame."""
+        """Sample a rotation from the object to the camera frame."""
         return random_rotation(rng)
 
 
@@ -62,7 +62,7 @@ class FacingTurning(Checked):
     kind: Literal["facing"] = "facing"
 
     def draw(self, rng: Generator) -> RotationMatrix:
-        """Draw a rotation from the object to the camera frame."""
+        """Sample a rotation from the object to the camera frame."""
         in_plane = np.radians(rng.uniform(-self.in_plane_deg, self.in_plane_deg))
         tilt = np.arccos(rng.uniform(np.cos(np.radians(self.tilt_deg)), 1.0))
         azimuth = rng.uniform(0.0, 2 * np.pi)
@@ -90,7 +90,7 @@ class UprightTurning(Checked):
     kind: Literal["upright"] = "upright"
 
     def draw(self, rng: Generator) -> RotationMatrix:
-        """Draw a rotation from the object to the camera frame."""
+        """Sample a rotation from the object to the camera frame."""
         elevation = np.radians(rng.uniform(*self.elevation_deg))
         roll = np.radians(rng.uniform(-self.roll_deg, self.roll_deg))
         azimuth = rng.uniform(0.0, 2 * np.pi)
@@ -103,7 +103,7 @@ class UprightTurning(Checked):
 
 
 Turning = Annotated[FreeTurning | FacingTurning | UprightTurning, Discriminator("kind")]
-"""Draws a target's orientation."""
+"""Distribution of a target's orientation."""
 
 
 def looking_down(elevation: float) -> RotationMatrix:
@@ -134,7 +134,7 @@ class _Placement(Checked):
         """Return another position for an object that is not well visible, or None.
 
         Coordinates that a placement keeps retain their distribution for any number of rejections.
-        After None, the orientation is drawn again as well.
+        After None, the caller samples a new orientation too.
         """
         return None
 
@@ -170,7 +170,7 @@ class OffsetPlacement(_Placement):
             )
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
-        """Draw the object's origin in the camera frame, metres."""
+        """Sample the object's origin in the camera frame, metres."""
         x, y = rng.uniform(-self.lateral, self.lateral, 2)
         return np.array([x, y, self._draw_depth(rng)])
 
@@ -179,7 +179,7 @@ class OffsetPlacement(_Placement):
         return np.array([position[0], position[1], self._draw_depth(rng)])
 
     def _draw_depth(self, rng: Generator) -> float:
-        """Draw a depth within ``axial`` of ``distance``, metres."""
+        """Sample a depth within ``axial`` of ``distance``, metres."""
         return self.distance + rng.uniform(-self.axial, self.axial)
 
 
@@ -201,7 +201,7 @@ class DistancePlacement(_Placement):
     kind: Literal["distance"] = "distance"
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
-        """Draw the object's origin in the camera frame, metres."""
+        """Sample the object's origin in the camera frame, metres."""
         depth = rng.uniform(self.nearest, self.farthest)
         pixel = rng.uniform(self.margin, 1 - self.margin, 2) * size - 0.5
         return np.asarray(depth * np.linalg.solve(K, [*pixel, 1.0]))
@@ -272,7 +272,7 @@ class WorkingPlacement(_Placement):
     kind: Literal["working"] = "working"
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
-        """Draw the object's origin in the camera frame, metres."""
+        """Sample the object's origin in the camera frame, metres."""
         depth, offset = rng.uniform(self.nearest, self.farthest), rng.uniform(-0.5, 0.5, 2)
         lower, upper = rotated_hull.min(axis=0), rotated_hull.max(axis=0)
         # The front of the part appears larger than its middle.
@@ -297,7 +297,7 @@ class WorkingPlacement(_Placement):
 Placement = Annotated[
     OffsetPlacement | DistancePlacement | FillPlacement | WorkingPlacement, Discriminator("kind")
 ]
-"""Draws a target's position."""
+"""Distribution of a target's position."""
 
 
 def _depth_that_fills(

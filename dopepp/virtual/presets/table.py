@@ -74,7 +74,7 @@ class Table(Checked):
     picture_width: Annotated[Pair, Span(0.1, 20.0, "camera distances")] = (1.2, 2.4)
 
     def draw_view(self, rng: Generator) -> Transform:
-        """Draw T_cam_table: the table's origin lies on the optical axis, its z points up."""
+        """Sample T_cam_table: the table's origin lies on the optical axis, its z points up."""
         distance = rng.uniform(*self.distance)
         elevation = np.radians(rng.uniform(*self.elevation_deg))
         roll = np.radians(rng.uniform(-self.roll_deg, self.roll_deg))
@@ -83,7 +83,7 @@ class Table(Checked):
         return make_transform(rotation, np.array([0.0, 0.0, distance]))
 
     def draw_turning(self, rng: Generator, hull: Hull) -> tuple[Float[np.ndarray, "3 3"], float]:
-        """Draw an object's orientation: resting on a stable face, or leaning.
+        """Sample an object's orientation: resting on a stable face, or leaning.
 
         Returns:
             Rotation from the object to the table frame, and the height of the object's lowest point
@@ -109,7 +109,7 @@ class Table(Checked):
         size: Size,
         T_cam_table: Transform,
     ) -> TableImage:
-        """Draw the plane's image and, if the plane's end is in view, the surroundings."""
+        """Sample the plane's image and, if the plane's end is in view, the surroundings."""
         width, height = size
         image = backgrounds.draw(rng, width, height)
         metres = rng.uniform(*self.picture_width) * T_cam_table[2, 3]

@@ -247,8 +247,8 @@ class BopScene:
     """A scene's images, in the order of their numbers.
 
     Attributes:
-        files: Image files relative to the folder; empty for an image that is not on disk.
-        depth_files: Depth files relative to the folder; empty if missing.
+        files: Paths of the colour images relative to ``folder``; empty for a missing file.
+        depth_files: Paths of the depth images relative to ``folder``; empty for a missing file.
         depth_scales: Millimetres per unit of the depth images; NaN where not stated.
         first: Image i has the objects ``first[i] … first[i + 1] − 1``.
         gt_ids: Each object's index in its image's list, which names its masks.
@@ -327,6 +327,9 @@ def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int
 def _relative_files(
     folder: Path, kind: tuple[tuple[str, ...], tuple[str, ...]], images: Sequence[int]
 ) -> list[str]:
-    """Return each image's file relative to the scene, or an empty string if missing."""
+    """Return each image's path relative to the scene folder; empty if the file is missing.
+
+    ``kind`` is :data:`IMAGES` or :data:`DEPTHS`.
+    """
     files = image_files(folder, kind)
     return [files[i].relative_to(folder).as_posix() if i in files else "" for i in images]

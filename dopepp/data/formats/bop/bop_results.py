@@ -171,7 +171,7 @@ def _numbers(name: str, field: str, where: str) -> list[float]:
 
 
 def _check_repeats(path: Path, table: Table) -> None:
-    """Reject repeated poses of an object; times are ignored."""
+    """Reject lines that differ only in the time."""
     keys = table[:, 1:17]
     order = np.lexsort(keys.T[::-1])  # stable: equal rows keep the order of lines
     same = (keys[order[1:]] == keys[order[:-1]]).all(axis=1)

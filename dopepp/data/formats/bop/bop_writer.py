@@ -151,7 +151,7 @@ class BopWriter(BopFolder):
 
 
 def _staged_files(scene: Path) -> list[Path]:
-    """Return the files of the scene's images that are not merged yet."""
+    """Return the staged records of images, which are not in the scene's JSON files yet."""
     return staged_items(scene / STAGING, ".json")
 
 

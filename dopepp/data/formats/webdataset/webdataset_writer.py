@@ -43,7 +43,7 @@ class WebdatasetWriter(BopFolder):
     name = "webdataset"
 
     def write(self, index: int, sample: Sample) -> None:
-        """Stage an image."""
+        """Write an image to the staging folder, from which :meth:`finalize` reads it."""
         labels = self.labels(sample)
         content = {
             "rgb.png": encode_png(sample.image),
@@ -83,7 +83,7 @@ class WebdatasetWriter(BopFolder):
                 self._staging(chunk).rmdir()
 
     def _write_shard(self, chunk: int, staged: dict[int, Path]) -> None:
-        """Write a shard from the images that it has and the staged files."""
+        """Write a shard with its earlier images and the staged images."""
         # The webdataset library's TarWriter writes the same archive but imports torch.
         path = self._shard(chunk)
         partial = partial_path(path)
@@ -110,11 +110,11 @@ class WebdatasetWriter(BopFolder):
         return self.root / self.split / f"shard-{chunk:06d}.tar"
 
     def _staging(self, chunk: int) -> Path:
-        """Return the folder for a chunk's images that are not merged yet."""
+        """Return the folder of a chunk's staged images, which are not in the shard yet."""
         return self.root / self.split / STAGING / f"{chunk:06d}"
 
     def _staged(self, chunk: int) -> list[Path]:
-        """Return the files of the chunk's images that are not merged yet."""
+        """Return the files of a chunk's staged images."""
         return staged_items(self._staging(chunk), ".tar")
 
 

@@ -1,4 +1,4 @@
-"""Depth term of refinement: the evidence of a depth image about a pose, and its acceptance.
+"""Depth term of refinement: fit a pose to a depth image, and accept or reject the result.
 
 The part is represented by its surface points, which every checkpoint contains.
 
