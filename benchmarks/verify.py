@@ -4,7 +4,7 @@
 
 Poses are shifted by up to 20 mm and rotated by up to 20° from the true pose (both uniform, in
 random directions). The table has Spearman's rank correlation of agreement and ADD over all poses of
-a part and preset, and as the median over images; -1 is perfect.
+a part and preset, and as the median over single targets; -1 is perfect.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def measure(
 ) -> tuple[float, float, float, float, float]:
     """Return the row of a part and preset.
 
-    The numbers are the rank correlation over all poses, its median over images, the median
+    The numbers are the rank correlation over all poses, its median over targets, the median
     agreement of true poses and of poses with an ADD above 15 mm, and milliseconds per pose.
     """
     part = load_part(name, unit)

@@ -453,7 +453,7 @@ def _show_hand_eye(
 
 
 def _show_rig(calibration: Rig) -> None:
-    """Print the rejected images and each camera's errors and deviations."""
+    """Print rejected images, and each camera's reprojection error and standard deviations."""
     from math import degrees, hypot
 
     for moment in calibration.outliers:

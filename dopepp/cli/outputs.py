@@ -36,7 +36,7 @@ class Output(Protocol):
         """Write a result."""
 
     def close(self) -> None:
-        """Complete the files, also after an error."""
+        """Finish and close the files. Also called after an error, with the results so far."""
 
 
 class Outputs:
@@ -82,7 +82,7 @@ class OverlayFolder:
         self._video: VideoFile | None = None
 
     def begin(self, source: FrameSource) -> None:
-        """Complete the previous source's video."""
+        """Close the previous source's video."""
         self.close()
         self._source = source
 
@@ -103,7 +103,7 @@ class OverlayFolder:
         self._video.write(result.plot(), result.time)
 
     def close(self) -> None:
-        """Complete the video."""
+        """Close the video of the current source, if any."""
         if self._video is not None:
             video, self._video = self._video, None
             video.close()

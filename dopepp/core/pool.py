@@ -169,7 +169,7 @@ class ProcessPool(Pool):
     """Processes of this machine.
 
     Processes are spawned, because Mitsuba's thread pool does not survive a fork; this takes about a
-    second. Processes complete their item when the pipe is closed, so no file is half-written if
+    second. Processes finish their item when the pipe is closed, so no file is half-written if
     the pool is stopped or this process is killed.
 
     Args:

@@ -313,7 +313,7 @@ class VideoFile(AbstractContextManager["VideoFile"]):
             self._written += 1
 
     def close(self) -> None:
-        """Complete the file.
+        """Close the video, check its number of frames and move it to the final path.
 
         Raises:
             RunError: Frames are missing from the file.

@@ -402,21 +402,23 @@ class PoseEstimator:
         Args:
             images: RGB, uint8, of any sizes.
             cameras: Camera of each image, or its K in pixels of an undistorted image.
-            T_world_cam: Pose of each camera, metres; any frame that does not move is the world.
+            T_world_cam: Pose of each camera in a common world frame, metres. The world may be any
+                frame in which the scene is static.
             depths: Depth of each image; see :meth:`predict`.
             distances: See :meth:`predict`.
             camera_error: Standard deviations of each camera's pose: position along each axis
                 (metres) and rotation about each axis (radians). The default, 0.2 mm and 0.02°, is
                 typical after a hand-eye calibration.
-            names: Name of each image, for findings and files.
+            names: Name of each image, used in reported contradictions and as file name (default:
+                ``view 0``, …).
 
         Returns:
             Parts with their poses and covariances in the world and the evidence of each view, and
             contradictions between the views.
 
         Raises:
-            UserError: The estimator does not refine by region, an argument is invalid, or the
-                numbers of images, cameras and poses differ.
+            UserError: The estimator was loaded without refinement by region, an argument is
+                invalid, or the numbers of images, cameras and poses differ.
         """
         from dopepp.inference import several_views
 

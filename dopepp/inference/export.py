@@ -73,7 +73,7 @@ def check_possible(layout: str, precision: str) -> None:
     """Check that a format supports a precision and that the required extras are installed.
 
     Raises:
-        UserError: The format does not support the precision, or an extra is missing.
+        UserError: The format does not support the precision, or a required extra is not installed.
     """
     if layout == "safetensors" and precision == "int8":
         allowed, fix = "fp32 or fp16", "choose --format onnx or openvino for int8"

@@ -72,7 +72,7 @@ class TemplateEstimator(PoseEstimator):
         self.max_ms = max_ms
         self.scale_error = SCALE_ERROR if scale_error is None else scale_error
         self.levels: dict[str, float] = {}
-        """Log odds of verification at which a pose of a part has the score 0.5, by part name."""
+        """Log odds of ``Detection.probability`` at which a pose has the score 0.5, by part name."""
         self.device = torch.device("cpu")
         self.recovery = RecoveryOptions.of(learned_ranking().score)
         self._refine_by(refine, self.parts)
@@ -242,7 +242,7 @@ def _largest_log_odds(
     images: Iterable[RGBImage],
     K: CameraMatrix,
 ) -> list[float]:
-    """Return the largest log odds of verified poses on each image.
+    """Return the largest log odds of ``Detection.probability`` on each image.
 
     The searched depths are limited to a ratio of 4 around the geometric mean of ``distances``.
     """

@@ -54,7 +54,8 @@ class Viewer:
         path: ``.rrd`` file; None opens a window.
 
     Raises:
-        UserError: The extra is missing, the file cannot be written, or there is no display.
+        UserError: The extra ``rerun`` is not installed, the file cannot be written, or there is no
+            display.
     """
 
     def __init__(self, estimator: PoseEstimator, path: Path | None = None) -> None:
@@ -110,7 +111,7 @@ class Viewer:
         self._shown = set(named)
 
     def close(self) -> None:
-        """Complete the recording."""
+        """Close the recording, and move the partial file to the final path."""
         if not self._is_open:
             return
         self._recording.disconnect()

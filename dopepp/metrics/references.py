@@ -112,7 +112,10 @@ def _other_poses(
 def _best_constant(
     rotations: Float[np.ndarray, "n 3 3"], points: Tensor, threshold: float
 ) -> Float[np.ndarray, "n 3 3"]:
-    """Return the errors of the best constant: a test rotation or the mean; ADD breaks ties."""
+    """Return the rotation errors of the constant estimate with the highest pass rate.
+
+    Candidates are all test rotations and their mean; equal rates are decided by the mean ADD.
+    """
     mean = nearest_rotation(rotations.mean(axis=0))
     candidates = np.concatenate([rotations, mean[None]])
     Q = rotations.transpose(0, 2, 1)[None] @ candidates[:, None]

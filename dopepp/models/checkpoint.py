@@ -70,7 +70,7 @@ class Checkpoint:
         recovery: Thresholds that turn maps into detections.
         data: The data and camera configuration of the training.
         data_fingerprint: Hash of everything that determines the training data.
-        seen: Sizes and distances of the parts in the training data, by name.
+        seen: Ranges of diameter (pixels) and depth (metres) in the training data, by part name.
     """
 
     spec: dict[str, Any]

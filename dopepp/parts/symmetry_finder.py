@@ -120,7 +120,10 @@ class _Shape:
         return _round(rotations_about(self.centre, rotations))
 
     def axis(self, axis: Vector) -> ContinuousSymmetry:
-        """Return an axis through the centre and its point nearest the origin."""
+        """Return the symmetry about the line along ``axis`` through the centre.
+
+        The line is given by its direction and by its point nearest the origin, metres.
+        """
         offset = self.centre - (self.centre @ axis) * axis
         return tuple(_round(axis).tolist()), tuple(_round(offset).tolist())
 

@@ -58,7 +58,7 @@ _RIDGE: Final = 0.1  # weight of the squared weights, in detections; keeps the w
 _DEFAULTS_RIDGE: Final = 1.0  # weight of the squared distance from default weights, in detections
 _STEPS: Final = 50  # maximum number of iterations of a fit
 _MEAN_BELIEF: Final = tuple(float(name == "belief") for name in FEATURES)
-_VERIFIED: Final = 1e-4  # probabilities of verification are clipped to this distance from 0 and 1
+_VERIFIED: Final = 1e-4  # verified probabilities are limited to this distance from 0 and 1
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class RecoveryOptions:
         refined_min_score: Refined detections below this score are dropped.
         refined_bias, refined_score, refined_verification: Weights of the features of a refined
             pose's score, set by ``evaluate.py tune=true refine=region``; with the defaults, the
-            score is the probability of the verification.
+            score is ``Detection.probability``.
         refined_covariance_factor: Factor on the covariance of poses refined on the image alone, set
             by ``tune=true refine=region``.
     """
@@ -305,7 +305,7 @@ def detection_features(
 
 
 def log_odds(probability: float) -> float:
-    """Return the log odds of a probability of verification, clipped to about ±9."""
+    """Return the log odds of ``Detection.probability`` or a score, limited to about ±9.2."""
     return math.log(_odds(probability, _VERIFIED))
 
 

@@ -102,7 +102,7 @@ class LastCheckpoint(Checkpoint):
     def on_train_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, batch: Batch, batch_idx: int
     ) -> None:
-        """Save the state before this batch, if due."""
+        """If saving is due, save a checkpoint from which training resumes with this batch."""
         # Checkpoints have no accumulated gradients.
         if batch_idx % trainer.accumulate_grad_batches == 0:
             self._save_if_due(trainer, _before_batch)
@@ -114,7 +114,7 @@ class LastCheckpoint(Checkpoint):
     def on_validation_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, *_: Any
     ) -> None:
-        """Save if due; a resumed run repeats the whole validation."""
+        """If saving is due, save a checkpoint; a resumed run repeats the whole validation."""
         self._save_if_due(trainer, _before_validation)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -139,7 +139,7 @@ class LastCheckpoint(Checkpoint):
         self._stop.end()
 
     def _save_if_due(self, trainer: Trainer, cut: Cut) -> None:
-        """Save if due or requested; end the run after a request."""
+        """Save a checkpoint if due or after a stop signal, which also ends the run."""
         stop = self._stop.number
         wait_s = max(self.every_s, self._duration_s / self.max_share)
         progress = _progress(trainer)
@@ -277,7 +277,7 @@ def _before_validation(fit_loop: dict[str, Any]) -> None:
 
 
 def _between_epochs(fit_loop: dict[str, Any]) -> None:
-    """Complete the epoch, so that the next epoch starts with its first batch."""
+    """Mark the epoch as completed, so that the next epoch starts with its first batch."""
     for counter in fit_loop["epoch_progress"].values():
         counter["completed"] = counter["processed"]
 

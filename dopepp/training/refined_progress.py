@@ -65,7 +65,7 @@ class RefinedProgress(Callback):
         self._minutes_before = float(state_dict["minutes"])
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Start the clock."""
+        """Store the time at which training starts."""
         self._begin = self._due = time.monotonic()
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -80,7 +80,7 @@ class RunProgress(TQDMProgressBar):
         self._start, self._first_step = 0.0, 0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Start the clock."""
+        """Store the time and the step at which training starts."""
         super().on_train_start(trainer, pl_module)
         self._start, self._first_step = time.monotonic(), trainer.global_step
 

@@ -95,7 +95,7 @@ def _drop(
     bodies: Sequence[Body], pile: Pile, diameter: float, rng: Generator
 ) -> tuple[Sequence[Transform], Sides | None]:
     """Return the bodies' poses at rest, and the sides of their bin, if any."""
-    from dopepp.virtual.physics import settle  # needs the extra
+    from dopepp.virtual.physics import settle  # needs the extra ``robot``
 
     if not bodies:
         return [], None

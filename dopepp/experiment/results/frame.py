@@ -248,7 +248,7 @@ def radius_note(radii: Mapping[str, float]) -> str:
 
 
 def rate_curves(rates: Iterable[Value], per_unit: float = 1.0) -> dict[str, RateCurve]:
-    """Return the curve of a rate over the conditions (times ``per_unit``) of each method."""
+    """Return a curve for each method: the rate against the condition multiplied by ``per_unit``."""
     points: dict[str, list[tuple[float, ...]]] = {}
     for rate in rates:
         point = (per_unit * rate.condition, rate.value, rate.low, rate.high)

@@ -355,7 +355,7 @@ def measure(
 def _with_precision(
     rows: Mapping[str, PoseRow], ranked: Mapping[str, PoseRow]
 ) -> dict[str, PoseRow]:
-    """Return the rows of reported poses with the AP of all candidates."""
+    """Return the rows of reported poses, by object, with the AP from ``ranked``, all candidates."""
     return {
         name: replace(row, average_precision=ranked[name].average_precision)
         for name, row in rows.items()

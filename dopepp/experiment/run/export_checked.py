@@ -61,7 +61,7 @@ def export(
         num_images: Rendered scenes to calibrate int8 on, and as many to measure ADD-0.1d on.
 
     Raises:
-        UserError: The checkpoint, an option or the path is wrong, or an extra is missing.
+        UserError: The checkpoint, an option or the path is invalid, or an extra is not installed.
         RunError: The export disagrees with the checkpoint; nothing was written.
     """
     target = _output_path(path, layout, precision, out)

@@ -276,7 +276,7 @@ class WrongFocalLengths:
         return len(self._source)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Return an image with its wrong camera matrix, equal in every call."""
+        """Return an image with an erroneous focal length; ``index`` determines the error."""
         sample = self._source.sample(index, epoch)
         error = np.random.default_rng(index).uniform(-SCALE_ERROR, SCALE_ERROR)
         K = sample.K.copy()
@@ -340,8 +340,9 @@ def choose(
         empty: Detections on images without objects.
         false_positive_rate: Permitted share of the images without objects with a reported pose.
         refined: Whether the score of refined poses is chosen. The fewer refined poses there are,
-            the closer its weights stay to the weights of the verification. The weights of the
-            verification are used if all poses are correct or all are incorrect.
+            the closer its weights stay to the default weights, with which the score is
+            ``Detection.probability``. The default weights are used if all poses are correct or all
+            are incorrect.
 
     Returns:
         Values of :class:`RecoveryOptions`.

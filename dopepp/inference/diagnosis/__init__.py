@@ -126,7 +126,7 @@ def exposure(case: Case) -> Diagnosis:
 
 
 def sharpness(case: Case) -> Diagnosis:
-    """Check whether edges are sharp at the size on which the network runs."""
+    """Check whether edges are sharp after the image is resized to the detector's input."""
     width = edge_width(case.around())
     if width is None:
         return Diagnosis("sharpness", "too few edges to measure the sharpness")
@@ -141,7 +141,7 @@ def sharpness(case: Case) -> Diagnosis:
 
 
 def camera(case: Case) -> Diagnosis:
-    """Check whether K fits the part's perspective and distance."""
+    """Check K's focal length against the perspective of the part's keypoints and its distance."""
     half = np.array([case.image.shape[1], case.image.shape[0]]) / 2
     across, down = np.degrees(2 * np.arctan(half / case.K.diagonal()[:2]))
     sentence = f"K sees {across:.0f}° × {down:.0f}°"

@@ -119,7 +119,7 @@ class Case:
 
     @property
     def seen(self) -> LearnedRange | None:
-        """Sizes and distances of the part in training, if known."""
+        """Diameters (pixels) and depths (metres) of the part in training; None if unknown."""
         if not self.estimator.has_network:
             return None
         return self.estimator.checkpoint.seen.get(self.part.name)

@@ -39,7 +39,7 @@ def open_sources(sources: Iterable[SourceLike], topic: str | None = None) -> lis
 
     Raises:
         UserError: A file, camera or topic does not exist, a folder has no images, a video or
-            recording is unreadable, or the extra for recordings is missing.
+            recording is unreadable, or the extra ``bags`` is not installed.
     """
     opened: list[FrameSource] = []
     image_paths: list[Path] = []

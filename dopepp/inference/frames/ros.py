@@ -154,8 +154,8 @@ class Bag(FrameSource):
         topic: Image topic; required if several topics have images.
 
     Raises:
-        UserError: The extra is missing, the recording is unreadable or has no images, or several
-            topics have images and none is selected.
+        UserError: The extra ``bags`` is not installed, the recording is unreadable or has no
+            images, or several topics have images and none is selected.
     """
 
     def __init__(self, path: Path, topic: str | None = None) -> None:

@@ -114,7 +114,7 @@ def log_odds(
     ring: float,
     tiles: int,
 ) -> Float32[np.ndarray, "height width"] | None:
-    """Return the log odds of part against surroundings for every pixel.
+    """Return the log odds that each pixel shows the part and not its surroundings.
 
     Args:
         bins: Colour bins.
@@ -213,7 +213,7 @@ def _count(
 
 @compiled()
 def _tables(counts: Array, tables: Array) -> None:
-    """Write the log odds of part against surroundings per tile and colour.
+    """Write the log odds that a pixel shows the part, per tile and colour.
 
     Args:
         counts: Histograms of the part and of its surroundings per tile, shape (2, tiles, tiles,
@@ -251,14 +251,14 @@ def _tables(counts: Array, tables: Array) -> None:
 
 @compiled()
 def _look_up(bins: Array, rows: Array, columns: Array, tables: Array, odds: Array) -> None:
-    """Write the log odds of each pixel, from the colour table of its tile.
+    """Write the log odds that each pixel shows the part, from the colour table of its tile.
 
     Args:
-        bins: Colour bin of each pixel.
-        rows: Tile of each row of pixels.
-        columns: Tile of each column of pixels.
-        tables: Log odds by tile row, tile column and colour bin.
-        odds: Filled with the log odds of each pixel.
+        bins: Colour bins, shape (height, width).
+        rows: Tile of each row of pixels, shape (height,).
+        columns: Tile of each column of pixels, shape (width,).
+        tables: Log odds, shape (tiles, tiles, colours).
+        odds: Filled with the log odds, shape (height, width).
     """
     for v in range(bins.shape[0]):
         for u in range(bins.shape[1]):

@@ -308,7 +308,7 @@ def _refine_with_both(
 def poses_of_four(
     cuboid: Cuboid, peaks: Float[np.ndarray, "9 2"], K: CameraMatrix
 ) -> list[Transform]:
-    """Solve for the pose from each of several sets of four keypoints; equal in every call.
+    """Solve for the pose from each of several sets of four keypoints; deterministic.
 
     An occluder or a similar object displaces several keypoints together, which their covariances do
     not show. Sets without these keypoints give the correct pose.

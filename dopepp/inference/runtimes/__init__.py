@@ -134,8 +134,8 @@ def load(path: Path, device: torch.device) -> tuple[Runtime, Checkpoint]:
     """Load a checkpoint or an exported network (file, or OpenVINO's folder).
 
     Raises:
-        UserError: The file is missing, damaged or not safe to load, an extra is missing, or the
-            network cannot run on this device.
+        UserError: The file is missing, damaged or not safe to load, the extra of its format is not
+            installed, or the network cannot run on this device.
     """
     if not is_export(path):
         return load_network(path)

@@ -45,7 +45,7 @@ def load_openvino(choice: str) -> Any:
         choice: The user's choice that requires OpenVINO, for messages.
 
     Raises:
-        UserError: The extra is missing.
+        UserError: The extra ``openvino`` is not installed.
     """
     require("openvino", choice, "openvino")
     sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]

@@ -66,7 +66,7 @@ class JointEstimator:
         views: Images of the scene.
         names: Name of each view.
         geometries: Geometry of each part.
-        slope: Weight of the verification's log odds in the score.
+        slope: Weight of the log odds of ``Detection.probability`` in the score.
     """
 
     def __init__(

@@ -46,7 +46,7 @@ NUM_POINTS: Final = 100  # approximate number of points on the outline
 
 @dataclass(frozen=True)
 class NextView:
-    """The best of several camera poses."""
+    """Choice of the next view among candidate camera poses."""
 
     number: int  # index of the camera pose
     before: float  # present expected error of the part's points, metres

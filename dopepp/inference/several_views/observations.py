@@ -43,14 +43,14 @@ class PartGeometry:
         return cls(part.cuboid, group)
 
     def nearest(self, pose: Prior, to: Transform) -> Prior:
-        """Return the equivalent of a pose that is nearest to another pose."""
+        """Return the symmetry-equivalent of a pose whose cuboid is nearest to that of ``to``."""
         equal = pose.T_cam_obj @ self.group
         points = self.cuboid @ equal[:, :3, :3].swapaxes(1, 2) + equal[:, None, :3, 3]
         distances = ((points - transform(to, self.cuboid)) ** 2).sum(axis=(1, 2))
         return Prior(np.asarray(equal[distances.argmin()]), pose.information)
 
     def separation(self, pose: Prior, other: Prior) -> float:
-        """Return the Mahalanobis distance from a pose to the nearest equivalent of another pose."""
+        """Return the Mahalanobis distance to the symmetry-equivalent of ``other`` nearest to it."""
         return separation(pose, self.nearest(other, pose.T_cam_obj))
 
     def mean(self, poses: Sequence[Prior]) -> Prior:

@@ -1,8 +1,9 @@
-"""Level of verification that the poses of a part must exceed, measured on photos without the part.
+"""Smallest accepted log odds of a part's detections, measured on photos without the part.
 
 The best of many start poses can fit an ordinary edge well, and a plain part fits more edges than an
 intricate part. Therefore a few photos that ship with the package are searched for the part. The
-verified probabilities of the best poses determine the level. The user's cache folder stores it.
+``Detection.probability`` of the best poses determines the level, which the user's cache folder
+stores.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Ranking of matches by edges and colours of the image.
 
-Each match first moves to the best position nearby. Because views are 8 degrees apart, the views of
-the best matches are then replaced by neighbouring views that fit better.
+Each match first moves to the nearby pose with the largest mean edge response. Because views are 8
+degrees apart, the views of the best matches are then replaced by neighbouring views that have a
+larger response.
 
 Edges alone do not separate the part from busy texture. Colours do: the part has even colours, and
 its surroundings differ from them. A linear model of :data:`FEATURES` ranks the matches. Its weights
@@ -31,7 +32,7 @@ from dopepp.inference.templates.views import Templates
 
 FEATURES: Final = (
     "place",  # score of the match on the coarse image, standard deviations
-    "edges",  # score at the best position nearby, standard deviations
+    "edges",  # score of the moved match, standard deviations
     "response",  # mean response of the template's points at this position
     "supported",  # share of points with a response above SUPPORT
     "texture",  # mean of the strongest response at inner points
@@ -82,7 +83,7 @@ def learned_ranking() -> RankingModel:
 def move_nearby(
     matches: Matches, templates: Templates, responses: Responses, image: RGBImage, reach: float
 ) -> tuple[Matches, Features]:
-    """Move matches to the best position nearby.
+    """Move matches to nearby poses with the largest mean edge response.
 
     Args:
         matches: Matches in pixels of the image.
@@ -103,7 +104,7 @@ def move_nearby(
 def improve_views(
     matches: Matches, templates: Templates, responses: Responses, image: RGBImage
 ) -> tuple[Matches, Features]:
-    """Replace the views of matches by better neighbouring views.
+    """Replace the views of matches by neighbouring views with a larger mean edge response.
 
     Arguments and results are as in :func:`move_nearby`.
     """
@@ -215,7 +216,7 @@ def _improve_views(
     poses: Array,
     responses: Array,
 ) -> None:
-    """Replace the view of each match by its best neighbour, until no neighbour is better.
+    """Replace the view of each match by the neighbour with the largest response, repeatedly.
 
     ``views`` and ``poses`` are updated in place, and ``responses`` is filled with the response of
     each match.

@@ -33,7 +33,8 @@ def convex_pieces(part: Part) -> tuple[Piece, ...]:
     """Return convex pieces that make up a part's shape, in its frame, metres.
 
     Raises:
-        UserError: The part has no mesh, the cached pieces are damaged, or the extra is missing.
+        UserError: The part has no mesh, the cached pieces are damaged, or the extra ``robot``
+            is not installed.
     """
     if part.mesh is None:
         problem, allowed = f"part {part.name} without a mesh", "a built-in part or a mesh file"

@@ -71,7 +71,15 @@ def parse_sources(text: str) -> tuple[PoseSource, ...]:
 
 
 def check_task(task: GraspTask, poses: str, count: int) -> GraspTask:
-    """Check a task before the slow work, and set its sources of poses.
+    """Check the options of a task before the trials start, and set ``sources`` and ``network``.
+
+    Args:
+        task: Options from the command line.
+        poses: Comma-separated names of :data:`SOURCES`.
+        count: Number of trials.
+
+    Returns:
+        The task with its sources of poses; ``network`` is None if no source needs a network.
 
     Raises:
         UserError: An option has an invalid value, or the part has no network or no grasp.

@@ -164,7 +164,7 @@ def camera_settings(camera: dict[str, Any]) -> dict[str, Any]:
 
 
 def camera_data(sample: Sample) -> dict[str, Any]:
-    """Return an annotation's ``camera_data``."""
+    """Return an annotation's ``camera_data``: image size, K in pixels, identity pose."""
     (fx, _, cx), (_, fy, cy), _ = np.asarray(sample.K, np.float64).tolist()
     return {
         "width": sample.size[0],

@@ -239,7 +239,7 @@ class Film:
     def resampled(
         self, image: Float32[np.ndarray, "film_height film_width 4"]
     ) -> Float32[np.ndarray, "height width 4"]:
-        """Return the film's image in the window's pixels."""
+        """Return the film's RGBA image, resampled to the window's pixels."""
         left, top, right, bottom = self.window
         if np.array_equal(self.film_from_window, np.eye(2, 3)):
             return image
