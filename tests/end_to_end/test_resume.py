@@ -115,7 +115,7 @@ def test_mistakes_in_the_three_words(run, call, tiny, tmp_path):
         assert not list((tmp_path / "new").glob("**/versions.json"))
 
     done = call("train.py", f"resume={run}", "model/attention=se")
-    assert "whose network differs from the chosen one" in done.line
+    assert "whose network differs from the config's" in done.line
 
 
 def damage(path: Path, how: str) -> None:
