@@ -15,7 +15,7 @@ def test_verified_refined_poses_are_measured_during_training(tiny):
     config = tiny("experiment=quickstart", "stop_at=0.9", "data.num_val=3")
     (progress,) = progress_of(config)
     assert isinstance(progress, RefinedProgress)
-    assert (progress.stop_at, len(progress.pictures)) == (0.9, 3)
+    assert (progress.stop_at, len(progress.images)) == (0.9, 3)
 
 
 @pytest.mark.parametrize("refine", ["null", "depth"])
@@ -44,5 +44,5 @@ def test_progress_is_measured_on_whole_images(tiny, tmp_path):
     data = fit_to_camera(config, parts := build_parts(config.data)).data
     datamodule = build_datamodule(data, parts, config.seed)
     (progress,) = _progress(config, datamodule)
-    assert progress.pictures.sample(0).image.shape == (240, 320, 3)
+    assert progress.images.sample(0).image.shape == (240, 320, 3)
     assert datamodule.val_source.sample(0).image.shape == (128, 128, 3)
