@@ -30,7 +30,7 @@ _NOTICE_S: Final = 5.0  # Time from a broken connection until the death of a pro
 _GRACE_S: Final = 20.0  # Time after a death in which other processes may end by themselves
 
 
-def is_first_process() -> bool:
+def is_rank_zero() -> bool:
     """Return whether this process has rank 0, also before there is a trainer."""
     return not getattr(rank_zero_only, "rank", 0)
 

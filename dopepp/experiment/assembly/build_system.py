@@ -38,7 +38,7 @@ from dopepp.parts.size import LearnedRange
 from dopepp.recovery.detection import RecoveryOptions
 from dopepp.training.loggers import MetricsTable
 from dopepp.training.optimizers import AveragedWeights
-from dopepp.training.processes import WatchedDDP, is_first_process
+from dopepp.training.processes import WatchedDDP, is_rank_zero
 from dopepp.training.run_checkpoints import AtomicCheckpointIO
 from dopepp.training.system import OptimizerFactory, PoseSystem, SchedulerFactory
 from dopepp.training.throughput import RunProgress, make_profiler
@@ -146,7 +146,7 @@ def _initialise(network: PoseNetwork, config: RunConfig) -> None:
         start_from_checkpoint(network, Path(config.init_from))
         return
     fits = start_from_parts(network)
-    if config.resume is None and is_first_process():
+    if config.resume is None and is_rank_zero():
         program.print_line(
             "initial weights: learned on random parts (init_from=auto)"
             if fits
@@ -193,7 +193,7 @@ def build_trainer(
     elif accelerator == "auto":
         accelerator = "cpu"
     precision, reason = choose_precision(options.precision, accelerator)
-    if is_first_process():
+    if is_rank_zero():
         program.print_line(f"precision {precision}: {reason}")
     callbacks = [*(CALLBACKS.build(node) for node in config.callbacks.values()), *further]
     if config.ema is not None:

@@ -61,7 +61,7 @@ from dopepp.inference.refinement.refiner import refine_terms
 from dopepp.parts.part import Parts
 from dopepp.training.loggers import GuardedLogger
 from dopepp.training.pose_validation import EarlyStop
-from dopepp.training.processes import ProcessDiedError, is_first_process
+from dopepp.training.processes import ProcessDiedError, is_rank_zero
 from dopepp.training.pruning import PrunedError, raise_if_pruned
 from dopepp.training.refined_progress import RefinedProgress
 from dopepp.training.run_checkpoints import FOLDER, check_free_space, newest_checkpoint, saved_step
@@ -142,7 +142,7 @@ def _train(
     seed_everything(config.seed, verbose=False)
     keep_freed_memory()
     # Only rank 0 reports.
-    display.console.quiet = not is_first_process()
+    display.console.quiet = not is_rank_zero()
     parts = build_parts(config.data)
     config = fit_to_camera(config, parts)
     if config.tune:
@@ -164,7 +164,7 @@ def _train(
     display.show_config(config.plain)
     for change in changes:
         display.console.print(f"changed since the run began: {change}")
-    if is_first_process():
+    if is_rank_zero():
         write_config(run_dir, config.plain)
         write_environment(run_dir, config.seed, fingerprint, [str(change) for change in changes])
         if config.resume is not None:
