@@ -114,7 +114,7 @@ BOMBS = {
 
 @pytest.mark.parametrize("name", BOMBS)
 @pytest.mark.parametrize("place", ["data", "optimizer state"])
-def test_a_call_that_allocates_huge_memory(name, place, write, Call, rejected):
+def test_a_call_that_creates_a_huge_object(name, place, write, Call, rejected):
     """torch's list of safe calls includes calls that allocate any given size."""
     try:
         path = write(place, BOMBS[name](Call))
