@@ -78,8 +78,11 @@ def with_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
     if is_coloured and (len(discrete) or continuous):
         reason = "if they distinguish the sides, set data.symmetries=none"
         _log.warning("%s has colours, which the search ignores: %s", part.name, reason)
-    found = discrete if len(discrete) else None
-    return replace(part, symmetries_discrete=found, symmetries_continuous=continuous)
+    return replace(
+        part,
+        symmetries_discrete=discrete if len(discrete) else None,
+        symmetries_continuous=continuous,
+    )
 
 
 def describe_symmetries(path: Path | str, unit: str | None, tolerance: float) -> str:

@@ -115,12 +115,15 @@ def nearest_rotation(matrices: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndar
     return np.asarray((left * scales[..., None, :]) @ right)
 
 
-def is_rigid(T: Float[np.ndarray, "4 4"]) -> bool:
-    """Return whether a matrix is a finite 4×4 rigid transform, with the last row 0, 0, 0, 1."""
+def is_rigid(T: Float[np.ndarray, "4 4"], tolerance: float = 1e-3) -> bool:
+    """Return whether a matrix is a finite 4×4 rigid transform, with the last row 0, 0, 0, 1.
+
+    ``tolerance`` is that of :func:`is_rotation`.
+    """
     return (
         T.shape == (4, 4)
         and bool(np.isfinite(T).all())
-        and is_rotation(T[:3, :3])
+        and is_rotation(T[:3, :3], tolerance)
         and T[3].tolist() == [0, 0, 0, 1]
     )
 

@@ -23,6 +23,12 @@ _FORMS: Final = (
     "matrix: 4×4 numbers; ROS's translation and rotation; or position (metres) with "
     "quaternion_wxyz or quaternion_xyzw"
 )
+ROUNDED: Final = 1e-3
+"""Largest deviation from orthogonality of matrices that were written with a few digits."""
+
+EXACT: Final = 1e-6
+"""Largest deviation from orthogonality of matrices that ``dopepp calibrate`` has written."""
+
 _FIX: Final = "write the transform in metres, or pass a file from `dopepp calibrate`"
 
 
@@ -35,19 +41,20 @@ def transform_record(T: Transform) -> dict[str, object]:
     }
 
 
-def read_transform(path: Path, name: str) -> Transform:
+def read_transform(path: Path, name: str, tolerance: float = EXACT) -> Transform:
     """Read a transform by its name from a YAML file, e.g. ``T_flange_cam`` of a hand-eye file.
+
+    ``tolerance`` is the largest deviation of a given matrix from orthogonality.
 
     Raises:
         UserError: The file cannot be read, or has no rigid transform of this name.
     """
     content = read_yaml(path)
-    return parse_transform(
-        content.get(name) if isinstance(content, Mapping) else None, f"{path}: {name}"
-    )
+    value = content.get(name) if isinstance(content, Mapping) else None
+    return parse_transform(value, f"{path}: {name}", tolerance)
 
 
-def parse_transform(value: object, where: str) -> Transform:
+def parse_transform(value: object, where: str, tolerance: float = ROUNDED) -> Transform:
     """Parse a rigid transform.
 
     Args:
@@ -55,6 +62,7 @@ def parse_transform(value: object, where: str) -> Transform:
             ``rotation`` {x, y, z, w}; or with ``position`` and either ``quaternion_wxyz`` or
             ``quaternion_xyzw``. Lengths are metres.
         where: File and field, for error messages.
+        tolerance: Largest deviation of a given matrix from orthogonality.
 
     Raises:
         UserError: The value has none of these forms, or is not a rigid transform.
@@ -79,6 +87,6 @@ def parse_transform(value: object, where: str) -> Transform:
             T = make_transform(R, np.array(position, np.float64).reshape(3))
     except (KeyError, IndexError, TypeError, ValueError):
         raise UserError(problem, _FORMS, _FIX) from None
-    if not is_rigid(T):
+    if not is_rigid(T, tolerance):
         raise UserError(problem, "a rigid transform", _FIX)
     return make_transform(nearest_rotation(T[:3, :3]), T[:3, 3])

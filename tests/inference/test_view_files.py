@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.transform_file import parse_transform
+from dopepp.geometry.transform_file import ROUNDED, parse_transform, read_transform
 from dopepp.inference.several_views.view_files import read_camera_poses
 
 TURN = Rotation.from_euler("xyz", [20, -30, 140], degrees=True)
@@ -43,6 +43,16 @@ def test_every_form_of_a_pose_is_read(form):
 def test_other_forms_are_rejected(form):
     with pytest.raises(UserError, match="here"):
         parse_transform(form, "here")
+
+
+def test_matrices_of_calibrations_must_be_exact(tmp_path):
+    path = tmp_path / "hand_eye.yaml"
+    rounded = T_WORLD_CAM.copy()
+    rounded[0, 0] += 1e-4
+    path.write_text(yaml.safe_dump({"T_flange_cam": {"matrix": rounded.tolist()}}))
+    with pytest.raises(UserError, match=r"hand_eye\.yaml: T_flange_cam"):
+        read_transform(path, "T_flange_cam")
+    assert_allclose(read_transform(path, "T_flange_cam", ROUNDED), T_WORLD_CAM, atol=2e-4)
 
 
 def test_camera_of_all_views_or_of_a_single_view(tmp_path):

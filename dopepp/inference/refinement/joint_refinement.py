@@ -167,6 +167,7 @@ def refine_views(
     end = Solution(start.T_cam_obj, prior.information)
     num_stages = max((len(search.rounds) for search in searches), default=0)
     terms: list[Term] = []
+    # As for a single image, the last stage is repeated until it converges.
     for stages_left in (*range(num_stages, 0, -1), *[1] * MAX_REPEATS):
         searches = [search for search in searches if search.learn(end.T_cam_obj, stages_left)]
         terms = [term for search in searches for term in search.terms(stages_left)]

@@ -28,7 +28,7 @@ from dopepp.core.validation import Range, check
 from dopepp.core.yaml import read_yaml
 from dopepp.geometry.camera import Transform, invert_transform, make_transform
 from dopepp.geometry.camera_file import Camera, camera_of_fields, camera_of_text, read_camera
-from dopepp.geometry.transform_file import parse_transform, read_transform
+from dopepp.geometry.transform_file import ROUNDED, parse_transform, read_transform
 
 FORMATS: Final = (
     "YAML with `views: {a.png: {T_world_cam: …}}`, BOP's scene_camera.json, or COLMAP's images.txt"
@@ -93,7 +93,7 @@ def read_camera_poses(path: Path) -> CameraPoses:
     camera, hand_eye, error = (content.get(key) for key in ("camera", "hand_eye", "camera_error"))
     T_flange_cam = None
     if hand_eye is not None:
-        T_flange_cam = read_transform(path.parent / str(hand_eye), "T_flange_cam")
+        T_flange_cam = read_transform(path.parent / str(hand_eye), "T_flange_cam", ROUNDED)
     pose_name = "T_world_cam" if T_flange_cam is None else "T_base_flange"
     poses = {}
     for name, view in views.items():
