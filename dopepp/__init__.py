@@ -1,4 +1,4 @@
-"""DOPE++: from the CAD file of a weakly textured part to a measured 6D pose estimator.
+"""DOPE++: from the CAD file of a weakly textured part to a trained and evaluated 6D pose estimator.
 
 ``import dopepp`` is light: :class:`PoseEstimator` (and torch with it) loads on first use.
 """
@@ -15,7 +15,7 @@ __all__ = ["PoseEstimator", "__version__"]
 
 
 def __getattr__(name: str) -> object:
-    """Load the public classes on first use (PEP 562)."""
+    """Import :class:`PoseEstimator` on first use (PEP 562)."""
     if name == "PoseEstimator":
         from dopepp.inference.estimator import PoseEstimator
 

@@ -1,1 +1,1 @@
-"""Basics of every package: errors, validation, files, JSON, YAML and process pools."""
+"""Basics for all packages: errors, validation, files, JSON, YAML and process pools."""

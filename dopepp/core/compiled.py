@@ -51,7 +51,7 @@ def compile_in_background(function: str) -> None:
 
 
 class _Compilation(event.Listener):  # type: ignore[misc]  # numba has no types
-    """Shares the first compilation with other processes, and logs the reason for the delay.
+    """Starts the warm-ups at numba's first compilation, and logs the reason for the delay.
 
     Garbage collection is paused, because it would take a quarter of the time without effect.
     """
@@ -59,7 +59,7 @@ class _Compilation(event.Listener):  # type: ignore[misc]  # numba has no types
     is_first, depth, collects = True, 0, False
 
     def on_start(self, event: event.Event) -> None:
-        """Pause garbage collection; at the first compilation, start the other processes."""
+        """Pause garbage collection; at the first compilation, start the warm-ups."""
         if self.depth == 0:
             self.collects = gc.isenabled()
             gc.disable()
@@ -78,7 +78,7 @@ class _Compilation(event.Listener):  # type: ignore[misc]  # numba has no types
 
 
 def _call_in_process(module: str, function: str) -> None:
-    """Call a function in a new process, if the process can be started."""
+    """Call a function in a new process without waiting; ignore a failure to start the process."""
     code = f"import sys; sys.path[:] = {sys.path!r}; from {module} import {function} as f; f()"
     with contextlib.suppress(OSError):
         null = subprocess.DEVNULL

@@ -20,7 +20,7 @@ class UserError(ValueError):
     """A mistake in an input, a file or an option that the user can correct.
 
     Args:
-        got: The value with its file and field.
+        got: The rejected value, with its file and field.
         allowed: The allowed values.
         fix: How to correct the mistake.
     """
@@ -53,7 +53,7 @@ class StoppedError(RunError):
 
 
 class Interruption(KeyboardInterrupt):
-    """Ctrl-C, or SIGTERM from a scheduler."""
+    """Interruption of a run by Ctrl-C, or by SIGTERM from a scheduler."""
 
     def __init__(self, number: int, advice: str = RESUME) -> None:
         super().__init__(f"interrupted; {advice}")
@@ -61,7 +61,7 @@ class Interruption(KeyboardInterrupt):
 
 
 def require(package: str, choice: str, extra: str) -> ModuleSpec:
-    """Find the package that an option needs, without importing it.
+    """Return the import spec of the package that an option needs, without importing the package.
 
     Args:
         package: Name of the package.
@@ -93,7 +93,7 @@ def check_choice(option: str, value: str, allowed: Iterable[str]) -> None:
 
 
 def system_failure(error: OSError, path: Path) -> str:
-    """Describe a failed operation of the operating system on a path."""
+    """Return a message for a failed file operation on a path, with advice if the disk is full."""
     if error.errno in NO_SPACE:
         return f"no space left for {path}: free some disk space"
     return f"{error.filename or path}: {error.strerror or error}"

@@ -49,7 +49,7 @@ def enable(packages: Iterable[str]) -> None:
 
 
 def components(group: str) -> dict[str, str]:
-    """Return the dotted names of the enabled packages' components of a group, by name."""
+    """Return a group's components in the enabled packages: dotted Python names by short name."""
     enabled = _enabled()
     if not enabled:
         return {}
@@ -61,7 +61,7 @@ def components(group: str) -> dict[str, str]:
 
 
 def advice(group: str, name: str) -> str:
-    """Return instructions for enabling a component of an installed or missing package."""
+    """Return advice to enable, or to install, the package of a component that was not found."""
     for entry in _entries(group):
         if name in (entry.name, entry.value.replace(":", ".")):
             return f"enable its package: extensions=[{_package(entry)}]"
@@ -70,7 +70,7 @@ def advice(group: str, name: str) -> str:
 
 
 def config_folders() -> Iterator[tuple[str, Path]]:
-    """Yield name and config folder of every installed package, without importing it."""
+    """Yield name and config folder of every installed extension package, without importing it."""
     for entry in _entries("conf"):
         package, *folders = entry.value.split(".")
         spec = find_spec(package)  # finding a top-level package does not run its code
@@ -82,7 +82,7 @@ def config_folders() -> Iterator[tuple[str, Path]]:
 
 
 def _enabled() -> list[str]:
-    """Return the names of the enabled packages, which child processes inherit."""
+    """Return the names of the enabled packages from the environment variable."""
     return [name for name in os.environ.get(VARIABLE, "").split(",") if name]
 
 

@@ -35,7 +35,7 @@ IMAGES: Final = (".png", ".jpg", ".jpeg")
 
 
 def write_png(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> None:
-    """Write an RGB image as PNG, for any suffix of the path.
+    """Write an RGB image atomically as PNG, whatever the path's suffix.
 
     Raises:
         ValueError: The image is not uint8 of shape (H, W, 3), or is empty.
@@ -46,12 +46,12 @@ def write_png(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> N
 
 
 def write_image(path: Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
-    """Write an RGB image in the format of the path's suffix, one of :data:`IMAGES`."""
+    """Write an RGB image atomically in the format of the path's suffix, one of :data:`IMAGES`."""
     write_file(path, _encode(image, path.suffix.lower()))
 
 
 def _encode(image: UInt8[np.ndarray, "height width 3"], suffix: str) -> bytes:
-    """Return an image encoded in the format of a suffix."""
+    """Return an RGB image encoded in the format of a suffix, e.g. ``.png``."""
     import cv2  # takes a tenth of a second, and not every command writes images
 
     return bytes(cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes())
@@ -81,7 +81,7 @@ def check_target(path: Path, suffixes: Sequence[str] = ()) -> None:
 def write_csv(
     path: Path | str, rows: Sequence[Mapping[str, object]], header: Sequence[str] = ()
 ) -> None:
-    """Write a CSV file; missing values are empty, and the default header is the longest row's."""
+    """Write rows as CSV, missing values as empty; the default header is that of the longest row."""
     text = io.StringIO(newline="")
     longest: Mapping[str, object] = max(rows, key=len)
     writer = csv.DictWriter(text, header or list(longest), restval="", lineterminator="\n")
@@ -99,7 +99,7 @@ def read_csv(path: Path) -> list[dict[str, str]]:
 
 
 def write_file(path: Path | str, content: bytes) -> None:
-    """Write a file atomically."""
+    """Write a file under a temporary name and rename it to ``path``; make its folder."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = partial_path(path)
@@ -112,7 +112,7 @@ def write_file(path: Path | str, content: bytes) -> None:
 
 @contextmanager
 def draft(path: Path) -> Iterator[Path]:
-    """Yield a temporary path of a file or folder that replaces ``path``, unless the block fails."""
+    """Yield a temporary path, whose file or folder replaces ``path`` unless the block raises."""
     folder = partial_path(path)
     folder.mkdir(parents=True)
     try:
@@ -133,7 +133,7 @@ _ABANDONED_S: Final = 600.0  # age of an abandoned partial file of another machi
 
 
 def read_limited(path: Path, max_bytes: int) -> bytes:
-    """Read an untrusted file, which may grow or have no end.
+    """Read an untrusted file, which may grow while it is read, or be endless.
 
     Raises:
         OSError: The file cannot be read.
@@ -148,12 +148,12 @@ def read_limited(path: Path, max_bytes: int) -> bytes:
 
 
 def partial_path(path: Path) -> Path:
-    """Return a temporary path in a file's folder, which no other process uses on any machine."""
+    """Return a temporary path next to a file, which no other process on any machine uses."""
     return path.with_name(f".{path.name}.{_machine()}-{os.getpid()}{PARTIAL_SUFFIX}")
 
 
 def is_abandoned(path: Path, now: float) -> bool:
-    """Return whether a partial file's process has ended at the file system's time ``now``."""
+    """Return whether a partial file's process has ended or, at ``now``, the file is 10 min old."""
     match = _PARTIAL.fullmatch(path.name)
     if match and match[1] == _machine() and not _is_running(int(match[2])):
         return True
@@ -179,7 +179,7 @@ def _is_running(process: int) -> bool:
 
 @cache
 def _machine() -> str:
-    """Return eight hex digits that identify the scope in which process ids are unique."""
+    """Return eight hex digits that identify the machine or container of the process ids."""
     # Host names are not unique (containers, ``localhost``), so on Linux the boot and the process
     # namespace are included.
     facts = [socket.gethostname()]

@@ -18,8 +18,8 @@ from dopepp.core.errors import UserError
 from dopepp.core.files import read_limited
 
 MAX_BYTES: Final = 64_000_000
-"""Size of 10,000 images of a BOP scene with ten objects each. Parsed JSON takes up to 20 times this
-size in memory."""
+"""Default size limit: 10,000 images of a BOP scene with ten objects each. Parsed JSON takes up to
+20 times its size in memory."""
 
 MAX_DEPTH: Final = 64  # the formats here need six
 
@@ -90,11 +90,11 @@ def parse_json(text: str | bytes, where: str) -> object:
 
 
 class _NotFiniteError(ValueError):
-    """A number such as ``NaN`` or ``1e999``."""
+    """A JSON number is not finite, such as ``NaN`` or ``1e999``."""
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Convert the pairs of a JSON object to a dictionary, and reject a repeated key."""
+    """Convert the pairs of a JSON object to a dictionary; raise a ValueError for a repeated key."""
     fields = dict(pairs)
     if len(fields) < len(pairs):
         seen: set[str] = set()
@@ -104,7 +104,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _finite(text: str) -> float:
-    """Convert a number's text to a float, and reject overflow."""
+    """Convert a number's text to a float; raise :class:`_NotFiniteError` if it is not finite."""
     number = float(text)
     if not math.isfinite(number):
         raise _NotFiniteError(text)
@@ -112,7 +112,7 @@ def _finite(text: str) -> float:
 
 
 def _position(text: str) -> str:
-    """Return the position of the first number that is not finite, as text."""
+    """Return "line …, column …: " of the first number that is not finite, or ""."""
     for match in _NOT_FINITE.finditer(text):
         if match[1] or (match[2] and math.isinf(float(match[2]))):
             line = text.count("\n", 0, match.start()) + 1
@@ -122,7 +122,7 @@ def _position(text: str) -> str:
 
 
 def _depth(bare: bytes) -> int:
-    """Return the nesting depth of JSON whose strings are removed."""
+    """Return the largest nesting depth of JSON whose strings are removed."""
     code = np.frombuffer(bare, np.uint8)
     opened = (code == ord("[")) | (code == ord("{"))
     closed = (code == ord("]")) | (code == ord("}"))
@@ -139,6 +139,5 @@ def _may_overflow(bare: bytes) -> bool:
 
 
 def _bad(where: str, problem: str) -> UserError:
-    """Return the error for invalid JSON."""
     allowed = "UTF-8 JSON with finite numbers and each key once"
     return UserError(f"{where}: {problem}", allowed, "correct the file, or write it again")

@@ -1,6 +1,6 @@
 """Pools that apply a function to many items: processes of this machine, or a Ray cluster.
 
-A pool receives the pickled function once and yields each item with its future when it is done. An
+A pool receives the pickled function once and yields each item with its future on completion. An
 exception or a lost process affects its own item only.
 
 When one process dies, ``concurrent.futures.ProcessPoolExecutor`` and loky lose all items in
@@ -43,24 +43,24 @@ THREAD_LIMITS: Final = tuple(f"{library}_THREADS" for library in _LIMITED)
 """Environment variables that limit the threads of libraries loaded after they are set."""
 
 _ITEMS_PER_WORKER: Final = 2
-"""Submitted items per worker: no worker waits, and an autoscaling cluster sees a queue."""
+"""Unfinished items per worker: no worker idles, and an autoscaling cluster sees a queue."""
 
 _PATIENCE_S: Final = 3.0
-"""Time for a process to complete its item when the pool is stopped, before it is killed."""
+"""Time in which a process may finish its item after a failure, before it is killed."""
 
 _CORES_EVERY_S: Final = 10.0
-"""Interval of queries for the cluster's number of cores, which may change."""
+"""Interval of queries for the cluster's number of CPU cores, which may change."""
 
 
 def available_cores() -> int:
-    """Return the number of cores that this process may use; outside Linux, of all cores."""
+    """Return the number of CPU cores that this process may use; outside Linux, of all CPU cores."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def physical_cores() -> int:
-    """Return the number of physical cores that this process may use."""
+    """Return the number of physical CPU cores for this process; outside Linux, of logical cores."""
     if not hasattr(os, "sched_getaffinity"):
         return os.cpu_count() or 1
     siblings = set()
@@ -71,26 +71,26 @@ def physical_cores() -> int:
 
 
 def num_threads() -> int:
-    """Return ``OMP_NUM_THREADS`` if it is set, else the physical cores of this process."""
+    """Return ``OMP_NUM_THREADS`` if it is a positive integer, else :func:`physical_cores`."""
     text = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
     return int(text) if text.isdecimal() and int(text) > 0 else physical_cores()
 
 
 def cpu_fact(*names: str) -> str:
-    """Return the first entry of /proc/cpuinfo with one of these names, or an empty string."""
+    """Return the value of the first line of /proc/cpuinfo that starts with a name, or ""."""
     path = Path("/proc/cpuinfo")
     lines = path.read_text().splitlines() if path.is_file() else []
     return next((line.partition(":")[2].strip() for line in lines if line.startswith(names)), "")
 
 
 class LostWorkerError(RuntimeError):
-    """A process, or a machine of the cluster, died while it processed an item."""
+    """A worker process, or a machine of the cluster, died while it processed an item."""
 
 
 class PickledFunction:
     """A pickled function, which is unpickled when its first item arrives.
 
-    Calls return a pickled pair (value, error).
+    A call returns the pickled pair (value, None), or (None, error) if the function raised.
     """
 
     def __init__(self, content: bytes) -> None:
@@ -98,7 +98,7 @@ class PickledFunction:
         self._function: Callable[[Any], Any] | None = None
 
     def __call__(self, item: object) -> bytes:
-        """Apply the function."""
+        """Apply the function to an item."""
         try:
             if self._function is None:
                 self._function = pickle.loads(self._content)
@@ -122,11 +122,11 @@ def unpickle_answer(answer: bytes) -> Any:
 
 
 class Pool(ABC):
-    """Applies a pickled function to items in parallel; a context manager."""
+    """Base of pools, which apply a pickled function to items in parallel; a context manager."""
 
     batch_size: int
-    """Recommended size of an item. Small items lose little work when stopped; large items have less
-    overhead."""
+    """Recommended number of scenes to render per item. Small items lose little work when stopped;
+    large items have less overhead."""
 
     def __enter__(self) -> Pool:
         return self
@@ -136,11 +136,11 @@ class Pool(ABC):
 
     @abstractmethod
     def capacity(self) -> int:
-        """Return how many items may be submitted at a time."""
+        """Return how many submitted items may be unfinished at a time."""
 
     @abstractmethod
     def submit(self, item: object) -> Future[Any]:
-        """Submit an item."""
+        """Submit an item, and return the future of the function's value."""
 
     def run(self, items: Iterable[Item]) -> Iterator[tuple[Item, Future[Any]]]:
         """Yield items and their futures in the order of completion.
@@ -159,17 +159,17 @@ class Pool(ABC):
 
 
 class _Worker(threading.local):
-    """A thread's process and the pipe to it."""
+    """Worker process of the current thread, and the pipe to it."""
 
     process: SpawnProcess | None = None
     connection: Connection
 
 
 class ProcessPool(Pool):
-    """Processes of this machine.
+    """Pool of processes on this machine.
 
-    Processes are spawned, because Mitsuba's thread pool does not survive a fork; this takes about a
-    second. Processes finish their item when the pipe is closed, so no file is half-written if
+    Processes are spawned (in about a second), because Mitsuba's thread pool does not survive a
+    fork. Processes finish their item when the pipe is closed, so no file is half-written if
     the pool is stopped or this process is killed.
 
     Args:
@@ -202,15 +202,15 @@ class ProcessPool(Pool):
             process.join()
 
     def capacity(self) -> int:
-        """Return how many items may be submitted at a time."""
+        """Return how many submitted items may be unfinished at a time."""
         return self._num_workers * _ITEMS_PER_WORKER
 
     def submit(self, item: object) -> Future[Any]:
-        """Submit an item."""
+        """Submit an item, and return the future of the function's value."""
         return self._threads.submit(self._apply, item)
 
     def _apply(self, item: object) -> Any:
-        """Apply the function to an item in this thread's worker process; start it if needed."""
+        """Apply the function to an item in this thread's worker process, started if needed."""
         worker = self._worker
         is_new = worker.process is None
         process = worker.process = worker.process or self._start()
@@ -242,13 +242,12 @@ class ProcessPool(Pool):
         return process
 
     def _kill(self) -> None:
-        """Kill all worker processes."""
         for process in self._processes:
             process.kill()
 
 
 def _block_signals() -> None:
-    """Block signals in the processes that this thread starts."""
+    """Block SIGINT and SIGTERM in the processes that this thread starts."""
     # Ctrl-C reaches every process of the terminal, but only the parent should react.
     if hasattr(signal, "pthread_sigmask"):
         resource_tracker.ensure_running()  # it starts with the first process, and unblocks signals
@@ -256,7 +255,7 @@ def _block_signals() -> None:
 
 
 def _serve(connection: Connection) -> None:
-    """Receive the function, then apply it to items until the pipe ends."""
+    """Receive the pickled function, then apply it to items until the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # for systems without a signal mask
     with suppress(EOFError, OSError):  # the parent has ended
         function = PickledFunction(connection.recv_bytes())
@@ -269,7 +268,7 @@ _environment_lock = threading.Lock()
 
 @contextmanager
 def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables for processes that are started in the block."""
+    """Set environment variables in the block, for the processes that are started in it."""
     with _environment_lock:
         previous = {name: os.environ[name] for name in variables if name in os.environ}
         os.environ.update(variables)
@@ -282,7 +281,7 @@ def _environment(variables: Mapping[str, str]) -> Iterator[None]:
 
 
 class ClusterPool(Pool):
-    """Tasks of a Ray cluster.
+    """Pool of tasks on a Ray cluster.
 
     All machines must have the same dopepp and the same files under the same paths. Ray repeats the
     tasks of a lost machine. ``num_tasks`` counts the finished tasks by the node's id.
@@ -290,9 +289,9 @@ class ClusterPool(Pool):
     Args:
         content: Pickled function of one item.
         address: ``host:port`` of the cluster (default: start one on this machine for the pool).
-        num_workers: Cores of a cluster on this machine.
-        asked_by: The option that needs Ray, for messages.
-        option: The option with the address, for messages.
+        num_workers: Number of CPU cores of a cluster that is started on this machine.
+        asked_by: The option that needs Ray, for error messages.
+        option: The option that sets the address, for error messages.
         task_options: Options of ``ray.remote`` for a task, e.g. ``num_gpus`` (default: one core).
 
     Raises:
@@ -328,14 +327,14 @@ class ClusterPool(Pool):
         _log.info("Ray: %d tasks on %d nodes", self.num_tasks.total(), len(self.num_tasks))
 
     def capacity(self) -> int:
-        """Return how many items may be submitted at a time."""
+        """Return how many submitted items may be unfinished at a time."""
         if time.monotonic() - self._asked_at >= _CORES_EVERY_S:
             cores = int(self._ray.cluster_resources().get("CPU", 0))
             self._room, self._asked_at = max(cores, 1) * _ITEMS_PER_WORKER, time.monotonic()
         return self._room
 
     def submit(self, item: object) -> Future[Any]:
-        """Submit an item."""
+        """Submit an item, and return the future of the function's value."""
         result: Future[Any] = Future()
 
         def finish(answered: Future[tuple[bytes, str]]) -> None:
@@ -391,7 +390,7 @@ _functions: dict[str, PickledFunction] = {}
 
 
 def _apply(content: list[Any], key: str, item: object) -> tuple[bytes, str]:
-    """Apply the function in a process of the cluster; return its answer and the node's id."""
+    """Apply the function to an item in a cluster process; return its answer and the node's id."""
     import ray
 
     if key not in _functions:

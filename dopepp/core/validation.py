@@ -1,6 +1,6 @@
-"""Validation of plain values, by pydantic in its strict JSON mode.
+"""Validation of JSON-like values, by pydantic in its strict JSON mode.
 
-:func:`parse` converts a plain value from a YAML or JSON file to a type, e.g. a frozen dataclass
+:func:`parse` converts a JSON-like value from a YAML or JSON file to a type, e.g. a frozen dataclass
 whose numbers have a :class:`Range`. :func:`check` validates an argument, and :class:`Checked` the
 fields of a dataclass. The first mistake raises :class:`~dopepp.core.errors.UserError`.
 
@@ -46,7 +46,7 @@ _WORDS: Final = {
     "mapping": "a mapping",
     "none": "null",
 }
-"""Names of the allowed values, by the first part of pydantic's error type."""
+"""Allowed values in words, by the first part of pydantic's error type."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Span(Range):
     """Range of a pair (smallest, largest), as in ``Annotated[tuple[float, float], Span(0, 1)]``."""
 
     def allowed(self, kind: Any) -> str:
-        """Return the allowed values in words."""
+        """Return the allowed pairs in words."""
         bounds = f"{self.lowest:g} <= smallest <= largest <= {self.highest:g}"
         return f"(smallest, largest) with {bounds}{self._unit}"
 
@@ -110,13 +110,13 @@ class Span(Range):
 
 
 Pair = tuple[float, float]
-"""Smallest and largest number of a :class:`Span`."""
+"""A pair (smallest, largest) that a :class:`Span` limits."""
 
 Share = Annotated[float, Range(0.0, 1.0, "share")]
 
 
 class _Mistake(NamedTuple):
-    """A value that its type does not allow; ``got`` is empty for a missing value."""
+    """A rejected value ``got`` (empty if missing) and what is allowed at its location."""
 
     location: tuple[str | int, ...]
     got: str
@@ -130,11 +130,11 @@ class _Mistake(NamedTuple):
 
 
 def parse(kind: type[T], value: object, name: str = "", fix: str = "") -> T:
-    """Validate a plain value.
+    """Convert a JSON-like value to a type, without coercion.
 
     Args:
         kind: Type to build.
-        value: Null, true or false, numbers, text, and lists and mappings of them.
+        value: Null, true, false, numbers, text, and lists and mappings of them.
         name: Dotted name or file of the value, for messages.
         fix: Advice for the user (default: correct the field).
 
@@ -168,13 +168,13 @@ def check(
 
     Args:
         name: Name of the argument, for messages.
-        value: Plain value, of unknown type.
+        value: JSON-like value to validate.
         kind: Required type.
         limits: Range of the number or numbers.
-        of: Owner of the argument, for messages: an object with a name, or of a named class.
+        of: Object that has the argument; messages contain its ``name``, or else its class.
 
     Returns:
-        The typed value: a float for a number, a tuple for a list.
+        The value as ``kind``; an integer becomes a float and a list a tuple if ``kind`` says so.
 
     Raises:
         UserError: The value is of another type or out of range.
@@ -207,7 +207,7 @@ class Checked:
 
 @cache
 def _ranged_fields(kind: Any) -> dict[str, Any]:
-    """Return the annotations of the fields that have a :class:`Range`."""
+    """Return the annotations, by name, of a class's fields that have a :class:`Range`."""
     hints = typing.get_type_hints(kind, include_extras=True)
     return {
         name: hint
@@ -236,12 +236,12 @@ def _adapter(kind: type[T]) -> TypeAdapter[T]:
 
 
 def _validate(kind: Any, value: object, name: str) -> Any:
-    """Validate a plain value against a type, without converting between types."""
+    """Validate a JSON-like value against a type, without coercion; ``name`` is for messages."""
     return _adapter(kind).validate_json(_json(value, name), strict=True)
 
 
 def _json(value: object, name: str) -> str:
-    """Return a plain value as JSON, and reject values that JSON cannot represent."""
+    """Return a value as JSON text; raise a UserError if JSON cannot represent the value."""
     try:
         return json.dumps(value)
     except (TypeError, ValueError, RecursionError) as error:
@@ -251,7 +251,7 @@ def _json(value: object, name: str) -> str:
 
 
 def _user_error(mistake: _Mistake, root: str, fix: str) -> UserError:
-    """Return the message for a mistake, with the most similar name if a name is unknown."""
+    """Return the error for a mistake; its advice is the most similar name for an unknown field."""
     name = mistake.name(root)
     if mistake.is_unknown:
         fields = mistake.allowed.split(", ")
@@ -265,7 +265,7 @@ def _user_error(mistake: _Mistake, root: str, fix: str) -> UserError:
 
 
 def _mistakes(kind: type[Any], value: object, error: ValidationError) -> Iterator[_Mistake]:
-    """Translate pydantic's errors, and merge the errors of a union's alternatives."""
+    """Yield pydantic's errors as mistakes, with the alternatives of a union merged."""
     located = [(_location(value, detail), detail) for detail in error.errors()]
     for location, group in groupby(located, key=lambda pair: pair[0]):
         details = [detail for _, detail in group]
@@ -295,13 +295,13 @@ def _location(value: object, detail: ErrorDetails) -> tuple[str | int, ...]:
 
 
 def _cause(detail: ErrorDetails) -> UserError | None:
-    """Return the error that a dataclass raised in ``__post_init__``."""
+    """Return the UserError that a dataclass raised in ``__post_init__``, or None."""
     cause = detail.get("ctx", {}).get("error")
     return cause if isinstance(cause, UserError) else None
 
 
 def _allowed(detail: ErrorDetails) -> str:
-    """Return the allowed values in pydantic's description of an error."""
+    """Return the allowed values in words, from pydantic's description of an error."""
     context = detail.get("ctx", {})
     if cause := _cause(detail):
         return cause.allowed
@@ -329,9 +329,10 @@ def _fields(kind: Any, location: Sequence[str | int], value: Any) -> list[str]:
 
 
 def _dataclass(kind: Any, value: Any) -> Any:
-    """Return a dataclass, or the member of a union that matches the value.
+    """Return ``kind`` if it is a dataclass, or the union member whose tag matches the value.
 
-    The members of a tagged union have a field ``kind`` with their tag as default.
+    Members of a tagged union have a field ``kind`` with their tag as default. If no tag matches,
+    the first member is returned.
     """
     members = [*filter(dataclasses.is_dataclass, (kind, *typing.get_args(kind)))]
     tag = value.get("kind") if isinstance(value, Mapping) else None

@@ -34,7 +34,7 @@ def read_yaml(path: Path) -> object:
 
 
 def parse_yaml(text: str, where: Path | str) -> object:
-    """Parse YAML text. The caller limits its size.
+    """Parse YAML text from a source ``where`` (for messages). The caller limits its size.
 
     Raises:
         UserError: As for :func:`read_yaml`.
@@ -47,7 +47,7 @@ def parse_yaml(text: str, where: Path | str) -> object:
 
 
 def _check_events(text: str) -> None:
-    """Check the structure of a text before it is loaded."""
+    """Raise a ValueError for deep nesting, anchors, aliases and tags, before the text is loaded."""
     depth = 0
     for event in yaml.parse(text, yaml.SafeLoader):
         if isinstance(event, yaml.CollectionStartEvent):
@@ -64,6 +64,5 @@ def _check_events(text: str) -> None:
 
 
 def _bad(where: Path | str, problem: str) -> UserError:
-    """Return the error for YAML that is not accepted."""
     allowed = f"YAML of at most {MAX_BYTES / 1e6:g} MB, without anchors and tags"
     return UserError(f"{where}, {problem}", allowed, "write plain YAML, or restore the file")

@@ -33,12 +33,12 @@ Pixels = Float[np.ndarray, "*batch 2"]
 
 
 def transform(T_a_b: Transform, points_b: Points) -> Points:
-    """Map points from frame b into frame a."""
+    """Map points (metres) from frame b into frame a by the rigid transform ``T_a_b``."""
     return np.asarray(points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3])
 
 
 def make_transform(rotation: RotationMatrix, translation: Vector) -> Transform:
-    """Assemble a 4×4 rigid transform."""
+    """Assemble a 4×4 rigid transform from a rotation and a translation (metres)."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation, translation
     return T
@@ -51,18 +51,18 @@ def invert_transform(T_a_b: Transform) -> Transform:
 
 
 def move_pose(T_cam_obj: Transform, step: Step) -> Transform:
-    """Apply a step to a pose."""
+    """Rotate a pose about the object's origin and shift it, both in camera axes."""
     R = rotation_vector_to_matrix(step[:3])
     return make_transform(R @ T_cam_obj[:3, :3], T_cam_obj[:3, 3] + step[3:])
 
 
 def orbited_camera(point: Vector, angle: float, direction: float) -> Transform:
-    """Return T_new_cam after this camera has orbited around a point.
+    """Return T_new_cam, from a camera's frame to its frame after an orbit around a point.
 
     Args:
-        point: The point in this camera, metres.
-        angle: Angle between both lines of sight to the point, radians.
-        direction: Direction of the rotation's axis in the image plane, radians.
+        point: Centre of the orbit in the camera's original frame, metres.
+        angle: Angle between the two lines of sight to the point, radians.
+        direction: Angle of the rotation axis from x in the image plane, radians.
     """
     axis = np.array([math.cos(direction), math.sin(direction), 0.0])
     R = rotation_vector_to_matrix(angle * axis)
@@ -70,13 +70,13 @@ def orbited_camera(point: Vector, angle: float, direction: float) -> Transform:
 
 
 def step_between(before: Transform, after: Transform) -> Step:
-    """Return the step from one pose to another, the inverse of :func:`move_pose`."""
+    """Return the step from one pose to another: ``move_pose(before, step)`` is ``after``."""
     rotvec = matrix_to_rotation_vector(after[:3, :3] @ before[:3, :3].T)
     return np.concatenate([rotvec, after[:3, 3] - before[:3, 3]])
 
 
 def project(points_cam: Points, K: CameraMatrix) -> Pixels:
-    """Project camera-frame points (metres) to pixels; NaN at or behind the camera."""
+    """Project camera-frame points (metres) to pixels; NaN for points at or behind the camera."""
     points_cam = np.asarray(points_cam, np.float64)
     depth = points_cam[..., 2:]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -87,7 +87,7 @@ def project(points_cam: Points, K: CameraMatrix) -> Pixels:
 def project_keypoints(
     cuboid: Cuboid, T_cam_obj: Transform, K: CameraMatrix
 ) -> Float[np.ndarray, "9 2"]:
-    """Project the nine keypoints of an object to pixels; NaN at or behind the camera."""
+    """Project an object's nine keypoints to pixels; NaN for keypoints at or behind the camera."""
     return project(transform(T_cam_obj, cuboid), K)
 
 
@@ -97,7 +97,8 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> CameraMatrix:
 
 
 def resize_camera(K: CameraMatrix, scale_x: float, scale_y: float) -> CameraMatrix:
-    """Return K of a resized image: u becomes s·(u + ½) − ½, as pixel centres are integers."""
+    """Return K of an image that is resized by ``scale_x`` and ``scale_y``."""
+    # As pixel centres are integers, u becomes s·(u + ½) − ½.
     resized = np.array(K, np.float64)
     resized[0] *= scale_x
     resized[1] *= scale_y
@@ -107,7 +108,7 @@ def resize_camera(K: CameraMatrix, scale_x: float, scale_y: float) -> CameraMatr
 
 
 def crop_camera(K: CameraMatrix, left: float, top: float) -> CameraMatrix:
-    """Return K of a crop with the first pixel (left, top)."""
+    """Return K of a crop whose top-left pixel is the image's pixel (left, top)."""
     cropped = np.array(K, np.float64)
     cropped[:2, 2] -= left, top
     return cropped
@@ -126,7 +127,7 @@ def resize_points(points_px: Pixels, scale_x: float, scale_y: float) -> Pixels:
 
 @dataclass(frozen=True)
 class Letterbox:
-    """Resize of an image to fit into a network's input, before padding.
+    """Resizing of an image to fit into a network's input, before padding.
 
     Padding on the right and at the bottom leaves K unchanged. The scales of the two axes differ by
     the rounding to whole pixels.
@@ -145,7 +146,7 @@ class Letterbox:
 
     @classmethod
     def fit(cls, image_size: tuple[int, int], input_size: tuple[int, int]) -> Letterbox:
-        """Fit an image (width, height) into an input (width, height)."""
+        """Return the largest letterbox of an image (width, height) in an input (width, height)."""
         scale = min(input_size[0] / image_size[0], input_size[1] / image_size[1])
         box = cls.scaled(image_size, scale)
         width, height = min(input_size[0], box.width), min(input_size[1], box.height)
@@ -160,7 +161,7 @@ class Letterbox:
     def image(
         self, image: UInt8[np.ndarray, "rows columns 3"]
     ) -> UInt8[np.ndarray, "height width 3"]:
-        """Resize an RGB image, without padding."""
+        """Resize an RGB image to ``width`` × ``height``, without padding."""
         if (image.shape[1], image.shape[0]) == (self.width, self.height):
             return image
         # INTER_AREA averages pixels when shrinking but repeats them when enlarging.
@@ -181,7 +182,7 @@ class Letterbox:
 
 
 def pinhole_matrix(K: CameraMatrix, source: str) -> CameraMatrix:
-    """Return K as float64, with exact zeros and ones; ``source`` is its origin, for messages.
+    """Return K as float64, with exact zeros and ones; ``source`` names its origin in messages.
 
     Raises:
         UserError: K is not a finite pinhole matrix.

@@ -46,7 +46,7 @@ COEFFICIENTS: Final = (0, 4, 5, 8, 12, 14)  # Numbers of coefficients of OpenCV'
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A calibrated camera.
+    """Calibrated pinhole camera with OpenCV's lens distortion.
 
     Attributes:
         size: (width, height) of the calibrated images, pixels; None if unknown.
@@ -62,7 +62,7 @@ class Camera:
 
     @property
     def coefficients(self) -> Float[np.ndarray, "coefficients"] | None:
-        """Distortion for OpenCV and ``PoseEstimator.predict``; None without distortion."""
+        """Distortion coefficients for OpenCV and ``PoseEstimator.predict``, or None."""
         return np.array(self.distortion) if self.distortion else None
 
     def undistorted(
@@ -80,8 +80,8 @@ class Camera:
 
         Args:
             size: (width, height) of the image.
-            K_size: Size of the calibrated image, if this image was resized.
-            crop: Region of the calibrated image, if this image was cropped.
+            K_size: (width, height) of the calibrated image, if this image was resized.
+            crop: Region (x, y, width, height) of the calibrated image, if this image is a crop.
 
         Raises:
             UserError: K belongs to another size and neither option explains it, or an option is

@@ -165,7 +165,7 @@ def calibration_of_fields(content: Mapping[Any, object], source: str) -> Calibra
 
 
 class _Fields:
-    """Named fields of a file, with their full names for messages."""
+    """Named fields of a camera file; messages name a field "file: field"."""
 
     def __init__(self, content: Mapping[Any, object], source: str) -> None:
         self.source = source
@@ -187,13 +187,13 @@ class _Fields:
         return ", ".join(self._names[:10]) or "no field"
 
     def find(self, *names: str) -> tuple[str, object] | None:
-        """Return the full name and the value of the first existing field."""
+        """Return full name and value of the first of ``names`` that the file has, or None."""
         keys = [_key(name) for name in names if _key(name) in self._fields]
         return self._fields[keys[0]] if keys else None
 
 
 def _key(name: str) -> str:
-    """Return a field's name in the form in which names are compared."""
+    """Return a field's name in lower case, without underscores."""
     return name.lower().replace("_", "")
 
 

@@ -19,7 +19,7 @@ from dopepp.geometry.cuboid import Cuboid
 
 MIN_POINTS: Final = 8  # With fewer keypoints, an outlier resembles perspective
 MILD: Final = 0.02
-"""Error of a keypoint, as a share of the part's extent, above which the loss is not quadratic."""
+"""Keypoint error, as a share of the part's extent in the image, above which the loss is linear."""
 
 LENGTHS: Final = (0.5, 1.0, 2.0)  # Initial factors; each search covers half to twice the factor
 
@@ -30,7 +30,7 @@ class Focal(NamedTuple):
     Attributes:
         factor: Factor on the focal lengths.
         deviation: Standard deviation of the factor's logarithm.
-        gain: Ratio of the squared keypoint errors before and after the correction.
+        gain: Robust reprojection cost per degree of freedom before the correction, over that after.
     """
 
     factor: float
@@ -41,12 +41,12 @@ class Focal(NamedTuple):
 def focal_factor(
     cuboid: Cuboid, keypoints: Float[np.ndarray, "9 2"], T_cam_obj: Transform, K: CameraMatrix
 ) -> Focal | None:
-    """Fit a focal length to the keypoints of an object.
+    """Fit a focal length, together with the pose, to the detected keypoints of an object.
 
     Args:
         cuboid: Keypoints of the object, metres.
         keypoints: Detected positions of the keypoints, pixels; NaN if missing.
-        T_cam_obj: Pose estimated with K, metres.
+        T_cam_obj: Pose estimated with K, metres; start of the fit.
         K: Camera matrix, pixels.
 
     Returns:
@@ -58,7 +58,7 @@ def focal_factor(
     extent = float(np.ptp(keypoints[is_known], axis=0).max())
 
     def errors(values: Float[np.ndarray, "unknowns"], first: float) -> Float[np.ndarray, "errors"]:
-        """Return the reprojection errors over the object's extent, for a step and a factor."""
+        """Return reprojection errors over the extent, for a step and log(factor / ``first``)."""
         step, lens, start = values[:6].copy(), K.copy(), T_cam_obj.copy()
         factor = first * math.exp(values[6]) if len(values) > 6 else first
         lens[[0, 1], [0, 1]] *= factor
@@ -70,7 +70,7 @@ def focal_factor(
         )
 
     def fit(unknowns: int, first: float) -> OptimizeResult:
-        """Fit the pose and, with a seventh unknown, the logarithm of the factor over ``first``."""
+        """Fit the pose and, with a seventh unknown, the logarithm of factor / ``first``."""
         most = np.array([*6 * [math.inf], math.log(2)])[:unknowns]
         start, bounds = np.zeros(unknowns), (-most, most)
         return least_squares(

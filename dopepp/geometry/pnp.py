@@ -128,9 +128,10 @@ def _prepare(
     K: CameraMatrix,
     covariance: Float[np.ndarray, "n 2 2"],
 ) -> tuple[Rays, Whitenings, Bool[np.ndarray, "n"]]:
-    """Return the rays of the usable points, their whitenings of pixels, and which are usable.
+    """Return rays and pixel whitenings of the usable points, and the mask of the usable points.
 
-    A whitening W of the covariance Σ has WᵀW = Σ⁻¹.
+    Usable are finite points within ``MAX_TANGENT`` of the axis whose covariance Σ is positive
+    definite. A whitening W of Σ has WᵀW = Σ⁻¹.
     """
     # Inputs may be any number and squares may overflow, so the results are checked. W is the
     # inverse of Cholesky's L with Σ = LLᵀ.
@@ -178,7 +179,7 @@ def _solve(
     whitening: Whitenings,
     widenings: Sequence[float],
 ) -> PnPResult:
-    """Solve for complete points; ``to_px`` maps rays to pixels, ``whitening`` is of pixels."""
+    """Solve for usable points; ``to_px`` maps rays to pixels, ``whitening`` is for pixel errors."""
     no_inliers = np.zeros(len(rays), bool)
     if reason := degenerate(object_points, rays, to_px, whitening):
         return PnPResult(None, math.inf, no_inliers, reason)
@@ -217,7 +218,7 @@ def _fit_inliers(
     size: float,
     centre: Vector,
 ) -> tuple[Transform, float, Float[np.ndarray, "6 6"]]:
-    """Fit the pose (R, t) to the points that agree by least squares, in place.
+    """Fit the pose (R, t) to its inliers by least squares, in place.
 
     The points are those of the object minus ``centre``, divided by ``size`` (metres).
 
@@ -273,7 +274,7 @@ class _Starts:
         self._steps: list[Float[np.ndarray, "s 6"]] = []
 
     def without(self, left_out: int) -> Float[np.ndarray, "s 6"]:
-        """Return SQPnP's poses (rotation vector, translation) for all omissions, or NaN."""
+        """Return SQPnP's pose (rotation vector, translation) per subset, NaN for failures."""
         while len(self._steps) <= left_out:
             kept = _selections(len(self.rays), len(self._steps))
             steps = np.full((len(kept), 6), np.nan)
@@ -294,14 +295,14 @@ class _Starts:
 
 @cache
 def _selections(count: int, left_out: int) -> list[NDArray[np.intp]]:
-    """Return all selections of rows that omit ``left_out`` rows."""
+    """Return the row indices of every subset of ``count`` rows that omits ``left_out`` rows."""
     return [np.array(rows) for rows in combinations(range(count), count - left_out)][::-1]
 
 
 def _best_pose(
     whitening: Whitenings, starts: _Starts
 ) -> tuple[tuple[RotationMatrix, Vector] | None, Bool[np.ndarray, "n"]]:
-    """Return the refined pose with the smallest truncated cost, and which points agree with it."""
+    """Return the refined pose with the smallest truncated cost, or None, and the inlier mask."""
     R, t, cost = np.empty((3, 3)), np.empty(3), math.inf
     points, rays, count = starts.object_points, starts.rays, len(whitening)
     normal, is_plate = starts.normal, starts.is_plate
@@ -327,13 +328,13 @@ def _improve(
     best: float,
     agree: Bool[np.ndarray, "n"],
 ) -> float:
-    """Refine the most likely start poses, and update the best pose and its agreeing points.
+    """Refine the ``NUM_STARTS`` starts of least cost; update the best pose and its inliers.
 
     Start poses are a rotation vector and a translation. For a plate with a ``normal``, the mirrored
     tilt of each start pose is refined as well.
 
     Returns:
-        The cost of the best pose.
+        The truncated cost of the best pose.
     """
     count = len(starts)
     residuals = np.empty((len(rays), 2))
@@ -363,7 +364,7 @@ def _improve(
 
 @compiled()
 def _truncated_cost(residuals: Array) -> float:
-    """Return the MSAC cost of a pose: squared errors, at most the squared gate."""
+    """Return the MSAC cost of a pose, Σ min(r², GATE²) over the points' whitened errors r."""
     cost = 0.0
     for i in range(len(residuals)):
         squared = residuals[i, 0] ** 2 + residuals[i, 1] ** 2
@@ -373,7 +374,7 @@ def _truncated_cost(residuals: Array) -> float:
 
 @compiled()
 def _is_plausible(object_points: ObjectPoints, R: RotationMatrix, t: Vector) -> bool:
-    """Return whether R is a rotation, t is not too long, and all points are before the camera."""
+    """Return whether R is a rotation, t at most MAX_DISTANCE long, and all depths are positive."""
     for i in range(len(object_points)):
         x, y, z = object_points[i, 0], object_points[i, 1], object_points[i, 2]
         if not R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2] > 0.0:

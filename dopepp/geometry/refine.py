@@ -62,7 +62,7 @@ def refine_pose(
     t: Vector,
     gate: float,
 ) -> None:
-    """Minimise the Geman–McClure cost Σ r²/(r² + g²) with the gate g from a pose, in place.
+    """Refine the pose (R, t) in place: minimise the Geman–McClure cost Σ r²/(r² + g²), gate g.
 
     Steps are damped, and a step that does not reduce the cost is repeated with more damping
     (Levenberg–Marquardt). A pose with points behind the camera remains unchanged.
@@ -110,7 +110,7 @@ def reproject(
     t: Vector,
     out: Float[np.ndarray, "n 2"],
 ) -> bool:
-    """Write the whitened reprojection errors; return whether all points are before the camera.
+    """Write the whitened reprojection errors; return whether all points are in front of the camera.
 
     The errors of points behind the camera are NaN.
     """
@@ -160,7 +160,7 @@ def normal_equations(
     hessian: Float[np.ndarray, "6 6"],
     gradient: Float[np.ndarray, "6"],
 ) -> None:
-    """Write JᵀJ and Jᵀr of a left increment (rotation vector, translation), robustly weighted.
+    """Write JᵀJ and Jᵀr of a left increment (rotation vector, translation), with robust weights.
 
     The residuals are the whitened reprojection errors of :func:`reproject`.
 
@@ -212,7 +212,7 @@ def solve_damped(hessian: Array, gradient: Array, damping: float, step: Array) -
 def solve_inside(
     hessian: Array, gradient: Array, damping: float, step: Array, workspace: Array
 ) -> None:
-    """Like :func:`solve_damped`, in a (7, 6) workspace, which avoids allocations in a loop."""
+    """Like :func:`solve_damped`, in a (7, 6) workspace that a loop allocates once."""
     L, scale = workspace[:6], workspace[6]
     for i in range(6):
         scale[i] = 1.0 / math.sqrt(hessian[i, i] + 1e-12)
@@ -298,7 +298,7 @@ def _spreads(
 
     The values are the object's extent (metres), the object's two largest singular values divided
     by the extent, the number of distinct pixels, the pixels' two singular values, and the median
-    deviation (det W)^(−1/2).
+    deviation (det W)^(−1/2), both in pixels.
     """
     n = len(object_points)
     extent = 0.0

@@ -54,7 +54,7 @@ def matrix_to_quaternion(rotation: RotationMatrix) -> Float[np.ndarray, "4"]:
 def rotation_vector_to_matrix(
     vector: Float[np.ndarray, "*batch 3"],
 ) -> Float[np.ndarray, "*batch 3 3"]:
-    """Exponential map: rotate by ``|vector|`` radians about ``vector`` (Rodrigues' formula)."""
+    """Convert rotation vectors (axis times angle in radians) to matrices by Rodrigues' formula."""
     vector = np.asarray(vector, np.float64)
     x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
     half = 0.5 * np.sqrt(x * x + y * y + z * z)[..., None, None]
@@ -69,7 +69,7 @@ def rotation_vector_to_matrix(
 
 
 def matrix_to_rotation_vector(rotation: RotationMatrix) -> Vector:
-    """Return the rotation vector with an angle in [0, π]; inverse of the exponential map."""
+    """Return the rotation vector (axis times angle in [0, π] radians) of a rotation matrix."""
     (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, np.float64).tolist()
     axial = 0.5 * np.array([h - f, c - g, d - b])
     cosine = 0.5 * (a + e + i - 1.0)
@@ -84,7 +84,7 @@ def matrix_to_rotation_vector(rotation: RotationMatrix) -> Vector:
 
 
 def rotation_angle(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch"]:
-    """Return the angle of each rotation in [0, π].
+    """Return the angle of each rotation in [0, π], radians.
 
     ``atan2(|axial vector|, trace − 1)`` keeps full precision near 0 and π, unlike ``arccos``.
     """
@@ -95,7 +95,7 @@ def rotation_angle(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarra
 
 
 def rotation_to_z(axis: Vector) -> RotationMatrix:
-    """Return a rotation that maps a unit axis to z; the directions of x and y are arbitrary."""
+    """Return a rotation that maps a unit axis to z; the rotation about z is arbitrary."""
     right = np.cross(np.eye(3)[np.abs(axis).argmin()], axis)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(axis, right), axis])
@@ -107,7 +107,7 @@ def random_rotation(rng: np.random.Generator) -> RotationMatrix:
 
 
 def nearest_rotation(matrices: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """Return the rotation U diag(1, 1, det U·det V) Vᵀ nearest to each matrix (Umeyama 1991)."""
+    """Return the nearest rotations U diag(1, 1, ±1) Vᵀ by the Frobenius norm (Umeyama 1991)."""
     left, _, right = np.linalg.svd(matrices)
     sign = np.sign(np.linalg.det(left) * np.linalg.det(right))
     scales = np.ones_like(matrices[..., 0])
@@ -118,7 +118,7 @@ def nearest_rotation(matrices: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndar
 def is_rigid(T: Float[np.ndarray, "4 4"], tolerance: float = 1e-3) -> bool:
     """Return whether a matrix is a finite 4×4 rigid transform, with the last row 0, 0, 0, 1.
 
-    ``tolerance`` is that of :func:`is_rotation`.
+    ``tolerance`` is the largest absolute entry of R Rᵀ − I for the rotation R.
     """
     return (
         T.shape == (4, 4)
@@ -129,7 +129,7 @@ def is_rigid(T: Float[np.ndarray, "4 4"], tolerance: float = 1e-3) -> bool:
 
 
 def is_rotation(rotation: RotationMatrix, tolerance: float = 1e-3) -> bool:
-    """Return whether a matrix is 3×3, finite, orthogonal within a tolerance and right-handed."""
+    """Return whether a matrix is 3×3, finite, right-handed, and max |R Rᵀ − I| <= ``tolerance``."""
     rotation = np.asarray(rotation, np.float64)
     return bool(
         rotation.shape == (3, 3)

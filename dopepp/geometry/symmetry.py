@@ -83,7 +83,7 @@ def rotations_about(
 def _ball_rotations(step: float) -> Float[np.ndarray, "rotations 3 3"]:
     """Return rotations that cover all orientations, about ``step`` radians apart.
 
-    They turn the z axis to directions on a spiral, each with several turns about the axis.
+    They map z to directions on a spiral, after one of several rotations about z.
     """
     number = np.arange(math.ceil(4 * math.pi / step**2))
     z = 1 - 2 * number / number[-1]  # the first direction is z

@@ -44,7 +44,7 @@ def transform_record(T: Transform) -> dict[str, object]:
 def read_transform(path: Path, name: str, tolerance: float = EXACT) -> Transform:
     """Read a transform by its name from a YAML file, e.g. ``T_flange_cam`` of a hand-eye file.
 
-    ``tolerance`` is the largest deviation of a given matrix from orthogonality.
+    ``tolerance`` is the largest absolute entry of R Rᵀ − I for the rotation R.
 
     Raises:
         UserError: The file cannot be read, or has no rigid transform of this name.
@@ -62,7 +62,7 @@ def parse_transform(value: object, where: str, tolerance: float = ROUNDED) -> Tr
             ``rotation`` {x, y, z, w}; or with ``position`` and either ``quaternion_wxyz`` or
             ``quaternion_xyzw``. Lengths are metres.
         where: File and field, for error messages.
-        tolerance: Largest deviation of a given matrix from orthogonality.
+        tolerance: Largest absolute entry of R Rᵀ − I for the rotation R.
 
     Raises:
         UserError: The value has none of these forms, or is not a rigid transform.
