@@ -1,8 +1,8 @@
-"""Encode poses as maps, and find peaks in maps: the DOPE representation.
+"""Encode keypoints as belief maps and vector fields, and find peaks in maps (DOPE).
 
-Maps are drawn in batches on the device of the keypoints. Peaks are local maxima with sub-cell
-positions, covariances and vectors. Compiled code finds and fits peaks on the host: copying an
-image's maps, a few hundred kilobytes, is faster than many small operations on a device.
+:func:`encode` computes the maps of a batch on the device of its keypoints. :func:`find_peaks` runs
+compiled code on the CPU: copying an image's maps, a few hundred kilobytes, is faster than many
+small operations on a GPU.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ Beliefs = Float[Tensor, "batch beliefs height width"]
 Fields = Float[Tensor, "batch fields height width"]
 
 REACH: Final = 2.5
-"""Half-width of the fitted neighbourhood in standard deviations of a perfect peak. It contains the
-flanks of a clamped top; cells outside add more noise than information."""
+"""Half-width of the fitted neighbourhood over the standard deviation of a target peak. It contains
+the flanks of a peak whose top is clamped to 1; cells outside add more noise than information."""
 
 HALF_WIDTHS: Final = (2, 4)
-"""Smallest and largest half-width, cells: a fit needs 5×5 cells, and 9×9 always suffice."""
+"""Limits of the neighbourhood's half-width, cells: a fit needs 5×5 cells; 9×9 always suffice."""
 
 TIE_BREAK: Final = 1e-11
-"""Weight of the neighbourhood's sum in the rank of equal cells; the rounding of 25 beliefs does not
-change the weighted float64."""
+"""Weight of the 5×5 sum in :func:`_tie_break`, so small that the sum's float32 rounding errors do
+not change the float64 rank."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class MapGeometry:
     Attributes:
         stride: Input pixels per cell. Cell i covers pixels ``stride·i … stride·i + stride − 1``,
             so its centre is pixel ``stride·i + (stride − 1)/2``.
-        sigma: Standard deviation of a belief peak, cells.
-        field_radius: Radius of the disc around a corner that carries its vector, cells.
+        sigma: Standard deviation of a target's belief peak, cells.
+        field_radius: Radius of the disc around a corner in which the field is defined, cells.
     """
 
     stride: int = 8
@@ -51,7 +51,7 @@ class MapGeometry:
     field_radius: float = 2.0
 
     def to_cells(self, pixels: Tensor) -> Tensor:
-        """Convert input pixels to cell coordinates, in which cell centres are whole numbers."""
+        """Convert pixels of the network's input to cell coordinates (integer at cell centres)."""
         return (pixels - (self.stride - 1) / 2) / self.stride
 
 
@@ -62,18 +62,18 @@ def encode(
     map_size: tuple[int, int],
     geometry: MapGeometry,
 ) -> tuple[Beliefs, Fields]:
-    """Draw the target maps of a batch: 9·C belief and 16·C field channels.
+    """Return the target maps of a batch: 9·C belief and 16·C field channels.
 
     Beliefs are Gaussians of peak 1, combined over instances by their maximum. Keypoints outside the
-    map or not finite are ignored. Fields are unit vectors from a corner to its instance's centroid;
-    in overlapping discs, a cell has the vector of the nearest corner.
+    map or not finite are ignored. In the disc around a corner, the field (x, y) is the unit vector
+    from this corner to its instance's centroid; where discs overlap, the nearest corner counts.
 
     Args:
-        keypoints: Input pixels.
-        object_index: Object of each instance; −1 marks padding.
+        keypoints: (x, y) of corners 0–7 and the centroid, pixels of the network's input.
+        object_index: Index (0 to C − 1) of each instance's object; −1 marks padding.
         num_objects: Number of objects C.
         map_size: (height, width) of the maps, cells.
-        geometry: Geometry of the maps.
+        geometry: Stride, peak width and disc radius.
     """
     height, width = map_size
     batch, instances = object_index.shape
@@ -110,16 +110,16 @@ def encode(
 
 @dataclass(frozen=True)
 class Peaks:
-    """The strongest local maxima of every channel, strongest first, on the host.
+    """The highest local maxima of every belief channel, by descending belief.
 
     Attributes:
-        position: (x, y) in input pixels; NaN in an empty slot.
+        position: (x, y) in pixels of the network's input; NaN in an empty slot.
         score: Belief at the peak's cell; 0 in an empty slot.
         covariance_px: Covariance of the position, pixels²: the excess variance of the peak over a
-            perfect peak, plus the variance of the fit. A network trained with a proper loss returns
+            target peak, plus the variance of the fit. A network trained with a proper loss returns
             the target Gaussian blurred by its own uncertainty, so variances subtract.
-        toward: Mean of the field's vectors around a corner's peak, shorter for differing vectors;
-            zero for a centroid.
+        toward: Weighted mean (x, y) of the unit vectors of the field around a corner's peak; the
+            more they differ, the shorter it is. Zero for a centroid.
     """
 
     position: Float[np.ndarray, "batch channels peaks 2"]
@@ -137,16 +137,16 @@ def find_peaks(
 ) -> Peaks:
     """Find up to ``max_peaks`` local maxima above ``threshold`` in each channel.
 
-    A peak is a cell not below its eight neighbours. Among equal cells, as on the flat top of a
-    clamped belief, the peak is the cell with the highest neighbourhood (usually the middle cell),
-    or else the first cell in raster order. A Gaussian fit to the neighbourhood gives the position.
+    A peak is a cell not below its eight neighbours. Among equal cells, as on a top that is clamped
+    to 1, the peak is the cell with the highest sum of 5×5 cells (usually the middle cell), or else
+    the first cell in raster order. A Gaussian fit to the neighbourhood gives the position.
 
     Args:
-        belief: Maps of nine channels per object.
-        geometry: Geometry of the maps.
-        threshold: Smallest belief of a peak.
+        belief: Belief maps, nine channels per object.
+        geometry: Stride, peak width and disc radius.
+        threshold: Belief that a peak exceeds.
         max_peaks: Number of slots per channel.
-        field: Vectors of 16 channels per object; without it, ``toward`` is zero.
+        field: Vector fields, 16 channels per object; without them, ``toward`` is zero.
     """
     maps = _on_host(belief)
     height, width = maps.shape[2:]
@@ -175,7 +175,7 @@ def find_peaks(
 
 
 def _on_host(maps: Tensor) -> Float[np.ndarray, "batch channels height width"]:
-    """Return maps as a contiguous float32 array."""
+    """Return maps as a contiguous float32 array in CPU memory."""
     return np.ascontiguousarray(maps.detach().float().cpu().numpy())
 
 
@@ -192,7 +192,7 @@ def _find(
     covariance: Array,
     toward: Array,
 ) -> None:
-    """Fill the last four arrays with the peaks of all channels, in cells; see :class:`Peaks`."""
+    """Write the peaks of all channels to the last four arrays, in cells; see :class:`Peaks`."""
     cells = np.empty((score.shape[1], 2), np.int64)
     for channel in range(len(belief)):
         count = _strongest(belief[channel], threshold, score[channel], cells)
@@ -208,7 +208,7 @@ def _find(
 
 @compiled()
 def _strongest(belief: Array, threshold: float, score: Array, cells: Array) -> int:
-    """Write belief and (column, row) of the strongest maxima in order; return their number."""
+    """Write belief, column and row of maxima above ``threshold`` by belief; return their number."""
     count = 0
     for y in range(belief.shape[0]):
         for x in range(belief.shape[1]):
@@ -230,7 +230,7 @@ def _strongest(belief: Array, threshold: float, score: Array, cells: Array) -> i
 
 @compiled()
 def _is_highest(belief: Array, y: int, x: int) -> bool:
-    """Return whether a cell is the highest of its 3×3 neighbourhood; ties have a single winner."""
+    """Return whether a cell is first of its 3×3 cells by belief, tie-break rank, raster order."""
     value = belief[y, x]
     for v in range(max(y - 1, 0), min(y + 2, belief.shape[0])):
         for u in range(max(x - 1, 0), min(x + 2, belief.shape[1])):
@@ -247,7 +247,7 @@ def _is_highest(belief: Array, y: int, x: int) -> bool:
 
 @compiled()
 def _tie_break(belief: Array, y: int, x: int) -> float:
-    """Return the rank among equal cells: the belief plus a tiny multiple of the 5×5 cells' sum."""
+    """Return the belief of a cell plus :data:`TIE_BREAK` times the sum of the 5×5 cells around."""
     total = np.float32(0.0)
     for u in range(max(x - 2, 0), min(x + 3, belief.shape[1])):
         column = np.float32(0.0)

@@ -1,8 +1,8 @@
 """Fit Gaussians to the neighbourhoods of peaks, in compiled code.
 
 A belief map is the maximum over instances of b = exp(c + p·x + q·y − r·x² − t·xy − s·y²), with x
-and y relative to the peak's cell. All peaks of a channel are fitted together, each to the cells
-that no other peak dominates. The cells are assigned again once positions are known.
+and y relative to the peak's cell. Each peak is fitted to the cells in which no other peak of the
+channel has the higher Gaussian. After a first fit, cells are reassigned by the fitted positions.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.refine import solve_inside
 
 FLOOR: Final = 1e-6
-"""Smallest relative belief whose logarithm is used. A peak of σ = 0.5 on the border needs its third
-column, with a relative belief of e⁻¹²·⁵ = 4e-6."""
+"""Smallest belief, relative to the peak's, whose logarithm is used. For a peak of σ = 0.5 cells on
+the border, the fit needs the third column, with a relative belief of e⁻¹²·⁵ = 4e-6."""
 
 FIRST_MARGIN: Final = 3.0
-"""Smallest difference between a cell's squared distances to another peak and to its own peak,
-cells², while positions within cells are unknown."""
+"""Smallest difference between a cell's squared distances to any other peak and to the peak that it
+belongs to, cells², before positions within cells are fitted."""
 
-MARGIN: Final = 1.0  # FIRST_MARGIN after both positions are fitted
+MARGIN: Final = 1.0  # Replaces FIRST_MARGIN after positions are fitted
 ROUNDING: Final = 1e-6  # above the rounding errors of squared distances, cells²
 
 PLATEAU: Final = 3  # Number of cells as high as the peak that indicates a clamped top
@@ -31,7 +31,7 @@ PLATEAU: Final = 3  # Number of cells as high as the peak that indicates a clamp
 STEPS: Final = 3  # Gauss–Newton steps; without noise, the start is exact.
 
 MAX_EXPONENT: Final = 10.0
-"""Largest logarithm of a fitted top, relative to the peak's belief."""
+"""Largest logarithm of a fitted Gaussian, relative to the peak's belief."""
 
 CONVERGED: Final = 1e-4  # Largest parameter change at convergence: 1e-3 px at stride 8
 
@@ -42,27 +42,27 @@ RIDGE: Final = 1e-14  # Determines directions in which no cell exceeds the floor
 MIN_CURVATURE: Final = 1e-3  # 1/cells²: a standard deviation of 22 cells
 
 CENTRE_VARIANCE: Final = 4.0
-"""Variance of a position that is only the centre of its highest cells, cells²."""
+"""Variance of the position if the fit is not sound (see :func:`_mode`), cells²."""
 
 
 @compiled()
 def fit_peaks(
     belief: Array, cells: Array, half: int, sigma: float, position: Array, covariance: Array
 ) -> None:
-    """Fit all peaks of a channel, first to logarithms, then to the beliefs.
+    """Fit a Gaussian to each peak of a channel, first to the logarithms, then to the beliefs b.
 
     Logarithms make the first fit linear and exact for a clean Gaussian, even at the border; weights
     b² compensate for their amplification of noise (Guo, IEEE SPM 2011). Gauss–Newton on b then
     removes the bias that noise causes in logarithms.
 
     Args:
-        belief: The channel's map.
+        belief: Belief map of the channel, (height, width).
         cells: (column, row) of each peak.
         half: Half-width of the fitted window, cells.
-        sigma: Standard deviation of a perfect peak, cells.
+        sigma: Standard deviation of a target peak, cells.
         position: Filled with (x, y) of each peak, cells.
-        covariance: Filled with the covariance of each position, cells²: the covariance of the fit,
-            plus the excess of the fitted Gaussian over the target if larger than the map's noise.
+        covariance: Filled with the covariance of each position, cells²: the covariance of the fit
+            plus the fitted variance, reduced by its standard error, in excess of ``sigma``².
     """
     (height, width), count, side = belief.shape, len(cells), 2 * half + 1
     theta, hessian = np.zeros((count, 6)), np.zeros((count, 6, 6))
@@ -117,17 +117,17 @@ def fit_peaks(
 def mean_vectors(
     vectors: Array, cells: Array, position: Array, radius: float, toward: Array
 ) -> None:
-    """Average the vector field over the disc around each corner.
+    """Average the vector field over the disc around each peak of a corner's channel.
 
-    Where discs overlap, a cell's vector belongs to the nearest corner. The weights 1 − (d/radius)²
-    fall to 0 at the edges of discs, where inexact positions make the vectors uncertain.
+    Where discs overlap, a cell's vector belongs to the nearest peak. At distance d, the weight
+    1 − (d/radius)² falls to 0 at the disc's edge, where inexact positions make vectors uncertain.
 
     Args:
         vectors: x and y component of the field, (2, height, width).
-        cells: (column, row) of each corner's peak.
-        position: (x, y) of each corner, cells.
+        cells: (column, row) of each peak.
+        position: Fitted (x, y) of each peak, cells.
         radius: Radius of the discs, cells.
-        toward: Filled with the mean vector of each corner; zeros before.
+        toward: Filled with the mean vector of each peak; must be zero on entry.
     """
     height, width = vectors.shape[1:]
     half = math.ceil(radius)
@@ -172,11 +172,12 @@ def _own_cells(
     margin: float,
     usable: Array,
 ) -> None:
-    """Mark the cells of a peak's window that belong to this peak.
+    """Mark in ``usable`` the cells of the window around peak ``i`` that belong to this peak.
 
-    A cell belongs to peak ``i`` if the cell is finite, the peak is the highest there, and the cell
-    is not part of a clamped plateau. Of Gaussians s·exp(−d²/2σ²), the highest in a cell has the
-    smallest d² − 2σ² log s; ``margin`` is the required difference to any other peak, cells².
+    A cell belongs to a peak if the cell is finite, the peak's Gaussian is the highest there, and
+    fewer than :data:`PLATEAU` cells are as high as the peak or the cell is lower. Of Gaussians
+    s·exp(−d²/2σ²), the highest in a cell has the smallest d² − 2σ² log s; ``margin`` is the
+    required difference to any other peak, cells².
     """
     side, highest = windows.shape[1], 0
     half = side // 2
@@ -222,8 +223,8 @@ def _fit_logarithm(
 ) -> None:
     """Fit the logarithm of a Gaussian to the usable cells by weighted linear least squares.
 
-    ``theta`` receives the coefficients of (1, x, y, −x², −xy, −y²). ``noise``, a cell's variance
-    over the peak's squared belief, weights the prior of the shape.
+    ``theta`` receives the coefficients of (1, x, y, −x², −xy, −y²). ``window`` has the beliefs over
+    the peak's belief; ``noise``, their variance, weights the prior of the shape.
     """
     side, half, curvature = len(window), len(window) // 2, 0.5 / sigma**2
     theta[:] = 0.0
@@ -256,7 +257,7 @@ def _linearised(
     gradient: Array,
     hessian: Array,
 ) -> tuple[float, float]:
-    """Write the normal equations of a Gaussian fit at ``theta`` into gradient and Hessian.
+    """Write gradient and Hessian of a Gaussian fit to the beliefs, linearised at ``theta``.
 
     Returns the sum of squared residuals and the number of usable cells; arguments are as in
     :func:`_fit_logarithm`.
@@ -284,7 +285,7 @@ def _linearised(
 
 @compiled()
 def _step(theta: Array, hessian: Array, workspace: Array) -> float:
-    """Take a Gauss–Newton step from the gradient in ``workspace[0]``; return its largest entry."""
+    """Add the Gauss–Newton step for gradient ``workspace[0]``; return its largest magnitude."""
     solve_inside(hessian, workspace[0], 0.0, workspace[1], workspace[4:])
     farthest = 0.0
     for k in range(6):
@@ -295,7 +296,7 @@ def _step(theta: Array, hessian: Array, workspace: Array) -> float:
 
 @compiled()
 def _add(work: Array, x: float, weight: float, residual: float) -> None:
-    """Add a cell to its row's sums of weight·xᵃ (a ≤ 4) and residual·xᵃ (a ≤ 2)."""
+    """Add a cell to the sums of its row: weight·xᵃ in ``work[a, 6]``, residual·xᵃ in ``[a, 5]``."""
     work[0, 5] += residual
     work[1, 5] += residual * x
     work[2, 5] += residual * x * x
@@ -306,7 +307,7 @@ def _add(work: Array, x: float, weight: float, residual: float) -> None:
 
 @compiled()
 def _end_row(work: Array, y: float) -> None:
-    """Add a row's sums, times powers of y, to the window's sums, and clear the row's sums."""
+    """Add a row's sums times yᵇ to ``work[a, b]`` and ``work[a, 7 + b]``; clear the row's sums."""
     power = 1.0
     for b in range(5):
         for a in range(5 - b):
@@ -321,7 +322,7 @@ def _end_row(work: Array, y: float) -> None:
 def _system(
     work: Array, theta: Array, noise: float, sigma: float, hessian: Array, gradient: Array
 ) -> None:
-    """Write the normal equations of (1, x, y, −x², −xy, −y²) from the sums, with the prior."""
+    """Write gradient and Hessian for ``theta`` from the sums in ``work`` and the shape's prior."""
     across, down = (0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)
     curvature = 0.5 / sigma**2
     weight = noise / (SHAPE_PRIOR * curvature) ** 2 + RIDGE
@@ -341,7 +342,8 @@ def _system(
 def _mode(window: Array, theta: Array) -> tuple[float, float, bool]:
     """Return x and y of the maximum from the window's middle, cells, and whether the fit is sound.
 
-    Without a sound fit, the maximum is the centre of the highest cells.
+    The fit is sound if it has a maximum near the centre of the cells that are as high as the peak.
+    Otherwise, this centre is returned.
     """
     half = len(window) // 2
     across, down, count = 0.0, 0.0, 0
@@ -375,10 +377,10 @@ def _covariance(
     workspace: Array,
     out: Array,
 ) -> None:
-    """Write the covariance of the position of a sound fit; see :func:`fit_peaks`.
+    """Write the covariance of the position (x, y) of a sound fit, cells²; see :func:`fit_peaks`.
 
-    The offset is P⁻¹(p, q) with the precision P = [[2r, t], [t, 2s]] of the Gaussian, so it moves
-    by P⁻¹(dp − 2x·dr − y·dt, dq − x·dt − 2y·ds).
+    The position is P⁻¹(p, q) with the precision P = [[2r, t], [t, 2s]] of the Gaussian. Its
+    differential is P⁻¹(dp − 2x·dr − y·dt, dq − x·dt − 2y·ds).
     """
     a, b, c = 2 * theta[3], theta[4], 2 * theta[5]
     determinant = a * c - b * b
@@ -414,7 +416,6 @@ def _covariance(
 
 @compiled()
 def _product(left: Array, right: Array) -> float:
-    """Return the scalar product of two vectors of length 6."""
     total = 0.0
     for k in range(6):
         total += left[k] * right[k]

@@ -1,13 +1,13 @@
 """Group the peaks of one object into instances and solve the pose of each instance.
 
-:func:`select_peaks` picks an object's peaks on one image. :func:`solve_instances` then alternates
+:func:`select_peaks` selects an object's peaks on one image. :func:`solve_instances` then alternates
 :func:`associate`, which assigns corner peaks to centroids, and PnP, until the poses no longer
 change a group.
 
-Before there are poses, an affine camera predicts corners: seen from far enough away, a corner with
-signs s lies at c + A s, where c is the centroid and A a 2×3 matrix. Opposite corners have opposite
-arms A s, and the arms of three diagonals give the fourth. So any three corners, no two of them
-opposite, predict the other five.
+In the first round, without poses, an affine camera predicts the corners: seen from far enough away,
+a corner with signs s lies at c + A s, where c is the centroid and A a 2×3 matrix. Opposite corners
+have opposite vectors A s ("arms"), and the arms of three diagonals give the fourth. So any three
+corners, no two of them opposite, predict the other five.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from dopepp.geometry.pnp import PnPResult, solve_pnp
 from dopepp.geometry.refine import MIN_POINTS, too_few
 from dopepp.maps.codec import Peaks
 
-Evidence = Float[np.ndarray, "instances 8 peaks"]
+Evidence = Float[np.ndarray, "instances 8 peaks"]  # log-likelihood ratios
 CornerPeaks = Float[np.ndarray, "8 peaks 2"]
 Corners = Float[np.ndarray, "instances 8 2"]
 
@@ -58,18 +58,18 @@ RIVALS: Final = -2  # marks a corner whose best peak is the same for two instanc
 
 @dataclass(frozen=True)
 class ObjectPeaks:
-    """The peaks of one object's corners and its centroids.
+    """The peaks of one object's corners and centroids on one image.
 
     Attributes:
-        position: (x, y) of corners 0–7, input pixels; NaN in slots without a peak.
+        position: (x, y) of peaks of corners 0–7, input pixels; NaN in slots without a peak.
         score: Belief at the peak; 0 in slots without a peak.
         covariance_px: Covariance of the position, pixels².
-        toward: The field's mean vector at the peak, pointing to the centroid. The shorter it is,
+        toward: Mean vector of the field at the peak, pointing to the centroid. The shorter it is,
             the less certain is its direction.
-        centroid: (x, y) of centroids.
-        centroid_score: Beliefs of centroids.
-        centroid_covariance_px: Covariances of centroids, pixels².
-        area_px: Area of the maps, pixels².
+        centroid: (x, y) of the centroid peaks, one per instance, input pixels.
+        centroid_score: Belief at each centroid peak.
+        centroid_covariance_px: Covariance of each centroid's position, pixels².
+        area_px: Area of the network's input, pixels².
     """
 
     position: CornerPeaks
@@ -84,7 +84,7 @@ class ObjectPeaks:
 
 @dataclass(frozen=True)
 class KeypointGroup:
-    """The keypoints of one instance; missing corners have NaN positions and zero scores."""
+    """An instance's corners and centroid, input pixels; NaN and a score of 0 without a peak."""
 
     position: Float[np.ndarray, "9 2"]
     score: Float[np.ndarray, "9"]
@@ -98,11 +98,11 @@ def select_peaks(
 
     Args:
         peaks: Peaks of all channels of a batch.
-        image: Index of the image.
+        image: Index of the image in the batch.
         number: Index of the object.
-        threshold: Belief from which a centroid is an instance.
+        threshold: Smallest belief of a centroid peak that counts as an instance.
         cells: (width, height) of the maps, cells.
-        stride: Pixels per cell.
+        stride: Input pixels per cell.
     """
     first = number * NUM_KEYPOINTS
     corners, centroid = (image, slice(first, first + NUM_CORNERS)), (image, first + CENTROID)
@@ -124,7 +124,7 @@ def select_peaks(
 def solve_instances(
     peaks: ObjectPeaks, cuboid: Cuboid, K: CameraMatrix, max_angle: float, coincident_px: float
 ) -> list[tuple[KeypointGroup, PnPResult]]:
-    """Group an object's peaks and solve the pose of each group; see :func:`direction_evidence`."""
+    """Group peaks into instances by :func:`direction_evidence` and solve their poses by PnP."""
     if not len(peaks.centroid):
         return []
     evidence = direction_evidence(peaks, max_angle, coincident_px)
@@ -148,11 +148,11 @@ def solve_instances(
 
 
 def solve_group(group: KeypointGroup, cuboid: Cuboid, K: CameraMatrix) -> PnPResult:
-    """Solve PnP with each keypoint weighted by its own covariance.
+    """Solve PnP with keypoints weighted by their inverse covariances.
 
     Covariances are averaged over directions: the width of a network's peak predicts the size of its
-    error, its shape does not predict the direction. The maps of a network are narrower than its
-    errors, so deviations are widened while fewer than two thirds of the keypoints agree on a pose.
+    error, its shape does not predict the direction. Peaks are narrower than a network's errors, so
+    deviations are multiplied by :data:`WIDENINGS` until two thirds of the keypoints fit a pose.
     """
     count = sum(math.isfinite(x) for x in group.position[:, 0].tolist())
     if count < MIN_POINTS:  # noise produces many groups with too few keypoints
@@ -162,18 +162,16 @@ def solve_group(group: KeypointGroup, cuboid: Cuboid, K: CameraMatrix) -> PnPRes
 
 
 def direction_evidence(peaks: ObjectPeaks, max_angle: float, coincident_px: float) -> Evidence:
-    """Return the evidence of belief and direction that each corner peak belongs to each instance.
+    """Return log-likelihood ratios that each corner peak belongs to each instance.
 
-    The likelihood of the angle is divided by the likelihood of a uniform angle, so a vector without
-    a direction is neutral. Unit vectors whose angles deviate by σ have a mean of length exp(−σ²/2).
+    A ratio is the product of both beliefs and the density of the angle between the field's vector
+    at the corner and the direction to the centroid, over a uniform density. A vector without
+    direction is neutral. Unit vectors whose angles deviate by σ have a mean of length exp(−σ²/2).
 
     Args:
         peaks: Corner peaks and centroids.
-        max_angle: Largest angle between a vector and its centroid, radians.
+        max_angle: Largest allowed angle, radians; for larger angles, the result is −∞.
         coincident_px: Distance from a centroid within which any angle is allowed.
-
-    Returns:
-        Log-likelihood ratios; −∞ for pairs that are not allowed.
     """
     arrays = (peaks.position, peaks.score, peaks.toward, peaks.centroid, peaks.centroid_score)
     return _direction_evidence(*arrays, max_angle, coincident_px)
@@ -184,9 +182,9 @@ def associate(
 ) -> list[KeypointGroup]:
     """Group peaks into instances, one per centroid.
 
-    For each corner, peaks are assigned to centroids one-to-one so that the total evidence is
-    greatest: evidence of belief and direction, and of the distance to the expected position. A peak
-    without positive evidence is not assigned.
+    For each corner, peaks are assigned to centroids one-to-one so that the sum of log-likelihood
+    ratios is greatest: of belief and direction, and of the distance to the expected position. A
+    peak without a positive ratio is not assigned.
 
     Args:
         peaks: Corner peaks and centroids.
@@ -219,7 +217,7 @@ def associate(
 
 
 def _border_covariance(position: Array, covariance: Array, extent: Array, stride: float) -> Array:
-    """Widen the covariance of peaks at the border of the maps; the outermost pixel ends at −½."""
+    """Widen the covariances, pixels², of peaks within :data:`BORDER` cells of the maps' border."""
     inward = np.minimum(position + 0.5, extent - 0.5 - position).min(axis=-1)
     widened = covariance.copy()
     widened[inward < BORDER * stride] += (BORDER_DEVIATION * stride) ** 2 * np.eye(2)
@@ -228,7 +226,7 @@ def _border_covariance(position: Array, covariance: Array, extent: Array, stride
 
 @compiled()
 def _averaged(covariance: Array) -> Array:
-    """Return circular covariances of the same mean variance plus the floor; NaN stays NaN."""
+    """Return isotropic covariances: the mean variance plus the squared floor; NaN stays NaN."""
     averaged = np.zeros(covariance.shape)
     for k in range(len(covariance)):
         variance = (covariance[k, 0, 0] + covariance[k, 1, 1]) / 2 + SIGMA_FLOOR_PX**2
@@ -282,11 +280,11 @@ def _gain(
     deviation: Array,
     area_px: float,
 ) -> Array:
-    """Add the evidence of each peak's distance from its expected position; negative sums become 0.
+    """Return ``evidence`` plus the evidence of the peaks' positions; negative sums become 0.
 
-    The evidence of a distance is the logarithm of a ratio: a Gaussian density around the expected
+    The evidence of a position is the logarithm of a ratio: a Gaussian density around the expected
     position (``deviation``: its standard deviation for each instance, pixels) over the density of a
-    peak anywhere on the maps. Without an expected position, the evidence is 0.
+    peak anywhere on the maps. Without an expected position, this evidence is 0.
     """
     gain = np.zeros(evidence.shape)
     for i, k, m in np.ndindex(evidence.shape):
@@ -305,7 +303,7 @@ def _gain(
 
 @compiled()
 def _unrivalled(gain: Array) -> Array:
-    """Return each instance's best peak per corner; −1: none, RIVALS: two instances share it."""
+    """Return each instance's peak of highest gain per corner; −1: none, RIVALS: a shared peak."""
     chosen = np.full(gain.shape[:2], -1, np.int64)
     for k in range(gain.shape[1]):
         for i in range(len(gain)):
@@ -325,11 +323,11 @@ def _unrivalled(gain: Array) -> Array:
 def _predict(
     position: Array, evidence: Array, centroid: Array, area_px: float
 ) -> tuple[Array, Array]:
-    """Predict each instance's corners from the three corner peaks that agree best with the others.
+    """Predict the corners of each instance from three of its corner peaks by :func:`_best_triple`.
 
     Returns:
-        (x, y) of the corners, NaN for instances with fewer than three usable corners, and their
-        standard deviation for each instance, pixels.
+        (x, y) of the corners, NaN for an instance without three usable corners, and their standard
+        deviation for each instance, pixels.
     """
     count = len(evidence)
     expected, deviation = np.full((count, NUM_CORNERS, 2), math.nan), np.empty(count)
@@ -369,7 +367,7 @@ def _predict(
 def _best_triple(
     arms: Array, evidence: Array, usable: Array, area_px: float, expected: Array
 ) -> float:
-    """Predict the corners of an instance from the three corner peaks that agree with most others.
+    """Predict an instance's corners from the corner peaks with the highest :func:`_agreement`.
 
     The ``usable[k]`` candidates of corner k have the vectors ``arms[k]`` from the centroid, pixels.
     ``expected`` is filled with the predicted vectors, and their standard deviation is returned.
@@ -412,13 +410,13 @@ def _best_triple(
 def _agreement(
     diagonals: Array, arms: Array, evidence: Array, usable: Array, area_px: float, least: float
 ) -> tuple[float, float]:
-    """Sum the evidence of all candidates near the corners that four diagonals predict.
+    """Sum each corner's highest evidence of a candidate for the corners that diagonals predict.
 
-    The diagonals are vectors from the centroid to one end, pixels. The summation stops early, with
-    an upper bound, once the sum cannot exceed ``least``.
+    ``diagonals`` has the vectors from the centroid to corners 0–3, pixels. The summation stops
+    early, with an upper bound, once the sum cannot exceed ``least``.
 
     Returns:
-        The sum, and the variance of the predicted positions, squared pixels.
+        The sum, and the variance of the predicted positions, pixels².
     """
     size = 0.0
     for d in range(4):

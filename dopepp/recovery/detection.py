@@ -5,8 +5,8 @@
 - Distance: a network's keypoints are means over the poses that it considers possible, and the mean
   of a rotated shape is smaller. Poses are therefore too far away, by about the same factor.
 - Covariance: peaks predict independent errors of keypoints, not their common errors.
-- Score: a logistic model of the probability that ADD is below a tenth of the diameter. With the
-  default weights, the score is the mean belief.
+- Score: a logistic model of the probability that the pose is correct, i.e. that ADD is below a
+  tenth of the diameter. With the default weights, the score is the mean belief.
 
 To add a feature of the score, name it in :data:`FEATURES`, compute it in
 :func:`detection_features` and add its weight to :class:`RecoveryOptions`.
@@ -63,10 +63,10 @@ _VERIFIED: Final = 1e-4  # verified probabilities are limited to this distance f
 
 @dataclass(frozen=True)
 class Detection:
-    """One object found on an image.
+    """An object detected on an image, with its pose.
 
     Attributes:
-        object: The part's name.
+        object: Name of the part.
         score: Confidence in the pose, in [0, 1]: the mean belief or, for tuned checkpoints, the
             probability that ADD is below a tenth of the diameter.
         belief: Mean belief over the nine keypoints, in [0, 1]; keypoints that are missing or do not
@@ -79,10 +79,10 @@ class Detection:
         covariance: Covariance of a small rotation about the object's origin (rotation vector in
             the camera frame, radians) and a small translation (camera frame, metres).
         kept: Why the refinement kept the network's pose; empty otherwise.
-        agreement: Share of the image's information about the outline that agrees with the refined
-            outline, in [0, 1]; None without refinement.
-        support: Share of the refined outline at which image information agrees, in [0, 1]; occluded
-            points have no information. None without refinement.
+        agreement: Share of the information of colours and edges along the outline that agrees with
+            the refined pose, in [0, 1]; None without refinement.
+        support: Share of the refined outline with agreeing information, in [0, 1]; occluded points
+            have no information. None without refinement.
         probability: Probability that ADD(-S) is below a tenth of the diameter, from the image at
             the refined pose (:mod:`dopepp.inference.refinement.verification`); None without
             refinement by region.
@@ -114,21 +114,22 @@ class RecoveryOptions:
     """Thresholds of the recovery from maps to poses; stored in the checkpoint.
 
     Attributes:
-        sigma: Width of a perfect belief peak, cells.
-        peak_threshold: Belief below which a corner's maximum does not count as a peak.
-        centroid_threshold: Belief below which there is no instance.
-        max_angle_deg: Largest angle between a corner's vector and its centroid, degrees.
+        sigma: Standard deviation of a target's belief peak, cells.
+        peak_threshold: Belief below which a local maximum of a map does not count as a peak.
+        centroid_threshold: Belief below which a centroid's peak is not an instance.
+        max_angle_deg: Largest angle between the field's vector at a corner and the direction to the
+            centroid, degrees.
         max_peaks: Maximum number of peaks per channel.
-        min_score: Score from which a candidate is a detection. The default is for the mean belief
-            of untuned networks. It is the highest multiple of 0.05 that keeps 90 % of the correct
-            detections (ADD below a tenth of the diameter; mean of five networks) on one half of
-            the frames. On the other half it kept 94 % of them and 6 % of the false candidates.
+        min_score: Smallest score of a detection. The default is for the mean belief of untuned
+            networks: the highest multiple of 0.05 that keeps 90 % of the correct detections (mean
+            of five networks) on one half of the frames. On the other half it kept 94 % of the
+            correct and 6 % of the false detections.
         distance_factor: Factor on the distance of every pose, set by ``evaluate.py tune=true``.
         covariance_factor: Factor on the covariance of every pose, set by ``tune=true``.
         score_bias, score_belief, score_spread, score_misfit, score_found: Weights of the score's
             features, set by ``evaluate.py tune=true``; with the defaults, the score is the mean
             belief.
-        refined_min_score: Refined detections below this score are dropped.
+        refined_min_score: Smallest score of a refined detection.
         refined_bias, refined_score, refined_verification: Weights of the features of a refined
             pose's score, set by ``evaluate.py tune=true refine=region``; with the defaults, the
             score is ``Detection.probability``.
@@ -159,7 +160,7 @@ class RecoveryOptions:
 
     @classmethod
     def of(cls, options: Mapping[str, float]) -> RecoveryOptions:
-        """Check the options of a config, a checkpoint or a caller.
+        """Return the checked options of a config, a checkpoint or a caller, by field name.
 
         Checkpoints of former versions have weights for other features of refined poses. Their
         ``refined_`` options are ignored, so the checkpoint must be tuned again.
@@ -182,7 +183,7 @@ class RecoveryOptions:
         return tuple(getattr(self, f"refined_{name}") for name in REFINED_FEATURES)
 
     def unrefined(self) -> RecoveryOptions:
-        """Return a copy with default values for all options of refined poses."""
+        """Return a copy with the default values of all ``refined_`` options."""
         defaults = {field.name: field.default for field in fields(self)}
         return replace(self, **{k: v for k, v in defaults.items() if k.startswith("refined_")})  # type: ignore[arg-type]
 
@@ -195,18 +196,15 @@ def make_detection(
     name: str,
     options: RecoveryOptions,
 ) -> Detection | None:
-    """Make the detection of a keypoint group from its pose.
+    """Return the calibrated detection of an instance, or None if PnP found no pose.
 
     Args:
-        group: The keypoints of one instance.
-        result: The pose from PnP.
-        cuboid: Keypoints of the part, metres.
+        group: Keypoints of the instance.
+        result: Pose and inliers from PnP on these keypoints.
+        cuboid: Keypoints of the part, object frame, metres.
         K: Camera matrix, pixels.
         name: Name of the part.
-        options: Calibration of distance, covariance and score.
-
-    Returns:
-        The calibrated detection; None if PnP found no pose.
+        options: Options with the factors of distance and covariance and the score's weights.
     """
     if result.T_cam_obj is None or result.covariance is None:
         return None
@@ -229,7 +227,7 @@ def calibrate(
 ) -> Detection:
     """Return a detection with corrected distance and covariance, and with its score.
 
-    The part moves along the ray through its origin.
+    ``options.distance_factor`` scales the translation, so the origin keeps its pixel.
     """
     if options.distance_factor != 1.0:
         T = detection.T_cam_obj.copy()
@@ -248,14 +246,14 @@ def calibrate(
 def recalibrate(
     refined: Sequence[Detection], options: RecoveryOptions, by_depth: bool = False
 ) -> list[Detection]:
-    """Return refined detections with the scores and covariances of refined poses, best first.
+    """Return detections with the scores and covariances of refined poses, by descending score.
 
     Detections without verification keep the network's score. Detections that were not refined keep
     the network's covariance.
 
     Args:
         refined: Detections after refinement and verification.
-        options: Options with the fitted weights and the factor.
+        options: Options with the weights and the covariance factor of refined poses.
         by_depth: Whether a depth image was used. The covariance factor was fitted without depth
             images and is not applied then.
     """
@@ -273,7 +271,7 @@ def recalibrate(
 
 
 def refined_features(detection: Detection) -> Float[np.ndarray, "features"]:
-    """Return the features of a verified detection that still has the network's score."""
+    """Return 1 and the log odds of the network's score (``detection.score``) and verification."""
     assert detection.probability is not None
     verified = _odds(detection.probability, _VERIFIED)
     return np.array([1.0, *np.log([_odds(detection.score), verified])])
@@ -282,13 +280,14 @@ def refined_features(detection: Detection) -> Float[np.ndarray, "features"]:
 def detection_features(
     detection: Detection, cuboid: Cuboid, K: CameraMatrix
 ) -> Float[np.ndarray, "features"]:
-    """Return the features of a detection for the logistic model of its score.
+    """Return the values of :data:`FEATURES`, from which a logistic model computes the score.
 
-    The features are those of :data:`FEATURES`; they do not depend on the detection's score.
+    They are 1, the log odds of the mean belief, the logarithms of the corners' predicted error and
+    of the reprojection error over the part's size, and minus the share of missing keypoints.
 
     Args:
         detection: Detection before refinement.
-        cuboid: Keypoints of the part, metres.
+        cuboid: Keypoints of the part, object frame, metres.
         K: Camera matrix, pixels.
     """
     T, corners = detection.T_cam_obj, cuboid[:NUM_CORNERS]
@@ -305,12 +304,12 @@ def detection_features(
 
 
 def log_odds(probability: float) -> float:
-    """Return the log odds of ``Detection.probability`` or a score, limited to about ±9.2."""
+    """Return the natural logarithm of a probability's odds, limited to about ±9.2."""
     return math.log(_odds(probability, _VERIFIED))
 
 
 def _odds(probability: float, certain: float = _CERTAIN) -> float:
-    """Return the odds of a probability, which is first limited to a range inside (0, 1)."""
+    """Return the odds of a probability after clipping it to [certain, 1 − certain]."""
     bounded = float(np.clip(probability, certain, 1 - certain))
     return bounded / (1 - bounded)
 
@@ -318,14 +317,14 @@ def _odds(probability: float, certain: float = _CERTAIN) -> float:
 def score(
     features: Float[np.ndarray, "*n features"], weights: Float[np.ndarray, "features"]
 ) -> Float[np.ndarray, "*n"]:
-    """Return the probability that each pose is correct, in (0, 1)."""
+    """Return the probability in (0, 1) that a logistic model assigns to each detection's pose."""
     return np.asarray(1 / (1 + np.exp(-np.clip(features @ weights, -30, 30))))
 
 
 def fit_distance_factor(
     estimated: Float[np.ndarray, "n 4 4"], true: Float[np.ndarray, "n 4 4"]
 ) -> float:
-    """Return the median ratio of true to estimated distance; 1 without poses."""
+    """Return the median ratio of true to estimated distance from the camera; 1 without poses."""
     if not len(estimated):
         return 1.0
     distances = [np.linalg.norm(T[:, :3, 3], axis=1) for T in (true, estimated)]
@@ -335,16 +334,17 @@ def fit_distance_factor(
 def fit_covariance_factor(
     squared_distances: Float[np.ndarray, "n"], *, refined: bool = False
 ) -> float:
-    """Return the factor on covariances that matches the errors of the correct poses.
+    """Return the factor by which covariances must be multiplied to match the poses' errors.
 
-    The squared distances are a mixture of correct poses, a multiple of χ² with six degrees of
-    freedom, and of wrong poses, whose logarithms are uniform. Expectation-maximisation separates
-    the two. The factor matches the 90 % quantile of the correct poses: their errors have heavier
-    tails than a Gaussian, and refinement, which uses the covariance as its prior, must reach the
-    true pose.
+    The squared distances are a mixture: of correct poses, with a multiple of χ² with six degrees of
+    freedom, and of wrong poses, with uniform logarithms. Expectation-maximisation separates the
+    two. The factor matches the 90 % quantile of the correct poses: their errors have heavier tails
+    than a Gaussian, and refinement, which uses the covariance as its prior, must reach the true
+    pose.
 
     Args:
-        squared_distances: Squared Mahalanobis distances of true poses, with a factor of 1.
+        squared_distances: Squared Mahalanobis distances of estimated from true poses, under the
+            uncorrected covariances.
         refined: Whether the poses were refined.
 
     Raises:
@@ -386,12 +386,12 @@ def fit_weights(
     correct: Bool[np.ndarray, "n"],
     defaults: Float[np.ndarray, "features"] | None = None,
 ) -> Float[np.ndarray, "features"]:
-    """Fit the score's weights by maximum likelihood (Newton's method) with a ridge penalty.
+    """Fit the weights of :func:`score` by maximum likelihood (Newton's method) and a ridge penalty.
 
     Args:
         features: Features of the detections.
-        correct: Whether each pose is correct; False for a detection without an instance.
-        defaults: Weights toward which the ridge penalty pulls (default: 0).
+        correct: Whether each pose is correct; False for a detection where there is no part.
+        defaults: Weights from which deviations are penalised (default: 0).
 
     Raises:
         ValueError: All or no detections are correct.

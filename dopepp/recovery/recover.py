@@ -41,9 +41,9 @@ KINDS: Final[dict[Kind, str]] = {
     "score": "below the threshold (best score {best:.3g})",
     "refined": "below the threshold once refined (best score {best:.3g})",
 }
-"""Kinds of reasons, in the order of the steps, with the text of a summary."""
+"""Kinds of reasons, in the order of the steps, each with its text in :func:`summary`."""
 
-MIN_CELLS: Final = 3.0  # Keypoints within fewer cells blend into one peak
+MIN_CELLS: Final = 3.0  # The peaks of a part that extends over fewer cells overlap
 
 
 @dataclass(frozen=True)
@@ -51,10 +51,11 @@ class Reason:
     """Why an object, or one candidate of it, is not detected.
 
     Attributes:
-        object: The part's name.
-        kind: The step that rejected the candidate.
-        best: The belief or score of the candidate.
-        text: Explanation with the threshold.
+        object: Name of the object.
+        kind: Step that rejected the candidate, a key of :data:`KINDS`.
+        best: Score of the candidate; without a pose, its centroid's belief; without a candidate,
+            the highest belief of the object's centroid map or, if all nine are empty, of all nine.
+        text: Explanation in words.
     """
 
     object: str
@@ -78,16 +79,16 @@ def recover(
     """Recover the poses of all objects in one image from its maps.
 
     Args:
-        belief: 9·C belief maps of C objects, peaks of 1.
-        field: 16·C vector-field maps.
-        cuboids: Nine keypoints of each object, metres.
+        belief: 9·C belief maps of C objects, as of :func:`~dopepp.maps.codec.encode`.
+        field: 16·C channels of the objects' vector fields.
+        cuboids: Nine keypoints of each object, object frame, metres.
         K: Camera matrix of the network's input, pixels.
-        stride: Pixels per cell.
+        stride: Pixels of the network's input per cell.
         names: Names of the objects (default: their indices).
         **options: Fields of :class:`RecoveryOptions`.
 
     Returns:
-        Detections of all objects, best score first.
+        Detections of all objects, by descending score.
     """
     return recover_batch(
         belief[None], field[None], cuboids, np.asarray(K)[None], stride, names, None, **options
@@ -104,22 +105,15 @@ def recover_batch(
     reasons: list[Reason] | None = None,
     **options: float,
 ) -> list[list[Detection]]:
-    """Recover the poses on every image of a batch; see :func:`recover`.
+    """Return the result of :func:`recover` for each image of a batch.
 
-    Args:
-        belief: Belief maps of the images.
-        field: Vector-field maps of the images.
-        cuboids: Nine keypoints of each object, metres.
-        K: Camera matrix of each image, pixels.
-        stride: Pixels per cell.
-        names: Names of the objects (default: their indices).
-        reasons: List to which a reason is appended for each object or candidate without a
-            detection.
-        **options: Fields of :class:`RecoveryOptions`.
+    Arguments are as in :func:`recover`; ``belief``, ``field`` and ``K`` have a leading batch axis.
+    A reason is appended to ``reasons`` for each object without a candidate (a centroid peak) and
+    for each candidate without a detection.
 
     Raises:
-        ValueError: Maps, cuboids, cameras and names do not fit each other.
-        UserError: An option is out of range.
+        ValueError: The shapes of maps, cuboids and cameras, or the number of names, disagree.
+        UserError: An option is unknown or out of range.
     """
     chosen = RecoveryOptions.of(options)
     cuboids, K = np.asarray(cuboids, np.float64), np.asarray(K, np.float64)
@@ -162,7 +156,7 @@ def explain(
     names: Sequence[str] | None = None,
     **options: float,
 ) -> list[Reason]:
-    """Explain why objects and candidates are not detected; arguments are as in :func:`recover`."""
+    """Return why each object or candidate was not detected; arguments as in :func:`recover`."""
     reasons: list[Reason] = []
     camera = np.asarray(K)[None]
     recover_batch(belief[None], field[None], cuboids, camera, stride, names, reasons, **options)
@@ -170,7 +164,7 @@ def explain(
 
 
 def _check_shapes(belief: Beliefs, field: Fields, num_objects: int, K: Cameras) -> None:
-    """Raise a ValueError if maps, objects and cameras do not fit each other."""
+    """Raise a ValueError if the shapes of maps and cameras and the number of objects disagree."""
     expected = (num_objects * NUM_KEYPOINTS, num_objects * NUM_CORNERS * 2)
     if belief.ndim != 4 or field.ndim != 4 or 0 in belief.shape[2:]:
         raise ValueError(
@@ -190,7 +184,7 @@ def _check_shapes(belief: Beliefs, field: Fields, num_objects: int, K: Cameras) 
 def _no_centroid(
     beliefs: Float[Tensor, "9 height width"], name: str, options: RecoveryOptions
 ) -> Reason:
-    """Explain why an object has no centroid peak."""
+    """Return the reason for an object without a peak above ``options.centroid_threshold``."""
     best = torch.nan_to_num(beliefs.detach().float()).flatten(1).amax(1)
     highest, centroid = float(best.max()), float(best[CENTROID])
     if highest <= options.peak_threshold:
@@ -207,10 +201,9 @@ def _rejected(
     cells: tuple[int, int],
     stride: int,
 ) -> tuple[Kind, float, str]:
-    """Explain why a candidate is rejected; ``cells`` is the (width, height) of the maps.
+    """Return kind, ``best`` and text of the reason for rejecting a candidate.
 
-    Returns:
-        Kind of the reason, the value compared with the threshold, and the explanation.
+    ``cells`` is the (width, height) of the maps.
     """
     kind: Kind = "pose"
     best, text, points = float(np.nan_to_num(group.score[CENTROID])), result.reason, group.position
@@ -228,14 +221,14 @@ def _rejected(
 
 
 def refined_reason(detection: Detection, min_score: float) -> Reason:
-    """Return why a refined detection was dropped."""
+    """Return the reason for dropping a refined detection whose score is below ``min_score``."""
     text = f"once refined, score {detection.score:.3f} below {min_score:.3g}"
     text += f" ({detection.kept})" if detection.kept else ""
     return Reason(detection.object, "refined", detection.score, text)
 
 
 def main_reasons(reasons: Sequence[Reason]) -> list[Reason]:
-    """Return each object's reason for rejecting its best candidate, sorted by progress."""
+    """Return each object's reason of the latest step and highest ``best``, latest step last."""
     order = list(KINDS)
     best: dict[str, Reason] = {}
     for reason in sorted(reasons, key=lambda reason: (order.index(reason.kind), reason.best)):
@@ -245,7 +238,7 @@ def main_reasons(reasons: Sequence[Reason]) -> list[Reason]:
 
 
 def format_reasons(reasons: Sequence[Reason]) -> str:
-    """Return the reasons for missing detections on one image as a line of text."""
+    """Return the main reason of each object on one image as a line of text, latest step first."""
     counts = Counter(reason.object for reason in reasons)
     lines = []
     for reason in reversed(main_reasons(reasons)):
@@ -255,7 +248,12 @@ def format_reasons(reasons: Sequence[Reason]) -> str:
 
 
 def summary(silent: Sequence[Reason], num_images: int) -> str:
-    """Return the reasons for missing detections on several images as a line of text."""
+    """Return a line of text with the number of reasons of each kind and their highest ``best``.
+
+    Args:
+        silent: One reason per image without detections.
+        num_images: Number of all images.
+    """
     groups = []
     for kind, words in KINDS.items():
         values = [reason.best for reason in silent if reason.kind == kind]
