@@ -28,24 +28,24 @@ SHORT_NAMES: Final = {
     "working_distance": "virtual.working_distance",
     "max_tilt_deg": "virtual.scene.turning.tilt_deg",
 }
-"""Options of the camera that have a short name on the command line."""
+"""Full option name by short name, for ``train.py``."""
 EVALUATION_SHORT_NAMES: Final = {**SHORT_NAMES, "scale": "scale_factors"}
 """Short names for ``evaluate.py``. In a training, ``scale`` selects a file of ``conf/scale``."""
 
 
 def prepare(open_nodes: Sequence[str], short_names: Mapping[str, str], num_words: int) -> None:
-    """Rewrite ``sys.argv`` for Hydra and for the further processes of Lightning.
+    """Expand short names in ``sys.argv``, and add the overrides of a run that is resumed.
 
     The records of a run and its worker processes use the rewritten list. Interpolations of Hydra
     cannot replace short names, because both options would appear in the config.
 
     Args:
-        open_nodes: Nodes that accept keys missing in ``conf/``; they are checked later.
-        short_names: Option for each short name.
-        num_words: Number of words of the program.
+        open_nodes: Config nodes that accept keys missing in ``conf/``, which are checked later.
+        short_names: Full option name by short name.
+        num_words: Number of words before the overrides: 1 for ``train.py``, 2 for ``dopepp train``.
 
     Raises:
-        UserError: The chosen folder holds another run, or the run to resume is unreadable.
+        UserError: ``hydra.run.dir`` contains another run, or the run to resume is unreadable.
     """
     words, given = sys.argv[:num_words], sys.argv[num_words:]
     arguments = [_spelled_out(text, short_names, open_nodes) for text in given]
@@ -57,7 +57,7 @@ def prepare(open_nodes: Sequence[str], short_names: Mapping[str, str], num_words
 
 
 def _spelled_out(argument: str, short_names: Mapping[str, str], open_nodes: Sequence[str]) -> str:
-    """Replace a short name, and mark keys of open nodes as additions."""
+    """Expand a short name in ``key=value``, and put ``++`` before keys below ``open_nodes``."""
     key, equals, value = argument.partition("=")
     named = f"{short_names.get(key, key)}{equals}{value}"
     inside = named.startswith(tuple(f"{node}." for node in open_nodes))
@@ -65,7 +65,7 @@ def _spelled_out(argument: str, short_names: Mapping[str, str], open_nodes: Sequ
 
 
 def _refuse_used_folder(arguments: Sequence[str]) -> None:
-    """Check that the folder of a new run contains no other run, before Hydra writes there."""
+    """Raise an error if ``hydra.run.dir`` already contains a run and no run is resumed."""
     words = dict(text.partition("=")[::2] for text in arguments)
     folder = words.get("hydra.run.dir", "")
     if not folder or words.get("resume", "null") not in ("", "null"):
@@ -82,7 +82,7 @@ def _refuse_used_folder(arguments: Sequence[str]) -> None:
 
 
 def _resumed(arguments: list[str]) -> list[str]:
-    """For ``resume=RUN``, add the overrides of the run and select its folder."""
+    """For ``resume=RUN``, add the stored overrides of RUN and make RUN the run folder."""
     runs = [text.partition("=")[2] for text in arguments if text.startswith("resume=")]
     if not runs or runs[-1] in ("", "null"):
         return arguments
@@ -97,7 +97,7 @@ def _resumed(arguments: list[str]) -> list[str]:
 
 
 def convert_error(error: Exception) -> UserError:
-    """Convert an error of Hydra or OmegaConf into a user error."""
+    """Convert an error of Hydra or OmegaConf into a UserError with allowed values and a fix."""
     text = " ".join(f"{error} {error.__cause__ or ''}".split())
     if match := re.search(r"Could not override '([^']+)'", text):
         key = match.group(1)
@@ -118,7 +118,7 @@ def convert_error(error: Exception) -> UserError:
 
 
 def _nearest(key: str) -> str:
-    """Return a hint: the most similar option, or the program that has the option."""
+    """Return a hint on an unknown option: the script that has it, or the most similar name."""
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
         options = {name: set(_flat(compose(name))) for name in ("train", "evaluate")}
     for name, names in options.items():
@@ -129,7 +129,7 @@ def _nearest(key: str) -> str:
 
 
 def _flat(node: DictConfig, prefix: str = "") -> Iterator[str]:
-    """Yield every option of a config in dotted form, groups included."""
+    """Yield the dotted names of all keys of a config, including nodes, after ``prefix``."""
     for key in node:
         yield f"{prefix}{key!s}"
         child = node._get_node(key)
@@ -141,12 +141,12 @@ def complete(name: str, words: Sequence[str], incomplete: str) -> list[str]:
     """Return the completions of an incomplete word for a shell.
 
     A single matching key is completed to its values, because a shell adds a space to a single
-    match. Bash splits words at ``=`` and replaces only the part after it.
+    match. After the word ``=``, only values are returned, because Bash splits words at ``=``.
 
     Args:
         name: ``train`` or ``evaluate``.
-        words: Words before the incomplete word.
-        incomplete: Word to complete.
+        words: Words of the command line before the incomplete word.
+        incomplete: Beginning of the word at the cursor; may be empty.
     """
     line = re.sub(r" ?= ?", "=", " ".join([*words, incomplete]))
     is_value = list(words[-1:]) == ["="]
@@ -165,7 +165,7 @@ def complete(name: str, words: Sequence[str], incomplete: str) -> list[str]:
 
 
 def _scene(words: Sequence[str]) -> str:
-    """Return an override with all fields of the preset, which ``conf/`` does not list."""
+    """Return a ``virtual.scene`` override with the fields of the preset that ``words`` select."""
     from dopepp.virtual.presets import PRESETS
 
     given = [word.partition("=")[2] for word in words if word.startswith("virtual.preset=")]

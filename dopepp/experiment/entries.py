@@ -1,7 +1,7 @@
 """Entry points of ``train.py`` (``dopepp train``) and ``evaluate.py`` (``dopepp evaluate``).
 
-The module converts the command into a plain config, and each error into one line. Slow imports
-happen only after a job has printed its folder.
+The module passes the config to the job as a dictionary, and prints each expected error as one line.
+Slow imports happen only after a job has printed its folder.
 
 Exit codes: 0 success, 1 failure, 2 user error, 130 interrupted, 143 terminated (SIGTERM).
 """
@@ -37,27 +37,27 @@ from dopepp.experiment.sweep import multirun
 _log = logging.getLogger(__name__)
 
 Job = Callable[[dict[str, Any], Path], object]
-"""Function that runs with a plain config in a run folder."""
+"""Function that runs a job, given its resolved config and its run folder."""
 
 FAILED: Final = 1
 USERS_MISTAKE: Final = 2
 
 _REFUSALS: Final = (*NO_SPACE, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EEXIST)
-"""Errors of the disk; any other ``OSError`` is a bug of this program."""
+"""Numbers of ``OSError`` for a full, read-only or inaccessible location; others are bugs."""
 
 
 def train(config: DictConfig) -> float | None:
-    """Run one job of ``train.py`` and return the value that a search maximises."""
+    """Run one job of ``train.py``; return its objective in a multirun (:func:`run_job`)."""
     return run_job(config, _imported("dopepp.experiment.run.train:do_job"))
 
 
 def evaluate(config: DictConfig) -> None:
-    """Run one evaluation of ``evaluate.py``."""
+    """Run the evaluation that the config of ``evaluate.py`` describes."""
     run_job(config, _imported("dopepp.experiment.run.evaluate:run_evaluation"))
 
 
 def _imported(name: str) -> Job:
-    """Return a job that is imported when it runs, because importing PyTorch takes seconds."""
+    """Return a job that imports ``MODULE:FUNCTION`` when it runs, because PyTorch loads slowly."""
     return lambda config, run_dir: resolve_name(name)(config, run_dir)
 
 
@@ -73,7 +73,7 @@ def start(name: str, num_words: int = 1) -> None:
 
     Args:
         name: ``train`` or ``evaluate``.
-        num_words: Number of words of the program: 1 for ``train.py``, 2 for ``dopepp train``.
+        num_words: Number of words before the overrides: 1 for ``train.py``, 2 for ``dopepp train``.
     """
     task, open_nodes, short_names = _ENTRIES[name]
 
@@ -97,7 +97,7 @@ def entry(
     short_names: Mapping[str, str] | None = None,
     num_words: int = 1,
 ) -> None:
-    """Run a main function that passes ``sys.argv`` to Hydra; print user errors as one line.
+    """Run ``main``, which passes ``sys.argv`` to Hydra; exit with one line on an expected error.
 
     The remaining arguments are as in :func:`~dopepp.experiment.command_line.prepare`.
     """
@@ -137,10 +137,11 @@ def run_job(config: DictConfig, job: Job) -> float | None:
     """Resolve the config and run a job in Hydra's run folder.
 
     In a multirun, a failing job writes ``failed.json`` and a pruned trial ``pruned.json``; the
-    other jobs continue. A single run with a user error leaves no folder.
+    other jobs continue. After a user error, the folder of a new single run is removed if it has no
+    results.
 
     Returns:
-        The objective of a training in a multirun, for Hydra's sweepers, else None.
+        In a multirun, the validation score of a training's best checkpoint, else None.
     """
     hydra = HydraConfig.get()
     run_dir = Path(hydra.runtime.output_dir)
@@ -178,7 +179,7 @@ def run_job(config: DictConfig, job: Job) -> float | None:
 
 
 def _remove_unused(run_dir: Path) -> None:
-    """Remove the folder of a rejected run, unless the run has written results."""
+    """Remove a run folder that holds only files written before the work began."""
     from dopepp.experiment.results.folder import DIFFERENCE, OF_THE_START
 
     names = {path.name for path in run_dir.iterdir()}
@@ -189,7 +190,7 @@ def _remove_unused(run_dir: Path) -> None:
 
 
 def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | None:
-    """Run a job of a multirun and record its end in its folder."""
+    """Run or continue a job of a multirun, as described in :func:`run_job`."""
     from dopepp.experiment.results import display
     from dopepp.experiment.results.folder import FAILURE_FILE, OBJECTIVE, PRUNED_FILE, write_json
     from dopepp.experiment.results.report import Report
@@ -222,6 +223,6 @@ def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | Non
 
 
 def _plain(config: DictConfig) -> dict[str, Any]:
-    """Resolve all interpolations and return plain values."""
+    """Return the config as nested dictionaries and lists, with interpolations resolved."""
     plain: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     return dict(plain)

@@ -1,4 +1,4 @@
-"""Describe this process: its command, its output and its rank."""
+"""Provide the command, the terminal output and the distributed rank of this process."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ _RANKS: Final = ("RANK", "LOCAL_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK")
 
 
 def entry_command(verb: str) -> str:
-    """Return the command for ``train`` or ``evaluate`` in the style of the present command."""
+    """Return ``python VERB.py`` if this process was started as a script, else ``dopepp VERB``."""
     script = Path(sys.argv[0]).name in _SCRIPTS
     return f"python {verb}.py" if script else f"dopepp {verb}"
 
 
 def relative_path(path: Path) -> str:
-    """Return a path relative to the working directory if possible, else absolute."""
+    """Return a path relative to the working directory if it lies inside, else absolute."""
     path = path.absolute()
     below = path.is_relative_to(Path.cwd())
     return str(path.relative_to(Path.cwd()) if below else path)
 
 
 def print_line(line: str) -> None:
-    """Print a line immediately, without Rich, whose import is slow."""
+    """Write a line to stdout and flush. Rich is avoided because its import is slow."""
     sys.stdout.write(f"{line}\n")
     sys.stdout.flush()
 
 
 def command() -> list[str]:
-    """Return the words of the present command, without the folder of the program."""
+    """Return the file name of the program and the arguments of this process."""
     return [Path(sys.argv[0]).name, *sys.argv[1:]]
 
 
 def line(words: Sequence[str]) -> str:
-    """Return the words of a command as a shell line."""
+    """Join the words of a command into a quoted shell line, with ``python`` before a script."""
     return ("python " if words[0].endswith(".py") else "") + shlex.join(words)
 
 
@@ -51,12 +51,12 @@ def is_first_process() -> bool:
 
 
 def configure_logging() -> None:
-    """Send messages to the terminal."""
+    """Log messages of level INFO and above to stderr, as plain text."""
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
 
 
 def quiet_lightning() -> None:
-    """Suppress messages of Lightning that repeat ours, after Lightning has been imported.
+    """Suppress Lightning's log messages below WARNING; call after the import of Lightning.
 
     Two warnings are suppressed as well: the use of ``LeafSpec`` in Lightning 2.6, which PyTorch 2.9
     deprecates, and layers in evaluation mode, which are the frozen layers of a backbone.

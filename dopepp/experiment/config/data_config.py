@@ -28,7 +28,7 @@ Share = Annotated[float, Range(0, 1)]
 Side = Annotated[int, Range(8, 16384)]
 
 MAX_WORKERS: Final = 1024
-"""Maximum number of loader processes; a larger number is a typing error."""
+"""Maximum number of loader processes."""
 
 _MULTIPLE: Final = 32
 """Both sides of the network's input are multiples of this number of pixels."""
@@ -39,7 +39,7 @@ _CLOSED: Final = ("data.jitter", "data.masking", "data.augment", "data.image_set
 
 @dataclass(frozen=True, kw_only=True)
 class LensConfig:
-    """Camera of the application. ``camera=FILE`` sets all of these values.
+    """Pinhole camera of the application. ``camera=FILE`` sets all of these values.
 
     Attributes:
         width, height: Image size, pixels.
@@ -79,8 +79,8 @@ class VirtualConfig:
         renderer: ``raster`` or ``photoreal``.
         camera: Camera of the application; None uses the camera of the preset.
         working_distance: Nearest and farthest distance of the parts from the camera, metres.
-        camera_scale: Scale of the camera's images at the network's input; None selects a scale that
-            suits the parts.
+        camera_scale: Scale of the camera's images at the network's input; None selects a scale by
+            the size of the parts in the images.
     """
 
     __pydantic_config__ = STRICT
@@ -96,7 +96,7 @@ class VirtualConfig:
 
     @classmethod
     def of(cls, node: object) -> VirtualConfig:
-        """Read the node ``virtual``.
+        """Parse the node ``virtual``, including the camera and preset files that it names.
 
         Raises:
             UserError: An option is unknown or wrong.
@@ -216,7 +216,7 @@ class DataConfig:
 
     @classmethod
     def of(cls, data: object, virtual: object) -> DataConfig:
-        """Read both nodes; ``virtual`` may be None for the defaults.
+        """Parse the nodes ``data`` and ``virtual``; None for ``virtual`` selects its defaults.
 
         Raises:
             UserError: An option is unknown, missing, of a wrong type or out of range.
@@ -238,7 +238,7 @@ class DataConfig:
 
     @property
     def preset_name(self) -> str:
-        """Name of the scene preset."""
+        """Name of the scene preset: ``virtual.preset``, or ``ycb`` with a root, else ``paper``."""
         return self.virtual.preset or ("paper" if self.root is None else "ycb")
 
     @property
@@ -248,10 +248,10 @@ class DataConfig:
 
     @property
     def network_input(self) -> tuple[int, int]:
-        """Size of the network's input, pixels.
+        """(width, height) of the network's input, pixels.
 
         Raises:
-            UserError: Neither the config nor a camera states the size.
+            UserError: ``input_size`` is neither set nor derived from a camera.
         """
         if self.input_size is None:
             raise UserError(
@@ -268,7 +268,7 @@ class DataConfig:
         return self.image_sets[split] is None
 
     def image_set(self, split: Split) -> str:
-        """Return the name of a split's image set below ``root``.
+        """Return the image set (YCB-Video) or folder below ``root`` (other formats) of a split.
 
         Raises:
             UserError: The split has no image set.
@@ -286,12 +286,12 @@ class DataConfig:
 def evaluation_data(
     data: Node | None, virtual: Node | None, stored: object, source: str
 ) -> DataConfig:
-    """Return the data to evaluate on: the data of the checkpoint with the user's changes.
+    """Return the data config of an evaluation: the checkpoint's, with the user's changes.
 
     Args:
-        data: Whole node ``data``, or options to change.
-        virtual: Whole node ``virtual``, or options to change.
-        stored: Data config of the checkpoint, which is not trusted.
+        data: Whole node ``data`` (with a ``name``), or options to change.
+        virtual: Whole node ``virtual`` (with renderer and preset), or options to change.
+        stored: Data config of the checkpoint; any value, because a file is not trusted.
         source: Path of the checkpoint, for messages.
 
     Raises:
@@ -322,7 +322,7 @@ def evaluation_data(
 
 
 def stored_config(description: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the data config in a checkpoint's description, or None."""
+    """Return the data config in ``Checkpoint.data``, or None if it has none."""
     config = description.get("config")
     return config if isinstance(config, dict) else None
 
@@ -330,7 +330,8 @@ def stored_config(description: Mapping[str, Any]) -> dict[str, Any] | None:
 def with_files(virtual: object) -> object:
     """Return the node ``virtual`` with file paths replaced by the contents of the files.
 
-    A camera file becomes its numbers; a preset file becomes changes to a built-in preset.
+    A camera file becomes the fields of :class:`LensConfig`; a preset file becomes changes to a
+    built-in preset.
     """
     if not isinstance(virtual, Mapping):
         return virtual
@@ -354,7 +355,7 @@ def _chosen_virtual(given: Mapping[str, Any], stored: object, source: str) -> Vi
 
 
 def _changed(base: object, changes: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Replace options recursively."""
+    """Return the node ``base``, of dotted name ``where``, with nested options changed."""
     if not isinstance(base, Mapping):
         fix = f"choose a file of conf/{where} with {where}=NAME"
         raise UserError(f"{where}={base!r:.100} in the checkpoint", "a mapping of options", fix)

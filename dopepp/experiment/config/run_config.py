@@ -28,7 +28,7 @@ _MAX_WAIT_S: Final = 7 * 24 * 3600
 _MIN_CELLS: Final = 0.1
 """Minimum width of a peak or disc in cells; a narrower peak may cover no cell."""
 _MAX_THRESHOLD: Final = 1000
-"""Upper limit for map sizes in cells, angles in degrees and numbers of peaks."""
+"""Maximum width of a peak or disc in cells."""
 
 AUTO: Final = "auto"
 """Value of ``init_from`` that selects the package's initial weights if they fit."""
@@ -50,7 +50,7 @@ class ModelConfig:
 
     Attributes:
         name: Name in tables.
-        width: Factor on the channel counts of all nodes below.
+        width: Factor on the channel counts of backbone, attention and head.
         backbone: Node of :data:`~dopepp.models.network.BACKBONES`.
         attention: Node of :data:`~dopepp.models.network.ATTENTIONS`.
         head: Node of :data:`~dopepp.models.network.HEADS`.
@@ -68,11 +68,11 @@ class ModelConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class MapsConfig:
-    """Target maps, with lengths in cells.
+    """Target maps of the training.
 
     Attributes:
-        sigma: Standard deviation of belief peaks.
-        field_radius: Radius of the disc around a corner on which its vector is drawn.
+        sigma: Standard deviation of belief peaks, cells.
+        field_radius: Radius of the disc around a corner that carries its vector, cells.
     """
 
     __pydantic_config__ = STRICT
@@ -129,7 +129,7 @@ class TrainerConfig:
         return max(outside, self.num_nodes * self._num_devices())
 
     def _num_devices(self) -> int:
-        """Return the number of devices that ``trainer.devices`` selects."""
+        """Return the number of devices per machine that ``trainer.devices`` selects."""
         devices = self.devices
         if isinstance(devices, str) and "," in devices:
             devices = [piece for piece in devices.split(",") if piece.strip()]
@@ -162,12 +162,12 @@ class CostConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class LearningRateConfig:
-    """Options of ``job=lr_finder``. The sweep ends earlier if the loss diverges.
+    """Options of ``job=lr_finder``, a training whose learning rate grows from step to step.
 
     Attributes:
         min_lr: Learning rate of the first step.
         max_lr: Learning rate of the last step.
-        num_steps: Number of steps.
+        num_steps: Number of steps; fewer if the loss diverges.
 
     Raises:
         UserError: ``max_lr`` is not above ``min_lr``.
@@ -202,12 +202,12 @@ class FalsePositiveTarget:
 
 @dataclass(frozen=True)
 class Protocols:
-    """Protocols to measure in addition to the test set.
+    """Measurements in addition to the accuracy on the unmodified test set.
 
     Attributes:
         shading: Shares of every object's visible area to cover, ascending, without 0.
         scales: Factors on the apparent size of the parts, ascending, without 1.
-        by: Quantities by which rates are broken down.
+        by: Quantities by which the pass rates are broken down.
         num_bins: Number of bins per quantity.
     """
 
@@ -218,7 +218,7 @@ class Protocols:
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> Protocols:
-        """Read the options; a training has no scales.
+        """Read the options from a config; ``scale_factors`` may be absent.
 
         Raises:
             UserError: An option is wrong.
@@ -234,14 +234,14 @@ class Protocols:
         )
 
     def __bool__(self) -> bool:
-        """Return whether any protocol is selected."""
+        """Return whether any measurement is selected."""
         return bool(self.shading or self.scales or self.by)
 
 
 def _levels(
     option: str, value: object, bounds: tuple[float, float], standard_level: float, allowed: str
 ) -> tuple[float, ...]:
-    """Read levels without ``standard_level``, which is always measured."""
+    """Return the ascending levels of an option, without the level that is always measured."""
     levels = [] if value is None else value if isinstance(value, list) else [value]
     numbers: list[float] = [n for n in levels if isinstance(n, int | float) and type(n) is not bool]
     wrong = len(numbers) < len(levels) or not all(bounds[0] <= n <= bounds[1] for n in numbers)
@@ -251,7 +251,7 @@ def _levels(
 
 
 def _quantities(given: object) -> tuple[QuantityName, ...]:
-    """Read ``by``: one or several quantities."""
+    """Return the quantities in ``by``, one name or a list of names, without repetition."""
     names = [] if given is None else given if isinstance(given, list) else [given]
     quantities: dict[object, QuantityName] = {name: name for name in get_args(QuantityName)}
     wrong = [name for name in names if not isinstance(name, str) or name not in quantities]
@@ -266,12 +266,12 @@ class MeasurementConfig(FalsePositiveTarget):
     """Options that a training and an evaluation share.
 
     Attributes:
-        plain: The whole config in plain values, as printed and stored.
+        plain: The whole config as nested dictionaries and lists, as printed and stored.
         shading: Shares of every object's visible area to cover; each share is evaluated (default:
             none).
         scale_factors: Factors on the apparent size of the parts; each factor is evaluated (default:
             none). ``scale`` is the short name.
-        by: Quantities by which rates are broken down: distance, visibility, size, rotation
+        by: Quantities by which the pass rates are broken down: distance, visibility, size, rotation
             (default: none).
         num_bins: Number of bins of each quantity in ``by``.
         tune: Whether to tune a distance factor, a score and its threshold before the measurement.
@@ -297,7 +297,7 @@ class MeasurementConfig(FalsePositiveTarget):
 
     @property
     def protocols(self) -> Protocols:
-        """Measurements in addition to the test set: shading, scales and rates per bin."""
+        """Selected measurements of shading, scales and rates per bin, parsed."""
         return Protocols.of(vars(self))
 
 
@@ -306,17 +306,17 @@ class RunConfig(MeasurementConfig):
     """Config of ``train.py``.
 
     Attributes:
-        job: Job to run.
+        job: ``train``, ``cost`` or ``lr_finder``.
         cost: Options of ``job=cost``.
         lr_finder: Options of ``job=lr_finder``.
         table: Table layout of a multirun (:class:`~dopepp.experiment.results.paper.PaperTable`).
         search: Search of a multirun (:mod:`dopepp.experiment.sweep.optuna_search`).
         recipe: Name of the combination of loss, optimiser and schedule.
-        seed: Seed of initial weights, order and training images.
+        seed: Seed of the initial weights, and of the content and order of the training images.
         compile: Whether to compile the network with torch.
         ema: Decay of an exponential moving average of the weights; None disables it.
-        stop_at: Share of the parts with a correct refined pose that ends the training, once the
-            share is confirmed on held-out images; None: the training has its full length.
+        stop_at: Share of the parts with a correct refined pose that ends the training, once further
+            held-out images confirm the share; None: the training has its full length.
         keep_checkpoints: Whether to keep the checkpoints after the measurement.
         resume: Folder of the interrupted run to resume.
         resume_anyway: Whether to resume even if the training data or the loss have changed.
@@ -363,7 +363,7 @@ class RunConfig(MeasurementConfig):
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> RunConfig:
-        """Read a composed and resolved config.
+        """Parse a config that Hydra has composed and resolved.
 
         Raises:
             UserError: An option is unknown, missing or wrong.
@@ -387,8 +387,8 @@ class EvaluationConfig(MeasurementConfig):
         ckpt_path: Checkpoint to measure.
         baseline: Second checkpoint, which comes first in tables.
         results: BOP challenge CSV with the poses of another method.
-        templates: Nearest and farthest distance of the parts, metres, at which templates of their
-            meshes are measured; None for no templates.
+        templates: Nearest and farthest distance of the parts, metres, for the method that matches
+            templates of their meshes; None omits the method.
         negatives: Folder of images that show none of the parts.
         negatives_camera: Camera file of these images; None for the camera of the data.
         method: Name of the method of ``results``; None derives the name from the file name.
@@ -420,7 +420,7 @@ class EvaluationConfig(MeasurementConfig):
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> EvaluationConfig:
-        """Read a composed and resolved config.
+        """Parse a config that Hydra has composed and resolved.
 
         Raises:
             UserError: An option is unknown, missing or wrong.
@@ -429,7 +429,7 @@ class EvaluationConfig(MeasurementConfig):
 
 
 def _parsed(kind: type[C], options: Mapping[str, Any]) -> C:
-    """Parse a whole config."""
+    """Parse a whole config, and store the unparsed config in ``plain``."""
     if "plain" in options:
         raise UserError(
             f"plain={short_repr(options['plain'])}", "the options of `--cfg job`", "leave out plain"
