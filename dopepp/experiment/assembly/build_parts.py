@@ -1,4 +1,4 @@
-"""Build the objects to learn, and the negatives to show, from the ``data`` config."""
+"""Load the parts to learn, and the negatives (parts to show unlabelled), from the config."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ PAPER_OBJECTS: Final = (
 
 
 def build_parts(data: DataConfig) -> list[Part]:
-    """Build the objects to learn: objects of the labelled images in ``root``, or listed parts."""
+    """Load the parts to learn, from ``data.root`` or ``data.parts``, with their symmetries."""
     return choose_symmetries(_read_parts(data), data.symmetries)
 
 
 def _read_parts(data: DataConfig) -> list[Part]:
-    """Read the parts of the data set, or the mesh files of ``data.parts``."""
+    """Load the objects of a YCB-Video or BOP root, or the names and mesh files in ``parts``."""
     if data.root is None:
         for option, value in (("objects", data.objects), ("frames", data.frames)):
             if value is not None:
@@ -49,7 +49,7 @@ def _read_parts(data: DataConfig) -> list[Part]:
 
 
 def _ycb_parts(root: Path, objects: Sequence[str] | None) -> list[Part]:
-    """Read YCB objects by name (default: the paper's objects)."""
+    """Load YCB objects by name; None selects :data:`PAPER_OBJECTS`."""
     classes = read_classes(root)
     names = PAPER_OBJECTS if objects is None else objects
     unknown = [name for name in names if name not in classes]
@@ -60,7 +60,7 @@ def _ycb_parts(root: Path, objects: Sequence[str] | None) -> list[Part]:
 
 
 def build_negatives(data: DataConfig, parts: Parts) -> list[Part]:
-    """Build the negatives: the listed parts, and the remaining models of a BOP data set."""
+    """Load the parts to show unlabelled: ``virtual.negatives`` and the other models of BOP."""
     listed = [load_part(name, data.unit) for name in data.virtual.negatives]
     if data.root is None or data.format != "bop" or data.objects is None:
         return listed
@@ -70,5 +70,5 @@ def build_negatives(data: DataConfig, parts: Parts) -> list[Part]:
 
 @lru_cache(maxsize=1)
 def _all_models(root: Path) -> tuple[Part, ...]:
-    """Read the models of a BOP data set once per run."""
+    """Load all models of a BOP data set, once per process."""
     return tuple(bop_parts(root))

@@ -53,7 +53,7 @@ _DIVIDED: Final = ("bop", "ndds", "webdataset")
 
 
 def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModule:
-    """Build the DataModule: training images from ``seed``, others from ``data.eval_seed``."""
+    """Build the DataModule. ``seed`` determines the training images, ``eval_seed`` the others."""
     backgrounds = training_backgrounds(data)
     val = val_images = held_out_source(data, parts, "val")
     if data.virtual.view is not None and isinstance(val, RenderedSource):
@@ -78,8 +78,8 @@ def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModul
 def held_out_source(data: DataConfig, parts: Parts, split: Split) -> DescribedSource:
     """Build the validation or test images at their native resolution.
 
-    The images are labelled images if the data set has a root, else renders. Validation falls back
-    to renders, with a warning, if the labelled images show none of the objects.
+    :meth:`DataConfig.is_rendered` selects renders or the labelled images of ``data.root``.
+    Validation falls back to renders, with a warning, if no labelled image shows a part.
     """
     if data.is_rendered(split):
         return held_out_renders(data, parts, split)
@@ -98,7 +98,7 @@ def held_out_source(data: DataConfig, parts: Parts, split: Split) -> DescribedSo
 def _train_source(
     data: DataConfig, parts: Parts, seed: int, backgrounds: Backgrounds
 ) -> DescribedSource:
-    """Mix real images, synthetic images of the data set and renders."""
+    """Mix labelled images, YCB-Video's synthetic images and renders in the configured shares."""
     real, synthetic = None, None
     if data.root is not None and data.real_fraction > 0:
         real = _real_frames(data, parts, seed)
@@ -129,7 +129,7 @@ def _train_source(
 
 
 def _real_frames(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
-    """Open the labelled training images, cut into windows if the user's camera is given."""
+    """Open the labelled training images, in random windows if ``virtual.camera`` is set."""
     frames, view = labelled_images(data, parts, seed, "train"), data.virtual.view
     if view is None:
         return with_cache(frames, data, data.cache, data.network_input)
@@ -140,10 +140,10 @@ def _real_frames(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
 
 
 def labelled_images(data: DataConfig, parts: Parts, seed: int, split: Split) -> DescribedSource:
-    """Open a split's labelled images.
+    """Open the labelled images of a split in ``data.root``; ``seed`` determines random choices.
 
     Raises:
-        UserError: ``data.root`` has no such images.
+        UserError: ``data.format`` is unknown, or ``data.root`` has no images of the split.
     """
     assert data.root is not None
     if data.format in FORMATS:
@@ -160,7 +160,7 @@ def labelled_images(data: DataConfig, parts: Parts, seed: int, split: Split) -> 
 def _synthetic_images(
     data: DataConfig, parts: Parts, seed: int, backgrounds: Backgrounds
 ) -> DescribedSource | None:
-    """Open the synthetic images in the training list of YCB-Video, if any."""
+    """Open the transparent synthetic images in YCB-Video's training list; None without any."""
     image_set = data.image_sets["train"]
     if data.root is None or data.format != "ycb_video" or image_set is None:
         return None
@@ -178,10 +178,10 @@ def _synthetic_images(
 
 
 def share_of(image_sets: Mapping[str, str | None], split: Split) -> tuple[float, float]:
-    """Return the range of a folder's images that belongs to a split, as fractions.
+    """Return the range of a folder's images that a split uses, as two fractions of the folder.
 
-    Splits that share a folder divide the folder in the order training, validation, test. Training
-    gets 80 %; the remaining splits get equal shares.
+    Splits with the same ``image_sets`` entry divide the folder in the order training, validation,
+    test. Training gets 80 %; the remaining splits get equal shares.
     """
     sharing = [name for name in ("train", "val", "test") if image_sets[name] == image_sets[split]]
     first = _TRAINING_SHARE if sharing[0] == "train" and len(sharing) > 1 else 1 / len(sharing)
@@ -229,7 +229,7 @@ FORMATS: Final[dict[str, Opener]] = {
         read_depth=split == "test",
     ),
 }
-"""Functions that open the images of each format."""
+"""Functions that open a split's labelled images, by name of the format."""
 
 
 def note_on_shared_folder(data: DataConfig) -> str | None:
@@ -250,10 +250,10 @@ def note_on_shared_folder(data: DataConfig) -> str | None:
 
 
 def fit_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
-    """Choose the camera scale and the input size by the apparent size of the parts.
+    """Return a config with camera scale and input size chosen by the apparent size of the parts.
 
-    Without a camera, renders of the models of a BOP data set use the data set's camera. Otherwise
-    the config stays unchanged. The chosen values are logged and stored in the config.
+    Without ``virtual.camera``, renders for a BOP data set use the camera of its test images. With
+    neither camera, the config is returned unchanged. The chosen values are logged.
 
     Raises:
         UserError: A part is larger than ``data.input_size``, or the working distance is unknown.
@@ -285,7 +285,7 @@ def fit_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
 
 
 def _with_camera_of_images(config: RunConfig, parts: Parts) -> RunConfig:
-    """Give the renders of a training the camera and the distances of the BOP test images."""
+    """Set the camera and distances of the BOP test images for renders without a camera."""
     data, virtual = config.data, config.data.virtual
     rendered = data.real_fraction == 0 or (data.real_fraction < 1 and data.input_size is None)
     labelled = data.format == "bop" and not data.is_rendered("test")

@@ -51,7 +51,7 @@ _M_MMAP_MAX: Final = -4
 
 _PROBE_ITEMS: Final = 3
 _PROBE_S: Final = 2.0
-"""Effort for the estimate of the duration: number of items and seconds of steps."""
+"""Number of loaded items and seconds of a timed step, for the estimate of a run's duration."""
 
 _BF16_FLAGS: Final = frozenset({"amx_bf16", "bf16"})
 """Names of the instruction sets on x86 and Arm."""
@@ -110,7 +110,11 @@ def build_system(
     images: Mapping[str, Any] | None = None,
     seen: Mapping[str, LearnedRange] | None = None,
 ) -> PoseSystem:
-    """Build network, loss and optimiser; ``images`` describes the data in the checkpoint."""
+    """Build the LightningModule: initialised network, loss, optimiser and schedule.
+
+    Checkpoints store ``fingerprint`` (hash of the data), ``images`` (description of each split's
+    images) and ``seen`` (trained range of sizes and distances by part).
+    """
     network, description = build_untrained(config, parts)
     description = replace(
         description,
@@ -139,7 +143,7 @@ def build_system(
 
 
 def _initialise(network: PoseNetwork, config: RunConfig) -> None:
-    """Copy the weights that ``init_from`` names, and print which weights were chosen."""
+    """Copy the weights of ``init_from`` into the network; for ``auto``, print the choice."""
     if config.init_from is None:
         return
     if config.init_from != AUTO:
@@ -155,7 +159,7 @@ def _initialise(network: PoseNetwork, config: RunConfig) -> None:
 
 
 def build_untrained(config: RunConfig, parts: list[Part]) -> tuple[PoseNetwork, Checkpoint]:
-    """Build the untrained network and its checkpoint description, without the data."""
+    """Build the untrained network, and a checkpoint that describes it, without weights and data."""
     spec = {
         "backbone": config.model.backbone,
         "attention": config.model.attention,
@@ -288,7 +292,7 @@ def estimate_training_s(
 
 
 def _loading_s(datamodule: PoseDataModule) -> float:
-    """Return the mean time to load a training item in this process, seconds."""
+    """Return the mean time to load one of the first training items in this process, seconds."""
     items = min(_PROBE_ITEMS, len(datamodule.train_source))
     start = time.perf_counter()
     for index in range(items):
@@ -297,7 +301,7 @@ def _loading_s(datamodule: PoseDataModule) -> float:
 
 
 def _step_s_per_image(network: PoseNetwork, datamodule: PoseDataModule, precision: str) -> float:
-    """Time a training step per image, with as large a batch as a few seconds allow."""
+    """Return the seconds per image of forward and backward pass, in a batch of at most 2 s."""
     width, height = datamodule.input_size
 
     def step_s(count: int) -> float:
@@ -350,6 +354,6 @@ def scheduler_factory(node: Mapping[str, Any]) -> SchedulerFactory | None:
 
 
 def build_optional(kind: str, base: type[T], node: Mapping[str, Any]) -> T | None:
-    """Build the object of a node with a single permitted class; None if the node has no target."""
+    """Build an object of class ``base`` from a config node; None if the node has no target."""
     registry = Registry(kind, base, [f"{base.__module__}.{base.__qualname__}"])
     return None if node.get(TARGET) is None else registry.build(node)

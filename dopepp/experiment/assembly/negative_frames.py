@@ -45,7 +45,7 @@ A threshold that rejects look-alikes would reject the part as well, so tables sh
 separate row."""
 
 FRAME: Final[Size] = (640, 480)
-"""(width, height) of the frames if there is no camera and the preset's images are smaller."""
+"""(width, height), pixels, of frames without a camera if the preset's images are smaller."""
 
 _MAX_DISTRACTORS: Final = 12  # per frame; limits the rendering time
 _LOOKALIKES_SHOWN: Final = (1, 3)  # smallest and largest number per frame
@@ -110,8 +110,8 @@ def negative_frames(
 def frame_view(data: DataConfig, parts: Parts) -> View:
     """Return the camera of the frames and the distances of the parts.
 
-    The camera is the user's camera or the camera of the labelled images. Otherwise the camera has
-    the preset's focal length and at least :data:`FRAME` pixels.
+    The camera is ``virtual.camera`` if set. Otherwise the camera has the preset's focal length and
+    images of at least :data:`FRAME` pixels.
     """
     if data.virtual.view is not None:
         return data.virtual.view
@@ -123,7 +123,7 @@ def frame_view(data: DataConfig, parts: Parts) -> View:
 
 
 def _distances(preset: Preset, parts: Parts) -> tuple[float, float]:
-    """Return the smallest and largest depth at which a preset places the middle of parts."""
+    """Return the smallest and largest depth of the middle of parts in a preset, metres."""
     if preset.table is not None:
         return preset.table.distance
     rng, depths = np.random.default_rng(0), []
@@ -137,7 +137,7 @@ def _distances(preset: Preset, parts: Parts) -> tuple[float, float]:
 
 
 def _as_dense(preset: Preset, size: Size) -> Preset:
-    """Return a preset with distractors of equal size and density in larger frames."""
+    """Return a preset whose distractors keep their pixel size and density in frames of ``size``."""
     old, scale = preset.distractors, size[0] / preset.width
     growth = size[0] * size[1] / (preset.width * preset.height)
     low, high = (min(math.ceil(count * growth), _MAX_DISTRACTORS) for count in old.number)

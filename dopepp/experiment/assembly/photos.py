@@ -28,7 +28,7 @@ _NEEDED: Final = f"at least {3 * MIN_PHOTOS} different photos"
 
 
 def training_backgrounds(data: DataConfig) -> Backgrounds:
-    """Return the backgrounds of training: the training share of the user's photos.
+    """Return the training backgrounds: ``virtual.backgrounds``, mixed with ``negative_photos``.
 
     Raises:
         UserError: A folder has no photo, or there are too few negative photos.
@@ -50,7 +50,7 @@ def training_backgrounds(data: DataConfig) -> Backgrounds:
 
 
 def held_out_photos(data: DataConfig, split: Literal["val", "test"]) -> PhotoBackgrounds:
-    """Return photos that training does not use: the user's, or the package's if none are given.
+    """Return photos that training does not use: the user's, or the package's without a folder.
 
     Raises:
         UserError: The folder of the backgrounds has too few photos to be divided.
@@ -69,7 +69,7 @@ def held_out_photos(data: DataConfig, split: Literal["val", "test"]) -> PhotoBac
 
 
 def negative_photos(data: DataConfig, split: PhotoSplit) -> PhotoBackgrounds | None:
-    """Return a split of the user's own images without the parts, or None without a folder.
+    """Return a split of the images in ``virtual.negative_photos``; None without that folder.
 
     Raises:
         UserError: There are too few images to be divided.

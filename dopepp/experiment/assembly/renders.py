@@ -1,4 +1,4 @@
-"""Build renders and their presets from the ``data`` config: for training and held out."""
+"""Build sources of rendered images, for training and for held-out splits, from the config."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from dopepp.virtual.presets import Preset
 def training_renders(
     data: DataConfig, parts: Parts, seed: int, backgrounds: Backgrounds
 ) -> DescribedSource:
-    """Render the training images at the size of the network's input, which saves time."""
+    """Return the source of rendered training images, at the size of the network's input."""
     factory = _factory(data, parts, training_preset(data), seed, backgrounds)
     source = RenderedSource(factory, data.samples_per_epoch)
     return with_cache(source, data, data.cache, data.network_input)
 
 
 def validation_windows(data: DataConfig, parts: Parts) -> DescribedSource:
-    """Render the validation images of the user's camera in the windows that training uses."""
+    """Return rendered validation images in windows of the camera's image, as in training."""
     backgrounds = find_backgrounds(data.virtual.backgrounds, "val")
     factory = _factory(data, parts, training_preset(data), data.eval_seed, backgrounds)
     return RenderedSource(factory, data.num_val, "val")
@@ -44,9 +44,9 @@ def held_out_renders(
 
     Args:
         data: Options of the data.
-        parts: The parts.
+        parts: Parts to render and label.
         split: ``val`` or ``test``.
-        scale: Factor on the apparent size of the parts.
+        scale: Factor by which the distance to the parts is divided.
     """
     renderer, count = data.virtual.renderer, data.num_val
     cache: Cache = "none"
@@ -62,7 +62,7 @@ def held_out_renders(
 
 
 def scaled_test_renders(data: DataConfig, parts: Parts, scale: float) -> DescribedSource:
-    """Render the test scenes with the camera closer to the parts by a factor.
+    """Return the test scenes rendered with the distance to the parts divided by ``scale``.
 
     Raises:
         UserError: The test images are not renders.
@@ -101,10 +101,10 @@ def validation_renders(
 def with_cache(
     source: DescribedSource, data: DataConfig, cache: Cache, input_size: tuple[int, int] | None
 ) -> DescribedSource:
-    """Add the configured cache to a source.
+    """Return a source with a cache in ``memory`` or on ``disk``, or for ``none`` the source itself.
 
     Raises:
-        UserError: The cache does not fit.
+        UserError: The cache does not fit into the memory or on the disk.
     """
     if cache == "none":
         return source
@@ -115,7 +115,7 @@ def with_cache(
 
 
 def training_preset(data: DataConfig) -> Preset:
-    """Return the preset at the network's input size: resized, or in windows of the images."""
+    """Return the preset resized to the network's input or, with a camera, in windows that size."""
     preset, view = data.preset, data.virtual.view
     if view is not None:
         return view.window(preset, data.virtual.camera_scale or 1.0, data.network_input)
@@ -131,7 +131,7 @@ def _factory(
     backgrounds: Backgrounds,
     renderer: str | None = None,
 ) -> Factory:
-    """Return the factory of the rendered images."""
+    """Return the factory that renders scenes of a preset, with the configured negatives."""
     return Factory(
         parts,
         preset,

@@ -22,7 +22,7 @@ ANGLE_DEG: Final = 25.0
 
 
 class StaticScenes:
-    """The images of a BOP split with ``others`` and the poses of their cameras.
+    """Images of a BOP split, each with further images of its scene and all camera poses.
 
     Args:
         reader: Reader of the images; every folder is a static scene.
@@ -61,7 +61,7 @@ class StaticScenes:
         return replace(first, others=others)
 
     def _further_views(self, index: int) -> Sequence[int]:
-        """Return the indices of further images of an image's scene."""
+        """Choose images of the same scene, each about 25° from its nearest chosen camera."""
         scene = self._reader.image_ids[index][0]
         left, chosen = [number for number in self._scenes[scene] if number != index], [index]
         axes = {number: self._T_world_cam[number][:3, 2] for number in self._scenes[scene]}
@@ -77,7 +77,7 @@ class StaticScenes:
         return self._reader.contains(label)
 
     def describe(self) -> list[SourceInfo]:
-        """Describe the images."""
+        """Return the description of the reader's images."""
         return self._reader.describe()
 
 

@@ -50,7 +50,7 @@ class ModelConfig:
 
     Attributes:
         name: Name in tables.
-        width: Factor on the channel counts of backbone, attention and head.
+        width: Factor on the channel counts of backbone and head.
         backbone: Node of :data:`~dopepp.models.network.BACKBONES`.
         attention: Node of :data:`~dopepp.models.network.ATTENTIONS`.
         head: Node of :data:`~dopepp.models.network.HEADS`.
