@@ -41,12 +41,12 @@ _ANYWHERE: Final = (
     "mem_gb",
     "name",
 )
-"""Options that submitit names equally on every cluster; other options belong to SLURM."""
+"""Options that every submitit cluster accepts; other options get the prefix ``slurm_``."""
 
 
 @dataclass(frozen=True)
 class Jobs:
-    """Common data of the jobs of a multirun, which is sent to their processes."""
+    """Function that runs a job of a multirun, with the data that all jobs share."""
 
     context: HydraContext
     config: DictConfig
@@ -55,7 +55,7 @@ class Jobs:
 
     @property
     def folder(self) -> Path:
-        """Folder of the multirun; the folder of a job is its number below it."""
+        """Folder of the multirun; a job runs in the subfolder named after its number."""
         return Path(str(self.config.hydra.sweep.dir))
 
     def __call__(self, job: tuple[int, list[str]]) -> JobReturn:
@@ -78,7 +78,7 @@ class Jobs:
         return result
 
     def checkpoint(self, job: tuple[int, list[str]]) -> Any:
-        """Submit the same job again near SLURM's time limit; the job resumes in its folder."""
+        """Return the job for resubmission; submitit calls this near SLURM's time limit."""
         from submitit.helpers import DelayedSubmission
 
         return DelayedSubmission(self, job)
@@ -94,7 +94,7 @@ Runner = Callable[[Jobs, Mapping[int, list[str]]], Ended]
 def launch(
     jobs: Jobs, overrides: Sequence[Sequence[str]], first: int, run: Runner
 ) -> list[JobReturn]:
-    """Run jobs, numbered from ``first``, and wait for all; a lost job counts as failed."""
+    """Run jobs numbered from ``first`` and wait; write ``failed.json`` if a process dies."""
     jobs.folder.mkdir(parents=True, exist_ok=True)
     numbered = {number: list(texts) for number, texts in enumerate(overrides, first)}
     returns: dict[int, JobReturn] = {}
@@ -135,7 +135,7 @@ def on_ray(address: str | None, num_cpus: float, num_gpus: float) -> Runner:
     Args:
         address: ``host:port`` of the cluster; None starts a cluster on this machine.
         num_cpus: Cores per job.
-        num_gpus: Accelerators per job.
+        num_gpus: GPUs per job; may be a fraction.
     """
 
     def run(jobs: Jobs, overrides: Mapping[int, list[str]]) -> Ended:
@@ -159,7 +159,7 @@ def on_ray(address: str | None, num_cpus: float, num_gpus: float) -> Runner:
 
 
 def _run(pool: Pool, overrides: Mapping[int, list[str]]) -> Ended:
-    """Yield the results of jobs, or an exception if their process was lost."""
+    """Yield number and result of each finished job; an exception if its process died."""
     with pool:
         for (number, _), future in pool.run(overrides.items()):
             try:

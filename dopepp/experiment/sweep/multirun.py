@@ -37,10 +37,10 @@ _STANDARD_OUT_AND_ERROR: Final = (1, 2)
 
 
 class AnnounceJobs(Callback):
-    """Hydra's hook at the start of a multirun: prints the folders."""
+    """Hydra callback that prints the output folders at the start of a multirun."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Print the folder of the multirun and the log file of remote jobs."""
+        """Print the multirun's folder and, for jobs in other processes, the path of their logs."""
         folder = config.hydra.sweep.dir
         program.print_line(f"begins in {folder}")
         if is_remote(config.hydra):
@@ -48,20 +48,20 @@ class AnnounceJobs(Callback):
 
 
 class CompareJobs(Callback):
-    """Hydra's hook at the end of a multirun.
+    """Hydra callback that compares the jobs at the end of a multirun.
 
-    Hydra skips the hook if a job raises. Therefore a failing job writes ``failed.json`` and
-    returns, and this hook ends the multirun with exit code 1 after the comparison.
+    Hydra skips the callback if a job raises. Therefore a failing job writes ``failed.json`` and
+    returns, and the callback ends the multirun with exit code 1 after the comparison.
     """
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Write the README of the multirun."""
+        """Write the README of the multirun before any job has run."""
         from dopepp.experiment.results.pages import write_multirun_readme
 
         write_multirun_readme(Path(str(config.hydra.sweep.dir)), program.command(), {})
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Compare all jobs of the multirun.
+        """Write the comparison of all jobs.
 
         Raises:
             SystemExit: A job failed; the exit code is 1.
@@ -71,7 +71,7 @@ class CompareJobs(Callback):
 
 
 def compare_jobs(folder: Path, config: DictConfig) -> bool:
-    """Compare the jobs in the folder of a multirun; return whether all succeeded."""
+    """Write the comparison of a multirun's jobs; return whether each has finished or was pruned."""
     from dopepp.experiment.results import display
     from dopepp.experiment.results.compare import compare_runs
     from dopepp.experiment.results.compared_runs import read_run
@@ -93,13 +93,13 @@ def compare_jobs(folder: Path, config: DictConfig) -> bool:
 
 
 def _node(config: DictConfig, key: str) -> dict[str, Any] | None:
-    """Return a node of a config in plain values, or None."""
+    """Return a config node as a dictionary; None if it is absent, empty or not a mapping."""
     node: Any = OmegaConf.to_container(config[key], resolve=True) if config.get(key) else None
     return node if isinstance(node, dict) else None
 
 
 def _state(job: Path) -> str:
-    """Return the state of a job from the files in its folder."""
+    """Return the state of a job from the files in its folder, with the reason for a failure."""
     from dopepp.experiment.results.cost import COST_FILE
     from dopepp.experiment.results.folder import FAILURE_FILE, METRICS_FILE, PRUNED_FILE, read_json
 
@@ -118,7 +118,7 @@ def is_remote(hydra: Any) -> bool:
 
 @contextmanager
 def redirected_output(path: Path) -> Iterator[None]:
-    """Append the output of this process and its children to a file."""
+    """Append stdout and stderr of this process and its children to a file inside the context."""
     path.parent.mkdir(parents=True, exist_ok=True)
     before = [os.dup(number) for number in _STANDARD_OUT_AND_ERROR]
     try:
@@ -140,7 +140,7 @@ def _redirect(targets: list[int]) -> None:
 
 
 def can_resume(config: Mapping[str, Any], run_dir: Path) -> bool:
-    """Return whether a job was interrupted in this folder with the same config.
+    """Return whether the folder holds the last checkpoint of a run with the same config.
 
     Requeued SLURM jobs and restarted searches continue in their folder.
     """
@@ -185,7 +185,7 @@ def record_run(command: Sequence[str], run_dir: Path) -> None:
 
 
 def requeued_run(command: Sequence[str]) -> Path | None:
-    """Return the run folder of this command if the SLURM job was requeued, else None."""
+    """Return the folder stored by :func:`record_run` if the SLURM job was requeued, else None."""
     note = _note(command)
     restarts = os.environ.get("SLURM_RESTART_COUNT", "0")
     if note is None or restarts == "0" or not note.is_file():
@@ -196,7 +196,7 @@ def requeued_run(command: Sequence[str]) -> Path | None:
 
 
 def _note(command: Sequence[str]) -> Path | None:
-    """Return the file for this job and command; the script of a job may contain several."""
+    """Return the file with the run folder of this SLURM job and command; None outside SLURM."""
     job = job_id()
     if job is None:
         return None

@@ -2,7 +2,7 @@
 
 A trial and its job have the same number. Trials that an interrupted command left ``RUNNING`` are
 resumed first, each in its own folder from its last checkpoint. Only one command may use a study at
-a time, and all trials of a study have the same configuration.
+a time, and all trials of a study have the same fixed options.
 
 To vary an option, add a Hydra sweep such as ``key=interval(0, 1)`` to ``search.space`` or to the
 command line.
@@ -59,7 +59,7 @@ _NO_PART: Final = (
 
 @dataclass(frozen=True)
 class Space:
-    """Varied options with their distributions and texts, and the overrides of every trial."""
+    """Distribution and sweep text of each varied option, and the overrides of every trial."""
 
     varied: dict[str, distributions.BaseDistribution]
     texts: dict[str, str]
@@ -73,7 +73,7 @@ def search(
     arguments: Sequence[str],
     swept: Sequence[str],
 ) -> list[JobReturn]:
-    """Run trials until ``search.num_trials`` trials of the study have finished.
+    """Run trials until ``search.num_trials`` trials of the study are complete, pruned or failed.
 
     Raises:
         UserError: An option of the search is wrong, the study belongs to another command, or the
@@ -121,7 +121,7 @@ class _Trials:
             )
 
     def run(self, num_trials: int, at_a_time: int) -> list[JobReturn]:
-        """Finish the trials of an earlier command, then run new trials up to ``num_trials``."""
+        """Run the unfinished trials of an earlier command, then new ones up to ``num_trials``."""
         returns: list[JobReturn] = []
         self._tell(self._running())
         left = self._running()
@@ -138,7 +138,7 @@ class _Trials:
         return returns
 
     def _launch(self, trials: Sequence[FrozenTrial]) -> Sequence[JobReturn]:
-        """Run trials of consecutive numbers and report their outcomes to the study."""
+        """Run trials of consecutive numbers and report their outcomes; no outcome is a failure."""
         jobs = [overrides(self._space, trial.params) for trial in trials]
         returns = self._launcher.launch(jobs, initial_job_idx=trials[0].number)
         self._tell(trials)
@@ -161,7 +161,7 @@ class _Trials:
 
 
 def _consecutive(trials: Sequence[FrozenTrial], at_most: int) -> Iterator[Sequence[FrozenTrial]]:
-    """Yield groups of trials with consecutive numbers, as launchers require."""
+    """Yield groups of up to ``at_most`` trials with consecutive numbers, for the launcher."""
     for _, run in groupby(enumerate(trials), lambda pair: pair[1].number - pair[0]):
         left = [trial for _, trial in run]
         for first in range(0, len(left), at_most):
@@ -169,7 +169,7 @@ def _consecutive(trials: Sequence[FrozenTrial], at_most: int) -> Iterator[Sequen
 
 
 def _report(study: optuna.Study, options: Mapping[str, Any]) -> None:
-    """Print the outcomes of the trials, and the best trial as overrides."""
+    """Print the number of trials by state, and the overrides of the best complete trial."""
     states = Counter(trial.state.name.lower() for trial in study.get_trials(deepcopy=False))
     counts = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
     display.console.print(f"study {study.study_name}: {counts}; {options['storage']}")
@@ -211,7 +211,7 @@ def read_space(loader: ConfigLoader, space: Sequence[str], arguments: Sequence[s
 
 
 def _distribution(sweep: Override) -> distributions.BaseDistribution:
-    """Return the Optuna distribution of a sweep."""
+    """Convert a Hydra sweep over an option into an Optuna distribution."""
     value = sweep.value()
     try:
         if isinstance(value, IntervalSweep):
@@ -252,17 +252,17 @@ def examples(space: Space) -> list[list[str]]:
 
 
 def _ends(distribution: Any) -> list[object]:
-    """Return all choices of a distribution, or one number of a range."""
+    """Return all choices of a distribution, or the lower end of a range."""
     return list(getattr(distribution, "choices", ())) or [distribution.low]
 
 
 def overrides(space: Space, params: dict[str, object]) -> list[str]:
-    """Return the overrides of a trial."""
+    """Return all overrides of a trial whose varied options have the values ``params``."""
     return [*space.fixed, *search_overrides(params)]
 
 
 def search_overrides(params: dict[str, object]) -> list[str]:
-    """Return the varied options as overrides, with four significant digits."""
+    """Return ``key=value`` for each varied option, with four significant digits for a float."""
     return [
         f"{key}={value:.4g}" if isinstance(value, float) else f"{key}={value}"
         for key, value in params.items()
@@ -271,7 +271,7 @@ def search_overrides(params: dict[str, object]) -> list[str]:
 
 @contextmanager
 def exclusive_search(folder: Path, study: str) -> Iterator[None]:
-    """Lock a folder against a second search; the lock ends with the process.
+    """Lock a folder against a second search, until the context or the process ends.
 
     Raises:
         UserError: Another command is searching in the folder.
@@ -291,12 +291,12 @@ def exclusive_search(folder: Path, study: str) -> Iterator[None]:
 
 
 def open_study(options: Mapping[str, Any], facts: Mapping[str, str], seed: int) -> optuna.Study:
-    """Open or create a study.
+    """Open or create the Optuna study of a search.
 
     Args:
-        options: Options of the search.
-        facts: Fixed options that affect the result of a trial.
-        seed: Seed of the sampler; resumed studies use a different state.
+        options: Node ``search`` of the config.
+        facts: Fixed options that affect the result of a trial, and the search space, as text.
+        seed: Seed of the sampler, to which the number of stored trials is added.
 
     Raises:
         UserError: The study was created with other options, or its storage cannot be opened.
@@ -339,7 +339,7 @@ def _check_same(stored: Mapping[str, str], now: Mapping[str, str], study: str) -
 
 
 def outcome(folder: Path) -> tuple[TrialState, float | None]:
-    """Return state and objective of a trial; a trial without a finite objective has failed."""
+    """Return state and objective of a trial from its files; a non-finite objective is a failure."""
     if (folder / PRUNED_FILE).is_file():
         return TrialState.PRUNED, None
     if (folder / FAILURE_FILE).is_file():
