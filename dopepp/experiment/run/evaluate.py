@@ -38,7 +38,7 @@ from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part, Parts
 
 TEMPLATES: Final = "templates"
-"""Name of the method that needs no training."""
+"""Name of the method that matches templates of the meshes, without training."""
 
 _log = logging.getLogger(__name__)
 
@@ -51,7 +51,7 @@ def tune_and_record(
     run_dir: Path,
     target: FalsePositiveTarget,
 ) -> Path:
-    """Tune a checkpoint, write it next to the original and print the changes; return its path."""
+    """Tune the recovery options of a checkpoint and write it beside ``path``; return its path."""
     if target.false_positive_rate == 1:
         fix = "set e.g. 0.005 to suppress detections on images without the part"
         _log.warning("false_positive_rate=1: every candidate is reported; %s", fix)
@@ -63,7 +63,7 @@ def tune_and_record(
 
 
 def _show(tuning: Tuning, path: Path) -> None:
-    """Print the effect of tuning on test images, the options and the path of the checkpoint."""
+    """Print the effect of tuning on test images, the options and the tuned checkpoint's path."""
     shown, empty = tuning.num_images
     title = f"tuned; measured on {shown} test images and {empty} without objects"
     table = Table("", "network before", "after", title=title)
@@ -79,7 +79,7 @@ def _show(tuning: Tuning, path: Path) -> None:
 
 
 def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part]:
-    """Return the last estimator's parts, or all parts of the test data without estimators.
+    """Return the test data's parts that the last estimator detects; all without an estimator.
 
     Unless ``data.symmetries`` is set, parts for which the test data states no symmetries have those
     of the checkpoint.
@@ -183,7 +183,7 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
 
 
 def _load(options: EvaluationConfig) -> list[PoseEstimator]:
-    """Load the baseline and the checkpoint, if given."""
+    """Load the estimators of ``baseline`` and ``ckpt_path``, if set, in this order."""
     paths = [path for path in (options.baseline, options.ckpt_path) if path is not None]
     device = options.device
     if device == "auto":
@@ -195,7 +195,7 @@ def _load(options: EvaluationConfig) -> list[PoseEstimator]:
 def _methods(
     options: EvaluationConfig, loaded: Sequence[PoseEstimator], parts: Parts
 ) -> tuple[dict[str, PoseEstimator], dict[str, Path]]:
-    """Return all estimators and files of poses, by name."""
+    """Return the estimators (networks, templates) and the files of poses to measure, by name."""
     estimators = list(loaded)
     names = [str(estimator.checkpoint.data.get("name", "estimate")) for estimator in loaded]
     files: dict[str, Path] = {}
@@ -217,7 +217,7 @@ def _methods(
 
 
 def _check_combination(options: EvaluationConfig) -> None:
-    """Raise the error of the first combination of options that is impossible."""
+    """Raise a UserError for the first impossible combination of options."""
     has_network = options.ckpt_path is not None or options.baseline is not None
     uses_templates, both = options.templates is not None, "both options together"
     further = options.protocols or options.negatives is not None or uses_templates

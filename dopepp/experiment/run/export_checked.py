@@ -1,4 +1,4 @@
-"""Export a checkpoint to a runtime, and check the export before writing it."""
+"""Export a checkpoint to a runtime, and compare the export with the checkpoint before writing."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ NUM_IMAGES: Final = 100  # scenes to calibrate on, and further scenes to measure
 
 @dataclass(frozen=True)
 class ExportResult:
-    """Path of an export, its description, its agreement with the checkpoint and next commands."""
+    """A written export: path, description, agreement with the checkpoint, suggested commands."""
 
     path: Path
     export: Export
@@ -58,11 +58,12 @@ def export(
         precision: One of :data:`~dopepp.inference.export.PRECISIONS`.
         out: Path of the export (default: next to the checkpoint, or the working directory for a
             released checkpoint).
-        num_images: Rendered scenes to calibrate int8 on, and as many to measure ADD-0.1d on.
+        num_images: For int8, number of rendered scenes for calibration, and of further scenes on
+            which ADD-0.1d is measured.
 
     Raises:
-        UserError: The checkpoint, an option or the path is invalid, or an extra is not installed.
-        RunError: The export disagrees with the checkpoint; nothing was written.
+        UserError: The checkpoint, an option or the path is invalid, or a package is not installed.
+        RunError: The export disagrees with the checkpoint, and nothing was written.
     """
     target = _output_path(path, layout, precision, out)
     if runtimes.is_export(path):
@@ -98,7 +99,7 @@ def export(
 
 @contextmanager
 def _draft_output(target: Path) -> Iterator[Path]:
-    """Yield a temporary path, which is moved to the target at the end."""
+    """Yield a temporary path, moved to ``target`` on success; RunError if writing fails."""
     try:
         with draft(target) as draft_path:
             yield draft_path
@@ -135,7 +136,7 @@ def _output_path(path: Path, layout: str, precision: str, out: Path | None) -> P
 
 
 def _network_inputs(estimator: PoseEstimator, sample: Sample) -> list[Pixels]:
-    """Return an image at the input sizes of the network."""
+    """Return the network's inputs for an image, each of shape (1, 3, height, width)."""
     views = estimator.views(sample.image, sample.K)
     return [np.ascontiguousarray(view.pixels.transpose(2, 0, 1)[None]) for view in views]
 
@@ -143,7 +144,7 @@ def _network_inputs(estimator: PoseEstimator, sample: Sample) -> list[Pixels]:
 def _accuracy(
     original: PoseEstimator, exported: PoseEstimator, source: SampleSource, count: int
 ) -> dict[str, float]:
-    """Measure ADD-0.1d of the checkpoint and its export on the same scenes."""
+    """Return ADD-0.1d of the checkpoint (``fp32``) and its export on the first ``count`` scenes."""
     _log.info("measuring both on %d other validation scenes", count)
     estimators = {"fp32": original, "int8": exported}
     methods = {

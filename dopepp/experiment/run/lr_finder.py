@@ -101,7 +101,7 @@ def find_learning_rate(config: RunConfig, run_dir: Path) -> Suggestion | None:
 
 
 def _short_training(config: RunConfig) -> RunConfig:
-    """Return the config of a training without schedule, validation and callbacks."""
+    """Return the config of a training on one device without schedule, validation and callbacks."""
     trainer = replace(
         config.trainer,
         max_steps=-1,
@@ -149,7 +149,7 @@ def _sweep(
 
 
 def suggest(rates: Steps, losses: Steps) -> Suggestion | None:
-    """Suggest a rate from ascending rates and finite losses; None if the loss did not fall."""
+    """Suggest a rate from ascending rates and their losses; None if the loss falls by under 5 %."""
     first = int(_SKIPPED * len(rates))
     smoothed = smooth(losses)[first:]
     if len(smoothed) < 3:
@@ -164,7 +164,7 @@ def suggest(rates: Steps, losses: Steps) -> Suggestion | None:
 
 
 def smooth(values: Steps) -> Steps:
-    """Return a Gaussian moving average, normalised at the ends."""
+    """Return a Gaussian moving average of width :data:`_SMOOTHING`, normalised at the ends."""
     position = np.arange(len(values))
     width = max(1.0, _SMOOTHING * len(values))
     weight = np.exp(-0.5 * ((position[:, None] - position) / width) ** 2)
@@ -172,7 +172,7 @@ def smooth(values: Steps) -> Steps:
 
 
 def _report(rates: Steps, losses: Steps, run_dir: Path) -> Suggestion | None:
-    """Write the table and the image, print the suggestion and return it."""
+    """Write the sweep's table and curve, print the suggested rate and return it."""
     smoothed = smooth(losses)
     rows = [
         {"step": step, "learning_rate": rate, "loss": loss, "smoothed_loss": mean}

@@ -72,7 +72,6 @@ class ConfigDifference(NamedTuple):
     values: tuple[str, str]
 
     def __str__(self) -> str:
-        """Return the difference as a line of text."""
         return f"{self.key}: {' → '.join(self.values)}"
 
 
@@ -134,7 +133,7 @@ def config_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[C
 
 
 def image_differences(saved: object, present: object) -> list[ConfigDifference]:
-    """Return differences of training and validation images that options do not explain."""
+    """Return the splits (train, val) whose descriptions in two checkpoints differ, with reasons."""
     if not isinstance(saved, Mapping) or not isinstance(present, Mapping):
         return []  # the checkpoint was not written by train.py
     return [
@@ -191,7 +190,7 @@ def read_overrides(run: Path) -> list[str] | None:
 
 
 def remember_overrides(run: Path) -> None:
-    """Store the overrides of a run atomically, because Hydra's own file may be truncated."""
+    """Store this process's overrides in ``run`` atomically; Hydra's own file may be truncated."""
     if not HydraConfig.initialized():
         return
     overrides = [str(text) for text in HydraConfig.get().overrides.task]
@@ -207,7 +206,7 @@ def _task(hydra: object) -> object:
 
 
 def _listed(differences: Sequence[ConfigDifference]) -> str:
-    """Return differences as text."""
+    """Join differences of options; without any, only the number of objects can differ."""
     return ", ".join(map(str, differences)) or "the number of objects"
 
 
@@ -221,7 +220,7 @@ _LONG: Final = 40
 
 
 def describe_images(source: DescribedSource) -> dict[str, Any]:
-    """Describe the sources and the first image of a split in plain values."""
+    """Return the sources of a split, and the labels and a thumbnail of its first image, as JSON."""
     sources = {
         f"{number} {info.name}": {"images": info.num_images, **info.identity}
         for number, info in enumerate(source.describe())
@@ -230,7 +229,7 @@ def describe_images(source: DescribedSource) -> dict[str, Any]:
 
 
 def differing_images(stored: Mapping[str, Any], present: Mapping[str, Any]) -> list[str]:
-    """Return the differences between two descriptions of images.
+    """Return the differences between two results of :func:`describe_images`, a text for each.
 
     Descriptions of presets are ignored, because a new version may add fields to a preset. The first
     image shows whether a preset has changed.
@@ -254,7 +253,7 @@ def differing_images(stored: Mapping[str, Any], present: Mapping[str, Any]) -> l
 
 
 def _thumbnail(sample: Sample) -> dict[str, Any]:
-    """Return a small copy of a sample's image and its ground truth as plain values."""
+    """Return a copy of up to 16×12 pixels of a sample's image, and its ground truth, as JSON."""
     box = Letterbox.fit(sample.size, _THUMBNAIL_SIZE)
     small = cv2.resize(sample.image, (box.width, box.height), interpolation=cv2.INTER_AREA)
     return {
@@ -267,7 +266,7 @@ def _thumbnail(sample: Sample) -> dict[str, Any]:
 
 
 def _image_difference(stored: Mapping[str, Any], present: Mapping[str, Any]) -> float:
-    """Return the mean absolute difference in grey levels; infinite for different sizes."""
+    """Return the mean grey-level difference of two thumbnails; infinite for different sizes."""
     if stored["size"] != present["size"]:
         return np.inf
     images = (
@@ -278,13 +277,13 @@ def _image_difference(stored: Mapping[str, Any], present: Mapping[str, Any]) -> 
 
 
 def _shown(value: object) -> str:
-    """Return a value as text of limited length."""
+    """Return a value as text, cut after :data:`_LONG` characters."""
     text = str(value)
     return text if len(text) <= _LONG else f"{text[:_LONG]}…"
 
 
 def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Parts) -> None:
-    """Warn of changed shapes, and of test images that changed while the options stayed the same.
+    """Warn if the parts' shapes, or the test images of equal options, differ from the checkpoint's.
 
     Args:
         checkpoint: Checkpoint to evaluate.
@@ -315,7 +314,7 @@ def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Parts)
 
 
 def _test_set(data: DataConfig) -> list[object]:
-    """Return the options that define the test set."""
+    """Return the options of a config that define its test images."""
     named = (data.format, data.root, data.objects, data.parts, data.unit, data.frames, data.virtual)
     chosen = (data.image_sets, data.num_test, data.eval_seed, data.test.renderer, data.targets)
     return [*named, *chosen, data.classes or {}]

@@ -39,7 +39,7 @@ _UNSAID: Final = ("experiment=", "scale=", "logger", "model=", "data=", "resume"
 
 @contextmanager
 def open_trackers(config: RunConfig, run_dir: Path) -> Iterator[list[GuardedLogger]]:
-    """Yield the trackers of a training and close them when the training ends."""
+    """Yield the trackers of ``config.logger``, and close them when the context ends."""
     chosen = [override for override in overrides_of(run_dir) if not override.startswith(_UNSAID)]
     name = " ".join([config.model.name, config.data.name, *chosen])
     group = run_dir.resolve().parent.name if run_dir.name.isdigit() else None
@@ -57,7 +57,7 @@ def _open(
     kind: str,
     begun: str | None = None,
 ) -> Iterator[list[GuardedLogger]]:
-    """Build trackers and close them; options of a node take precedence."""
+    """Build a tracker per node, yield and close them; a node's options override the arguments."""
     trackers = []
     for node in (nodes or {}).values():
         # A wrong name is the user's mistake, not a failure of the tracker.
@@ -77,14 +77,14 @@ def _open(
 
 
 def _interrupted_id(run_dir: Path) -> str | None:
-    """Return the Weights & Biases id of an interrupted run, or None."""
+    """Return the id of the latest Weights & Biases log in a run folder, or None."""
     folders = sorted((run_dir / "wandb").glob("*run-*-*"), key=lambda path: path.stat().st_mtime)
     match = re.fullmatch(r"(?:offline-)?run-\d+_\d+-(\w+)", folders[-1].name) if folders else None
     return match.group(1) if match else None
 
 
 def log_report(trackers: Sequence[GuardedLogger], report: Report, run_dir: Path) -> None:
-    """Log the result of a run: test metrics, reference rows and images."""
+    """Log the result of a run: its test measures, those of reference methods, and images."""
     figures = _figures("test", report.rows)
     for reference, rows in report.references.items():
         figures |= _figures(f"reference/{reference}", rows)
@@ -94,7 +94,7 @@ def log_report(trackers: Sequence[GuardedLogger], report: Report, run_dir: Path)
 
 
 def _figures(prefix: str, rows: Mapping[str, PoseRow]) -> dict[str, float]:
-    """Return all measures by names with slashes; the mean is omitted for a single object."""
+    """Return the known measures by ``PREFIX/OBJECT/FIELD``, with a mean for several objects."""
     return {
         f"{prefix}/{name}/{column.field}": value
         for name, row in shown_rows(rows).items()
@@ -117,7 +117,7 @@ def log_comparison(nodes: Mapping[str, Any] | None, folder: Path) -> None:
 
 
 def _send_images(tracker: GuardedLogger, paths: Mapping[str, Path]) -> None:
-    """Log the images that exist and are complete."""
+    """Log the image files, by name in the log, that exist and can be read."""
     for name, path in paths.items():
         try:
             image = read_rgb(path) if path.is_file() else None

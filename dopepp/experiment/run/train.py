@@ -87,7 +87,7 @@ def do_job(config: Mapping[str, Any], run_dir: Path) -> object:
 
 
 def _refuse_parallel_multirun(trainer: TrainerConfig) -> None:
-    """Check that a multirun uses one process, because each process would start the sweep again."""
+    """Raise an error if a multirun has several processes, as each would start the sweep again."""
     if not HydraConfig.initialized() or HydraConfig.get().mode != RunMode.MULTIRUN:
         return
     if trainer.num_processes > 1:
@@ -103,7 +103,7 @@ def run_training(config: RunConfig, run_dir: Path) -> Report:
     """Train, then measure the best checkpoint on the test set.
 
     Raises:
-        UserError: A choice, a file or an option is wrong.
+        UserError: An option, a file or the data is wrong.
         PrunedError: A search stopped the training.
         Interruption: A signal ended the training; the message names the last checkpoint.
     """
@@ -190,7 +190,7 @@ def _train(
 
 
 def _progress(config: RunConfig, datamodule: PoseDataModule) -> list[Callback]:
-    """Return the measurement of refined poses during the training, if poses are refined."""
+    """Return the callback that measures refined poses during training, if ``region`` refines."""
     if "region" in (terms := refine_terms(config.refine)):
         return [RefinedProgress(datamodule.val_images, terms, config.stop_at)]
     if config.stop_at is not None:
@@ -209,7 +209,7 @@ def _fit(
     resume_from: Path | None,
     run_dir: Path,
 ) -> None:
-    """Train; errors that end the training early state how to resume it."""
+    """Train, from the checkpoint ``resume_from`` if set; a RunError states how to resume."""
     try:
         trainer.fit(system, datamodule=datamodule, ckpt_path=resume_from, weights_only=True)
     except SystemExit as end:
@@ -225,7 +225,7 @@ def _fit(
 
 
 def _print_outcome(trainer: Trainer, run_dir: Path) -> None:
-    """Print the reason for early stopping, and the profile."""
+    """Print why early stopping ended the training, and the running time by function, if any."""
     for stopping in trainer.early_stopping_callbacks:
         if isinstance(stopping, EarlyStop) and stopping.impatient:
             display.console.print(
@@ -240,7 +240,7 @@ def _print_outcome(trainer: Trainer, run_dir: Path) -> None:
 def _announce_duration(
     options: TrainerConfig, system: PoseSystem, datamodule: PoseDataModule, trainer: Trainer
 ) -> None:
-    """Without an accelerator, print the expected duration and a faster alternative."""
+    """On a CPU, print the expected duration and, from one hour, the command of the quickstart."""
     if trainer.accelerator.__class__.__name__ != "CPUAccelerator" or not trainer.is_global_zero:
         return
     seconds = estimate_training_s(system.network, datamodule, options, str(trainer.precision))
@@ -254,7 +254,7 @@ def _announce_duration(
 def template_commands(data: DataConfig) -> list[str]:
     """Return a command for each part that estimates poses by templates with the user's camera.
 
-    The objects of a data set have no command.
+    Without a camera, and for the objects of a data set, there are no commands.
     """
     virtual, lens = data.virtual, data.virtual.camera
     if data.root is not None or lens is None or virtual.working_distance is None:
@@ -275,7 +275,7 @@ def template_commands(data: DataConfig) -> list[str]:
 def _resume_path(
     config: RunConfig, system: PoseSystem
 ) -> tuple[Path | None, list[ConfigDifference]]:
-    """Return the checkpoint of the interrupted run and the accepted changes since then."""
+    """Return the checkpoint to resume from, or None, and the accepted changes of the config."""
     resume = config.resume
     if resume is None:
         if config.resume_anyway:
@@ -300,14 +300,14 @@ def _resume_path(
 
 
 def _advice(run_dir: Path) -> str:
-    """Describe the saved state of an interrupted run, and how to resume the run."""
+    """Return a text with the last saved step of an interrupted run, and how to resume it."""
     step = saved_step(run_dir / LAST_CHECKPOINT)
     saved = f"saved up to step {step} in {LAST_CHECKPOINT}" if step else "nothing saved yet"
     return f"{saved}; continue with resume={run_dir}"
 
 
 def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Trainer) -> Report:
-    """Measure the best checkpoint of a finished run and record the result."""
+    """Measure the best checkpoint of a run, after tuning if ``tune`` is set, and record it."""
     savers = [saver for saver in trainer.checkpoint_callbacks if isinstance(saver, ModelCheckpoint)]
     path = Path(savers[0].best_model_path) if savers else Path()
     if not path.is_file():

@@ -92,14 +92,14 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class ScoredDetections:
-    """Detections on a set of images."""
+    """Detections of an estimator on a set of images, compared with the ground truth."""
 
     features: Float[np.ndarray, "n features"]  # features of the score
-    scores: Float[np.ndarray, "n"]
+    scores: Float[np.ndarray, "n"]  # scores with the estimator's present options
     correct: Bool[np.ndarray, "n"]  # whether ADD(-S) is below a tenth of the diameter
     image: np.ndarray  # (n,) index of each detection's image
     kinds: Sequence[str]  # source of each image
-    num_instances: int  # instances on all images that count
+    num_instances: int  # evaluated instances on all images
 
     @property
     def num_images(self) -> int:
@@ -111,20 +111,20 @@ class ScoredDetections:
         return np.array([kind == LOOKALIKES for kind in self.kinds], bool)
 
     def best_scores(self, scores: Float[np.ndarray, "n"]) -> Float[np.ndarray, "images"]:
-        """Return the best score in every image; 0 without a detection."""
+        """Return the highest of ``scores``, one per detection, in every image; 0 without any."""
         best = np.zeros(self.num_images)
         np.maximum.at(best, self.image, scores)
         return best
 
     def average_precision(self, scores: Float[np.ndarray, "n"]) -> float:
-        """Return the average precision of the correct poses."""
+        """Return the average precision of the detections ranked by ``scores``."""
         ranked = torch.from_numpy(scores), torch.from_numpy(self.correct)
         return average_precision(*ranked, self.num_instances)
 
 
 @dataclass(frozen=True)
 class DetectionQuality:
-    """Quality of scores and threshold."""
+    """Quality of an estimator's scores, and of its reported poses, on test images."""
 
     calibration_error: float  # expected calibration error of the scores
     false_positive_rate: float  # share of the images without objects on which a pose is reported
@@ -153,7 +153,7 @@ def tune(
 
     Args:
         estimator: Estimator of the checkpoint.
-        data: Data sources.
+        data: Config of the validation and test images.
         parts: Parts of the checkpoint.
         target: Number of images without objects, and permitted rate of false positives.
 
@@ -192,10 +192,10 @@ def _chosen_factors(
     rate: float,
     old: RecoveryOptions,
 ) -> tuple[RecoveryOptions, ScoredDetections, str]:
-    """Fit the factors of network poses, and keep the old factors if they give better poses.
+    """Fit the factors of network poses; keep the old factors if the fit lowers AP by over ``SAME``.
 
-    The average precision of the estimator's final poses decides, because a wrong covariance of the
-    network's poses misleads the refinement. The score of network poses is fitted for both.
+    AP is measured on the estimator's final poses, because a wrong covariance of the network's poses
+    misleads the refinement. The score of network poses is fitted for both.
 
     Returns:
         Options, the detections with these options on the validation images, and why the old factors
@@ -235,7 +235,7 @@ def _measured(
     empty: SampleSource,
     options: RecoveryOptions,
 ) -> DetectionQuality:
-    """Measure the detection quality of options on test images."""
+    """Measure the detection quality of an estimator with ``options`` on test images."""
     estimator.recovery = _without_thresholds(options)
     shown, without = (score_images(estimator, parts, source) for source in (test, empty))
     estimator.recovery = options
@@ -252,7 +252,7 @@ def _without_refinement(estimator: PoseEstimator) -> PoseEstimator:
 def fit_factors(
     pairs: Sequence[tuple[Detection, Float[np.ndarray, "equivalents 4 4"]]],
 ) -> dict[str, float]:
-    """Fit the factors on distances and covariances to poses estimated with factors of 1."""
+    """Fit distance and covariance factor to :func:`matched_poses` estimated with factors of 1."""
     estimated = np.reshape([detection.T_cam_obj for detection, _ in pairs], (-1, 4, 4))
     true = np.reshape([equivalents[0] for _, equivalents in pairs], (-1, 4, 4))
     distance = fit_distance_factor(estimated, true)
@@ -261,7 +261,7 @@ def fit_factors(
 
 
 class WrongFocalLengths:
-    """Images of a source with a camera matrix as a calibration may state it.
+    """Images of a source with simulated calibration errors of the camera matrix.
 
     The relative error of the focal length is uniformly distributed up to the scale error that
     refinement assumes. With exact cameras, covariances would be fitted to errors that no real
@@ -311,7 +311,10 @@ def squared_distances(
     pairs: Sequence[tuple[Detection, Float[np.ndarray, "equivalents 4 4"]]],
     distance_factor: float = 1.0,
 ) -> Float[np.ndarray, "n"]:
-    """Return the squared Mahalanobis distance of each estimate to the nearest equivalent pose."""
+    """Return each match's squared Mahalanobis distance, the smallest over symmetric true poses.
+
+    Estimated translations are multiplied by ``distance_factor`` first.
+    """
     squared = []
     for detection, equivalents in pairs:
         stated = np.broadcast_to(detection.covariance, (len(equivalents), 6, 6)).copy()
@@ -332,8 +335,8 @@ def choose(
 ) -> dict[str, float]:
     """Choose the weights and the threshold of a score.
 
-    Look-alikes contribute to the weights, but not to the threshold, which would otherwise exclude
-    most poses of the objects.
+    Detections on look-alikes contribute to the weights, but not to the threshold, which would
+    otherwise exclude most poses of the objects.
 
     Args:
         shown: Detections on images with objects.
@@ -345,7 +348,7 @@ def choose(
             are incorrect.
 
     Returns:
-        Values of :class:`RecoveryOptions`.
+        Values of :class:`RecoveryOptions` by field.
 
     Raises:
         UserError: There are no detections of the network, or all are correct or all are incorrect.
@@ -381,7 +384,7 @@ def choose(
 def _refined_threshold(
     silent: float, shown: ScoredDetections, weights: Float[np.ndarray, "features"]
 ) -> float:
-    """Return the threshold of refined poses.
+    """Return the smallest score of a reported refined pose.
 
     The threshold for the rate of false positives (``silent``) applies if it rejects at most the
     share :data:`MAX_LOST` of the correct poses, because otherwise a single frame with a high score
@@ -403,7 +406,7 @@ def _refined_threshold(
 def score_images(
     estimator: PoseEstimator, parts: Parts, *sources: SampleSource
 ) -> ScoredDetections:
-    """Run an estimator on all images of sources, and judge every detection."""
+    """Run an estimator on all images, and compare every candidate with the ground truth."""
     refined = estimator.refiner is not None and estimator.refiner.verifies
     names = REFINED_FEATURES if refined else FEATURES
     rows: list[tuple[np.ndarray, float, bool, int]] = []
@@ -432,16 +435,12 @@ def score_images(
 def matched_poses(
     estimator: PoseEstimator, parts: Parts, source: SampleSource, *, only_right: bool = False
 ) -> list[tuple[Detection, Float[np.ndarray, "equivalents 4 4"]]]:
-    """Match detections with instances.
+    """Match candidates with instances by :func:`~dopepp.metrics.pose.assign`.
 
-    Args:
-        estimator: Estimator.
-        parts: Parts.
-        source: Images.
-        only_right: Leave out poses with ADD(-S) above a tenth of the diameter.
+    ``only_right`` leaves out poses with ADD(-S) above a tenth of the diameter.
 
     Returns:
-        Matched detections, each with the poses equivalent to the pose of its instance.
+        Matched candidates, each with its instance's pose under every symmetry of the part.
     """
     matches = []
     for _, _, part, detections, instances in _by_object(estimator, parts, source):
@@ -459,7 +458,7 @@ def matched_poses(
 def _by_object(
     estimator: PoseEstimator, parts: Parts, *sources: SampleSource
 ) -> Iterator[tuple[int, Sample, Part, list[Detection], list[Instance]]]:
-    """Yield image number, sample, part, detections and instances for every image and part."""
+    """Yield image number, sample, part, candidates and instances for every image and part."""
     images = ((source, index) for source in sources for index in range(len(source)))
     for number, (source, index) in enumerate(images):
         sample = source.sample(index, 0)
@@ -471,7 +470,7 @@ def _by_object(
 
 
 def write_tuned(checkpoint: Checkpoint, path: Path, options: Mapping[str, float]) -> Path:
-    """Write a checkpoint with changed recovery options next to the original; return its path."""
+    """Write a checkpoint with changed recovery options as ``NAME_tuned.ckpt``; return its path."""
     recovery = replace(RecoveryOptions.of(checkpoint.recovery), **options)  # type: ignore[arg-type]
     tuned = replace(checkpoint, recovery=vars(recovery))
     target = path.with_name(f"{path.stem}_tuned.ckpt")
@@ -482,7 +481,7 @@ def write_tuned(checkpoint: Checkpoint, path: Path, options: Mapping[str, float]
 def _judge(
     part: Part, detections: Sequence[Detection], true: Sequence[Instance]
 ) -> tuple[Bool[np.ndarray, "found"], Bool[np.ndarray, "found"]]:
-    """Return which detections are correct (ADD(-S) below 0.1 d), and which count."""
+    """Return which detections are correct (ADD(-S) below 0.1 d), and which are evaluated."""
     # As in every evaluation, detections of heavily occluded instances do not count.
     numbers = assign(part, detections, true)
     counts = np.array([number < 0 or is_evaluated(true[number]) for number in numbers], bool)
@@ -499,7 +498,7 @@ def _judge(
 
 
 def _quality(test: ScoredDetections, empty: ScoredDetections, threshold: float) -> DetectionQuality:
-    """Measure the quality of detections on test images with and without (``empty``) the parts."""
+    """Measure the detections on test images with and without (``empty``) the parts."""
     scores, correct = torch.from_numpy(test.scores), torch.from_numpy(test.correct)
     error = expected_calibration_error(scores, correct)
     loud = empty.best_scores(np.where(empty.scores >= threshold, 1.0, 0.0))
@@ -514,7 +513,7 @@ def _quality(test: ScoredDetections, empty: ScoredDetections, threshold: float) 
 
 
 class TuningCache:
-    """Cache for images and maps, which tuning uses several times.
+    """Cache in memory for images and network outputs, which tuning uses several times.
 
     Args:
         max_bytes: Size of the cache. Items that do not fit are computed each time.
@@ -539,7 +538,7 @@ class TuningCache:
         return _CachedSource(source, self, source.name)
 
     def with_cached_maps(self, estimator: PoseEstimator) -> PoseEstimator:
-        """Return a copy of an estimator that caches the maps of each image."""
+        """Return a copy of an estimator that caches the network's maps of each input."""
         network, cached = estimator.network, copy.copy(estimator)
         cached.network = _CachedNetwork(network, self, network.stride, network.size_multiple)
         return cached
@@ -557,7 +556,7 @@ class _CachedSource:
         return len(self.source)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Return an item, from the cache if possible."""
+        """Return an item; items of epoch 0 come from the cache if possible."""
         if epoch:
             return self.source.sample(index, epoch)
         return self.cache.get((id(self), index), lambda: self.source.sample(index), _num_bytes)
@@ -565,7 +564,7 @@ class _CachedSource:
 
 @dataclass
 class _CachedNetwork:
-    """Network whose maps are cached by the pixels of the input."""
+    """Network whose output maps are cached, with a hash of the input's pixels as key."""
 
     network: Runtime
     cache: TuningCache
@@ -573,7 +572,7 @@ class _CachedNetwork:
     size_multiple: int
 
     def maps(self, images: Images) -> Stage:
-        """Return the maps of images, from the cache if possible."""
+        """Return the network's maps of a batch of images, from the cache if possible."""
         pixels = images.permute(0, 2, 3, 1).contiguous().cpu().numpy()
         key = (id(self), pixels.shape, hashlib.blake2b(pixels.tobytes()).digest())
         return self.cache.get(
@@ -582,6 +581,6 @@ class _CachedNetwork:
 
 
 def _num_bytes(sample: Sample) -> int:
-    """Return the size of a sample's arrays."""
+    """Return the size of a sample's image, depth and masks in bytes."""
     arrays = [sample.image, sample.depth, *(instance.mask for instance in sample.instances)]
     return sum(array.nbytes for array in arrays if array is not None)
