@@ -1,9 +1,9 @@
 """Confidence intervals of differences between two methods: a paired, hierarchical bootstrap.
 
-Both methods are measured on the same instances and trained with one or several seeds. A resample
-draws seeds and instances with replacement, jointly for both methods, and recomputes the difference.
-The interval holds the middle share of the resampled differences (percentile bootstrap; Efron and
-Tibshirani, An Introduction to the Bootstrap, 1993).
+Both methods are measured on the same instances and trained with one or several seeds. For each
+resample, seeds and instances are sampled with replacement, jointly for both methods, and the
+difference is recomputed. The interval holds the middle share of the resampled differences
+(percentile bootstrap; Efron and Tibshirani, An Introduction to the Bootstrap, 1993).
 
 To support another statistic, add its function to :data:`STATISTICS`.
 """
@@ -23,7 +23,7 @@ from scipy.stats import norm, t
 from dopepp.core.errors import UserError
 
 Numbers = Sequence[Float[np.ndarray, "_ instances"]]
-"""Array of each object: a number for each seed and instance."""
+"""For each object, the values of a measure by seed and instance."""
 
 Draws = Float[np.ndarray, "resamples seeds"]
 """Weight of each seed in each resample; weights sum to 1."""
@@ -39,7 +39,7 @@ class Difference:
     """Difference of a statistic between a method and the baseline.
 
     Attributes:
-        value: The difference.
+        value: The method's statistic minus the baseline's.
         low: Lower end of the confidence interval.
         high: Upper end of the confidence interval.
         num_differing: Number of instances on which the methods differ.
@@ -78,10 +78,10 @@ def paired_difference(
     the interval does not cover the noise of training.
 
     Args:
-        mine: Numbers of the method. The median ignores numbers that are not finite (misses).
-        baseline: Numbers of the baseline, on the same instances.
+        mine: Values of the method. The median ignores values that are not finite (misses).
+        baseline: Values of the baseline, on the same instances.
         statistic: Name of the statistic.
-        same_seeds: Whether row s of both methods has the same seed, to draw seeds in pairs.
+        same_seeds: Whether row s of both methods has the same seed, to resample seeds in pairs.
         confidence: Share of the resamples inside the interval.
         num_resamples: Number of resamples.
         few_seeds: Whether to correct for few seeds. Resamples of S seeds spread less than new
@@ -162,7 +162,7 @@ def fewest_differing(confidence: float) -> int:
 
 
 def _finite_median(values: Float[np.ndarray, "... n"]) -> Float[np.ndarray, "..."]:
-    """Return the median of the finite numbers, or NaN without finite numbers."""
+    """Return the median of the finite values on the last axis, or NaN without finite values."""
     ordered = np.sort(np.where(np.isfinite(values), values, np.inf), axis=-1)
     count = np.isfinite(ordered).sum(axis=-1, keepdims=True)
     middle = np.maximum(np.concatenate([(count - 1) // 2, count // 2], axis=-1), 0)
@@ -175,7 +175,7 @@ STATISTICS: Final[dict[StatisticName, _Statistic]] = {
     "mean": lambda values: np.asarray(values.mean(axis=-1)),
     "median": _finite_median,
 }
-"""Functions of the last axis."""
+"""Statistics over the last axis, by name."""
 
 
 def _check(mine: Numbers, baseline: Numbers, statistic: str, same_seeds: bool) -> None:
@@ -207,7 +207,7 @@ def _resampled_difference(
 ) -> Float[np.ndarray, "resamples"]:
     """Return the difference of the statistic in each resample, averaged over objects.
 
-    ``draws`` are the weights of the seeds of both methods; ``rng`` draws the instances.
+    ``draws`` are the weights of the seeds of both methods; ``rng`` samples the instances.
     """
     total = np.zeros(len(draws[0]))
     for ours, theirs in zip(mine, baseline, strict=True):
@@ -227,7 +227,7 @@ def _resampled_difference(
 def _stretching(
     effects: Float[np.ndarray, "seeds"], draws: Draws, confidence: float
 ) -> Float[np.ndarray, "resamples"]:
-    """Return a term that widens the bootstrap distribution, because few seeds vary too little.
+    """Return a term per resample that widens the distribution, too narrow for few seeds.
 
     The term moves each resample away from the mean, so that the interval gets the width that
     Student's t gives for this number of seeds. ``effects`` are the differences between the methods.

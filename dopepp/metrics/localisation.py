@@ -93,7 +93,7 @@ class Localisation:
         size: Size,
         depth: DepthMap | None = None,
     ) -> None:
-        """Add the detections and ground truth of one image, with its measured depth in metres."""
+        """Add the detections, ground truth and measured depth (metres) of an image of ``size``."""
         for part in self._parts.values():
             true = [i.T_cam_obj for i in instances if i.label == part.name and is_evaluated(i)]
             candidates = (d for d in detections if d.object == part.name)
@@ -142,7 +142,7 @@ class Localisation:
 def num_matched(errors: Errors, threshold: float) -> int:
     """Count the targets matched with an error below a threshold.
 
-    Each estimate, by descending score, is matched with the free target of the smallest error.
+    Each estimate, a row by descending score, is matched with the free target of smallest error.
     """
     free = np.ones(errors.shape[1], bool)
     for row in errors:
@@ -173,7 +173,7 @@ def _errors(
     K: CameraMatrix,
     width: int,
 ) -> _Group:
-    """Compute MSSD, MSPD and ADD(-S) over the mesh's vertices."""
+    """Compute MSSD, MSPD and ADD(-S) between all estimates and targets over the mesh's vertices."""
     shape = len(estimated), len(true)
     T_est = torch.from_numpy(np.repeat(estimated.astype(np.float64), shape[1], axis=0))
     T_gt = torch.from_numpy(np.tile(true.astype(np.float64), (shape[0], 1, 1)))

@@ -49,7 +49,7 @@ score, covariance. Missed and unknown values are NaN."""
 
 
 class PredictedPose(Protocol):
-    """Attributes of a detection that the accumulator reads."""
+    """Attributes of a detection that :class:`PoseMetrics` reads."""
 
     @property
     def object(self) -> str:
@@ -69,7 +69,7 @@ class PredictedPose(Protocol):
 
 
 class TruePose(Protocol):
-    """Attributes of a ground-truth instance that the accumulator reads.
+    """Attributes of a ground-truth instance that :class:`PoseMetrics` reads.
 
     Attributes:
         label: Name of the part.
@@ -95,10 +95,10 @@ def matching_radius(part: Part) -> float:
 def assign(
     part: Part, detections: Sequence[PredictedPose], instances: Sequence[TruePose]
 ) -> Int[np.ndarray, "detections"]:
-    """Match the detections of an object in an image with the instances of the object.
+    """Match the detections of a part in an image with the part's instances, one to one.
 
     Cuboid centres within :func:`matching_radius` match, by
-    :func:`~dopepp.metrics.functional.match`: first evaluated instances, then hidden instances.
+    :func:`~dopepp.metrics.functional.match`: first evaluated instances, then the others.
 
     Returns:
         Index of each detection's instance; −1 if it matches none.
@@ -122,7 +122,7 @@ def assign(
 
 
 def is_evaluated(instance: TruePose) -> bool:
-    """Return whether an instance is a target or, without a list of targets, visible enough."""
+    """Return whether an instance is a listed target or, without a list, at least 10 % visible."""
     if instance.wanted is not None:
         return instance.wanted
     return instance.visible_fraction >= MIN_VISIBLE_FRACTION
@@ -211,7 +211,7 @@ class PoseMetrics(Metric):
             self._keep(self.false_positives, np.array(strays, np.float64))
 
     def _keep(self, state: list[Tensor], rows: Float[np.ndarray, "rows columns"]) -> None:
-        """Append rows to a metric's state."""
+        """Append rows, flattened, to a state on the metric's device."""
         if rows.size:
             state.append(torch.from_numpy(rows.ravel()).to(self.device))
 

@@ -73,7 +73,7 @@ def reference_rows(
 
 
 def _row(part: Part, name: str, Q: Tensor, few_points: Tensor, points: Tensor) -> PoseRow:
-    """Measure guesses at the true position with the rotation errors Q, (n, 3, 3)."""
+    """Return the row of guesses at the true position with the rotation errors Q, (n, 3, 3)."""
     identity = torch.eye(3, dtype=torch.float64).expand_as(Q)
     origin = Q.new_zeros(len(Q), 3)
     # Chance guesses are in random order, so the first guesses are a random sample.
@@ -101,7 +101,7 @@ def _row(part: Part, name: str, Q: Tensor, few_points: Tensor, points: Tensor) -
 def _other_poses(
     rotations: Float[np.ndarray, "n 3 3"], rng: np.random.Generator
 ) -> Float[np.ndarray, "draws 3 3"]:
-    """Return the rotation errors between pairs of test poses: all pairs, or a random subset."""
+    """Return the rotations between pairs of test poses: all pairs, or a random subset."""
     n = len(rotations)
     # Pair k of the n·(n − 1) ordered pairs has a true pose and the index offset of its guess.
     true, step = np.divmod(rng.permutation(n * (n - 1))[:_NUM_DRAWS], max(n - 1, 1))

@@ -56,9 +56,9 @@ class PoseErrors:
             unknown.
         rotation_deg: Angle between the orientations, degrees.
         rotation_s_deg: Smallest angle over the part's symmetries, degrees.
-        translation: Distance between the object frame's origins, metres; None for guesses.
+        translation: Distance between the object frame's origins, metres; None for a reference row.
         mahalanobis: Mahalanobis distance under the estimated covariance; infinite without a
-            covariance, None for guesses.
+            covariance, None for a reference row.
         diameter: Diameter of the part, metres.
         num_symmetries: Number of symmetry transforms, including the identity.
     """
@@ -84,7 +84,7 @@ class PoseErrors:
         width: Errors,
         covariance: Float[Tensor, "n 6 6"],
     ) -> PoseErrors:
-        """Compute all errors.
+        """Compute all errors of estimated poses from true poses.
 
         Args:
             part: The object.
@@ -119,7 +119,7 @@ class PoseErrors:
 
 
 def symmetry_transforms(part: Part) -> Float[Tensor, "s 4 4"]:
-    """Return the part's symmetry transforms, the identity first."""
+    """Return a part's symmetry transforms, metres, identity first; continuous ones are sampled."""
     return torch.from_numpy(symmetry_group(part.symmetries_discrete, part.symmetries_continuous))
 
 
@@ -218,7 +218,7 @@ class Column:
     formula: Formula | None = None
 
     def text(self, row: PoseRow) -> str:
-        """Return the cell of a row."""
+        """Return the cell of a row in this column."""
         return self.format(getattr(row, self.field))
 
     def format(self, value: float | None, *, signed: bool = False) -> str:
@@ -229,17 +229,17 @@ class Column:
 
 
 def _below(error: str, diameters: float) -> Formula:
-    """Return the formula of a pass rate at a threshold relative to the diameter."""
+    """Return the formula of the share of errors below a threshold in diameters."""
     return lambda errors: pass_rate(getattr(errors, error), diameters * errors.diameter)
 
 
 def _within(error: str, metres: float) -> Formula:
-    """Return the formula of a pass rate at a threshold in metres."""
+    """Return the formula of the share of errors below a threshold in metres."""
     return lambda errors: pass_rate(getattr(errors, error), metres)
 
 
 def _area(error: str) -> Formula:
-    """Return the formula of the area under an error's accuracy curve up to 0.1 m."""
+    """Return the formula of an error's area under the accuracy curve up to 0.1 m, in [0, 1]."""
     return lambda errors: auc(getattr(errors, error), 0.1)
 
 
@@ -273,7 +273,6 @@ def _near(errors: PoseErrors) -> float | None:
 
 
 def _ar_mssd(errors: PoseErrors) -> float:
-    """Return BOP's average recall of MSSD."""
     return average_recall(errors.mssd, [share * errors.diameter for share in BOP_THRESHOLDS])
 
 
@@ -283,7 +282,7 @@ def _ar_mspd(errors: PoseErrors) -> float | None:
 
 
 def _mspd_5px(errors: PoseErrors) -> float | None:
-    """Return the share of poses with an MSPD below 5 pixels, or None without cameras."""
+    """Return the share of MSPDs below 5 px of a 640-pixel-wide image, or None without cameras."""
     return None if errors.mspd is None else pass_rate(errors.mspd, 5)
 
 

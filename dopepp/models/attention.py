@@ -31,7 +31,7 @@ class Identity(Attention):
         super().__init__()
 
     def forward(self, features: Features) -> Features:
-        """Return the features."""
+        """Return the features unchanged."""
         return features
 
 

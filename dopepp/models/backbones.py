@@ -216,7 +216,7 @@ class Pyramid(Backbone):
 def copy_layer(
     weights: Mapping[str, object], name: str, layer: nn.Module, path: str, network: str
 ) -> None:
-    """Copy the weights of a file to a layer, which is called ``name`` in the file.
+    """Copy the weights of a file to a layer, whose name in the file is ``name``.
 
     ``path`` and ``network`` of the file are for messages.
 

@@ -67,7 +67,7 @@ class Checkpoint:
         input_size: (width, height) of training images, pixels.
         stride: Pixels per map cell.
         sigma: Standard deviation of the belief targets, cells.
-        recovery: Thresholds that turn maps into detections.
+        recovery: Thresholds of the recovery of detections from maps, by option.
         data: The data and camera configuration of the training.
         data_fingerprint: Hash of everything that determines the training data.
         seen: Ranges of diameter (pixels) and depth (metres) in the training data, by part name.
@@ -85,10 +85,10 @@ class Checkpoint:
     seen: dict[str, LearnedRange] = field(default_factory=dict)
 
     def to_payload(self) -> dict[str, Any]:
-        """Return the description as plain values, for the file's ``dopepp`` key.
+        """Return the description as JSON values, for the file's ``dopepp`` key.
 
         Raises:
-            TypeError: A value is neither plain nor a numpy scalar or array.
+            TypeError: A value is neither a JSON value nor a numpy scalar or array.
         """
         names = ("input_size", "stride", "sigma", "recovery", "data", "data_fingerprint", "seen")
         values = {
@@ -101,7 +101,7 @@ class Checkpoint:
         return payload
 
     def to_file(self) -> dict[str, Any]:
-        """Return the content of a file with this checkpoint and without training state."""
+        """Return the content of a ``.ckpt`` file: weights and description, no training state."""
         weights = {STATE_PREFIX + name: value for name, value in self.state_dict.items()}
         return {"state_dict": weights, KEY: self.to_payload()}
 
@@ -185,7 +185,7 @@ def parse_description(payload: object) -> Checkpoint:
 
 
 def _check_plain(payload: Mapping[Any, Any]) -> None:
-    """Reject values that are not plain, nested too deeply or too many, repetitions included."""
+    """Reject values that are no JSON values, too deeply nested or too many, repeats included."""
     counts: dict[int, int] = {}
     for name, value in payload.items():
         try:
@@ -196,7 +196,7 @@ def _check_plain(payload: Mapping[Any, Any]) -> None:
 
 
 def _count(value: object, depth: int, counts: dict[int, int]) -> int:
-    """Return the number of plain values in a value; ``counts`` caches containers by id."""
+    """Return the number of JSON values in a value; ``counts`` caches containers by id."""
     if type(value) not in (dict, list, tuple):
         if isinstance(value, int) and value.bit_length() > _MAX_BITS:
             raise ValueError(f"an integer of {value.bit_length()} bits")
@@ -219,7 +219,7 @@ def _count(value: object, depth: int, counts: dict[int, int]) -> int:
 
 
 def _check_weights(checkpoint: Checkpoint, size: int) -> None:
-    """Compare the weights with the network of the spec, built on ``meta``."""
+    """Raise a ``UserError`` if the weights differ in name, kind or size from the spec's network."""
     with torch.device("meta"):
         network = build_network(checkpoint.spec)
     described = f"stride {checkpoint.stride} and {len(checkpoint.parts)} parts"
@@ -240,7 +240,7 @@ def _check_weights(checkpoint: Checkpoint, size: int) -> None:
 
 
 def _same_kind(value: object, expected: Tensor) -> bool:
-    """Return whether a stored value fits a network's tensor: dense, same shape and number kind."""
+    """Return whether a value is a dense CPU tensor of the expected shape and kind of number."""
     return (
         isinstance(value, Tensor)
         and value.layout is torch.strided
@@ -259,7 +259,7 @@ def _from_numpy(value: object) -> object:
 
 
 def released_paths() -> dict[str, Path]:
-    """Return the released checkpoints by name."""
+    """Return the paths of the released checkpoints in the package, by name."""
     folder = Path(__file__).parents[1] / FOLDER
     return {path.stem: path for path in sorted(folder.glob(f"*{SUFFIX}"))}
 

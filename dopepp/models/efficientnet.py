@@ -127,7 +127,7 @@ class EfficientNetLite(Backbone):
         return self
 
     def _load(self, path: str) -> None:
-        """Load the weights of a file."""
+        """Load encoder weights from a file, and adapt them to this network's normalised pixels."""
         weights = read_mapping(Path(path), "a state_dict of EfficientNet-Lite0 (.pth)")
         kinds = (nn.Conv2d, nn.BatchNorm2d)
         layers = [layer for layer in self.down.modules() if isinstance(layer, kinds)]
@@ -170,7 +170,7 @@ class InvertedResidual(nn.Module):
         self.added = stride == 1 and in_channels == out_channels
 
     def forward(self, features: Features) -> Features:
-        """Return the block's features."""
+        """Return the convolved features, plus the input if the shapes match."""
         after: Tensor = self.layers(features)
         return features + after if self.added else after
 
@@ -183,7 +183,7 @@ class DepthwiseConv(nn.Conv2d):
     """
 
     def forward(self, features: Features) -> Features:
-        """Return the convolution of each channel."""
+        """Return the convolution of each channel; float32 if the layer trains on a CPU."""
         trains_in_bf16 = (
             features.device.type == "cpu"
             and torch.is_autocast_enabled("cpu")
@@ -205,7 +205,7 @@ def same_conv(
     groups: int = 1,
     relu: bool = True,
 ) -> nn.Sequential:
-    """Return convolution, batch norm and ReLU6 with TensorFlow's padding and averaging.
+    """Return convolution, batch norm and ReLU6 with the padding and batch norm of TensorFlow.
 
     With a stride of 2, even sides have one more padding pixel on the right and bottom.
     """
@@ -219,7 +219,7 @@ def same_conv(
 
 
 def _weights_file(path: str) -> str:
-    """Return the path of the weights: a given file, or the ImageNet weights of a package."""
+    """Return ``path`` or, for ``imagenet``, the path of the weights in an installed package."""
     if path != IMAGENET:
         return path
     # The package is not imported, because only its file is needed.

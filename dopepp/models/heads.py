@@ -44,11 +44,11 @@ class Branch(nn.Module, ABC):
     @property
     @abstractmethod
     def outputs(self) -> list[nn.Conv2d]:
-        """The convolutions that produce maps."""
+        """The convolutions that produce the maps, also the auxiliary maps."""
 
     @abstractmethod
     def forward(self, features: Features) -> list[Features]:
-        """Return auxiliary maps for the loss, if any, and the branch's maps last."""
+        """Return the branch's maps, preceded by auxiliary maps for the loss, if any."""
 
 
 class Head(nn.Module):
@@ -119,7 +119,6 @@ class Head(nn.Module):
 
 
 def _outputs(branches: Iterable[nn.Module]) -> list[nn.Conv2d]:
-    """Return the convolutions that produce the maps of branches."""
     return [layer for branch in branches for layer in cast(Branch, branch).outputs]
 
 
@@ -162,7 +161,7 @@ class ChainBranch(nn.Sequential, Branch):
         return [cast(nn.Conv2d, self[-1])]
 
     def forward(self, features: Features) -> list[Features]:
-        """Return the maps."""
+        """Return a list of the maps of the last layer."""
         return [super().forward(features)]  # type: ignore[no-untyped-call]
 
 
@@ -247,7 +246,7 @@ class MultiScaleBranch(Branch):
         return [*(cast(nn.Conv2d, scale[-1]) for scale in scales), self.output]
 
     def forward(self, features: Features) -> list[Features]:
-        """Return the maps; height and width must be multiples of 4."""
+        """Return the fused maps, after those of the scales if learned; sides are multiples of 4."""
         full = self.down_full(features)
         half = self.down_half(full)
         quarter = self.down_quarter(half)

@@ -35,7 +35,7 @@ _CHANNEL_STEP: Final = 8  # Channel counts are multiples of this block size of S
 
 
 def scaled_channels(channels: int, width: float) -> int:
-    """Scale a channel count by a factor in (0, 4], rounded to a multiple of 8 and at least 8."""
+    """Scale a channel count by a factor in [1/64, 4], rounded to a multiple of 8 and at least 8."""
     width = check("width", width, float, Range(MIN_WIDTH, MAX_WIDTH))
     return max(_CHANNEL_STEP, round(channels * width / _CHANNEL_STEP) * _CHANNEL_STEP)
 
@@ -50,7 +50,7 @@ def conv_block(
     batch_norm: bool = False,
     relu: bool = True,
 ) -> nn.Sequential:
-    """Return a convolution with batch norm or bias, and ReLU; stride 1 keeps the size."""
+    """Return a convolution with batch norm or bias, and ReLU; ``stride`` divides the size."""
     sizes = (kernel_size, stride, kernel_size // 2)
     conv = nn.Conv2d(in_channels, out_channels, *sizes, groups=groups, bias=not batch_norm)
     norm = [nn.BatchNorm2d(out_channels)] if batch_norm else []
@@ -81,7 +81,7 @@ class ResidualBlock(nn.Module):
 
 
 def double(maps: Features) -> Float[Tensor, "batch channels 2*height 2*width"]:
-    """Return maps of twice the size by nearest-neighbour upsampling."""
+    """Return maps of twice the height and width by nearest-neighbour upsampling."""
     return functional.interpolate(maps, scale_factor=2.0, mode="nearest")
 
 
@@ -122,7 +122,7 @@ ACTIVATIONS: Final[Mapping[str, Activation]] = {
 
 
 def find_activation(name: object) -> Activation:
-    """Return an activation by name.
+    """Return the activation with this name in :data:`ACTIVATIONS`.
 
     Raises:
         UserError: No activation has this name.

@@ -142,7 +142,7 @@ class SpatialCrossEntropy(MapLoss):
 
 
 def _capped_exp(value: Tensor, count: Tensor) -> Tensor:
-    """Return exp, continued as its tangent beyond e² times the expected count (at least 1)."""
+    """Return exp(value), continued as its tangent beyond e² times the expected count (≥ 1)."""
     limit = count.clamp(min=1.0).log() + _LINEAR_FROM
     excess = (value - limit).clamp(min=0.0)
     return torch.minimum(value, limit).exp() * (1 + excess)

@@ -1,4 +1,4 @@
-"""The pose network: normalisation, backbone, attention and head, built from a plain spec.
+"""The pose network: normalisation, backbone, attention and head, built from a spec.
 
 A spec, in configs and checkpoints, holds the nodes ``backbone``, ``attention`` and ``head``
 (``_target_`` and arguments), ``activation`` and ``num_objects``. Channel counts follow from the
@@ -98,7 +98,7 @@ class PoseNetwork(nn.Module):
         return network
 
     def maps(self, images: Images) -> heads.Stage:
-        """Return the last stage's belief maps (after the activation) and vector field."""
+        """Return the last stage's belief maps (after the activation) and field for RGB, 0–255."""
         logits, field = self(images)[-1]
         return self.activate(logits), field
 
@@ -157,7 +157,7 @@ def check_spec(spec: Mapping[str, Any]) -> None:
 
 
 def _check_keys(spec: object) -> None:
-    """Check that a spec has exactly the required keys."""
+    """Raise a ``UserError`` unless a spec has exactly the keys ``SPEC_KEYS``."""
     if not isinstance(spec, Mapping) or set(spec) != set(SPEC_KEYS):
         keys = sorted(map(str, spec)) if isinstance(spec, Mapping) else repr(spec)[:200]
         allowed = f"exactly {', '.join(SPEC_KEYS)}"
@@ -166,7 +166,7 @@ def _check_keys(spec: object) -> None:
 
 
 def architecture(spec: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a deep copy of a spec without ``weights_path``.
+    """Return a deep copy of a spec without the backbone's ``weights_path``.
 
     Loading a checkpoint must not need a file that exists only on the machine where it was trained.
     """

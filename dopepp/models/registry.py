@@ -1,7 +1,7 @@
 """Registries: allow-lists of the classes that a config or checkpoint may instantiate.
 
-A node is a plain dict ``{"_target_": "package.module.Class", argument: value, …}``. The dotted name
-must be in the allow-list before anything is imported, and the resolved class is checked again. This
+A node is a dict ``{"_target_": "package.module.Class", argument: value, …}``. The dotted name must
+be in the allow-list before anything is imported, and the resolved class is checked again. This
 excludes paths through other modules (``dopepp.models.network.os.system``) and re-bound names;
 Hydra's own block-list can be circumvented. Arguments of backbones, attention modules, heads and
 losses must have their annotated types; torch and Lightning check their classes' own arguments.
@@ -36,7 +36,7 @@ _GROUPS: Final = {
 
 
 class Registry(Generic[T]):
-    """Builds objects of one kind from plain nodes.
+    """Builds objects of one kind from nodes (``_target_``, arguments) whose class is allowed.
 
     Args:
         kind: Name of the kind for messages, such as ``"backbone"``.
@@ -69,7 +69,7 @@ class Registry(Generic[T]):
         return tuple(sorted(self._targets.union(added)))
 
     def register(self, dotted: str) -> None:
-        """Allow a further class.
+        """Allow a further class by its dotted name.
 
         Raises:
             UserError: The name does not resolve to a subclass of this registry's base class.
@@ -95,10 +95,10 @@ class Registry(Generic[T]):
         return self._load(dotted)
 
     def build(self, node: object, **provided: Any) -> T:
-        """Build the object of a node.
+        """Build the object that a node describes.
 
         Args:
-            node: ``{"_target_": dotted name, argument: plain value, …}``.
+            node: ``{"_target_": dotted name, argument: JSON value, …}``.
             **provided: Further arguments, which the node must not repeat.
 
         Raises:
@@ -160,7 +160,7 @@ class Registry(Generic[T]):
         arguments: Mapping[Any, object],
         provided: Mapping[str, object],
     ) -> None:
-        """Refuse arguments that are unknown, missing, provided by the program or not plain."""
+        """Reject arguments that are unknown, missing, also in ``provided``, or not JSON values."""
         parameters = inspect.signature(target).parameters
         named = {
             name: parameter
@@ -184,7 +184,7 @@ class Registry(Generic[T]):
 
 
 def _check_plain(value: object, where: str) -> None:
-    """Reject all values but plain data, because arguments are never instantiated."""
+    """Reject a value that is not null, a boolean, a number, text or a container of these."""
     if isinstance(value, Mapping):
         for key, item in value.items():
             if not isinstance(key, str) or key.startswith("_"):

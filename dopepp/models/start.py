@@ -24,7 +24,7 @@ _FILE: Final = Path(__file__).parents[1] / "pretrained" / "start" / "dopepp_fast
 
 
 def start_from_parts(network: PoseNetwork) -> bool:
-    """Copy the weights of random parts into backbone and head if they fit.
+    """Copy the package's weights, learned from random parts, to backbone and head if they fit.
 
     The output layers, which belong to the objects, and the attention keep their weights.
 
@@ -37,7 +37,7 @@ def start_from_parts(network: PoseNetwork) -> bool:
 
 
 def start_from_checkpoint(network: PoseNetwork, path: Path) -> None:
-    """Copy the weights of a checkpoint.
+    """Copy the weights of a checkpoint to a network.
 
     The output layers keep their weights if the checkpoint has another number of objects.
 
@@ -59,7 +59,7 @@ def start_from_checkpoint(network: PoseNetwork, path: Path) -> None:
 
 
 def _copy(network: PoseNetwork, weights: Mapping[str, Tensor], others: set[str]) -> bool:
-    """Copy weights if they fill the network except ``others``; return whether they do."""
+    """Copy weights if names and shapes match the network without ``others``; return whether."""
     present = network.state_dict()
     if present.keys() - others != weights.keys() or any(
         present[name].shape != value.shape for name, value in weights.items()
@@ -72,7 +72,7 @@ def _copy(network: PoseNetwork, weights: Mapping[str, Tensor], others: set[str])
 
 
 def output_tensors(network: PoseNetwork) -> set[str]:
-    """Return the names of the weights that belong to single objects."""
+    """Return the names of the output layers' weights, which depend on the number of objects."""
     layers = {id(layer) for layer in network.head.outputs}
     return {
         f"{name}.{tensor}"

@@ -71,7 +71,7 @@ _FIELDS: Final = {"dtype", "shape", "data_offsets"}
 
 
 def write_atomic(payload: Mapping[str, Any], path: Path, previous: Path | None = None) -> None:
-    """Write a torch file atomically, after moving the old file to ``previous`` if given.
+    """Write a torch file atomically, after moving an existing file to ``previous``, if set.
 
     Raises:
         OSError: The file cannot be written; the old file is intact.
@@ -111,7 +111,7 @@ def read_mapping(path: Path, kind: str) -> dict[Any, Any]:
 
     Raises:
         UserError: The file is missing, damaged or too large, or its content is not a mapping of
-            tensors and plain values.
+            tensors, numbers, text and containers of them.
     """
     path = Path(path)
     _check_file(path, kind)
@@ -140,7 +140,7 @@ def read_mapping(path: Path, kind: str) -> dict[Any, Any]:
 
 
 def check_container(path: Path, kind: str) -> int:
-    """Return the unpacked size of a torch file, at most the size of the file, bytes.
+    """Return the unpacked size of a torch file, bytes, which must not exceed the file's size.
 
     Raises:
         UserError: The file is missing, truncated, not a torch file or compressed.
@@ -166,7 +166,6 @@ def check_container(path: Path, kind: str) -> int:
 
 
 def _check_file(path: Path, kind: str) -> None:
-    """Check that a path is a file."""
     if not path.is_file():
         raise UserError(f"{path}, which is not a file", kind, "pass the path of an existing file")
 
@@ -205,7 +204,7 @@ def _check_legacy(path: Path) -> None:
 
 
 def _claimed_storages(content: bytes, num_pickles: int = 1) -> dict[str, int]:
-    """Return the claimed bytes of each storage by its key in the first pickles of a file.
+    """Return the claimed bytes of each storage, by key, in the first pickles of a file.
 
     Raise ``ValueError`` if a pickle is damaged, too long, or has operations that weights need not.
     """
@@ -224,7 +223,7 @@ def _claimed_storages(content: bytes, num_pickles: int = 1) -> dict[str, int]:
 
 
 class _Name(str):
-    """A name that a pickle refers to, unlike a plain string."""
+    """A global name in a pickle, which a plain string cannot imitate."""
 
     __slots__ = ()
 
@@ -306,7 +305,7 @@ def write_safetensors(
     """Write tensors and metadata atomically.
 
     Raises:
-        ValueError: The header is longer than readers accept.
+        ValueError: The header is longer than :func:`read_safetensors` accepts.
     """
     plain = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     content = save(plain, dict(metadata))
@@ -315,7 +314,7 @@ def write_safetensors(
 
 
 def _header(content: bytes) -> bytes:
-    """Return the header of a file's content, which the library accepts up to 100 MB."""
+    """Return the JSON header of a safetensors file, if it has at most ``MAX_HEADER_BYTES``."""
     length = int.from_bytes(content[:_LENGTH_BYTES], "little")
     if length > MAX_HEADER_BYTES:
         raise ValueError(f"a header of {length} bytes, over {MAX_HEADER_BYTES}")

@@ -94,11 +94,11 @@ BUILTIN: Final[dict[str, Callable[[], Part]]] = {
 def load_part(path_or_name: str | Path, unit: str | None = None) -> Part:
     """Return a built-in part, or the part in a mesh file, named after the file.
 
-    The part's size is logged, with a warning if it is unlikely.
+    The part's size is logged, as a warning if the diameter is outside 1 cm – 2 m.
 
     Args:
         path_or_name: Mesh file, or name of a built-in part.
-        unit: Unit of the file (default: the unit of its format, otherwise millimetres).
+        unit: Unit of the file (default: as stated by its format, otherwise millimetres).
 
     Raises:
         UserError: The part or file does not exist, or the file is invalid (see
@@ -202,7 +202,7 @@ def _slot(start: tuple[float, float], end: tuple[float, float], width: float) ->
 
 
 def _prism(section: CrossSection, bottom: float = BACK, top: float = FRONT) -> Manifold:
-    """Extrude a section along z between two heights."""
+    """Extrude a section along z between two heights (millimetres)."""
     return section.extrude(top - bottom).translate((0.0, 0.0, bottom))
 
 

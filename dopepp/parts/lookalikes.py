@@ -40,7 +40,7 @@ def lookalikes(parts: Sequence[Part]) -> list[Part]:
 
 
 def mirror_distance(mesh: Mesh) -> float:
-    """Return the smallest mean distance of a reflected surface, diameters of the bounding sphere.
+    """Return the least mean distance of a surface to its reflections, bounding-sphere diameters.
 
     The search covers reflections at planes through the centroid and at the centroid itself; a part
     with another improper symmetry counts as chiral.
@@ -89,5 +89,5 @@ def _meshes(mesh: Mesh) -> Iterator[tuple[str, Mesh]]:
 
 
 def _replace_triangles(mesh: Mesh, vertices: Vertices, faces: Faces) -> Mesh:
-    """Return a mesh with other vertices and faces, and with computed normals."""
+    """Return a mesh with other vertices and faces, and without the normals of the file."""
     return replace(mesh, vertices=vertices, faces=np.ascontiguousarray(faces), normals=None)

@@ -1,6 +1,6 @@
 """A part: a rigid object with its mesh, size, cuboid and symmetries, all in metres.
 
-A record holds a part as plain values in a file. Files are not trusted, so
+A record holds a part as JSON values in a checkpoint. Checkpoints are not trusted, so
 :meth:`Part.from_record` checks every field.
 """
 
@@ -48,7 +48,7 @@ MAX_SYMMETRIES: Final = 1000
 """Far more than any real part has; bounds on the memory of a hostile file."""
 
 MAX_LIGHT_FACES: Final = 4000
-"""Triangles of a record's mesh: edges of two pixels on a part of 100 pixels."""
+"""Most triangles of a record's mesh: edges of two pixels on a part of 100 pixels."""
 
 _SAME_SHAPE: Final = 0.001  # Largest distance between equal surfaces, diameters
 _FARTHEST: Final = 1e6  # Largest coordinate, metres; its square is finite
@@ -63,7 +63,7 @@ class Mesh:
         faces: Vertex indices of each triangle, counter-clockwise from outside, int32.
         uv: Texture coordinates per vertex, v upwards as in OBJ; None without a texture.
         texture: RGB texture image, first row on top.
-        colours: sRGB of each vertex; None with a texture.
+        colours: sRGB of each vertex, 0 – 255; None with a texture.
         normals: Normal of each vertex as in the file, of any length; may be zero or not finite.
     """
 
@@ -82,13 +82,13 @@ class Part:
     Attributes:
         cuboid: Eight bounding-box corners in NDDS order and the centre, metres, object frame.
         diameter: Largest distance between two vertices, metres.
-        points: ADD points in the object frame, metres.
+        points: Surface points for the ADD metric, object frame, metres.
         mesh: At most 200,000 triangles to render (from a checkpoint: :attr:`light_mesh`); None for
             an object with ADD points only.
         mesh_deviation: Largest distance of the mesh from the file's triangles, metres.
-        mesh_hash: SHA-256 of the original vertices and faces, hex.
-        symmetries_discrete: BOP-style rigid transforms (S, 4, 4) without the identity.
-        symmetries_continuous: BOP-style axes of rotational symmetry as (axis, offset) pairs.
+        mesh_hash: SHA-256 of the original vertices and faces, hex; empty without a mesh.
+        symmetries_discrete: BOP-style rigid transforms (S, 4, 4), metres, without the identity.
+        symmetries_continuous: BOP-style axes of revolution: (direction, point in metres) pairs.
         unit: Unit of the part's file; empty without a file.
     """
 
@@ -110,9 +110,9 @@ class Part:
         return bool(self.symmetries_continuous) or (discrete is not None and len(discrete) > 0)
 
     def has_shape_of(self, other: Part) -> bool:
-        """Return whether two surfaces differ by at most 0.1 % of the diameter, for any triangles.
+        """Return whether the surfaces differ by at most 0.1 % of the diameter, decimation aside.
 
-        Parts without meshes are compared by hash.
+        If either part has no mesh, the mesh hashes are compared.
         """
         if self.mesh_hash == other.mesh_hash or self.mesh is None or other.mesh is None:
             return self.mesh_hash == other.mesh_hash
@@ -125,7 +125,8 @@ class Part:
     def light_mesh(self) -> tuple[Mesh, float] | None:
         """At most 4,000 untextured triangles for a checkpoint, and their largest deviation, metres.
 
-        Lengths are rounded to 0.1 µm. None without a mesh, or if it cannot be decimated.
+        The deviation is from the file's triangles. Lengths are rounded to 0.1 µm. None without a
+        mesh or if decimation fails.
         """
         if self.mesh is None:
             return None
@@ -142,7 +143,7 @@ class Part:
         return Mesh(vertices, faces.astype(np.int32)), deviation
 
     def to_record(self) -> dict[str, Any]:
-        """Return plain values, including the light mesh, for a checkpoint's objects table."""
+        """Return the fields as JSON values for a checkpoint; the mesh is :attr:`light_mesh`."""
         discrete = self.symmetries_discrete
         mesh = None
         if self.light_mesh is not None:
@@ -162,7 +163,7 @@ class Part:
 
     @classmethod
     def from_record(cls, record: object) -> Part:
-        """Create a part from the plain values of :meth:`to_record`.
+        """Create a part from a record of :meth:`to_record`.
 
         Raises:
             UserError: A field is missing, unknown or invalid.
@@ -202,7 +203,7 @@ _Row: TypeAlias = tuple[_Metres, _Metres, _Metres, _Metres]
 
 @dataclass(frozen=True)
 class _MeshRecord:
-    """Triangles of a record, and the largest displacement of a vertex, metres."""
+    """Triangles of a record, and their largest distance from the file's triangles, metres."""
 
     __pydantic_config__ = STRICT
     vertices: Annotated[list[_Point], Field(min_length=3, max_length=3 * MAX_LIGHT_FACES)]
@@ -214,7 +215,7 @@ class _MeshRecord:
 
 @dataclass(frozen=True)
 class _Record:
-    """Plain values of a :class:`Part`."""
+    """Fields of a :class:`Part` as JSON values."""
 
     __pydantic_config__ = STRICT
     name: str
@@ -230,7 +231,7 @@ class _Record:
 
 
 def _parse_cuboid(rows: Sequence[_Point]) -> Float[np.ndarray, "9 3"]:
-    """Return the cuboid of a record, whose corners must form an axis-aligned box in NDDS order."""
+    """Return the cuboid of a record, if its corners form an axis-aligned box in NDDS order."""
     cuboid = np.array(rows, np.float64)
     expected = cuboid_keypoints(cuboid.min(axis=0), cuboid.max(axis=0))
     # Another order of corners would silently give wrong poses; 1e-6 is float32's rounding.
@@ -307,7 +308,7 @@ def make_part(
 
 
 def _renderable(mesh: Mesh, name: str) -> tuple[Mesh, float]:
-    """Return a mesh of at most ``MAX_FACES`` triangles, and the largest displacement, metres."""
+    """Return a mesh of at most ``MAX_FACES`` triangles, and the largest vertex shift, metres."""
     if len(mesh.faces) <= MAX_FACES:
         return mesh, 0.0
     values = mesh.uv if mesh.colours is None else mesh.colours.astype(np.float64)
@@ -326,7 +327,7 @@ def _renderable(mesh: Mesh, name: str) -> tuple[Mesh, float]:
 
 
 def _check_diameter(diameter: float, name: str, unit: str) -> None:
-    """Refuse a diameter (metres) that nearly always means a wrong unit, and suggest units."""
+    """Raise a ``UserError`` with likely units if a diameter (metres) is outside 5 mm – 5 m."""
     if SMALLEST_DIAMETER <= diameter <= LARGEST_DIAMETER:
         return
     written = diameter / UNITS[unit]
@@ -339,7 +340,7 @@ def _check_diameter(diameter: float, name: str, unit: str) -> None:
 
 
 def check_name(name: object) -> str:
-    """Return a valid part name: a text of 1 to 200 printable characters.
+    """Return the name of a part if it has 1 to 200 printable characters.
 
     Raises:
         UserError: The name is invalid.

@@ -29,7 +29,7 @@ def size_in_words(extents: Vector) -> str:
 
 
 def part_in_words(part: Part) -> str:
-    """Describe a part in one line: its name, size, unit of the file, and bodies if several."""
+    """Describe a part in one line: name, size, unit of the file, and separate bodies if several."""
     words = f"{part.name}: {size_in_words(np.ptp(part.cuboid, axis=0))}"
     if part.unit:
         words += f", read in {part.unit}"
@@ -48,8 +48,8 @@ class LearnedRange(NamedTuple):
     """Range of sizes and distances of a part that a network has learned.
 
     Attributes:
-        smallest_px: Smallest diameter (times focal length over depth), pixels of the input.
-        largest_px: Largest diameter, pixels of the input.
+        smallest_px: Smallest size (diameter × focal length / depth), pixels of the input.
+        largest_px: Largest size, pixels of the input.
         nearest: Smallest depth of the cuboid's centre, metres.
         farthest: Largest depth of the cuboid's centre, metres.
     """
@@ -61,7 +61,7 @@ class LearnedRange(NamedTuple):
 
     @classmethod
     def parse(cls, values: object) -> LearnedRange:
-        """Validate the four numbers of a checkpoint.
+        """Convert a list of the four values in a checkpoint to a range.
 
         Raises:
             UserError: The values are not four numbers, or a number is out of range.

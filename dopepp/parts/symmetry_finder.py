@@ -71,7 +71,7 @@ def find_symmetries(mesh: Mesh, tolerance: float = TOLERANCE) -> Symmetries:
 
 
 class _Shape:
-    """A mesh of diameter 1 about the centroid of its surface, with probes for rotations."""
+    """A mesh of diameter 1 about the centroid of its surface, with points that test rotations."""
 
     def __init__(self, mesh: Mesh, tolerance: float) -> None:
         vertices = np.asarray(mesh.vertices, np.float64)
@@ -88,7 +88,7 @@ class _Shape:
         self._many = np.concatenate([corners, centres, self.surface.spread(_NUM_PROBES, seed=4)[0]])
 
     def fits(self, rotation: RotationMatrix) -> bool:
-        """Return whether the rotated surface coincides with the surface."""
+        """Return whether rotated surface points stay within the tolerance of the surface."""
         for probes in (self._few, self._many):
             moved = probes @ rotation.T
             # One triangle per point is quick and never underestimates; misses are refined.
@@ -101,7 +101,7 @@ class _Shape:
         return True
 
     def is_round(self, axis: Vector) -> bool:
-        """Return whether every rotation about an axis fits."""
+        """Return whether every rotation about an axis through the centre is a symmetry."""
         # For any prism, one of 36 golden-ratio angles is within a few per cent of a side of the
         # worst angle.
         golden = (np.sqrt(5) - 1) / 2
@@ -109,7 +109,7 @@ class _Shape:
         return all(self.fits(axis_rotation(axis, float(angle))) for angle in angles)
 
     def order(self, axis: Vector, prime: int) -> int:
-        """Return the highest order of an axis, a multiple of a prime."""
+        """Return the largest multiple of ``prime`` up to 12 that is an order of an axis."""
         orders = range(MAX_ORDER - MAX_ORDER % prime, prime, -prime)
         return next((n for n in orders if self.fits(axis_rotation(axis, 2 * np.pi / n))), prime)
 
@@ -129,7 +129,7 @@ class _Shape:
 
 
 def _search(shape: _Shape) -> tuple[Vector | None, list[RotationMatrix]]:
-    """Return the first axis of continuous symmetry, or None and rotations that fit."""
+    """Return an axis of continuous symmetry, or None and symmetry rotations by decreasing order."""
     candidates = Candidates(shape.surface)
     generators: list[tuple[int, RotationMatrix]] = []
     group = np.eye(3)[None]
@@ -154,7 +154,7 @@ def _search(shape: _Shape) -> tuple[Vector | None, list[RotationMatrix]]:
 def _largest_group(
     shape: _Shape, generators: list[RotationMatrix]
 ) -> Float[np.ndarray, "rotations 3 3"]:
-    """Return a group of rotations that all fit, without the identity."""
+    """Return a group of symmetry rotations, built from the generators, without the identity."""
     # Rotations that barely fit are excluded if they generate rotations that do not fit.
     group = np.eye(3)[None]
     for rotation in generators:
@@ -176,7 +176,7 @@ class Candidates:
         self._probes = surface.spread(400, seed=2)[0]
 
     def axes(self, order: int) -> Iterator[Vector]:
-        """Yield refined symmetry axes of a prime order, smallest coarse distance first."""
+        """Yield refined axes for a prime order, by increasing distance error before refinement."""
         R = axis_rotation(self._axes, 2 * np.pi / order)
         change = R @ self._moments @ np.swapaxes(R, 1, 2) - self._moments
         scale = np.linalg.norm(self._moments)
@@ -198,7 +198,7 @@ class Candidates:
                 return
 
     def _refine(self, axis: Vector, order: int, special: bool) -> Vector:
-        """Refine an axis so that the rotated surface coincides best with the surface."""
+        """Refine an axis so that a rotation by 2π / order maps the surface best onto itself."""
         rotation = axis_rotation(axis, 2 * np.pi / order)
         for _ in range(12):
             step = self._step(rotation)
@@ -214,7 +214,7 @@ class Candidates:
         return refined
 
     def _step(self, rotation: RotationMatrix) -> Vector:
-        """Return the rotation vector that moves the rotated points towards their planes."""
+        """Return the rotation vector of a damped least-squares step on point-to-plane distances."""
         moved = self._probes @ rotation.T
         closest, normals = self._surface.nearest(moved)
         offsets = ((closest - moved) * normals).sum(axis=1)
@@ -225,7 +225,7 @@ class Candidates:
         return np.asarray(np.linalg.solve(normal_matrix, lever.T @ (weight * offsets)))
 
     def _error(self, axis: Vector, order: int) -> float:
-        """Return the RMS distance of the rotated surface points from the surface."""
+        """Return the RMS distance of the rotated surface points from the surface, diameters."""
         moved = self._probes @ axis_rotation(axis, 2 * np.pi / order).T
         return float(np.sqrt((self._surface.distances(moved) ** 2).mean()))
 
@@ -247,7 +247,7 @@ def second_moments(surface: SurfaceTree) -> Float[np.ndarray, "3 3"]:
 
 
 def special_axes(surface: SurfaceTree) -> Float[np.ndarray, "axes 3"]:
-    """Return the axes of coordinates, of the moments and of the largest flat areas.
+    """Return the coordinate axes, eigenvectors of the second moments and normals of large areas.
 
     Sums, differences and cross products of normals are the axes of regular solids.
     """
@@ -262,7 +262,7 @@ def special_axes(surface: SurfaceTree) -> Float[np.ndarray, "axes 3"]:
 
 
 def _main_normals(surface: SurfaceTree) -> Float[np.ndarray, "clusters 3"]:
-    """Return the directions with the most area, up to sign."""
+    """Return up to 8 normals of the largest triangles, over 5° apart; their sign is ignored."""
     # The largest triangles suffice, as relevant flat areas have large triangles.
     largest = np.argsort(-surface.areas, kind="stable")[:3000]
     normals, areas = surface.normals[largest], surface.areas[largest].copy()
@@ -275,7 +275,7 @@ def _main_normals(surface: SurfaceTree) -> Float[np.ndarray, "clusters 3"]:
 
 
 def _across(axis: Vector) -> Vector:
-    """Return a direction perpendicular to an axis, a coordinate axis if possible."""
+    """Return a unit vector perpendicular to an axis, a coordinate axis if possible."""
     nearest = np.eye(3)[np.abs(axis).argmin()]
     across = nearest - (nearest @ axis) * axis
     return np.asarray(across / np.linalg.norm(across))

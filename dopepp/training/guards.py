@@ -95,7 +95,7 @@ class FiniteSteps(Callback):
     def on_before_backward(
         self, trainer: Trainer, pl_module: LightningModule, loss: Tensor
     ) -> None:
-        """Store the loss, which a gradient scaler may have scaled."""
+        """Store the loss, which the gradient scaler of mixed precision may have scaled."""
         self._loss = loss.detach()
 
     def on_after_backward(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -167,7 +167,7 @@ class FiniteSteps(Callback):
 
 
 def _dump_batch(path: Path, batch: Batch, facts: Mapping[str, Any]) -> None:
-    """Write a batch with facts (``.pt``) and its images (``.png``), or warn on a failure."""
+    """Write ``PATH.pt`` (batch, ``facts``) and ``PATH.png`` (first images); warn on a failure."""
     shown = batch.rows(torch.arange(min(len(batch), _MAX_TILES))).to("cpu")
     images, truths = shown.images.permute(0, 2, 3, 1).numpy(), shown.keypoints.numpy()
     tiles = [
@@ -198,7 +198,7 @@ class EmptyMaps(Callback):
         self._sizes: list[Tensor] = []
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the counts, for a resumed run."""
+        """Return number of empty validations, first loss and whether the warning was logged."""
         return {"empty": self._num_empty, "warned": self._warned, "first_loss": self._first_loss}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -207,14 +207,14 @@ class EmptyMaps(Callback):
         self._first_loss = float(state_dict["first_loss"])
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Reset the statistics."""
+        """Reset the highest beliefs and the statistics of labels."""
         self._highest = torch.zeros(2, device=pl_module.device)
         self._inside, self._sizes = [], []
 
     def on_validation_batch_end(  # type: ignore[override]
         self, trainer: Trainer, system: PoseSystem, outputs: ValidationOutput, batch: Batch, *_: Any
     ) -> None:
-        """Update the highest beliefs and the statistics of labels."""
+        """Update the highest beliefs, and the positions and sizes of labels."""
         belief = outputs.belief.reshape(len(batch), -1, NUM_KEYPOINTS, *outputs.belief.shape[-2:])
         highest = torch.stack([belief[:, :, :CENTROID].max(), belief[:, :, CENTROID].max()])
         self._highest = torch.fmax(self._highest, highest)
@@ -242,7 +242,7 @@ class EmptyMaps(Callback):
             self._warn(trainer, pl_module)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Warn at the end of a training with few validations."""
+        """Warn if the last validation had empty maps and the warning was not logged before."""
         assert isinstance(pl_module, PoseSystem)
         if self._num_empty:
             self._warn(trainer, pl_module)
@@ -273,7 +273,7 @@ class EmptyMaps(Callback):
         _log.warning("\n".join(lines))
 
     def _early(self, trainer: Trainer, system: PoseSystem) -> str:
-        """Describe the progress of the training and recommend a faster loss."""
+        """Return advice for a training that has run too few steps."""
         text = f"step {trainer.global_step:,} of {trainer.estimated_stepping_batches:,}; wait, or "
         text += "train longer (trainer.max_epochs)"
         if isinstance(system.loss, MapMSE):
@@ -284,7 +284,7 @@ class EmptyMaps(Callback):
         return text
 
     def _rate(self, trainer: Trainer) -> tuple[bool, str]:
-        """Return whether the learning rate is a likely cause, judged by the loss, with advice."""
+        """Return whether the validation loss has not decreased by 5 %, and advice on the rate."""
         first, last = self._first_loss, self._loss
         flat = self._num_empty > 1 and not last < _FALL * first
         rates = [
@@ -297,7 +297,7 @@ class EmptyMaps(Callback):
         )
 
     def _labels(self) -> tuple[bool, str]:
-        """Return whether labels are a likely cause (outside the images, or small), with advice."""
+        """Return whether labels are mostly outside the images or too small, with advice."""
         inside, sizes = torch.cat(self._inside), torch.cat(self._sizes)
         advice = "check the green labels in val_overlay.png, and run dopepp check on the data"
         if not len(inside):

@@ -42,7 +42,7 @@ _ANSWERS: Final = {
 }
 
 Cut = Callable[[dict[str, Any]], None]
-"""Sets the counters of a loop's state to a moment from which a run can be resumed."""
+"""Sets the counters in the fit loop's state to a moment from which a run can be resumed."""
 
 
 class LastCheckpoint(Checkpoint):
@@ -63,11 +63,11 @@ class LastCheckpoint(Checkpoint):
         self._saved: tuple[int, float | None] = (0, None)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the random states; in a validation, the states at the start of the validation."""
+        """Return the states of the random generators; in a validation, the states at its start."""
         return {"random": self._random or _capture()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Store the states until training starts."""
+        """Store the random states, which :meth:`on_train_start` restores."""
         self._random = state_dict["random"]
 
     def on_save_checkpoint(
@@ -82,7 +82,7 @@ class LastCheckpoint(Checkpoint):
             _between_epochs(fit_loop)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Restore random states, catch signals and clean up after an interrupted run."""
+        """Restore random states, catch signals and remove partial files of an interrupted run."""
         if self._random is not None:
             _restore(self._random)
             self._random = None
@@ -102,7 +102,7 @@ class LastCheckpoint(Checkpoint):
     def on_train_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, batch: Batch, batch_idx: int
     ) -> None:
-        """If saving is due, save a checkpoint from which training resumes with this batch."""
+        """Save periodically, after a new best score or on a signal; a resumed run starts here."""
         # Checkpoints have no accumulated gradients.
         if batch_idx % trainer.accumulate_grad_batches == 0:
             self._save_if_due(trainer, _before_batch)
@@ -114,15 +114,15 @@ class LastCheckpoint(Checkpoint):
     def on_validation_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, *_: Any
     ) -> None:
-        """If saving is due, save a checkpoint; a resumed run repeats the whole validation."""
+        """Save like :meth:`on_train_batch_start`; a resumed run repeats the whole validation."""
         self._save_if_due(trainer, _before_validation)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Discard the stored random states."""
+        """Discard the random states of the start of the validation."""
         self._random = None
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Save the result.
+        """Save the last checkpoint, and write the checkpoints that could not be written before.
 
         Raises:
             SavingFailedError: The checkpoint cannot be written.
@@ -135,11 +135,11 @@ class LastCheckpoint(Checkpoint):
             writer.finish()
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Restore the signal handlers."""
+        """Restore the signal handlers of the process."""
         self._stop.end()
 
     def _save_if_due(self, trainer: Trainer, cut: Cut) -> None:
-        """Save a checkpoint if due or after a stop signal, which also ends the run."""
+        """Save periodically, after a new best score or on a stop signal, which ends the run."""
         stop = self._stop.number
         wait_s = max(self.every_s, self._duration_s / self.max_share)
         progress = _progress(trainer)
@@ -155,7 +155,7 @@ class LastCheckpoint(Checkpoint):
             raise Interruption(stop or signal.SIGTERM)
 
     def _save(self, trainer: Trainer, cut: Cut) -> None:
-        """Save the checkpoint, and measure how long it takes."""
+        """Save the checkpoint with the counters of ``cut``, and measure the duration of saving."""
         folder = Path(trainer.default_root_dir) / files.FOLDER
         self._cut, start = cut, time.monotonic()
         options = {"previous": folder / files.PREVIOUS}
@@ -192,7 +192,7 @@ class StopRequest:
             self._previous[number] = signal.signal(number, self._handle)
 
     def end(self) -> None:
-        """Restore the signal handlers."""
+        """Restore the previous signal handlers."""
         for number, handler in self._previous.items():
             signal.signal(number, handler)
         self._previous = {}
@@ -211,7 +211,7 @@ class StopRequest:
 
 
 def _restore_position(trainer: Trainer) -> None:
-    """Set loop and loader to the batch at the loop's counters."""
+    """Set Lightning's loop and the training loader to the next batch of a resumed epoch."""
     epoch_loop, epochs = trainer.fit_loop.epoch_loop, trainer.fit_loop.epoch_progress.total
     batches = epoch_loop.batch_progress
     num_done = 0 if batches.is_last_batch else batches.current.ready
@@ -225,13 +225,13 @@ def _restore_position(trainer: Trainer) -> None:
 
 
 def _progress(trainer: Trainer) -> tuple[int, float | None]:
-    """Return step and best score; a checkpoint is saved only if either has changed."""
+    """Return step and best score; without a change of either, no checkpoint is saved."""
     score = getattr(_best(trainer), "best_model_score", None)
     return trainer.global_step, None if score is None else float(score)
 
 
 def _best(trainer: Trainer) -> ModelCheckpoint | None:
-    """Return the callback that keeps the best checkpoint."""
+    """Return the callback that keeps the best checkpoint, or None."""
     for callback in trainer.checkpoint_callbacks:
         if isinstance(callback, ModelCheckpoint) and callback.monitor is not None:
             return callback

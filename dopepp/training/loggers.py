@@ -47,7 +47,7 @@ class MetricsTable(Logger):
     version = name
 
     def forget_after(self, step: int) -> None:
-        """Drop the rows of steps that a resumed run repeats."""
+        """Drop the rows of all later steps, which a resumed run repeats."""
         self._rows = {key: row for key, row in self._rows.items() if key <= step}
 
     def log_hyperparams(self, params: dict[str, Any] | Namespace, *_: Any, **__: Any) -> None:
@@ -55,12 +55,12 @@ class MetricsTable(Logger):
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Add values to the row of a step."""
+        """Add the metrics to the row of ``step`` in memory; :meth:`save` writes the rows."""
         self._rows.setdefault(step or 0, {}).update(metrics)
 
     @rank_zero_only
     def save(self) -> None:
-        """Write the file, or warn once that it cannot be written."""
+        """Write all rows to the CSV file; warn at the first of successive failures."""
         try:
             self.write()
         except OSError as error:
@@ -73,7 +73,7 @@ class MetricsTable(Logger):
 
     @rank_zero_only
     def write(self) -> None:
-        """Write the file.
+        """Write all rows to the CSV file, unless there are none.
 
         Raises:
             OSError: The file cannot be written.
@@ -85,12 +85,12 @@ class MetricsTable(Logger):
         write_csv(self.path, rows, ["step", *columns])
 
     def finalize(self, status: str) -> None:
-        """Write the remaining rows."""
+        """Write all rows to the CSV file, whatever the status."""
         self.save()
 
 
 class GuardedLogger(Logger):
-    """Forwards to a logger and, with a warning, disables it at its first failure."""
+    """Wraps the logger that ``make`` builds; its first exception disables it with a warning."""
 
     def __init__(self, make: Callable[[], Logger]) -> None:
         super().__init__()
@@ -99,7 +99,7 @@ class GuardedLogger(Logger):
         self.inner = self.guard(make)
 
     def guard(self, call: Callable[[], T]) -> T | None:
-        """Call the logger; return None if the call fails or the logger is disabled."""
+        """Return ``call()``, or None if it raises an exception or the logger is disabled."""
         if self._failed:
             return None
         try:
@@ -110,38 +110,38 @@ class GuardedLogger(Logger):
             return None
 
     def _forward(self, call: Callable[[Logger], T]) -> T | None:
-        """Call the inner logger, if it is still in use."""
+        """Return ``call(inner)``; None if the logger could not be built, is disabled or fails."""
         inner = self.inner
         return None if inner is None else self.guard(lambda: call(inner))
 
     @property
     def name(self) -> str | None:
-        """The inner logger's name."""
+        """Name of the wrapped logger; None if the logger is disabled."""
         return self._forward(lambda inner: inner.name)
 
     @property
     def version(self) -> str | int | None:
-        """The inner logger's version."""
+        """Version of the wrapped logger; None if the logger is disabled."""
         return self._forward(lambda inner: inner.version)
 
     def log_hyperparams(self, params: dict[str, Any] | Namespace, *args: Any, **kw: Any) -> None:
-        """Forward to the logger."""
+        """Log the hyperparameters with the wrapped logger."""
         self._forward(lambda inner: inner.log_hyperparams(params, *args, **kw))
 
     def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
-        """Forward to the logger."""
+        """Log the metrics with the wrapped logger."""
         self._forward(lambda inner: inner.log_metrics(metrics, step))
 
     def save(self) -> None:
-        """Forward to the logger."""
+        """Save the values of the wrapped logger."""
         self._forward(lambda inner: inner.save())
 
     def finalize(self, status: str) -> None:
-        """Forward to the logger."""
+        """Finalise the wrapped logger with the status of the run."""
         self._forward(lambda inner: inner.finalize(status))
 
     def log_picture(self, name: str, image: RGBImage, step: int | None = None) -> None:
-        """Log an RGB image to TensorBoard or Weights & Biases."""
+        """Log an RGB image with TensorBoard or Weights & Biases; other loggers ignore the image."""
         inner = self.inner
         if isinstance(inner, TensorBoardLogger):
             self.guard(lambda: inner.experiment.add_image(name, image, step, dataformats="HWC"))
@@ -149,7 +149,7 @@ class GuardedLogger(Logger):
             self.guard(lambda: inner.log_image(name, [image], step=step))
 
     def log_table(self, name: str, rows: Sequence[Mapping[str, str]], text: str) -> None:
-        """Log rows to W&B or Markdown to TensorBoard; the first row has all columns."""
+        """Log ``rows`` to W&B (columns of the first row) or ``text`` (Markdown) to TensorBoard."""
         inner = self.inner
         if isinstance(inner, TensorBoardLogger):
             self.guard(lambda: inner.experiment.add_text(name, text))
@@ -159,7 +159,7 @@ class GuardedLogger(Logger):
             self.guard(lambda: inner.log_table(name, columns, cells))
 
     def log_summary(self, figures: Mapping[str, float]) -> None:
-        """Log the final values, in Weights & Biases as the run's summary."""
+        """Log the final metrics, in Weights & Biases as the summary of the run."""
         inner = self.inner
         if isinstance(inner, WandbLogger):
             self.guard(lambda: inner.experiment.summary.update(dict(figures)))
@@ -167,7 +167,7 @@ class GuardedLogger(Logger):
             self.log_metrics(dict(figures))
 
     def close(self, failed: bool) -> None:
-        """End the logger's run; later values belong to another run."""
+        """Close the logged run as failed or successful; later values belong to another run."""
         if isinstance(self.inner, WandbLogger):
             self._failed = False  # a failed logger's run must end, too
             self.guard(lambda: _finish_wandb(failed))
@@ -176,7 +176,7 @@ class GuardedLogger(Logger):
 
 
 def _finish_wandb(failed: bool) -> None:
-    """End the open run of Weights & Biases; stop the service if the service does not respond."""
+    """End the open run of Weights & Biases; on an ``OSError``, also stop its service."""
     import wandb  # Weights & Biases is slow to import
 
     try:

@@ -64,7 +64,7 @@ class Muon(AdamW):
         return loss
 
     def _step_matrix(self, weight: nn.Parameter, gradient: Tensor, group: dict[str, Any]) -> None:
-        """Take the step of a matrix."""
+        """Update a weight in place by its weight decay and its orthogonalised momentum."""
         state = self.state[weight]
         if not state:  # AdamW's names, which it requires in a resumed run
             state |= {"step": torch.zeros(()), "exp_avg": torch.zeros_like(weight)}
@@ -96,7 +96,7 @@ def orthogonalise(matrix: Float[Tensor, "m n"]) -> Float[Tensor, "m n"]:
 
 
 def _polynomial(gram: Float[Tensor, "m m"]) -> Float[Tensor, "m m"]:
-    """Return the factor of a round for a matrix with a Gram matrix."""
+    """Return a·I + b·G + c·G², the factor of a round of ``orthogonalise`` for a Gram matrix G."""
     a, b, c = _QUINTIC
     identity = torch.eye(len(gram), dtype=gram.dtype, device=gram.device)
     return a * identity + b * gram + c * (gram @ gram)
@@ -135,7 +135,7 @@ class AveragedWeights(WeightAveraging):
             self._average_model.n_averaged = torch.tensor(1)
 
     def _move(self, averages: list[Tensor], weights: list[Tensor], _: object) -> None:
-        """Move averages of one dtype towards the weights."""
+        """Move averages of one dtype towards the weights, in place."""
         if averages[0].is_floating_point():
             n = int(self._averaged.n_averaged)
             decay = min(self.decay, n / (n + _RAMP - 1))
@@ -146,12 +146,12 @@ class AveragedWeights(WeightAveraging):
             average.copy_(weight)
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Copy the average to the network."""
+        """Store the trained weights and copy the average to the network."""
         self._set_aside = {name: value.clone() for name, value in pl_module.state_dict().items()}
         self._copy_average_to_current(pl_module)
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Restore the trained weights."""
+        """Restore the trained weights in the network."""
         pl_module.load_state_dict(self._set_aside)
         self._set_aside = {}
 
@@ -171,7 +171,7 @@ class AveragedWeights(WeightAveraging):
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Save average and trained weights, also during a validation."""
+        """Store the average as ``state_dict`` and the trained weights under :data:`TRAINED`."""
         trained = self._set_aside or checkpoint["state_dict"]
         averaged = self._averaged.module.state_dict()
         checkpoint[TRAINED] = trained

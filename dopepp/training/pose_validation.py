@@ -46,26 +46,26 @@ _OF_MATCHES: Final = ("median_rotation_deg", "median_rotation_s_deg")  # Undefin
 class PoseMetricsCallback(Callback):
     """Logs the pose metrics of every validation as ``val/<metric>``, averaged over objects.
 
-    ``val/selection``, which chooses the best checkpoint, is the mean over objects of the exact AUC
-    of ADD up to 0.1 m, or of ADD-S for symmetric objects ("ADD(-S)"). Later callbacks in the list
-    can read :attr:`metrics`.
+    ``val/selection``, which chooses the best checkpoint, is the mean over objects of the area under
+    the accuracy curve (exact AUC) of ADD up to 0.1 m, or of ADD-S for symmetric objects
+    ("ADD(-S)"). Later callbacks in the list can read :attr:`metrics`.
     """
 
     metrics: PoseMetrics
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Create the pose metrics of the system's parts."""
+        """Create empty pose metrics for the parts of the system."""
         assert isinstance(pl_module, PoseSystem)
         self.metrics = PoseMetrics(pl_module.parts)
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Reset the pose metrics, on the device that gathers them across processes."""
+        """Reset the pose metrics and move them to the device that gathers them across processes."""
         self.metrics.to(pl_module.device).reset()
 
     def on_validation_batch_end(  # type: ignore[override]
         self, trainer: Trainer, system: PoseSystem, outputs: ValidationOutput, batch: Batch, *_: Any
     ) -> None:
-        """Recover the poses of the batch and compare them with its instances."""
+        """Recover poses from the maps of the batch and compare them with the labelled instances."""
         detections, truths = system.recover(outputs, batch), batch_instances(batch, system.parts)
         width = batch.images.shape[-1]
         cameras = batch.K.double().cpu().numpy()
@@ -73,7 +73,7 @@ class PoseMetricsCallback(Callback):
             self.metrics.update(*image, width)
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Log the means over objects, without metrics that are undefined."""
+        """Log means over objects; undefined rotation errors are omitted, other values are NaN."""
         rows = self.metrics.compute()
         values = {name: getattr(rows[MEAN], name) for name in LOGGED}
         objects = [row for name, row in rows.items() if name != MEAN]
@@ -90,7 +90,7 @@ class PoseMetricsCallback(Callback):
 
 
 def batch_instances(batch: Batch, parts: tuple[Part, ...]) -> Iterator[list[Instance]]:
-    """Yield the labelled instances of each image."""
+    """Yield a list of labelled instances per image; ``parts`` are in channel order."""
     index = batch.object_index.cpu().numpy()
     poses, keypoints = batch.T_cam_obj.double().cpu().numpy(), batch.keypoints.cpu().numpy()
     visible = batch.visible_fraction.cpu().numpy()
@@ -114,20 +114,20 @@ class EarlyStop(EarlyStopping):
         return bool(self.wait_count >= self.patience)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the state, but not the patience."""
+        """Restore the best value and the validations since then, but not the patience."""
         super().load_state_dict({**state_dict, "patience": self.patience})
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Stop a resumed run that had stopped before, unless the patience has grown."""
+        """Stop a resumed run whose validations without improvement have reached the patience."""
         if self.impatient:
             trainer.should_stop = True
 
 
 class AUCCurves(Callback):
-    """Draws accuracy curves, ``val_auc``; must follow :class:`PoseMetricsCallback`."""
+    """Draws accuracy over ADD threshold, ``val_auc``; must follow :class:`PoseMetricsCallback`."""
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw one curve per object; all processes gather the errors."""
+        """Draw an accuracy curve per object from the errors of all processes."""
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         (metrics,) = (item.metrics for item in callbacks if isinstance(item, PoseMetricsCallback))
         curves = {name: metrics.errors(name) for name in metrics.parts}
@@ -152,16 +152,16 @@ class ValidationSheet(Callback):
 
     @abstractmethod
     def tiles(self, system: PoseSystem, outputs: ValidationOutput, batch: Batch) -> Sequence[Tile]:
-        """Return the tiles of all images of a batch, in order."""
+        """Return the captioned pictures to show for a batch, in the order of its images."""
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Clear the sheet."""
+        """Discard the tiles of the last validation."""
         self._tiles, self._num_drawn = [], 0
 
     def on_validation_batch_end(  # type: ignore[override]
         self, trainer: Trainer, system: PoseSystem, outputs: ValidationOutput, batch: Batch, *_: Any
     ) -> None:
-        """Draw the first images of the batch until the sheet is full."""
+        """Add the tiles of the first images, until ``num_images`` images are on the sheet."""
         num = min(self.num_images - self._num_drawn, len(batch))
         if num <= 0 or not trainer.is_global_zero or trainer.sanity_checking:
             return
@@ -170,7 +170,7 @@ class ValidationSheet(Callback):
         self._num_drawn += num
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Write and log the sheet."""
+        """Write the sheet to the run folder and log it as an image."""
         if not self._tiles:
             return
         sheet = contact_sheet(self._tiles)
@@ -186,7 +186,7 @@ class Overlays(ValidationSheet):
     name: ClassVar[str] = "overlay"
 
     def tiles(self, system: PoseSystem, outputs: ValidationOutput, batch: Batch) -> Sequence[Tile]:
-        """Return each image with its wireframes."""
+        """Return each image with the wireframes of the labels and of the recovered poses."""
         images = batch.images.permute(0, 2, 3, 1).cpu().numpy()
         truths = batch.keypoints.cpu().numpy()
         tiles = []
@@ -225,7 +225,7 @@ def _log_picture(trainer: Trainer, name: str, image: RGBImage) -> None:
 
 @contextmanager
 def best_effort(name: str) -> Iterator[None]:
-    """Log a warning with the file's name instead of raising an ``OSError``."""
+    """Log an ``OSError`` of the context as a failure to write the file ``name``."""
     try:
         yield
     except OSError as error:

@@ -48,7 +48,7 @@ class Watch(threading.Thread):
         self._stopped = threading.Event()
 
     def run(self) -> None:
-        """End this process some time after the death of another process."""
+        """End this process ``_GRACE_S`` seconds after the death of another process."""
         while not self._stopped.wait(_POLL_S):
             death = self.death()
             if death is not None:
@@ -78,12 +78,12 @@ class Watch(threading.Thread):
 
 
 class WatchedLauncher(_SubprocessScriptLauncher):
-    """Starts the other processes like Lightning and watches them."""
+    """Starts a process for each further rank of this machine, like Lightning, and watches it."""
 
     def launch(
         self, function: Callable[..., Any], *args: Any, trainer: Trainer | None = None, **kw: Any
     ) -> Any:
-        """Start the other processes, then call the function.
+        """Start the processes of the further ranks, then call the function.
 
         Raises:
             ProcessDiedError: The function failed because another process has died.
@@ -122,7 +122,6 @@ class WatchedDDP(DDPStrategy):
         super().__init__(timeout=timedelta(seconds=timeout_s))
 
     def _configure_launcher(self) -> None:
-        """Use the launcher that watches the other processes."""
         assert self.cluster_environment is not None
         self._launcher = WatchedLauncher(
             self.cluster_environment, self.num_processes, self.num_nodes

@@ -24,11 +24,11 @@ MOST: Final = 10**6  # Maximum number of trials or epochs
 
 
 class PrunedError(Exception):
-    """A trial was stopped because other trials are better; not a failure."""
+    """A trial of a study was stopped because other trials are better; not a failure."""
 
 
 class TrialReport(Callback):
-    """Reports the objective after each validation and stops poor trials.
+    """Reports the objective of a trial to its study after each validation and stops poor trials.
 
     Optuna's median rule stops a trial whose best value is worse than the median of the other
     trials' values at the same epoch.
@@ -64,7 +64,7 @@ class TrialReport(Callback):
         self._after_epochs = check("search.prune_after_epochs", after_epochs, int, Range(0, MOST))
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Load the study and the id of the trial."""
+        """Load the study and find the trial's id in its database."""
         import optuna
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -77,7 +77,7 @@ class TrialReport(Callback):
         )
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Report the value of the epoch; a resumed trial repeats reports."""
+        """Report a finite ``monitor`` value of the epoch, and stop the training of a poor trial."""
         value = trainer.callback_metrics.get(self.monitor)
         if value is None or not math.isfinite(value):
             return
@@ -94,7 +94,7 @@ class TrialReport(Callback):
 
 
 def raise_if_pruned(trainer: Trainer) -> None:
-    """Check whether training was stopped early.
+    """Raise an exception if a :class:`TrialReport` has stopped the training.
 
     Raises:
         PrunedError: The trial was pruned.

@@ -29,16 +29,18 @@ MAX_SHARE: Final = 0.1  # largest share of the time that measurements take
 
 
 class RefinedProgress(Callback):
-    """Measures reported refined poses on whole images of the camera after validations.
+    """Measures the refined poses of the network on full-resolution camera images after validations.
 
     A measurement is logged as ``val/refined`` and ``val/refined_precision``, printed with its 95 %
     interval, and drawn in ``refined.png`` over the minutes of training. ``val/refined`` is the
-    share of instances with a reported pose whose ADD(-S) is below a tenth of the diameter.
+    share of instances whose pose has a score of at least ``MIN_SCORE`` and an ADD(-S) below a tenth
+    of the diameter.
 
     Args:
         images: Held-out images, at the camera's resolution.
-        refine: Evidence that refines the poses.
-        stop_at: Share that ends the training, once more images confirm the share; None: never.
+        refine: Method or methods that refine the poses, e.g. ``region``.
+        stop_at: ``val/refined`` that ends the training, if confirmed on ``NUM_CONFIRMING`` images;
+            None: never.
         every_s: Shortest time between two measurements, seconds. The time is longer if measurements
             would take more than a tenth of the training.
     """
@@ -52,11 +54,11 @@ class RefinedProgress(Callback):
     ) -> None:
         self.images, self.refine, self.stop_at, self.every_s = images, refine, stop_at, every_s
         self.curve: list[tuple[float, float, float, float]] = []
-        """Minutes of training, share, and the ends of its interval."""
+        """Minutes of training, ``val/refined``, and the ends of its 95 % interval."""
         self._minutes_before, self._begin, self._due = 0.0, 0.0, 0.0
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the curve and the minutes of training."""
+        """Return the points of the curve and the minutes of training."""
         return {"curve": [list(point) for point in self.curve], "minutes": self._minutes()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -69,7 +71,7 @@ class RefinedProgress(Callback):
         self._begin = self._due = time.monotonic()
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Measure the network, unless a measurement was made recently; stop at the goal."""
+        """Measure if ``every_s`` has passed since the last measurement; stop at ``stop_at``."""
         assert isinstance(pl_module, PoseSystem)
         reached, start = False, time.monotonic()
         if trainer.is_global_zero and not trainer.sanity_checking and start >= self._due:
@@ -79,7 +81,7 @@ class RefinedProgress(Callback):
         trainer.should_stop = trainer.should_stop or trainer.strategy.broadcast(reached)
 
     def _measure_and_report(self, trainer: Trainer, system: PoseSystem) -> bool:
-        """Measure, log, print and draw; return whether the goal is reached."""
+        """Measure, log, print and draw; return whether ``stop_at`` is reached."""
         estimator = self._estimator(system)
         # Only rank 0 measures, so metrics are not gathered across processes.
         metrics = PoseMetrics(system.parts, sync_on_compute=False)
@@ -113,7 +115,7 @@ class RefinedProgress(Callback):
     def _measure(
         self, estimator: PoseEstimator, metrics: PoseMetrics, first: int, end: int
     ) -> tuple[float, int, float]:
-        """Add the images first, …, end − 1; return recall, number of instances and precision."""
+        """Add images ``first`` to ``end`` − 1; return recall, number of instances and precision."""
         for index in range(first, min(end, len(self.images))):
             sample = self.images.sample(index)
             poses = estimator.predict(sample.image, sample.K)
@@ -126,7 +128,7 @@ class RefinedProgress(Callback):
         return self._minutes_before + (time.monotonic() - self._begin) / 60
 
     def _draw(self, folder: Path) -> None:
-        """Draw the curve."""
+        """Write ``refined.png``, which shows ``val/refined`` over the minutes of training."""
         x, rate, low, high = np.array(self.curve).T
         panels = {"refined and reported poses": {"ADD(-S)-0.1d": RateCurve(x, rate, low, high)}}
         figure = rates_figure(panels, "minutes of training", columns=1)

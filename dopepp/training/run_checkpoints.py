@@ -87,7 +87,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             _log.warning("%s; retrying at the next save", _failure(self.waiting[0], error))
 
     def finish(self) -> None:
-        """Write the waiting files.
+        """Write the checkpoints that could not be written yet.
 
         Raises:
             SavingFailedError: A file cannot be written.
@@ -97,7 +97,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             raise SavingFailedError(_failure(self.waiting[0], error)) from error
 
     def _write_waiting(self) -> OSError | None:
-        """Write the waiting files in order up to the first failure, which is returned."""
+        """Write the waiting files, oldest first; stop at the first error and return it."""
         for path, (checkpoint, previous) in list(self._waiting.items()):
             try:
                 if self._prepare is not None:
@@ -113,7 +113,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         return None
 
     def remove_checkpoint(self, path: str | Path) -> None:
-        """Remove a file of the run; other paths are kept, because checkpoints are not trusted."""
+        """Remove a file of the run folder; keep other files, which a forged checkpoint may name."""
         target = Path(os.fspath(path))
         folder = target.parent.resolve()
         if self._folder is not None and not folder.is_relative_to(self._folder.resolve()):
@@ -175,7 +175,7 @@ def saved_step(path: Path) -> int | None:
 
 
 def check_free_space(run_dir: Path, weight_bytes: int) -> None:
-    """Check in advance that a run can write its checkpoints, for weights of this size.
+    """Check in advance that a run can write its checkpoints, each with ``weight_bytes`` of weights.
 
     Raises:
         UserError: The folder is not writable, or has too little free space.
@@ -208,7 +208,7 @@ def sweep(run_dir: Path) -> None:
 
 
 def _read_intact(path: Path) -> tuple[Checkpoint, int]:
-    """Read a checkpoint and verify its checksums, which torch ignores."""
+    """Return a checkpoint and its step; verify the checksums of the file, which torch ignores."""
     checkpoint = read(path)
     with zipfile.ZipFile(path) as archive:
         try:

@@ -43,12 +43,12 @@ OptimizerFactory = Callable[[Iterable[nn.Parameter]], Optimizer]
 SchedulerFactory = Callable[[Optimizer, int], LRScheduler]
 
 _SCHEDULE_PROGRESS: Final = ("last_epoch", "_step_count", "_last_lr")
-"""Progress in a schedule's state; the other entries describe the schedule."""
+"""Entries of a scheduler's state that count steps; the other entries are its settings."""
 
 
 @dataclass
 class ValidationOutput:
-    """Loss of a validation batch with the last stage's belief maps (activated) and field."""
+    """Loss of a validation batch, with activated belief maps and vector field of the last stage."""
 
     loss: Float[Tensor, ""]
     belief: Beliefs
@@ -62,11 +62,11 @@ class PoseSystem(LightningModule):
         network: The network to train.
         loss: Loss of the network's maps against the target maps.
         parts: The objects, in the order of the network's channels.
-        geometry: Geometry of the target maps.
+        geometry: Stride, peak width and field radius of the target maps.
         recovery: Options of the recovery from maps to poses.
         make_optimizer: Builds the optimiser.
         make_scheduler: Builds a schedule, stepped every batch, from optimiser and number of steps.
-        payload: Description stored in every checkpoint under ``dopepp``.
+        payload: Description of network and data, stored in every checkpoint under ``dopepp``.
         compile_network: Whether to compile the network with ``torch.compile``.
         symmetry: Options for symmetric parts.
     """
@@ -100,7 +100,7 @@ class PoseSystem(LightningModule):
             self.network.compile()
 
     def forward(self, images: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return the belief logits and fields of all stages."""
+        """Return belief logits and vector fields of each stage for images (B, 3, height, width)."""
         stages: list[tuple[Tensor, Tensor]] = self.network(
             images.contiguous(memory_format=torch.channels_last)
         )
@@ -109,8 +109,8 @@ class PoseSystem(LightningModule):
     def targets(self, batch: Batch, stages: Sequence[Stage] | None = None) -> Targets:
         """Return the target maps of a batch, on its device.
 
-        The network's output may choose among the equivalent poses of a symmetric part
-        (:mod:`~dopepp.training.targets`).
+        The outputs ``stages`` of the network may choose among the equivalent poses of a symmetric
+        part (:mod:`~dopepp.training.targets`).
         """
         keypoints = batch.keypoints
         if self.symmetry.active:
@@ -118,7 +118,7 @@ class PoseSystem(LightningModule):
         return draw_maps(batch, keypoints, len(self.parts), self.geometry)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Return the loss; log the loss and its terms."""
+        """Return the loss of the batch; log the loss and its terms."""
         stages = self(batch.images)
         loss, terms = self.loss(stages, *self.targets(batch, stages))
         size = len(batch)
@@ -127,7 +127,7 @@ class PoseSystem(LightningModule):
         return loss  # type: ignore[no-any-return]
 
     def validation_step(self, batch: Batch, batch_idx: int) -> ValidationOutput:  # type: ignore[override]
-        """Log the loss and return the maps for the callbacks."""
+        """Log the loss of the batch and return the maps for the callbacks."""
         stages = self(batch.images)
         loss, _ = self.loss(stages, *self.targets(batch, stages))
         self.log("val/loss", loss, prog_bar=True, batch_size=len(batch), sync_dist=True)
@@ -135,7 +135,7 @@ class PoseSystem(LightningModule):
         return ValidationOutput(loss, self.network.activate(logits.float()), field.float())
 
     def recover(self, output: ValidationOutput, batch: Batch) -> list[list[Detection]]:
-        """Recover all candidates, including weak ones, on every image of a validation batch."""
+        """Recover the detections of every score on each image of a validation batch."""
         cameras, names = batch.K.cpu().numpy(), [part.name for part in self.parts]
         maps = (output.belief, output.field, self.cuboids, cameras, self.geometry.stride)
         return recover_batch(*maps, names, **vars(replace(self.recovery, min_score=0.0)))
@@ -153,7 +153,7 @@ class PoseSystem(LightningModule):
         return configured
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Prepare a checkpoint for resuming: trained weights, and the progress of schedules.
+        """Keep only the trained weights and the progress of schedules of a checkpoint to resume.
 
         The schedules' other values come from the config, because a resumed run may be longer.
         """
@@ -166,7 +166,7 @@ class PoseSystem(LightningModule):
         ]
 
     def on_train_start(self) -> None:
-        """Continue the table and the schedule at the resumed step."""
+        """Continue the metrics table and the learning rate schedule at the resumed step."""
         for logger in self.loggers:
             if isinstance(logger, MetricsTable):
                 logger.forget_after(self.global_step - 1)
@@ -196,7 +196,7 @@ class PoseSystem(LightningModule):
                 group.update({k: v for k, v in settings.items() if k not in unchanged})
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the description, so that the file can be loaded without this module or a config.
+        """Add :attr:`payload`, so that the file can be loaded without this module or a config.
 
         Raises:
             RunError: Weights or optimiser states are not finite.
@@ -206,18 +206,18 @@ class PoseSystem(LightningModule):
 
 
 def _without_progress(state: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the part of a schedule's state that describes the schedule."""
+    """Return the settings of a scheduler in its state, without the counts of steps."""
     return {name: value for name, value in state.items() if name not in _SCHEDULE_PROGRESS}
 
 
 def all_finite(tensors: Iterable[Tensor]) -> bool:
-    """Return whether all values are finite; synchronises with the device once."""
+    """Return whether all floating-point values are finite; synchronises with the device once."""
     flags = [tensor.isfinite().all() for tensor in tensors if tensor.is_floating_point()]
     return not flags or bool(torch.stack(flags).all())
 
 
 def check_state(checkpoint: Mapping[str, Any]) -> None:
-    """Check that weights and optimiser states are finite.
+    """Check that weights and optimiser states of a checkpoint are finite.
 
     Raises:
         RunError: A value is not finite.

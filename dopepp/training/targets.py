@@ -41,9 +41,9 @@ class SymmetryOptions(Checked):
     """Options for targets of symmetric parts.
 
     Attributes:
-        canonical: Whether targets use the equivalent pose nearest to the reference.
-        border_deg: Difference of angles to the reference, degrees, within which equivalent poses
-            are alternatives; the pose with the lowest loss is used. 0 allows no alternatives.
+        canonical: Whether targets use the equivalent pose nearest to the reference orientation.
+        border_deg: An equivalent pose may be used, if its loss is lower, when its angle to the
+            reference exceeds the smallest angle by less than this, degrees.
 
     Raises:
         UserError: ``border_deg`` is above 0 without ``canonical``.
@@ -63,7 +63,7 @@ class SymmetryOptions(Checked):
 def draw_maps(
     batch: Batch, keypoints: Keypoints, num_objects: int, geometry: MapGeometry
 ) -> Targets:
-    """Draw keypoints (input pixels) as target maps, without instances too occluded for metrics."""
+    """Encode keypoints (input pixels) as target maps, without instances less than 10 % visible."""
     height, width = batch.images.shape[-2:]
     map_size = height // geometry.stride, width // geometry.stride
     is_visible = batch.visible_fraction >= MIN_VISIBLE_FRACTION
@@ -78,7 +78,7 @@ def choose_keypoints(
     loss: MapLoss,
     geometry: MapGeometry,
 ) -> Keypoints:
-    """Return the keypoints of each instance in the equivalent pose to train on.
+    """Return the keypoints (input pixels) of each instance in the equivalent pose to train on.
 
     The default is the pose nearest to the reference orientation. An allowed alternative is used if
     its maps have a lower loss against the network's ``stages``; instances are decided in sequence.
@@ -104,7 +104,7 @@ def choose_keypoints(
 
 
 class Equivalents(NamedTuple):
-    """Keypoints of equivalent poses, input pixels, the nearest to the reference first.
+    """Keypoints of equivalent poses, input pixels, by increasing angle to the reference pose.
 
     ``allowed`` marks poses that may be used as targets; the first is always allowed.
     """
@@ -131,7 +131,7 @@ class SymmetryHandling:
         }
 
     def equivalents(self, batch: Batch) -> Equivalents:
-        """Return the equivalent poses of a batch's instances.
+        """Return the keypoints of the poses that are equivalent to the labels of a batch.
 
         Instances of parts without symmetries keep exactly their labelled keypoints.
         """
@@ -154,10 +154,11 @@ class SymmetryHandling:
         )
 
     def _poses(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Return T·S·C for every discrete S, and their angles to the reference.
+        """Return T·S·C for each label T and discrete symmetry S, and its angle to the reference.
 
-        C is the best rotation about the axis of a round part. Poses have the shape (batch,
-        instances, choices, 4, 4), angles (batch, instances, choices), radians; padding is infinite.
+        C is the rotation about the axis of a round part with the smallest angle. Poses have the
+        shape (batch, instances, choices, 4, 4), angles (batch, instances, choices), radians;
+        padding is infinite.
         """
         tables = self._on(batch.T_cam_obj.device)
         index = batch.object_index.clamp(min=0)
@@ -177,7 +178,7 @@ class SymmetryHandling:
         return poses, torch.where(tables["is_pose"][index], angle, torch.inf)
 
     def _on(self, device: torch.device) -> dict[str, Tensor]:
-        """Return the tables of symmetries on a device."""
+        """Return the rows of all parts (``_symmetry_row``), stacked by name, on a device."""
         if self._tables["axes"].device != device:
             self._tables = {name: table.to(device) for name, table in self._tables.items()}
         return self._tables
@@ -218,7 +219,7 @@ def _symmetry_row(part: Part) -> dict[str, np.ndarray]:
 
 
 def _rotation_between(start: np.ndarray, end: np.ndarray) -> Float[np.ndarray, "3 3"]:
-    """Return the smallest rotation of one unit vector to another."""
+    """Return the rotation with the smallest angle that turns one unit vector to another."""
     across = np.cross(start, end)
     sine, cosine = np.linalg.norm(across), start @ end
     if sine < 1e-9:  # equal, or opposite (a half turn in the image plane)
@@ -229,7 +230,7 @@ def _rotation_between(start: np.ndarray, end: np.ndarray) -> Float[np.ndarray, "
 def _line_of_sight(
     T_cam_obj: Float[Tensor, "batch instances 4 4"], fixed: Float[Tensor, "batch instances 3"]
 ) -> Float[Tensor, "batch instances 3 3"]:
-    """Return the smallest rotation from the optical axis to the direction of a part's centre.
+    """Return the smallest rotation from the optical axis to the direction of a part's fixed point.
 
     A part that moves across the image and rotates by this matrix keeps its appearance.
     """

@@ -73,7 +73,7 @@ class Throughput(Callback):
 
 
 class RunProgress(TQDMProgressBar):
-    """Adds ``left``, the estimated time until the last step of the run."""
+    """Progress bar that also shows ``left``, the estimated time until the last step of the run."""
 
     def __init__(self) -> None:
         super().__init__(refresh_rate=5)  # drawing the bar takes longer than a small network's step
@@ -87,7 +87,7 @@ class RunProgress(TQDMProgressBar):
     def get_metrics(
         self, trainer: Trainer, pl_module: LightningModule
     ) -> dict[str, int | str | float | dict[str, float]]:
-        """Return the values shown next to the bar."""
+        """Return the values shown next to the bar, with ``left`` (h:mm:ss) after the first step."""
         metrics = super().get_metrics(trainer, pl_module)
         done = trainer.global_step - self._first_step
         if done <= 0:
@@ -106,7 +106,7 @@ class Operators(PyTorchProfiler):
         self._totals: dict[str, tuple[int, float]] = {}
 
     def _collect(self, recorded: profile) -> None:
-        """Add a recording."""
+        """Export a recording as a Chrome trace, and add its times and calls to the totals."""
         self._folder.mkdir(parents=True, exist_ok=True)
         recorded.export_chrome_trace(str(self._folder / f"trace_{self._num_traces}.json"))
         self._num_traces += 1
@@ -124,7 +124,7 @@ class Operators(PyTorchProfiler):
         return _slowest_first((name, *total) for name, total in self._totals.items())
 
     def summary(self) -> str:
-        """Return the report."""
+        """Return a report with a line per operator, slowest first: seconds, calls and name."""
         self._delete_profilers()
         return "".join(
             f"{seconds:12.6f} s {calls:8d} calls  {name}\n"
@@ -140,7 +140,7 @@ def make_profiler(kind: Literal["simple", "pytorch"] | None, run_dir: Path) -> P
 
 
 def profile_rows(profiler: object, limit: int = 12) -> list[dict[str, str]]:
-    """Return the slowest hooks or operators as rows of text."""
+    """Return the slowest hooks or operators, with calls, total seconds and ms per call as text."""
     totals: list[Total] = []
     if isinstance(profiler, Operators):
         totals = profiler.totals()
@@ -155,5 +155,4 @@ def profile_rows(profiler: object, limit: int = 12) -> list[dict[str, str]]:
 
 
 def _slowest_first(totals: Iterable[Total]) -> list[Total]:
-    """Sort by total time, largest first."""
     return sorted(totals, key=lambda total: total[2], reverse=True)

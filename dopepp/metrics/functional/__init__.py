@@ -113,7 +113,7 @@ def wilson_interval(passed: int, num: int, confidence: float = 0.95) -> tuple[fl
 
 
 def region_levels(distances: Errors) -> Errors:
-    """Return each pose's smallest level in [0, 1] whose region contains the true pose.
+    """Return, for each pose, the smallest confidence level whose region contains the true pose.
 
     The squared Mahalanobis distance x of a true pose from its estimate follows χ² with six degrees
     of freedom if the covariance is correct. The level is that distribution's value at x,
@@ -124,7 +124,7 @@ def region_levels(distances: Errors) -> Errors:
 
 
 def coverage(distances: Errors, level: float = 0.9) -> float:
-    """Return the share of true poses within the covariance region of a level; 0.0 without poses."""
+    """Return the share of Mahalanobis distances inside a confidence region; 0.0 without any."""
     levels = region_levels(distances)
     return float((levels <= level).double().mean()) if len(levels) else 0.0
 

@@ -42,11 +42,11 @@ def add(
     """Return the mean distance between corresponding points at both poses (ADD), metres.
 
     Args:
-        R_est: Estimated rotations.
+        R_est: Estimated rotations from object to camera frame.
         t_est: Estimated translations, metres.
         R_gt: True rotations.
         t_gt: True translations, metres.
-        points: ADD points of the object, metres.
+        points: ADD points in the object frame, metres.
     """
     R_est, t_est, R_gt, t_gt, points = _checked(R_est, t_est, R_gt, t_gt, points)
     # (R_est − R_gt)·x + (t_est − t_gt) needs a single matrix product.
@@ -150,7 +150,7 @@ def project_points(
     points: Float[Tensor, "*#n v 3"],
     K: Float[Tensor, "*#n 3 3"],
 ) -> Float[Tensor, "*n v 2"]:
-    """Project object points at poses (R, t) to pixels; NaN at or behind the camera."""
+    """Project points (object frame, metres) at poses to pixels; NaN at or behind the camera."""
     cam = points @ R.mT + t[..., None, :]
     depth = cam[..., 2:]
     rays = torch.where(depth > 0, cam / depth, torch.nan)
@@ -231,7 +231,7 @@ def mahalanobis(
 
 
 def to_float64(array: Tensor) -> Tensor:
-    """Return any array as a float64 tensor on its own device."""
+    """Return a tensor, array or list as a float64 tensor; tensors keep their device."""
     return torch.as_tensor(array, dtype=torch.float64)
 
 
@@ -256,7 +256,7 @@ def _checked(
 
 
 def _check_cameras(K: Tensor, num_poses: int) -> Rotations:
-    """Return one camera matrix for every pose."""
+    """Return a camera matrix for every pose, in pixels."""
     K = to_float64(K)
     if K.shape[-2:] != (3, 3) or K.shape[:-2] not in ((), (num_poses,)):
         raise ValueError(f"K must be (3, 3) or (N, 3, 3) of N = {num_poses}, got {tuple(K.shape)}")
@@ -279,13 +279,13 @@ def _check_symmetries(
 
 
 def _chunks(num_poses: int, num_points: int) -> Iterator[slice]:
-    """Return slices of the poses that need little memory with ``num_points`` points each."""
+    """Return slices of poses of which each has about ``_CHUNK_POINTS`` points."""
     step = max(1, _CHUNK_POINTS // num_points)
     return (slice(start, start + step) for start in range(0, num_poses, step))
 
 
 def nan_is_miss(errors: Tensor) -> Tensor:
-    """Replace NaN by an infinite error."""
+    """Replace NaN by infinity, the error of a missed pose."""
     return errors.nan_to_num(nan=torch.inf, posinf=torch.inf, neginf=-torch.inf)
 
 

@@ -59,7 +59,7 @@ def mean_nearest(
 def _tree(
     points: Float[np.ndarray, "v 3"],
 ) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "nodes 6"], Int[np.ndarray, "leaves+1"]]:
-    """Return points in the tree's order, every node's box and every leaf's first point."""
+    """Build a k-d tree: points in leaf order, box of each node, first point index of each leaf."""
     depth = max(math.ceil(math.log2(len(points) / _LEAF)), 0)
     order = np.arange(len(points))
     firsts = np.linspace(0, len(points), 2**depth + 1).astype(np.int64)
@@ -236,7 +236,7 @@ def _search(
     perspective: bool,
     errors: Float[np.ndarray, "n"],
 ) -> None:
-    """Write the maximum point distance of every pose under its best symmetry.
+    """Write the smallest maximum point distance over the symmetries to ``errors``, per pose.
 
     The arguments are as in :func:`least_farthest`; the probes are the first points.
     """

@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 
 
 def convex_pieces(part: Part) -> tuple[Piece, ...]:
-    """Return convex pieces that make up a part's shape, in its frame, metres.
+    """Return the vertices (object frame, metres) of convex pieces that make up a part's shape.
 
     Raises:
         UserError: The part has no mesh, the cached pieces are damaged, or the extra ``robot``
@@ -54,7 +54,7 @@ def convex_pieces(part: Part) -> tuple[Piece, ...]:
 
 
 def hull_faces(hull: ConvexHull) -> Int[np.ndarray, "faces 3"]:
-    """Return the triangles of a convex hull with outward normals."""
+    """Return the triangles of a convex hull as point indices, counter-clockwise from outside."""
     a, b, c = hull.points[hull.simplices].swapaxes(0, 1)
     is_inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
     faces = hull.simplices.astype(np.int32)
@@ -63,7 +63,7 @@ def hull_faces(hull: ConvexHull) -> Int[np.ndarray, "faces 3"]:
 
 
 def _decompose(mesh: Mesh) -> tuple[Piece, ...]:
-    """Decompose a mesh into approximately convex pieces."""
+    """Decompose a mesh into at most ``MAX_PIECES`` approximately convex pieces with CoACD."""
     import coacd
 
     coacd.set_log_level("error")

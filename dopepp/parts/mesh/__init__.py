@@ -42,7 +42,7 @@ be the nearest triangle."""
 
 
 class RawMesh(NamedTuple):
-    """Triangles of a file with its unit, if stated; see :class:`~dopepp.parts.part.Mesh`."""
+    """Triangles in the unit of a file (None: not stated); see :class:`~dopepp.parts.part.Mesh`."""
 
     vertices: Vertices
     faces: Faces
@@ -62,7 +62,7 @@ def face_areas(vertices: Vertices, faces: Faces) -> Float[np.ndarray, " faces"]:
 def sample_surface(
     vertices: Vertices, faces: Faces, num_points: int = NUM_SURFACE_POINTS, seed: int = SURFACE_SEED
 ) -> Points:
-    """Sample random points uniformly over the area of a mesh.
+    """Return random points, sampled uniformly over the area of a mesh.
 
     Raises:
         ValueError: The triangles have no area.
@@ -116,7 +116,7 @@ def largest_distance(points: Points) -> float:
 
 
 def _is_round(points: Float[np.ndarray, "points axes"]) -> bool:
-    """Return whether most points are corners of their hull, which is then slow to compute."""
+    """Return whether most points lie on their convex hull, which is then slow to compute."""
     if len(points) <= _FEW_CORNERS:
         return False
     sample = points[:: len(points) // _FEW_CORNERS + 1]
@@ -125,7 +125,7 @@ def _is_round(points: Float[np.ndarray, "points axes"]) -> bool:
 
 
 def _farthest(sources: Float[np.ndarray, "sources 3"], points: Points) -> tuple[float, int]:
-    """Return the largest distance from a source to a point, and the index of the point."""
+    """Return the largest distance from a source to a point, and the index of that point."""
     best, end = -1.0, 0
     # 512 rows at a time keep the distances of a 100,000-vertex hull under 0.5 GB.
     for start in range(0, len(sources), 512):
@@ -136,7 +136,7 @@ def _farthest(sources: Float[np.ndarray, "sources 3"], points: Points) -> tuple[
 
 
 def _longest_of_directions(points: Points) -> Iterator[tuple[float, int]]:
-    """Yield the distance between the extreme points along each direction, and a point's index."""
+    """Yield, per 16 directions, the largest distance of extreme points, and the index of one."""
     # Along a direction at an angle φ to the diameter, the distance is at least cos φ diameters, and
     # with 2,500 directions φ is below 2.42°. Single precision suffices and halves the time.
     directions = half_sphere(2500).astype(np.float32)
@@ -149,7 +149,7 @@ def _longest_of_directions(points: Points) -> Iterator[tuple[float, int]]:
 
 
 def half_sphere(num_directions: int) -> Float[np.ndarray, "directions 3"]:
-    """Return unit vectors spread evenly over half a sphere, on a golden-angle spiral."""
+    """Return unit vectors spread evenly over the half sphere z > 0, on a golden-angle spiral."""
     number = np.arange(num_directions) + 0.5
     z, angle = number / num_directions, np.pi * (3 - np.sqrt(5)) * number
     ring = np.sqrt(1 - z * z)
@@ -164,7 +164,7 @@ def hash_triangles(vertices: Vertices, faces: Faces) -> str:
 
 
 def weld(vertices: Vertices, faces: Faces) -> tuple[Float[np.ndarray, "welded 3"], Faces]:
-    """Merge vertices at the same position; degenerate faces remain."""
+    """Merge vertices at exactly one position; faces that become degenerate remain."""
     # Adding 0.0 turns −0.0 into 0.0.
     positions = vertices + 0.0
     order = np.lexsort(positions.T[::-1])  # sort by x, then y, then z
@@ -179,7 +179,7 @@ def weld(vertices: Vertices, faces: Faces) -> tuple[Float[np.ndarray, "welded 3"
 def connected(
     start: Int[np.ndarray, " links"], end: Int[np.ndarray, " links"], num_nodes: int
 ) -> tuple[int, Int[np.ndarray, " nodes"]]:
-    """Return the number of connected components of linked nodes, and the component of each."""
+    """Return the number of connected components of a graph, and the component of each node."""
     links = (np.ones(len(start), bool), (start, end))
     graph = scipy.sparse.coo_array(links, shape=(num_nodes, num_nodes))
     count, components = scipy.sparse.csgraph.connected_components(graph, directed=False)
@@ -213,7 +213,7 @@ class SurfaceTree:
         self._owners = np.concatenate([self._owners, *[np.arange(len(a))] * 4])
 
     def spread(self, num_points: int, seed: int) -> tuple[Points, Int[np.ndarray, " points"]]:
-        """Return random points of nearly uniform density on the surface, and their triangles."""
+        """Return random surface points of nearly uniform density, and their triangle indices."""
         rng = np.random.default_rng(seed)
         cumulative = np.cumsum(self.areas)
         positions = (np.arange(num_points) + rng.random()) / num_points * cumulative[-1]
@@ -221,14 +221,14 @@ class SurfaceTree:
         return _points_inside(self.triangles[owners], rng), owners
 
     def nearest(self, points: Points) -> tuple[Points, Points]:
-        """Return approximately the nearest surface point to each point, and the normal there."""
+        """Return approximately the nearest surface point to each point, and its unit normal."""
         owners = self._owners[self._tree.query(points)[1]]
         return _closest_on_triangles(points, self.triangles[owners]), self.normals[owners]
 
     def distances(
         self, points: Float[np.ndarray, "*batch 3"], neighbours: int = _NUM_NEIGHBOURS
     ) -> Float[np.ndarray, "*batch"]:
-        """Return the distance of each point to the surface."""
+        """Return each point's distance to the triangles of the nearest ``neighbours`` points."""
         flat = points.reshape(-1, 3)
         neighbour = self._tree.query(flat, k=np.arange(1, neighbours + 1))[1]
         triangles = self.triangles[self._owners[neighbour]]
@@ -240,7 +240,7 @@ class SurfaceTree:
 def _closest_on_triangles(
     points: Float[np.ndarray, "*#batch 3"], triangles: Float[np.ndarray, "*batch 3 3"]
 ) -> Float[np.ndarray, "*batch 3"]:
-    """Return the point of each triangle that is closest to a point."""
+    """Return the point of each triangle that is closest to the corresponding point."""
     # The closest point is the foot of the perpendicular if inside, otherwise a point on an edge.
     a, b, c = triangles[..., 0, :], triangles[..., 1, :], triangles[..., 2, :]
     normal = np.cross(b - a, c - a)

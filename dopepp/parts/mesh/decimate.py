@@ -62,7 +62,7 @@ def decimate(
 def _cluster(
     vertices: Vertices, faces: Faces, max_faces: int
 ) -> tuple[Int[np.ndarray, " vertices"], Int[np.ndarray, " kept"]]:
-    """Return each vertex's cell and the kept triangles, for the finest grid within the limit."""
+    """Return each vertex's cell and the indices of kept triangles, for a grid within the limit."""
     # A surface through a cell becomes two triangles.
     side = float(np.sqrt(2 * face_areas(vertices, faces).sum() / max_faces))
     best_cells, best_kept = np.zeros(len(vertices), np.int64), np.zeros(0, np.int64)
@@ -82,7 +82,7 @@ def _cluster(
 
 
 def _cells(vertices: Vertices, side: float) -> Int[np.ndarray, " vertices"]:
-    """Return each vertex's grid cell; cells with vertices are numbered from 0."""
+    """Return each vertex's cell in a cubic grid; cells with vertices are numbered from 0."""
     offsets = vertices - vertices.min(axis=0)
     # At most a million cells along the longest side keep cell numbers within an int64.
     indices = (offsets / max(side, 1e-6 * float(offsets.max()))).astype(np.int64)
@@ -92,7 +92,7 @@ def _cells(vertices: Vertices, side: float) -> Int[np.ndarray, " vertices"]:
 
 
 def _select_triangles(corners: Faces) -> Int[np.ndarray, " kept"]:
-    """Return the first triangle for every triple of cells and orientation."""
+    """Return the indices of triangles over three cells, one per cell triple and orientation."""
     a, b, c = corners.T
     candidates = np.flatnonzero((a != b) & (b != c) & (c != a))
     a, b, c = corners[candidates].T
@@ -145,7 +145,7 @@ def _cell_positions(
 
 
 def _islands(faces: Faces, cells: Int[np.ndarray, " vertices"]) -> Int[np.ndarray, " vertices"]:
-    """Number the groups of vertices that are connected by edges within a cell."""
+    """Return each vertex's group; a group is connected by edges within one cell."""
     start, end = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
     inside = cells[start] == cells[end]
     return connected(start[inside], end[inside], len(cells))[1]

@@ -48,7 +48,7 @@ _TRIANGLES: Final = 4  # glTF's number of the mode; lower numbers are points and
 
 
 def read_stl(path: Path) -> RawMesh:
-    """Read a binary or text STL file, with equal corners merged.
+    """Read a binary or text STL file, and merge corners at equal positions.
 
     Raises:
         ValueError: The length disagrees with the number of triangles, or a number is not finite.
@@ -76,7 +76,7 @@ def read_stl(path: Path) -> RawMesh:
 
 
 def read_3mf(path: Path) -> RawMesh:
-    """Read the build of a 3MF file, with its unit.
+    """Read the objects placed by the build of a 3MF file, with the unit of the file.
 
     Raises:
         UserError: The unit is not one of :data:`UNITS_3MF`.
@@ -107,7 +107,7 @@ def read_3mf(path: Path) -> RawMesh:
 
 
 def _count_pieces(model: bytes) -> int:
-    """Count the mesh instances of a 3MF build."""
+    """Return the number of mesh instances that the build of a 3MF model places."""
     # trimesh spends hours on objects that contain themselves or are doubled twenty times, and reads
     # all objects of another file instead of the named object.
     from lxml import etree
@@ -133,7 +133,7 @@ def _count_pieces(model: bytes) -> int:
 
 
 def _check_size(num_bytes: int, max_bytes: int = MAX_UNPACKED_BYTES) -> None:
-    """Check that unpacked data are not too large."""
+    """Raise a ``ValueError`` if unpacked data are larger than either limit."""
     if num_bytes > min(max_bytes, MAX_UNPACKED_BYTES):
         raise ValueError(f"{num_bytes / 1e6:.0f} MB of text, over {max_bytes / 1e6:.0f} MB")
 
@@ -176,7 +176,7 @@ def read_glb(path: Path) -> RawMesh:
 
 
 def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """Return the JSON and binary chunks; both are required, unlike in trimesh."""
+    """Return JSON header and binary chunk of a GLB file; both are required, unlike in trimesh."""
     magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)
     if (magic, version, kind, length) != (b"glTF", 2, b"JSON", len(data)):
         raise ValueError(f"{len(data)} bytes, not the {length} of a GLB file of version 2")
@@ -190,7 +190,7 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def _packed(header: dict[str, Any], binary: bytes) -> bytes:
-    """Return the bytes of a GLB file."""
+    """Return the bytes of a GLB file with a JSON header and a binary chunk."""
     text = json.dumps(header).encode()
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
     chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
@@ -198,7 +198,7 @@ def _packed(header: dict[str, Any], binary: bytes) -> bytes:
 
 
 def _check(header: dict[str, Any], primitives: list[dict[str, Any]], num_bytes: int) -> None:
-    """Reject features that trimesh ignores, and files that need excessive memory or time."""
+    """Reject glTF features that trimesh ignores, and files that need excessive memory or time."""
     required = [name for name in header.get("extensionsRequired", ()) if "_materials_" not in name]
     if required:
         raise ValueError(f"the extension {required[0]}, which is not read")
@@ -226,7 +226,7 @@ def _check(header: dict[str, Any], primitives: list[dict[str, Any]], num_bytes: 
 
 
 def _image_number(header: dict[str, Any], primitive: dict[str, Any]) -> int | None:
-    """Return the number of the image of a primitive's colour texture, or None."""
+    """Return the index of the image of a primitive's colour texture, or None without a texture."""
     material = header["materials"][primitive["material"]] if "material" in primitive else {}
     info = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
     if info is None:
@@ -285,7 +285,7 @@ def read_scene(data: bytes, kind: str) -> tuple[RawMesh, int]:
 
 
 def _transform_vertices(vertices: Vertices, transform: Transform) -> Vertices:
-    """Apply a transform to vertices, with equal results on every processor."""
+    """Apply a transform to vertices, with bit-identical results on every processor."""
     if (transform == np.eye(4)).all():
         return vertices  # a product would spread infinite coordinates as NaN
     # The last digits of a matrix product would depend on the processor.

@@ -79,7 +79,7 @@ class ObjFile:
     _material: str | None = None
 
     def add(self, line: str, number: int) -> None:
-        """Add one line.
+        """Parse a line and append its statement; unsupported statements are ignored.
 
         Raises:
             ValueError: The line is damaged.
@@ -125,7 +125,7 @@ def _index(word: str, count: int) -> int:
 
 
 def _texture(obj: ObjFile, path: Path) -> RGBImage | None:
-    """Read the texture of the used materials; None without a texture."""
+    """Read the texture of the materials that the faces use; None without a texture."""
     if not obj.libraries:
         return None
     maps: dict[str | None, str | None] = {None: None}
@@ -169,7 +169,7 @@ def _colour_maps(path: Path) -> dict[str | None, str | None]:
 
 
 def _text(path: Path) -> str:
-    """Return a text with plain line ends; file names in any encoding remain intact."""
+    """Return the text of a file with LF line ends; file names in any encoding remain intact."""
     return path.read_bytes().decode("utf-8", "surrogateescape").replace("\r\n", "\n")
 
 
@@ -194,7 +194,7 @@ def companion_path(mesh_path: Path, name: str, statement: str) -> Path:
 
 
 def read_texture(path: Path) -> RGBImage:
-    """Return an image as RGB.
+    """Read a texture image as RGB.
 
     Raises:
         UserError: The image is damaged or larger than 8,192 pixels a side.
@@ -240,7 +240,7 @@ def fans(
 
     Args:
         vertices: Positions.
-        corners: Vertex index of each corner, polygon by polygon; checked by the caller.
+        corners: Vertex index of each corner, polygon by polygon; not checked here.
         counts: Number of corners of each polygon.
 
     Returns:
@@ -276,7 +276,7 @@ class FoldedPolygonError(ValueError):
 def _find_folded(
     vertices: Vertices, faces: Faces, polygons: Int[np.ndarray, " faces"]
 ) -> Bool[np.ndarray, " faces"]:
-    """Return which triangles face opposite to their polygon, or belong to one of total area 0."""
+    """Mark triangles that face against their polygon's mean normal, or whose polygon has none."""
     a, b, c = vertices[faces].swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
     totals = np.zeros((int(polygons[-1]) + 1, 3))

@@ -43,7 +43,7 @@ _ROUNDING: Final = 1e-3  # Share of the range by which a colour may exceed it, d
 
 
 class PlyProperty(NamedTuple):
-    """A property: name, types of its numbers (doubles in a text) and of a list's length."""
+    """A property: name, number type (double in text), list length type or None, declared type."""
 
     name: str
     number: np.dtype[Any]
@@ -105,14 +105,14 @@ def read_ply(path: Path) -> RawMesh:
 
 
 def _vectors(vertex: Table, names: Sequence[str]) -> NDArray[np.float64] | None:
-    """Return a vertex property of several numbers, or None."""
+    """Return the named vertex properties as columns, or None if a property is missing."""
     if not {*names} <= set(vertex):
         return None
     return np.stack([vertex[name] for name in names], axis=1).astype(np.float64)
 
 
 def _colours(vertex: Table, elements: Sequence[Element]) -> NDArray[np.uint8] | None:
-    """Return the vertices' colours, 0 – 255; None also for a uniform grey, programs' default."""
+    """Return sRGB vertex colours, 0 – 255; None if missing or uniform grey, a common default."""
     values = _vectors(vertex, COLOURS)
     if values is None or not len(values):
         return None
@@ -166,7 +166,7 @@ def _parse_header(lines: list[list[str]]) -> tuple[bool, list[Element]]:
 
 
 def _doubles(text: bytes) -> bytes:
-    """Convert a text body to the bytes of its numbers."""
+    """Convert the numbers of a text body to the bytes of little-endian doubles."""
     with warnings.catch_warnings():
         # numpy stops at a damaged number with a warning only.
         warnings.simplefilter("error", DeprecationWarning)
@@ -220,7 +220,7 @@ def _read_table(body: bytes, start: int, element: Element) -> tuple[Table, int]:
 
 
 def _length(body: bytes, start: int, kind: np.dtype[Any]) -> int:
-    """Return the length of a list, which a damaged file may write as a fraction or negative."""
+    """Return the length of a list; a fraction or negative number in a damaged file is an error."""
     written = np.frombuffer(body, kind, 1, start)[0].item()
     if written != int(written) or not 0 <= written <= len(body):
         raise ValueError(f"a list of {written} values")

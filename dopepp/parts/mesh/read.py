@@ -47,9 +47,9 @@ MANY_CAVITIES: Final = 1000
 def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     """Read an STL, OBJ, PLY, GLB, 3MF or OFF file, and convert it to metres.
 
-    Duplicate STL vertices are merged, zero-area triangles dropped, and the rest oriented alike.
-    Edges may be open, and triangles may intersect each other. OBJ, PLY and GLB files may have a
-    texture, PLY files also colours and normals.
+    Duplicate STL vertices are merged, zero-area triangles dropped, and the others oriented
+    consistently. Surfaces may have holes, and triangles may intersect each other. OBJ, PLY and GLB
+    files may have a texture, PLY files also colours and normals.
 
     Args:
         path: Mesh file, whose suffix states the format; a texture must lie in its folder.
@@ -65,7 +65,7 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
 
 
 def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
-    """Like :func:`read_mesh`, but return also the unit from which the mesh was converted."""
+    """Read a mesh like :func:`read_mesh`, and return also the unit that the file was read in."""
     path = Path(path)
     if unit is not None and unit not in UNITS:
         fix = "set the unit in which the file was exported, e.g. unit=mm"
@@ -129,7 +129,7 @@ def ycb_part(root: str | Path, name: str) -> Part:
 
 
 def _read_points(path: Path) -> Points:
-    """Read a file of points, a table of three columns."""
+    """Read a text file of points, with x, y and z in each line."""
     allowed = "lines of three finite numbers"
     try:
         if path.stat().st_size > MAX_POINTS_BYTES:
@@ -145,7 +145,7 @@ def _read_points(path: Path) -> Points:
 
 
 def _clean_mesh(path: Path, raw: RawMesh) -> Mesh:
-    """Check a mesh, drop flat triangles and unused vertices, and orient the triangles."""
+    """Check a mesh, drop zero-area triangles and unused vertices, and orient the triangles."""
     vertices, faces, uv, texture, *_ = raw
     if not len(vertices) or not len(faces):
         raise _damage_error(path, f"{len(vertices)} vertices and {len(faces)} faces")
@@ -190,13 +190,13 @@ def _damage_error(path: Path, problem: str, fix: str = "export the mesh again") 
 
 @dataclass(frozen=True)
 class Topology:
-    """Edges of triangles, with corners at one position merged.
+    """Edges of a triangle mesh whose vertices at one position are merged.
 
     Attributes:
         num_open: Number of edges of a single triangle (rims of holes).
         num_crowded: Number of edges of more than two triangles.
-        neighbours: Pairs of triangles that share another edge.
-        opposed: Whether the triangles of each pair face opposite ways.
+        neighbours: Pairs of triangles that share an edge of exactly two triangles.
+        opposed: Whether the triangles of each pair have opposite orientations.
     """
 
     num_open: int
@@ -211,7 +211,7 @@ class Topology:
 
 
 def find_topology(corners: Faces) -> Topology:
-    """Find the edges of triangles with three different corners; one position has one number."""
+    """Find the edges of triangles with three different corners; equal positions share an index."""
     start, end = corners.reshape(-1), corners[:, [1, 2, 0]].reshape(-1)
     # Both directions of an edge have the same number, which fits into an int64.
     edges = np.minimum(start, end) * (np.int64(corners.max(initial=0)) + 1) + np.maximum(start, end)
@@ -248,14 +248,14 @@ def misoriented_faces(
 
 
 def flip_faces(faces: Faces, inverted: Bool[np.ndarray, " faces"]) -> Faces:
-    """Flip the marked triangles."""
+    """Reverse the order of the corners of the marked triangles."""
     return np.where(inverted[:, None], faces[:, ::-1], faces)
 
 
 def _find_minority(
     areas: Float[np.ndarray, " faces"], topology: Topology
 ) -> Bool[np.ndarray, " faces"]:
-    """Return the triangles that face against most of their connected surface."""
+    """Mark the triangles that face against most of the area of their connected surface."""
     # Each triangle is two nodes of a graph, as it is and flipped, and links join nodes that face
     # the same way. An orientable surface has two components, one per orientation, and triangle f is
     # flipped if the component of its flipped node has more area.
@@ -275,7 +275,7 @@ def _find_minority(
 def _find_inverted_bodies(
     vertices: Vertices, faces: Faces, topology: Topology
 ) -> Bool[np.ndarray, " faces"]:
-    """Return the triangles of closed bodies that face inwards and lie in no other body's box."""
+    """Mark the triangles of closed bodies that face inwards and lie in no other body's box."""
     first_face, second_face = topology.neighbours.T
     count, bodies = connected(first_face, second_face, len(faces))
     volumes = np.bincount(bodies, _signed_volumes(vertices, faces), minlength=count)
@@ -285,7 +285,7 @@ def _find_inverted_bodies(
 
 
 def body_extents(vertices: Vertices, faces: Faces) -> list[Float[np.ndarray, "3"]]:
-    """Return the sides of the box of each separate body, the largest body first.
+    """Return the sides of each separate body's bounding box, by decreasing volume of the box.
 
     A body is a connected surface (corners at one position are merged) other than a cavity. A cavity
     faces inwards and lies in the box of another body.
@@ -308,7 +308,7 @@ def body_extents(vertices: Vertices, faces: Faces) -> list[Float[np.ndarray, "3"
 def _bounding_boxes(
     points: Points, bodies: Int[np.ndarray, " points"], count: int
 ) -> tuple[Float[np.ndarray, "bodies 3"], Float[np.ndarray, "bodies 3"]]:
-    """Return the lower and upper corners of the box of each body."""
+    """Return the lower and upper corners of the axis-aligned box of each body's points."""
     lower, upper = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     np.minimum.at(lower, bodies, points)
     np.maximum.at(upper, bodies, points)
@@ -320,7 +320,7 @@ def _find_enclosed(
     upper: Float[np.ndarray, "bodies 3"],
     candidates: Int[np.ndarray, " candidates"],
 ) -> Bool[np.ndarray, " bodies"]:
-    """Return which candidates lie in the box of another body."""
+    """Mark the candidates whose box lies in the box of another body."""
     enclosed = np.zeros(len(lower), bool)
     for body in candidates:
         around = (lower < lower[body]).all(axis=1) & (upper > upper[body]).all(axis=1)
@@ -329,6 +329,6 @@ def _find_enclosed(
 
 
 def _signed_volumes(vertices: Vertices, faces: Faces) -> Float[np.ndarray, " faces"]:
-    """Return the volume between each triangle and the centre, negative if facing the centre."""
+    """Return the volume between each triangle and the mean vertex, negative if facing it."""
     a, b, c = (vertices - vertices.mean(axis=0))[faces].swapaxes(0, 1)
     return np.asarray(np.einsum("ij,ij->i", a, np.cross(b, c)) / 6)
