@@ -56,7 +56,7 @@ def time_frames(estimator: PoseEstimator, images: CameraImages, num_frames: int)
 
 @dataclass(frozen=True)
 class ExportAgreement:
-    """Largest differences between an exported network and the original."""
+    """Largest differences of maps and poses between an exported network and the original."""
 
     maps: float  # difference of a map value, relative to the largest value above 1
     position_mm: float
@@ -67,7 +67,7 @@ class ExportAgreement:
 
     @property
     def is_exact(self) -> bool:
-        """Whether rounding in float32 explains all differences."""
+        """Whether all differences are within ``MAX_MAPS``, ``MAX_MM`` and ``MAX_DEG``."""
         close = self.maps <= MAX_MAPS and self.position_mm <= MAX_MM
         return close and self.rotation_deg <= MAX_DEG and not self.num_single
 

@@ -57,8 +57,8 @@ class PoseEstimator:
         network: Trained PyTorch network, or exported network.
         checkpoint: Parts, input size and thresholds of the network.
         device: Device that runs the network, e.g. ``cpu`` or ``cuda``.
-        refine: Evidence that refines poses: ``region`` (the image), ``depth`` (the depth image
-            passed to :meth:`predict`), or both, ``("region", "depth")``. None: no refinement.
+        refine: Measurements that refine poses: ``region`` (the image), ``depth`` (the depth
+            image passed to :meth:`predict`), or both, ``("region", "depth")``. None: no refinement.
         parts: The checkpoint's parts with other meshes (default: the meshes in the checkpoint).
         max_ms: Time limit for the refinement of an image, milliseconds. The best detections are
             refined first; detections beyond the limit keep the network's pose.
@@ -319,7 +319,7 @@ class PoseEstimator:
         return self.recovery.refined_min_score if is_verified else self.recovery.min_score
 
     def reporting(self, min_score: float | None) -> PoseEstimator:
-        """Return an estimator with the same network and another threshold.
+        """Return an estimator with the same network and another minimum score.
 
         Args:
             min_score: New :attr:`min_score`, in [0, 1]; None keeps the threshold.
@@ -335,7 +335,7 @@ class PoseEstimator:
         return changed
 
     def split(self, candidates: Sequence[Detection]) -> tuple[list[Detection], list[float]]:
-        """Return the candidates that pass the threshold, and the scores of the others."""
+        """Return the candidates with at least :attr:`min_score`, and the scores of the others."""
         passed = [candidate for candidate in candidates if candidate.score >= self.min_score]
         weaker = [candidate.score for candidate in candidates if candidate.score < self.min_score]
         return passed, weaker
@@ -347,7 +347,7 @@ class PoseEstimator:
         K: CameraMatrix,
         depth: Depth | None = None,
     ) -> list[Detection]:
-        """Refine detections; without a refinement, return the given detections.
+        """Refine detections; without a refinement, return the detections unchanged.
 
         Args:
             detections: Detections of these parts, from any source.
@@ -413,8 +413,8 @@ class PoseEstimator:
                 ``view 0``, …).
 
         Returns:
-            Parts with their poses and covariances in the world and the evidence of each view, and
-            contradictions between the views.
+            Parts with their poses and covariances in the world and their visibility in each view,
+            and contradictions between the views.
 
         Raises:
             UserError: The estimator was loaded without refinement by region, an argument is
@@ -472,7 +472,7 @@ class PoseEstimator:
         return network_views(self.checkpoint, multiple, image, K, distances, roi)
 
     def maps(self, image: RGBImage) -> Maps:
-        """Run the network on an RGB image whose sides are multiples of ``size_multiple``."""
+        """Return belief maps and vector fields of an RGB image, padded as in :meth:`views`."""
         pixels = torch.from_numpy(image).to(self.device).permute(2, 0, 1)[None]
         with torch.inference_mode():
             belief, field = self.network.maps(pixels)
@@ -485,7 +485,7 @@ class PoseEstimator:
 
     @contextmanager
     def _timed(self, step: str) -> Iterator[None]:
-        """Measure the time of a step, including its pending work on a GPU."""
+        """Add the block's time to that of a step, including its pending work on a GPU."""
         start = time.perf_counter()
         yield
         if self.device.type == "cuda":

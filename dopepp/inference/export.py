@@ -64,7 +64,7 @@ class _Maps(nn.Module):
         self.network = network
 
     def forward(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the maps of uint8 images."""
+        """Return the belief maps and vector fields of uint8 RGB images."""
         belief, field = self.network.maps(pixels)
         return belief.float(), field.float()
 
@@ -85,7 +85,7 @@ def check_possible(layout: str, precision: str) -> None:
 
 
 def to_onnx(network: PoseNetwork, precision: str, images: Sequence[Pixels]) -> Save:
-    """Convert to an ONNX model; see :data:`Exporter`."""
+    """Convert a network to an ONNX model; see :data:`Exporter`."""
     program = _trace(network)
     with _conversion(network, "ONNX"):
         names: dict[str, Any] = {"input_names": [INPUT], "output_names": list(OUTPUTS)}
@@ -109,7 +109,7 @@ def to_onnx(network: PoseNetwork, precision: str, images: Sequence[Pixels]) -> S
 
 
 def to_openvino(network: PoseNetwork, precision: str, images: Sequence[Pixels]) -> Save:
-    """Convert to an OpenVINO model; see :data:`Exporter`."""
+    """Convert a network to an OpenVINO model; see :data:`Exporter`."""
     openvino = load_openvino("--format openvino")
     program = _trace(network)
     with _conversion(network, "OpenVINO"):
@@ -133,7 +133,7 @@ def to_openvino(network: PoseNetwork, precision: str, images: Sequence[Pixels]) 
 
 
 def to_safetensors(network: PoseNetwork, precision: str, images: Sequence[Pixels]) -> Save:
-    """Keep the weights, in full or half precision, for PyTorch; see :data:`Exporter`."""
+    """Keep a network's weights, in full or half precision, for PyTorch; see :data:`Exporter`."""
     weights = network.state_dict()
 
     def save(path: Path, checkpoint: Checkpoint, export: Export) -> None:
@@ -163,7 +163,7 @@ def _trace(network: PoseNetwork) -> ExportedProgram:
 
 @contextmanager
 def _conversion(network: PoseNetwork, language: str) -> Iterator[None]:
-    """Silence a conversion, and report an unsupported operator in one line."""
+    """Suppress a conversion's logs and warnings, and raise its failures as UserError."""
     levels = {logger: logger.level for logger in map(logging.getLogger, _CHATTY)}
     for logger in levels:
         logger.setLevel(logging.ERROR)
@@ -188,7 +188,7 @@ def _conversion(network: PoseNetwork, language: str) -> Iterator[None]:
 
 
 def _strip(graph: Any) -> None:
-    """Remove references to source code, and name the free dimensions."""
+    """Remove references to source code from an ONNX graph, and name the free dimensions."""
     for item in (*graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
         del item.metadata_props[:]
         item.doc_string = ""
@@ -201,7 +201,7 @@ def _strip(graph: Any) -> None:
 
 
 def _halve(graph: Any) -> None:
-    """Store weights in half precision, followed by a cast that a runtime evaluates once."""
+    """Store an ONNX graph's weights in half precision, with a cast that runtimes evaluate once."""
     from onnx import TensorProto, helper, numpy_helper
 
     conversions = []
@@ -246,7 +246,7 @@ def _last_openvino_convolutions(model: Any) -> list[str]:
 
 
 def _quantise(model: Any, images: Sequence[Any], ends: Sequence[str]) -> Any:
-    """Return a graph that computes in 8 bits, except the last convolutions.
+    """Return a graph, calibrated on images, that computes in 8 bits except in the nodes ``ends``.
 
     Weights use 7 bits: without VNNI, sums of two 8-bit products overflow.
     """

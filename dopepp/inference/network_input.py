@@ -251,7 +251,7 @@ def check_region(roi: Region | None, image: RGBImage) -> Region | None:
 def resize_and_pad(
     image: RGBImage, letterbox: Letterbox, multiple: int
 ) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Resize an image into a letterbox and pad its sides to a multiple, at the right and bottom."""
+    """Resize an image, and pad it at the right and bottom to sides that ``multiple`` divides."""
     image = letterbox.image(image)
     rows, columns = -image.shape[0] % multiple, -image.shape[1] % multiple
     return np.pad(image, ((0, rows), (0, columns), (0, 0)))
@@ -336,7 +336,7 @@ def _scales(seen: LearnedRange, reach: float, depths: tuple[float, float]) -> Se
 
 
 def are_same(first: Detection, second: Detection) -> bool:
-    """Return whether two detections of an image may show the same instance."""
+    """Return whether names agree and centroids are closer than half the larger extent (pixels)."""
     distance = np.linalg.norm(first.keypoints[-1] - second.keypoints[-1])
     extents = [np.ptp(detection.keypoints[:-1], axis=0).max() for detection in (first, second)]
     return first.object == second.object and bool(distance < max(extents) / 2)

@@ -174,7 +174,7 @@ def _camera_inputs() -> list[Any]:
 def _outputs(
     estimator: PoseEstimator, path: Path, kind: str, inputs: Sequence[Any], folder: Path
 ) -> Outputs:
-    """Estimate the poses on an uploaded image."""
+    """Estimate the poses on an uploaded image, and return the contents of the page's outputs."""
     photo = read_photo(path)
     size = (photo.shape[1], photo.shape[0])
     camera = _camera(kind, inputs, *size).for_picture(size)
@@ -235,7 +235,7 @@ def _camera(kind: str, inputs: Sequence[Any], width: int, height: int) -> Camera
 
 
 def belief_sheet(estimator: PoseEstimator, image: RGBImage, K: CameraMatrix) -> RGBImage:
-    """Draw the belief maps over the image, in every size that the network is run on."""
+    """Draw the belief maps over the image at every size that the network processes."""
     tiles = []
     for view in estimator.views(image, K):
         belief = estimator.maps(view.pixels)[0].cpu().numpy()

@@ -88,7 +88,7 @@ class Shape:
 
 
 def make_shape(part: Part) -> Shape:
-    """Prepare a part for drawing."""
+    """Return the geometry of a part for drawing."""
     mesh = part.mesh
     outline = None if mesh is None else make_outline_mesh(mesh.vertices, mesh.faces)
     return Shape(part.diameter, outline)
@@ -96,7 +96,7 @@ def make_shape(part: Part) -> Shape:
 
 @dataclass(frozen=True, eq=False)
 class PoseResult:
-    """The detections on one frame."""
+    """Detections on one frame, with its image and camera matrix."""
 
     image: RGBImage = field(repr=False)  # RGB, without lens distortion: keypoints and K refer to it
     K: CameraMatrix  # camera matrix, pixels
@@ -151,7 +151,7 @@ class PoseResult:
         write_image(Path(path), self.plot())
 
     def records(self) -> list[dict[str, Any]]:
-        """Return each detection as plain values, with the name of its image and its frame."""
+        """Return each detection as a dictionary for JSON, with image name, number and time."""
         shared: dict[str, Any] = {"image": self.name, "number": self.number}
         if self.time is not None:
             shared["time"] = self.time
@@ -204,7 +204,7 @@ class PoseResult:
 
 
 def record(detection: Detection) -> dict[str, Any]:
-    """Return a detection as plain values for JSON, with None for NaN and infinity."""
+    """Return a detection as a dictionary for JSON, with None for NaN and infinity."""
     return {
         "object": detection.object,
         "score": detection.score,
@@ -242,7 +242,7 @@ def draw_poses(
     labels: Sequence[str],
     shapes: Mapping[str, Shape],
 ) -> RGBImage:
-    """Return a copy of the image with poses drawn on it, enlarged if it is narrow."""
+    """Return a copy of the image with poses and labels, at least ``MIN_WIDTH_PX`` wide."""
     factor = max(1, -(-MIN_WIDTH_PX // image.shape[1]))
     canvas, K = enlarge(image, factor), resize_camera(K, factor, factor)
     tags = []

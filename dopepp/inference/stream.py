@@ -52,7 +52,7 @@ def stream(
 
     Args:
         estimator: Detects the parts.
-        source: Path, glob pattern, camera number, URL, or open source.
+        source: Path, glob pattern, camera number, URL, or opened frame source.
         K: Camera matrix of undistorted images, pixels.
         camera: Camera or camera file, instead of K (default: the camera of a recording).
         options: See :class:`StreamOptions`.

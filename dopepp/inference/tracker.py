@@ -99,7 +99,7 @@ class Motion:
         return self.covariance[:6, :6]
 
     def predict(self, sudden: bool = False) -> Motion:
-        """Predict the next frame, after a ``sudden`` change in velocity or without one."""
+        """Predict the motion on the next frame; ``sudden`` permits a large change in velocity."""
         step = np.eye(12)
         step[:6, 6:] = step[6:, 6:] = PERSISTENCE * np.eye(6)
         added = np.kron([[1.0, 1.0], [1.0, 1.0]], np.diag(self._velocity_change(sudden) ** 2))
@@ -141,7 +141,7 @@ def at_rest(T_cam_obj: Transform, covariance: Float[np.ndarray, "6 6"]) -> Motio
 
 @dataclass(frozen=True)
 class Track:
-    """A part on a frame."""
+    """Pose and velocity of a tracked part on one frame."""
 
     identity: int  # number of the instance, kept while the part is tracked or lost
     detection: Detection  # this frame's pose, with score and peaks of the network's last run
@@ -163,7 +163,7 @@ class _State:
     disagreements: int = 0  # detections in a row that were elsewhere
 
     def move_to(self, detection: Detection) -> None:
-        """Continue from a detection of the network."""
+        """Continue from a detection of the network, at rest."""
         self.track = Track(self.track.identity, detection, np.zeros(6), detected=True)
         self.motion = at_rest(detection.T_cam_obj, detection.covariance)
         self.unseen = self.doubts = self.disagreements = 0
@@ -195,7 +195,7 @@ class PoseTracker:
         self.estimator = estimator
         """Estimator, whose threshold may change between two frames."""
         self.weaker: list[float] = []
-        """Scores of the weaker candidates of the last frame, if the network was run on it."""
+        """Scores below the threshold on the last frame, if the network was run on it."""
         self._cuboid_of = {part.name: part.cuboid for part in estimator.parts}
         self._diameters = {part.name: part.diameter for part in estimator.parts}
         self._states: list[_State] = []
@@ -287,7 +287,7 @@ class PoseTracker:
                     state.move_to(detection)
 
     def _assigned(self, detections: Sequence[Detection]) -> list[tuple[_State | None, Detection]]:
-        """Assign detections to tracked parts, then to lost or doubtful parts; None: a new part."""
+        """Assign detections by distance to tracked, then to lost or doubtful parts; None: new."""
         pairs: list[tuple[_State | None, Detection]] = []
         for name in self._cuboid_of:
             left = [detection for detection in detections if detection.object == name]
@@ -318,7 +318,7 @@ class PoseTracker:
 
 
 def _region_around(detections: Sequence[Detection], image: RGBImage) -> Region | None:
-    """Return a region around detections; None if they are almost outside the image."""
+    """Return a region with a margin around detections; None if it is almost outside the image."""
     points = np.concatenate([detection.keypoints for detection in detections])
     margin = AROUND * max(np.ptp(detection.keypoints, axis=0).max() for detection in detections)
     limits = np.array(image.shape[1::-1])

@@ -74,7 +74,7 @@ class Viewer:
             raise UserError("--show without a display", "a desktop session", fix)
 
     def begin(self, source: FrameSource) -> None:
-        """Continue with another source on the same timeline."""
+        """Do nothing: the frames of another source continue on the same timeline."""
 
     def write(self, result: PoseResult) -> None:
         """Add a frame: its image, outlines, belief maps and poses."""
@@ -128,14 +128,14 @@ class Viewer:
         self.close()
 
     def _distance(self, result: PoseResult) -> float:
-        """Return the distance of the farthest part, or of a part that fills the image, metres."""
+        """Return the depth of the farthest part, or of a part that fills the image, metres."""
         if result.detections:
             return max(float(detection.T_cam_obj[2, 3]) for detection in result.detections)
         largest = max(part.diameter for part in self._parts.values())
         return float(largest * result.K[0, 0] / min(result.image.shape[:2]))
 
     def _open(self, distance: float) -> None:
-        """Open the file or window, with a view over the camera's shoulder."""
+        """Open the file or window, with a 3D view from behind the camera."""
         import rerun as rr
 
         blueprint = _blueprint(distance)

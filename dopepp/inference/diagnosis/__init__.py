@@ -81,7 +81,7 @@ TUNE: Final = (
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Result of a check."""
+    """Result of a check: an observation and its remedy."""
 
     subject: str  # part, exposure, sharpness, camera, size, visibility, elsewhere or pose
     sentence: str  # observation
@@ -212,7 +212,7 @@ def visibility(case: Case) -> Diagnosis:
 
 
 def elsewhere(case: Case) -> Diagnosis:
-    """Check for detections away from the parts that the user has pointed out."""
+    """Check for detections away from the part centres that the user specified."""
     if case.centres is None:
         return Diagnosis(
             "elsewhere", "not checked, because neither --at nor --empty states where the parts are"
@@ -264,14 +264,14 @@ CHECKS: Final[Sequence[Check]] = (
     elsewhere,
     pose,
 )
-"""Checks, in the order of causes."""
+"""Checks; faults that a check finds may also explain the failures of later checks."""
 
 EMPTY_CHECKS: Final[Sequence[Check]] = (part_size, elsewhere)
 """Checks of an image that shows none of the parts, so that every detection is a false positive."""
 
 
 def diagnose(case: Case) -> list[Diagnosis]:
-    """Return the result of every check, in the order of causes."""
+    """Return the results of :data:`CHECKS`; of :data:`EMPTY_CHECKS` if ``centres`` is empty."""
     is_empty = case.centres is not None and not case.centres
     return [check(case) for check in (EMPTY_CHECKS if is_empty else CHECKS)]
 
@@ -299,7 +299,7 @@ def _near(ratio: float, factor: float) -> bool:
 
 
 def _unit_fix(ratio: float) -> str:
-    """Return the fix for a mesh that is too large by a ratio, e.g. the ratio of two units."""
+    """Return the remedy for a mesh that is too large by a ratio, e.g. the ratio of two units."""
     for read, metres in UNITS.items():
         for actual, actual_metres in UNITS.items():
             if read != actual and _near(ratio * actual_metres / metres, SAME):

@@ -38,7 +38,7 @@ WHITE: Final = 250  # a pixel is clipped if all its channels reach this level
 
 
 class Case:
-    """An image with its camera and estimator, and the detections that checks need.
+    """An image to diagnose, with its camera and estimator, and the detections that checks use.
 
     Args:
         estimator: Estimator to diagnose.
@@ -72,12 +72,12 @@ class Case:
 
     @property
     def expected(self) -> Detection | None:
-        """Best detection at the expected distances."""
+        """Best detection at the expected distances, or None."""
         return self.reported[0] if self.reported else None
 
     @cached_property
     def unexpected(self) -> list[Detection]:
-        """Detections farther than half a part length (pixels) from every given centre."""
+        """Detections centred more than half a part length (pixels) from every given centre."""
         return [
             detection
             for detection in self.reported
@@ -108,12 +108,12 @@ class Case:
 
     @property
     def detection(self) -> Detection | None:
-        """Best detection at any distance."""
+        """Best detection at the expected distances, or else outside them."""
         return self.expected or self.outside_range
 
     @cached_property
     def part(self) -> Part:
-        """Detected part, or the checkpoint's first."""
+        """Part of the best detection, or else the estimator's first part."""
         parts = {part.name: part for part in self.estimator.parts}
         return parts[self.detection.object] if self.detection else self.estimator.parts[0]
 
@@ -143,7 +143,7 @@ class Case:
 
     @cached_property
     def refined(self) -> Detection | None:
-        """Detection with the agreement of its outline; None without a mesh or detection."""
+        """Best detection with the agreement of its outline; None without a mesh or detection."""
         if self.detection is None or any(part.mesh is None for part in self.parts):
             return None
         if self.estimator.refiner is not None:
@@ -185,7 +185,7 @@ class Case:
 
 
 def num_keypoints(detection: Detection) -> int:
-    """Return the number of keypoints that have a peak."""
+    """Return the number of a detection's keypoints that have a measured peak."""
     return int(np.isfinite(detection.peaks[:, 0]).sum())
 
 
@@ -208,19 +208,19 @@ def edge_width(image: RGBImage) -> float | None:
 
 
 def highlights(image: RGBImage) -> float:
-    """Return the 99th percentile of the grey levels."""
+    """Return the 99th percentile of the image's grey levels (0 to 255)."""
     return float(np.percentile(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), 99))
 
 
 def clipped_share(image: RGBImage) -> float:
-    """Return the share of clipped pixels."""
+    """Return the share of pixels whose channels are all at least ``WHITE``."""
     return float((image.min(axis=2) >= WHITE).mean())
 
 
 def _gradient(
     grey: Float32[np.ndarray, "height width"], sigma_px: float
 ) -> Float32[np.ndarray, "height width"]:
-    """Return the gradient of the blurred image, grey levels per pixel."""
+    """Return the gradient's magnitude in the blurred image, grey levels per pixel."""
     soft = cv2.GaussianBlur(grey, (0, 0), sigma_px)
     # Scharr's filter weighs 16 on each side, two pixels apart.
     x, y = (cv2.Scharr(soft, cv2.CV_32F, *axis, scale=1 / 32) for axis in ((1, 0), (0, 1)))

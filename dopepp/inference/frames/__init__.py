@@ -77,7 +77,7 @@ def _resolve(sources: Iterable[SourceLike]) -> Iterator[SourceLike]:
 
 
 def _expand(pattern: str) -> list[Path]:
-    """Return the paths that match a glob pattern.
+    """Return the paths that match a glob pattern, in natural order.
 
     Raises:
         UserError: No file matches.

@@ -49,7 +49,7 @@ logger = logging.getLogger(__name__)
 
 
 class Images(FrameSource):
-    """Image files, in the given order."""
+    """Frame source of image files, in the order of ``paths``."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self._paths = paths
@@ -97,7 +97,7 @@ def sort_paths(paths: Iterable[Path]) -> list[Path]:
 
 
 class Video(FrameSource):
-    """A video file.
+    """Frame source of a video file.
 
     Raises:
         UserError: The file is missing, empty or no video, or its frames are too large.
@@ -160,14 +160,13 @@ def _check_container(path: Path) -> None:
 
 
 def _unreadable(path: Path, reason: str) -> UserError:
-    """Return the error for a video that cannot be read."""
     allowed = f"a video that FFmpeg can read, up to {MAX_PIXELS / 1e6:.0f} megapixels a frame"
     fix = f"copy it again, or convert it: ffmpeg -i {path.name} video.mp4"
     return UserError(f"video {path}: {reason}", allowed, fix)
 
 
 class Live(FrameSource):
-    """A camera or a network stream.
+    """Frame source of a camera or a network stream.
 
     Args:
         address: Camera number, device path, or URL of a stream.
@@ -248,7 +247,7 @@ class _NewestFrame:
         self._stopped.set()
 
     def _read(self) -> None:
-        """Read images in a thread, of which only the newest is kept."""
+        """Read images until :meth:`stop`, and keep the newest; runs in the thread."""
         number = 0
         while not self._stopped.is_set():
             delivered, image = False, None
@@ -281,7 +280,7 @@ def is_url(text: str) -> bool:
 
 
 def _open_live(address: int | str) -> cv2.VideoCapture:
-    """Open a camera or a stream; streams have timeouts."""
+    """Open a camera or a stream, with timeouts for a stream."""
     if isinstance(address, int) or not is_url(address):
         return _open_capture(address)
     timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, int(1000 * FIRST_S)]
@@ -306,7 +305,7 @@ def _as_rgb(image: UInt8[np.ndarray, "height width *channels"]) -> RGBImage:
 
 
 def _plausible_rate(rate: float) -> float:
-    """Return the frames per second of a header, or the usual rate if they are impossible."""
+    """Return a header's frames per second, or the usual rate outside (0, ``HIGHEST_RATE``]."""
     return rate if 0 < rate <= HIGHEST_RATE else USUAL_RATE
 
 

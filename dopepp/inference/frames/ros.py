@@ -52,7 +52,7 @@ ENCODINGS: Final[dict[str, tuple[int, int | None]]] = {
 
 
 def decode_image(message: Any) -> RGBImage:
-    """Return the RGB image of a message.
+    """Return the RGB image of an ``Image`` or ``CompressedImage`` message.
 
     Raises:
         ValueError: The encoding is not supported, or the image's size is inconsistent or too large.
@@ -75,7 +75,7 @@ def decode_image(message: Any) -> RGBImage:
 
 
 def is_rectified(topic: str) -> bool:
-    """Return whether a topic's images are undistorted; their K is then the left 3×3 part of P."""
+    """Return whether a topic's name states undistorted images, whose K is the left part of P."""
     return topic.removesuffix("/compressed").rpartition("/")[2].startswith("image_rect")
 
 
@@ -194,7 +194,7 @@ class Bag(FrameSource):
         return None
 
     def messages(self) -> Iterator[tuple[float, Any, Any | None]]:
-        """Yield time, image message and latest ``camera_info`` message of each image.
+        """Yield time (seconds since 1970), image message and latest ``camera_info`` of each image.
 
         Images before the first ``camera_info`` message are paired with that message. The third
         value is None if the recording has no ``camera_info``.
@@ -208,7 +208,7 @@ class Bag(FrameSource):
                 yield seconds, message, info
 
     def _messages(self, topics: Sequence[str], *kinds: str) -> Iterator[tuple[float, Any]]:
-        """Yield the time (seconds since 1970) and the content of messages."""
+        """Yield time (seconds since 1970) and content of the messages of these topics and types."""
         from rosbags.typesys import Stores, get_typestore
 
         is_ros1 = self._path.suffix == ".bag"
@@ -256,7 +256,6 @@ class Bag(FrameSource):
         raise UserError(f"{self._path} {problem}", allowed, fix)
 
     def _unreadable(self, reason: str) -> UserError:
-        """Return the error for a recording that cannot be read."""
         allowed = f"a ROS recording ({', '.join(BAGS)}, or a folder with metadata.yaml)"
         return UserError(f"{self._path}: {reason:.300}", allowed, "copy it again, or record again")
 

@@ -17,7 +17,7 @@ from dopepp.inference.network_input import Depth32, read_depth_image, undistort_
 
 @dataclass(frozen=True, eq=False)
 class CameraFrame:
-    """One frame of a source."""
+    """One image of a frame source, with its name, number and time."""
 
     image: RGBImage  # RGB, with the lens distortion of the camera
     name: str  # image file, or name of a source of many frames
@@ -69,7 +69,7 @@ class Lens:
         return camera.undistorted(image), camera.K
 
     def read_depth(self, path: Path, scale: float, K: CameraMatrix) -> Depth32:
-        """Read a depth image in metres and remove the lens distortion."""
+        """Read a depth image of ``scale`` metres per unit in metres; remove the lens distortion."""
         metres, coefficients = read_depth_image(path, scale), self.camera.coefficients
         return metres if coefficients is None else undistort_depth(metres, K, coefficients)
 
@@ -90,10 +90,10 @@ def given_camera(K: CameraMatrix | None, camera: Camera | Path | str | None) -> 
 def choose_camera(
     K: CameraMatrix | None, camera: Camera | Path | str | None, source: FrameSource
 ) -> Camera:
-    """Return the camera that the user specified, or else the source's own.
+    """Return the camera that the user specified, or else the camera that the source describes.
 
     Raises:
-        UserError: As for :func:`given_camera`, or neither has a camera.
+        UserError: As for :func:`given_camera`, or neither user nor source specifies a camera.
     """
     chosen = given_camera(K, camera) or source.camera
     if chosen is None:

@@ -50,12 +50,12 @@ class Crop:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height."""
+        """Width and height, pixels."""
         return self.colours.shape[1], self.colours.shape[0]
 
     @cached_property
     def bins(self) -> Int[np.ndarray, "height width"]:
-        """Colour bins, computed on first use, as a refinement round may be skipped."""
+        """Colour bin of each pixel, computed on first use, as a refinement round may be skipped."""
         return colour_bins(self.colours)
 
 
@@ -101,7 +101,7 @@ def crop_around(
 
 
 def colour_bins(image: RGBImage) -> Int[np.ndarray, "height width"]:
-    """Return each pixel's colour bin, below 4096."""
+    """Return each pixel's colour bin (four bits per channel, below 4096)."""
     bins = np.empty(image.shape[:2], np.int16)
     _bins(image, bins)
     return bins
@@ -124,7 +124,7 @@ def log_odds(
         tiles: Tiles along each side of the part's box.
 
     Returns:
-        None if part or surroundings have too few pixels on the image.
+        Log odds in [-3, 3]; None if part or surroundings have too few pixels on the image.
     """
     thinned = math.ceil(max(mask.shape) / LONGEST_PX)
     reduced_mask, unsure, ring = mask[::thinned, ::thinned], unsure / thinned, ring / thinned
@@ -158,7 +158,7 @@ def log_odds(
 
 
 def _tile_of(length: int, start: int, extent: int, tiles: int) -> Int[np.ndarray, "length"]:
-    """Return the tile of each pixel along a side; pixels outside the box belong to its ends."""
+    """Return each pixel's tile along an image side; outer tiles extend beyond the part's box."""
     return np.clip((np.arange(length) - start) * tiles // max(extent, 1), 0, tiles - 1)
 
 

@@ -62,7 +62,7 @@ class PosedImage:
         return np.asarray(self.T_cam_world @ T_world_obj)
 
     def error_at(self, position: Vector) -> PoseMatrix:
-        """Return the covariance of a part's pose due to the camera's error.
+        """Return the covariance of a part's pose due to the camera's error, in camera axes.
 
         ``position`` is the object's origin in the camera frame, metres.
         """
@@ -74,13 +74,13 @@ class PosedImage:
     def to_world(
         self, T_cam_obj: Transform, covariance: PoseMatrix
     ) -> tuple[Transform, PoseMatrix]:
-        """Return pose and covariance in the world, with the error of the camera's pose."""
+        """Convert pose and covariance to the world; add the error of the camera's pose."""
         R = self.T_cam_world[:3, :3]
         T_world_obj = np.linalg.inv(self.T_cam_world) @ T_cam_obj
         return T_world_obj, rotate_covariance(R.T, covariance + self.error_at(T_cam_obj[:3, 3]))
 
     def to_camera(self, T_world_obj: Transform, covariance: PoseMatrix) -> Prior:
-        """Return the distribution of a pose in the camera, with the error of the camera's pose."""
+        """Convert pose and covariance to the camera frame; add the error of the camera's pose."""
         T_cam_obj = self.pose(T_world_obj)
         error = self.error_at(T_cam_obj[:3, 3])
         both = rotate_covariance(self.T_cam_world[:3, :3], covariance) + error
@@ -88,7 +88,7 @@ class PosedImage:
 
 
 def rotate_covariance(R: RotationMatrix, matrix: PoseMatrix) -> PoseMatrix:
-    """Rotate the axes of a covariance or information by R."""
+    """Rotate the axes of a pose's covariance or information by R."""
     R_step = _step_rotation(R)
     return np.asarray(R_step @ matrix @ R_step.T)
 
@@ -102,7 +102,7 @@ def _step_rotation(R: RotationMatrix) -> PoseMatrix:
 
 @dataclass(frozen=True, eq=False)
 class ViewTerm:
-    """A term of one view, as a term of the pose in the world."""
+    """Solver term of one view, for the pose in the world."""
 
     term: Term
     view: PosedImage
@@ -143,7 +143,7 @@ def refine_views(
     prior: Prior,
     surface: SurfacePoints | None = None,
 ) -> JointRefinement:
-    """Refine a pose on all views that show its outline.
+    """Refine a pose in the world on all views that show the part's outline.
 
     Args:
         region: Refiner of the part.
@@ -189,7 +189,7 @@ def refine_views(
 
 
 class _ViewSearch:
-    """The rounds of one view.
+    """Rounds of refinement on one view, with the term of its depth image.
 
     Raises:
         UndecidedError: Too little of the outline is on the image.
@@ -221,11 +221,11 @@ class _ViewSearch:
         self._depth = [evidence.term(evidence.visible(self._start.T_cam_obj))]
 
     def round(self, left: int) -> Round:
-        """Return the round that is followed by ``left - 1`` others."""
+        """Return the round that ``left - 1`` rounds follow, or the first of fewer rounds."""
         return self.rounds[max(0, len(self.rounds) - left)]
 
     def learn(self, T_world_obj: Transform, left: int) -> bool:
-        """Learn the colours at a pose; return False if too little is visible."""
+        """Learn part and background colours at a pose; return False if too little is visible."""
         stage, pose = self.round(left), self._view.pose(T_world_obj)
         try:
             stage.learn(pose, self._reach)
@@ -234,12 +234,12 @@ class _ViewSearch:
         return stage.contour(pose) is not None
 
     def terms(self, left: int) -> list[Term]:
-        """Return the terms of a round, in the world."""
+        """Return the depth and outline terms of a round, for the pose in the world."""
         terms = [*self._depth, self.round(left).term(self._reach)]
         return [ViewTerm(term, self._view) for term in terms]
 
     def agreement(self, T_world_obj: Transform) -> OutlineAgreement | None:
-        """Return the agreement of the outline with the view."""
+        """Return the outline's agreement with the image, or None if too little of it is visible."""
         try:
             return self.rounds[-1].agreement(self._view.pose(T_world_obj), self._reach)
         except UndecidedError:
@@ -247,12 +247,12 @@ class _ViewSearch:
 
 
 def _disagreements(end: Solution, prior: Prior, owners: Sequence[int]) -> dict[int, float]:
-    """Return the Mahalanobis distance of each view from the other views and the prior.
+    """Return each view's Mahalanobis distance per √degree of freedom from other views and prior.
 
     Args:
         end: Pose with the equations of each term.
         prior: Prior of the descent.
-        owners: View of each term.
+        owners: Index of the view of each term.
     """
     distances: dict[int, float] = {}
     gradient = prior.information @ prior.offset(end.T_cam_obj)

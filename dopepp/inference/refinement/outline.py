@@ -95,7 +95,7 @@ def make_outline_mesh(vertices: Vertices, faces: Faces) -> OutlineMesh:
 
 @dataclass(frozen=True, eq=False)
 class PosedMesh:
-    """A mesh at a pose."""
+    """Projection of a mesh at a pose."""
 
     T_cam_obj: Transform
     arms: Float[np.ndarray, "vertices 3"]  # vertices from the object's origin, camera axes, metres
@@ -146,7 +146,7 @@ def find_contour(
     """Return the points of an outline that are on the image.
 
     Args:
-        mesh: Mesh.
+        mesh: Mesh of the part.
         posed_mesh: Mesh at its pose.
         mask: Filled mask of the posed mesh.
         spacing: Approximate distance between points, pixels.
@@ -161,7 +161,7 @@ def find_contour(
 def outline_rows(
     contour: Contour, T_cam_obj: Transform, K: CameraMatrix
 ) -> Float[np.ndarray, "points 6"]:
-    """Return the derivative of each point's motion along its normal (pixels) by the pose."""
+    """Return each point's motion along its normal, pixels per rotation (rad) and shift (m)."""
     rows = np.empty((len(contour), 6))
     _rows(contour.arms, contour.normals, T_cam_obj, K, rows)
     return rows
@@ -259,7 +259,7 @@ def _wind(
 
 @compiled()
 def _cross_rows(pixels: Array, i: int, j: int, winding: Array) -> None:
-    """Add an edge to the winding number's changes in the rows that it crosses."""
+    """Add the edge from vertex i to j to the winding number's changes in the rows it crosses."""
     height, width = winding.shape[0], winding.shape[1] - 1
     way = 1
     if pixels[i, 1] > pixels[j, 1]:

@@ -118,7 +118,7 @@ class DepthView:
 
 
 def view_around(depth: Depth, K: CameraMatrix, points_cam: Points) -> DepthView | None:
-    """Crop a depth image around a part; None if the part is outside the image."""
+    """Crop a depth image around a part's points (metres); None if they are outside the image."""
     u, v = (points_cam[:, :2] / points_cam[:, 2:] * K.diagonal()[:2] + K[:2, 2]).T
     margin = MARGIN * max(np.ptp(u), np.ptp(v))
     left, right = max(0, math.floor(u.min() - margin)), math.ceil(u.max() + margin) + 1
@@ -139,7 +139,7 @@ def view_around(depth: Depth, K: CameraMatrix, points_cam: Points) -> DepthView 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceOverlay:
-    """A posed part's visible points, compared with a depth view."""
+    """Comparison of a posed part's visible points with a depth view."""
 
     points: Points  # points within the view, camera frame, metres
     normals: Points  # unit normals of either sign
@@ -151,7 +151,7 @@ class SurfaceOverlay:
 
     @property
     def covered(self) -> Mask:
-        """Pixels of the part with a measured depth."""
+        """Mask of the pixels that the part covers and that have a measured depth."""
         return np.asarray((self.distance <= COVERED) & np.isfinite(self.offset))
 
     @property
@@ -215,7 +215,7 @@ def overlay_surface(
 
 
 def nearest_zero(mask: Array) -> tuple[Array, Array]:
-    """Return the distance of every pixel to the nearest zero of a mask, and that zero's label."""
+    """Return each pixel's distance (pixels) to the nearest zero of a mask, and the zero's label."""
     distance, labels = cv2.distanceTransformWithLabels(
         mask, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -289,12 +289,12 @@ def _offsets(
 
     Args:
         depth: Measured depth, metres; 0 where unknown.
-        rays: Ray (x/z, y/z) of each pixel.
-        distance: Distance of each pixel from the part's nearest visible point, pixels.
+        rays: Ray (x/z, y/z, 1) of each pixel.
+        distance: Distance of each pixel from the part's nearest visible point, spacings.
         nearest: Index of this point.
         points: Points of the posed part, camera frame, metres.
         normals: Normals of the points, camera frame.
-        farthest: Pixels farther from their nearest point get NaN.
+        farthest: Distance from the nearest point beyond which a pixel gets NaN, spacings.
         limit: Largest difference between the depths of plane and point, metres.
         offset: Filled with the differences; NaN where unknown.
     """

@@ -77,7 +77,7 @@ Refine = str | Sequence[str]  # name or names in TERMS
 
 
 def refine_terms(refine: Refine | None) -> tuple[str, ...]:
-    """Return the names in ``refine``; none without a refinement."""
+    """Return the term names in ``refine`` as a tuple, empty for None."""
     return (refine,) if isinstance(refine, str) else tuple(refine or ())
 
 
@@ -169,7 +169,7 @@ class PartRefiner:
 
     Args:
         part: Part.
-        terms: Evidence, some of :data:`TERMS`.
+        terms: Measurement terms, some of :data:`TERMS`.
         scale_error: See :class:`Refiner`.
 
     Raises:
@@ -236,7 +236,7 @@ class PartRefiner:
             starts: Further start poses; see :meth:`RegionRefiner.refine`.
 
         Returns:
-            The refined pose and its covariance, or the given pose and the reason why it was kept.
+            The refined pose and its covariance, or the start pose and the reason why it was kept.
         """
         given = np.asarray(T_cam_obj, np.float64)
         by_image = None
@@ -259,7 +259,7 @@ class PartRefiner:
 
 
 def _checked(evidence: DepthEvidence, end: Solution) -> Refinement:
-    """Return the result of a descent on depth alone, if the depth image confirms the pose."""
+    """Return the result of a descent on depth alone; raise UndecidedError if depth refutes it."""
     evidence.check(end.T_cam_obj)
     return Refinement(end.T_cam_obj, np.linalg.inv(end.information))
 
@@ -308,7 +308,7 @@ def _refine_with_both(
 def poses_of_four(
     cuboid: Cuboid, peaks: Float[np.ndarray, "9 2"], K: CameraMatrix
 ) -> list[Transform]:
-    """Solve for the pose from each of several sets of four keypoints; deterministic.
+    """Solve for a pose from each of up to ``NUM_QUADRUPLES`` sets of four keypoints; deterministic.
 
     An occluder or a similar object displaces several keypoints together, which their covariances do
     not show. Sets without these keypoints give the correct pose.
@@ -357,7 +357,7 @@ def warm_up_refinement() -> None:
 
 
 def _box() -> tuple[Points, CameraMatrix, Transform, Float[np.ndarray, "8 2"]]:
-    """Return the corners of a box, a camera, the box's pose and the corners' pixels."""
+    """Return a box's corners (object frame), K, its pose and the corners' pixels."""
     corners = 0.06 * (np.array(list(np.ndindex(2, 2, 2))) - 0.5)
     rotation = rotation_vector_to_matrix(np.array([0.5, 0.4, 0.3]))
     K, T = camera_matrix(120, 120, 63.5, 63.5), make_transform(rotation, np.array([0.0, 0.0, 0.2]))

@@ -1,6 +1,6 @@
 """Solver of a pose: Gauss–Newton steps on a prior and several measurement terms.
 
-To add a kind of evidence, write a :class:`Term`.
+To add a kind of measurement, write a :class:`Term`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from dopepp.geometry.camera import Transform, move_pose, step_between
 from dopepp.geometry.refine import solve_damped
 
 PoseMatrix = Float[np.ndarray, "6 6"]
-"""Covariance or information of a rotation vector about the object's origin and a shift."""
+"""Covariance or information (inverse covariance) of a rotation vector about the object's origin
+(radians) and a shift (metres)."""
 
 NormalEquations = tuple[PoseMatrix, Float[np.ndarray, "6"]]
 """H and g of H ξ = g, where ξ is rotation vector (radians) and shift (metres), in camera axes."""
@@ -71,7 +72,7 @@ class Prior:
     information: PoseMatrix  # inverse of the covariance
 
     def offset(self, T_cam_obj: Transform) -> Float[np.ndarray, "6"]:
-        """Return the step from a pose to the mean."""
+        """Return the step (rotation vector, shift) from a pose to the mean."""
         return step_between(T_cam_obj, self.T_cam_obj)
 
     def squared_distance(self, T_cam_obj: Transform) -> float:
@@ -94,12 +95,12 @@ class Prior:
 def make_prior(
     T_cam_obj: Transform, diameter: float, covariance: PoseMatrix | None = None
 ) -> Prior:
-    """Return the prior of a pose.
+    """Return the distribution of a pose before refinement: its covariance plus a lower bound.
 
     Args:
         T_cam_obj: Mean.
         diameter: Diameter of the part, metres.
-        covariance: Covariance; a broad one is assumed without a finite one.
+        covariance: Covariance; if it is None or not finite, a broad covariance is assumed.
 
     Raises:
         UndecidedError: The pose is not finite.

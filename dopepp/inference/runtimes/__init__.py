@@ -100,7 +100,7 @@ class ExportedNetwork(ABC):
 
     @abstractmethod
     def run(self, pixels: Pixels) -> Arrays:
-        """Return the outputs of the graph."""
+        """Return the belief maps and vector fields of images."""
 
     def maps(self, images: Images) -> Stage:
         """Return the belief maps, after the activation, and the vector field of images.
@@ -155,7 +155,7 @@ def move_to_device(network: Runtime, device: torch.device) -> Runtime:
 
 
 def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
-    """Read a file of an export.
+    """Read an exported file of at most ``max_bytes``.
 
     Raises:
         UserError: The file is missing, unreadable or too large.
@@ -200,7 +200,7 @@ def invalid_export(path: Path, problem: object, allowed: str = "") -> UserError:
 
 
 def pack(checkpoint: Checkpoint, export: Export) -> str:
-    """Return the description for a file's metadata."""
+    """Return the description of checkpoint and export as JSON, for a file's metadata."""
     return payload_json(describe_export(checkpoint, export)[KEY])
 
 
@@ -212,7 +212,7 @@ def describe_export(checkpoint: Checkpoint, export: Export) -> dict[str, Any]:
 
 
 def unpack(text: str | None, path: Path) -> tuple[Checkpoint, Export]:
-    """Read the description in a file's metadata without building anything.
+    """Read the description in a file's metadata, without building the network.
 
     Args:
         text: Description, not trusted; None if the file has none.

@@ -98,7 +98,7 @@ class OnnxNetwork(ExportedNetwork):
             raise invalid_export(path, error) from error
 
     def run(self, pixels: Pixels) -> Arrays:
-        """Return the outputs of the graph."""
+        """Return the belief maps and vector fields of images."""
         belief, field = self.session.run(OUTPUTS, {INPUT: pixels})
         return belief, field
 
@@ -154,7 +154,7 @@ def _tensors(graph: onnx.GraphProto) -> Iterator[onnx.TensorProto]:
 def _shapes(
     model: onnx.ModelProto, path: Path, pixels: tuple[int, ...]
 ) -> dict[str, list[int] | None]:
-    """Infer the shape of every tensor for an input of shape ``pixels``; None: unknown.
+    """Infer every tensor's shape, by name, for an input of shape ``pixels``; None if unknown.
 
     The integers from which operators compute shapes are evaluated as well.
     """
@@ -194,7 +194,7 @@ def _shape(kind: onnx.TypeProto) -> list[int] | None:
 def _evaluate(
     node: onnx.NodeProto, types: Mapping[str, Any], values: Mapping[str, onnx.TensorProto]
 ) -> dict[str, onnx.TensorProto]:
-    """Return the outputs of a node that computes a shape from known values."""
+    """Return a node's output by name if it computes a shape from known values, else nothing."""
     from onnx import numpy_helper
     from onnx.reference import ReferenceEvaluator
 

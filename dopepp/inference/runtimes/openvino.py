@@ -93,7 +93,7 @@ class OpenVinoNetwork(ExportedNetwork):
         self.request = compile_model(model).create_infer_request()
 
     def run(self, pixels: Pixels) -> Arrays:
-        """Return the outputs of the graph."""
+        """Return the belief maps and vector fields of images."""
         self.request.infer([pixels])
         belief, field = (self.request.get_output_tensor(number).data.copy() for number in range(2))
         return belief, field
@@ -116,7 +116,7 @@ def compile_model(model: Any) -> Any:
 
 
 def _shapes(model: Any) -> dict[str, list[int] | None]:
-    """Return the shape of every tensor of a model; None if unknown."""
+    """Return the shape of every tensor of a model, by name; None if unknown."""
     return {
         f"{node.get_friendly_name()}.{number}": None
         if output.get_partial_shape().is_dynamic
@@ -127,7 +127,7 @@ def _shapes(model: Any) -> dict[str, list[int] | None]:
 
 
 def _check_xml(content: bytes, num_weights: int, path: Path) -> str | None:
-    """Check that an XML is one plain graph, and return its description."""
+    """Check that an XML is one plain graph with constants in the weights; return its metadata."""
     if b"<!" in content:
         problem = "an XML file with declarations or comments"
         raise invalid_export(path, problem, "an XML file of layers and edges only")

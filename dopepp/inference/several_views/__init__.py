@@ -5,7 +5,7 @@
    (:mod:`~dopepp.inference.several_views.observations`).
 3. The pose of each part is refined on all views together and verified in each view
    (:mod:`~dopepp.inference.several_views.joint`).
-4. Of several parts with the same pose, the most probable remains.
+4. Of several parts with the same name and pose, the part with the best score remains.
 5. Contradictions between views are reported
    (:mod:`~dopepp.inference.several_views.contradictions`).
 """
@@ -96,7 +96,7 @@ def _posed_images(
     camera_error: tuple[float, float],
     names: Sequence[str],
 ) -> list[PosedImage]:
-    """Check the arguments of all views and remove the lens distortion."""
+    """Check the arguments of all views, and return the images without lens distortion."""
     count = len(images)
     lengths = {"cameras": cameras, "T_world_cam": T_world_cam, "depths": depths, "names": names}
     for name, values in lengths.items():
@@ -128,7 +128,7 @@ def _posed_images(
 def _search(
     estimator: PoseEstimator, views: Sequence[PosedImage], distances: Distances | None
 ) -> tuple[list[list[PartObservation]], list[dict[str, float]]]:
-    """Search each view alone; return its observations and the milliseconds of each step."""
+    """Detect parts in each view alone; return observations and milliseconds per step by view."""
     observations, speeds = [], []
     for number, view in enumerate(views):
         before = dict(estimator.spent_ms)

@@ -27,8 +27,8 @@ from dopepp.inference.several_views.observations import (
 from dopepp.inference.several_views.views_result import WorldDetection
 
 DISAGREEING: Final = 1.2
-"""Disagreement of views on a part from which it is reported. With exact camera poses, the largest
-of 30 disagreements on rendered scenes was 0.9."""
+"""Smallest reported disagreement of views on a part (:class:`WorldDetection`). With exact camera
+poses, the largest of 30 disagreements on rendered scenes was 0.9."""
 
 Views = Sequence[Sequence[PartObservation]]  # observations of each view
 Associate = Callable[[Views], list[list[PartObservation]]]
@@ -42,7 +42,7 @@ class _Conflict(NamedTuple):
     is_mutual: bool  # whether both views show something else at the other's pose
 
     def describe(self, names: Sequence[str]) -> str:
-        """Return the views, the part and the difference of its poses."""
+        """Return the views, the part and the difference of its poses (mm and degrees) in words."""
         first, second = (detection.T_world_obj for detection in self.detections)
         shift = 1e3 * np.linalg.norm(first[:3, 3] - second[:3, 3])
         angle = math.degrees(float(rotation_angle(first[:3, :3] @ second[:3, :3].T)))
@@ -109,12 +109,12 @@ def contradictions(
 
 
 def _support(detection: WorldDetection) -> list[int]:
-    """Return the numbers of the views that support a detection."""
+    """Return the indices of the views that support a detection."""
     return [n for n, item in enumerate(detection.evidence) if item.status == "supports"]
 
 
 def _conflict(first: WorldDetection, second: WorldDetection) -> _Conflict | None:
-    """Return the conflict between two detections, or None if there is none."""
+    """Return the conflict between two detections, preferably a mutual conflict, or None."""
     if first.object != second.object or separation(first.pose, second.pose) <= CONSISTENT:
         return None
     conflicts = []
@@ -129,7 +129,7 @@ def _conflict(first: WorldDetection, second: WorldDetection) -> _Conflict | None
 def _swapped(
     observations: Views, images: Sequence[PosedImage], associated: Associate
 ) -> tuple[int, int] | None:
-    """Return the two views whose camera poses are swapped; None if no swap improves agreement."""
+    """Return the two views whose swap associates the most observations; None if no swap helps."""
 
     def agreeing(order: Sequence[int]) -> int:
         views = [

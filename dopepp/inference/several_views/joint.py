@@ -52,14 +52,14 @@ USUAL_MOVE: Final = 1.0
 
 @dataclass(frozen=True, eq=False)
 class JointPart:
-    """A part in the world, with the observations that belong to it."""
+    """A part detected in the world, with the observations in single views that belong to it."""
 
     observations: Sequence[PartObservation]
     detection: WorldDetection
 
 
 class JointEstimator:
-    """Estimates the joint poses of parts.
+    """Estimates poses of parts in the world from all views together.
 
     Args:
         refiner: Refines and verifies poses on the image.
@@ -81,7 +81,7 @@ class JointEstimator:
         self._geometries, self._slope = geometries, slope
 
     def parts(self, clusters: Sequence[Sequence[PartObservation]]) -> list[JointPart]:
-        """Estimate the parts of all clusters, without duplicates, best score first.
+        """Estimate a part from each cluster of observations, without duplicates, best score first.
 
         An observation that does not agree with the joint pose of its cluster forms another cluster.
         """
@@ -171,7 +171,7 @@ class JointEstimator:
         observations: Sequence[PartObservation],
         agreement: OutlineAgreement | None,
     ) -> ViewEvidence:
-        """Return whether a view shows the part at a pose in the world."""
+        """Return the visibility and probability in one view of a part at a pose in the world."""
         view = self._views[number]
         observation = next((item for item in observations if item.view == number), None)
         distribution = view.to_camera(pose.T_cam_obj, np.linalg.inv(pose.information))

@@ -118,8 +118,8 @@ def _information(
 ) -> PoseMatrix | None:
     """Return the information about the pose that the outline on an image of this size adds.
 
-    The information is in camera axes, as is ``prior``, the information before the image. None: the
-    image does not show the whole part.
+    ``prior`` is the information before the image. Both are in camera axes. The result is None if
+    the image does not show the whole part.
     """
     posed_mesh = posed(mesh, T_cam_obj, K)
     if posed_mesh is None:

@@ -31,14 +31,14 @@ were fitted to images like the training images, and the joint pose is verified."
 
 @dataclass(frozen=True, eq=False)
 class PartGeometry:
-    """Cuboid and symmetries of a part, for comparing its poses."""
+    """Cuboid and symmetries of a part, to compare poses that are equivalent by symmetry."""
 
     cuboid: Cuboid
     group: Float[np.ndarray, "group 4 4"]  # transforms that map the part onto itself
 
     @classmethod
     def of(cls, part: Part) -> PartGeometry:
-        """Return the geometry of a part."""
+        """Return the geometry of a part, with its sampled continuous symmetries."""
         group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
         return cls(part.cuboid, group)
 
@@ -50,11 +50,11 @@ class PartGeometry:
         return Prior(np.asarray(equal[distances.argmin()]), pose.information)
 
     def separation(self, pose: Prior, other: Prior) -> float:
-        """Return the Mahalanobis distance to the symmetry-equivalent of ``other`` nearest to it."""
+        """Return the Mahalanobis distance of a pose from the nearest equivalent of ``other``."""
         return separation(pose, self.nearest(other, pose.T_cam_obj))
 
     def mean(self, poses: Sequence[Prior]) -> Prior:
-        """Return the mean of several poses, weighted by their information."""
+        """Return the mean, weighted by information, of poses as equivalents near the first pose."""
         first = poses[0].T_cam_obj
         information, gradient = np.zeros((6, 6)), np.zeros(6)
         for pose in poses:
@@ -65,7 +65,7 @@ class PartGeometry:
 
 @dataclass(frozen=True, eq=False)
 class PartObservation:
-    """A detection of one view, expressed in the world."""
+    """Detection in one view, with its poses in the world before and after refinement."""
 
     view: int  # index of the view
     detection: Detection  # detection in the camera
@@ -74,7 +74,7 @@ class PartObservation:
 
 
 def make_observation(view: int, detection: Detection, image: PosedImage) -> PartObservation:
-    """Express a detection in the world."""
+    """Return the observation in the world for a detection in the view with index ``view``."""
     pose = _in_world(image, detection.T_cam_obj, detection.covariance)
     assert detection.start is not None
     start = _in_world(image, *detection.start)
@@ -85,13 +85,13 @@ def make_observation(view: int, detection: Detection, image: PosedImage) -> Part
 
 
 def _in_world(image: PosedImage, T_cam_obj: Transform, covariance: PoseMatrix) -> Prior:
-    """Express a pose and its covariance in the world, with the error of the camera's pose."""
+    """Return a pose in the world; the camera pose's error is added to the covariance."""
     T_world_obj, in_world = image.to_world(T_cam_obj, covariance)
     return Prior(T_world_obj, np.linalg.inv(in_world))
 
 
 def separation(first: Prior, second: Prior) -> float:
-    """Return the Mahalanobis distance between two poses."""
+    """Return the Mahalanobis distance between two poses under the sum of their covariances."""
     both = np.linalg.inv(first.information) + np.linalg.inv(second.information)
     return math.sqrt(Prior(first.T_cam_obj, np.linalg.inv(both)).squared_distance(second.T_cam_obj))
 
@@ -99,7 +99,7 @@ def separation(first: Prior, second: Prior) -> float:
 def associate(
     views: Sequence[Sequence[PartObservation]], geometries: Mapping[str, PartGeometry]
 ) -> list[list[PartObservation]]:
-    """Group the observations that can show the same part.
+    """Group observations by part: same name, and poses within :data:`GATE` of the best detection.
 
     Args:
         views: Observations of each view.

@@ -38,7 +38,7 @@ MAX_COLMAP_BYTES: Final = 64_000_000
 
 @dataclass(frozen=True, eq=False)
 class CameraPose:
-    """The camera of an image."""
+    """Pose and calibration of an image's camera."""
 
     T_world_cam: Transform
     camera: Camera | None  # None if the file names no camera
@@ -46,7 +46,7 @@ class CameraPose:
 
 @dataclass(frozen=True, eq=False)
 class CameraPoses:
-    """The cameras of several images.
+    """Camera poses and calibrations of several images, from a file.
 
     Attributes:
         poses: Camera of each image, by the image's name without folder (BOP: by its number).
@@ -113,7 +113,7 @@ def _error(value: object, path: Path) -> tuple[float, float]:
 
 
 def _bop(path: Path) -> CameraPoses:
-    """Read ``scene_camera.json``; lengths are millimetres."""
+    """Read BOP's ``scene_camera.json``, whose lengths are millimetres."""
     content: Any = read_json(path)
     poses = {}
     for name, record in content.items() if isinstance(content, Mapping) else ():
@@ -132,7 +132,7 @@ def _bop(path: Path) -> CameraPoses:
 
 
 def _colmap(path: Path) -> CameraPoses:
-    """Read ``images.txt``.
+    """Read COLMAP's ``images.txt``, and ``cameras.txt`` next to it.
 
     Each image has two lines: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and its points.
     """

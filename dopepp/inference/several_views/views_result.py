@@ -52,7 +52,7 @@ class WorldDetection:
 
     @property
     def pose(self) -> Prior:
-        """Pose and information in the world."""
+        """Pose in the world, with its information (inverse covariance)."""
         return Prior(self.T_world_obj, np.linalg.inv(self.covariance))
 
     @property
@@ -61,7 +61,7 @@ class WorldDetection:
         return [item.view for item in self.evidence if item.status == "supports"]
 
     def to_record(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
+        """Return the detection as a dictionary for JSON (metres, radians)."""
         return {
             "object": self.object,
             "score": self.score,
@@ -83,7 +83,7 @@ class WorldDetection:
 
 @dataclass(frozen=True, eq=False)
 class ViewsResult:
-    """The parts in a static scene."""
+    """Parts detected in several views of a static scene."""
 
     detections: Sequence[WorldDetection]  # best score first
     findings: Sequence[str]  # contradictions between the views, and how to resolve them
@@ -99,11 +99,11 @@ class ViewsResult:
         return f"{count} part{'s' * (count > 1)}: {shown}" if count else "nothing found"
 
     def records(self) -> list[dict[str, Any]]:
-        """Return each detection as plain values."""
+        """Return each detection as a dictionary for JSON."""
         return [detection.to_record() for detection in self.detections]
 
     def to_json(self) -> str:
-        """Return detections and findings as a line of JSON."""
+        """Return image names, findings and detections as one line of JSON."""
         images = [view.name for view in self.views]
         content = {"images": images, "findings": list(self.findings), "detections": self.records()}
         return json.dumps(content, ensure_ascii=False, allow_nan=False)

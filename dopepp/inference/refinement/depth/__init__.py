@@ -62,7 +62,7 @@ MIN_FOUND: Final = 20  # smallest number of points that agree with their depth
 
 @dataclass(frozen=True)
 class DepthStage:
-    """A stage from coarse to fine; lengths are in diameters unless stated otherwise."""
+    """A stage of the fit to depth; lengths are in diameters of the part unless stated otherwise."""
 
     reach: float  # largest distance from a plane that has a weight
     steps: int = 2  # Gauss–Newton steps
@@ -82,7 +82,7 @@ STAGES: Final = (
 
 
 class DepthEvidence:
-    """A part on a depth image.
+    """Depth image around a part, to which the part's pose is fitted.
 
     Args:
         surface: Surface points of the part.
@@ -115,10 +115,10 @@ class DepthEvidence:
         self._before = self._fit(prior.T_cam_obj, self._given_visible)
 
     def descend(self) -> Solution:
-        """Search and descend, coarse to fine.
+        """Fit the prior's pose to the depth by shifts and Gauss–Newton steps, from coarse to fine.
 
         Raises:
-            UndecidedError: There is too little depth.
+            UndecidedError: Too few points of the part have agreeing depth.
         """
         end, is_visible = (
             Solution(self.prior.T_cam_obj, self.prior.information),
@@ -140,22 +140,22 @@ class DepthEvidence:
         return visible(self._surface, pose)
 
     def information(self, pose: Transform, is_visible: Visible) -> PoseMatrix:
-        """Return the information of the prior and of the depth at a pose."""
+        """Return the information about the pose from the prior and the depth together."""
         prior = self.prior.information
         equations = self.term(is_visible)(pose, (prior, np.zeros(6)))
         return prior if equations is None else np.asarray(prior + equations[0])
 
     def term(self, is_visible: Visible, stage: DepthStage = FINE) -> DepthTerm:
-        """Return the term of the visible points."""
+        """Return the solver term of the depth at the visible points."""
         reach = max(stage.reach * self._diameter, GATE * self._view.noise)
         outline = stage.outline * self._diameter
         return DepthTerm(self._view, self._surface, is_visible, reach, outline)
 
     def check(self, pose: Transform) -> None:
-        """Check whether depth confirms a pose.
+        """Check that depth fits a pose well, and better than the prior's pose.
 
         Raises:
-            UndecidedError: It does not.
+            UndecidedError: It does not, or the pose is more than ``FARTHEST`` from the prior's.
         """
         reason = self._fit(pose, self.visible(pose)).doubt(self._before)
         distance = math.sqrt(self.prior.squared_distance(pose))
@@ -166,7 +166,7 @@ class DepthEvidence:
             raise UndecidedError(reason)
 
     def _fit(self, pose: Transform, is_visible: Visible) -> Fit:
-        """Measure the agreement of a pose with the depth."""
+        """Measure how well the visible points at a pose agree with the depth."""
         view, spacing = self._view, self._surface.spacing
         overlay = overlay_surface(view, self._surface, is_visible, pose)
         if overlay is None:
@@ -210,7 +210,7 @@ class DepthEvidence:
 
 @dataclass(frozen=True)
 class Fit:
-    """Agreement of a pose with depth."""
+    """Agreement of a posed part with a depth image."""
 
     inliers: float  # share of the unobstructed points with depth that agree
     seen: float  # share of the visible points that agree
@@ -219,7 +219,7 @@ class Fit:
 
     @property
     def score(self) -> float:
-        """Score for comparing poses."""
+        """Agreeing share minus the contradicting and uncovered shares; higher is better."""
         return self.seen - (1.0 - self.inliers) - self.uncovered
 
     def doubt(self, before: Fit) -> str:

@@ -38,12 +38,12 @@ INDEPENDENT: Final = 100.0
 ROUGH: Final = 0.25  # standard deviation of a point's plane, spacings
 
 Pulls = tuple[Float[np.ndarray, "points 3"], Float[np.ndarray, "points 2"]]
-"""Points of the part, camera frame, and their desired motion on the image, pixels."""
+"""Points of the part (camera frame, metres) and their desired motion on the image (pixels)."""
 
 
 @dataclass(frozen=True, eq=False)
 class DepthTerm:
-    """Term of the depth at the visible points of a part."""
+    """Solver term of a depth image at the visible points of a part."""
 
     view: DepthView
     surface: SurfacePoints
@@ -67,10 +67,10 @@ class DepthTerm:
 def plane_terms(
     view: DepthView, overlay: SurfaceOverlay, origin: Vector, spacing: float, reach: float
 ) -> NormalEquations:
-    """Return the point-to-plane terms of a posed part; all lengths are metres.
+    """Return normal equations of a posed part's point-to-plane terms; all lengths are metres.
 
     Args:
-        view: Depth.
+        view: Crop of the depth image.
         overlay: Posed part on the depth.
         origin: Object's origin, camera frame.
         spacing: Spacing of the part's points.
@@ -87,7 +87,7 @@ def plane_terms(
 def outline_terms(
     view: DepthView, overlay: SurfaceOverlay, origin: Vector, spacing: float, reach: float
 ) -> NormalEquations:
-    """Return the terms of the outline; see :func:`plane_terms` for the arguments.
+    """Return normal equations of the outline terms; see :func:`plane_terms` for the arguments.
 
     ``spacing`` is also the standard deviation of a point, and ``reach`` the largest difference
     between the outlines that has a weight.
@@ -173,8 +173,8 @@ def _add_planes(
 
     Args:
         depth: Measured depth, metres; 0 where unknown.
-        rays: Ray (x/z, y/z) of each pixel.
-        distance: Distance of each pixel from the part's nearest visible point, pixels.
+        rays: Ray (x/z, y/z, 1) of each pixel.
+        distance: Distance of each pixel from the part's nearest visible point, spacings.
         nearest: Index of this point.
         points: Points of the posed part, camera frame, metres.
         normals: Normals of the points, camera frame.

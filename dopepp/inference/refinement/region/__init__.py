@@ -64,7 +64,7 @@ FAR: Final = 3.0
 """Additional deviations of the extended search, as multiples of the deviations of a pose without
 covariance."""
 
-NUM_DRAWS: Final = 4  # poses that are drawn in the extended search
+NUM_DRAWS: Final = 4  # poses that are sampled from the weaker prior in the extended search
 NUM_STARTS: Final = 4  # most likely starts that are tried besides the given pose
 NUM_CONTINUED: Final = 2  # coarse results that the other stages continue
 
@@ -115,8 +115,8 @@ class RegionRefiner:
         """Refine one pose; see :meth:`~dopepp.inference.refinement.refiner.PartRefiner.refine`.
 
         If the image does not agree with poses near the given pose, the search is extended to the
-        poses that ``starts`` returns and to randomly drawn poses. Without ``starts``, the search is
-        not extended.
+        poses that ``starts`` returns and to randomly sampled poses. Without ``starts``, the search
+        is not extended.
         """
         given = np.asarray(T_cam_obj, np.float64)
         try:
@@ -185,7 +185,7 @@ def refinement(end: Solution, agreement: OutlineAgreement) -> Refinement:
 def _search(
     rounds: Sequence[Round], prior: Prior, wide_prior: Prior, starts: Starts | None
 ) -> Outcome:
-    """Descend from the given pose and, if the result is doubtful, from other start poses.
+    """Descend from the prior's pose and, if this fails or agrees less than ``SURE``, from others.
 
     Args:
         rounds: Rounds of optimisation, from coarse to fine.
@@ -280,7 +280,7 @@ def _coarse_end(coarse: Round, start: Transform, prior: Prior, reach: float) -> 
 
 
 def necessary_rounds(rounds: Sequence[Round], reach: float) -> Sequence[Round]:
-    """Drop the rounds that search farther than necessary; a tracked part needs only the last round.
+    """Drop each coarse round whose next round searches at least ``ENOUGH`` of the search distance.
 
     Args:
         rounds: Rounds of optimisation, from coarse to fine.
@@ -295,7 +295,7 @@ def necessary_rounds(rounds: Sequence[Round], reach: float) -> Sequence[Round]:
 
 
 def _refine(rounds: Sequence[Round], start: Transform, prior: Prior, reach: float) -> Outcome:
-    """Descend in one round after the other, and check the result.
+    """Descend in one round after another, repeat the last until it converges, and check the result.
 
     Args:
         rounds: Rounds of optimisation, from coarse to fine.
@@ -304,7 +304,7 @@ def _refine(rounds: Sequence[Round], start: Transform, prior: Prior, reach: floa
         reach: Search distance, pixels of the image.
 
     Raises:
-        UndecidedError: The result is not accepted.
+        UndecidedError: :meth:`Round.check` rejects the result.
     """
     end, last = _descend(rounds, start, prior, reach), rounds[-1]
     for _ in range(MAX_REPEATS if reach > EDGE_PX else 0):
@@ -317,7 +317,7 @@ def _refine(rounds: Sequence[Round], start: Transform, prior: Prior, reach: floa
 
 
 def has_converged(end: Solution, before: Transform) -> bool:
-    """Return whether a round has moved the pose by less than ``CONVERGED`` deviations."""
+    """Return whether a round moved the pose by less than ``CONVERGED`` standard deviations."""
     return Prior(before, end.information).squared_distance(end.T_cam_obj) < CONVERGED**2
 
 

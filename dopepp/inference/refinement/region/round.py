@@ -1,4 +1,4 @@
-"""One round of refinement on the image: its crop, learned colours, forces and acceptance."""
+"""One round of refinement on the image: its crop, learned colours, outline term and final check."""
 
 from __future__ import annotations
 
@@ -83,14 +83,14 @@ Silhouette = tuple[PosedMesh, UInt8[np.ndarray, "height width"]]  # posed mesh a
 
 
 class Round:
-    """A stage on its crop, with the colours that it has learned.
+    """A stage of refinement on its crop, with the learned colours of part and surroundings.
 
     Args:
         mesh: Mesh of the part.
-        crop: Image in the size of the stage.
+        crop: Image around the part, at the stage's resolution.
         stage: Resolution and search distance.
         weights: Weights of colours and edges.
-        more: Terms in addition to the outline.
+        more: Solver terms in addition to the outline.
         scale_error: Largest relative error of the outline's scale.
     """
 
@@ -112,7 +112,7 @@ class Round:
         self._last: tuple[Transform, Silhouette | None] = np.empty((0, 0)), None
 
     def learn(self, pose: Transform, reach: float) -> None:
-        """Learn the colours at a pose; ``reach`` is the search distance, pixels of the image.
+        """Learn colours in and around the outline; ``reach`` is the search distance, image pixels.
 
         Raises:
             UndecidedError: Too few pixels are visible.
@@ -130,7 +130,7 @@ class Round:
             self._smooth_odds = cv2.blur(odds, (step, step))
 
     def contour(self, pose: Transform) -> Contour | None:
-        """Return the outline; None if too little of it is on the image."""
+        """Return the outline at a pose; None if too little of it is on the image."""
         silhouette = self._silhouette(pose)
         if silhouette is None:
             return None
@@ -138,7 +138,7 @@ class Round:
         return contour if len(contour) >= MIN_POINTS else None
 
     def descend(self, start: Transform, prior: Prior, reach: float) -> Solution:
-        """Take the stage's steps.
+        """Take the stage's Gauss–Newton steps; ``reach`` is the search distance, image pixels.
 
         Raises:
             UndecidedError: The outline leaves the image.
@@ -150,7 +150,7 @@ class Round:
         return end
 
     def term(self, reach: float) -> Term:
-        """Return the term of the outline, in the colours learned last."""
+        """Return the solver term of the outline, for the colours learned last."""
 
         def outline(pose: Transform, prior: NormalEquations) -> NormalEquations | None:
             contour = self.contour(pose)
@@ -164,7 +164,7 @@ class Round:
         return outline
 
     def log_likelihood(self, pose: Transform, prior: Prior) -> float:
-        """Return the logarithm of a pose's probability, up to a constant."""
+        """Return a pose's log probability from learned colours and prior, up to a constant."""
         silhouette = self._silhouette(pose)
         if silhouette is None:
             return -math.inf
@@ -173,7 +173,7 @@ class Round:
         return inside - 0.5 * prior.squared_distance(pose)
 
     def agreement(self, pose: Transform, reach: float) -> OutlineAgreement:
-        """Return the agreement of an outline with the image, in the colours learned last.
+        """Return the agreement of a pose's outline with the image, for the colours learned last.
 
         Raises:
             UndecidedError: The outline leaves the image.
@@ -183,7 +183,7 @@ class Round:
     def check(
         self, end: Solution, prior: Prior, reach: float, information: PoseMatrix
     ) -> OutlineAgreement:
-        """Return the agreement of the outline at the end of a descent.
+        """Return the agreement of the outline at the end of a descent, if the pose is accepted.
 
         Args:
             end: End of the descent.
@@ -192,7 +192,7 @@ class Round:
             information: Information at the end without the outline.
 
         Raises:
-            UndecidedError: The image does not determine this pose.
+            UndecidedError: The image does not determine the pose or contradicts it.
         """
         contour = self._outline(end.T_cam_obj)
         agreement = self._agreement(contour, reach)
@@ -216,11 +216,11 @@ class Round:
         return agreement
 
     def reach(self, reach: float) -> float:
-        """Return the stage's share of a search distance, pixels of its crop."""
+        """Return the stage's share of a search distance (image pixels), in pixels of its crop."""
         return max(EDGE_PX, self.stage.reach * reach * self.crop.scale)
 
     def farthest(self, reach: float) -> float:
-        """Return the stage's share of a search distance, pixels of the image."""
+        """Return the stage's share of a search distance, both in pixels of the image."""
         return self.reach(reach) / self.crop.scale
 
     def _outline(self, pose: Transform) -> Contour:
@@ -267,5 +267,5 @@ class Round:
 
 
 def _step(reach: float) -> float:
-    """Return the distance between two samples, pixels."""
+    """Return the distance of samples along a normal, for a search distance (both pixels)."""
     return min(max(1.0, reach / SAMPLES), 4.0)

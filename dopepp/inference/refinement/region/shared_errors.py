@@ -55,15 +55,15 @@ def region_terms(
     position: Vector,
     scale_error: float = SCALE_ERROR,
 ) -> NormalEquations:
-    """Return the terms of an outline, with offset and scale eliminated.
+    """Return the normal equations of an outline, with offset and scale eliminated.
 
     Points are reweighted by their residuals after a common step: the spread of the residuals is
     added to each point's variance, and outliers get a small weight (Geman–McClure).
 
     Args:
-        rows: Derivatives of the points' motion.
-        shifts: Shifts of the points.
-        prior: Prior of the step.
+        rows: Derivatives of each point's motion along its normal by the pose, pixels.
+        shifts: Measured shift of the part's border at each point.
+        prior: Normal equations of the prior and of other terms.
         spacing: Distance between points, pixels.
         extent: Extent of the part, pixels.
         position: Object's origin, camera frame, metres.

@@ -40,16 +40,16 @@ class Weights(NamedTuple):
 
 
 FOUND: Final = Weights(colour=0.5, edge=1.0)
-"""For a start that may be far off: colours decide which of many edges is the part's."""
+"""Weights for a start that may be far off: colours decide which of many edges is the part's."""
 
 FOLLOWED: Final = Weights(colour=0.12, edge=4.0)
-"""For a tracked part: the nearest edge is the part's, and its centre is robust to blur. For starts
-that are far off, these weights are worse than :data:`FOUND`."""
+"""Weights for a tracked part: the nearest edge is the part's, and its centre is robust to blur. For
+starts that are far off, these weights are worse than :data:`FOUND`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shifts:
-    """Shift of the image's outline from a pose's, along each normal."""
+    """Shift of the part's border on the image from a projected outline, along each normal."""
 
     mean: Float[np.ndarray, "points"]  # pixels, outward
     information: Float[np.ndarray, "points"]  # pixels⁻²; 0 where all shifts are equally likely
@@ -63,10 +63,10 @@ def find_shifts(
     step: float,
     weights: Weights,
 ) -> Shifts:
-    """Measure the shifts of an outline.
+    """Measure how far the part's border on the image is from an outline, along its normals.
 
     Args:
-        odds: Log odds of the pixels, 0 where unknown.
+        odds: Log odds that each pixel shows the part; 0 where unknown.
         colours: RGB.
         contour: Outline.
         reach: Search distance to each side, pixels.
@@ -99,7 +99,7 @@ def _changes(
         changes: Filled with the changes of each point.
 
     Returns:
-        The mean change.
+        The mean change plus ``MIN_CHANGE``, grey levels.
     """
     height, width = colours.shape[:2]
     samples = np.empty((2 * count + 5, 3))
@@ -185,7 +185,7 @@ def _shifts(
 
 @compiled()
 def _sampled(values: Array, u: float, v: float) -> float:
-    """Interpolate between four pixels; 0 outside the image."""
+    """Interpolate values at column u and row v between four pixels; 0 outside the image."""
     height, width = values.shape
     if not (0.0 <= u < width - 1.0 and 0.0 <= v < height - 1.0):
         return 0.0
