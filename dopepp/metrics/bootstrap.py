@@ -74,8 +74,8 @@ def paired_difference(
 ) -> Difference | None:
     """Return the difference of a statistic between two methods, with its confidence interval.
 
-    The statistic over instances is averaged over objects and seeds. With a single seed
-    the interval does not cover the noise of training.
+    The statistic over instances is averaged over objects and seeds. With a single seed, the
+    interval does not cover the noise of training.
 
     Args:
         mine: Values of the method. The median ignores values that are not finite (misses).

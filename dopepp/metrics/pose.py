@@ -61,11 +61,11 @@ class PredictedPose(Protocol):
 
     @property
     def T_cam_obj(self) -> Transform:  # noqa: N802
-        """Estimated pose, metres."""
+        """Estimated rigid transform from object to camera frame, metres."""
 
     @property
     def covariance(self) -> Float[np.ndarray, "6 6"] | None:
-        """As in :class:`~dopepp.recovery.detection.Detection`; None if unknown."""
+        """Covariance as in :class:`~dopepp.recovery.detection.Detection`; None if unknown."""
 
 
 class TruePose(Protocol):
@@ -239,7 +239,7 @@ class PoseMetrics(Metric):
         return np.asarray(getattr(self._gathered[name].errors, measure).numpy())
 
     def references(self) -> dict[str, dict[str, PoseRow]]:
-        """Return the rows of each reference on the evaluated instances, by object or :data:`MEAN`.
+        """Return, by reference, the rows of objects and :data:`MEAN` on the evaluated instances.
 
         All ranks must call this method, like ``compute``.
         """
@@ -298,7 +298,7 @@ class EvaluatedInstances:
         self.errors = PoseErrors.of(part, T_est, self.T_gt, self.K, camera[:, 9], covariance)
 
     def row(self, method: str) -> PoseRow:
-        """Return the row of the object, which has only counts without ground truth."""
+        """Return the row of the object; without evaluated instances, it has counts only."""
         errors, num_false = self.errors, len(self.false_positives)
         if len(errors.add) == 0:
             row = PoseRow(self.part.name, method, 0, num_symmetries=errors.num_symmetries)

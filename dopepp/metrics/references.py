@@ -112,7 +112,7 @@ def _other_poses(
 def _best_constant(
     rotations: Float[np.ndarray, "n 3 3"], points: Tensor, threshold: float
 ) -> Float[np.ndarray, "n 3 3"]:
-    """Return the rotation errors of the constant estimate with the highest pass rate.
+    """Return the rotation errors of the constant rotation with the most ADDs below a threshold.
 
     Candidates are all test rotations and their mean; equal rates are decided by the mean ADD.
     """

@@ -218,7 +218,7 @@ class Column:
     formula: Formula | None = None
 
     def text(self, row: PoseRow) -> str:
-        """Return the cell of a row in this column."""
+        """Return the text of this column for a row."""
         return self.format(getattr(row, self.field))
 
     def format(self, value: float | None, *, signed: bool = False) -> str:

@@ -1,1 +1,1 @@
-"""Networks, losses, the plain spec that describes a network, and checkpoints."""
+"""Networks, losses, the spec that describes a network, and checkpoints."""

@@ -50,7 +50,7 @@ class SE(Attention):
 
 
 class CBAM(Attention):
-    """The paper's attention (Eq. 5, 6): channel attention, then spatial attention.
+    """Attention of DOPE++ (Eq. 5, 6): channel attention, then spatial attention.
 
     Channel: features · σ(MLP(mean) + MLP(maximum)) over the map (Eq. 5). Spatial: features ·
     σ(conv([mean; maximum])) over the channels (Eq. 6). ``reduction`` divides the width of the MLP's
@@ -78,7 +78,7 @@ class CBAM(Attention):
 
 
 def _bottleneck(channels: int, reduction: int) -> nn.Sequential:
-    """Return W1·ReLU(W0·x) with at least one hidden unit and, as in both papers, no biases."""
+    """Return W1·ReLU(W0·x) without biases, with channels / ``reduction`` (≥ 1) hidden units."""
     hidden = max(1, channels // check("reduction", reduction, int, Range(1, 1024)))
     return nn.Sequential(
         nn.Linear(channels, hidden, bias=False),

@@ -41,7 +41,7 @@ class Backbone(nn.Module, ABC):
     Attributes:
         out_channels: Channels of the feature maps.
         stride: Input pixels per feature cell, along each axis.
-        cell_multiple: Divisor of the feature map's height and width.
+        cell_multiple: Number of which the feature map's height and width must be multiples.
     """
 
     out_channels: int
@@ -82,7 +82,7 @@ class VGG19(_Chain):
     """DOPE's backbone: VGG19's layers 0–22, then 3×3 convolutions 512→256 and 256→128.
 
     Args:
-        width: Factor on every channel count (paper: 1).
+        width: Factor on every channel count (DOPE: 1).
         batch_norm: Whether batch norm replaces the bias of every convolution.
         weights_path: File with a ``state_dict`` of torchvision's ``vgg19`` that initialises the VGG
             layers. Checkpoints do not store this path.
@@ -120,13 +120,13 @@ class VGG19(_Chain):
 
 
 class VGG19Original(VGG19):
-    """Backbone "original" of Table 4: :class:`VGG19` with one more VGG convolution."""
+    """Backbone "original" of DOPE++'s Table 4: :class:`VGG19` with one more VGG convolution."""
 
     plan: ClassVar[Plan] = (*VGG19.plan, 512)
 
 
 class DSC(_Chain):
-    """The paper's light backbone of depthwise separable convolutions (Fig. 7).
+    """DOPE++'s light backbone of depthwise separable convolutions (Fig. 7).
 
     A 3×3 convolution, then pairs of a depthwise 3×3 and a pointwise 1×1 convolution with ReLU after
     each. Three poolings reduce 416×416 pixels to 52×52 cells of 128 channels. ``width`` and
@@ -218,7 +218,7 @@ def copy_layer(
 ) -> None:
     """Copy the weights of a file to a layer, whose name in the file is ``name``.
 
-    ``path`` and ``network`` of the file are for messages.
+    ``path`` of the file and the name of the expected ``network`` are for messages.
 
     Raises:
         UserError: A tensor is missing or has another shape.

@@ -310,7 +310,7 @@ def write_content(content: Mapping[str, Any], path: Path, half: bool = True) -> 
 
 
 def payload_json(payload: Mapping[str, Any]) -> str:
-    """Return a payload as one line of JSON, without local paths."""
+    """Return the result of :meth:`Checkpoint.to_payload` as a line of JSON, without local paths."""
     return json.dumps(_without_folders(payload), allow_nan=False)
 
 
@@ -327,7 +327,7 @@ def _half(name: str, value: Tensor) -> Tensor:
 
 
 def _without_folders(value: Any, key: str = "") -> Any:
-    """Return a payload without local paths.
+    """Return a description without local paths.
 
     A path is replaced by the name of its file, and a folder under a key of :data:`_FOLDER_KEYS`
     by None.

@@ -66,7 +66,7 @@ class Head(nn.Module):
         make_branch: Builds a branch from input channels, output channels and stage (from 0).
 
     Attributes:
-        cell_multiple: Divisor of the feature map's height and width.
+        cell_multiple: Number of which the feature map's height and width must be multiples.
     """
 
     cell_multiple: int = 1
@@ -166,7 +166,7 @@ class ChainBranch(nn.Sequential, Branch):
 
 
 class MultiScale(Head):
-    """A chain of 1 to 12 MultiScaleDOPEstages of the paper (§3.3).
+    """A chain of 1 to 12 MultiScaleDOPEstages of DOPE++ (§3.3).
 
     ``width`` is a factor on the 128 channels. If ``batch_norm``, batch norm follows every
     convolution except output convolutions. ``maps`` selects the fusion's input from each scale:

@@ -78,7 +78,7 @@ class Registry(Generic[T]):
         self._targets.add(dotted)
 
     def resolve(self, dotted: object) -> type[T]:
-        """Return the class of an allowed name.
+        """Return the class with an allowed dotted name.
 
         Raises:
             UserError: The name is not in the allow-list, or does not resolve to the allowed class.

@@ -151,7 +151,7 @@ def with_meshes(
 
 
 def _with_mesh(part: Part, chosen: str | None, unit: str | None) -> Part:
-    """Return a part with the mesh of a chosen file, or with its own mesh without a file."""
+    """Return a part with the mesh of the file ``chosen`` or, for None, with its present mesh."""
     if chosen is None:
         if part.mesh is not None:
             return part
@@ -165,7 +165,7 @@ def _with_mesh(part: Part, chosen: str | None, unit: str | None) -> Part:
 
 
 def _tapered(foot: float, top: float, *sections: CrossSection) -> Manifold:
-    """Extrude convex sections along z, shrinking them by ``SLOPE`` all around."""
+    """Extrude convex sections from ``foot`` to ``top`` (mm), shrinking them by ``SLOPE``."""
     # Walls that lean make the features visible from straight above.
     solids = []
     for section in sections:
@@ -176,14 +176,14 @@ def _tapered(foot: float, top: float, *sections: CrossSection) -> Manifold:
 
 
 def _polygon(*corners: tuple[float, float]) -> CrossSection:
-    """Return a convex polygon: the hull of its corners, in any order."""
+    """Return a convex polygon (mm): the hull of its corners, in any order."""
     return CrossSection.hull_points(np.array(corners, np.float64))
 
 
 def _rectangle(
     lower: tuple[float, float], upper: tuple[float, float], radius: float = 0.0
 ) -> CrossSection:
-    """Return an axis-aligned rectangle whose corners are rounded by ``radius``."""
+    """Return an axis-aligned rectangle (mm) whose corners are rounded by ``radius``."""
     (left, bottom), (right, top) = lower, upper
     xs, ys = (left + radius, right - radius), (bottom + radius, top - radius)
     if radius == 0:
@@ -192,17 +192,17 @@ def _rectangle(
 
 
 def _disc(centre: tuple[float, float], radius: float) -> CrossSection:
-    """Return a disc, approximated by a polygon."""
+    """Return a disc (mm), approximated by a polygon."""
     return CrossSection.circle(radius, SEGMENTS).translate(centre)
 
 
 def _slot(start: tuple[float, float], end: tuple[float, float], width: float) -> CrossSection:
-    """Return a band with round ends around the line from ``start`` to ``end``."""
+    """Return a band (mm) with round ends around the line from ``start`` to ``end``."""
     return CrossSection.batch_hull([_disc(start, width / 2), _disc(end, width / 2)])
 
 
 def _prism(section: CrossSection, bottom: float = BACK, top: float = FRONT) -> Manifold:
-    """Extrude a section along z between two heights (millimetres)."""
+    """Extrude a section along z between two heights (mm)."""
     return section.extrude(top - bottom).translate((0.0, 0.0, bottom))
 
 

@@ -42,7 +42,7 @@ SMALLEST_DIAMETER: Final = 0.005
 LARGEST_DIAMETER: Final = 5.0
 """Metres. Other diameters nearly always mean a wrong unit."""
 
-MAX_NAME: Final = 200  # Characters; a hostile file prints no more
+MAX_NAME: Final = 200  # Characters; limits the text that a hostile file can print
 MAX_POINTS: Final = 100_000
 MAX_SYMMETRIES: Final = 1000
 """Far more than any real part has; bounds on the memory of a hostile file."""

@@ -48,8 +48,8 @@ class LearnedRange(NamedTuple):
     """Range of sizes and distances of a part that a network has learned.
 
     Attributes:
-        smallest_px: Smallest size (diameter × focal length / depth), pixels of the input.
-        largest_px: Largest size, pixels of the input.
+        smallest_px: Smallest size (diameter × focal length / depth), network input pixels.
+        largest_px: Largest size, network input pixels.
         nearest: Smallest depth of the cuboid's centre, metres.
         farthest: Largest depth of the cuboid's centre, metres.
     """

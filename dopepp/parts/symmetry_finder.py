@@ -48,8 +48,8 @@ def find_symmetries(mesh: Mesh, tolerance: float = TOLERANCE) -> Symmetries:
         tolerance: Largest distance of a moved surface point from the surface, diameters.
 
     Returns:
-        Discrete symmetries without the identity, metres (one flip for a round part), and axes of
-        continuous symmetry (three for a ball).
+        Discrete symmetries without the identity, metres (at most a half turn for a round part),
+        and axes of continuous symmetry (three for a ball).
 
     Raises:
         UserError: ``tolerance`` is outside 1e-4 … 0.1.

@@ -202,7 +202,7 @@ class EmptyMaps(Callback):
         return {"empty": self._num_empty, "warned": self._warned, "first_loss": self._first_loss}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the number of empty validations, the first loss and the warning."""
+        """Restore the values of :meth:`state_dict`."""
         self._num_empty, self._warned = int(state_dict["empty"]), bool(state_dict["warned"])
         self._first_loss = float(state_dict["first_loss"])
 
@@ -214,7 +214,7 @@ class EmptyMaps(Callback):
     def on_validation_batch_end(  # type: ignore[override]
         self, trainer: Trainer, system: PoseSystem, outputs: ValidationOutput, batch: Batch, *_: Any
     ) -> None:
-        """Update the highest beliefs, and the positions and sizes of labels."""
+        """Update the highest beliefs, and the positions and sizes of the visible labels."""
         belief = outputs.belief.reshape(len(batch), -1, NUM_KEYPOINTS, *outputs.belief.shape[-2:])
         highest = torch.stack([belief[:, :, :CENTROID].max(), belief[:, :, CENTROID].max()])
         self._highest = torch.fmax(self._highest, highest)

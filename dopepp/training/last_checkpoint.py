@@ -46,11 +46,11 @@ Cut = Callable[[dict[str, Any]], None]
 
 
 class LastCheckpoint(Checkpoint):
-    """Saves ``checkpoints/last.ckpt``, also during an epoch, and keeps the previous file.
+    """Saves ``last.ckpt``, also during an epoch; the old file becomes ``previous.ckpt``.
 
     Files are saved between two batches or before a validation: every ``every_s`` seconds, after a
-    new best checkpoint, at the end, and when a signal requests a stop. Periodic saving takes at
-    most ``max_share`` of the time.
+    new best checkpoint, at the end of training, and when a signal requests a stop. Periodic saving
+    takes at most ``max_share`` of the time.
     """
 
     def __init__(self, every_s: float = 60.0, max_share: float = 0.01) -> None:
@@ -102,7 +102,7 @@ class LastCheckpoint(Checkpoint):
     def on_train_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, batch: Batch, batch_idx: int
     ) -> None:
-        """Save periodically, after a new best score or on a signal; a resumed run starts here."""
+        """Save periodically, after a new best score or on a signal; resume with this batch."""
         # Checkpoints have no accumulated gradients.
         if batch_idx % trainer.accumulate_grad_batches == 0:
             self._save_if_due(trainer, _before_batch)

@@ -73,7 +73,7 @@ class PoseMetricsCallback(Callback):
             self.metrics.update(*image, width)
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Log means over objects; undefined rotation errors are omitted, other values are NaN."""
+        """Log means over objects; undefined means are NaN, undefined rotation errors omitted."""
         rows = self.metrics.compute()
         values = {name: getattr(rows[MEAN], name) for name in LOGGED}
         objects = [row for name, row in rows.items() if name != MEAN]
@@ -124,10 +124,10 @@ class EarlyStop(EarlyStopping):
 
 
 class AUCCurves(Callback):
-    """Draws accuracy over ADD threshold, ``val_auc``; must follow :class:`PoseMetricsCallback`."""
+    """Draws accuracy–threshold curves of ADD; must follow :class:`PoseMetricsCallback`."""
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw an accuracy curve per object from the errors of all processes."""
+        """Draw a curve per object, from the errors of all processes, as ``val_auc``."""
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         (metrics,) = (item.metrics for item in callbacks if isinstance(item, PoseMetricsCallback))
         curves = {name: metrics.errors(name) for name in metrics.parts}
@@ -198,7 +198,7 @@ class Overlays(ValidationSheet):
 
 
 class BeliefMaps(ValidationSheet):
-    """Images under the belief maps of corners and centroid: ``val_belief.png``."""
+    """Images overlaid with the belief maps of corners and centroid: ``val_belief.png``."""
 
     name: ClassVar[str] = "belief"
 

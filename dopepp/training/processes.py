@@ -48,7 +48,7 @@ class Watch(threading.Thread):
         self._stopped = threading.Event()
 
     def run(self) -> None:
-        """End this process ``_GRACE_S`` seconds after the death of another process."""
+        """End this process 20 s after the death of another process."""
         while not self._stopped.wait(_POLL_S):
             death = self.death()
             if death is not None:

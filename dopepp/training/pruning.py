@@ -36,7 +36,7 @@ class TrialReport(Callback):
     Args:
         storage: SQLite file or database URL.
         study: Name of the study.
-        number: Number of the trial.
+        number: Number of the trial within the study.
         monitor: Logged value that is the objective.
         prune: Whether poor trials are stopped.
         after_trials: Number of finished trials before any trial is stopped.

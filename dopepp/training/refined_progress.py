@@ -62,7 +62,7 @@ class RefinedProgress(Callback):
         return {"curve": [list(point) for point in self.curve], "minutes": self._minutes()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the curve and the minutes."""
+        """Restore the points of the curve and the minutes of training."""
         self.curve = [tuple(point) for point in state_dict["curve"]]
         self._minutes_before = float(state_dict["minutes"])
 
@@ -81,7 +81,7 @@ class RefinedProgress(Callback):
         trainer.should_stop = trainer.should_stop or trainer.strategy.broadcast(reached)
 
     def _measure_and_report(self, trainer: Trainer, system: PoseSystem) -> bool:
-        """Measure, log, print and draw; return whether ``stop_at`` is reached."""
+        """Measure refined poses, report the accuracy, and return whether ``stop_at`` is reached."""
         estimator = self._estimator(system)
         # Only rank 0 measures, so metrics are not gathered across processes.
         metrics = PoseMetrics(system.parts, sync_on_compute=False)

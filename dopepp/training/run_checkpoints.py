@@ -52,11 +52,11 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     """Saves Lightning's checkpoints atomically and loads them without running code.
 
     A checkpoint that cannot be written (disk full, server unavailable) is kept in memory until the
-    next checkpoint. It is written first, so that no file refers to a missing file. A newer version
-    of the same file replaces the kept version.
+    next save, which writes it first, so that no file refers to a missing file. A newer version of
+    the same file replaces the kept version.
 
     Args:
-        prepare: Called before each writing; if it raises ``OSError``, nothing is written.
+        prepare: Called before each file is written; its ``OSError`` prevents the writing.
         folder: Folder of the run; no files outside are removed.
     """
 
@@ -125,9 +125,9 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def load_checkpoint(
         self, path: Any, map_location: Any = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """Load a file as plain data, without pickled objects.
+        """Load a checkpoint without running pickled code.
 
-        The run folder may have been moved, so the callbacks' paths are updated.
+        The run folder may have been moved, so the file paths in the callbacks' states are updated.
         """
         loaded: Mapping[str, Any] = super().load_checkpoint(path, map_location, weights_only=True)
         if self._folder is None:
@@ -233,7 +233,7 @@ def _copy(value: Any) -> Any:
 
 
 def _move_paths(state: Any, folder: Path) -> Any:
-    """Return a callback's state, with the files of a ``ModelCheckpoint`` moved to a folder."""
+    """Return a callback's state, with the file paths of a ``ModelCheckpoint`` set to a folder."""
     if not isinstance(state, dict) or "dirpath" not in state:
         return state
 

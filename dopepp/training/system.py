@@ -56,7 +56,7 @@ class ValidationOutput:
 
 
 class PoseSystem(LightningModule):
-    """Trains a network on maps and recovers poses from them.
+    """Trains a network on belief maps and vector fields, and recovers poses from its maps.
 
     Args:
         network: The network to train.
@@ -135,7 +135,7 @@ class PoseSystem(LightningModule):
         return ValidationOutput(loss, self.network.activate(logits.float()), field.float())
 
     def recover(self, output: ValidationOutput, batch: Batch) -> list[list[Detection]]:
-        """Recover the detections of every score on each image of a validation batch."""
+        """Recover the detections on each image of a validation batch, without a minimum score."""
         cameras, names = batch.K.cpu().numpy(), [part.name for part in self.parts]
         maps = (output.belief, output.field, self.cuboids, cameras, self.geometry.stride)
         return recover_batch(*maps, names, **vars(replace(self.recovery, min_score=0.0)))
@@ -206,7 +206,7 @@ class PoseSystem(LightningModule):
 
 
 def _without_progress(state: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a scheduler in its state, without the counts of steps."""
+    """Return a scheduler's state without its counts of steps and the last rates."""
     return {name: value for name, value in state.items() if name not in _SCHEDULE_PROGRESS}
 
 

@@ -104,7 +104,7 @@ def choose_keypoints(
 
 
 class Equivalents(NamedTuple):
-    """Keypoints of equivalent poses, input pixels, by increasing angle to the reference pose.
+    """Keypoints of equivalent poses, input px, by increasing angle to the reference orientation.
 
     ``allowed`` marks poses that may be used as targets; the first is always allowed.
     """
@@ -156,9 +156,9 @@ class SymmetryHandling:
     def _poses(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """Return T·S·C for each label T and discrete symmetry S, and its angle to the reference.
 
-        C is the rotation about the axis of a round part with the smallest angle. Poses have the
-        shape (batch, instances, choices, 4, 4), angles (batch, instances, choices), radians;
-        padding is infinite.
+        C is the rotation about a round part's axis that minimises this angle. Poses have the shape
+        (batch, instances, choices, 4, 4), angles (batch, instances, choices), radians, infinite in
+        padding.
         """
         tables = self._on(batch.T_cam_obj.device)
         index = batch.object_index.clamp(min=0)

@@ -42,7 +42,7 @@ class Throughput(Callback):
         self._started = self._step_ended = 0.0
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Reset the counters."""
+        """Reset the number of images and the waiting time."""
         self._images, self._waited = 0, 0.0
         self._started = self._step_ended = time.perf_counter()
 
@@ -60,7 +60,7 @@ class Throughput(Callback):
         self._step_ended = time.perf_counter()
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Log the values of the epoch."""
+        """Log images per second and the share of waiting over the epoch."""
         elapsed = max(self._step_ended - self._started, 1e-9)
         speed, waiting = self._images / elapsed, self._waited / elapsed
         pl_module.log("throughput/images_per_s", speed, rank_zero_only=False)

@@ -28,7 +28,7 @@ _LEAF: Final = 16  # Largest number of points in a leaf
 _ROUNDING: Final = 1e-9
 """Share by which a bound is lowered, so that rounding errors never prune the nearest point."""
 
-_NUM_PROBES: Final = 8  # Number of corners of a box
+_NUM_PROBES: Final = 8  # As many as a box has corners
 
 
 def mean_nearest(
@@ -179,7 +179,7 @@ def least_farthest(
 
 
 def _probes_first(points: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
-    """Reorder points so that the probes come first, each farthest from all earlier probes."""
+    """Reorder points so that each of the first ``_NUM_PROBES`` is farthest from those before."""
     order = np.arange(len(points))
     distances = ((points - points.mean(axis=0)) ** 2).sum(axis=1)
     for k in range(min(_NUM_PROBES, len(points))):

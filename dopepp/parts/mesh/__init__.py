@@ -228,7 +228,7 @@ class SurfaceTree:
     def distances(
         self, points: Float[np.ndarray, "*batch 3"], neighbours: int = _NUM_NEIGHBOURS
     ) -> Float[np.ndarray, "*batch"]:
-        """Return each point's distance to the triangles of the nearest ``neighbours`` points."""
+        """Return each point's distance to the triangles of ``neighbours`` nearby surface points."""
         flat = points.reshape(-1, 3)
         neighbour = self._tree.query(flat, k=np.arange(1, neighbours + 1))[1]
         triangles = self.triangles[self._owners[neighbour]]

@@ -133,7 +133,7 @@ def _count_pieces(model: bytes) -> int:
 
 
 def _check_size(num_bytes: int, max_bytes: int = MAX_UNPACKED_BYTES) -> None:
-    """Raise a ``ValueError`` if unpacked data are larger than either limit."""
+    """Raise a ``ValueError`` if unpacked data exceed ``max_bytes`` or ``MAX_UNPACKED_BYTES``."""
     if num_bytes > min(max_bytes, MAX_UNPACKED_BYTES):
         raise ValueError(f"{num_bytes / 1e6:.0f} MB of text, over {max_bytes / 1e6:.0f} MB")
 

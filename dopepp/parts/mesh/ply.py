@@ -220,7 +220,7 @@ def _read_table(body: bytes, start: int, element: Element) -> tuple[Table, int]:
 
 
 def _length(body: bytes, start: int, kind: np.dtype[Any]) -> int:
-    """Return the length of a list; a fraction or negative number in a damaged file is an error."""
+    """Return the length of a list; a fractional, negative or too large number is an error."""
     written = np.frombuffer(body, kind, 1, start)[0].item()
     if written != int(written) or not 0 <= written <= len(body):
         raise ValueError(f"a list of {written} values")

@@ -231,7 +231,7 @@ def find_topology(corners: Faces) -> Topology:
 def misoriented_faces(
     vertices: Vertices, faces: Faces, topology: Topology
 ) -> Bool[np.ndarray, " faces"]:
-    """Find the triangles to flip so that every connected surface faces the same way.
+    """Find the triangles to flip for consistent surfaces that face outwards if closed.
 
     Within a connected surface, the orientation with less area is flipped; a Möbius strip remains
     unchanged. A closed surface that faces inwards is flipped, and then every body that faces
